@@ -34,6 +34,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from ..common.errors import AerpawCmpError, InputError, UsageError
 from ..common.interrupts import SIGNALS
@@ -85,29 +86,30 @@ class Holder:
     name: str
 
 
+def _list_ports() -> list[Any]:
+    """Return the serial ports of this system as pyserial lists them."""
+    from serial.tools import list_ports
+
+    return list(list_ports.comports())
+
+
 @dataclass(frozen=True, slots=True)
 class Roots:
-    """The folders where the system lists devices. Tests use a separate tree."""
+    """The folder of devices and the list of serial ports; tests use others."""
 
     dev: Path = Path("/dev")
-    sys: Path = Path("/sys")
+    ports: Callable[[], list[Any]] = _list_ports
 
-
-def _usb_of(tty: str, roots: Roots) -> tuple[str, str] | None:
-    """Return ``(vendor:product, interface)`` of a tty from sysfs."""
-    device = roots.sys / "class/tty" / tty / "device"
-    if not device.exists():
-        return None
-    for folder in (device.resolve(), *device.resolve().parents):
-        number = folder / "bInterfaceNumber"
-        if number.exists():
-            usb = folder.parent
-            try:
-                product = (usb / "idVendor").read_text().strip() + ":" + (usb / "idProduct").read_text().strip()
-                return product, number.read_text().strip()
-            except OSError:
-                return None
-    return None
+    def usb(self) -> dict[str, tuple[str, str]]:
+        """Return ``(vendor:product, interface)`` of each USB serial port, by the name of its device."""
+        devices = {}
+        for port in self.ports():
+            # the kernel's name of the interface, such as 1-1:1.2; a device of one interface has none
+            interface = re.search(r":\d+\.(\d+)$", port.location or "")
+            if port.vid is not None:
+                number = int(interface[1]) if interface else 0
+                devices[Path(port.device).name] = f"{port.vid:04x}:{port.pid:04x}", f"{number:02x}"
+        return devices
 
 
 def _entries(folder: Path, pattern: str) -> list[Path]:
@@ -123,18 +125,17 @@ def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
     """Return AT ports of Quectel modems, the likeliest first: by-id names, USB interface numbers, then PCIe nodes."""
     roots = roots or Roots()
     ports: list[PortInfo] = []
+    by_name = roots.usb()
     for interface in _AT_INTERFACES:
         for link in _entries(roots.dev / "serial/by-id", f"*[Qq]uectel*-if{interface}*"):
             if link.exists():
-                usb = _usb_of(link.resolve().name, roots)
+                usb = by_name.get(link.resolve().name)
                 ports.append(PortInfo(link, link.resolve(), "by-id", interface, usb[0] if usb else None))
     known = {port.device for port in ports}
-    ttys = sorted(_entries(roots.sys / "class/tty", "ttyUSB*"), key=lambda p: (len(p.name), p.name))
     for interface in _AT_INTERFACES:
-        for tty in ttys:
-            usb = _usb_of(tty.name, roots)
-            node = roots.dev / tty.name
-            if usb and usb[0].startswith(_QUECTEL_VENDOR) and usb[1] == interface and node.resolve() not in known:
+        for name, usb in sorted(by_name.items(), key=lambda item: (len(item[0]), item[0])):
+            node = roots.dev / name
+            if usb[0].startswith(_QUECTEL_VENDOR) and usb[1] == interface and node.resolve() not in known:
                 ports.append(PortInfo(node, node.resolve(), "usb", interface, usb[0]))
     for name in ("mhi_DUN", "smd11"):
         if (roots.dev / name).exists():
@@ -165,7 +166,8 @@ def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
     path = Path(port)
     if not path.exists():
         raise PortGoneError(f"{path} is not there")
-    usb = _usb_of(path.resolve().name, roots) or _usb_of(path.name, roots)
+    by_name = roots.usb()
+    usb = by_name.get(path.resolve().name) or by_name.get(path.name)
     interface, product = (usb[1], usb[0]) if usb else (None, None)
     by_id = roots.dev / "serial/by-id"
     if path.parent == roots.dev:

@@ -9,6 +9,7 @@ import sys
 import time
 import tty
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -43,7 +44,7 @@ def test_wrong_device_within_two_probes(modem, tmp_path, kind, message):
 def test_no_port(tmp_path):
     with pytest.raises(InputError, match="is not there; expected the modem's AT port"):
         run_tap(TapSettings(tmp_path / "log", str(tmp_path / "ttyUSB9")))
-    roots = Roots(tmp_path, tmp_path)
+    roots = Roots(tmp_path, list)
     with pytest.raises(InputError, match="no AT port of a Quectel modem"):
         run_tap(TapSettings(tmp_path / "log", roots=roots))
 
@@ -274,27 +275,27 @@ def test_a_folder_with_an_earlier_log(modem, tap, tools, tmp_path):
     assert len(list((tmp_path / "log").iterdir())) == 2
 
 
-# finding the port, in a made-up /dev and /sys ---------------------------------------------------------------
+# finding the port, in a simulated /dev and list of ports ---------------------------------------------------------------
+
+
+# Ports by their folder: they may change while a tap runs.
+WIRED = {}
 
 
 def wire(root, wires):
-    """The ttys of one modem, as the kernel shows them: ``{number: (interface, where it leads or None)}``."""
-    roots = Roots(root / "dev", root / "sys")
-    for folder in (roots.dev, roots.sys):
-        shutil.rmtree(folder, ignore_errors=True)
-    roots.dev.mkdir(parents=True)
+    """The ttys of one modem, as pyserial lists them: ``{number: (interface, where it leads or None)}``."""
+    dev = root / "dev"
+    shutil.rmtree(dev, ignore_errors=True)
+    dev.mkdir(parents=True)
+    ports = []
     for number, (interface, node) in wires.items():
-        device = roots.sys / f"devices/usb1/1-1/1-1:1.{interface}"
-        (device / f"ttyUSB{number}").mkdir(parents=True)
-        (device / "bInterfaceNumber").write_text(f"{interface:02d}\n")
-        entry = roots.sys / f"class/tty/ttyUSB{number}"
-        entry.mkdir(parents=True)
-        (entry / "device").symlink_to(device / f"ttyUSB{number}")
-        name = roots.dev / f"ttyUSB{number}"
+        name = dev / f"ttyUSB{number}"
         name.touch() if node is None else name.symlink_to(node)
-    (roots.sys / "devices/usb1/1-1/idVendor").write_text("2c7c\n")
-    (roots.sys / "devices/usb1/1-1/idProduct").write_text("0800\n")
-    return roots
+        ports.append(
+            SimpleNamespace(device=f"/dev/ttyUSB{number}", vid=0x2C7C, pid=0x0800, location=f"1-1:1.{interface}")
+        )
+    WIRED[dev] = ports
+    return Roots(dev, lambda: WIRED[dev])
 
 
 def test_the_at_port_is_found_by_interface_not_by_number(tmp_path):
@@ -324,7 +325,7 @@ def test_the_second_at_port_is_taken_when_the_first_is_held(modem, tmp_path):
         process = subprocess.Popen(["sleep", "30"], stdin=node)
     try:
         settings = TapSettings(
-            tmp_path / "log", roots=Roots(tmp_path / "dev", tmp_path / "sys"), duration_s=0.5, status_s=0.1, ri_hz=20
+            tmp_path / "log", roots=Roots(tmp_path / "dev", list), duration_s=0.5, status_s=0.1, ri_hz=20
         )
         summary = run_tap(settings)
         assert summary.answers["nr5g_csi"]["ok"] >= 3

@@ -71,7 +71,7 @@ def trained_on(text: str) -> tuple[str, ...]:
 
 
 def marks(text: str) -> tuple[str, ...]:
-    """Marks of the logs that a learned file was learned from, as :func:`trained_on`.
+    """Return marks of the logs that a learned file was learned from, as :func:`trained_on`.
 
     Examples
     --------

@@ -120,7 +120,7 @@ class Factor:
 def determining(
     points: FloatArray, kernel: Callable[[FloatArray, FloatArray], FloatArray], share: float, most: int
 ) -> IntArray:
-    """Numbers of those points that determine a process of unit variance at all of them.
+    """Return numbers of those points that determine a process of unit variance at all of them.
 
     Parameters
     ----------

@@ -85,7 +85,7 @@ def azimuth_rad(vectors: FloatArray) -> FloatArray:
 
 
 def elevation_rad(vectors: FloatArray) -> FloatArray:
-    """Elevation (...) of vectors (..., 3) above the plane of their first two axes [rad]."""
+    """Return the elevation (...) of vectors (..., 3) above the plane of their first two axes [rad]."""
     return np.asarray(np.arctan2(vectors[..., 2], np.hypot(vectors[..., 0], vectors[..., 1])))
 
 

@@ -104,7 +104,7 @@ def noted() -> Iterator[None]:
 
 
 def _set(numbers: tuple[int, ...], handler: _Handler, *untouched: _Handler) -> list[tuple[int, _Handler]]:
-    """Handle the signals that have a default handler. Return their previous handlers."""
+    """Set a handler for signals whose handler is in ``untouched`` (default: Python's). Return the previous ones."""
     if threading.current_thread() is not threading.main_thread():
         return []
     # a program that embeds this one may handle its signals, so keep its handlers

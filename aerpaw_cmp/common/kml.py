@@ -136,7 +136,7 @@ _AREA_DEG = 5.0
 
 
 def _in_threes(numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
-    """Places of numbers that no blank divides."""
+    """Return places of numbers that no blank divides."""
     threes = [numbers[i : i + 3] for i in range(0, len(numbers), 3)]
     if len(numbers) % 3 or any(max(column) - min(column) > _AREA_DEG for column in list(zip(*threes, strict=True))[:2]):
         raise InputError(

@@ -38,7 +38,7 @@ _CHILD = "import sys; sys.path[:] = sys.argv[2:]; from aerpaw_cmp.common.native 
 
 
 def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
-    """Arrays of a file, and what else is known of them.
+    """Return arrays of a file, and what else is known of them.
 
     Parameters
     ----------

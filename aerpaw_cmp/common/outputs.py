@@ -109,7 +109,7 @@ def read_sums(folder: Path) -> dict[str, str] | None:
 
 
 def changed_files(folder: Path) -> list[str]:
-    """Names in ``SHA256SUMS`` whose file is there with another content."""
+    """Return names in ``SHA256SUMS`` whose file exists with different content."""
     return [
         name
         for name, digest in (read_sums(folder) or {}).items()
@@ -764,7 +764,7 @@ class Sink:
         return int(self._spared(self._stream.seek, offset, whence))
 
     def tell(self) -> int:
-        """Place in the stream."""
+        """Return the place in the stream."""
         return int(self._spared(self._stream.tell))
 
     def write(self, block: Any) -> int:

@@ -47,7 +47,7 @@ def logged(text: str, fraction: float | None = None, /) -> None:
 
 
 def duration(seconds: float) -> str:
-    """Seconds in a unit that is read at a glance.
+    """Return seconds in a unit that is read at a glance.
 
     Examples
     --------

@@ -106,7 +106,7 @@ def db_from_amplitude(amplitude: ArrayLike) -> FloatArray:
 
 
 def amplitude_from_db(level_db: ArrayLike) -> FloatArray:
-    """Ratio of magnitudes of a level in dB."""
+    """Return the ratio of magnitudes of a level in dB."""
     return np.asarray(10.0 ** (unmasked(level_db) / 20.0))
 
 
@@ -129,7 +129,7 @@ def finite_mean(values: ArrayLike) -> float:
 
 
 def spread_out(count: int, most: int) -> IntArray:
-    """Indices of at most ``most`` of ``count`` items, evenly apart, the first and the last among them.
+    """Return indices of at most ``most`` of ``count`` items, evenly apart, the first and the last among them.
 
     Examples
     --------

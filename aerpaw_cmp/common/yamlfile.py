@@ -353,7 +353,7 @@ class _Builder:
 
 
 def _plain_value(text: str) -> Any:
-    """Value of an unquoted scalar by the core schema of YAML 1.2."""
+    """Return the value of an unquoted scalar by the core schema of YAML 1.2."""
     if text in _WORDS:
         return _WORDS[text]
     # Python takes quadratic time for long integers and refuses them from 4 300 digits on: they become floats

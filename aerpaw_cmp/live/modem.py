@@ -670,7 +670,7 @@ class Framer:
         self._open = _Open(command, prefixes, [], [])
 
     def feed(self, data: bytes) -> list[Event]:
-        """Events that these bytes complete, in their order."""
+        """Return events that these bytes complete, in their order."""
         events: list[Event] = []
         for line in self._buffer.feed(data):
             pieces = unglue(line.text) if not line.dropped else (line.text,)

@@ -81,9 +81,9 @@ class RunningInterval:
     Notes
     -----
     The bounds are order statistics of the last ``keep`` residuals. Neighbours in time are correlated, so quantiles
-    alone would cover less than ``share``. After each residual the tail share ``a`` therefore moves by ``a += step (1 -
-    share - outside)`` (Gibbs and Candes 2021, doi 10.48550/arXiv.2106.00170), which makes the long-run share correct
-    for any sequence.
+    alone would cover less than ``share``. After each residual the tail share ``a`` therefore changes by
+    ``a += step (1 - share - outside)`` (Gibbs and Candes 2021, doi 10.48550/arXiv.2106.00170). This makes the long-run
+    share correct for any sequence.
 
     Examples
     --------

@@ -29,7 +29,7 @@ _LATENCY_S = 0.02
 
 
 def _flight_rank(seconds: float) -> int:
-    """Rank of the built-in flight: 1 to 4 in slow turns, now and then no CSI."""
+    """Return the rank of the built-in flight: 1 to 4 in slow turns, now and then no CSI."""
     if seconds % 120.0 > 118.0:
         return 0
     return 1 + round(1.5 + 1.5 * math.sin(seconds / 20.0))
@@ -62,7 +62,7 @@ class FlightModem:
         self._asked = 0
 
     def reply(self, command: str) -> tuple[str, ...]:
-        """Lines for a command, the final result last."""
+        """Return lines for a command, the final result last."""
         now = time.monotonic() - self._start
         rank = self._rank(now) if self.csi[1] else 0
         rsrp = round(self._rsrp(now))
@@ -242,7 +242,7 @@ class ModemSimulator:
 
 
 def framed(lines: Iterable[str]) -> bytes:
-    """Lines of an answer as a modem writes them."""
+    """Return lines of an answer as a modem writes them."""
     return b"".join(b"\r\n" + line.encode("latin-1") + b"\r\n" for line in lines)
 
 

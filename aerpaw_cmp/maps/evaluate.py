@@ -82,7 +82,7 @@ def makima(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> FloatArray:
 
 
 def _makima_tangents(slope: FloatArray) -> FloatArray:
-    """Tangents (..., m, fields) from slopes (..., m - 1, fields), m >= 3."""
+    """Return tangents (..., m, fields) from slopes (..., m - 1, fields), m >= 3."""
     # Akima's two further slopes at each end: those of a parabola through the last samples
     before = 2 * slope[..., :1, :] - slope[..., 1:2, :]
     after = 2 * slope[..., -1:, :] - slope[..., -2:-1, :]
@@ -209,11 +209,11 @@ class _Local:
         return self
 
     def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Estimate at targets (t, dims), ``(t,)`` or ``(t, fields)``, and NaN for the variance."""
+        """Return the estimate at targets (t, dims), ``(t,)`` or ``(t, fields)``, and NaN for the variance."""
         return self._estimate(unmasked(targets_m), leave_out=False)
 
     def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
-        """Estimate at each sample from the others, and NaN for the variance."""
+        """Return the estimate at each sample from the others, and NaN for the variance."""
         return self._estimate(self.points_m_, leave_out=True)
 
     def _estimate(self, targets: FloatArray, *, leave_out: bool) -> tuple[FloatArray, FloatArray]:
@@ -242,7 +242,7 @@ class _Local:
         return estimate
 
     def _combine(self, near: _Near) -> FloatArray:
-        """Estimate (t, fields)."""
+        """Return the estimate (t, fields)."""
         raise NotImplementedError
 
 
@@ -316,7 +316,7 @@ class ServingTowerMean:
         return self
 
     def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Mean of each target's tower, NaN for a tower without samples, and NaN for the variance."""
+        """Return the mean of each target's tower, NaN for a tower without samples, and NaN for the variance."""
         tower = serving_tower(targets_m, self.towers_m)
         return self._mean(self.total_[tower], self.count_[tower])
 

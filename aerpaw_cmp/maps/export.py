@@ -80,7 +80,7 @@ class MapLayers:
         return np.asarray(np.round(np.column_stack([longitude, latitude]), 7), dtype=np.float64)
 
     def towers_of(self, border: Border) -> list[str]:
-        """Names of the towers between which a border lies."""
+        """Return names of the towers between which a border lies."""
         names = list(self.towers_m)
         return [names[i] if i < len(names) else str(i) for i in border.towers]
 
@@ -361,7 +361,7 @@ def _stacked(
 
 
 def _codes(meanings: Sequence[str], long_name: str) -> dict[str, Any]:
-    """Attributes of a variable of classes 0, 1, ..."""
+    """Return attributes of a variable of classes 0, 1, ..."""
     return {
         "long_name": long_name,
         **flags(meanings),

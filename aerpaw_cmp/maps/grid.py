@@ -128,7 +128,7 @@ class Grid:
         return np.column_stack([east.ravel(), north.ravel()])
 
     def positions_m(self, altitude_m: float) -> FloatArray:
-        """Positions (n, 3) at one height above ground [m]."""
+        """Return positions (n, 3) at one height above ground [m]."""
         return np.column_stack([self.points_m, np.full(len(self), float(altitude_m))])
 
     def raster(self, values: ArrayLike) -> AnyArray:
@@ -180,7 +180,7 @@ class Border:
 
 
 def voronoi_borders(towers_m: ArrayLike, area_m: tuple[float, float, float, float]) -> tuple[Border, ...]:
-    """Borders of the serving areas, clipped to the map.
+    """Return borders of the serving areas, clipped to the map.
 
     The border of towers a and b is the part of their perpendicular bisector that is inside the area and no
     nearer to any third tower. Along the bisector each of these conditions is linear, so the part is one segment.
@@ -210,7 +210,7 @@ def voronoi_borders(towers_m: ArrayLike, area_m: tuple[float, float, float, floa
 def _bisector_segment(
     a: int, b: int, towers: FloatArray, area_m: tuple[float, float, float, float]
 ) -> FloatArray | None:
-    """Part (2, 2) of the bisector of towers a and b that is their border, or None."""
+    """Return the part (2, 2) of the bisector of towers a and b that is their border, or None."""
     between = towers[b] - towers[a]
     length = float(np.hypot(*between))
     # two towers on one mast have no bisector
@@ -243,7 +243,7 @@ def _bisector_segment(
 
 
 def class_names(highest: int = 4) -> tuple[str, ...]:
-    """Names of the rank classes: ``Z``, ``1``, ..."""
+    """Return names of the rank classes: ``Z``, ``1``, ..."""
     return (OUT_OF_COVERAGE, *(str(rank) for rank in range(1, highest + 1)))
 
 
@@ -369,7 +369,7 @@ class MapResult:
         return np.stack([(rank == number).mean(axis=-1) for number in range(HIGHEST_RANK + 1)], axis=-1)
 
     def coverage(self, antennas: Antennas = "mimo", tower: str | None = None) -> FloatArray:
-        """Probability of coverage per RSS altitude: share of positions with a path."""
+        """Return the probability of coverage per RSS altitude: share of positions with a path."""
         return np.asarray(np.isfinite(self.rss(antennas, tower)).mean(axis=1))
 
     def _of(self, values: NDArray[np.generic], tower: str | None) -> FloatArray:
@@ -512,7 +512,7 @@ def foliage_difference(without: MapResult, foliage: MapResult) -> FoliageDiffere
 
 
 def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
-    """Maps of a result as layers: joint ones, and with ``towers_too`` those of each tower alone."""
+    """Return maps of a result as layers: joint ones, and with ``towers_too`` those of each tower alone."""
     layers = [Layer("serving_tower", result.serving, "1", "Serving tower", result.tower_names)]
     for tower in (None, *(result.tower_names if towers_too else ())):
         layers += _rss_layers(result, tower)

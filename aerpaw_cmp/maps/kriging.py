@@ -208,7 +208,7 @@ def _in_micrometres(distance_m: FloatArray) -> FloatArray:
 
 
 def _tie_order(distance: FloatArray, who: IntArray, samples_m: FloatArray, targets_m: FloatArray) -> IntArray:
-    """Order of candidates by distance, then offset (up, north, east), then number."""
+    """Return the order of candidates by distance, then offset (up, north, east), then number."""
     offset = _in_micrometres(samples_m[who] - targets_m[:, None, :])
     keys = [offset[:, :, axis] for axis in range(offset.shape[2])]
     return np.lexsort((who, *keys, _in_micrometres(distance)), axis=-1)
@@ -627,7 +627,7 @@ def _solve_bordered(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArra
 
 
 def _solve_reduced(gamma: FloatArray, to_target: FloatArray) -> FloatArray:
-    """Weights (t, m) that sum to 1 and minimise the variance over directions that carry any."""
+    """Return weights (t, m) that sum to 1 and minimise the variance over directions that carry any."""
     from scipy.linalg import helmert
 
     m = to_target.shape[1]
@@ -671,7 +671,7 @@ def _variance_of(weight: FloatArray, gamma: FloatArray, to_target: FloatArray) -
 
 
 def _apply(rule: Weights, values: FloatArray) -> FloatArray:
-    """Estimates (targets, fields) of values (places, fields)."""
+    """Return estimates (targets, fields) of values (places, fields)."""
     from scipy.sparse import csr_array
 
     used = rule.index >= 0

@@ -163,7 +163,7 @@ class _Projection:
         return chosen, np.take_along_axis(residual, pick, axis=-2)[..., 0, :]
 
     def double(self) -> FloatArray:
-        """Logarithms of the two best rates, the faster first."""
+        """Return logarithms of the two best rates, the faster first."""
         # on the paper's bins neighbouring rates differ by a factor of 1.5
         axis = np.linspace(*self.log_rates, 48)
         first, second = np.triu_indices(len(axis), 1)
@@ -175,7 +175,7 @@ class _Projection:
         return np.sort(self._search(valley, 1e-15))[::-1]
 
     def _search(self, start: FloatArray, tolerance: float) -> FloatArray:
-        """Bottom of the valley that a start lies in."""
+        """Return the bottom of the valley that a start lies in."""
         from scipy.optimize import least_squares
 
         fit = least_squares(
@@ -401,7 +401,7 @@ def field_correlation(
 
 
 def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorrelation:
-    """Correlation of the maps of two altitudes, binned by their difference in height.
+    """Return the correlation of the maps of two altitudes, binned by their difference in height.
 
     Parameters
     ----------

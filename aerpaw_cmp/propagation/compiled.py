@@ -78,7 +78,7 @@ def switch() -> str:
 
 
 def _source_hash() -> str:
-    """Hash of the sources, of numba's version and of Python's."""
+    """Return the hash of the sources, of numba's version and of Python's."""
     # machine code of another numba or Python is another, and may not be loadable
     digest = sha256(f"{version('numba')} {sys.version_info[:3]}".encode())
     for name in SOURCES:

@@ -113,7 +113,7 @@ def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
 
 
 def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:
-    """Paths of all parts as one set: their poses are numbered as in the flight, and in order."""
+    """Return paths of all parts as one set: their poses are numbered as in the flight, and in order."""
     numbered = [replace(part, pose=at[part.pose]) for at, part in zip(rows, parts, strict=True)]  # type: ignore[type-var]
     paths = numbered[0].one_after_another(numbered)
     # stable: within a pose the order by tower, depth and faces stays
@@ -135,7 +135,7 @@ def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
 
 
 def _shared(first: Faces, second: Faces) -> int:
-    """Number of faces, from the first on, that are the same in both."""
+    """Return the number of faces, from the first on, that are the same in both."""
     count = min(len(first), len(second))
     same = (first.normal[:count] == second.normal[:count]).all(axis=1)
     same &= first.offset_m[:count] == second.offset_m[:count]
@@ -146,7 +146,7 @@ def _shared(first: Faces, second: Faces) -> int:
 
 
 def added_up(omissions: Iterable[Omission]) -> list[Omission]:
-    """Omissions of the parts of a replay, each once, counts added up."""
+    """Return omissions of the parts of a replay, each once, counts added up."""
     added: dict[tuple[str, str], Omission] = {}
     for item in omissions:
         key = item.tower, item.what

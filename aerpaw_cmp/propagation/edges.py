@@ -240,7 +240,7 @@ class EdgePaths(Further):
         return np.asarray(np.where(after, 10 * (2 + 10 * before) + 1, 2 + 10 * before))
 
     def words(self, faces: Faces) -> list[str]:
-        """Corners of each path, from tower to UAV."""
+        """Return corners of each path, from tower to UAV."""
         label = (*faces.label, "")  # the last entry is for -1, which means no face
         edges = zip(self.wedge.tolist(), self.vertices_m[:, 1].tolist(), strict=True)
         middle = (f"edge of {label[f]} and {label[n]} at {', '.join(f'{x:.1f}' for x in at)} m" for (f, n), at in edges)
@@ -250,7 +250,7 @@ class EdgePaths(Further):
     def fields(
         self, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
     ) -> Fields:
-        """Part of the paths in H and in the powers.
+        """Return the part of the paths in H and in the powers.
 
         Parameters
         ----------
@@ -363,7 +363,7 @@ class Edges(NamedTuple):
 
     @classmethod
     def of(cls, faces: Faces, wavelength: float = 0.0) -> Edges:
-        """Edges of the prisms of a scene, but of those that are lower than half a wavelength [m].
+        """Return edges of the prisms of a scene, except prisms lower than half a wavelength [m].
 
         Upright corners begin at the highest of the level grounds where their wall begins lower.
         """
@@ -418,13 +418,13 @@ def _of_solid(
 
 
 def _point(faces: Faces, wall: int, end: int, height_m: float) -> FloatArray:
-    """Point of a wall's first or last upright at a height."""
+    """Return the point of a wall's first or last upright at a height."""
     at = (faces.lower, faces.upper)[end][wall, 0]
     return np.asarray(faces.normal[wall] * faces.offset_m[wall] + at * faces.along[wall] + [0.0, 0.0, height_m])
 
 
 def _corner(faces: Faces, wall: int, end: int) -> tuple[float, float]:
-    """Corner of the footprint, to the tenth of a millimetre, as a key."""
+    """Return the corner of the footprint, to the tenth of a millimetre, as a key."""
     point = _point(faces, wall, end, 0.0)
     # both walls compute the corner from their own plane, so the last digits differ
     return round(float(point[0]), 4), round(float(point[1]), 4)
@@ -454,7 +454,7 @@ class _Search:
     def of_tower(
         self, tower: int, source_m: FloatArray, targets_m: FloatArray, poses: IntArray, ground: tuple[int, int]
     ) -> list[EdgePaths]:
-        """Paths of one tower with the given ground reflections before and after the edge."""
+        """Return paths of one tower with the given ground reflections before and after the edge."""
         # mirrored in their ground, so that each bent leg is straight
         images = (source_m, targets_m[poses])
         source, ends = (p if g < 0 else self.faces.mirrored(g, p) for g, p in zip(ground, images, strict=True))
@@ -680,7 +680,7 @@ def _round_edge(
 
 
 def _element_places(end: _End, point_m: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Places of an end's elements along the edge and their distances from it (paths, elements) [m]."""
+    """Return places of an end's elements along the edge and their distances from it (paths, elements) [m]."""
     places = (end.centre_m - point_m)[:, :, None] + np.einsum("nji,njk->nik", end.axes, end.places_m)
     along, down, up = np.einsum("nij,njk->ink", frame, places)
     return along, np.hypot(down, up)

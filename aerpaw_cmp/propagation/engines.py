@@ -44,7 +44,7 @@ MOST = 2_560_000
 
 
 def path_cache(search: Search, run: Run) -> PathCache | None:
-    """Cache of a replay, None where there is none."""
+    """Return the cache of a replay, None where there is none."""
     folder = run.cache_dir
     if folder is None:
         # the image engine is faster than reading its paths back
@@ -154,7 +154,7 @@ def search_or_read(
 
 
 def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Run) -> PathSet:
-    """Paths by the engine of ``search``.
+    """Return paths by the engine of ``search``.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ class PathCache:
         carrier_hz: float,
         search: Search,
     ) -> str:
-        """Digest of everything that decides the paths.
+        """Return the digest of everything that decides the paths.
 
         Parameters
         ----------

@@ -119,11 +119,11 @@ class Faces:
         return len(self.normal)
 
     def height_m(self, face: int, points_m: FloatArray) -> FloatArray:
-        """Heights (...) of points (..., 3) in front of the plane of one face."""
+        """Return heights (...) of points (..., 3) in front of the plane of one face."""
         return np.asarray(points_m @ self.normal[face] - self.offset_m[face])
 
     def mirrored(self, face: int, points_m: FloatArray) -> FloatArray:
-        """Images of points (..., 3) in the plane of one face."""
+        """Return images of points (..., 3) in the plane of one face."""
         return np.asarray(points_m - 2.0 * self.height_m(face, points_m)[..., None] * self.normal[face])
 
     def select(self, rows: IntArray) -> Faces:
@@ -200,7 +200,7 @@ class Surfaces:
         return len(self.faces)
 
     def mesh(self) -> tuple[FloatArray, IntArray, IntArray]:
-        """Vertices (n, 3), triangles (m, 3) and the face of each triangle, as the file has them."""
+        """Return vertices (n, 3), triangles (m, 3) and the face of each triangle, as the file has them."""
         count = len(self.corners_m)
         return self.corners_m.reshape(-1, 3), np.arange(3 * count, dtype=np.int64).reshape(-1, 3), self.face
 
@@ -309,7 +309,7 @@ class PathSet(Rows):
 
 
 def sources_of(paths: Rows, sources_m: FloatArray) -> FloatArray:
-    """Sources (paths, 3) of paths, of places (towers, 3), or (poses, towers, 3) of towers that move."""
+    """Return sources (paths, 3) of paths, of places (towers, 3), or (poses, towers, 3) of towers that move."""
     return np.asarray(sources_m[paths.tower] if sources_m.ndim == 2 else sources_m[paths.pose, paths.tower])
 
 
@@ -327,7 +327,7 @@ def legs(source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray) -> 
 
 
 def path_lengths(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
-    """Length of each path along its reflection points.
+    """Return the length of each path along its reflection points.
 
     Parameters
     ----------
@@ -370,7 +370,7 @@ class _Face(NamedTuple):
 
 
 def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
-    """Faces of a site.
+    """Return faces of a site.
 
     Parameters
     ----------
@@ -430,7 +430,7 @@ def _parts(footprint: Polygon) -> list[Polygon]:
 
 
 def _corners(ring: shapely.LinearRing) -> FloatArray:
-    """Vertices (corners, 2) of a ring at which it turns."""
+    """Return vertices (corners, 2) of a ring at which it turns."""
     # a ring repeats its first corner; a third coordinate of the map is not used as a height
     points = np.asarray(ring.coords, dtype=np.float64)[:-1, :2]
     # a triangle keeps its corners, even if it is very flat
@@ -557,7 +557,7 @@ def corners(faces: Faces, reach_m: float = np.inf) -> FloatArray:
 
 
 def triangles(faces: Faces, reach_m: float) -> tuple[FloatArray, IntArray, IntArray]:
-    """Triangulation of all faces, for ray tracers.
+    """Return the triangulation of all faces, for ray tracers.
 
     Parameters
     ----------
@@ -593,7 +593,7 @@ def triangles(faces: Faces, reach_m: float) -> tuple[FloatArray, IntArray, IntAr
 
 
 def inside_solids(site: Site, points_m: FloatArray) -> BoolArray:
-    """Points (points,) strictly inside a building."""
+    """Check which points (points,) are strictly inside a building."""
     result = np.zeros(len(points_m), dtype=np.bool_)
     top = np.array([building.base_m + building.height_m for building in site.buildings])
     low = np.flatnonzero(np.isfinite(points_m).all(axis=1) & (points_m[:, 2] < top.max(initial=-np.inf)))
@@ -791,7 +791,7 @@ def _mounted(
     yaw_deg: float,
     roll_deg: float = 0.0,
 ) -> Array:
-    """Elements of one pattern in a device that is turned and rolled."""
+    """Return elements of one pattern in a device that is turned and rolled."""
     # no pitch: the arrays of the paper and of maps look level
     mount = rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, 0.0, roll_deg]))
     return Array(positions_m, np.radians(np.array(slant_deg)), (pattern or Isotropic(),), mount)

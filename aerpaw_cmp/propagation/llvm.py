@@ -225,7 +225,7 @@ def _failure(child: subprocess.CompletedProcess[str]) -> str:
 def _run_trial(
     library: Library | None, variant: str, python: str, program: str, timeout_s: float
 ) -> tuple[str, dict[str, object]]:
-    """Reason of failure (empty if none) and the child's answer."""
+    """Return the reason of failure (empty if none) and the child's answer."""
     with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-trial-") as scratch:
         # a kernel in the user's cache would hide that this library cannot compile
         environ = {**os.environ, "DRJIT_CACHE_DIR": scratch}

@@ -179,7 +179,7 @@ class PathTable:
 def path_table(
     contributions: tuple[Any, ...], faces: Faces, ends: Ends, counts: AnyArray, names: dict[str, int]
 ) -> PathTable:
-    """Paths of a replay, each with its own gain.
+    """Return paths of a replay, each with its own gain.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ def path_table(
 
 
 def _gains(item: Any, faces: Faces, ends: Ends, loss_db: FloatArray | None) -> ComplexArray:
-    """Gain (paths, n_rx, n_tx) of each path: H of a pose of its own, where it is the only path."""
+    """Return the gain (paths, n_rx, n_tx) of each path: H of a pose of its own, where it is the only path."""
     pieces, order = [], []
     for tower, (name, array) in enumerate(ends.link.tower_arrays.items()):
         rows = np.flatnonzero(item.tower == tower)
@@ -327,7 +327,7 @@ def check_band(bandwidth_hz: float, carrier_hz: float) -> None:
 
 
 def subcarriers_hz(bandwidth_hz: float, count: int) -> FloatArray:
-    """Offsets (count,) of subcarriers from the carrier, as an FFT centred on it has them.
+    """Return offsets (count,) of subcarriers from the carrier, as an FFT centred on it has them.
 
     Examples
     --------
@@ -596,7 +596,7 @@ def passed(
 def further_paths(
     site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field
 ) -> list[tuple[Further, Fields]]:
-    """Paths of the further kinds that are asked for, and what they add to H and to the powers.
+    """Return paths of the further kinds that are asked for, and what they add to H and to the powers.
 
     Parameters
     ----------
@@ -636,7 +636,7 @@ def _shaped_ground(
 
 
 def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:
-    """Paths (paths,) that the elevation model lets through.
+    """Return paths (paths,) that the elevation model lets through.
 
     It is asked on the direct line between the ends, whose shadow a reflection off level ground shares; a path over
     walls alone is asked on each of its segments.
@@ -755,7 +755,7 @@ def trace(
 
 
 def _level(position_m: ArrayLike) -> Poses:
-    """Poses of a level aircraft, nose to the east, at positions (poses, 3)."""
+    """Return poses of a level aircraft, nose to the east, at positions (poses, 3)."""
     position = np.atleast_2d(unmasked(position_m))
     if position.ndim != 2 or position.shape[1] != 3:
         raise UsageError(

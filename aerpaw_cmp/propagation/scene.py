@@ -41,7 +41,7 @@ class Scene:
 
     @classmethod
     def of(cls, site: Site, link: Link, poses: Poses) -> Scene:
-        """Scene of a site as the towers of a link see it."""
+        """Return the scene of a site as the towers of a link see it."""
         names = tuple(link.tower_arrays)
         unknown = [name for name in names if name not in site.towers]
         if unknown:
@@ -70,7 +70,7 @@ class Scene:
         return cls(faces, sources, usable, excluded | (poses.position_m[:, 2] < lowest))
 
     def links_to(self, poses: Poses) -> Links:
-        """Ends of the links from the towers to the poses."""
+        """Return ends of the links from the towers to the poses."""
         return Links(self.sources_m, poses.position_m, self.usable, self.excluded)
 
 

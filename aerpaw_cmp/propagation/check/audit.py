@@ -756,7 +756,7 @@ def audit(
 
 
 def _spread(poses: Poses, count: int | None) -> IntArray:
-    """Indices of poses with a position, evenly spread."""
+    """Return indices of poses with a position, evenly spread."""
     good = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
     return good if count is None else np.asarray(good[spread_out(len(good), count)])
 

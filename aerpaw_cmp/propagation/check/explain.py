@@ -226,7 +226,7 @@ def _bounce(faces: Faces, face: int, point: FloatArray, leg: FloatArray, link: L
 
 
 def power_sum_dbm(paths: tuple[ExplainedPath, ...]) -> float:
-    """Level of the paths' powers added [dBm]."""
+    """Return the level of the paths' powers added [dBm]."""
     return float(db_from_power(sum(float(power_from_db(path.level_dbm)) for path in paths)))
 
 

@@ -244,7 +244,7 @@ class Mirror:
     solid: int = -1
 
     def height(self, p: Vector) -> float:
-        """Distance in front of the plane."""
+        """Return the distance in front of the plane."""
         return _dot(self.normal, p) - self.offset_m
 
     def mirrored(self, p: Vector) -> Vector:
@@ -287,7 +287,7 @@ def _edges(part: shapely.Polygon) -> Iterator[tuple[tuple[float, ...], tuple[flo
 
 
 def _mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
-    """Ground of the tower, then walls and roof of each building."""
+    """Return the ground of the tower, then walls and roof of each building."""
     mirrors = [Mirror((0.0, 0.0, 1.0), tower.ground_m, site.ground_material)]
     for number, building in enumerate(site.buildings):
         # as the replay's walls, so that planes and edges can be compared
@@ -500,7 +500,7 @@ class Reference:
         return None if strict or worst < margin_m else True
 
     def pair(self, sequence: Sequence[Mirror], tx: int, rx: int, target: Vector, turn: Matrix) -> complex:
-        """Amplitude of one path between tower element ``tx`` and UAV element ``rx``, without foliage.
+        """Return the amplitude of one path between tower element ``tx`` and UAV element ``rx``, without foliage.
 
         Parameters
         ----------
@@ -723,7 +723,7 @@ def _p833(mhz: float) -> tuple[float, float]:
 
 
 def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -> float:
-    """Length of a segment inside crowns (cones) or trunks (cylinders).
+    """Return the length of a segment inside crowns (cones) or trunks (cylinders).
 
     The largest of the distances outside base, top and side is a convex function along the segment. Golden section finds
     its minimum, then bisection finds the two ends of the chord.

@@ -88,7 +88,7 @@ def two_ray_dbm(
 
 
 def specular_factor(roughness_m: float, sine_grazing: FloatArray, wavelength_m: float) -> FloatArray:
-    """Share of the field that rough ground still reflects as a mirror: ``exp(-2 (k sigma sin(grazing))^2)``.
+    """Return the share of the field that rough ground still reflects as a mirror: ``exp(-2 (k sigma sin(grazing))^2)``.
 
     Source: Ament, Proc. IRE 41 (1953), 142-146, doi:10.1109/JRPROC.1953.274171.
 

@@ -141,7 +141,7 @@ def field_vector(m: Rotation, toward: Vector, e_theta: Number, e_phi: Number) ->
 
 
 def incidence(toward: Vector, normal: Vector) -> Number:
-    """Cosine of the angle of incidence."""
+    """Return the cosine of the angle of incidence."""
     return np.abs(normal[0] * toward[0] + normal[1] * toward[1] + normal[2] * toward[2])
 
 

@@ -221,7 +221,7 @@ def foliage_loss_db(
     trees: Trees | CrownIndex,
     model: FoliageModel,
 ) -> FloatArray:
-    """Loss of each path in foliage [dB].
+    """Return the loss of each path in foliage [dB].
 
     Parameters
     ----------
@@ -387,7 +387,7 @@ class CrownIndex:
         return total
 
     def _within_heights(self, start_m: FloatArray, end_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Share of each segment (first, last) that lies between the lowest base and the highest top."""
+        """Return the share of each segment (first, last) that lies between the lowest base and the highest top."""
         low, high = self._bodies[:, 2].min(), self._bodies[:, 3].max()
         return slab(start_m[:, 2], end_m[:, 2] - start_m[:, 2], low, high)
 
@@ -424,7 +424,7 @@ class CrownIndex:
     def _candidates(
         self, start: FloatArray, move: FloatArray, middle: FloatArray, segment: IntArray
     ) -> tuple[IntArray, IntArray]:
-        """Pairs (piece, body) of pieces, given by the middle of each, and the bodies listed in its cell."""
+        """Return pairs (piece, body) of pieces, given by the middle of each, and the bodies listed in its cell."""
         i = np.floor((start[segment, 0] + middle * move[segment, 0] - self._low[0]) / self._cell_m).astype(np.int64)
         j = np.floor((start[segment, 1] + middle * move[segment, 1] - self._low[1]) / self._cell_m).astype(np.int64)
         rows, columns = self._shape2
@@ -439,7 +439,7 @@ class CrownIndex:
 def slab(
     at: FloatArray, step: FloatArray, low: AnyArray | float, high: AnyArray | float
 ) -> tuple[FloatArray, FloatArray]:
-    """Interval of t in [0, 1] with ``low <= at + t step <= high``.
+    """Return the interval of t in [0, 1] with ``low <= at + t step <= high``.
 
     Parameters
     ----------
@@ -461,7 +461,7 @@ def slab(
 
 
 def _chord_share(start: FloatArray, move: FloatArray, bodies: FloatArray, shape: Shape) -> FloatArray:
-    """Share of each segment (n,) inside its body (n, 5: east, north, base, top, radius).
+    """Return the share of each segment (n,) inside its body (n, 5: east, north, base, top, radius).
 
     The side of a body is a quadric, ``A t^2 + 2 B t + C <= 0`` along the segment.
     """
@@ -528,7 +528,7 @@ def stand_loss_db(
     wavelength_m: float,
     in_leaf: FoliageModel | None = None,
 ) -> FloatArray:
-    """Loss of paths at the stands of a site.
+    """Return the loss of paths at the stands of a site.
 
     Source: ITU-R P.833-10 section 3.2.
 
@@ -579,7 +579,7 @@ def over_stands(site: Site, source_m: FloatArray, vertices_m: FloatArray, target
 
 
 def stand_depth_m(site: Site, source_m: FloatArray, target_m: FloatArray) -> FloatArray:
-    """Length (lines,) [m] in the stands of a site of straight lines between points (lines, 3)."""
+    """Return the length (lines,) [m] in the stands of a site of straight lines between points (lines, 3)."""
     depth = np.zeros(len(source_m))
     for crossing in _crossings(site, source_m, target_m):
         depth[crossing.segment] += crossing.depth_m(np.zeros(len(crossing.segment)))
@@ -620,7 +620,7 @@ class _Crossing:
         return self.stand.height_m
 
     def depth_m(self, lowered_m: FloatArray) -> FloatArray:
-        """Length (k,) in the canopy, what runs between trunks in part, of segments lowered by (k,) [m]."""
+        """Return the length (k,) in the canopy, what runs between trunks in part, of segments lowered by (k,) [m]."""
         way = self.end - self.start
         up, rise = (self.start[:, 2] - lowered_m)[self.piece] - self.ground_m, way[self.piece, 2]
         base = self.height_m * self.stand.crown_base_fraction
@@ -663,13 +663,13 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
 
 
 def _corners(stand: Forest) -> tuple[FloatArray, IntArray]:
-    """Corners (n, 2) of the rings of a stand, each closed, and the last corners of all rings but the last."""
+    """Return corners (n, 2) of the rings of a stand, each closed, and the last corners of all rings but the last."""
     rings = [shapely.get_coordinates(ring) for ring in (stand.area.exterior, *stand.area.interiors)]
     return np.concatenate(rings), np.cumsum([len(ring) for ring in rings[:-1]], dtype=np.int64) - 1
 
 
 def _pieces(start: FloatArray, end: FloatArray, corner: FloatArray, last: IntArray) -> tuple[IntArray, FloatArray]:
-    """Pieces of lines (k, 2) inside rings of corners: their lines (n,), and where they begin and end (n, 2)."""
+    """Return pieces of lines (k, 2) inside rings of corners: their lines (n,), and where they begin and end (n, 2)."""
     way = end - start
     # on which side of each line a corner lies
     left = way[:, :1] * (corner[:, 1] - start[:, 1:]) - way[:, 1:] * (corner[:, 0] - start[:, :1]) > 0
@@ -693,7 +693,7 @@ def _pieces(start: FloatArray, end: FloatArray, corner: FloatArray, last: IntArr
 
 
 def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wavelength_m: float) -> FloatArray:
-    """Loss (k,) of segments that cross a stand [dB]."""
+    """Return the loss (k,) of segments that cross a stand [dB]."""
     source, target, stand, count = crossing.start, crossing.end, crossing.stand, len(crossing.segment)
     if isinstance(model, Opaque):
         return model.loss_db(crossing.depth_m(np.zeros(count)))
@@ -722,7 +722,7 @@ def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wa
 
 
 def _between(share: FloatArray, up: FloatArray, rise: FloatArray, low: float, high: float) -> FloatArray:
-    """Part of the way (pieces,) that runs between two heights."""
+    """Return the part of the way (pieces,) that runs between two heights."""
     first, last = slab(up, rise, low, high)
     return np.asarray(np.maximum(np.minimum(share[:, 1], last) - np.maximum(share[:, 0], first), 0.0))
 
@@ -775,7 +775,7 @@ def _parameter(height_m: FloatArray, before_m: FloatArray, after_m: FloatArray, 
 
 
 def deygout_db(profile: Profile, wavelength_m: float) -> FloatArray:
-    """Loss (links,) [dB] of up to three edges by Deygout's construction with Causebrook's correction.
+    """Return the loss (links,) [dB] of up to three edges by Deygout's construction with Causebrook's correction.
 
     Sources: Deygout, IEEE Trans. Antennas Propag. 14 (1966) 480, doi 10.1109/TAP.1966.1138719; Causebrook and Davis,
     BBC Research Department report 1971/43, eq. 13 to 15.

@@ -167,6 +167,6 @@ class FaceMaterials:
         )
 
     def table(self, wavelength_m: float) -> FloatArray:
-        """Columns (faces + 1, 3): real and imaginary part of the permittivity, thickness in wavelengths."""
+        """Return columns (faces + 1, 3): real and imaginary part of the permittivity, thickness in wavelengths."""
         eta = self.permittivity
         return np.column_stack([eta.real, eta.imag, self.thickness_m / wavelength_m])

@@ -57,7 +57,7 @@ class Elements(NamedTuple):
 
 
 def _columns(array: Array, element: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Places (3, pairs) and slants (2, pairs) of chosen elements."""
+    """Return places (3, pairs) and slants (2, pairs) of chosen elements."""
     return np.ascontiguousarray(array.positions_m[element].T), np.ascontiguousarray(array.slant_parts[:, element])
 
 
@@ -68,7 +68,7 @@ Ends = tuple[FloatArray | None, FloatArray | None]
 def geometry(
     paths: PathSet, faces: Faces, table: FloatArray, sources_m: FloatArray, poses: Poses, link: Link
 ) -> Geometry:
-    """Columns of some paths.
+    """Return columns of some paths.
 
     Parameters
     ----------

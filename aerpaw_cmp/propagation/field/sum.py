@@ -73,7 +73,7 @@ class Further(Rows):
     def fields(
         self, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
     ) -> Fields:
-        """Part of the paths in H and in the powers, as :func:`channel_matrices` gives it.
+        """Return the part of the paths in H and in the powers, as :func:`channel_matrices` gives it.
 
         Parameters
         ----------
@@ -87,7 +87,7 @@ class Further(Rows):
         raise NotImplementedError
 
     def words(self, faces: Faces) -> list[str]:
-        """Corners of each path, from tower to UAV."""
+        """Return corners of each path, from tower to UAV."""
         raise NotImplementedError
 
     @property
@@ -327,13 +327,13 @@ def _ports(arrays: Sequence[Array]) -> int:
 
 
 def _by_link(paths: PathSet, towers: int) -> IntArray | None:
-    """Order of the paths by pose and tower, None where they have it: a link is summed in one run."""
+    """Return the order of the paths by pose and tower, None where they have it: a link is summed in one run."""
     key = paths.pose * towers + paths.tower
     return None if (np.diff(key) >= 0).all() else np.argsort(key, kind="stable")
 
 
 def parts_between_poses(pose: IntArray, most: int = PATHS_PER_PART) -> list[slice]:
-    """Runs of some ``most`` paths that end between poses (paths,): threads must not share a link."""
+    """Return runs of some ``most`` paths that end between poses (paths,): threads must not share a link."""
     edges = [0]
     while edges[-1] < len(pose):
         stop = min(edges[-1] + most, len(pose))

@@ -191,7 +191,7 @@ class _Search:
         self.targets = targets, box_tree(targets, targets)
 
     def direct(self) -> _Level:
-        """Lines of sight."""
+        """Return lines of sight."""
         free = _direct(self.solids, self.source, self.targets[0], self.rules)
         pose = np.flatnonzero(free)
         return pose, np.zeros((len(pose), 0), np.int64), np.zeros((len(pose), 0, 3))
@@ -263,7 +263,7 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
 def reflection_points(
     surfaces: Surfaces, sequence: IntArray, sources_m: FloatArray, targets_m: FloatArray, *, edge_m: float
 ) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Place where paths over stated faces reflect, in float64.
+    """Return the place where paths over stated faces reflect, in float64.
 
     Parameters
     ----------

@@ -287,7 +287,7 @@ _SMALLEST_M2 = 1e-10
 
 
 def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
-    """Faces of a scene.
+    """Return faces of a scene.
 
     Parameters
     ----------
@@ -393,7 +393,7 @@ def _axes(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _faces_of_triangles(
     corners: FloatArray, normal: FloatArray, offset: FloatArray, area: FloatArray, shape: IntArray, merge_m: float
 ) -> tuple[IntArray, IntArray]:
-    """Face of each triangle, and the triangle whose plane each face has: its largest."""
+    """Return the face of each triangle, and the triangle whose plane each face has: its largest."""
     # files repeat a corner for each triangle, in float32: equal means equal to a tenth of a millimetre
     grid = np.round(corners.reshape(-1, 3) / WELD_M).astype(np.int64)
     # within one shape: walls of two houses that touch are two faces

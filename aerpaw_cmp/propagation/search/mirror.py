@@ -216,7 +216,7 @@ def _within(before: FloatArray, after: FloatArray, level: float) -> tuple[FloatA
 
 
 def _by_solid(faces: Faces) -> tuple[IntArray, IntArray]:
-    """Faces of solids, one solid after another, and where each solid starts among them."""
+    """Return faces of solids, one solid after another, and where each solid starts among them."""
     order = np.argsort(faces.solid, kind="stable")
     rows = order[faces.solid[order] >= 0]
     solid = faces.solid[rows]
@@ -408,7 +408,7 @@ def find_paths(
 
 
 def searched_links(links: Links) -> BoolArray:
-    """Links (towers, poses) that may have paths: with a pose, long enough and not excluded."""
+    """Return links (towers, poses) that may have paths: with a pose, long enough and not excluded."""
     alive = np.empty((len(links.sources_m), len(links.targets_m)), dtype=np.bool_)
     with np.errstate(invalid="ignore"):
         # tower by tower: an array of all pairs and three coordinates would be the largest of the search
@@ -444,7 +444,7 @@ class _Bounds:
 
     @classmethod
     def of(cls, faces: Faces, farthest_m: float) -> _Bounds:
-        """Bounds of faces, the infinite ones cut at ten times the farthest point."""
+        """Return bounds of faces, the infinite ones cut at ten times the farthest point."""
         # far beyond any reflection point between two points of the scene
         box = corners(faces, 10.0 * farthest_m)
         first, second, third, fourth = box.transpose(1, 0, 2)
@@ -583,7 +583,7 @@ class Mirrors:
 
 
 def _facing(faces: Faces, box: _Bounds, tolerance_m: float) -> BoolArray:
-    """Pairs (first, second) of which each has a point in front of the other."""
+    """Return pairs (first, second) of which each has a point in front of the other."""
     highest = faces.normal @ box.centre_m.T - faces.offset_m[:, None]
     for half in box.reach_m.transpose(1, 2, 0):
         highest += np.abs(faces.normal @ half)
@@ -625,7 +625,7 @@ def _paths_of_level(
     max_depth: int,
     hiding: Occlusion,
 ) -> PathSet:
-    """Paths of all sequences of one length."""
+    """Return paths of all sequences of one length."""
     depth = level.faces.shape[1]
     pieces: list[PathSet] = []
     pose_step = min(len(poses), 4096)
@@ -786,7 +786,7 @@ def trace_back(
 
 
 def images_of(faces: Faces, sequence: IntArray, sources_m: FloatArray) -> FloatArray:
-    """Images (paths, depth, 3) of the sources (paths, 3) at the faces of ``sequence`` (paths, depth)."""
+    """Return images (paths, depth, 3) of the sources (paths, 3) at the faces of ``sequence`` (paths, depth)."""
     images = np.zeros((*sequence.shape, 3))
     point = sources_m
     for step in range(sequence.shape[1]):
@@ -836,7 +836,7 @@ def _order(paths: PathSet) -> IntArray:
 
 
 def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
-    """Paths (paths,) over the same planes as one before them in ``order``, with the same ends."""
+    """Return paths (paths,) over the same planes as one before them in ``order``, with the same ends."""
     plane = planes_of(faces)
     # most scenes have no two faces in a plane, and then no path can repeat
     shared = np.append(np.bincount(plane)[plane] > 1, False)

@@ -167,7 +167,7 @@ def free_memory() -> None:
 
 
 def engine_versions() -> dict[str, str]:
-    """Versions of sionna-rt, mitsuba and drjit (from their metadata), the variant and the LLVM in use."""
+    """Return versions of sionna-rt, mitsuba and drjit (from their metadata), the variant and the LLVM in use."""
     versions = {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
     versions["variant"] = load_variant()
     import drjit as dr
@@ -199,7 +199,7 @@ class _Builder:
     own_table: bool = False
 
     def scene(self, chosen: IntArray) -> _Scene:
-        """Scene of the faces ``chosen``."""
+        """Return the scene of the faces ``chosen``."""
         import drjit as dr
 
         try:
@@ -482,7 +482,7 @@ class _Finder:
 
 
 def _arrays(paths: Any, count: int) -> dict[str, Any]:
-    """Validity of Sionna's paths of the first ``count`` targets, and what they meet."""
+    """Return the validity of Sionna's paths of the first ``count`` targets, and what they meet."""
     return {
         "valid": paths.valid.numpy()[:count],
         "kind": paths.interactions.numpy()[:, :count],
@@ -535,7 +535,7 @@ def find_paths(
     surfaces: Surfaces | None = None,
     progress: Progress | None = None,
 ) -> PathSet:
-    """Paths that Sionna's PathSolver finds, refined in float64.
+    """Return paths that Sionna's PathSolver finds, refined in float64.
 
     Parameters
     ----------
@@ -672,7 +672,7 @@ def own_coefficients(
 def _raw_paths(
     finder: _Finder, target: _Ends, poses: IntArray, towers: IntArray, rays: Rays
 ) -> tuple[PathSet, ComplexArray]:
-    """Paths of one batch made of reflections only, and their gains (paths, V and H, V and H)."""
+    """Return paths of one batch made of reflections only, and their gains (paths, V and H, V and H)."""
     traced = finder.trace(target, rays.max_depth, rays.samples)
     real, imaginary = (np.asarray(part.numpy()) for part in traced.a)
     raw = _arrays(traced, len(poses))

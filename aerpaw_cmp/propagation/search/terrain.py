@@ -56,7 +56,7 @@ class OnTerrain:
 
 
 def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: float) -> OnTerrain:
-    """Paths of an engine with the ground of an elevation model in place of level planes.
+    """Return paths of an engine with the ground of an elevation model in place of level planes.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def _stationary(
         slope = np.diff(ground, axis=0) / np.diff(along, axis=0)  # NaN where a shorter profile repeats its end
 
         def growth(d: FloatArray, z: FloatArray) -> FloatArray:
-            """Growth of the way over the ground along the profile."""
+            """Return the growth of the way over the ground along the profile."""
             from_source, from_target = np.hypot(d, z - up[0]), np.hypot(d - length, z - up[1])
             before = (d + slope * (z - up[0])) / np.maximum(from_source, 1e-12)
             after = (d - length + slope * (z - up[1])) / np.maximum(from_target, 1e-12)

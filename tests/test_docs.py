@@ -21,7 +21,6 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md")),
     *sorted((ROOT / "reports").glob("README.md")),
-    *sorted((ROOT / "reports" / "lake_wheeler").glob("*.md")),
 ]
 PROGRAM: Any = typer.main.get_command(app)
 _NUMBERS = {"N", "DB", "S", "HZ", "M", "K"}

@@ -42,7 +42,8 @@ def without_values(stream: Stream, path: str) -> InputError | None:
     except InputError as error:
         return error
     value = frame["rss_db" if stream.kind == "rss" else "rank"]
-    if value.notna().any() or not len(frame):
+    # a row without a signal or without CSI has no number either, but its flag is a measurement
+    if value.notna().any() or (frame["flag"] != "").any() or not len(frame):
         return None
     return InputError(
         f"{stream.kind} {stream.name!r} has no value in any row",

@@ -477,7 +477,8 @@ def test_an_expectation_that_the_flight_refutes_is_withdrawn(
     monkeypatch.setattr(compare_flight, "lock_elsewhere", lambda *_: lock)
     locks = floor_low_db is not None
     floored = SimpleNamespace(rmse_ci95_db=(floor_low_db, 12.0)) if locks else None
-    case = SimpleNamespace(data=data, series=SimpleNamespace(locked=np.ones(3) if locks else None))
+    series = SimpleNamespace(locked=np.ones(3) if locks else None)
+    case = SimpleNamespace(data=data, series=series, replayed=SimpleNamespace(learned=None))
     known = compare_flight._elsewhere(case, SimpleNamespace(rmse_ci95_db=(low_db, 9.0)), floored)
     assert (known is not None and known["rmse_db"] == 3.5) == expected
 

@@ -331,7 +331,8 @@ class TileStore:
             outer = tuple(slice(-(-axis.start // step), -(-axis.stop // step)) for axis in part)
             for (mode, name), raster in rasters.items():
                 plane = getattr(maps[mode], name)
-                raster[(..., *outer)] = plane.reshape(*plane.shape[:-1], *maps[mode].grid.shape)[(..., *inner)]
+                tile = plane.reshape(*plane.shape[:-1], *maps[mode].grid.shape)
+                raster[..., outer[0], outer[1]] = tile[..., inner[0], inner[1]]
         flat = {key: raster.reshape(*raster.shape[:-2], -1) for key, raster in rasters.items()}
         joined = {
             mode: over_grid(like, grid, {name: flat[mode, name] for name in PLANES})

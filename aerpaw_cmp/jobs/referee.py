@@ -322,6 +322,9 @@ def _checked(frame: pd.DataFrame, path: Path, site: Site) -> tuple[str, pd.DataF
     if "level" not in table:
         table["level"] = np.nan
     _check_levels(table["level"].to_numpy(np.float64), quantity, path)
+    if "yaw_deg" in frame and table["time"].isna().all():
+        # a turn on the spot has several levels at one position: samples are matched without their heading
+        table = table.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False, dropna=False).mean()
     _check_repeats(table, path)
     return quantity, table
 

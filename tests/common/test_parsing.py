@@ -134,6 +134,7 @@ OWN = {
     "propagation/llvm.py": "the answer of a child",
     "propagation/engines.py": "sealed by this user",
     "maps/kriging.py": "bytes of its own arguments",
+    "maps/store.py": "tiles that it wrote itself, checked by their SHA-256",
 }
 
 

@@ -189,7 +189,7 @@ def test_rank_study_of_a_flat_map_says_so():
     made = map_job(GRID, TOWERS, flat, rss_altitudes_m=(), rank_altitudes_m=(30, 40))
     study = interpolation_study(GRID, rank_fields(made)[1], made.towers_m)
     assert study.fit.degenerate
-    assert "stands in" in study.fit.message
+    assert "the paper's curve is used" in study.fit.message
     assert (study.scores["Kriging"].mae == 0).all()
     assert study.correlation.excluded_constant == len(GRID)
 

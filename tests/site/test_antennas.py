@@ -171,7 +171,7 @@ def test_foreign_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="one cut of two"):
         read_pattern_text(path)
     path.write_bytes(b"\x00\xff\x80" * 100)
-    with pytest.raises(InputError, match="no UTF-8 text"):
+    with pytest.raises(InputError, match="not UTF-8 text"):
         read_pattern_text(path)
     with pytest.raises(InputError, match="cannot be read"):
         read_pattern_text(tmp_path / "absent.txt")

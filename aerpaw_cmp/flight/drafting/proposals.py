@@ -534,6 +534,9 @@ def _antennas_for(
             if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, band):
                 continue
             named_odds = _named_odds(data, series, item)
+            # what taught nothing about its own flights is offered to its own receiver alone
+            if named_odds <= 0.0 and not item.teaches:
+                continue
             # antennas of another name must also win against their airframe at an unknown antenna
             airframe = item.airframe if item.teaches and named_odds <= 0.0 else None
             odds = evidence.of_link(number, item.moments, airframe).with_prior(named_odds)
@@ -584,8 +587,9 @@ def _airframe_for(
 
 
 # Log odds of antennas of both ends before any level: with the names of its tower and channel, or of its receiver; and
-# with levels in another unit, which are those of another receiver. Levels of field flights decide by 13 and more.
-_SAME_NAME, _OTHER_UNIT = 4.0, -3.0
+# with levels in another unit, which are those of another receiver. Levels of field flights decide by 13 and more, and
+# can refuse antennas of the same name; a short or smooth flight must not.
+_SAME_NAME, _OTHER_UNIT = 10.0, -3.0
 
 # Log odds that a known pair of antennas is mounted as it was, and not rotated by a quarter turn or more.
 _MOUNTED_AS_LEARNED = 3.0

@@ -534,8 +534,8 @@ def _antennas_for(
             if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, band):
                 continue
             named_odds = _named_odds(data, series, item)
-            # what taught nothing about its own flights is offered to its own receiver alone
-            if named_odds <= 0.0 and not item.teaches:
+            # what cannot teach another flight is not offered to another receiver, whose levels have another unit
+            if named_odds < 0.0 and not item.teaches:
                 continue
             # antennas of another name must also win against their airframe at an unknown antenna
             airframe = item.airframe if item.teaches and named_odds <= 0.0 else None

@@ -320,3 +320,14 @@ def test_no_user_reads_a_banned_word() -> None:
     }
     assert by_line == {}
     assert len(FILES) > 200
+
+
+def test_the_tree_of_the_architecture_page_is_the_one_on_disk() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    tree = page.partition("## The tree")[2].partition("```\n")[2].partition("```")[0]
+    shown = set(re.findall(r"[\w]+", tree))
+    files = [*(ROOT / "aerpaw_cmp").glob("*/**/*.py"), *(ROOT / "parsers" / "aerpaw_parsers").glob("*.py")]
+    assert len(files) > 150
+    assert {file.stem for file in files} - {"__init__"} <= shown
+    folders = {file.parent.name for file in files}
+    assert shown <= {file.stem for file in files} | folders | {"parsers"}

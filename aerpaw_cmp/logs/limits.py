@@ -429,7 +429,7 @@ class _Check:
     def _lost_readings(self) -> None:
         """Flag a few levels near 0 dB far above all others: what a program writes for a reading that it lost."""
         level = self._values("rss_db")
-        near = np.abs(level) < _LOST_DB
+        near = np.abs(level) <= _LOST_DB  # -1 is a common placeholder
         if not near.any() or near.sum() > _LOST_SHARE * np.isfinite(level).sum():
             return
         if (highest := float(np.nanmax(level[~near]))) < -_LOST_DB - _FAR_DB:

@@ -53,7 +53,10 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     fix = sheet.find("fix")
     written = np.isfinite(values[PLACE[0]]) & np.isfinite(values[PLACE[1]])
     if fix is not None and (sheet.numbers(fix) > 0).any():  # some leave the column at 0 throughout
-        values[PLACE[0]] = np.where(sheet.numbers(fix) == 0, np.nan, values[PLACE[0]])
+        state = sheet.numbers(fix)
+        # a fix type of MAVLink is 1 without a fix and 3 with one; a quality of NMEA is 1 with a fix
+        none = 1.0 if "type" in sheet.names[fix].lower() and (state >= 3.0).any() else 0.0
+        values[PLACE[0]] = np.where(state <= none, np.nan, values[PLACE[0]])
     lost = clean(rows, values)
     if coarse := whole_degrees([sheet.names[latitude], sheet.names[longitude]], values):
         raise _sheet.shifted(coarse, "positions")

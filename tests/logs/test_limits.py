@@ -111,7 +111,7 @@ def test_a_record_of_a_line_without_its_end_is_not_scored() -> None:
 @pytest.mark.parametrize(("highest", "lost"), [(-42.0, 3), (-15.0, 0)])
 def test_readings_that_were_lost_lie_near_zero_far_above_all_others(highest: float, lost: int) -> None:
     level = np.linspace(-60.0, highest, 180)
-    level[[40, 90, 130]] = [-0.37, 0.26, 0.0]
+    level[[40, 90, 130]] = [-0.37, -1.0, 0.0]
     result = checked("rss", {"unit": "dB re full scale"}, rows=180, rss_db=level)
     frame = result.streams[0].frame
     assert (frame["flag"] == "level_lost").sum() == lost == unscored(frame).sum()

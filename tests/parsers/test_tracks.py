@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from aerpaw_cmp import open_flight
+from aerpaw_cmp import open_flight, read
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.jobs.run import run_ingest
 from aerpaw_cmp.logs.ingest import ingest
@@ -200,3 +200,12 @@ def test_positions_on_a_local_grid_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t,unix_time,north_m,east_m,down_m\n0,1749564000,0,0,-30\n")
     with pytest.raises(InputError, match="positions on a grid, such as column 'north_m'"):
         ingest(tmp_path / "a.csv")
+
+
+def test_a_fix_type_of_one_has_no_position(tmp_path: Path) -> None:
+    """MAVLink's fix type is 1 without a fix; a quality of NMEA is 1 with one."""
+    rows = [f"2025-06-11T14:30:{i:02d}Z,{1 if i < 3 else 3},35.7{i:04d},-78.6960,{30 + i}" for i in range(10)]
+    for name, positions in (("fix_type", 7), ("fix", 10)):
+        (tmp_path / "log.csv").write_text("\n".join([f"utc,{name},lat,lon,alt_agl_m", *rows]) + "\n")
+        (frame,) = read(tmp_path / "log.csv").values()
+        assert frame["latitude_deg"].notna().sum() == positions

@@ -71,7 +71,7 @@ DEAREST = (
     "jobs/test_plan.py",
     "test_published.py",
     "report/test_figures.py",
-    "test_benchmarks.py",
+    "long/test_long.py",
     "compare/test_locate.py",
     "compare/test_direction_gain.py",
     "test_examples.py",

@@ -24,7 +24,7 @@ PAGES = [
 ]
 PROGRAM: Any = typer.main.get_command(app)
 _NUMBERS = {"N", "DB", "S", "HZ", "M", "K"}
-STARTS = ("aerpaw-cmp ", "python benchmarks/", "python tools/", "pytest ", "make ")
+STARTS = ("aerpaw-cmp ", "python benchmarks/", "python tools/", "python -m ", "pytest ", "make ")
 
 
 def commands(text: str) -> list[tuple[str, bool]]:
@@ -51,7 +51,8 @@ def check(line: str, in_block: bool) -> None:
     elif program == "pytest":
         assert all((ROOT / word.split("::")[0]).exists() for word in words if word.startswith("tests/")), line
     elif program == "python":
-        code = (ROOT / words[0]).read_text()
+        script = f"{words[1].replace('.', '/')}.py" if words[0] == "-m" else words[0]
+        code = (ROOT / script).read_text()
         assert all(f'"{word}"' in code for word in words if word.startswith("--")), line
     elif not words[0].isupper() and words not in (["-h"], ["--help"]):
         parse([word for word in words if word not in ("-h", "--help")], in_block)

@@ -10,7 +10,7 @@ import pytest
 import aerpaw_cmp
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError, parsed, parsing
-from benchmarks.fuzz_inputs import PLY, SMALL_FILES
+from tests.long.fuzz_inputs import PLY, SMALL_FILES
 
 ROOM = Path(aerpaw_cmp.__file__).parent
 

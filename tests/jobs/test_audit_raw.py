@@ -1,4 +1,4 @@
-"""The audit from raw bytes is silent on a right flight; benchmarks/outside_faults.py plants faults under it."""
+"""The audit from raw bytes is silent on a right flight; tests/long/outside_faults.py plants faults under it."""
 
 import csv
 import math

@@ -13,7 +13,7 @@ from aerpaw_cmp.live.modem import QUERIES
 from aerpaw_cmp.live.tap import Stop, Tap, TapSettings
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
 from benchmarks.simulated_modem import BadLine, FaultyModem, read_log
-from benchmarks.tap_common import free_port, start_tap
+from tests.long.tap_common import free_port, start_tap
 
 PAGE = Page(b"<!doctype html><title>t</title>", "default-src 'none'")
 

@@ -16,8 +16,8 @@ import pytest
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.live.ports import PortGoneError, Roots, SerialPort, TapSettings, find_candidates, find_port, holders
 from benchmarks.simulated_modem import Faults, FaultyModem
-from benchmarks.tap_common import run_tap
 from tests.live.terminals import held, until
+from tests.long.tap_common import run_tap
 
 
 @pytest.mark.parametrize(

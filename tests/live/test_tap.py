@@ -20,8 +20,8 @@ from aerpaw_cmp.live.tap import TapSettings, TapStatus, format_status
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER
 from benchmarks.simulated_modem import Faults
-from benchmarks.tap_common import run_tap
 from tests.live.terminals import until
+from tests.long.tap_common import run_tap
 
 
 def kinds(records):

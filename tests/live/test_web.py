@@ -19,8 +19,8 @@ from aerpaw_cmp.live.feed import CHUNK, MEASURED, STALE_S, Feed, Rows
 from aerpaw_cmp.live.ports import TapStatus
 from aerpaw_cmp.live.predict import RunningInterval
 from aerpaw_cmp.live.web import Address, Limits, WebServer
-from benchmarks.tap_common import damaged
 from tests.live.terminals import until
+from tests.long.tap_common import damaged
 
 SECOND = 1_000_000_000
 QUIET = Limits(per_second=1e6, burst=1e6, connections=200)

@@ -8,7 +8,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.logs.readers import catalogue
-from benchmarks import fuzz_inputs as fuzz
+from tests.long import fuzz_inputs as fuzz
 
 
 @pytest.fixture(scope="module")

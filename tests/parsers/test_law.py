@@ -14,7 +14,7 @@ from aerpaw_cmp.logs import limits
 from aerpaw_cmp.logs.readers import ReadOptions, by_name, catalogue, claims, identify
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_parsers import drive_test
-from benchmarks import fuzz_inputs
+from tests.long import fuzz_inputs
 from tests.parsers.samples import BINARY, CASES, NO_LOGS, OPTIONS, SAMPLES
 
 SNIFFED = [case for case in CASES if case[0] != "generic_csv"]

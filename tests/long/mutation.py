@@ -6,8 +6,8 @@ A mutant that every test passes has survived; `mutation_equivalent.txt` beside t
 that change nothing that can be seen. Mutants are drawn at random over all modules of the rooms, with a seed, since all
 of them would take weeks.
 
-    python benchmarks/mutation.py record MAP [--tests tests/compare]   # which test reaches which line (some minutes)
-    python benchmarks/mutation.py draw MAP --count 60 --seed 7 [--part 1/2] [--account FILE] [--only compare/ maps/]
+    python -m tests.long.mutation record MAP [--tests tests/compare]   # which test reaches which line (some minutes)
+    python -m tests.long.mutation draw MAP --count 60 --seed 7 [--part 1/2] [--account FILE] [--only compare/ maps/]
 
 A line that hundreds of tests reach is tried on the shortest case of each, then on further cases, up to `--budget`
 seconds of the processor: what only a longer test would notice counts as survived, so that the score is a lower bound.
@@ -41,7 +41,7 @@ from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EQUIVALENT = Path(__file__).with_name("mutation_equivalent.txt")
 ROOMS = ("propagation", "compare", "flight", "maps")
 # Modules of the room `jobs` that decide what is scored, and on what.

@@ -18,11 +18,19 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent))
-from simulated_modem import BadLine, Faults, FaultyModem, read_log
-from tap_common import CSI, conditions, cpu_s, damaged, free_port, resident_kib, show, start_browser, start_tap
-
 from aerpaw_cmp.report.live import live_page
+from benchmarks.simulated_modem import BadLine, Faults, FaultyModem, read_log
+from tests.long.tap_common import (
+    CSI,
+    conditions,
+    cpu_s,
+    damaged,
+    free_port,
+    resident_kib,
+    show,
+    start_browser,
+    start_tap,
+)
 
 
 def log_against_modem(log: Path, modem: FaultyModem) -> dict[str, int]:

@@ -20,9 +20,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent))
-from simulated_modem import BadLine, Faults, FaultyModem, read_log
-from tap_common import conditions, read_lines, show, start_tap
+from benchmarks.simulated_modem import BadLine, Faults, FaultyModem, read_log
+from tests.long.tap_common import conditions, read_lines, show, start_tap
 
 FINAL = {"ok": "OK", "error": "ERROR", "cme": "+CME ERROR: ", "cms": "+CMS ERROR: "}
 

@@ -1,6 +1,6 @@
 """Random whole command lines: none may end in exit code 70, in a traceback, in silence or never.
 
-    python benchmarks/fuzz_commands.py [--calls 10000] [--seed 1]
+    python -m tests.long.fuzz_commands [--calls 10000] [--seed 1]
 
 Each call is a fork of this process, so that imports are paid for once. Drawn are the command, the spelling of every
 path (relative, absolute, ``..``, links, members of archives, odd and impossible names), the working folder (also one
@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 
-SAMPLE = Path(__file__).resolve().parents[1] / "sample_logs"
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_logs"
 LOGS = ("UAV/2025-06-01_10_00_00_vehicleOut.txt", "UAV/modem_ri.csv", "LW1/USRP1_power_log.txt")
 LINES = 30
 CODES = {0, 1, 2, 3, 141}

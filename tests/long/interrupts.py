@@ -1,6 +1,6 @@
 """Ctrl-C in every command: seconds of the processor until it has ended, how it ended, and what it left.
 
-    python benchmarks/interrupts.py [--only TEXT] [--moments 7] [--json]
+    python -m tests.long.interrupts [--only TEXT] [--moments 7] [--json]
 
 Each command runs once to its end on a large input, which gives the processor time that it takes; then once for each
 moment, a share of that time, at which its process group gets SIGINT as from a terminal (the tap and its modem: by the
@@ -26,7 +26,7 @@ from typing import Any
 
 from aerpaw_cmp.common.outputs import changed_files, read_sums
 
-SAMPLE = Path(__file__).resolve().parents[1] / "sample_logs"
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_logs"
 MOST_S = 1.0
 # These wait for the modem or for whoever opens it, and end in order: seconds of the clock in which they are stopped.
 LIVE, LIVE_S = ("tap", "modem-sim"), 8.0

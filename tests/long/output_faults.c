@@ -1,4 +1,4 @@
-/* Faults in the calls that change a disk, below one folder: for benchmarks/output_faults.py, by LD_PRELOAD.
+/* Faults in the calls that change a disk, below one folder: for tests/long/output_faults.py, by LD_PRELOAD.
 
    fault_arm(root, at, kind, error, sticky) counts the calls that change something below root; call number `at`
    (from 1) fails with `error`, or ends the process: before the call (kind 1), after it, or in the middle of a write

@@ -16,9 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
-from simulated_modem import BadLine, Faults, FaultyModem, read_log
-from tap_common import conditions, free_port, read_lines, show, start_browser, start_tap
+from benchmarks.simulated_modem import BadLine, Faults, FaultyModem, read_log
+from tests.long.tap_common import conditions, free_port, read_lines, show, start_browser, start_tap
 
 
 def one_kill(number: int, seed: int, folder: Path, *, web: bool = False, patience_s: float = 0.25) -> dict[str, int]:

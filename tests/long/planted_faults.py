@@ -6,10 +6,9 @@ switched off. Beside the verdict of the audit
 stands what the fault changes: RSS, the phase of H, ranks at K = 10. A fault below 0.1 dB, 0.01 rad and any rank need
 not be seen.
 
-Run: python benchmarks/planted_faults.py [--only TEXT] [--no-sionna] [--markdown] [--json]
+Run: python -m tests.long.planted_faults [--only TEXT] [--no-sionna] [--markdown] [--json]
 """
 
-# ruff: noqa: E501 (one fault a line)
 import argparse
 import dataclasses
 import importlib
@@ -26,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 P = "aerpaw_cmp.propagation"
 os.environ["AERPAW_CMP_COMPILED"] = "never"
 

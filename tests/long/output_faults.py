@@ -44,7 +44,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-SAMPLE = HERE.parent / "sample_logs"
+SAMPLE = HERE.parents[1] / "sample_logs"
 VARIANTS = ("a", "b")
 NOTHING, BEFORE, AFTER, FAIL, COMMAND = range(5)
 ERRORS = {"full": (errno.ENOSPC, 1), "broken": (errno.EIO, 0), "read-only": (errno.EROFS, 1)}

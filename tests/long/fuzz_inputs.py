@@ -40,19 +40,17 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "parsers")]
+import numpy as np
 
-import numpy as np  # noqa: E402
+from aerpaw_cmp.common import native
+from aerpaw_cmp.common.errors import AerpawCmpError
+from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.logs import limits
+from aerpaw_cmp.logs.files import whole_lines
+from aerpaw_cmp.logs.readers import HEAD_BYTES, Reader, ReadOptions, catalogue
+from aerpaw_cmp.logs.records import ReadResult
 
-from aerpaw_cmp.common import native  # noqa: E402
-from aerpaw_cmp.common.errors import AerpawCmpError  # noqa: E402
-from aerpaw_cmp.common.geodesy import SiteFrame  # noqa: E402
-from aerpaw_cmp.logs import limits  # noqa: E402
-from aerpaw_cmp.logs.files import whole_lines  # noqa: E402
-from aerpaw_cmp.logs.readers import HEAD_BYTES, Reader, ReadOptions, catalogue  # noqa: E402
-from aerpaw_cmp.logs.records import ReadResult  # noqa: E402
-
+ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 2.0
 LIMIT_MIB = 300
 # A worker that spends so much of the processor on one input hangs in native code, where no alarm reaches it.

@@ -5,10 +5,9 @@ tests/jobs/test_audit_raw.py (attitude that turns all the time, antennas with lo
 a radio clock ahead); the tests are named beside the fault and need no field data. A fault that the audit need not see
 has the reason.
 
-    python benchmarks/outside_faults.py [--only TEXT] [--stale] [--no-tests] [--json]
+    python -m tests.long.outside_faults [--only TEXT] [--stale] [--no-tests] [--json]
 """
 
-# ruff: noqa: E501 (one fault a line)
 import argparse
 import json
 import os
@@ -20,7 +19,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 RAW = "tests/jobs/test_audit_raw.py::test_a_right_flight_is_recomputed_to_rounding"
 NO_LEVEL = "it moves no pose and no level"
 
@@ -118,13 +117,13 @@ def main() -> int:
         for name in ("aerpaw_cmp", "parsers", "tests", "sample_logs", "benchmarks", "docs"):
             shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
         shutil.copy(ROOT / "pyproject.toml", copy)
-        clean = json.loads(python(copy, "benchmarks/outside_faults.py", "--audit-here").stdout)
+        clean = json.loads(python(copy, "tests/long/outside_faults.py", "--audit-here").stdout)
         part, parts = (int(text) for text in options.part.split("/"))
         for fault in [entry for entry in FAULTS if options.only in entry.name][part - 1 :: parts]:
             file = copy / fault.file
             right = file.read_text(encoding="utf-8")
             file.write_text(right.replace(fault.old, fault.new), encoding="utf-8")
-            audit = json.loads(python(copy, "benchmarks/outside_faults.py", "--audit-here").stdout)
+            audit = json.loads(python(copy, "tests/long/outside_faults.py", "--audit-here").stdout)
             failed = None
             if not options.no_tests:
                 tests = python(copy, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *fault.tests.split())

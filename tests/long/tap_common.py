@@ -11,8 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "parsers")]
+ROOT = Path(__file__).resolve().parents[2]
 
 CSI = 'AT+QNWCFG="nr5g_csi"'
 
@@ -22,7 +21,7 @@ from pathlib import Path
 from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.live.log import LogSettings
 from aerpaw_cmp.live.tap import TapSettings
-from benchmarks.tap_common import run_tap
+from tests.long.tap_common import run_tap
 values = json.loads(sys.argv[1])
 log = LogSettings(**values.pop("log", {}))
 show = values.pop("show_status", False)

@@ -63,6 +63,7 @@ SMALLEST: dict[str, list[str]] = {
     "kriging": ["--quick", "--pairs", "60"],
     "learned_map": ["--quick", "--only", "flights", "lte"],
     "left_out_reports": ["--only", "lte50"],
+    "outside_causes": [],
     "pages": ["--only", "long", "--repeats", "1"],
     "peers": ["--quick"],
     "performance": ["--docs", "{folder}/performance.md"],

@@ -1,10 +1,9 @@
-"""Ladder of models, to find what a scene needs: scored on stretches of the flight that had no part in their offset.
+"""Cross-validated comparison of models of rising complexity, to find what a scene needs.
 
-Each rung is a prediction of the same samples by a model with one thing more than another. A flight is cut into
-places; the offset of a model is fitted without one and scored on it, in turn. Models are
-compared on the same samples by paired differences, and the simplest one within one standard error of the best is
-recommended: what a flight cannot show to help is not worth having (Breiman, Friedman, Olshen, Stone 1984, section
-3.4.3: the 1 SE rule).
+All models predict the same samples. The flight is cut into areas; the offset of a model is fitted without one area and
+scored on that area, in turn. Models are compared on the same samples by paired differences. The simplest model within
+one standard error of the best is recommended, because an effect that a flight cannot show should not be modelled
+(Breiman, Friedman, Olshen, Stone 1984, section 3.4.3: the 1 SE rule).
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray, IntArray
-from .statistics import NO_INTERVAL, Interval, PairedDifference, paired_difference
+from .statistics import NO_INTERVAL, Interval, PairedDifference, paired_difference, pooled_difference
 
-# Places that a flight is cut into: a power of two, made by halving.
+# Areas that a flight is cut into: a power of two, because areas are halved.
 _BLOCKS = 8
 
 # A model that has no level at more than a fifth of the samples cannot be compared with the others.
@@ -26,10 +25,18 @@ _LEAST_COVERED = 0.8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rung:
-    """One model: its name, its level (n,) [dBm] at the samples of each series, and what it cost [s].
+    """One model of the comparison.
 
-    ``regressor_db`` (n,) per series marks a line that replays nothing: its slope is fitted beside the offset, without
-    the places that it is scored on. A regressor of zeros leaves the constant alone.
+    Parameters
+    ----------
+    model : str
+    level_db : tuple of (n,)
+        Level at the samples of each series [dBm].
+    seconds : float
+        Time to compute the levels of the flight [s].
+    regressor_db : tuple of (n,), optional
+        Abscissa of a straight line, per series, for models without ray tracing. The slope is fitted together with the
+        offset, without the area that is scored. Zeros make the model a constant.
     """
 
     model: str
@@ -40,24 +47,24 @@ class Rung:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LadderRow:
-    """A model on one tower and channel.
+    """The score of a model on one tower and channel.
 
     Parameters
     ----------
     model, tower, channel : str
     rmse_heldout_db : float
-        Over all stretches left out [dB]; NaN where the model has too few levels.
+        RMSE over all held-out areas [dB]; NaN if the model has too few levels.
     difference_to_best_db, difference_to_best_ci95_db : float, (low, high)
         RMSE minus that of the best model on the same samples [dB].
     n : int
         Samples that all compared models share.
     seconds : float
-        For the whole flight, the same in each of its rows.
+        Time to compute the levels of the flight [s].
     recommended : bool
-        The simplest model within one standard error of the best, over all series of the flight; the best on other
-        flights, where its calibration knows that.
+        True for the simplest model within one standard error of the best, over all series of the flight. If a
+        calibration knows the errors on other flights, the best model on those flights is recommended instead.
     elsewhere_db : (float, float), optional
-        RMSE of the recommended model and of free space on flights left out [dB], where these chose it.
+        RMSE of the recommended model and of free space on other flights [dB], if these selected the model.
     """
 
     model: str
@@ -72,7 +79,41 @@ class LadderRow:
     elsewhere_db: tuple[float, float] | None = None
 
 
-# Models that differ by less than this on every channel [dB] are one row: the tables show hundredths.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelRow:
+    """The score of a model over all channels of the flight.
+
+    Parameters
+    ----------
+    model : str
+    rmse_heldout_db : float
+        RMSE over all held-out areas and channels [dB]; NaN if the model has too few levels.
+    difference_to_best_db, difference_to_best_ci95_db : float, (low, high)
+        RMSE minus that of the best model on the same samples [dB].
+    n : int
+        Samples of all channels that all compared models share.
+    seconds : float
+        Time to compute the levels of the flight [s].
+    recommended : bool
+        As in :class:`LadderRow`.
+    fastest_sufficient : bool
+        True for the fastest model whose difference to the best is not significant.
+    elsewhere_db : (float, float), optional
+        As in :class:`LadderRow`.
+    """
+
+    model: str
+    rmse_heldout_db: float
+    difference_to_best_db: float
+    difference_to_best_ci95_db: Interval
+    n: int
+    seconds: float
+    recommended: bool
+    fastest_sufficient: bool
+    elsewhere_db: tuple[float, float] | None = None
+
+
+# Models that differ by less than this on every channel [dB] share one row, because the tables show hundredths.
 _SAME_DB = 0.01
 
 
@@ -84,7 +125,7 @@ def distinct(rows: Sequence[LadderRow], keep: str) -> tuple[list[LadderRow], lis
     rows : sequence of LadderRow
         In the order of the models, with the same channels for each.
     keep : str
-        Model that stays; so does the recommended one.
+        Model that always has a row, as the recommended model has.
 
     Returns
     -------
@@ -110,33 +151,46 @@ def distinct(rows: Sequence[LadderRow], keep: str) -> tuple[list[LadderRow], lis
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ladder:
-    """All rungs, scored: ``error_db[rung][series]`` (n,), NaN outside the shared samples.
+    """The scored models.
 
-    ``position_m`` is by series (n, 3). ``rmse_db`` is over all series. ``best`` (of all rungs), ``best_replay`` and
-    ``recommended`` (without the lines that replay nothing) are indices of rungs, None where nothing was compared.
+    Parameters
+    ----------
+    rungs : tuple of Rung
+        Simplest first.
+    error_db : tuple of tuple of (n,)
+        ``error_db[model][series]``: held-out errors [dB]; NaN for samples that the models do not share.
+    time_s, position_m : tuple of (n,), tuple of (n, 3)
+        Time [s] and position [m] of the samples of each series.
+    rmse_db : tuple of float
+        RMSE of each model over all series [dB].
+    best, best_replay, recommended : int, optional
+        Index of the best model, of the best one that traces rays, and of the recommended one. None if no models were
+        compared.
+    elsewhere_db : (float, float), optional
+        RMSE of the recommended model and of free space on other flights [dB], if these selected the model.
     """
 
     rungs: tuple[Rung, ...]
     error_db: tuple[tuple[FloatArray, ...], ...]
+    time_s: tuple[FloatArray, ...]
     position_m: tuple[FloatArray, ...]
     rmse_db: tuple[float, ...]
     best: int | None
     best_replay: int | None
     recommended: int | None
     elsewhere_db: tuple[float, float] | None = None
-    """RMSE of the recommended model and of free space on other flights, where these chose it [dB]."""
 
 
 def places_of(position_m: FloatArray, blocks: int = _BLOCKS) -> IntArray:
-    """Place of each sample (n,): cells of equally many samples, made by halving along the longer side of the plan.
+    """Return the area of each sample, shape (n,).
 
-    A place that a flight comes back to is one place, and is left out as a whole; stretches of time would leave its
-    other visits in.
+    Areas have equal numbers of samples. They are halved along the longer side of their plan. All visits of an area are
+    held out together; segments in time would keep the other visits in the fit.
 
     Parameters
     ----------
     position_m : (n, 2) or (n, 3)
-        East, north [m]; of equal ones the earlier come first.
+        East, north [m]. Equal positions are ordered by time.
     blocks : int
         A power of two.
 
@@ -173,18 +227,18 @@ def climb(
     rungs: Sequence[Rung],
     position_m: Sequence[FloatArray],
 ) -> Ladder:
-    """Score the rungs of a ladder, given from the simplest to the most complex model.
+    """Score models on held-out areas.
 
     Parameters
     ----------
     measured_db : sequence of (n,)
-        By series, in time order; NaN does not count [dB].
+        Level of each series in time order [dB]; NaN is not scored.
     time_s : sequence of (n,)
-        Orders the errors of all series, so that channels that share their instants share their blocks [s].
+        Orders the errors of all series, so that channels with the same times share their correlated errors [s].
     rungs : sequence of Rung
-        Simplest first: ties go to the earlier one.
+        Simplest first, because a tie goes to the earlier model.
     position_m : sequence of (n, 3)
-        Where each sample was taken: places are left out (:func:`places_of`).
+        Position of each sample [m]; areas are held out (:func:`places_of`).
 
     Returns
     -------
@@ -209,34 +263,33 @@ def climb(
     rmse = tuple(_rmse(e) for e in joined)
     if not any(np.isfinite(rmse)):
         return Ladder(
-            rungs=tuple(rungs), error_db=errors, position_m=tuple(position_m), rmse_db=rmse, best=None,
-            best_replay=None, recommended=None,
+            rungs=tuple(rungs), error_db=errors, time_s=tuple(time_s), position_m=tuple(position_m), rmse_db=rmse,
+            best=None, best_replay=None, recommended=None,
         )  # fmt: skip
     replays = [i for i, rung in enumerate(rungs) if rung.regressor_db is None and np.isfinite(rmse[i])]
-    # lines replay nothing: they are shown, and never recommended
+    # a straight line is shown and never recommended, because it predicts no other place
     chosen = recommended = min(replays, key=lambda i: rmse[i], default=None)
     if chosen is not None:
         recommended = next(i for i in replays if i == chosen or _as_good(joined[i], joined[chosen], place))
     return Ladder(
-        rungs=tuple(rungs), error_db=errors, position_m=tuple(position_m), rmse_db=rmse,
+        rungs=tuple(rungs), error_db=errors, time_s=tuple(time_s), position_m=tuple(position_m), rmse_db=rmse,
         best=int(np.nanargmin(rmse)), best_replay=chosen, recommended=recommended,
     )  # fmt: skip
 
 
 def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[LadderRow]:
-    """The rows of one series.
+    """Return the rows of one series, one per model.
 
     Parameters
     ----------
     ladder : Ladder
     series : int
-        Which of the series of its rungs.
+        Index of the series.
     name : (tower, channel)
 
     Returns
     -------
     list of LadderRow
-        One per rung.
     """
     rows = []
     for index, rung in enumerate(ladder.rungs):
@@ -261,42 +314,43 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[Ladd
     return rows
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ModelCost:
-    """A scored model over all series: its seconds, its RMSE on held-out segments [dB], and whether it is the knee.
+def model_rows(ladder: Ladder) -> list[ModelRow]:
+    """Return the score of each model over all channels, simplest first.
 
-    The knee is the fastest model that no series tells from the best one.
+    Parameters
+    ----------
+    ladder : Ladder
+
+    Returns
+    -------
+    list of ModelRow
+        Empty if no models were compared.
     """
-
-    model: str
-    seconds: float
-    rmse_heldout_db: float
-    knee: bool
-
-
-def costs(rows: Sequence[LadderRow]) -> list[ModelCost]:
-    """Time against error of the models that are scored on every series on which any is."""
-    scored: dict[str, list[LadderRow]] = {}
-    for row in rows:
-        if np.isfinite(row.rmse_heldout_db):
-            scored.setdefault(row.model, []).append(row)
-    most = max(map(len, scored.values()), default=0)
-    scored = {model: of for model, of in scored.items() if len(of) == most}
-    as_good = [
-        model for model, of in scored.items()
-        if all(row.difference_to_best_db <= 0.0 or row.difference_to_best_ci95_db[0] <= 0.0 for row in of)
+    if ladder.best is None:
+        return []
+    best = ladder.error_db[ladder.best]
+    pairs = [
+        pooled_difference(list(zip(ladder.time_s, errors, best, strict=True)), free_offset=False,
+                          place_m=ladder.position_m)
+        for errors in ladder.error_db
     ]  # fmt: skip
-    knee = min(as_good, key=lambda model: scored[model][0].seconds, default=None)
+    scored = [i for i, rmse in enumerate(ladder.rmse_db) if np.isfinite(rmse)]
+    # not significant: an interval is known and contains 0; the best model always is
+    sufficient = [i for i in scored if i == ladder.best or pairs[i].difference_ci95_db[0] <= 0.0]
+    fastest = min(sufficient, key=lambda i: ladder.rungs[i].seconds)
     return [
-        ModelCost(
-            model=model,
-            seconds=of[0].seconds,
-            rmse_heldout_db=float(
-                np.sqrt(np.average([row.rmse_heldout_db**2 for row in of], weights=[row.n for row in of]))
-            ),
-            knee=model == knee,
+        ModelRow(
+            model=rung.model,
+            rmse_heldout_db=ladder.rmse_db[i],
+            difference_to_best_db=pairs[i].difference_db,
+            difference_to_best_ci95_db=pairs[i].difference_ci95_db,
+            n=sum(int(np.isfinite(error).sum()) for error in ladder.error_db[i]),
+            seconds=rung.seconds,
+            recommended=i == ladder.recommended,
+            fastest_sufficient=i == fastest,
+            elsewhere_db=ladder.elsewhere_db if i == ladder.recommended else None,
         )
-        for model, of in scored.items()
+        for i, rung in enumerate(ladder.rungs)
     ]
 
 
@@ -307,23 +361,23 @@ def held_out_error_db(
     place: IntArray,
     regressor_db: FloatArray | None = None,
 ) -> FloatArray:
-    """Measured minus predicted (n,), each place with the offset of all the others [dB]; NaN where not ``keep``.
+    """Return measured minus predicted level, each area with the offset of all other areas, shape (n,) [dB].
 
     Parameters
     ----------
     measured_db, level_db : (n,)
         Levels in time order [dB].
     keep : (n,) bool
-        Samples that count.
+        True for samples that are fitted and scored.
     place : (kept samples,) int
-        Of each sample that counts, below :data:`_BLOCKS`.
+        Area of each of these samples, below :data:`_BLOCKS`.
     regressor_db : (n,), optional
-        Has a slope that is fitted together with the offset, on the same samples.
+        Abscissa of a line whose slope is fitted together with the offset.
 
     Returns
     -------
     (n,)
-        Errors [dB].
+        Errors [dB]; NaN where ``keep`` is False.
 
     Examples
     --------
@@ -341,20 +395,20 @@ def held_out_error_db(
 
 
 def held_out_lines(values: FloatArray, x: FloatArray, block: IntArray, blocks: int) -> tuple[FloatArray, FloatArray]:
-    """Least-squares lines through all blocks but one: offset and slope (blocks,) for each block left out.
+    """Return least-squares lines through all blocks but one.
 
     Parameters
     ----------
     values, x : (n,)
-        Ordinate and abscissa. Where ``x`` does not vary, the slope is 0.
+        Ordinate and abscissa. If ``x`` does not vary, the slope is 0.
     block : (n,) int
-        Of each sample, 0 to ``blocks - 1``.
+        Block of each sample, 0 to ``blocks - 1``.
     blocks : int
 
     Returns
     -------
     (offset, slope) : each (blocks,)
-        NaN offset where no sample is left.
+        Line of each held-out block; the offset is NaN if no other block has samples.
     """
     centre = float(x.mean()) if len(x) else 0.0
     centred = x - centre
@@ -370,21 +424,21 @@ def held_out_lines(values: FloatArray, x: FloatArray, block: IntArray, blocks: i
 
 
 def log_distance_level_db(measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray) -> FloatArray:
-    """Log-distance level (n,) about its mean [dB], each place by the slope of the other places.
+    """Return the log-distance level about its mean, each area with the slope of the other areas, shape (n,) [dB].
 
-    The offset is left to the comparison, as for every other model. NaN where no distance is known.
+    The comparison fits the offset, as for every other model.
 
     Parameters
     ----------
     measured_db, distance_m : (n,)
-        Level [dB] and distance of the ends [m]; NaN is left out of the fit.
+        Level [dB] and distance between transmitter and receiver [m]; NaN is not fitted.
     position_m : (n, 3)
-        See :func:`places_of`.
+        East, north, up [m]; see :func:`places_of`.
 
     Returns
     -------
     (n,)
-        [dB].
+        Level [dB]; NaN if the distance is not known.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         x = 10.0 * np.log10(distance_m)
@@ -402,7 +456,7 @@ def log_distance_level_db(measured_db: FloatArray, distance_m: FloatArray, posit
 
 
 def compared(error_db: FloatArray, best_db: FloatArray, position_m: FloatArray) -> PairedDifference:
-    """A model against the best one; errors of stretches left out count as they are."""
+    """Return the difference in RMSE to the best model, without a further offset."""
     return paired_difference(error_db, best_db, free_offset=False, place_m=position_m)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, db_from_amplitude
 from .causes import Cause
 from .gains import StatedSpread
-from .ladder import LadderRow
+from .ladder import LadderRow, ModelRow
 from .level import (
     LEARNED_HERE,
     ChannelDifference,
@@ -367,9 +367,10 @@ class FlightVerdict:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightResult:
-    """Everything that was found about one flight; empty where it has no such series.
+    """The results of one flight; empty for series that the flight does not have.
 
-    ``ladder`` holds one row per model, tower and channel; none where it was not climbed.
+    ``models`` has one row per model over all channels, ``ladder`` one row per model, tower and channel. Both are empty
+    if no models were compared.
     """
 
     rss: tuple[RssResult, ...] = ()
@@ -377,17 +378,18 @@ class FlightResult:
     pairs: tuple[PairResult, ...] = ()
     engine: EngineResult | None = None
     serving: ServingComparison | None = None
+    models: tuple[ModelRow, ...] = ()
     ladder: tuple[LadderRow, ...] = ()
     verdict: FlightVerdict | None = None
-    """None where no channel and baseline could be scored."""
+    """The comparison with the best baseline over all channels; None if nothing could be scored."""
     likely_cause: Cause | None = None
-    """The one trouble that explains most of the error of the flight; None where none is identified."""
+    """The systematic error that explains most of the RMSE; None if none is identified."""
     next_step: str | None = None
-    """The one thing to do next, a clause; None where nothing that is known changes the result."""
+    """The next step of the user, a clause; None if no known step changes the result."""
 
     @property
     def cause(self) -> str | None:
-        """The likely cause in a sentence."""
+        """The sentence of the likely cause; None if none is identified."""
         return None if self.likely_cause is None else self.likely_cause.sentence
 
     @property

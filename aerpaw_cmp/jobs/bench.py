@@ -21,7 +21,6 @@ from ..common.jsonable import named
 from ..common.stages import Progress, begin_peak, logged, peak_mib
 from ..common.text import counted
 from ..common.units import wavelength_m
-from ..compare.ladder import LadderRow, costs
 from ..propagation.check.audit import RANK_K, compare
 from ..propagation.geometry import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from ..propagation.options import Run, Search
@@ -59,15 +58,15 @@ def run_bench(
     ratios : bool
         Compare with the peers, too.
     report : Path, optional
-        Folder of a report, whose ladder of models is a table, too.
+        Folder of a report, whose model comparison becomes a table.
     progress : Progress
 
     Returns
     -------
     dict
-        ``conditions``, ``replay.rows``, ``ratios``, ``details`` and, of a report, ``ladder``.
+        ``conditions``, ``replay.rows``, ``ratios``, ``details`` and, with a report, ``models``.
     """
-    ladder = {} if report is None else {"ladder": _costs(report)}
+    models = {} if report is None else {"models": _costs(report)}
     site, link, some = random_scene(poses)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
     measured = _against_peers(progress) if ratios else {}
@@ -77,26 +76,19 @@ def run_bench(
         "replay": {"rows": rows},
         "ratios": {name: value["ratio"] for name, value in measured.items() if value is not None},
         "details": measured,
-        **ladder,
+        **models,
     }
 
 
 def _costs(report: Path) -> list[Row]:
-    """Time against error of the models of a report's ladder."""
+    """Return time and error of the models that a report compares, without the models that have no score."""
     from .diff_reports import read_metrics
 
     file = report / "metrics.json"
-    rows = read_metrics(file, report).get("ladder") or []
-    nothing = {"rmse_heldout_db": np.nan, "difference_to_best_db": np.nan}
+    rows = read_metrics(file, report).get("models") or []
+    columns = ("model", "seconds", "rmse_heldout_db", "fastest_sufficient")
     with parsing(file, "metrics.json of a report", "an edited file", any_shape=True):
-        models = [
-            LadderRow(**{
-                **row, **{key: value for key, value in nothing.items() if row[key] is None},
-                "difference_to_best_ci95_db": tuple(np.array(row["difference_to_best_ci95_db"], dtype=float)),
-            })
-            for row in rows
-        ]  # fmt: skip
-    return [named(at, "model seconds rmse_heldout_db knee") for at in costs(models)]
+        return [{name: row[name] for name in columns} for row in rows if row["rmse_heldout_db"] is not None]
 
 
 def _against_peers(progress: Progress) -> dict[str, Any]:

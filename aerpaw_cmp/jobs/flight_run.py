@@ -30,7 +30,7 @@ from ..common.text import counted
 from ..common.units import FloatArray
 from ..common.yamlfile import KeyPath, edited, parse_yaml
 from ..compare.causes import OF_DIRECTION, Cause
-from ..compare.ladder import Ladder, Rung, climb, series_rows
+from ..compare.ladder import Ladder, Rung, climb, model_rows, series_rows
 from ..compare.result import BASELINE_TITLE, FlightResult
 from ..compare.statistics import pooled_difference
 from ..compare.verdict import is_one_place
@@ -638,7 +638,11 @@ def run_flight(
             climbed = flight_ladder(data, replays)
             if climbed is not None:
                 rows = (series_rows(climbed.ladder, index, name) for index, name in enumerate(climbed.names))
-                result = dataclasses.replace(result, ladder=tuple(row for of_series in rows for row in of_series))
+                result = dataclasses.replace(
+                    result,
+                    models=tuple(model_rows(climbed.ladder)),
+                    ladder=tuple(row for of_series in rows for row in of_series),
+                )
     result = dataclasses.replace(result, likely_cause=unrivalled(result.likely_cause, climbed))
     result = dataclasses.replace(result, next_step=next_step(data, result, climbed))
     return FlightRun(data=data, replays=replays, result=result, ladder=climbed)

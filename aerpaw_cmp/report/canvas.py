@@ -389,7 +389,7 @@ def lonely(level: FloatArray) -> BoolArray:
 def draw_out_of_coverage(
     ax: Axes, seconds: FloatArray, mask: BoolArray, label: str, *, height: float = 1.0, hatch: str = "////"
 ) -> None:
-    """Hatched spans, marked Z where there is room, over a share of the height of the axes.
+    """Draw hatched spans over a share of the height of the axes.
 
     Parameters
     ----------
@@ -399,15 +399,15 @@ def draw_out_of_coverage(
     mask : (n,) bool
         Samples out of coverage.
     label : str
-        For the legend.
+        Text of the legend.
     height : float
-        Share of the height of the axes, from below.
+        Share of the height of the axes that the spans fill, from below.
     hatch : str
-        Of matplotlib.
+        Hatch pattern of matplotlib.
     """
     if not mask.any():
         return
-    # a sample stands for half a step to each side: one lost sample alone would have no width
+    # a sample covers half a step on each side, because a single lost sample would have no width
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
     spans = [(seconds[a] - step / 2, seconds[b] - seconds[a] + step) for a, b in _apart(runs(mask), seconds)]
     bars = ax.broken_barh(
@@ -415,13 +415,6 @@ def draw_out_of_coverage(
         hatch=hatch, linewidth=0.0, label=label, zorder=0.5 if height == 1.0 else 4.0,
     )  # fmt: skip
     bars.set_rasterized(len(spans) > 300)
-    duration = max(float(seconds[-1] - seconds[0]), step)
-    for begin, width in spans:
-        if width > 0.015 * duration and height == 1.0:
-            ax.text(
-                begin + width / 2, 0.93, "Z", transform=ax.get_xaxis_transform(), ha="center", va="center", zorder=6,
-                fontweight="bold", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
-            )  # fmt: skip
 
 
 # More spans than this are joined where no eye could part them.

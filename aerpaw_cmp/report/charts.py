@@ -14,7 +14,7 @@ import numpy as np
 
 from ..common.kml import CLASS_COLOURS
 from ..common.units import AnyArray
-from ..compare.ladder import LadderRow, ModelCost, costs, distinct
+from ..compare.ladder import ModelRow, distinct
 from ..compare.level import DetectionScore, ServingComparison
 from ..compare.result import RankResult
 from ..logs.records import has_wall_clock
@@ -88,18 +88,20 @@ def charts_of(data: ReportData) -> list[Chart]:
                 f"{score.constant_log_score:.3f} ({learned_on(score)}).",
                 content=_detection(score),
             ))  # fmt: skip
-    if any(np.isfinite(row.rmse_heldout_db) for row in data.ladder):
+    scored = [row for row in data.models if np.isfinite(row.rmse_heldout_db)]
+    if scored:
+        names = {row.model for row in distinct(data.ladder, AS_SET)[0]}
+        shown = [row for row in data.models if row.model in names]
         charts.append(Chart(
-            section="ladder", title="Models from the simplest to the richest",
-            caption="RMSE on held-out segments. Whiskers: 95 % interval of the difference to the best model on the "
-            "same samples.",
-            content=_ladder(distinct(data.ladder, AS_SET)[0]),
+            section="ladder", title="Models from the simplest to the most complex",
+            caption="RMSE on held-out areas, over all channels. Whiskers: 95 % interval of the difference to the best "
+            "model on the same samples.",
+            content=_errors(shown),
         ))  # fmt: skip
         charts.append(Chart(
             section="ladder", title="What does accuracy cost?",
-            caption="RMSE over all series against the seconds of the whole flight. Knee: the fastest model that no "
-            "series tells from the best.",
-            content=_costs(costs(data.ladder)),
+            caption="RMSE against the computing time of the complete flight. Numbers: rows of the table.",
+            content=_costs(shown),
         ))  # fmt: skip
     charts += [
         Chart(
@@ -119,38 +121,31 @@ def charts_of(data: ReportData) -> list[Chart]:
     return charts
 
 
-def _ladder(rows: Sequence[LadderRow]) -> dict[str, Any]:
-    """RMSE of each model on held-out segments, dots of one colour per tower and channel."""
-    models = list(dict.fromkeys(row.model for row in rows))
-    channels: dict[str, list[LadderRow]] = {}
-    for row in rows:
-        if np.isfinite(row.rmse_heldout_db):
-            channels.setdefault(f"{row.tower} {row.channel}".strip(), []).append(row)
-    marks = [
-        {
-            "kind": "dots",
-            "name": name,
-            "x": np.array([row.rmse_heldout_db for row in of]),
-            "y": np.array([models.index(row.model) for row in of]) + 0.5 * ((number + 0.5) / len(channels) - 0.5),
-            "low": np.array([row.rmse_heldout_db - row.difference_to_best_db + row.difference_to_best_ci95_db[0]
-                             for row in of]),
-            "high": np.array([row.rmse_heldout_db - row.difference_to_best_db + row.difference_to_best_ci95_db[1]
-                              for row in of]),
-        }
-        for number, (name, of) in enumerate(channels.items())
-    ]  # fmt: skip
-    chosen = next((models.index(row.model) for row in rows if row.recommended), -1)
-    return {"rows": models, "chosen": chosen, "x": {"label": "RMSE on held-out segments [dB]"}, "marks": marks}
+def _errors(models: Sequence[ModelRow]) -> dict[str, Any]:
+    """Return a row per model, with its RMSE on held-out areas."""
+    of = [(i, row) for i, row in enumerate(models) if np.isfinite(row.rmse_heldout_db)]
+    rmse, apart = (np.array([getattr(row, key) for _, row in of])
+                   for key in ("rmse_heldout_db", "difference_to_best_db"))  # fmt: skip
+    low, high = np.array([row.difference_to_best_ci95_db for _, row in of]).T + rmse - apart
+    mark = {"kind": "dots", "name": "RMSE, all channels", "x": rmse, "y": np.array([float(i) for i, _ in of])}
+    names = [f"{number}  {row.model}" for number, row in enumerate(models, 1)]
+    chosen = next((i for i, row in of if row.recommended), -1)
+    return {"rows": names, "chosen": chosen, "x": {"label": "RMSE on held-out areas [dB]"},
+            "marks": [{**mark, "low": low, "high": high}]}  # fmt: skip
 
 
-def _costs(models: Sequence[ModelCost]) -> dict[str, Any]:
-    """A dot for each model."""
-    marks = [
-        {"kind": "dots", "name": f"{at.model} (knee)" if at.knee else at.model, "x": np.array([at.seconds]),
-         "y": np.array([at.rmse_heldout_db])}
-        for at in models
-    ]  # fmt: skip
-    return {"x": {"label": "Seconds"}, "y": {"label": "RMSE on held-out segments [dB]"}, "marks": marks}
+def _costs(models: Sequence[ModelRow]) -> dict[str, Any]:
+    """Return a numbered dot for each model, and a mark of its own for the fastest sufficient one."""
+    marks = []
+    for name, fastest in (("other models", False), ("fastest sufficient", True)):
+        of = [(number, row) for number, row in enumerate(models, 1)
+              if np.isfinite(row.rmse_heldout_db) and row.fastest_sufficient == fastest]  # fmt: skip
+        marks.append({
+            "kind": "dots", "name": name, "labels": [str(number) for number, _ in of],
+            "x": np.array([row.seconds for _, row in of]), "y": np.array([row.rmse_heldout_db for _, row in of]),
+        })  # fmt: skip
+    marks = [mark for mark in marks if mark["labels"]]
+    return {"x": {"label": "Computing time [s]"}, "y": {"label": "RMSE on held-out areas [dB]"}, "marks": marks}
 
 
 def _predicted(series: AgainstSeries) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from ..common.jsonable import fields_of, json_safe
 from ..common.stages import Stages
 from ..common.text import counted
 from ..common.units import AnyArray, FloatArray
-from ..compare.ladder import LadderRow, distinct
+from ..compare.ladder import distinct
 from ..compare.level import PART_DB, ErrorSpan, FieldAudit
 from ..compare.result import APPLIED, GIVEN, AuditResult, ClockResult, EngineResult, RankResult, RssResult
 from ..compare.statistics import Interval
@@ -32,7 +32,7 @@ from .explorer import payload
 from .exports import FOLDER
 from .flight_data import RANKS, InputFile, ReportData, start_of
 from .page import about, json_text, merge, rendered, write_figures, write_file
-from .texts import clock, coded, cut, duration, flat, interval, k_key, minute, number, percent
+from .texts import clock, coded, cut, duration, interval, k_key, minute, number, percent
 
 # Rejected lines shown per file; the flight file holds all.
 _REJECTED_SHOWN = 20
@@ -74,7 +74,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         "rank": {item.tower: _rank_metrics(item) for item in data.rank},
         "rt": None if data.engine is None else _engine_metrics(data.engine),
         **about(data),
-        **({"ladder": data.ladder} if data.ladder else {}),
+        **({"models": data.models, "ladder": data.ladder} if data.models else {}),
         "clock": {name: clock_metrics(clock) for name, clock in data.clocks.items()},
         **({} if data.serving is None else {"serving": data.serving.as_dict()}),
         **({"pairs": pairs} if pairs else {}),
@@ -146,24 +146,13 @@ def _rank_metrics(series: RankResult) -> dict[str, Any]:
         "simulated": simulated,
         "best_k": score.best_k,
         "best_k_ci95": score.curve.best_k_interval,
-        **further_numbers(series),
-    }
-
-
-def further_numbers(series: RssResult | RankResult) -> dict[str, Any]:
-    """Numbers of a series that stand in a table of their own on the page, as JSON has them."""
-    numbers: dict[str, Any] = {}
-    if isinstance(series, RankResult):
-        curve = series.score.curve
-        numbers = {
-            "n": series.score.n, "n_effective": series.score.n_effective, "n_no_csi": series.score.n_no_csi,
-            "best_k_total_variation": curve.best_k_total_variation,
-            "best_k_total_variation_ci95": curve.best_k_total_variation_interval,
-            "stale": {"verdict": series.score.staleness.verdict, "n_reports": series.score.staleness.n_reports,
-                      "hold_s": series.score.staleness.hold_s},
-        }  # fmt: skip
-    safe: dict[str, Any] = json_safe(numbers | fields_of(series.further))
-    return safe
+        "best_k_total_variation": score.curve.best_k_total_variation,
+        "best_k_total_variation_ci95": score.curve.best_k_total_variation_interval,
+        "n": score.n, "n_effective": score.n_effective, "n_no_csi": score.n_no_csi,
+        "stale": {"verdict": score.staleness.verdict, "n_reports": score.staleness.n_reports,
+                  "hold_s": score.staleness.hold_s},
+        **fields_of(series.further),
+    }  # fmt: skip
 
 
 def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
@@ -189,7 +178,7 @@ def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
 
 def result_card(data: ReportData) -> Card:
     """Return the card of all errors: levels by channel, ranks by tower and K."""
-    best = words.ladder_verdict(data.ladder)
+    best = words.models_verdict(data.models)
     return Card(
         title="Result", id="result", link="Result", chart="forecast",
         text=[paragraph(bold(best)) if best else "", words.headline(data)],
@@ -232,11 +221,12 @@ def _ranks(data: ReportData) -> Table:
                          Markup(percent(at.agreement)) + sd, at.kappa, at.out_of_coverage))  # fmt: skip
     grounds = any(p.further.agreement_sd_by_ground for p in data.rank)
     return Table(
-        caption="Channel rank: shares of rank 1 to 4 in coverage, and distance of the simulation from the reported "
-        "rank."
-        + (" ±: by the shape of the ground between its known heights, one standard deviation." if grounds else ""),
+        caption="Channel rank: shares of rank 1 to 4 in coverage. K: singular values of the channel matrix above the "
+        "largest one divided by K count. Total variation: distance between the two distributions, 0 to 1. Agreement: "
+        "share of samples with the same rank. Kappa: agreement beyond chance, 1 is perfect, 0 is chance."
+        + (" ±: standard deviation by the shape of the ground between its known heights." if grounds else ""),
         columns={"Tower": HEAD, "Source": TEXT, **{f"Rank {rank}": SHARE for rank in RANKS},
-                 "Total variation": RIGHT, "Agreement": RIGHT, "Kappa": 2, "Z": 0},
+                 "Total variation": RIGHT, "Agreement": RIGHT, "Kappa": 2, "Out of coverage": 0},
         rows=rows,
     )  # fmt: skip
 
@@ -263,8 +253,7 @@ def _channel(data: ReportData, p: RssResult) -> Card:
             f"Offset {number(score.offset_db)} dB {interval(score.intervals.offset_db)}.",
             counts_as if math.isfinite(independent) else "", lag if p.clock_verdict else "",
         )],
-        parts=[Card(tables=[_spans(data, p.time, p.spans, f"Segments with the largest error, {p.name}.")]),
-               _more_numbers(p, f"Further numbers of {p.name}.")],
+        parts=[Card(tables=[_spans(data, p.time, p.spans, f"Segments with the largest error, {p.name}.")])],
     )  # fmt: skip
 
 
@@ -284,12 +273,6 @@ def _spans(data: ReportData, time: AnyArray, spans: Sequence[ErrorSpan], caption
         "Mean [dB]": 1,
     }
     return Table(caption=caption, columns=heads, rows=rows)
-
-
-def _more_numbers(series: RssResult | RankResult, caption: str) -> Card:
-    rows = list(flat(further_numbers(series)))
-    table = Table(caption=caption, columns={"Name": HEAD, "Value": TEXT}, rows=rows)
-    return Card(title="More numbers", fold=True, tables=[table])
 
 
 def against_card(data: ReportData) -> Card:
@@ -361,36 +344,48 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
 _MEANS = ("model", "channels", "bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "crps_db", "coverage_90")
 
 
-def ladder_card(data: ReportData) -> Card:
-    """Return the card that compares models by their error on held-out segments."""
-    models: dict[str, dict[str, LadderRow]] = {}
+def models_card(data: ReportData) -> Card:
+    """Return the card that compares models by their error on held-out areas, over all channels and for each."""
+    if not data.models:
+        return Card()
     kept, same = distinct(data.ladder, words.AS_SET)
-    for row in kept:
-        models.setdefault(row.model, {})[f"{row.tower} {row.channel}".strip()] = row
-    channels = list(next(iter(models.values()), {}))
-    table = Table(
-        caption="RMSE in dB on held-out segments, and its difference to the best model on the same samples with a 95 % "
-        "interval. Marked: the simplest model within one standard error of the best, over all channels.",
-        columns={"Model": HEAD, **{c + of: form for c in channels for of, form in (("", 2), (": difference", RIGHT))},
-                 "Seconds": 1},
+    rows = {(row.model, row.tower, row.channel): row for row in kept}
+    names, channels = dict.fromkeys(row.model for row in kept), dict.fromkeys((row.tower, row.channel) for row in kept)
+    shown = [row for row in data.models if row.model in names]
+    notes = {row.model: ", ".join(["recommended"] * row.recommended + ["fastest sufficient"] * row.fastest_sufficient)
+             for row in shown}  # fmt: skip
+    pooled = Table(
+        caption="RMSE in dB on held-out areas over all channels, and its difference to the best model on the same "
+        "samples with a 95 % interval. Recommended: the simplest replay within one standard error of the best replay. "
+        "Fastest sufficient: the fastest model whose difference to the best model is not significant.",
+        columns={"No.": RIGHT, "Model": HEAD, "RMSE [dB]": 2, "Difference to the best [dB]": RIGHT, "Time [s]": 2,
+                 "Note": TEXT},
         rows=[
-            (Markup("<b>{}</b> (recommended)").format(model) if any(r.recommended for r in rows.values()) else model,
-             *(cell for c in channels for cell in (
-                 rows[c].rmse_heldout_db,
-                 estimate(rows[c].difference_to_best_db, rows[c].difference_to_best_ci95_db))),
-             max(r.seconds for r in rows.values()))
-            for model, rows in models.items()
+            (str(number), bold(row.model) if row.recommended else row.model, row.rmse_heldout_db,
+             estimate(row.difference_to_best_db, row.difference_to_best_ci95_db), row.seconds, notes[row.model])
+            for number, row in enumerate(shown, 1)
         ],
         notes=[f"Within 0.01 dB of a row above on every channel: {'; '.join(same)}."] if same else [],
     )  # fmt: skip
+    each = Table(
+        caption="RMSE in dB on held-out areas, and in brackets the 95 % interval of its difference to the best model.",
+        columns={"Tower": HEAD, "Channel": HEAD, **{f"Model {number}": RIGHT for number in range(1, len(shown) + 1)}},
+        rows=[
+            (*of, *(estimate(row.rmse_heldout_db, row.difference_to_best_ci95_db)
+                    for model in names for row in [rows[(model, *of)]]))
+            for of in channels
+        ],
+        look="dense",
+    )  # fmt: skip
     text = (
-        f"{words.ladder_verdict(data.ladder)} The flight is cut into eight segments. Each segment is scored with the "
-        "offset of the remaining seven; nothing else is fitted. Each stage (antennas, trees, ground, buildings) adds "
-        "its variants to the best model so far."
+        f"{words.models_verdict(data.models)} The flight is cut into eight areas. Each area is scored with the offset "
+        "of the other seven; nothing else is fitted. Each stage (antennas, trees, ground, buildings) adds its variants "
+        "to the best model so far."
     )
-    title = "Model comparison (cross-validated)"
-    shown = [text] if models else []
-    return Card(title=title, id="ladder", link="Models", text=shown, tables=[table], chart="ladder" if models else "")
+    return Card(
+        title="Which model does this flight need?", id="ladder", link="Models", text=[text], tables=[pooled],
+        chart="ladder", parts=[Card(title="Models, channel by channel", tables=[each], fold=True)],
+    )  # fmt: skip
 
 
 def serving_card(data: ReportData) -> Card:
@@ -428,7 +423,7 @@ def _tower(p: RankResult) -> Card:
         caption=f"Distances between the reported and the simulated rank at {p.tower}. Brackets: 95 % interval. p: "
         "chance of such a distance if both had one distribution.",
         columns={"K": HEAD, "Agreement by pose": RIGHT, "Kappa": 2, "Total variation": RIGHT, "Wasserstein": 2, "p": 3,
-                 "Z": 0},
+                 "Out of coverage": 0},
         rows=[
             (k_key(k), estimate(at.agreement, at.agreement_ci95), at.kappa,
              estimate(at.total_variation, at.total_variation_ci95), at.wasserstein, at.p_histogram, at.out_of_coverage)
@@ -436,8 +431,7 @@ def _tower(p: RankResult) -> Card:
         ],
     )  # fmt: skip
     text = [paragraph(words.rank_verdict(p), best if math.isfinite(score.best_k) else "")]
-    more = _more_numbers(p, f"Further numbers of the rank at {p.tower}.")
-    return Card(title=p.tower, group="rank-tower", text=text, tables=[table], parts=[more])
+    return Card(title=p.tower, group="rank-tower", text=text, tables=[table])
 
 
 def engine_card(data: ReportData) -> Card:
@@ -557,7 +551,7 @@ def method_card(data: ReportData, files: Sequence[str]) -> Card:
 
 # Cards in the order of the page. A new card is one function more.
 CARDS = (
-    result_card, channels_card, against_card, referee_card, ladder_card, serving_card, ranks_card, engine_card,
+    result_card, channels_card, against_card, referee_card, models_card, serving_card, ranks_card, engine_card,
     inputs_card,
 )  # fmt: skip
 

@@ -160,7 +160,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
     start, score = start_of(data), panel.score
     seconds = seconds_since(panel.time, start)
     fig, (ax, below) = subplots((9.2, 5.6), 2, 1, sharex=True, height_ratios=(2.6, 1.0))
-    draw_out_of_coverage(ax, seconds, panel.simulated_out_of_coverage, "Z: no path in the simulation")
+    draw_out_of_coverage(ax, seconds, panel.simulated_out_of_coverage, "out of coverage: no path in the simulation")
     draw_out_of_coverage(
         ax, seconds, panel.measured_out_of_coverage, "no signal in the measurement", height=0.05, hatch="xxxxx"
     )
@@ -226,7 +226,7 @@ def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssR
         seconds = seconds_since(panel.time, start)
         dots(ax, seconds, panel.measured_db + by, 2.5, color=colour, label=f"{panel.channel}, {words}")
     seconds, simulated = seconds_since(first.time, start), _moved(first.simulated_dbm, first.score.offset_db)
-    draw_out_of_coverage(ax, seconds, first.simulated_out_of_coverage, "Z: no path in the simulation")
+    draw_out_of_coverage(ax, seconds, first.simulated_out_of_coverage, "out of coverage: no path in the simulation")
     ax.plot(*thinned(seconds, simulated), color=SIMULATED, linewidth=1.0, label="ray tracing")
     draw_waypoints(ax, data.moments, start)
     time_axis(ax, start)
@@ -240,7 +240,7 @@ def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssR
 
 
 def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: FloatArray, title: str) -> None:
-    """Ranks at their positions: colour and marker differ; 0 is Z, NaN is left out.
+    """Ranks at their positions: colour and marker differ; 0 has no path, NaN is not drawn.
 
     Parameters
     ----------
@@ -263,11 +263,11 @@ def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: F
             style = {"facecolor": CLASS_COLOURS[value], "edgecolors": "#222222", "linewidths": 0.25}
         ax.scatter(
             east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **style,
-            label=f"{'Z: no path' if value == 0 else f'rank {value}'} ({count(number)})",
+            label=f"{'no path' if value == 0 else f'rank {value}'} ({count(number)})",
             zorder=3.0 + 1.0 / number,  # the rarer a rank, the higher it lies: a few points must not vanish under many
         )  # fmt: skip
     ax.set_title(title)
-    handles, labels = legend_of(ax, lambda label: label.startswith(("rank", "Z")))
+    handles, labels = legend_of(ax, lambda label: label.startswith(("rank", "no path")))
     if handles:
         ax.legend(
             handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, markerscale=1.6,
@@ -342,7 +342,7 @@ def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
             seconds, np.where(rank == 0, np.nan, rank), linestyle="none", marker="|", markersize=7, rasterized=True,
             color=SIMULATED, label=f"K = {k_key(k)}",
         )  # fmt: skip
-        draw_out_of_coverage(ax, seconds, rank == 0, "Z: no path")
+        draw_out_of_coverage(ax, seconds, rank == 0, "out of coverage: no path")
     for number, ax in enumerate(axes[:rows]):
         draw_waypoints(ax, data.moments, start, names=number == 0)
         ax.set_yticks(RANKS)

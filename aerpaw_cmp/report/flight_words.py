@@ -13,7 +13,7 @@ import numpy as np
 from ..common.text import counted
 from ..common.units import AnyArray, Printed
 from ..compare.causes import FEWEST_SAMPLES
-from ..compare.ladder import LadderRow, costs
+from ..compare.ladder import ModelRow
 from ..compare.level import DetectionScore, ErrorSpan
 from ..compare.receiver import ForecastScore
 from ..compare.result import BASELINE_TITLE, AuditResult, FlightVerdict, RankResult, RssResult
@@ -38,7 +38,7 @@ def said_of(verdict: Verdict, table: Mapping[str, tuple[str, str]], **facts: Any
     return f"{text} Next: {action}." if action else text
 
 
-# Name of the ladder's rung with the settings of the flight file.
+# Name of the model with the settings of the flight file.
 AS_SET = "as set in flight.yaml"
 
 
@@ -278,32 +278,30 @@ def verdicts(rss: Sequence[RssResult], rank: Sequence[RankResult]) -> list[str]:
     return [rss_verdict(panel) for panel in rss] + [rank_verdict(panel) for panel in rank]
 
 
-def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
-    """Cross-validated errors of this replay, of the baselines and of the recommended model."""
-    rows = [row for row in ladder if math.isfinite(row.rmse_heldout_db)]
-    best = next((row for row in rows if row.recommended), None)
+def models_verdict(models: Sequence[ModelRow]) -> str:
+    """Return the cross-validated errors of this replay and of the baselines, and the recommended model."""
+    error = {row.model: row.rmse_heldout_db for row in models if math.isfinite(row.rmse_heldout_db)}
+    best = next((row for row in models if row.recommended), None)
     if best is None:
         return ""
-    chosen = best.model
-    mine = {row.model: [r for r in rows if r.model == row.model] for row in rows}
-    error = {model: pooled_db([r.rmse_heldout_db for r in of], [r.n for r in of]) for model, of in mine.items()}
     compared = [f"{name} {error[name]:.1f} dB" for name in (AS_SET, *BASELINE_TITLE.values()) if name in error]
     least = min(error, key=lambda name: error[name])
     text = f"Cross-validated RMSE: {', '.join(compared)}."
     lines = BASELINE_TITLE["log_distance"], BASELINE_TITLE["constant"]
     if least in lines:
-        text += f" The {least}, which replays nothing, has the smallest error of all models."
-    # a line that no single series tells from the best may lose over all of them, as the first sentence says
-    if (knee := next((at for at in costs(rows) if at.knee), None)) and knee.model not in lines:
+        text += f" The {least}, which traces no rays, has the smallest error of all models."
+    fastest = next(row for row in models if row.fastest_sufficient)
+    if fastest.model not in (least, *lines):
         text += (
-            f" \u201c{knee.model}\u201d ({knee.seconds:.2g} s) is the fastest model that no series tells from the best."
+            f" \u201c{fastest.model}\u201d ({fastest.seconds:.2g} s) is the fastest sufficient model: its difference "
+            "to the best model is not significant."
         )
+    if best.model == AS_SET:
+        return f"{text} No model of the replay is significantly better, by 0.1 dB or more, than this flight file."
     how = "the simplest replay within one standard error of the best replay"
     if best.elsewhere_db is not None:
         how = "the best on other flights ({:.1f} dB, free space {:.1f} dB)".format(*best.elsewhere_db)
-    if chosen == AS_SET:
-        return f"{text} No replay improves significantly, by 0.1 dB or more, on the settings of this flight file."
-    return f"{text} \u201c{chosen}\u201d is {how}: {error[chosen]:.1f} dB."
+    return f"{text} Recommended: \u201c{best.model}\u201d, {how}: {error[best.model]:.1f} dB."
 
 
 def training_sentence(names: Sequence[str], what: str) -> str:

@@ -387,7 +387,7 @@ def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    entries: list[Any] = [Patch(**MISSING, label="Z: out of coverage")]
+    entries: list[Any] = [Patch(**MISSING, label="out of coverage")]
     entries.append(Line2D([], [], marker="^", color=TOWER, markeredgecolor="white", linestyle="none", label="tower"))
     if drawn_buildings(data.site):
         entries.append(Patch(facecolor="white", edgecolor="black", label="building"))
@@ -482,7 +482,7 @@ def rank_shares(members: Sequence[RankMap]) -> dict[str, Any]:
     share = 100.0 * np.array([member.share for member in members])
     edges = np.repeat(np.column_stack([np.zeros(len(at)), share.cumsum(axis=1)]), 2, axis=0)
     marks = [
-        {"kind": "band", "name": f"rank {rank}" if rank else "Z: out of coverage", "x": sides, "low": edges[:, rank],
+        {"kind": "band", "name": f"rank {rank}" if rank else "out of coverage", "x": sides, "low": edges[:, rank],
          "high": edges[:, rank + 1], "colour": CLASS_COLOURS[rank]}
         for rank in (0, *RANKS)
     ]  # fmt: skip
@@ -539,20 +539,21 @@ def plates(data: MapsData) -> Iterator[Plate]:
     for words, maps in grouped((*data.rss, *data.corrected), lambda m: f"{m.antennas}{_under(m.foliage)}").items():
         yield Plate(
             name=f"rss_cdf_{safe_name(words)}", section="rss", title=f"Distribution of RSS, {words}",
-            caption="Share of positions with an RSS below the value; a curve starts at its share of Z.",
+            caption="Share of positions with an RSS below the value. A curve starts at the share of positions out of "
+            "coverage.",
             panels={f"{at:g} m": distribution(some) for at, some in grouped(maps, lambda m: m.altitude_m).items()},
         )  # fmt: skip
     for words, ranks in grouped(data.rank, lambda m: _under(m.foliage)).items():
         yield Plate(
             name="_".join(["rank_share", *([safe_name(words)] if words else [])]), section="rank",
-            title=f"Rank against height{words}", caption="Share of positions with each rank; Z is out of coverage.",
+            title=f"Rank against height{words}", caption="Share of positions with each rank, and out of coverage.",
             panels={source: rank_shares(some) for source, some in grouped(ranks, lambda m: m.source).items()},
         )  # fmt: skip
     for tower, ranks in grouped(data.corrected_rank, lambda m: m.tower).items():
         yield Plate(
             name=f"rank_share_learned_{safe_name(tower)}", section="rank",
             title=f"Rank of {tower} against height, raw and corrected",
-            caption="Raw: share of positions with each rank of the traced channel, by K; Z is out of coverage. Learned "
+            caption="Raw: share of positions with each rank of the traced channel, by K, and out of coverage. Learned "
             "receiver: mean probability of each rank.",
             panels={source: rank_shares(some) for source, some in grouped(ranks, lambda m: m.source).items()},
         )  # fmt: skip
@@ -902,7 +903,8 @@ def ranks_card(data: MapsData) -> Card:
     """Return the card of the rank against height."""
     table = Table(
         caption="Share of positions with each rank.",
-        columns={"K": HEAD, "Foliage": TEXT, "Height": RIGHT, "Z": RIGHT, **{f"Rank {rank}": RIGHT for rank in RANKS}},
+        columns={"K": HEAD, "Foliage": TEXT, "Height": RIGHT, "Out of coverage": RIGHT,
+                 **{f"Rank {rank}": RIGHT for rank in RANKS}},
         rows=[(k_key(m.k or 0.0), m.foliage, number(m.altitude_m, 0, "m"), *(percent(share, 1) for share in m.share))
               for m in data.rank],
     )  # fmt: skip

@@ -1,7 +1,5 @@
 """Ladder of models on planted truths."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -9,11 +7,11 @@ from aerpaw_cmp.compare.ladder import (
     LadderRow,
     Rung,
     climb,
-    costs,
     distinct,
     held_out_error_db,
     held_out_lines,
     log_distance_level_db,
+    model_rows,
     places_of,
     series_rows,
 )
@@ -185,26 +183,27 @@ def test_a_missing_level_or_place_leaves_the_line_of_the_others() -> None:
     assert np.polyfit(x, level[~good & (distance > 0.0)], 1)[0] == pytest.approx(-2.5, abs=0.1)
 
 
-def test_the_knee_is_the_fastest_model_that_no_series_tells_from_the_best() -> None:
-    """Of four models: a fast one that one channel rules out, the knee, the best, and a slow one as good."""
-    rows = [
-        LadderRow(
-            model=model, tower="T", channel=channel, rmse_heldout_db=rmse, n=n, seconds=seconds, recommended=False,
-            difference_to_best_db=rmse - 3.0, difference_to_best_ci95_db=(rmse - 3.0 - half, rmse - 3.0 + half),
-        )
-        for model, seconds, half, errors in (
-            ("line", 0.0, 0.5, (3.2, 5.0)), ("flat", 0.4, 0.5, (3.3, 3.4)), ("rich", 2.0, 0.0, (3.0, 3.0)),
-            ("dear", 9.0, 0.5, (3.1, 3.1)),
-        )
-        for channel, n, rmse in zip("AB", (100, 300), errors, strict=True)
-    ]  # fmt: skip
-    points = {at.model: at for at in costs(rows)}
-    assert [model for model, at in points.items() if at.knee] == ["flat"]
-    assert points["line"].rmse_heldout_db == pytest.approx(np.sqrt((100 * 3.2**2 + 300 * 5.0**2) / 400))
-    # without an interval nothing says that it is as good
-    unknown = [dataclasses.replace(row, difference_to_best_ci95_db=(np.nan, np.nan)) for row in rows]
-    assert [at.model for at in costs(unknown) if at.knee] == ["rich"]
-    assert costs([]) == []
+def test_the_fastest_sufficient_model_is_not_significantly_worse_than_the_best() -> None:
+    """Four models of two channels: a fast one that is worse, the fastest sufficient one, the best, and a slow one."""
+    rng = np.random.default_rng(8)
+    n = 600
+    truth = [rng.normal(0.0, 1.0, n) for _ in "AB"]
+    position = [np.column_stack([rng.uniform(0.0, 900.0, (n, 2)), np.full(n, 40.0)]) for _ in "AB"]
+    rungs = [
+        Rung(model=model, level_db=tuple(each + rng.normal(0.0, sd, n) for each in truth), seconds=seconds)
+        for model, sd, seconds in (("worse", 3.0, 0.0), ("fast", 1.0, 0.4), ("same", 1.0, 2.0), ("slow", 1.0, 9.0))
+    ]
+    times = [np.arange(n, dtype=float)] * 2
+    ladder = climb(truth, times, rungs, position)
+    rows = {row.model: row for row in model_rows(ladder)}
+    assert [model for model, row in rows.items() if row.fastest_sufficient] == ["fast"]
+    assert rows["worse"].difference_to_best_ci95_db[0] > 1.0
+    both = np.concatenate([ladder.error_db[0][0], ladder.error_db[0][1]])
+    assert rows["worse"].rmse_heldout_db == pytest.approx(np.sqrt(np.mean(both**2)))
+    assert rows["worse"].n == 2 * n
+    assert rows["worse"].difference_to_best_db == pytest.approx(rows["worse"].rmse_heldout_db - min(ladder.rmse_db))
+    # without samples there is nothing to compare
+    assert model_rows(climb([each * np.nan for each in truth], times, rungs, position)) == []
 
 
 def test_models_that_cannot_differ_are_one_row() -> None:

@@ -67,7 +67,7 @@ def test_free_space_is_found_said_and_written(tmp_path: Path, capsys: pytest.Cap
     assert as_set["difference_to_best_db"] > 0.2
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "free space 1.0 dB" in page[page.index('id="result"') :][:400]  # the first sentence of the verdict
-    assert "Models from the simplest to the richest" in page
+    assert "Models from the simplest to the most complex" in page
 
     seal, *lines = better.read_text().splitlines()
     mine = path.read_text().splitlines()

@@ -6,11 +6,12 @@ import re
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.ladder import LadderRow
+from aerpaw_cmp.compare.ladder import LadderRow, ModelRow
 from aerpaw_cmp.compare.level import DetectionScore, compare_serving
 from aerpaw_cmp.report import flight as html
 from aerpaw_cmp.report.against import Against, AgainstSeries
 from aerpaw_cmp.report.charts import charts_of, shown_confusion
+from aerpaw_cmp.report.flight import models_card
 from benchmarks.fabricated import with_numbers
 
 
@@ -47,23 +48,33 @@ def test_many_cells_are_gathered_without_losing_a_sample():
     assert np.trace(table[:16, :16]) == sum(comparison.confusion[i, i] for i in named)
 
 
-def test_a_ladder_has_a_dot_for_each_score_and_whiskers_of_the_difference(report_data):
-    rows = [
-        LadderRow(model=model, tower="LW1", channel=channel, rmse_heldout_db=rmse, n=100, seconds=1.0,
-                  difference_to_best_db=rmse - 3.0, difference_to_best_ci95_db=(rmse - 3.5, rmse - 2.75),
-                  recommended=model == "rich")
-        for model, channel, rmse in (("free space", "A", 5.0), ("free space", "B", 6.0), ("rich", "A", 3.0),
-                                     ("rich", "B", np.nan))
+def test_models_have_a_dot_for_each_score_and_whiskers_of_the_difference(report_data):
+    models = [
+        ModelRow(model=model, rmse_heldout_db=rmse, difference_to_best_db=rmse - 3.0, n=100, seconds=seconds,
+                 difference_to_best_ci95_db=(rmse - 3.5, rmse - 2.75), recommended=model == "rich",
+                 fastest_sufficient=model == "rich")
+        for model, rmse, seconds in (("free space", 5.0, 0.1), ("opaque", np.nan, 0.5), ("rich", 3.0, 2.0))
     ]  # fmt: skip
-    chart, cost = charts_of(dataclasses.replace(report_data, ladder=tuple(rows)))
-    assert [mark["name"] for mark in cost.content["marks"]] == ["free space"]  # the other is not scored on both
-    first, second = chart.content["marks"]
-    assert (chart.content["rows"], chart.content["chosen"]) == (["free space", "rich"], 1)
-    np.testing.assert_allclose(first["x"], [5.0, 3.0])
-    np.testing.assert_allclose(first["low"] - first["x"], -0.5)
-    np.testing.assert_allclose(first["high"] - first["x"], 0.25)
-    np.testing.assert_array_equal(np.rint(first["y"]), [0, 1])
-    np.testing.assert_allclose(second["x"], [6.0])  # what was not scored has no dot
+    ladder = [
+        LadderRow(model=row.model, tower="LW1", channel="A", rmse_heldout_db=row.rmse_heldout_db, n=100,
+                  difference_to_best_db=row.difference_to_best_db, seconds=row.seconds, recommended=row.recommended,
+                  difference_to_best_ci95_db=row.difference_to_best_ci95_db)
+        for row in models
+    ]  # fmt: skip
+    data = dataclasses.replace(report_data, models=tuple(models), ladder=tuple(ladder))
+    chart, cost = charts_of(data)
+    assert [(mark["name"], mark["labels"]) for mark in cost.content["marks"]] == [
+        ("other models", ["1"]), ("fastest sufficient", ["3"]),
+    ]  # fmt: skip
+    (mark,) = chart.content["marks"]
+    assert (chart.content["rows"], chart.content["chosen"]) == (["1  free space", "2  opaque", "3  rich"], 2)
+    np.testing.assert_allclose(mark["x"], [5.0, 3.0])  # a model without a score has no dot
+    np.testing.assert_allclose(mark["low"] - mark["x"], -0.5)
+    np.testing.assert_allclose(mark["high"] - mark["x"], 0.25)
+    np.testing.assert_array_equal(mark["y"], [0, 2])
+    card = models_card(data)
+    assert [row[0] for row in card.tables[0].rows] == ["1", "2", "3"]
+    assert len(card.parts[0].tables[0].rows) == 1  # one channel
 
 
 def test_the_bands_of_a_forecast_are_its_probabilities_one_upon_the_other(report_data):

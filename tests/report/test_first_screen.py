@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.causes import MOST_CAUSE_WORDS, Cause
-from aerpaw_cmp.compare.ladder import LadderRow
+from aerpaw_cmp.compare.ladder import ModelRow
 from aerpaw_cmp.compare.level import DetectionScore, FieldAudit, floored_fit
 from aerpaw_cmp.compare.receiver import score_forecast
 from aerpaw_cmp.compare.result import FlightVerdict
@@ -33,7 +33,7 @@ from aerpaw_cmp.report.flight_words import (
     cautions,
     first_sentence,
     headlines,
-    ladder_verdict,
+    models_verdict,
     offset_sentences,
     paragraph,
     pretty,
@@ -373,12 +373,12 @@ def test_a_ranking_says_worse_only_where_intervals_do(verdicts):
 
 @pytest.mark.parametrize(("fast", "named"), [("log-distance line", False), ("free space", True)])
 def test_a_line_is_no_model_that_is_as_good_and_faster(fast, named):
-    """By channel it was not told from the replay that beat it over the flight, as the first sentence said."""
-    number = {"tower": "LW1", "channel": "A", "n": 100, "rmse_heldout_db": 11.0}
-    rows = [LadderRow(model=model, seconds=cost, difference_to_best_db=apart, difference_to_best_ci95_db=(-0.5, 3.0),
-                      recommended=apart == 0.0, **number)
+    """A straight line traces no rays, so it is not named as a fast replay."""
+    rows = [ModelRow(model=model, seconds=cost, rmse_heldout_db=11.0 + apart, difference_to_best_db=apart,
+                     difference_to_best_ci95_db=(-0.5, 3.0), recommended=apart == 0.0, n=100,
+                     fastest_sufficient=cost == 0.0)
             for model, cost, apart in ((fast, 0.0, 1.6), (AS_SET, 0.1, 0.0))]  # fmt: skip
-    assert ("fastest" in ladder_verdict(rows)) == named
+    assert ("fastest" in models_verdict(rows)) == named
 
 
 @pytest.mark.parametrize("word", ["better", "worse", "not significant", "no interval"])

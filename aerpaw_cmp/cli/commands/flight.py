@@ -109,11 +109,11 @@ def _print_cards(verdict: Mapping[str, Any]) -> None:
 
 
 def _nothing_compared(metrics: Mapping[str, Any]) -> int:
-    """1 where no channel and no rank has samples enough to compare, which is said; 0 else."""
+    """Return 1 and warn if no channel and no rank has enough samples to compare; return 0 otherwise."""
     from ...compare.statistics import FEWEST
 
     channels = [m for channels in metrics["rss"].values() for m in channels.values()]
-    # a channel left out because its antenna was learned on this log is no failure
+    # a channel that is not scored because its antenna was learned on this log is not a failure
     most = max([m["n"] for m in (*channels, *metrics["rank"].values())], default=0)
     if most >= FEWEST or any(m.get("trained_on") for m in channels):
         return 0
@@ -123,27 +123,25 @@ def _nothing_compared(metrics: Mapping[str, Any]) -> int:
 
 
 def _verdict(outcome: Any, strict: bool) -> int:
-    """Say each stated check that failed; 1 where that is asked to be a failure."""
+    """Warn about each failed check; return 1 if a failed check makes the command fail."""
     for check in outcome.failed_checks:
         say.warn(f"check failed: {check}")
     return 1 if strict and outcome.failed_checks else 0
 
 
-def _print_ladder(ladder: Sequence[Mapping[str, Any]]) -> None:
-    """One line per model; over several channels the range of its errors, which the page has one by one."""
-    rows = []
-    for model in dict.fromkeys(m["model"] for m in ladder):
-        mine = [m for m in ladder if m["model"] == model]
-        errors = [m["rmse_heldout_db"] for m in mine if m["rmse_heldout_db"] is not None]
-        ends = (min(errors), max(errors))[: len(errors)] if errors else None
-        star = "* " if any(m["recommended"] for m in mine) else ""
-        rows.append({"model": star + model, "rmse_db": ends, "seconds": max(m["seconds"] for m in mine)})
-    title = "Model comparison (cross-validated); * simplest replay within 1 SE of the best"
-    records(rows, {"model": "model", "RMSE dB": "rmse_db:.2f", "s": "seconds:.1f"}, title)
+def _print_models(models: Sequence[Mapping[str, Any]]) -> None:
+    """Print one line per model, over all channels; the page has each channel."""
+    notes = {"recommended": "recommended", "fastest_sufficient": "fastest sufficient"}
+    rows = [{**row, "note": ", ".join(notes[key] for key in notes if row[key])} for row in models]
+    columns = {
+        "model": "model", "RMSE dB": "rmse_heldout_db:.2f", "minus best": "difference_to_best_db:.2f",
+        "95 %": "difference_to_best_ci95_db:.2f", "s": "seconds:.1f", "": "note",
+    }  # fmt: skip
+    records(rows, columns, "Models, cross-validated over all channels")
 
 
 def _print_forecasts(rank: Mapping[str, Any]) -> None:
-    """The forecast of the fitted receivers, where one was scored."""
+    """Print the scores of the rank forecasts of fitted receivers, if there are any."""
     known = [{"tower": tower, **(m.get("receiver") or {}), "n": m["n"]} for tower, m in rank.items()]
     columns = {
         "tower": "tower", "kappa": "kappa:.2f", "95 %": "kappa_ci95:.2f", "agreement": "agreement:.3f",
@@ -155,9 +153,11 @@ def _print_forecasts(rank: Mapping[str, Any]) -> None:
 
 
 def _print_report_summary(outcome: Any) -> None:
+    """Print the summary of the page first, then its tables."""
     from ...compare.result import BASELINE_TITLE
     from ...compare.statistics import FEWEST
 
+    show(" ".join([outcome.metrics["sentence"], *outcome.metrics["offsets"]]))
     links = [
         {
             **m, "tower": tower, "channel": channel, "ci95_db": m.get("rmse_ci95_db"),
@@ -170,10 +170,10 @@ def _print_report_summary(outcome: Any) -> None:
     columns = {
         "tower": "tower", "channel": "channel", "offset dB": "offset_db:.1f", "RMSE dB": "rmse_db:.2f",
         "95 %": "ci95_db:.2f", **{title: f"{name}:.2f" for name, title in BASELINE_TITLE.items()},
-        "corr.": "correlation:.2f", "n": "n", "out of cov.": "n_out_of_coverage",
+        "corr.": "correlation:.2f", "n": "n", "out of coverage": "n_out_of_coverage",
     }  # fmt: skip
     records(links, columns, "RSS, measured against replayed")
-    _print_ladder(outcome.metrics.get("ladder", ()))
+    _print_models(outcome.metrics.get("models", ()))
     thresholds = [
         {"tower": tower, "k": k, **fit, "n": m["n"]}
         for tower, m in outcome.metrics["rank"].items()
@@ -182,7 +182,6 @@ def _print_report_summary(outcome: Any) -> None:
     columns = {"tower": "tower", "K": "k", "agreement": "agreement:.3f", "total variation": "total_variation:.3f"}
     records(thresholds, {**columns, "n": "n"}, "Rank, measured against replayed")
     _print_forecasts(outcome.metrics["rank"])
-    show(" ".join([outcome.metrics["sentence"], *outcome.metrics["offsets"]]))
     for verdict in outcome.metrics.get("referee", []):
         _print_cards(verdict)
     if "against" in outcome.metrics:

@@ -46,9 +46,9 @@ def bench(
         "RSS error dB max": "rss_max_error_db:.2g", "rms": "rss_rms_error_db:.2g", "rank disagreement per K": "ranks",
     }  # fmt: skip
     records(rows, columns, f"Speed against error ({_conditions(result['conditions'])})")
-    costs = [{**row, "knee": "knee" if row["knee"] else ""} for row in result.get("ladder", ())]
+    costs = [{**row, "note": "fastest sufficient" * row["fastest_sufficient"]} for row in result.get("models", ())]
     if costs:
-        columns = {"model": "model", "s": "seconds:.3g", "RMSE dB": "rmse_heldout_db:.2f", "": "knee"}
+        columns = {"model": "model", "s": "seconds:.3g", "RMSE dB": "rmse_heldout_db:.2f", "": "note"}
         records(costs, columns, "What accuracy costs on the flight of the report")
     for name, ratio in result["ratios"].items():
         show(f"{name}: {ratio:.3g} times")

@@ -264,17 +264,26 @@ const common = (() => {
     night.addEventListener("change", () => later(job));
   }
 
-  // charts of the sections, from marks over two axes; ``get`` gives the array of a number
+  // Charts of the sections, from marks over two axes; ``get`` returns the array with a number. Marks differ in colour
+  // and in shape or dashes, so that they can be told apart without colours.
+  const SHAPES = "■●▲◆✚▼", DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
   function plots(specs, get) {
     const HUES = ["--measured", "--second", "--baseline", "--accent", "--ink", "--soft"];
+    function dot(p, x, y, size, shape) {
+      const at = (angles, r = size) => { p.beginPath(); for (const angle of angles) p.lineTo(x + r * Math.sin(angle * Math.PI), y - r * Math.cos(angle * Math.PI)); p.closePath(); p.fill(); };
+      if (size < 2 || shape === "■") p.fillRect(x - size, y - size, 2 * size, 2 * size);
+      else if (shape === "●") { p.beginPath(); p.arc(x, y, 1.1 * size, 0, 2 * Math.PI); p.fill(); }
+      else if (shape === "✚") { p.fillRect(x - 1.3 * size, y - size / 2, 2.6 * size, size); p.fillRect(x - size / 2, y - 1.3 * size, size, 2.6 * size); }
+      else at({ "▲": [0, 2 / 3, 4 / 3], "▼": [1, 1 / 3, 5 / 3], "◆": [0, 0.5, 1, 1.5] }[shape], 1.4 * size);
+    }
     function drawPlot(place) {
       const spec = specs[place.dataset.plot], n = spec.rows ? spec.rows.length : 0;
       if (!place.clientWidth) return;
       if (n) place.style.height = `${30 * n + 50}px`;
-      const marks = spec.marks.map((m, i) => ({ ...m, hue: m.colour || css(HUES[i % HUES.length]), x: get(m.x), y: get(m.y), low: get(m.low), high: get(m.high) }));
+      const marks = spec.marks.map((m, i) => ({ ...m, hue: m.colour || css(HUES[i % HUES.length]), shape: SHAPES[i % SHAPES.length], dash: DASHES[i % DASHES.length], x: get(m.x), y: get(m.y), low: get(m.low), high: get(m.high) }));
       const reach = lists => { let low = Infinity, high = -Infinity; for (const list of lists) for (const v of list || []) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); } return low < high ? [low, high] : [low - 1, low + 1]; };
       const [west, east] = spec.x.ends || reach(marks.flatMap(m => n ? [m.x, m.low, m.high] : [m.x])), [south, north] = n ? [n - 0.4, -0.9] : spec.y.ends || reach(marks.flatMap(m => [m.y, m.low, m.high]));
-      const [p, w, h] = frame(place), x = { low: west, high: east, label: spec.x.label }, y = { low: south, high: north, label: n ? "" : spec.y.label };
+      const [p, w, h] = frame(place), room = marks.some(m => m.labels) ? 0.06 : 0, wide = east - west, tall = room * (north - south), x = { low: west - (n ? 0.02 : room) * wide, high: east + room * wide, label: spec.x.label }, y = { low: south - tall, high: north + 2 * tall, label: n ? "" : spec.y.label };
       if (spec.x.start) { const begun = Date.parse(spec.x.start + "Z") / 1000; x.marks = clockTicks(west, east, w / 110, begun); x.words = v => clockText(v + begun); }
       if (n) y.marks = [];
       const g = axes(p, w, h, x, y, n ? 14 : 50);
@@ -282,15 +291,17 @@ const common = (() => {
       for (const m of marks) {
         p.fillStyle = p.strokeStyle = m.hue; p.lineWidth = 1.4; p.globalAlpha = m.kind === "band" ? (m.colour ? 0.9 : 0.25) : 1; p.beginPath();
         if (m.kind === "band") { for (let i = 0; i < m.x.length; i++) p.lineTo(g.X(m.x[i]), g.Y(m.high[i])); for (let i = m.x.length - 1; i >= 0; i--) p.lineTo(g.X(m.x[i]), g.Y(m.low[i])); p.fill(); }
-        else if (m.kind === "line") { for (let i = 0; i < m.x.length; i++) p.lineTo(g.X(m.x[i]), g.Y(m.y[i])); p.stroke(); }
+        else if (m.kind === "line") { p.setLineDash(m.dash); for (let i = 0; i < m.x.length; i++) p.lineTo(g.X(m.x[i]), g.Y(m.y[i])); p.stroke(); p.setLineDash([]); }
         else for (let i = 0; i < m.x.length; i++) {
-          const size = m.x.length > 200 ? 1.2 : 3.2, [a, b] = [g.X(m.x[i]), g.Y(m.y[i])];
-          p.fillRect(a - size, b - size, 2 * size, 2 * size);
-          if (m.low && Number.isFinite(m.low[i])) { p.moveTo(g.X(m.low[i]), b); p.lineTo(g.X(m.high[i]), b); p.stroke(); p.beginPath(); }
+          const [a, b] = [g.X(m.x[i]), g.Y(m.y[i])];
+          dot(p, a, b, m.x.length > 200 ? 1.2 : 3.2, m.shape);
+          if (m.low && Number.isFinite(m.low[i])) { p.beginPath(); p.moveTo(g.X(m.low[i]), b); p.lineTo(g.X(m.high[i]), b); p.stroke(); }
+          if (m.labels) { p.fillStyle = css("--ink"); p.fillText(m.labels[i], a + 7, b - 5); p.fillStyle = m.hue; }
         }
         p.globalAlpha = 1;
       }
-      place.parentElement.querySelector(".key").replaceChildren(...marks.map(m => { const s = document.createElement("span"), i = document.createElement("i"); i.textContent = "■ "; i.style.color = m.hue; s.append(i, m.name); return s; }), ...downloads(place, place.getAttribute("aria-label"), () => [["series", spec.x.label, n ? "row" : spec.y.label, "low", "high"],
+      const symbol = m => m.kind === "band" ? "▒ " : m.kind === "line" ? (m.dash.length ? "╌ " : "— ") : m.shape + " ";
+      place.parentElement.querySelector(".key").replaceChildren(...marks.map(m => { const s = document.createElement("span"), i = document.createElement("i"); i.textContent = symbol(m); i.style.color = m.hue; s.append(i, m.name); return s; }), downloads(place, place.getAttribute("aria-label"), () => [["series", spec.x.label, n ? "row" : spec.y.label, "low", "high"],
         ...marks.flatMap(m => Array.from(m.x, (x, i) => [m.name, x, n ? spec.rows[Math.round(m.y[i])] : m.y ? m.y[i] : null, ...[m.low, m.high].map(list => list ? list[i] : null)]))], () => drawPlot(place)));
     }
     for (const place of document.querySelectorAll("canvas[data-plot]")) whenResized(place, () => drawPlot(place));

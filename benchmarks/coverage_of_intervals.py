@@ -382,14 +382,8 @@ def rank_cell(process: Shadowing, flights: int) -> dict[str, object]:
     for _ in range(flights):
         measured, other = process.sequences(rng, 2) / size
         simulated = mix * measured + np.sqrt(1 - mix**2) * other
-        fit = compare_ranks(
-            np.searchsorted(CUTS, measured) + 1.0, np.searchsorted(CUTS + 0.3, simulated) + 1.0, process.track,
-            replicates=300,
-        )  # fmt: skip
-        swapped = compare_ranks(
-            np.searchsorted(CUTS + 0.3, simulated) + 1.0, np.searchsorted(CUTS, measured) + 1.0, process.track,
-            replicates=20,
-        )  # fmt: skip
+        sides = np.searchsorted(CUTS, measured) + 1.0, np.searchsorted(CUTS + 0.3, simulated) + 1.0
+        fit, swapped = (compare_ranks(*pair, process.track, replicates=2) for pair in (sides, sides[::-1]))
         ends = {
             "agreement": fit.agreement_ci95, "kappa": fit.kappa_ci95, "total_variation": fit.total_variation_ci95,
             "wasserstein": fit.wasserstein_ci95, "bar_1": swapped.histogram_ci95[0],
@@ -486,7 +480,8 @@ TABLES = {
     "place-between": (level_cell, PLACE_BETWEEN), "loud": (level_cell, LOUD), "pooled": (pooled_cell, POOLED),
     "pooled-place": (pooled_cell, POOLED_PLACE),
     "rank": (rank_cell, [*(Shadowing(n, (float(np.exp(-1.0 / m)),)) for n, m in ((1500, 5.0), (3000, 30.0))),
-                         Shadowing(1000, (), 0.4, route="lawnmower", length_m=50.0)]),
+                         *(Shadowing(n, (), 0.4, route=route, length_m=50.0)
+                           for n, route in ((1000, "lawnmower"), (400, "waypoints")))]),
 }  # fmt: skip
 # With ``--quick``, one kind in three, and as many flights of each.
 EVERY, QUICK = 3, 60

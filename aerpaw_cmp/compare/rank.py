@@ -6,7 +6,7 @@ a float with NaN where the modem gave no CSI; it is never 0.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, unmasked
 from .statistics import (
+    FEWEST,
     LANES,
     LARGEST,
     NO_INTERVAL,
@@ -25,13 +26,16 @@ from .statistics import (
     autocorrelation,
     bootstrap_means,
     certain_rank,
-    interval,
+    influence_interval,
     same_places,
     share_interval,
 )
 
 # Ranks of the histograms: 1 to 4 (RI of the AERPAW modems).
 MAX_RANK = 4
+
+# Independent samples below which K has no interval.
+_FEWEST_INDEPENDENT = 10.0
 
 # Matrix entries per SVD batch: bounds memory.
 _CHUNK = 1 << 20
@@ -393,6 +397,8 @@ def k_curve(
     ranks = np.stack([rank_from_singular_values(profile, value).astype(np.int8) for value in grid], axis=1)
     equal = ranks == ri[:, None]
     known = autocorrelation(equal.mean(axis=1))
+    # resamples of fewer independent samples repeat the flight's own accidents
+    enough = known.n_effective >= _FEWEST_INDEPENDENT
     agree = equal.mean(axis=0)
     drawn, vary, varied = np.zeros((replicates, len(grid))), np.zeros(len(grid)), np.zeros((replicates, len(grid)))
     width = max(1, _CELLS_AT_ONCE // len(ri))
@@ -412,9 +418,9 @@ def k_curve(
         agreement=agree,
         total_variation=vary,
         best_k_agreement=float(best),
-        best_k_interval=_central(_middle_of_best(drawn, grid), grid) if known.enough else NO_INTERVAL,
+        best_k_interval=_central(_middle_of_best(drawn, grid), grid) if enough else NO_INTERVAL,
         best_k_total_variation=float(best_tv),
-        best_k_total_variation_interval=_central(_middle_of_best(-varied, grid), grid) if known.enough else NO_INTERVAL,
+        best_k_total_variation_interval=_central(_middle_of_best(-varied, grid), grid) if enough else NO_INTERVAL,
         at_edge=bool(np.argmax(agree) == 0 or agree[-1] >= agree.max()),
     )
 
@@ -637,30 +643,22 @@ def compare_rank(
     simulated = {float(k): rank_from_singular_values(sigma, k) for k in ks}
     reported = np.isfinite(ri)
     place = None if place_m is None else place_m[reported]
-    known = autocorrelation(ri[reported], place)
+    known = autocorrelation(ri[reported])
     time = np.arange(len(ri)) if time_s is None else time_s
     return RankComparison(
         n=int(reported.sum()),
         n_effective=known.n_effective,
         n_no_csi=int((~reported).sum()),
         histogram=histogram(ri),
-        histogram_ci95=_histogram_intervals(ri[reported], replicates, place),
+        histogram_ci95=_histogram_intervals(ri[reported], place),
         simulated={k: compare_ranks(ri, rank, place_m, replicates=replicates) for k, rank in simulated.items()},
         curve=k_curve(ri, sigma, replicates=replicates),
         staleness=stale_reports(time, ri, {} if sinr_db is None else {"sinr_db": sinr_db}),
     )
 
 
-def _histogram_intervals(rank: FloatArray, replicates: int, place_m: FloatArray | None = None) -> list[Interval]:
-    if len(rank) < 2:
-        return [NO_INTERVAL] * MAX_RANK
-    intervals, overall = [], autocorrelation(rank, place_m)
-    for bar in one_hot(rank).T:
-        # a rank never seen says nothing about its own memory
-        known = autocorrelation(bar, place_m) if np.ptp(bar) else overall
-        drawn = bootstrap_means(bar[:, None], known.block_length, replicates=replicates)
-        intervals.append(share_interval(float(bar.mean()), float(drawn.std()), known))
-    return intervals
+def _histogram_intervals(rank: FloatArray, place_m: FloatArray | None = None) -> list[Interval]:
+    return [share_interval(bar, place_m, rank) for bar in one_hot(rank).T]
 
 
 def compare_ranks(
@@ -692,10 +690,10 @@ def compare_ranks(
     tv, move = total_variation(bars, simulated_bars), wasserstein(bars, simulated_bars)
     both = (measured_rank >= 1) & (simulated_rank >= 1)
     places = None if place_m is None else (place_m[both], place_m[simulated_rank >= 1])
-    bounds = _pair_intervals(a, b, (agree, kappa, tv, move), replicates, places and places[0])
+    bounds = _pair_intervals(a, b, (agree, kappa, tv, move), places and places[0])
     return RankFit(
         histogram=simulated_bars,
-        histogram_ci95=_histogram_intervals(simulated_rank[simulated_rank >= 1], replicates, places and places[1]),
+        histogram_ci95=_histogram_intervals(simulated_rank[simulated_rank >= 1], places and places[1]),
         out_of_coverage=int((simulated_rank == 0).sum()),
         agreement=agree,
         agreement_ci95=bounds[0],
@@ -739,7 +737,7 @@ def commonest_rank(measured: ArrayLike, place_m: FloatArray | None = None) -> Co
         return CommonestRank(rank=0, agreement=float("nan"), agreement_ci95=NO_INTERVAL)
     best = int(np.argmax(bars))
     reported = np.isfinite(ri)
-    bounds = _histogram_intervals(ri[reported], REPLICATES, None if place_m is None else place_m[reported])[best]
+    bounds = _histogram_intervals(ri[reported], None if place_m is None else place_m[reported])[best]
     return CommonestRank(rank=best + 1, agreement=float(bars[best]), agreement_ci95=bounds)
 
 
@@ -762,19 +760,15 @@ class RankRepeat:
     n: int
 
 
-def repeat_rank(
-    first: Visit, second: Visit, radius_m: float = SAME_PLACE_M, *, replicates: int = REPLICATES
-) -> RankRepeat:
-    """Kappa of the ranks that two passes of a flight report at the same places.
+def repeat_rank(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> RankRepeat:
+    """Return the kappa of the ranks that two passes of a flight report at the same places.
 
     Parameters
     ----------
     first, second : Visit
-        Their values are ranks; 0 and NaN are left out.
+        Their values are ranks; 0 and NaN are ignored.
     radius_m : float
         A sample pairs with the nearest one of the other pass within this distance.
-    replicates : int
-        Of the bootstrap.
 
     Returns
     -------
@@ -786,98 +780,41 @@ def repeat_rank(
     if not len(rows):
         return RankRepeat(kappa=float("nan"), kappa_ci95=NO_INTERVAL, agreement=float("nan"), n=0)
     a, b = _pairs(ranks[0][rows], ranks[1][partners])
-    agree, kappa = agreement(a, b), cohen_kappa(a, b)
-    bounds = _pair_intervals(a, b, (agree, kappa, float("nan"), float("nan")), replicates)[1]
-    return RankRepeat(kappa=kappa, kappa_ci95=bounds, agreement=agree, n=len(a))
-
-
-def _explored(a: IntArray, b: IntArray) -> bool:
-    """Check whether both sequences are long enough to have met the ranks that their process has.
-
-    Agreement forgets sooner than the ranks do, but a rank that a short flight never met is in no resample of it.
-    """
-    # a constant has no memory to be judged by
-    return all(autocorrelation(ranks).enough or not np.ptp(ranks) for ranks in (a, b))
+    kappa = cohen_kappa(a, b)
+    bounds = influence_interval(kappa, kappa_influence(a, b), first.position_m[rows], (-1.0, 1.0))
+    return RankRepeat(kappa=kappa, kappa_ci95=bounds, agreement=agreement(a, b), n=len(a))
 
 
 def _pair_intervals(
-    a: IntArray,
-    b: IntArray,
-    values: tuple[float, float, float, float],
-    replicates: int,
-    place_m: FloatArray | None = None,
+    a: IntArray, b: IntArray, values: tuple[float, float, float, float], place_m: FloatArray | None = None
 ) -> list[Interval]:
-    """Intervals of agreement, kappa, total variation and Wasserstein from one bootstrap of the pairs."""
-    if len(a) < 2 or not _explored(a, b):
+    """Return the intervals of agreement, kappa, total variation and Wasserstein distance of paired ranks (n,)."""
+    if len(a) < FEWEST:
         return [NO_INTERVAL] * 4
-    equal, first, second = (a == b).astype(np.float64), one_hot(a), one_hot(b)
-    columns = np.column_stack([equal, first, second])
-    intervals: list[Interval] = []
-    for influence, statistic, bounds in _pair_statistics(equal, first, second):
-        known = autocorrelation(influence, place_m)
-        drawn = statistic(bootstrap_means(columns, known.block_length, replicates=replicates))
-        value = values[len(intervals)]
-        intervals.append(
-            # agreement is a share: at 0 and 1, where all resamples are alike, Wilson's interval still has a width
-            share_interval(value, float(drawn.std()), known)
-            if not intervals
-            else interval(value, drawn, known, bounds=bounds)
+    equal, *influences = _influences((a == b).astype(np.float64), one_hot(a), one_hot(b))
+    # agreement is a share: at 0 and 1, where no sample differs, Wilson's interval still has a width
+    return [share_interval(equal, place_m, a.astype(np.float64))] + [
+        influence_interval(value, influence, place_m, bounds)
+        for value, influence, bounds in zip(
+            values[1:], influences, ((-1.0, 1.0), (0.0, 1.0), (0.0, MAX_RANK - 1.0)), strict=True
         )
-    return intervals
-
-
-def _pair_statistics(
-    equal: FloatArray, first: FloatArray, second: FloatArray
-) -> list[tuple[FloatArray, Callable[[FloatArray], FloatArray], tuple[float, float]]]:
-    """Agreement, kappa, total variation and Wasserstein distance of paired ranks.
-
-    For each: what a pose adds to it (n,), to first order; the statistic as a function of means (r, 1 + 2 MAX_RANK) of
-    agreement and indicators; and its range.
-    """
-    p, q = first.mean(axis=0), second.mean(axis=0)
-    agree, chance = float(equal.mean()), float(p @ q)
-    by_chance = first @ q + second @ p
-    beyond_chance = max(1.0 - chance, 1e-12)
-    # the slope of an absolute value is its sign
-    apart = np.sign(np.cumsum(p - q))
-
-    def move(means: FloatArray) -> FloatArray:
-        return np.asarray(np.abs(np.cumsum(np.subtract(*_halves(means)), axis=1))[:, :-1].sum(axis=1))
-
-    return [
-        (equal, lambda means: means[:, 0], (0.0, 1.0)),
-        (equal / beyond_chance + (agree - 1.0) / beyond_chance**2 * by_chance, kappa_of_means, (-1.0, 1.0)),
-        ((first - second) @ np.sign(p - q), variation_of_means, (0.0, 1.0)),
-        (np.cumsum(first - second, axis=1) @ apart, move, (0.0, MAX_RANK - 1.0)),
     ]
 
 
-def _halves(means: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Both histograms (m, ranks) of column means (m, 1 + 2 ranks), whose first column is the agreement."""
-    return means[:, 1 : MAX_RANK + 1], means[:, MAX_RANK + 1 :]
+def _influences(equal: FloatArray, first: FloatArray, second: FloatArray) -> list[FloatArray]:
+    """Return what a pose adds to agreement, kappa, total variation and Wasserstein distance (n,), to first order."""
+    p, q = first.mean(axis=0), second.mean(axis=0)
+    by_chance, beyond_chance = first @ q + second @ p, max(1.0 - float(p @ q), 1e-12)
+    # the slope of an absolute value is its sign
+    apart = np.sign(np.cumsum(p - q))
+    return [
+        equal,
+        equal / beyond_chance + (float(equal.mean()) - 1.0) / beyond_chance**2 * by_chance,
+        0.5 * (first - second) @ np.sign(p - q),
+        np.cumsum(first - second, axis=1) @ apart,
+    ]
 
 
-def kappa_of_means(means: FloatArray) -> FloatArray:
-    """Cohen's kappa (m,) of means of columns: agreement, indicators of the one rank, of the other."""
-    by_luck = np.prod(_halves(means), axis=0).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(by_luck < 1 - 1e-12, (means[:, 0] - by_luck) / (1 - by_luck), np.nan)
-
-
-def variation_of_means(means: FloatArray) -> FloatArray:
-    """Total variation distance (m,) of the two histograms in means of columns."""
-    return np.asarray(0.5 * np.abs(np.subtract(*_halves(means))).sum(axis=1))
-
-
-def kappa_parts(measured: IntArray, simulated: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Columns of paired ranks (n,), each 1 .. ``MAX_RANK``, whose means give kappa (:func:`kappa_of_means`).
-
-    Returns
-    -------
-    columns : (n, 1 + 2 MAX_RANK)
-        Agreement, indicators of either rank.
-    influence : (n,)
-        What a pose adds to kappa, to first order.
-    """
-    equal, first, second = (measured == simulated).astype(np.float64), one_hot(measured), one_hot(simulated)
-    return np.column_stack([equal, first, second]), _pair_statistics(equal, first, second)[1][0]
+def kappa_influence(measured: IntArray, simulated: IntArray) -> FloatArray:
+    """Return what each pose adds to kappa (n,), to first order, of paired ranks (n,) from 1 to ``MAX_RANK``."""
+    return _influences((measured == simulated).astype(np.float64), one_hot(measured), one_hot(simulated))[1]

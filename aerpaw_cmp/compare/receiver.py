@@ -31,8 +31,8 @@ from ..common.errors import InputError
 from ..common.geodesy import azimuth_rad
 from ..common.text import counted
 from ..common.units import FloatArray, IntArray, unmasked
-from .rank import MAX_RANK, cohen_kappa, kappa_of_means, one_hot, total_variation, variation_of_means
-from .statistics import NO_INTERVAL, REPLICATES, Interval, autocorrelation, bootstrap_means, interval
+from .rank import MAX_RANK, cohen_kappa, kappa_influence, one_hot, total_variation
+from .statistics import NO_INTERVAL, Interval, influence_interval, mean_interval
 
 # What a rank counts in the log score that a forecast held impossible.
 _LEAST_PROBABILITY = 1e-6
@@ -124,8 +124,6 @@ def score_forecast(
     probability: FloatArray,
     decided: ArrayLike,
     constant: FloatArray,
-    *,
-    replicates: int = REPLICATES,
 ) -> ForecastScore:
     """Score a forecast on samples in time order.
 
@@ -139,8 +137,6 @@ def score_forecast(
         The one rank said; 0 where there is no forecast.
     constant : (ranks,)
         The constant forecast, from the flights of the fit (:func:`constant_forecast`).
-    replicates : int
-        Block bootstrap.
 
     Returns
     -------
@@ -153,32 +149,24 @@ def score_forecast(
     if not len(rank):
         return ForecastScore(n=0)
     flat = np.broadcast_to(constant, p.shape)
-    reported, chosen = one_hot(rank), one_hot(choice)
     log, log_constant = log_losses(p, rank), log_losses(flat, rank)
-    columns = np.column_stack([log, log - log_constant, p, rank == choice, reported, chosen]).astype(np.float64)
-    pair_columns = columns[:, -1 - 2 * MAX_RANK :]  # agreement and the two ranks, as kappa takes them
-    # one set of resamples serves all numbers: the longest memory is safe for each
-    memory = max((autocorrelation(c) for c in (pair_columns[:, 0], *columns[:, :2].T)), key=lambda m: m.block_length)
-    drawn = bootstrap_means(columns, memory.block_length, replicates=replicates)
-    drawn_p, drawn_pair = drawn[:, 2 : 2 + MAX_RANK], drawn[:, 2 + MAX_RANK :]
-    mean = columns.mean(axis=0)
-    expected, share = mean[2 : 2 + MAX_RANK], pair_columns.mean(axis=0)[1 : 1 + MAX_RANK]
-    kappa = cohen_kappa(rank, choice)
-    spread = total_variation(share, expected)
-    varied = variation_of_means(np.column_stack([drawn_pair[:, : 1 + MAX_RANK], drawn_p]))
+    reported, expected = one_hot(rank), p.mean(axis=0)
+    share = reported.mean(axis=0)
+    kappa, spread = cohen_kappa(rank, choice), total_variation(share, expected)
+    varied = 0.5 * (reported - p) @ np.sign(share - expected)
     return ForecastScore(
         n=len(rank),
         kappa=kappa,
-        kappa_ci95=interval(kappa, kappa_of_means(drawn_pair), memory, bounds=(-1.0, 1.0)),
+        kappa_ci95=influence_interval(kappa, kappa_influence(rank, choice), bounds=(-1.0, 1.0)),
         agreement=float(np.mean(rank == choice)),
         majority_agreement=float(share.max()),
-        log_score=float(mean[0]),
-        log_score_ci95=interval(float(mean[0]), drawn[:, 0], memory, bounds=(0.0, np.inf)),
+        log_score=float(log.mean()),
+        log_score_ci95=influence_interval(float(log.mean()), log, bounds=(0.0, np.inf)),
         constant_log_score=float(log_constant.mean()),
-        log_score_gain=float(1.0 - mean[0] / log_constant.mean()),
-        log_score_difference_ci95=interval(float(mean[1]), drawn[:, 1], memory),
+        log_score_gain=float(1.0 - log.mean() / log_constant.mean()),
+        log_score_difference_ci95=mean_interval(log - log_constant),
         total_variation_expected=spread,
-        total_variation_ci95=interval(spread, varied, memory, bounds=(0.0, 1.0)),
+        total_variation_ci95=influence_interval(spread, varied, bounds=(0.0, 1.0)),
     )
 
 
@@ -647,7 +635,6 @@ def choose_features(
     groups: IntArray,
     *,
     finalists: int = 60,
-    replicates: int = REPLICATES,
 ) -> FeatureChoice:
     """Choose between candidate geometries by groups left out within the training flights.
 
@@ -661,8 +648,6 @@ def choose_features(
     finalists : int
         Only those with the best likelihood on the training samples themselves are cross-validated: all candidates have
         equally many coefficients, and a fit costs a tenth of a cross-validation.
-    replicates : int
-        Of the bootstrap that says which candidates are no worse than the best.
 
     Returns
     -------
@@ -682,7 +667,7 @@ def choose_features(
     losses = np.concatenate([_left_out_losses(x[final[i : i + step]], y, group) for i in range(0, len(final), step)])
     score = losses.mean(axis=1)
     rows = np.argsort(np.round(score, 9), kind="stable")
-    tied = tuple(int(final[r]) for r in rows if _not_worse(losses[r] - losses[rows[0]], replicates))
+    tied = tuple(int(final[r]) for r in rows if _not_worse(losses[r] - losses[rows[0]]))
     return FeatureChoice(
         best=int(final[rows[0]]), order=final[rows], log_score=score[rows], tied=tied, candidates=len(features)
     )
@@ -718,11 +703,6 @@ def _left_out_losses(x: FloatArray, rank: IntArray, groups: IntArray) -> FloatAr
     return np.stack([log_losses(item, rank) for item in out_of_group(x, rank, groups, _CHOICE_PENALTY)])
 
 
-def _not_worse(difference: FloatArray, replicates: int) -> bool:
-    if np.abs(difference).max() < 1e-9:  # the same channel by another name
-        return True
-    known = autocorrelation(difference)
-    mean = float(difference.mean())
-    drawn = bootstrap_means(difference[:, None], known.block_length, replicates=replicates)[:, 0]
-    low, _ = interval(mean, drawn, known)
-    return not low > 0.0
+def _not_worse(difference: FloatArray) -> bool:
+    # the same channel by another name differs by rounding alone
+    return bool(np.abs(difference).max() < 1e-9) or not mean_interval(difference)[0] > 0.0

@@ -465,19 +465,11 @@ REPLICATES = 1000
 # One seed feeds all resampling: the same logs give the same intervals.
 SEED = 20_250_210
 
-# Blocks are twice Politis and White's length: that one minimises the error of the variance, not of the coverage
-# (on 500 simulated flights it brings 89-93 % to 92-95 % where a flight holds only 25 independent samples).
+# Blocks are twice Politis and White's length: that one minimises the error of the variance, not of the coverage.
 _LONGER = 2.0
 
 # Lags in a row: Politis and White's max(5, sqrt(log10 n)) is 5 for any flight.
 _RUN = 5
-
-# Fewer independent samples than this give no interval: how long such a sequence remembers cannot be told from it.
-_FEWEST_INDEPENDENT = 10.0
-
-# The variance is widened by this over the independent samples, for what the estimate of the memory leaves open (chosen
-# on simulated flights).
-_UNSURE = 3.0
 
 # Width of an interval over its value from which its lower end alone is given.
 _BOUND = 2.0
@@ -508,31 +500,11 @@ class Autocorrelation:
         Block length for the circular block bootstrap [samples].
     n_effective : float
         Independent samples that would fix the mean equally well, 1 to ``n``; NaN below two samples.
-    variance_factor : float
-        What the variance of a block bootstrap of that length must be multiplied with (first-order bias).
     """
 
     n: int
     block_length: int
     n_effective: float
-    variance_factor: float
-
-    @property
-    def half_width(self) -> float:
-        """Half width of a 95 % interval per bootstrap standard deviation.
-
-        Student's t for few blocks, the block variance's first-order bias, and the uncertainty of the memory itself.
-        """
-        from scipy.special import stdtrit  # scipy.stats would load for 0.2 s what one quantile needs
-
-        blocks = max(self.n / max(self.block_length, 1), 2.0)
-        unsure = 1.0 + _UNSURE / self.n_effective if self.n_effective > 0 else 1.0
-        return float(stdtrit(blocks - 1.0, 0.975) * np.sqrt(unsure * self.variance_factor * blocks / (blocks - 1.0)))
-
-    @property
-    def enough(self) -> bool:
-        """True if an interval can be given at all: at least :data:`_FEWEST_INDEPENDENT` independent samples."""
-        return bool(self.n_effective >= _FEWEST_INDEPENDENT)
 
 
 def autocovariance(values: ArrayLike, lags: int) -> FloatArray:
@@ -585,16 +557,13 @@ def _exponential_decay(covariance: FloatArray, n: int) -> tuple[float, float]:
     return float(covariance[0] + 2.0 * correlated / (1.0 - decay)), float(correlated / (1.0 - decay) ** 2)
 
 
-def autocorrelation(values: ArrayLike, place_m: FloatArray | None = None) -> Autocorrelation:
-    """Block length and effective sample size of a sequence.
+def autocorrelation(values: ArrayLike) -> Autocorrelation:
+    """Return the block length and the effective sample size of a sequence.
 
     Parameters
     ----------
     values : array_like, (n,)
         In time order, without NaN.
-    place_m : (n, 3), optional
-        As for :func:`mean_draws`: the variance of the mean is then that over time and that over place, each by its
-        share of the evidence.
 
     Returns
     -------
@@ -623,7 +592,7 @@ def autocorrelation(values: ArrayLike, place_m: FloatArray | None = None) -> Aut
     x = unmasked(values)
     n = len(x)
     if n < 8 or np.ptp(x) == 0.0:
-        return Autocorrelation(n, 1 if n else 0, float(n) if n > 1 else float("nan"), 1.0)
+        return Autocorrelation(n, 1 if n else 0, float(n) if n > 1 else float("nan"))
     lags = n // 2
     unbiased = autocovariance(x, lags) * n / (n - np.arange(lags + 1))
     hidden, long_run, reach = 0.0, float(unbiased[0]), 0.0
@@ -636,7 +605,7 @@ def autocorrelation(values: ArrayLike, place_m: FloatArray | None = None) -> Aut
         by_window = (by_window - width * hidden) / (1.0 - width / n) if width < 0.8 * n else np.inf
         long_run, reach = max(by_window, by_decay), max(window_reach, decay_reach)
         if long_run >= n * covariance[0]:
-            return Autocorrelation(n, max(1, n // 5), 1.0, 2.0)
+            return Autocorrelation(n, max(1, n // 5), 1.0)
         if long_run <= 0.0:  # oscillating: the mean is known at least as well as from independent samples
             long_run = float(unbiased[0])
         if abs(long_run / n - hidden) < 1e-3 * unbiased[0]:
@@ -646,27 +615,8 @@ def autocorrelation(values: ArrayLike, place_m: FloatArray | None = None) -> Aut
     length = _LONGER * (1.5 * slope**2 * n) ** (1.0 / 3.0)
     # five blocks at least: of fewer the draws repeat each other
     block = int(np.clip(np.ceil(length), 1, max(1, n // 5)))
-    factor = 1.0 / (1.0 - min(0.5, slope / block))
     effective = float(np.clip(n * (unbiased[0] + hidden) / long_run, 1.0, n))
-    share, variance = _over_place(x, place_m)
-    # how much larger the variance of the mean is than over time alone
-    more = 1.0 - share + share * variance * effective / float(unbiased[0] + hidden)
-    return Autocorrelation(n, block, float(np.clip(effective / more, 1.0, n)), factor * more)
-
-
-def _over_place(values: FloatArray, place_m: FloatArray | None) -> tuple[float, float]:
-    """Share of the evidence for correlation over place, and the variance of the mean of ``values`` (n,) if it is so."""
-    if place_m is None or len(values) < FEWEST:
-        return 0.0, 0.0
-    slow = cosine_terms(values).slow
-    known = known_memories("mean", len(slow), place_m)
-    if len(known.parts) == 1:
-        return 0.0, 0.0
-    likelihood, square = likelihoods(slow, known.parts)
-    weighted, placed = likelihood * known.weights, slice(len(known.parts[0].power), None)
-    variance = square / (len(slow) - 2.0) * known.joined("variance") + np.square(known.joined("slope") @ slow)
-    by_place = weighted[placed] / max(float(weighted[placed].sum()), 1e-300)
-    return float(weighted[placed].sum() / weighted.sum()), float(by_place @ variance[placed])
+    return Autocorrelation(n, block, effective)
 
 
 def bootstrap_means(
@@ -724,40 +674,6 @@ def _block_sums(columns: FloatArray, length: int) -> FloatArray:
     running = np.zeros((len(columns) + length, columns.shape[1]))
     np.cumsum(np.concatenate([columns, columns[: length - 1]]), axis=0, out=running[1:])
     return np.asarray(running[length:] - running[:-length])
-
-
-def interval(
-    estimate: float,
-    replicates: FloatArray,
-    known: Autocorrelation,
-    *,
-    bounds: tuple[float, float] = (-np.inf, np.inf),
-) -> Interval:
-    """95 % interval around an estimate from its bootstrap replicates.
-
-    Parameters
-    ----------
-    estimate : float
-        The statistic on the data.
-    replicates : (r,)
-        The statistic on the resamples; NaN replicates are left out.
-    known : Autocorrelation
-        Of the sequence that was resampled.
-    bounds : (low, high)
-        The statistic's range.
-
-    Returns
-    -------
-    (low, high)
-        NaN ("no interval") below :data:`_FEWEST_INDEPENDENT` independent samples. Where resampling biases the
-        statistic (distances, RMSE), the same bias sits in the estimate and is taken off.
-    """
-    good = replicates[np.isfinite(replicates)]
-    if not known.enough or not np.isfinite(estimate) or len(good) < 2:
-        return NO_INTERVAL
-    centre, reach = 2.0 * estimate - float(good.mean()), known.half_width * float(good.std(ddof=1))
-    low, high = np.clip([centre - reach, centre + reach], *bounds)
-    return float(min(low, estimate)), float(max(high, estimate))
 
 
 @dataclass(frozen=True, slots=True)
@@ -837,14 +753,41 @@ def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray, pla
 
 
 def mean_interval(values: FloatArray, place_m: FloatArray | None = None) -> Interval:
-    """95 % interval of the mean of the process that a sequence (n,) in time order comes from.
+    """Return the 95 % interval of the mean of the process that a sequence (n,) in time order comes from.
 
     Errors may be correlated over the positions ``place_m`` (n, 3) [m] as well, as for :func:`mean_draws`.
     """
-    if len(values) < FEWEST:
+    return influence_interval(float(values.mean()) if len(values) else float("nan"), values, place_m)
+
+
+def influence_interval(
+    estimate: float,
+    influence: FloatArray,
+    place_m: FloatArray | None = None,
+    bounds: tuple[float, float] = (-np.inf, np.inf),
+) -> Interval:
+    """Return the 95 % interval of a statistic of a sequence.
+
+    Parameters
+    ----------
+    estimate : float
+        The statistic of the samples.
+    influence : (n,)
+        What each sample adds to the statistic, to first order and up to a constant, in time order.
+    place_m : (n, 3), optional
+        As for :func:`mean_draws`.
+    bounds : (low, high)
+        The range of the statistic.
+
+    Returns
+    -------
+    (low, high)
+        NaN if the statistic does not exist or has fewer than :data:`FEWEST` samples.
+    """
+    if len(influence) < FEWEST or not np.isfinite(estimate):
         return NO_INTERVAL
-    mean = float(values.mean())
-    return _around(mean, mean + mean_draws(values, place_m=place_m))
+    low, high = np.clip(_around(estimate, estimate + mean_draws(influence, place_m=place_m)), *bounds)
+    return float(low), float(high)
 
 
 def spread_interval(values: FloatArray, place_m: FloatArray | None = None) -> Interval:
@@ -1095,30 +1038,39 @@ def paired_verdict(low: float, high: float) -> Literal["better", "worse", "not s
     return "better" if high < 0 else "worse" if low > 0 else "not significant"
 
 
-def share_interval(share: float, spread: float, known: Autocorrelation) -> Interval:
-    """95 % interval of a share (a histogram bar): Wilson's, with as many samples as the spread is worth.
+def share_interval(
+    indicator: FloatArray, place_m: FloatArray | None = None, sequence: FloatArray | None = None
+) -> Interval:
+    """Return the 95 % interval of a share, such as a bar of a histogram.
 
     Parameters
     ----------
-    share : float
-        0 to 1.
-    spread : float
-        Bootstrap standard deviation of the share.
-    known : Autocorrelation
-        Of the sequence.
+    indicator : (n,)
+        1 for each sample that counts, else 0, in time order.
+    place_m : (n, 3), optional
+        As for :func:`mean_draws`.
+    sequence : (n,), optional
+        The sequence that the indicator comes from: its effective size counts at a share of 0 or 1.
+
+    Returns
+    -------
+    (low, high)
+        NaN for fewer than :data:`FEWEST` samples.
 
     Notes
     -----
-    Wilson's interval stays sensible at shares of 0 and 1, where a bootstrap has no spread at all; there the
-    effective size of the whole sequence counts. Wilson (1927), doi:10.1080/01621459.1927.10502953.
+    Wilson's interval for the number of independent samples that would fix the mean equally well. It is sensible at
+    shares of 0 and 1, where the samples do not vary. Wilson (1927), doi:10.1080/01621459.1927.10502953.
     """
-    if not known.enough or not np.isfinite(share):
+    n = len(indicator)
+    if n < FEWEST:
         return NO_INTERVAL
-    # 1.96: the 97.5 % point of the normal distribution, which Wilson's interval takes
-    variance = spread**2 * known.half_width**2 / 1.959964**2
-    size = known.n_effective if variance <= 0 else share * (1 - share) / variance
-    size = float(np.clip(size, 1.0, known.n))
+    share, varied = float(indicator.mean()), indicator
+    if np.ptp(indicator) == 0.0 and sequence is not None:
+        varied = sequence
     z2 = 1.959964**2
+    half = 0.5 * float(np.ptp(mean_interval(varied, place_m)))
+    size = float(np.clip(z2 * varied.var() / half**2, 1.0, n)) if half else float(n)
     centre = (share + z2 / (2 * size)) / (1 + z2 / size)
     reach = np.sqrt(z2 * (share * (1 - share) / size + z2 / (4 * size**2))) / (1 + z2 / size)
     low, high = float(centre - reach), float(centre + reach)

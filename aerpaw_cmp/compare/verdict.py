@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -32,7 +32,7 @@ from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 from . import statistics
 from .level import DetectionScore, floored_fit
 from .offset import SPAN_DB, nearest_offset, offset_grid
-from .rank import MAX_RANK, agreement, cohen_kappa, kappa_of_means, kappa_parts
+from .rank import MAX_RANK, agreement, cohen_kappa, kappa_influence
 from .result import FlightVerdict, RssResult
 from .statistics import (
     FEWEST,
@@ -996,22 +996,12 @@ def rank_difference(
 
 def _agreement_change(first: IntArray, second: IntArray, place_m: FloatArray | None) -> tuple[Changed, Changed]:
     """Agreement and kappa of two reports on the same poses, each (n, 2): measured and simulated rank."""
-    agree = [agreement(*pairs.T) for pairs in (first, second)]
-    kappa = [cohen_kappa(*pairs.T) for pairs in (first, second)]
-    if len(first) < 2:
-        return _changed(*agree), _changed(*kappa)
-    (columns, influence), (other_columns, other_influence) = (kappa_parts(*pairs.T) for pairs in (first, second))
-    # both reports in one table: a resample then draws the same poses of both
-    joined, width = np.column_stack([columns, other_columns]), columns.shape[1]
-
-    # one resample for both reports: what they share cancels in the difference
-    def change(of: list[float], influence: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -> Changed:
-        known = statistics.autocorrelation(influence, place_m)
-        drawn = statistics.bootstrap_means(joined, known.block_length)
-        shift = statistic(drawn[:, width:]) - statistic(drawn[:, :width])
-        return replace(_changed(*of), ci95=statistics.interval(of[1] - of[0], shift, known))
-
-    return (
-        change(agree, other_columns[:, 0] - columns[:, 0], lambda means: means[:, 0]),
-        change(kappa, other_influence - influence, kappa_of_means),
-    )
+    # one sequence for both reports: what they share cancels in the difference
+    equal = [(pairs[:, 0] == pairs[:, 1]).astype(np.float64) for pairs in (first, second)]
+    kappas = [kappa_influence(*pairs.T) for pairs in (first, second)] if len(first) else equal
+    out = []
+    for statistic, (before, after) in ((agreement, equal), (cohen_kappa, kappas)):
+        changed = _changed(*(statistic(*pairs.T) for pairs in (first, second)))
+        ends = statistics.influence_interval(changed.difference, after - before, place_m)
+        out.append(replace(changed, ci95=ends))
+    return out[0], out[1]

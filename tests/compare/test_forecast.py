@@ -5,7 +5,7 @@ import pytest
 
 from aerpaw_cmp.compare.rank import one_hot
 from aerpaw_cmp.compare.receiver import brier_losses, constant_forecast, log_losses, score_forecast
-from aerpaw_cmp.compare.statistics import autocorrelation, bootstrap_means, interval
+from aerpaw_cmp.compare.statistics import mean_draws
 
 
 def ranks(n=400, seed=1):
@@ -44,42 +44,38 @@ def test_samples_without_report_or_forecast_take_no_part():
     assert np.isnan(score_forecast(rank, np.full((50, 4), np.nan), np.zeros(50), np.full(4, 0.25)).kappa)
 
 
-def test_every_interval_is_that_of_blocks_of_the_longest_memory():
-    """By hand: the draws of each number, of one bootstrap whose blocks remember as long as any of the three sequences."""
+def test_every_interval_is_that_of_the_influence_of_the_samples():
+    """By leaving out one sample at a time: what that changes is the influence, and its mean's interval that of a number."""
     rng, rank = np.random.default_rng(5), ranks(600, 4)
     p = rng.dirichlet([2, 5, 3, 1], 600)
     p[::2] = p[1::2]
     choice, constant = np.where(rng.random(600) < 0.4, rank, p.argmax(axis=1) + 1), np.array([0.1, 0.4, 0.3, 0.2])
-    score = score_forecast(rank, p, choice, constant, replicates=200)
+    score = score_forecast(rank, p, choice, constant)
     row = np.arange(600)
     log, flat = -np.log(p[row, rank - 1]), -np.log(constant[rank - 1])
     right = (rank == choice).astype(float)
-    longest = max((autocorrelation(c) for c in (right, log, log - flat)), key=lambda memory: memory.block_length)
-    assert longest.block_length > 1
 
-    def means(*columns):
-        return bootstrap_means(np.column_stack(columns), longest.block_length, replicates=200)
+    def kappa(some):
+        luck = one_hot(rank)[some].mean(axis=0) @ one_hot(choice)[some].mean(axis=0)
+        return (right[some].mean() - luck) / (1.0 - luck)
 
-    share, expected = one_hot(rank).mean(axis=0), p.mean(axis=0)
-    drawn_share, drawn_choice, drawn_p = means(one_hot(rank)), means(one_hot(choice)), means(p)
-    luck = (drawn_share * drawn_choice).sum(axis=1)
-    kappa = (means(right)[:, 0] - luck) / (1.0 - luck)
-    chance = share @ one_hot(choice).mean(axis=0)
-    values = {
-        "kappa": ((right.mean() - chance) / (1 - chance), kappa, (-1.0, 1.0), score.kappa_ci95),
-        "log_score": (log.mean(), means(log)[:, 0], (0.0, np.inf), score.log_score_ci95),
-        "total_variation_expected": (
-            np.abs(share - expected).sum() / 2, np.abs(drawn_share - drawn_p).sum(axis=1) / 2, (0.0, 1.0),
-            score.total_variation_ci95,
-        ),
-    }  # fmt: skip
-    for name, (value, drawn, bounds, ends) in values.items():
-        assert getattr(score, name) == pytest.approx(value), name
-        assert ends == pytest.approx(interval(value, drawn, longest, bounds=bounds)), name
+    numbers = {
+        "kappa": kappa,
+        "log_score": lambda some: log[some].mean(),
+        "total_variation_expected": lambda some: 0.5 * np.abs((one_hot(rank) - p)[some].mean(axis=0)).sum(),
+        "log_score_difference": lambda some: (log - flat)[some].mean(),
+    }
+    for name, number in numbers.items():
+        value = number(row)
+        influence = np.array([599.0 * (value - number(row != left)) for left in row])
+        ends = getattr(score, f"{name.replace('_expected', '')}_ci95")
+        assert ends == pytest.approx(np.quantile(value + mean_draws(influence), [0.025, 0.975]), rel=5e-3), name
+        assert getattr(score, name, value) == pytest.approx(value), name
     gain = (log - flat).mean()
-    assert score.log_score_difference_ci95 == pytest.approx(interval(gain, means(log - flat)[:, 0], longest))
     assert score.log_score_gain == pytest.approx(-gain / flat.mean())
     assert score.constant_log_score == pytest.approx(flat.mean())
-    assert (score.majority_agreement, score.agreement) == pytest.approx((share.max(), right.mean()))
+    assert (score.majority_agreement, score.agreement) == pytest.approx(
+        (one_hot(rank).mean(axis=0).max(), right.mean())
+    )
     assert log_losses(np.array([[0.0, 1.0]]), np.array([1]))[0] == pytest.approx(-np.log(1e-6))
     assert constant_forecast([1.0, np.nan, 0.0, 3.0, 3.0]) == pytest.approx(np.array([2, 1, 3, 1]) / 7)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import wasserstein_distance
+from scipy.stats import norm, wasserstein_distance
 
 from aerpaw_cmp.compare import rank as ranks
 from aerpaw_cmp.compare.rank import (
@@ -273,6 +273,40 @@ def test_rank_intervals_hold_the_truth_of_a_known_process():
     assert (hits >= 0.85 * runs).all()
 
 
+def test_rank_intervals_cover_the_truth_of_a_process_over_place():
+    """Random waypoints over shadowing of 50 m: blocks of time covered 84 to 93 % of those given, and gave 94 % of them."""
+    rng, n, flights = np.random.default_rng(4), 400, 60
+    corners = rng.uniform(0.0, 500.0, (n, 2))
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    place = np.column_stack([*(np.interp(10.0 * np.arange(n), along, axis) for axis in corners.T), np.zeros(n)])
+    root = np.linalg.cholesky(np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / 50.0) + 0.16 * np.eye(n))
+    cuts, hits = np.array([-0.8, 0.5, 1.6]), np.zeros(3)
+    for _ in range(flights):
+        first, other = rng.normal(size=(2, n)) @ root.T / np.sqrt(1.16)
+        measured = np.searchsorted(cuts, first) + 1.0
+        simulated = np.searchsorted(cuts, 0.8 * first + 0.6 * other) + 1.0
+        fit = compare_ranks(measured, simulated, place, replicates=20)
+        ends = np.array([fit.agreement_ci95, fit.kappa_ci95, fit.histogram_ci95[0]])
+        # agreement and kappa of thresholds on two normals that correlate by 0.8, by integration
+        truth = np.array([0.6272, 0.4331, norm.cdf(-0.8)])
+        hits += (ends[:, 0] <= truth) & (truth <= ends[:, 1])
+    assert (hits >= 0.9 * flights).all(), hits
+
+
+def test_influences_are_what_leaving_a_pose_out_changes():
+    a, b = walk(300, 1), walk(300, 2)
+    influences = ranks._influences((a == b).astype(float), ranks.one_hot(a), ranks.one_hot(b))
+    numbers = [
+        ranks.agreement,
+        ranks.cohen_kappa,
+        lambda a, b: ranks.total_variation(ranks.histogram(a), ranks.histogram(b)),
+        lambda a, b: ranks.wasserstein(ranks.histogram(a), ranks.histogram(b)),
+    ]
+    for influence, number in zip(influences, numbers, strict=True):
+        change = 299.0 * np.array([number(a, b) - number(np.delete(a, at), np.delete(b, at)) for at in range(300)])
+        np.testing.assert_allclose(influence - influence.mean(), change - change.mean(), atol=0.02)
+
+
 def test_repeat_kappa_of_two_passes():
     rng = np.random.default_rng(3)
     here = np.column_stack([np.linspace(0, 900, 900), np.zeros((900, 2))])
@@ -304,7 +338,7 @@ def test_a_period_is_taken_when_19_of_20_changes_fall_on_it():
 
 def test_each_interval_is_that_of_its_own_number():
     rng = np.random.default_rng(23)
-    measured = walk(3000, 23).astype(float)
+    measured = rng.choice([1.0, 2.0, 3.0, 4.0], 3000, p=[0.2, 0.5, 0.2, 0.1])
     simulated = np.where(rng.random(3000) < 0.5, measured, np.clip(measured + 1, 1, 4))
     fit = compare_ranks(measured, simulated, replicates=200)
     values = [fit.agreement, fit.kappa, fit.total_variation, fit.wasserstein]
@@ -336,41 +370,6 @@ def test_ranks_by_counting_are_those_of_singular_values(n_rx, n_tx, k):
     if k in (10.0, 1000.0) and m > 1:
         _, certain = certain_rank(h[4 * n :], k)
         assert certain.mean() > 0.4, "counting decides nothing"
-
-
-@pytest.fixture(scope="module")
-def pair():
-    measured = walk(900, 1)
-    rng = np.random.default_rng(2)
-    simulated = np.where(rng.random(900) < 0.6, measured, walk(900, 3, 2, 4))
-    return measured, simulated
-
-
-def statistics_by_hand(a, b):
-    """Agreement, kappa, total variation and Wasserstein distance of two sequences, by counting."""
-    n = len(a)
-    p, q = (np.array([np.sum(x == r) / n for r in range(1, MAX_RANK + 1)]) for x in (a, b))
-    agree = np.sum(a == b) / n
-    chance = sum(x * y for x, y in zip(p, q, strict=True))
-    move = sum(abs(sum(p[:r]) - sum(q[:r])) for r in range(1, MAX_RANK))
-    return agree, (agree - chance) / (1 - chance), sum(abs(p - q)) / 2, move
-
-
-def test_the_influence_of_a_pose_is_the_slope_of_the_statistic_towards_it(pair):
-    a, b = pair
-    equal, first, second = (a == b).astype(float), ranks.one_hot(a), ranks.one_hot(b)
-    columns = np.column_stack([equal, first, second])
-    mean = columns.mean(axis=0)
-    for (influence, statistic, _), scale in zip(
-        ranks._pair_statistics(equal, first, second), (1, 1, 0.5, 1), strict=True
-    ):
-        toward = mean + 1e-6 * (columns - mean)
-        slope = (statistic(toward) - statistic(mean[None])) / 1e-6
-        np.testing.assert_allclose(scale * (influence - influence.mean()), slope, atol=2e-5)
-    of_kappa, influence = ranks.kappa_parts(a, b)
-    np.testing.assert_array_equal(of_kappa, columns)
-    assert ranks.kappa_of_means(mean[None])[0] == pytest.approx(statistics_by_hand(a, b)[1])
-    np.testing.assert_array_equal(influence, ranks._pair_statistics(equal, first, second)[1][0])
 
 
 @pytest.mark.parametrize("n", [16, 31, 240])
@@ -420,7 +419,7 @@ def test_places_of_two_passes_are_the_same_within_two_metres():
     first = np.column_stack([along, np.zeros((200, 2))])
     rank = walk(200, 9)
     for away, n in ((1.99, 200), (2.5, 0)):
-        repeated = ranks.repeat_rank(Visit(first, rank), Visit(first + np.array([0.0, away, 0.0]), rank), replicates=20)
+        repeated = ranks.repeat_rank(Visit(first, rank), Visit(first + np.array([0.0, away, 0.0]), rank))
         assert repeated.n == n
         assert (repeated.agreement == 1.0) == bool(n)
 

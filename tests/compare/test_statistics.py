@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from scipy.stats import t as student
 
 from aerpaw_cmp.compare import statistics
 from aerpaw_cmp.compare.statistics import (
@@ -16,7 +15,6 @@ from aerpaw_cmp.compare.statistics import (
     bootstrap_means,
     correlation,
     error_intervals,
-    interval,
     paired_difference,
     same_places,
     share_interval,
@@ -60,7 +58,7 @@ def test_blocks_are_those_of_the_law_for_a_known_process():
         blocks = [autocorrelation(shadowing(rng, n, -1.0 / np.log(keep), 1.0)).block_length for _ in range(40)]
         slope = 2.0 * keep / (1.0 - keep**2)
         assert np.median(blocks) == pytest.approx(2.0 * (1.5 * slope**2 * n) ** (1 / 3), rel=0.2)
-    assert autocorrelation(np.arange(7.0)) == Autocorrelation(7, 1, 7.0, 1.0)  # too few to tell
+    assert autocorrelation(np.arange(7.0)) == Autocorrelation(7, 1, 7.0)  # too few to tell
 
 
 def test_degenerate_sequences():
@@ -74,28 +72,6 @@ def test_degenerate_sequences():
     assert constant.offset_db == pytest.approx((-10.0, -10.0))
     assert np.isnan(constant.correlation).all()
     assert constant.rmse_db == (0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("n", "length", "effective", "factor"), [(100, 7, 12.0, 1.3), (100, 90, 10.0, 2.0), (50, 5, 0.0, 1.0)]
-)
-def test_half_width_is_students_widened_by_what_is_not_known(n, length, effective, factor):
-    known = Autocorrelation(n, length, effective, factor)
-    blocks = max(n / length, 2.0)
-    unsure = 1.0 + 3.0 / effective if effective else 1.0
-    expected = student.ppf(0.975, blocks - 1) * np.sqrt(unsure * factor / (1 - 1 / blocks))
-    assert known.half_width == pytest.approx(expected, rel=1e-9)
-    assert known.enough == (effective >= 10.0)
-    drawn = np.array([1.1, 1.4, 0.9, 1.6, np.nan])  # on average 0.25 above the estimate, as it is above the truth
-    ends = interval(1.0, drawn, known)
-    reach = expected * np.nanstd(drawn, ddof=1)
-    assert ends == (
-        pytest.approx((0.75 - reach, 0.75 + reach)) if effective else (pytest.approx(np.nan, nan_ok=True),) * 2
-    )
-    if effective:  # Wilson: the shares whose own normal interval just reaches the one that was seen
-        size = 0.3 * 0.7 / (0.05 * expected / 1.959964) ** 2
-        for end in share_interval(0.3, 0.05, known):
-            assert abs(end - 0.3) == pytest.approx(1.959964 * np.sqrt(end * (1 - end) / np.clip(size, 1, n)), rel=1e-6)
 
 
 def test_what_a_pair_may_add_by_chance_is_the_rest_of_regression_on_the_other_stretches():
@@ -240,18 +216,25 @@ def test_a_significant_difference_of_a_flight_of_few_correlation_times_is_found(
     assert words.count("worse") > 20
 
 
-def test_interval_contains_the_estimate_and_respects_bounds():
-    known = autocorrelation(np.random.default_rng(0).normal(size=100))
-    low, high = interval(0.02, np.array([0.05, 0.10, 0.02, 0.04]), known, bounds=(0.0, 1.0))
-    assert 0.0 <= low <= 0.02 <= high <= 1.0
+def test_an_influence_interval_respects_the_bounds_of_its_statistic():
+    few, many = (np.random.default_rng(0).normal(size=n) for n in (19, 20))
+    assert np.isnan(statistics.influence_interval(0.02, few)).all()
+    assert np.isnan(statistics.influence_interval(np.nan, many)).all()
+    low, high = statistics.influence_interval(0.02, 0.1 * many, bounds=(0.0, 1.0))
+    assert (low, high) == (0.0, pytest.approx(0.1 * (statistics.mean_interval(many)[1] - many.mean()) + 0.02))
 
 
 def test_share_interval_is_wilsons():
-    low, high = share_interval(0.0, 0.0, Autocorrelation(n=40, block_length=1, n_effective=40.0, variance_factor=1.0))
-    assert low == 0.0
-    assert high == pytest.approx(1.959964**2 / (40 + 1.959964**2), rel=1e-6)
-    few = Autocorrelation(n=40, block_length=8, n_effective=9.9, variance_factor=1.0)
-    assert np.isnan(share_interval(0.3, 0.1, few)).all()
+    """The shares whose own normal interval just reaches the one that was seen, with the effective number of samples."""
+    assert np.isnan(share_interval(np.zeros(19))).all()
+    seen = (np.random.default_rng(1).random(400) < 0.3).astype(float)
+    sd = np.ptp(statistics.mean_interval(seen)) / 2 / 1.959964
+    for end in share_interval(seen):
+        assert abs(end - seen.mean()) == pytest.approx(1.959964 * sd * np.sqrt(end * (1 - end) / seen.var()), rel=1e-6)
+    z2 = 1.959964**2
+    assert share_interval(np.zeros(40)) == (0.0, pytest.approx(z2 / (40 + z2)))
+    slow = np.repeat([1.0, 2.0, 1.0, 2.0], 10)  # a rank that a slow sequence never reached
+    assert share_interval(np.zeros(40), sequence=slow)[1] > 0.3
 
 
 def test_correlation():

@@ -193,11 +193,11 @@ def _levels(data: ReportData) -> Table:
         caption="RSS after the best constant offset. RMSE in dB; every model has its own offset. Brackets: 95 % "
         "interval.",
         columns={"Tower": HEAD, "Channel": TEXT, "Offset [dB]": RIGHT, "RMSE ray tracing": RIGHT,
-                 **{f"RMSE {words.pretty(name)}": 2 for name in models},
+                 **{f"RMSE {words.pretty(name)}": 1 for name in models},
                  "Correlation": 2, "Samples": 0, "Out of coverage": 0},
         rows=[
             (p.tower, p.channel, number(p.score.offset_db) + (" (edge)" if p.score.at_edge else ""),
-             estimate(p.score.rmse_db, p.score.rmse_ci95_db, mark="<b>{}</b>"),
+             estimate(p.score.rmse_db, p.score.rmse_ci95_db, decimals=1, mark="<b>{}</b>"),
              *(p.baselines[name].rmse_db if name in p.baselines else None for name in models),
              p.score.correlation, p.score.n, p.score.n_out_of_coverage)
             for p in data.rss
@@ -310,7 +310,7 @@ def referee_card(data: ReportData) -> Card:
 
 def _prediction_card(verdict: Mapping[str, Any]) -> Card:
     """Return the card of one prediction: means over channels, then each channel."""
-    errors: dict[str, str | int] = {"Bias [dB]": 1, "RMSE [dB]": 2, "after offset": 2, "over 1 s": 2}
+    errors: dict[str, str | int] = {"Bias [dB]": 1, "RMSE [dB]": 1, "after offset": 1, "over 1 s": 1}
     means = Table(
         caption="Means over channels; a dash where the levels have no reference in common with the log, or no band.",
         columns={"Model": HEAD, "Channels": 0, **errors, "CRPS [dB]": 2, "In 90 %": SHARE},
@@ -358,7 +358,7 @@ def models_card(data: ReportData) -> Card:
         caption="RMSE in dB on held-out areas over all channels, and its difference to the best model on the same "
         "samples with a 95 % interval. Recommended: the simplest replay within one standard error of the best replay. "
         "Fastest sufficient: the fastest model whose difference to the best model is not significant.",
-        columns={"No.": RIGHT, "Model": HEAD, "RMSE [dB]": 2, "Difference to the best [dB]": RIGHT, "Time [s]": 2,
+        columns={"No.": RIGHT, "Model": HEAD, "RMSE [dB]": 1, "Difference to the best [dB]": RIGHT, "Time [s]": 2,
                  "Note": TEXT},
         rows=[
             (str(number), bold(row.model) if row.recommended else row.model, row.rmse_heldout_db,
@@ -371,7 +371,8 @@ def models_card(data: ReportData) -> Card:
         caption="RMSE in dB on held-out areas, and in brackets the 95 % interval of its difference to the best model.",
         columns={"Tower": HEAD, "Channel": HEAD, **{f"Model {number}": RIGHT for number in range(1, len(shown) + 1)}},
         rows=[
-            (*of, *(estimate(row.rmse_heldout_db, row.difference_to_best_ci95_db)
+            (*of, *(Markup('{} <span class="small">{}</span>').format(
+                        number(row.rmse_heldout_db), interval(row.difference_to_best_ci95_db, 2))
                     for model in names for row in [rows[(model, *of)]]))
             for of in channels
         ],

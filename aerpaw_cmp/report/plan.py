@@ -107,7 +107,11 @@ def write_plan(data: PlanPage, folder: Path) -> list[Path]:
 
 
 def _groups(data: PlanPage) -> Iterator[Places]:
-    """The target, each point once over its headings: on the map, or the directions from a tower; and the route."""
+    """Yield the proposed route, which the page shows first, and the target: positions, or directions from a tower.
+
+    Each point of the target is one value over all headings.
+    """
+    yield Places(name="proposed route", at=data.track_m, values={"height [m]": data.track_m[:, 2]})
     _, first, member = np.unique(data.place_m.round(1), axis=0, return_index=True, return_inverse=True)
     count = np.bincount(member.ravel())
     now, after = (np.sqrt(np.bincount(member.ravel(), v**2) / count) for v in (data.before_db, data.after_db))
@@ -119,4 +123,3 @@ def _groups(data: PlanPage) -> Iterator[Places]:
         away = place - data.seen_from_m
         unit = away / np.linalg.norm(away, axis=1, keepdims=True)
         yield Places(name="directions from the tower", at=unit, values=values, around=COMPASS)
-    yield Places(name="proposed route", at=data.track_m, values={"height [m]": data.track_m[:, 2]})

@@ -95,26 +95,39 @@ def asked_outside(driver) -> list[str]:
 
 
 def serious_findings(driver) -> dict[str, list[str]]:
-    """Findings of axe-core that are serious or critical, by rule.
+    """Return the serious and critical findings of axe-core, by rule, with every section open.
 
-    The window holds the whole page meanwhile: the packaged axe calls the contrast of what it must scroll to unknown.
+    The page is tested at two widths and in both themes. The window contains the complete page, because the packaged
+    axe reports the contrast of parts outside the window as unknown.
     """
     axe = pytest.importorskip("axe_selenium_python", reason="axe-selenium-python is not installed")
     source = resources.files(axe) / "node_modules" / "axe-core" / "axe.min.js"
     driver.execute_script(source.read_text(encoding="utf-8"))
     driver.set_script_timeout(120)  # a busy machine: axe looks at every cell of every table
+    # details that share a name close each other
+    opened = "for (const d of document.querySelectorAll('details')) { d.removeAttribute('name'); d.open = true; }"
+    high = "scrollTo(0, 0); return document.documentElement.scrollHeight"
+    found = {}
     try:
-        set_width(
-            driver, 1440, driver.execute_script("scrollTo(0, 0); return document.documentElement.scrollHeight") + 100
-        )
-        audit = driver.execute_async_script("const done = arguments[0]; axe.run().then(done);")
+        driver.execute_script(opened)
+        for width, theme in ((1440, "light"), (390, "light"), (390, "dark"), (1440, "dark")):
+            set_scheme(driver, theme)
+            # the live page has a button for its theme
+            driver.execute_script(
+                "const d = document.documentElement.dataset; if (d.theme) d.theme = arguments[0]", theme
+            )
+            set_width(driver, width)
+            set_width(driver, width, driver.execute_script(high) + 100)
+            audit = driver.execute_async_script("const done = arguments[0]; axe.run().then(done);")
+            found |= {
+                f"{v['id']}, {width} px, {theme}": [n["html"][:120] for n in v["nodes"]]
+                for v in audit["violations"]
+                if v["impact"] in ("serious", "critical")
+            }
     finally:
+        set_scheme(driver)
         usual_width(driver)
-    return {
-        v["id"]: [n["html"][:120] for n in v["nodes"]]
-        for v in audit["violations"]
-        if v["impact"] in ("serious", "critical")
-    }
+    return found
 
 
 def set_width(driver, width: int, height: int = 1000) -> None:

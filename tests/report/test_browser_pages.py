@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.report.site import viewer
-from tests.report.browsing import complaints, needs_browser, open_page, saves_every_chart, set_scheme, set_width, start
+from tests.report.browsing import (
+    complaints,
+    needs_browser,
+    open_page,
+    saves_every_chart,
+    serious_findings,
+    set_scheme,
+    set_width,
+    start,
+)
 from tests.report.shown import PAGES
 
 pytestmark = needs_browser
@@ -42,6 +51,16 @@ def test_the_first_words_need_no_scrolling(
         assert any(unit in text for unit in (" dB", " %"))
         assert "Next: " in text or page in ("report", "diff")  # one next step or none
         assert "`" not in text
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_no_page_has_a_serious_finding_of_accessibility(
+    page: str, driver: Any, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    path = tmp_path / f"{page}.html"
+    path.write_text(PAGES[page](request.getfixturevalue), encoding="utf-8")
+    driver.get(path.as_uri())
+    assert serious_findings(driver) == {}
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -90,8 +90,8 @@ def _print_cards(verdict: Mapping[str, Any]) -> None:
     """Print the sentence and the small table of one prediction of another program."""
     show(verdict["sentence"])
     columns = {
-        "model": "model", "channels": "channels", "bias dB": "bias_db:.1f", "RMSE dB": "rmse_db:.2f",
-        "after offset": "rmse_offset_db:.2f", "1 s": "rmse_1s_db:.2f", "CRPS dB": "crps_db:.2f",
+        "model": "model", "channels": "channels", "bias dB": "bias_db:.1f", "RMSE dB": "rmse_db:.1f",
+        "after offset": "rmse_offset_db:.1f", "1 s": "rmse_1s_db:.1f", "CRPS dB": "crps_db:.2f",
         "inside 90 %": "coverage_90:.0%",
     }  # fmt: skip
     title = f"{verdict['prediction']} and other models on the same samples, means over channels (each in card.json)"
@@ -134,7 +134,7 @@ def _print_models(models: Sequence[Mapping[str, Any]]) -> None:
     notes = {"recommended": "recommended", "fastest_sufficient": "fastest sufficient"}
     rows = [{**row, "note": ", ".join(notes[key] for key in notes if row[key])} for row in models]
     columns = {
-        "model": "model", "RMSE dB": "rmse_heldout_db:.2f", "minus best": "difference_to_best_db:.2f",
+        "model": "model", "RMSE dB": "rmse_heldout_db:.1f", "minus best": "difference_to_best_db:.2f",
         "95 %": "difference_to_best_ci95_db:.2f", "s": "seconds:.1f", "": "note",
     }  # fmt: skip
     records(rows, columns, "Models, cross-validated over all channels")
@@ -168,8 +168,8 @@ def _print_report_summary(outcome: Any) -> None:
         for channel, m in channels.items()
     ]  # fmt: skip
     columns = {
-        "tower": "tower", "channel": "channel", "offset dB": "offset_db:.1f", "RMSE dB": "rmse_db:.2f",
-        "95 %": "ci95_db:.2f", **{title: f"{name}:.2f" for name, title in BASELINE_TITLE.items()},
+        "tower": "tower", "channel": "channel", "offset dB": "offset_db:.1f", "RMSE dB": "rmse_db:.1f",
+        "95 %": "ci95_db:.1f", **{title: f"{name}:.1f" for name, title in BASELINE_TITLE.items()},
         "corr.": "correlation:.2f", "n": "n", "out of coverage": "n_out_of_coverage",
     }  # fmt: skip
     records(links, columns, "RSS, measured against replayed")

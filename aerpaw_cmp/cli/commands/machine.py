@@ -48,7 +48,7 @@ def bench(
     records(rows, columns, f"Speed against error ({_conditions(result['conditions'])})")
     costs = [{**row, "note": "fastest sufficient" * row["fastest_sufficient"]} for row in result.get("models", ())]
     if costs:
-        columns = {"model": "model", "s": "seconds:.3g", "RMSE dB": "rmse_heldout_db:.2f", "": "note"}
+        columns = {"model": "model", "s": "seconds:.3g", "RMSE dB": "rmse_heldout_db:.1f", "": "note"}
         records(costs, columns, "What accuracy costs on the flight of the report")
     for name, ratio in result["ratios"].items():
         show(f"{name}: {ratio:.3g} times")

@@ -113,8 +113,8 @@
     if (s) {
       rows.push(["Samples", number(s.n, 0)]);
       if (rss().models[state.model].learned_here) rows.push(["RMSE", "n/a: learned from this flight"]);
-      else if (s.n) rows.push(["RMSE, offset refitted on the selection", number(s.rmse, 2, "dB")], ["Offset of the selection", number(s.offset, 1, "dB")],
-        ["RMSE with the flight's offset", number(s.rmseFlight, 2, "dB")], ["Mean residual", number(s.bias, 2, "dB")], ["Correlation", number(s.correlation, 2)]);
+      else if (s.n) rows.push(["RMSE, offset refitted on the selection", number(s.rmse, 1, "dB")], ["Offset of the selection", number(s.offset, 1, "dB")],
+        ["RMSE with the flight's offset", number(s.rmseFlight, 1, "dB")], ["Mean residual", number(s.bias, 2, "dB")], ["Correlation", number(s.correlation, 2)]);
     }
     if (r) rows.push(["Rank reports", number(r.n, 0)], ["Agreement", number(100 * r.agreement, 0, "%")]);
     cells(at("span"), rows);

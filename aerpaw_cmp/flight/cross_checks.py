@@ -254,7 +254,7 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
     if any(s.attributes.get("height_from") == "assumed" for s in streams):
         texts.append(f"the heights are read as {_source(streams, 'height') or 'above take-off'}: right?")
     for stream in streams:
-        sentence = "" if (jumps := jumps_of(stream))[0].any() else jumps[1]
+        sentence = "" if (jumps := jumps_of(stream.frame, f"{stream.kind} {stream.name!r}"))[0].any() else jumps[1]
         # a draft is checked by its lines that end in a question mark
         texts += [f"{sentence.rstrip('?')}?"] if sentence else []
         if stream.kind == "telemetry" and (low := _lowest_m(stream)) is not None and abs(low) > _GROUND_M:

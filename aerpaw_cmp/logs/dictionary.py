@@ -33,8 +33,8 @@ class Quantity:
     name : str
         The field's word, or the column of the record model.
     role : str
-        ``time``, ``position``, ``height``, ``angle``, ``velocity``, ``count``, ``identity``, ``cell`` or a kind of
-        stream: ``rss``, ``rank``, ``kpi``.
+        ``time``, ``position``, ``height``, ``angle``, ``velocity``, ``count``, ``doubt``, ``identity``, ``cell`` or a
+        kind of stream: ``rss``, ``rank``, ``kpi``.
     names : tuple of str
         Patterns that stand in a plain name (:func:`plain`), the preferred first.
     unit : str
@@ -111,6 +111,10 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"\b(easting|northing|utm|ecef|ned|enu)\b", r"^(pos(ition)? )?(north|east|down)( m| meters)?$",
         r"^(geom(etry)?|wkt|lat ?(lon|lng)|coordinates?|(gps )?(position|location))$",
     )),
+    Quantity("accuracy", "doubt", (
+        r"^(gps |gnss )?[hpg]dop$", r"^eph$",
+        r"^(gps |gnss |position |pos |location |horizontal |horiz )?((horizontal |horiz |h ?)?acc(uracy)?)( m)?$",
+    )),
     # how high: the datum that the name tells; heights of home and of the terrain are not the aircraft's
     Quantity("home", "other", (
         r"\b(home|take ?off|launch|terrain|ground|geoid|undulation|delta|target|max|min)\b.*" + _UP + r"(?!.*\babove)",
@@ -157,9 +161,15 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("velocity_down_mps", "velocity", (
         r"^velocity ?(down|z)( mps)?$", r"^vd$", r"^vz$", r"^vel d m s$", r"^(osd )?z ?speed", r"^speed ?z$",
     ), "m/s", can_be=_SPEED),
-    Quantity("fix", "count", (r"^(gps )?fix( type)?$", r"^gpsfix$", r"^gps lock$")),
+    Quantity("fix", "count", (
+        r"^(gps )?fix( type)?$", r"^gpsfix$", r"^gps lock$",
+        r"^((is|data) )?valid$",
+        r"^((has|is) )?(gps |gnss |pos(ition)? |loc(ation)? )?fix ?(type|ok|status|state|mode|quality|qual|valid)?$",
+        r"^((has|is) )?(gps|gnss|pos(ition)?|loc(ation)?) ?(fix ?type|status|state|mode|lock|quality|qual|valid|ok)$",
+    )),
     Quantity("satellites", "count", (
-        r"^(number of satellites?|satellites( used)?|num ?sat|osd gpsnum|nsats|numberofsatellites|gps count)$",
+        r"^(number of satellites?|satellites( used)?|num ?sats?|osd gpsnum|nsats?|numberofsatellites|gps count)$",
+        r"^((gps|gnss) )?(sats?|satellites?|num sats?)( (used|count|num|in use))?$",
     )),
     Quantity("battery_v", "count", (r"^(battery ?)?(volts?|voltage)( v)?$",), "V"),
     # who
@@ -191,9 +201,9 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"\b((pdsch|dl|nr|lte|[45]g|mimo|csi) rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri|dl layer num)\b",
     ), none=(0.0,), can_be=(0.0, 16.0)),
     Quantity("RSRP", "rss", (
-        r"\brs ?rp\b|\bss ?rsrp\b|\b(nrx)?rsrp\d{0,2}\b|\b(n|nb|nbr)\d{0,2}rsrp\b",
+        r"\brs ?rp\b|\bss ?rsrp\b|\brsrp\d{0,2}\b",
     ), "dBm", none=(0.0,), can_be=_DBM),
-    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(-99.0, 0.0, 99.0, 255.0), can_be=(-60.0, 3.0)),
+    Quantity("RSRQ", "kpi", (r"\brsrq\d{0,2}\b",), "dB", none=(-99.0, 0.0, 99.0, 255.0), can_be=(-60.0, 3.0)),
     Quantity("SINR", "kpi", (r"\b(rs ?)?s(i)?nr\d{0,2}\b|\brssnr\b",), "dB", none=(-99.0, 99.0, 255.0), can_be=_DB),
     Quantity("RSSI", "rss", (r"\brss(i\d{0,2})?\b",), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("RSCP", "rss", (r"\brscp\b",), "dBm", none=(0.0,), can_be=_DBM),
@@ -224,8 +234,12 @@ def _forms() -> tuple[tuple[re.Pattern[str], Quantity], ...]:
 
 _NEIGHBOUR = re.compile(
     r"\b(detected|neigh(bou?rs?)?\d{0,2}|ngh?br?s?\d{0,2}|nbr?\d{0,2}|nc(ell)? ?\d{0,2}|n ?\d{1,2}|nrx|nlte\w*"
-    r"|adj(acent)?\d{0,2})\b|\btop \d{1,2}\b"
-    r"|\bn\d?(rsrp|rxrsrp|rsrq|pci)\d{0,2}\b|^nrx|\bnbr?\d{0,2}(rsrp|rsrq|pci)\b"
+    r"|adj(acent)?\d{0,2})\b|\btop \d{1,2}\b|^nrx"
+)
+# A neighbour whose name is one word with its quantity: 'NRSRP1', 'nei1Pci', 'NCellRSRP2'.
+_JOINED = re.compile(
+    r"\b(?:n|nb|nbr|nc|ncell|nrx|nei|neigh|neighbou?r|neighbou?r?cell|ngbr|adj|det(?:ected)?)(\d{0,2})"
+    r"(?=(?:pci|rsrp|rsrq|rssi|rscp|sinr|e?arfcn|rxlev)\d{0,2}\b)"
 )
 _NR = re.compile(r"\b(nr|5g|spcell|ss ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss|\bnrpci\b|\bnr ?arfcn\b|\bnci\b")
 _LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
@@ -233,7 +247,6 @@ _LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
 _SECONDARY = re.compile(r"\bsc(?:ell|c) ?(\d{0,2})\b")
 _NUMBER = re.compile(
     r"(?:^| )(?:n|nb|nbr|nc|ngbr|neigh|neighbou?r|ncell|adj|top|rsrp|rsrq|pci|e?arfcn)? ?(\d{1,2})(?: |$)"
-    r"|\bn(?:br?)?(\d{1,2})[a-z]"
 )
 # Another cell of a table, or the cell of another device, by its number or its order.
 _OTHER = re.compile(
@@ -323,7 +336,8 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     if texts[0] == plain(name):
         # 'Time (+02:00)'; 'heightAboveGround'
         texts += [bare, plain(in_brackets(name)[2]), plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name))]
-    hits = ((row, text) for text in dict.fromkeys(texts) for form, row in _forms() if form.search(text))
+    texts = [_JOINED.sub(r"neighbour \1 ", text).replace("  ", " ") for text in dict.fromkeys(texts)]
+    hits = ((row, text) for text in texts for form, row in _forms() if form.search(text))
     row, text = next(hits, (None, ""))
     # 'rx [dBm]' is a level, and no name of a receiver
     if row is None or row.role == "other" or (row.role == "identity" and is_unit(unit)):
@@ -586,6 +600,19 @@ UNLIKE_A_LEVEL = re.compile(
     r"|\basu|mode|state|status|charge|energy|consum|\b(avg|mean|min|max|std|log|audio|sound|light|id)\b|threshold|count"
     r"|\b([xyz]|down|home|gyro|mag)\b|\b(lat|lon|lng|acc|vel|speed|temp|yaw|roll|pitch|heading|offset)"
 )
+
+
+_OF_A_CELL = re.compile(
+    r"((serving|lte|nr|nr5g|4g|5g|e ?utran?|global|full|dl|rx|tx|carrier|cent(er|re)) )*(tower|node|site|base ?station"
+    r"|bs|[eg]nb|cell|sector|e?ci|nci|l?cid|[en]?cgi|psc|bsic|channel|(antenna |ant )?port|antenna|ant|beam|ssb|csi ?rs"
+    r"|pol(ari[sz]ation)?|freq(uency)?|band)( (global|beam|port))? ?(id(entity|x)?|name|no|num(ber)?|index|[mgk]?hz)?"
+)
+_CELL_ID = re.compile(r"\b(cell ?id|l?cid|e?ci|nci|[en]?cgi|[eg]nb ?id|sector ?id|beam ?id|bssid|rnti|pci\d?)\b")
+
+
+def names_a_cell(words: str, *, alone: bool = False) -> bool:
+    """Check whether a plain name is that of a cell, an antenna or a beam; if ``alone``, of the row's own."""
+    return _OF_A_CELL.fullmatch(words) is not None or (not alone and _CELL_ID.search(words) is not None)
 
 
 def like_levels(names: Iterable[str]) -> list[str]:

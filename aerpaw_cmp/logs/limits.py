@@ -52,21 +52,23 @@ _STALE_S, _STALE_MPS = 3.0, 1.0
 _STEP_BACK_SHARE = 0.2
 
 
-def jumps_of(stream: Stream) -> tuple[BoolArray, str]:
-    """Rows (n,) of a stream whose position is a jump, and a sentence on them or on the track; empty where all fits.
+def jumps_of(frame: pd.DataFrame, what: str = "") -> tuple[BoolArray, str]:
+    """Return the rows (n,) of a stream whose position is a jump, and a sentence about them or about the track.
 
     Parameters
     ----------
-    stream : Stream
+    frame : DataFrame
+        Records of the stream.
+    what : str
+        Kind and name of the stream, for the sentence.
     """
-    none = np.zeros(len(stream.frame), dtype=np.bool_)
-    if not {"latitude_deg", "longitude_deg"} <= set(stream.frame.columns):
+    none = np.zeros(len(frame), dtype=np.bool_)
+    if not {"latitude_deg", "longitude_deg"} <= set(frame.columns):
         return none, ""
-    rows, time_s, place_m = path_of(stream.frame)
+    rows, time_s, place_m = path_of(frame)
     if len(rows) < 3:
         return none, ""
     speed_mps = _speed_mps(time_s, place_m)
-    what = f"{stream.kind} {stream.name!r}"
     if speed_mps > FASTEST_MPS and not _comes_back(time_s, place_m):
         return none, (
             f"{what}: its positions imply {speed_mps:.0f} m/s throughout: are its times in another unit, "
@@ -82,7 +84,7 @@ def jumps_of(stream: Stream) -> tuple[BoolArray, str]:
         )
     out = none.copy()
     out[rows[astray]] = True
-    line = int(stream.frame["line"].iloc[rows[at]])
+    line = int(frame["line"].iloc[rows[at]])
     return out, (
         f"{what}: {counted(int(out.sum()), 'row is', 'rows are')} flagged {FLAG}; the first: {fast_mps:.0f} m/s to the "
         f"position in line {line}; read as missing"
@@ -157,14 +159,17 @@ def _runs(time_s: FloatArray, place_m: FloatArray) -> tuple[IntArray, IntArray]:
     return begins, np.append(begins[1:], len(time_s))
 
 
-def stale_of(stream: Stream) -> tuple[BoolArray, str]:
-    """Return the rows (n,) whose position stays the same while the logged speed moves on, and a sentence on them.
+def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
+    """Return the rows (n,) whose position stays the same while the logged speed moves on, and a sentence about them.
 
     Parameters
     ----------
-    stream : Stream
+    frame : DataFrame
+        Records of the stream.
+    what : str
+        Kind and name of the stream, for the sentence.
     """
-    frame, none = stream.frame, np.zeros(len(stream.frame), dtype=np.bool_)
+    none = np.zeros(len(frame), dtype=np.bool_)
     if not {*PLACE[:2], *_SPEEDS} <= set(frame.columns):
         return none, ""
     rows, time_s, place_m = path_of(frame)
@@ -183,7 +188,7 @@ def stale_of(stream: Stream) -> tuple[BoolArray, str]:
     longest = int(np.argmax(np.where(runs, lasts_s, 0.0)))
     line, speed_mps = int(frame["line"].iloc[rows[begins[longest]]]), moved_m[longest] / lasts_s[longest]
     return none, (
-        f"{stream.kind} {stream.name!r}: {counted(int(none.sum()), 'row is', 'rows are')} flagged {STALE}: positions "
+        f"{what}: {counted(int(none.sum()), 'row is', 'rows are')} flagged {STALE}: positions "
         f"stand still for {lasts_s[longest]:.0f} s from line {line} on, at a logged speed of {speed_mps:.1f} m/s; "
         "read as missing"
     )
@@ -350,7 +355,7 @@ class _Check:
             self._two_levels()
         self._at_a_site_if_otherwise()
         for flag, check_of in ((STALE, stale_of), (FLAG, jumps_of)):
-            bad, sentence = check_of(replace(self.stream, frame=self.frame))
+            bad, sentence = check_of(self.frame, self._what)
             if bad.any():
                 self.frame = _marked(self.frame, bad, flag, [name for name in PLACE if name in self.frame.columns])
             self._said += [sentence] if sentence else []

@@ -152,9 +152,10 @@ def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: str, about: Mapping[str
         )
     # phones write the end of the scale (3GPP TS 36.133, 9.1.4) where they hear nothing; a weak cell fades down to it
     ends = (level == _END_DBM) & (about["quantity"] == "RSRP")
-    if ends.sum() > 1 and not ((level > _END_DBM) & (level < _END_DBM + 10.0)).any():
+    if ends.any() and not ((level > _END_DBM) & (level < _END_DBM + 10.0)).any():
         outside |= ends
-        rows.warnings.append(f"{cell}: {ends.sum()} levels of {_END_DBM:g} dBm, and none near above: out of coverage")
+        levels = counted(int(ends.sum()), "level")
+        rows.warnings.append(f"{cell}: {levels} of {_END_DBM:g} dBm, none within 10 dB above: read as out of coverage")
     if about["quantity"] == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
         rows.warnings.append(f"{cell}: RSSI lies below RSRP, which cannot be: are the columns exchanged?")
     _text.add_flag(flag, outside, "out_of_coverage")

@@ -18,6 +18,7 @@ import pandas as pd
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import Attribute
+from aerpaw_cmp.readers import dictionary
 
 from . import _sheet
 
@@ -68,6 +69,7 @@ def parts(
         rows.warnings.append(f"column {shown} distinguishes the rows: each of its values is a series")
     alone = {sheet.plain[i]: next(iter(values)) for i, values in _values(texts).items() if len(values) == 1}
     alone = {name: text for name, text in alone.items() if not any(sheet.plain[i] == name for i in several)}
+    sheet.used |= {*several, *(i for i, values in _values(texts).items() if len(values) == 1)}
     if not several:
         yield "", replace(rows, about=rows.about | attributes_of(alone)), sheet
         return
@@ -147,11 +149,6 @@ def _divides(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
     return max(values.values(), default=0) > 1
 
 
-_OF_A_CELL = re.compile(
-    r"((serving|lte|nr|nr5g|4g|5g|e ?utran?|global|full|dl|rx|tx|carrier|cent(er|re)) )*(tower|node|site|base ?station"
-    r"|bs|[eg]nb|cell|sector|e?ci|nci|l?cid|[en]?cgi|psc|bsic|channel|(antenna |ant )?port|antenna|ant|beam|ssb|csi ?rs"
-    r"|pol(ari[sz]ation)?|freq(uency)?|band)( (global|beam|port))? ?(id(entity|x)?|name|no|num(ber)?|index|[mgk]?hz)?"
-)
 # Words of another cell than that of the row's level, of what the aircraft does, and of the level itself in steps.
 _OTHERS = re.compile(
     r"\b(serving|best|target|source|dest|destination|strongest|prev|previous|next|handover|bars?|asu|quality|percent"
@@ -161,7 +158,9 @@ _OTHERS = re.compile(
 
 def of_a_cell(sheet: _sheet.Sheet) -> list[int]:
     """Return the columns that are named like a cell and that the dictionary does not know."""
-    return [i for i, words in enumerate(sheet.plain) if not sheet.meanings[i] and _OF_A_CELL.fullmatch(words)]
+    return [
+        i for i, words in enumerate(sheet.plain) if not sheet.meanings[i] and dictionary.names_a_cell(words, alone=True)
+    ]
 
 
 def _marks(
@@ -279,6 +278,7 @@ def further(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dict[s
     """
     texts = {i: _named(sheet, i) for i in of_a_cell(sheet)}
     chosen = refining(texts, _with_level(sheet), base)
+    sheet.used |= {i for i, values in _values(texts).items() if len(values) <= _MOST_PARTS}
     labels, about = [""] * len(sheet), dict[str, dict[str, Attribute]]()
     for row in range(len(sheet)) if chosen else ():
         written = {sheet.plain[i]: texts[i][row] for i in chosen if texts[i][row]}

@@ -6,11 +6,13 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
+import pandas as pd
 
 from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import text as _text
+from aerpaw_cmp.logs.limits import jumps_of
 from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
 from aerpaw_cmp.readers import ReadOptions, dictionary
 
@@ -49,18 +51,16 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     alike = [sheet.names[i] for i, quantity in known if dictionary.rank_of(quantity, sheet.plain[i]) == surest]
     if len(alike) > 1:
         rows.warnings.append(f"several columns of positions ({', '.join(alike)}): {alike[0]!r} was read, a guess")
+    sheet.used |= {i for i in (latitude, longitude, sheet.find("altitude_m")) if i is not None}
     values: dict[str, AnyArray] = {key: sheet.numbers(i) for key, i in zip(PLACE, (latitude, longitude), strict=False)}
-    fix = sheet.find("fix")
-    written = np.isfinite(values[PLACE[0]]) & np.isfinite(values[PLACE[1]])
-    if fix is not None and (sheet.numbers(fix) > 0).any():  # some leave the column at 0 throughout
-        state = sheet.numbers(fix)
-        # a fix type of MAVLink is 1 without a fix and 3 with one; a quality of NMEA is 1 with a fix
-        none = 1.0 if "type" in sheet.names[fix].lower() and (state >= 3.0).any() else 0.0
-        values[PLACE[0]] = np.where(state <= none, np.nan, values[PLACE[0]])
+    written, unfixed = np.isfinite(values[PLACE[0]]) & np.isfinite(values[PLACE[1]]), without_fix(sheet)
+    values[PLACE[0]] = np.where(unfixed, np.nan, values[PLACE[0]])
     lost = clean(rows, values)
     if coarse := whole_degrees([sheet.names[latitude], sheet.names[longitude]], values):
         raise _sheet.shifted(coarse, "positions")
     datum, height = _height(rows, sheet)
+    if datum not in ("take-off", "ground"):  # a barometer knows these without a fix
+        height = np.where(unfixed, np.nan, height)
     values["altitude_m"] = height
     about: Height = {"height_from": rows.height_from}
     if np.isfinite(height).any():
@@ -77,6 +77,33 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
             values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
     where = None if lost.all() else written  # a row of 0, 0 is a reading without a fix
     return rows.stream("telemetry", name, values, where=where, source=source, about=about)
+
+
+def without_fix(sheet: _sheet.Sheet) -> BoolArray:
+    """Return the rows (n,) that the table marks as rows without a fix, by any of its columns about the fix."""
+    unfixed = np.zeros(len(sheet), dtype=bool)
+    for i, meaning in enumerate(sheet.meanings):
+        name = "" if meaning is None else meaning.quantity.name
+        if name not in ("fix", "satellites", "accuracy"):
+            continue
+        values, words = sheet.numbers(i), sheet.plain[i]
+        if name == "accuracy":
+            # without a fix receivers write a DOP of 0, 99 or 99.99, or the largest number that they have
+            of_dop = "dop" in words and bool((values < _MOST_DOP).any())
+            none = (values >= _NO_DOP) | (values == 0) if of_dop else values >= _NO_ACCURACY
+        elif name == "satellites":
+            none = values == 0
+        else:
+            # MAVLink counts 1 without a fix and 3 with one; the quality of NMEA, which has no 3, is 1 with a fix
+            of_mavlink = re.search("type|status|mode", words) is not None and (values >= 3).any()
+            none = values <= float(of_mavlink or ((values == 3).any() and "qual" not in words))
+        # a column that says so throughout is one that the program does not fill
+        if (values[~none] > 0).any():
+            unfixed |= none
+    return unfixed
+
+
+_MOST_DOP, _NO_DOP, _NO_ACCURACY = 20.0, 99.0, 9999.0
 
 
 def of_readings(
@@ -188,6 +215,7 @@ def _with_moved_home(rows: _rows.Rows, sheet: _sheet.Sheet, height: FloatArray) 
             datum == "unknown" and sheet.program is not None and sheet.program.datum == "sea level"
         ):
             altitude = sheet.numbers(i)
+            sheet.used.add(i)
             if not home_was_set(altitude, height):
                 return height, False
             known = np.flatnonzero(np.isfinite(altitude) & np.isfinite(height))
@@ -224,7 +252,9 @@ def above_takeoff(
     """
     altitude: FloatArray = values["altitude_m"]
     about: Height = {"height_from": rows.height_from, "height_datum": datum}
-    known = np.flatnonzero(np.isfinite(altitude) & ~lost)
+    possible = (altitude > _POSSIBLE_M[0]) & (altitude < _POSSIBLE_M[1])
+    track = pd.DataFrame({"time": rows.time, "line": rows.row + 1, **{name: values[name] for name in PLACE}})
+    known = np.flatnonzero(possible & ~lost & ~jumps_of(track)[0])
     seconds = np.maximum(np.diff(rows.time[known]) / np.timedelta64(1, "s"), 0.1)
     rate_mps = np.abs(np.diff(altitude[known])) / seconds
     if 2 * (rate_mps > _FASTEST_MPS).sum() > (rate_mps > 0).sum():
@@ -257,6 +287,8 @@ def above_takeoff(
 _FASTEST_MPS = 60.0
 # What begins within a few metres of zero is relative to take-off.
 _NEAR_ZERO_M = 10.0
+# Other heights are damaged or placeholders.
+_POSSIBLE_M = (-1000.0, 20_000.0)
 _REST_S, _REST_M, _REST_MPS, _CLIMB_M, _CLIMB_MPS = 2.0, 3.0, 0.3, 5.0, 20.0
 _DEGREE_M = 111_000.0
 

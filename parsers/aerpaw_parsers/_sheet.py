@@ -97,8 +97,9 @@ def _number(text: str) -> tuple[float, str]:
 
 # Words for the fix of a GNSS receiver, the first that fits, and MAVLink's numbers for them.
 _FIXES = tuple((re.compile(form), number) for form, number in (
-    (r"\bno\b|no ?(fix|gps|gnss)|invalid|none|lost|searching", "0"), (r"float", "5"), (r"rtk|fixed|\bint\b", "6"),
-    (r"dgps|dgnss|diff|sbas", "4"), (r"\b2 ?d", "2"), (r"\b3 ?d|single|autonomous|spp|\bok\b|valid|\bfix\b", "3"),
+    (r"\bno\b|no ?(fix|gps|gnss)|invalid|none|lost|searching|^(n|v|f|false|void|bad)$", "0"), (r"float", "5"),
+    (r"rtk|fixed|\bint\b", "6"), (r"dgps|dgnss|diff|sbas", "4"), (r"\b2 ?d", "2"),
+    (r"\b3 ?d|single|autonomous|spp|\bok\b|valid|\bfix\b|^(y|a|t|yes|true|active|good)$", "3"),
 ))  # fmt: skip
 
 
@@ -158,6 +159,8 @@ class Sheet:
         Do rows end with a mark of their own, whatever ends the line?
     said : dict
         Quantities, by the column, of columns whose names say none: what the user says.
+    used : set of int
+        Columns that a stream was made of, shared by all parts of the table.
     """
 
     lines: _text.Lines
@@ -169,6 +172,7 @@ class Sheet:
     notes: dict[int, str] = field(default_factory=dict)
     closed: bool = False
     said: dict[int, dictionary.Quantity] = field(default_factory=dict)
+    used: set[int] = field(default_factory=set)
     _silent: dict[int, BoolArray] = field(default_factory=dict)
     _numbers: dict[int, FloatArray] = field(default_factory=dict)
     _cell_units: dict[int, str] = field(default_factory=dict)
@@ -335,6 +339,7 @@ class Sheet:
         for i, name in enumerate(self.names):
             letters = {cells[i].strip().upper() for cells in self.cells[:50]} - {""}
             if letters and letters <= {positive, negative} and (i == column + 1 or _OF_SIDES.search(name)):
+                self.used.add(i)
                 west = np.array([text.upper() == negative for text in self.texts(i)])
                 return np.where(west, -np.abs(values), values)
         return values
@@ -353,10 +358,30 @@ class Sheet:
         return bool(self.cells) and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for cell in self.cells[0])
 
     def unread(self) -> list[str]:
-        """Sentences about columns that were read otherwise than they are written."""
-        return [self.notes[column] for column in sorted(self.notes)]
+        """Return sentences about columns that were read otherwise than they are written, or not at all."""
+        left = [i for i in range(len(self.names)) if i not in self.used and self._is_of_interest(i)]
+        shown = ", ".join(repr(self.names[i]) for i in left[:_MOST_NAMED])
+        more = f" and {len(left) - _MOST_NAMED} more" if left[_MOST_NAMED:] else ""
+        said = (
+            [f"not read, though they look like levels, identities, positions or times: {shown}{more}"] if left else []
+        )
+        return [self.notes[column] for column in sorted(self.notes)] + said
+
+    def _is_of_interest(self, column: int) -> bool:
+        """Check whether a column with values is a level, an identity, a position or a time, as far as names show it."""
+        meaning, words = self.meanings[column], self.plain[column]
+        like = bool(dictionary.like_levels([self.names[column]])) or dictionary.names_a_cell(words)
+        role = "" if meaning is None else meaning.quantity.role
+        like |= role in _OF_INTEREST or (meaning is None and _WHERE_OR_WHEN.search(words) is not None)
+        return like and any(text.lower() not in NO_VALUE for text in self.texts(column))
 
 
+_OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank")
+_WHERE_OR_WHEN = re.compile(
+    r"\b(lat|latitude|lon|lng|long|longitude|alt|altitude|height|date|time|time ?stamp|utc|epoch)\b"
+)
+# Names of columns in one sentence.
+_MOST_NAMED = 20
 _DECIMAL_POINT = re.compile(r"[-+]?\d{1,20}\.\d{1,40}")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d{1,20},\d{1,40}")
 _THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d{0,40})?")
@@ -642,6 +667,8 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in bounded.items()])
     column = _time_column(sheet, options) if column is None else column
     weeks = None if mapped and column != sheet.find("gps_seconds") else _gps_weeks(sheet, column)
+    times = (column, sheet.find("time") if weeks is not None else None, *map(sheet.find, _OF_CLOCK))
+    sheet.used |= {i for i in times if i is not None}
     if column is None and weeks is None:
         return None
     if weeks is not None:
@@ -666,6 +693,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         timed_part = sheet.part(inside)
         sheet.row, sheet.cells, sheet._silent, sheet._numbers = timed_part.row, timed_part.cells, timed_part._silent, {}
     if (counter := sheet.named("time millisecond", "millisecond", "milliseconds", "msec", "ms")) not in (None, column):
+        sheet.used.add(counter)
         _finer(timed, sheet.numbers(counter))
     if (valid := sheet.named("valid", "is valid", "data valid")) is not None:
         words = ("0", "0.0", "false", "no", "n", "invalid")
@@ -677,6 +705,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     return timed
 
 
+_OF_CLOCK = ("date", "zone", "gps_week", "gps_seconds")
 # Begin of a log in a cell of JSON, as Open DroneLog writes it beside relative times.
 _START = re.compile(r'"start_time" ?: ?"([^"]{10,40})"')
 
@@ -807,6 +836,7 @@ def way_to_level(sheet: Sheet) -> list[str]:
     if not filled or time is None:
         return []
     pairs = [(time, "time"), *((sheet.find(quantity), quantity) for quantity in _MAPPED), (filled[0], "rss_db")]
+    sheet.used.update(filled)
     options = " ".join(f"--map {sheet.names[i]!r}={quantity}" for i, quantity in pairs if i is not None)
     relative = sheet.meanings[filled[0]] or "dbfs" in sheet.names[filled[0]].lower()
     unit = "dBm" if (sheet.unit_read(filled[0]) or "dBm") == "dBm" and not relative else "dB"

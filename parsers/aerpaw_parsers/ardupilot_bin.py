@@ -30,7 +30,7 @@ _TYPES = {
     "L": ("i", 1e-7), "M": ("B", 1.0), "q": ("q", 1.0), "Q": ("Q", 1.0), "g": ("e", 1.0),
     "n": ("4s", 0.0), "N": ("16s", 0.0), "Z": ("64s", 0.0), "a": ("64s", 0.0),
 }  # fmt: skip
-_FIX_3D = 3
+_FIX_2D, _FIX_3D = 2, 3
 _WANTED = ("POS", "GPS", "ATT", "XKF1", "NKF1", "EKF1", "BAT", "RAD")
 
 
@@ -149,6 +149,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     by_name, count, damaged = _text_messages(data) if _TEXT.match(data) else _messages(data)
     series = {name: _series(by_name, name) for name in _WANTED}
     gps = series["GPS"]
+    if "Status" in gps.columns:
+        for name in {"Lat", "Lng"} & set(gps.columns):  # 0 and 1 are no fix; at 0, 0 no aircraft flies
+            gps.columns[name] = np.where(gps.columns["Status"] < _FIX_2D, 0.0, gps.columns[name])
     place = series["POS"] if len(series["POS"].time_s) else gps
     if "Lat" not in place.columns or "Lng" not in place.columns:
         place = _autopilot.Series(gps.time_s[:0], gps.number[:0], {"Lat": gps.time_s[:0], "Lng": gps.time_s[:0]})

@@ -235,7 +235,7 @@ def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
         streams.append(_pose.from_sheet(of_device, table, name=name, source="table of a phone"))
         for network, part, cells in _identity.parts(of_device, table, "network"):
             suffix = "_".join(word for word in (network, device) if word)
-            streams += [_renamed(stream, suffix) for stream in _radio(part, cells)]
+            streams += [_renamed(stream, suffix) for stream in of_radio(part, cells)]
     levels = [stream for stream in streams if stream is not None and stream.kind in ("rss", "rank")]
     if all(stream.attributes.get("quantity") == "SNR" for stream in levels):
         rows.warnings += _sheet.way_to_level(sheet)
@@ -243,8 +243,12 @@ def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
     return rows.result(streams)
 
 
-def _radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
+def of_radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
+    """Return the levels, ranks and KPIs of a table."""
     cells, others, ranks = _places(sheet)
+    of_row = (sheet.find(name) for name in ("technology", "serving", "neighbouring"))
+    sheet.used |= {*others, *ranks, *(i for i in of_row if i is not None)}
+    sheet.used |= {i for cell in cells for i in (*cell.columns.values(), *cell.ports)}
     more, about = _identity.further(sheet, _identities(sheet, cells))
     owned: dict[tuple[str, str], list[_Cell]] = {}
     for cell in cells:

@@ -1,13 +1,15 @@
 """GPX tracks of phones, loggers and Nemo: ``<trkpt lat lon><ele><time>``.
 
-Read by pattern and not as XML: a parser that resolves entities has no business with a file from elsewhere. Nemo
-Handy writes times of the day without a date (``T14:13:17.853Z``), local in spite of the Z: their date is that of
-the file name. Elevations are brought to heights above the first point.
+The file is read by patterns and not as XML: a parser that resolves entities is a risk with a file from elsewhere.
+Elements and attributes inside a point, such as those of its extensions, are columns of a table: levels among them are
+read. Nemo Handy writes times of the day without a date (``T14:13:17.853Z``), local in spite of the Z: their date is
+that of the file name. Elevations are brought to heights above the first point.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,15 +20,17 @@ from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
-from aerpaw_cmp.readers import dictionary
 
-from . import _json, _pose, _stamps
+from . import _pose, _sheet, drive_test, pose_csv
 
-_N = rb"(" + _text.NUMBER + rb")"
 _TAG = rb"(?:\w{1,20}:)?(?:trkpt|wpt|rtept)"  # also of a named space, as programs that use an XML library write it
 _POINT = re.compile(rb"<" + _TAG + rb"\b([^<>]{0,200})>(.{0,2000}?)(?:</" + _TAG + rb">)", re.DOTALL)
-_ATTRIBUTE = re.compile(rb"\b(lat|lon)\s?=\s?[\"']\s?" + _N + rb"\s?[\"']")
-_INSIDE = re.compile(rb"<(?:\w{1,20}:)?(ele|time)>\s{0,40}([^<>]{1,60}?)\s{0,40}</")
+_INSIDE = re.compile(rb"<(?:[\w-]{1,20}:)?([\w-]{1,40})(?:\s[^<>]{0,80})?>\s{0,40}([^<>]{1,80}?)\s{0,40}</")
+# In the tag of a point or of an extension, or in the words of a remark: 'RSRP=-80, PCI: 11'.
+_PAIR = re.compile(rb"\b([A-Za-z][\w-]{0,40})\s?=\s?[\"']\s?([^\"'<>]{0,80}?)\s?[\"']")
+_REMARK = re.compile(rb"\b([A-Za-z][A-Za-z_]{1,40})\s?[=:]\s?(-?\d[\d.]{0,40})(?![\d:])")
+_REMARKS = ("cmt", "desc", "name")
+_NAMES = {"lat": "latitude", "lon": "longitude", "time": "time utc"}
 _START = re.compile(rb"<" + _TAG + rb"\b")
 
 
@@ -35,47 +39,53 @@ def sniff(head: bytes) -> bool:
     return re.search(rb"<(?:\w{1,20}:)?gpx\b", head[:4096]) is not None and _START.search(head) is not None
 
 
-def _points(data: bytes) -> list[tuple[int, dict[bytes, bytes]]]:
-    """Place and values of each whole point."""
+def _points(data: bytes) -> list[tuple[int, dict[str, str]]]:
+    """Return the place in the file and the cells of each complete point."""
     points, tracked = [], b"<trkpt" in data
     for point in _POINT.finditer(data):
-        # torn, where the next begins inside; beside a track, places that somebody marked
+        # cut off, if the next point begins inside; next to a track, single points are marked places
         if _START.search(point[2]) or (tracked and b"trkpt" not in point[0]):
             continue
-        values = dict(_ATTRIBUTE.findall(point[1]))
-        values |= dict(_INSIDE.findall(point[2]))
-        points.append((point.start(), values))
+        found = [*_PAIR.findall(point[1]), *_INSIDE.findall(point[2])]
+        found += [pair for tag in re.findall(rb"<[^/][^<>]*=[^<>]*>", point[2]) for pair in _PAIR.findall(tag)]
+        cells = {name.decode(): text.decode("utf-8", "replace") for name, text in reversed(found)}
+        for remark in (cells.pop(name, "") for name in _REMARKS):
+            cells |= {name.decode(): text.decode() for name, text in _REMARK.findall(remark.encode())}
+        points.append((point.start(), {_NAMES.get(name, name): text for name, text in cells.items()}))
     return points
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Return the telemetry ``track``; UsageError if the times have no zone and none is given.
+    """Return the telemetry ``track`` and the levels of its extensions.
 
     Raises
     ------
     InputError
         If no point has a time.
+    UsageError
+        If the times have no zone and none is given.
     """
     lines, known = _text.split(data), _points(data)
-    points = [(at, values) for at, values in known if {b"lat", b"lon", b"time"} <= set(values)]
+    points = [(at, cells) for at, cells in known if {*_NAMES.values()} <= set(cells)]
     if known and not points:
         raise InputError("a GPX track without times", expected="<time> in its points", cause="a route or a drawn track")
     row = lines.number_at(at for at, _ in points)
-    placed = [values for _, values in points]
-    texts = [values[b"time"].decode("ascii", "replace") for values in placed]
-    clock, time, warnings = _stamps.read(texts, options, zone="UTC")  # as GPX defines it
-    names = (b"lat", b"lon", b"ele")
-    column = {name.decode(): _text.cells([values.get(name, b"") for values in placed]) for name in names}
-    rows = _rows.built(
-        lines, row, {"time": time, **column}, options, reader="gpx", reason=lambda _line: None, clock=clock,
-        extra=_torn(lines, data, row), closed=True,
-    )  # fmt: skip
-    rows.warnings += warnings
+    readings = [(int(i), cells) for i, (_, cells) in zip(row, points, strict=True)]
+    sheet = _sheet.of_readings(lines, readings, _torn(lines, data, row))
+    rows = _sheet.rows(sheet, options, reader="gpx") if readings else None
+    if rows is None:
+        return _sheet.nothing(data, "gpx", "a point without position or time (torn?)")
     begun = [track.start() for track in re.finditer(rb"<(?:\w{1,20}:)?trk\b", data)]
     track = np.searchsorted(begun, np.array([at for at, _ in points], dtype=np.int64))[rows.at]
-    if not _overlap(rows, track):
-        return rows.result([_stream(rows, "track")])
-    return rows.result([_stream(rows.part(track == i), f"track_{i}") for i in np.unique(track).tolist()])
+    parts = {"": (rows, sheet)}
+    if _overlap(rows, track):
+        parts = {f"_{i}": (rows.part(track == i), sheet.part(track == i)) for i in np.unique(track).tolist()}
+    streams: list[Stream | None] = []
+    for suffix, (part, cells) in parts.items():
+        streams.append(_track(part, cells, f"track{suffix}"))
+        streams += drive_test.of_radio(part, cells) if pose_csv.has_radio(sheet.names) else []
+    rows.warnings += [*_sheet.way_to_level(sheet), *sheet.unread()]
+    return rows.result(streams)
 
 
 def _overlap(rows: _rows.Rows, track: IntArray) -> bool:
@@ -84,15 +94,10 @@ def _overlap(rows: _rows.Rows, track: IntArray) -> bool:
     return any(start < end for (_, end), (start, _) in pairwise(spans))
 
 
-def _stream(rows: _rows.Rows, name: str) -> Stream | None:
-    names = ("lat", "lon", "ele")
-    texts = {key: rows.columns[key].tolist() for key in names}
-    values = dictionary.record_columns({key: np.array([_json.number(cell) for cell in texts[key]]) for key in names})
-    lost = _pose.clean(rows, values)
+def _track(rows: _rows.Rows, sheet: _sheet.Sheet, name: str) -> Stream | None:
+    stream = _pose.from_sheet(rows, sheet, name=name, source="GPX")
     # GPX has one height, ele, which receivers give above sea level
-    rows.height_from = "program"
-    values["altitude_m"], about = _pose.above_takeoff(rows, values, "sea level", lost)
-    return rows.stream("telemetry", name, values, where=~lost, source="GPX", about=about)
+    return stream and replace(stream, attributes={**stream.attributes, "height_from": "program"})
 
 
 def _torn(lines: _text.Lines, data: bytes, row: object) -> list[RejectedLine]:
@@ -104,7 +109,7 @@ def _torn(lines: _text.Lines, data: bytes, row: object) -> list[RejectedLine]:
 
 
 READER = Reader(
-    name="gpx", title="GPX track (Nemo, phones, loggers)", kinds=("telemetry",),
+    name="gpx", title="GPX track (Nemo, phones, loggers)", kinds=("telemetry", "rss", "rank", "kpi"),
     sample='<trkpt lat="35.7280002" lon="-78.6960001"><ele>76.0</ele><time>2025-01-01T12:00:07Z</time></trkpt>',
     sniff=sniff, read=read,
 )  # fmt: skip

@@ -98,7 +98,7 @@ def _best(topics: list[tuple[str, int]], tables: Mapping[tuple[str, int], AnyArr
     return max(sorted(topics), key=fixes) if topics else None
 
 
-_RECEIVERS, _FIX_3D = ("vehicle_gps_position", "sensor_gps"), 3
+_RECEIVERS, _FIX_2D, _FIX_3D = ("vehicle_gps_position", "sensor_gps"), 2, 3
 
 
 def _table(bodies: list[bytes], text: str) -> AnyArray:
@@ -159,6 +159,10 @@ def _position(table: AnyArray) -> dict[str, FloatArray] | None:
     columns = _columns(table)
     if not len(table) or not {"latitude_deg", "longitude_deg"} <= set(columns):
         return None
+    if "fix" in columns:  # a receiver's own position; at 0, 0 no aircraft flies
+        columns |= {
+            name: np.where(columns["fix"] < _FIX_2D, 0.0, columns[name]) for name in ("latitude_deg", "longitude_deg")
+        }
     unknown = np.full(len(table), np.nan)
     return {name: columns.get(name, unknown) for name in ("latitude_deg", "longitude_deg", "altitude_m")}
 

@@ -33,6 +33,8 @@ from . import _json, _pose, _stamps
 _BURST_S = 0.02
 # Part of full scale at which a value is clipped, and the share of such values that is reported.
 _FULL, _CLIPPED_SHARE = 0.999, 1e-3
+# A DC part this far above the rest is the level that is read [dB]; below it may be the signal's own carrier.
+_DC_DB = 10.0
 _SAMPLES = {
     "cf64": ("f8", 1.0), "cf32": ("f4", 1.0), "ci32": ("i4", 2.0**31), "ci16": ("i2", 2.0**15), "ci8": ("i1", 2.0**7),
     "cu8": ("u1", 2.0**7), "cu16": ("u2", 2.0**15), "cu32": ("u4", 2.0**31), "ru8": ("u1", 2.0**7),
@@ -230,7 +232,7 @@ def _powers(
         # floats beyond one are of another scale
         if share > _CLIPPED_SHARE and most <= full_scale * 1.001:
             warnings.append(f"USRP{i + 1}: {share:.1%} of the values are at full scale: clipped, levels are too low")
-        if dc_db > 0:
+        if dc_db > _DC_DB:
             reason = "the receiver's own offset, or a carrier at the centre frequency"
             warnings.append(f"USRP{i + 1}: its levels are those of a DC part {dc_db:.0f} dB above the rest ({reason})")
     rows = _rows_of(list(stamps), options)

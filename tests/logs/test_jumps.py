@@ -32,7 +32,7 @@ def test_rows_that_cannot_be_reached_in_time_are_flagged_alone(column: str, rows
     frame = straight(step_s=step_s)
     far = 1500.0 if column == "altitude_m" else 1500.0 / DEGREE_M
     frame.loc[rows, column] += far
-    jumps, sentence = jumps_of(stream(frame))
+    jumps, sentence = jumps_of(frame)
     assert np.flatnonzero(jumps).tolist() == rows
     assert f"line {rows[0] + 1}" in sentence
 
@@ -51,20 +51,20 @@ def test_a_flagged_position_is_missing_and_the_row_stays() -> None:
 
 @pytest.mark.parametrize("frame", [straight(), straight(speed_mps=40.0), straight(step_s=14.0, speed_mps=8.0)])
 def test_a_flight_is_not_flagged(frame: pd.DataFrame) -> None:
-    jumps, sentence = jumps_of(stream(frame))
+    jumps, sentence = jumps_of(frame)
     assert (int(jumps.sum()), sentence) == (0, "")
 
 
 def test_positions_held_without_a_fix_and_caught_up_are_no_jump() -> None:
     frame = straight()
     frame.loc[80:110, "latitude_deg"] = frame["latitude_deg"][80]  # then 150 m in one second
-    assert not jumps_of(stream(frame))[0].any()
+    assert not jumps_of(frame)[0].any()
 
 
 def test_rows_written_in_bursts_are_no_jump() -> None:
     frame = straight(count=400, step_s=0.1)
     frame["time"] = frame["time"].dt.floor("1s") + pd.to_timedelta(np.arange(400) % 10, unit="us")
-    assert not jumps_of(stream(frame))[0].any()
+    assert not jumps_of(frame)[0].any()
 
 
 @pytest.mark.parametrize("times", [1000.0, 60.0])
@@ -72,7 +72,7 @@ def test_a_track_that_is_too_fast_throughout_has_another_unit_of_time(times: flo
     frame = straight(step_s=1.0)
     start = frame["time"][0]
     frame["time"] = start + (frame["time"] - start) / times
-    jumps, sentence = jumps_of(stream(frame))
+    jumps, sentence = jumps_of(frame)
     assert not jumps.any()
     assert "times in another unit" in sentence
 
@@ -80,7 +80,7 @@ def test_a_track_that_is_too_fast_throughout_has_another_unit_of_time(times: flo
 def test_two_vehicles_in_one_table_are_named() -> None:
     frame = straight()
     frame.loc[1::2, "longitude_deg"] += 2000.0 / DEGREE_M
-    jumps, sentence = jumps_of(stream(frame))
+    jumps, sentence = jumps_of(frame)
     assert not jumps.any()
     assert "two vehicles" in sentence
 
@@ -103,7 +103,7 @@ def test_a_log_that_rests_where_it_cannot_have_flown_is_flagged_there(end: str) 
     """An autopilot's filter falls back to its origin at disarm: 80 m in a second, slower than the fastest aircraft."""
     frame, rows = straight(speed_mps=2.0), slice(160, 199) if end == "end" else slice(0, 39)
     frame.loc[rows, "latitude_deg"] = frame["latitude_deg"][159 if end == "end" else 40] - 80.0 / DEGREE_M
-    jumps, sentence = jumps_of(stream(frame))
+    jumps, sentence = jumps_of(frame)
     assert np.flatnonzero(jumps).tolist() == list(range(200))[rows.start : rows.stop + 1]
     assert "flagged position_jump" in sentence
 
@@ -113,8 +113,8 @@ def test_a_receiver_that_reports_more_rarely_than_the_logger_writes_does_not_jum
     frame = straight(count=600, step_s=step_s, speed_mps=20.0)
     frame["latitude_deg"] = frame["latitude_deg"][np.arange(600) // held * held].to_numpy()
     frame["velocity_north_mps"], frame["velocity_east_mps"] = 20.0, 0.0
-    assert not jumps_of(stream(frame))[0].any()
-    assert not stale_of(stream(frame))[0].any()
+    assert not jumps_of(frame)[0].any()
+    assert not stale_of(frame, "")[0].any()
 
 
 @pytest.mark.parametrize(("speed_mps", "flagged"), [(5.0, 99), (0.0, 0), (0.1, 0)])

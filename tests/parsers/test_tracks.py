@@ -140,6 +140,8 @@ def test_clipping_and_dc_of_a_recording_are_reported(tmp_path: Path) -> None:
     assert not recording(tmp_path, (noise * 500).astype("<f4"), "cf32_le")  # floats of another scale
     offset = (0.001 * noise + [0.05, 0.0]).astype("<f4")  # 0.05^2 over 2 x 0.001^2: 31 dB
     assert any("a DC part 31 dB above the rest" in text for text in recording(tmp_path, offset, "cf32_le"))
+    carrier = (noise + np.array([1.8, 0.0])).astype("<f4")  # 1.8^2 over 2: 2 dB, which the signal itself may have
+    assert not recording(tmp_path, carrier, "cf32_le")
 
 
 def test_a_position_per_capture_is_a_track_and_one_for_all_is_not(tmp_path: Path) -> None:
@@ -205,7 +207,7 @@ def test_positions_on_a_local_grid_are_refused(tmp_path: Path) -> None:
 def test_a_fix_type_of_one_has_no_position(tmp_path: Path) -> None:
     """MAVLink's fix type is 1 without a fix; a quality of NMEA is 1 with one."""
     rows = [f"2025-06-11T14:30:{i:02d}Z,{1 if i < 3 else 3},35.7{i:04d},-78.6960,{30 + i}" for i in range(10)]
-    for name, positions in (("fix_type", 7), ("fix", 10)):
+    for name, positions in (("fix_type", 7), ("GPS quality", 10)):
         (tmp_path / "log.csv").write_text("\n".join([f"utc,{name},lat,lon,alt_agl_m", *rows]) + "\n")
         (frame,) = read(tmp_path / "log.csv").values()
         assert frame["latitude_deg"].notna().sum() == positions

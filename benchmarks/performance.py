@@ -23,17 +23,16 @@ FIGURE = "performance_scaling.png"
 AXES = {
     "poses": ("Poses", "replay of 5 towers, 4 x 4 elements, 12 buildings, depth 2"),
     "towers": ("Towers", "replay of 10 000 poses, 4 x 4 elements, 12 buildings, depth 2"),
-    "faces": ("Faces of buildings", "paths and fields of 100 poses of one tower, depth 2; the field grows with them"),
-    "samples": ("Samples of one channel", "comparison with all its intervals, without replay"),
-    "report": ("Samples of a flight", "whole report, two channels, without audit"),
-    "flights": ("Flights", "campaign, one tower, two channels, two settings, 130 s each, one worker"),
-    "workers": ("Workers", "the same campaign of the most flights"),
+    "faces": ("Faces of buildings", "paths and fields of 100 poses of one tower, depth 2, in an area that grows with the faces"),
+    "samples": ("Samples of one channel", "comparison with all intervals, without replay"),
+    "report": ("Samples of a flight", "complete report, two channels, without audit"),
+    "flights": ("Flights", "campaign: one tower, two channels, two settings, 130 s each, one worker"),
+    "workers": ("Workers", "the campaign with most flights"),
 }
 
 SEARCH_NOTE = (
-    "Path search is that of the bench scene (61 faces, 1000 places, depth 2). Its ratios fell with the run of "
-    "2026-11-23: small searches run in NumPy (the compiled search of mirror images is gone), and PathSolver is called "
-    "with smaller tables."
+    "The path search is that of the bench scene (61 faces, 1000 positions, depth 2). From 2026-11-23 on, small searches "
+    "run in NumPy instead of compiled code, and PathSolver is called with smaller tables, so the ratios are lower."
 )
 SEASON = {"flights": 200, "towers": 5, "settings": 20}
 CITY = {"faces": 50_000}
@@ -121,11 +120,11 @@ def season(scaling: dict[str, Any]) -> list[str]:
     tasks = SEASON["flights"] * SEASON["settings"]
     hours = task_s * SEASON["towers"] * tasks / 3600.0
     first, later, *_ = (*measured(scaling, "workers"), None, None)
-    shared = f" Two workers took {later['wall_s'] / first['wall_s']:.2f} of one's wall time." if later else ""
+    shared = f" Two workers took {later['wall_s'] / first['wall_s']:.2f} times the wall time of one." if later else ""
     return [
-        f"- **A season**: {SEASON['flights']} flights x {SEASON['settings']} settings = {number(tasks)} tasks. A "
-        f"task of one tower (two channels, 130 s, 260 samples each) costs {task_s:.2f} s of processor; with "
-        f"{SEASON['towers']} towers, each as dear, that is {hours:.1f} h of one core. It assumes that tasks cost alike "
+        f"- **A campaign**: {SEASON['flights']} flights x {SEASON['settings']} settings = {number(tasks)} tasks. A "
+        f"task of one tower (two channels, 130 s, 260 samples each) costs {task_s:.2f} s of processor time. "
+        f"With {SEASON['towers']} towers at the same cost, this is {hours:.1f} h of one core, if all tasks cost the same "
         f"(the campaign grew with power {power(scaling['flights']['power_cpu'])} in flights).{shared}"
     ]
 
@@ -138,8 +137,8 @@ def city(scaling: dict[str, Any]) -> list[str]:
     seconds, beyond = estimate
     return [
         f"- **A city**: {number(CITY['faces'])} faces (10 000 buildings), 100 poses of one tower, depth 2: "
-        f"{number(seconds)} s of processor, if the power {power(scaling['faces']['power_cpu'])} holds "
-        f"{beyond:.0f} times beyond the largest scene that was measured. That is far: read it as an order of magnitude."
+        f"{number(seconds)} s of processor time, if the power {power(scaling['faces']['power_cpu'])} is valid "
+        f"{beyond:.0f} times beyond the largest scene that was measured. This is only an order of magnitude."
     ]
 
 
@@ -150,8 +149,8 @@ def long_flight(scaling: dict[str, Any]) -> list[str]:
         return []
     seconds, beyond = estimate
     return [
-        f"- **A flight of ten hours** (1 000 000 samples of two channels): {number(seconds)} s of processor, "
-        f"{beyond:.0f} times beyond what was measured here; "
+        f"- **A flight of ten hours** (1 000 000 samples of two channels): {number(seconds)} s of processor time, "
+        f"{beyond:.0f} times beyond the largest measured flight. "
         "`python benchmarks/scaling.py --axes report --large --seconds 3600` measures it."
     ]
 
@@ -169,7 +168,7 @@ def peers(history: list[dict[str, Any]]) -> list[str]:
     out = [
         "## Against peers",
         "",
-        "Both sides in one process, by processor time; above 1 we are faster.",
+        "Both programs run in one process. The table has the ratio of processor times: above 1, this tool is faster.",
         SEARCH_NOTE,
         "",
         head,
@@ -189,7 +188,7 @@ def peers(history: list[dict[str, Any]]) -> list[str]:
 
 
 def last_result(history: list[dict[str, Any]], name: str) -> tuple[str, dict[str, Any]]:
-    """The last result of a benchmark, and when and at what load it was measured; empty where there is none."""
+    """The last result of a benchmark, and when and at what load it was measured; empty if there is no result."""
     for run in reversed(history):
         entry = run["benchmarks"].get(name, {})
         if result := entry.get("result"):
@@ -206,8 +205,8 @@ def town(history: list[dict[str, Any]]) -> list[str]:
         return []
     out = [
         f"Munich of Sionna RT ({number(rows[0]['faces'])} faces, {rows[0]['receivers']} receivers, one tower; {when}); "
-        "PathSolver's time holds what its kernel cache lacks:", "",
-        "| search | depth | processor s | times ours | paths that it lacks |", "| --- | ---: | ---: | ---: | ---: |",
+        "PathSolver's time includes kernels that are missing in its cache:", "",
+        "| search | depth | processor s | times ours | missing paths |", "| --- | ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
     for row in rows:
         cpu = row["search_s"][1]
@@ -232,7 +231,7 @@ def country(history: list[dict[str, Any]]) -> list[str]:
         "## A map of a country", "",
         f"Villages on 32 x 32 km: 3 towers, 3 000 buildings, one height of 3 m, one reflection, 4 x 4 elements, "
         f"{result['workers']} workers, tiles of {result['cells']} x {result['cells']} positions ({when}). Seconds of "
-        "the wall hold imports, store and page. `python benchmarks/country.py --receivers 1e7` measures it.", "",
+        "the wall include imports, store and page. `python benchmarks/country.py --receivers 1e7` measures it.", "",
         "| receivers | tiles | wall s | processor s | receivers a second | largest worker MiB | first process MiB "
         "| store MiB | files |",
         "| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
@@ -241,15 +240,15 @@ def country(history: list[dict[str, Any]]) -> list[str]:
     ]  # fmt: skip
     for row in result["extrapolated"]:
         out.append(
-            f"- **{number(row['receivers'])} receivers**, by the slopes between the last two rows: "
+            f"- **{number(row['receivers'])} receivers**, from the slopes between the last two rows: "
             f"{row['wall_s'] / 3600:.1f} h, {row['store_mib'] / 1024:.0f} GiB in {number(row['files'])} files, first "
-            f"process {number(row['first_mib'])} MiB and {number(row['first_cpu_s'])} s of processor."
+            f"process {number(row['first_mib'])} MiB and {number(row['first_cpu_s'])} s of processor time."
         )
     return [
         *out,
-        "- **What breaks first**: the number of cells. A grid has at most 10 000 a side, so 1e8 receivers at one "
-        "height are the largest map, and 1e9 are refused: ten maps. Then the files of the store, then the one process "
-        "that writes it: workers beyond the ratio of processor seconds to its own would wait for it.", "",
+        "- **The first limit** is the number of cells. A grid has at most 10 000 per side, so the largest map has 1e8 "
+        "receivers at one height, and 1e9 receivers are ten maps. The next limits are the number of files in the "
+        "store, and the one process that writes it, for which many workers would wait.", "",
     ]  # fmt: skip
 
 
@@ -262,8 +261,9 @@ def kriging(history: list[dict[str, Any]]) -> list[str]:
     counts = [int(key.split("_")[1]) for key in row if key.startswith("pykrige_") and key[8:-2].isdigit()]
     sizes = {f"{number(n)}": str(n) for n in counts} | {f"{number(counts[-1])}, first call of a process": "first"}
     return [
-        f"Kriging of one field, 20 neighbours ({when}), processor seconds, least of five in turn. Totals hold what "
-        "each side sets up, the first call of a process its imports too; the last line holds neither:",
+        f"Kriging of one field, 20 neighbours ({when}), processor seconds, the least of five runs in alternation. "
+        "Totals include the set-up of each program, and the first call of a process also its imports. The last row "
+        "includes neither:",
         "",
         "| targets | ours | PyKrige's C back end | times faster |",
         "| ---: | ---: | ---: | ---: |",
@@ -271,7 +271,7 @@ def kriging(history: list[dict[str, Any]]) -> list[str]:
             f"| {name} | {row[f'ours_{n}_s']:.3f} | {row[f'pykrige_{n}_s']:.3f} | {row[f'ratio_total_{n}']:.2f} |"
             for name, n in sizes.items()
         ),
-        f"| one more [us] | {row['ours_marginal_us']:.1f} | {row['pykrige_marginal_us']:.1f} "
+        f"| one more target [us] | {row['ours_marginal_us']:.1f} | {row['pykrige_marginal_us']:.1f} "
         f"| {row['ratio_marginal']:.2f} |",
         "", f"27 fields at {number(counts[0])} targets: {row[f'ratio_total_{counts[0]}_27_fields']:.0f} "
         "times faster than 27 runs of PyKrige.", "",
@@ -293,13 +293,13 @@ def reports(run: dict[str, Any]) -> list[str]:
     if not result or "later" not in result:
         return []
     rows = [("with `--audit none`, " + name, result["later"][key]) for key, name in WHEN.items()]
-    rows = [("as it comes, " + name, result["now"][key]) for key, name in WHEN.items() if "now" in result] + rows
+    rows = [("with the audit, " + name, result["now"][key]) for key, name in WHEN.items() if "now" in result] + rows
     short = result["two_channels"]
     return [
         "## A report", "",
-        f"Two channels ({short['flight']}), as processes, by processor time, against `import sionna.rt, "
-        f"matplotlib.pyplot, pandas` and against those without Sionna (medians{imports_of(short)}). The first report "
-        "finds no kernel, path, font list or tried LLVM on the disk; only bytecode is compiled:", "",
+        f"Processor time of the process for two channels ({short['flight']}). It is compared with "
+        f"`import sionna.rt, matplotlib.pyplot, pandas`, and with these imports without Sionna (medians{imports_of(short)}). "
+        "For the first report all caches on the disk are empty (kernels, paths, fonts, LLVM test):", "",
         "| | seconds | x imports | x imports without Sionna | peak MiB |", "| --- | ---: | ---: | ---: | ---: |",
         *(
             f"| {name} | {row['cpu_s']:.1f} | {row['ratio']:.2f} | {row['ratio_light']:.2f} | {row['peak_mib']:.0f} |"
@@ -315,9 +315,9 @@ def waits(run: dict[str, Any]) -> list[str]:
     if not result:
         return []
     return [
-        "## What is waited for", "",
-        "Whole processes, the next run, processor seconds:", "",
-        "| command | before | asked for | reached | peak MiB |", "| --- | ---: | ---: | ---: | ---: |",
+        "## Commands", "",
+        "Complete processes in processor seconds, after a first run. \"Before\" is an earlier version:", "",
+        "| command | before | goal | now | peak MiB |", "| --- | ---: | ---: | ---: | ---: |",
         *(
             f"| {row['command']} | {row['before_s']:g} | {row['asked_s']:g} | {row['cpu_s']:.1f} | "
             f"{row['peak_mib']:.0f} |"
@@ -333,13 +333,16 @@ def page(history: list[dict[str, Any]]) -> str:
     unmeasured = [f"{name}: {entry['failed']}" for name, entry in run["benchmarks"].items() if "failed" in entry]
     lines = [
         "# Performance", "",
-        "Made by `make bench-all` (`python benchmarks/all.py` measures and appends to `benchmarks/history.jsonl`,",
-        "`python benchmarks/performance.py` makes this page from it). Numbers are of one machine and one run.",
-        "Processor seconds count all threads and processes; other work on the machine inflates them, so the load is",
-        "stated.", "",
+        "How long does a command take, how much memory does it need, and how does this grow with the size? Read this",
+        "page before a large run. To measure your own machine:", "",
+        "```", "aerpaw-cmp bench      # speed against error of the replay, about a minute", "```", "",
+        "`make bench-all` makes this page: `python benchmarks/all.py` measures and appends to",
+        "`benchmarks/history.jsonl`, and `python benchmarks/performance.py` writes the page from it. The numbers are of",
+        "one machine and one run. Processor seconds count all threads and processes. Other work on the machine increases",
+        "them, so the load is given.", "",
         f"Last run: {run['date']}, version {run['version']}, {machine['processor']}, {machine['cpus']} processors, "
         f"{machine['memory_gib']} GiB, {machine['system']}, Python {machine['python']}; load {run['load_before']} "
-        f"before, {run.get('load_after', '-')} after (the run alone makes 1 to 2), {run['seconds'] / 60:.1f} min in "
+        f"before, {run.get('load_after', '-')} after (of which the run causes 1 to 2), {run['seconds'] / 60:.1f} min in "
         f"all.{' Kernels of replays were compiled before the first row.' * ('load_after' in run)}", "",
         *([f"Not measured: {'; '.join(unmeasured)}.", ""] if unmeasured else []),
         *waits(run),

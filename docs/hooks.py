@@ -1,4 +1,4 @@
-"""What ``make docs`` does besides turning pages into HTML.
+"""Hooks of ``make docs``, which turns pages into HTML.
 
 - Runs every script of ``docs/gallery``: its figure goes into the gallery, with the script, and in place of the comment
   ``<!-- gallery: NAME -->`` of any page. A script that fails ends the build.
@@ -49,8 +49,9 @@ def gallery() -> str:
     """The page of all figures with their code."""
     parts = [
         "# Gallery",
-        "Each figure is drawn by the code below it when this documentation is built (`make docs`). "
-        "Every script stands alone: copy it, change it, run it.",
+        "What do two-ray fading, Fresnel coefficients, an antenna pattern or Kriging look like with this package? `make docs` "
+        "draws each figure with the code below it. Copy a script and change it: its "
+        "variable `figure` is a Matplotlib figure.",
     ]
     for script in SCRIPTS:
         title, text, code = words_of(script)

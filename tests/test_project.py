@@ -143,26 +143,6 @@ def test_setup_says_what_to_do_without_python(tmp_path: Path) -> None:
     assert not (tmp_path / "venv").exists()
 
 
-def test_the_page_lists_every_knob_with_its_default() -> None:
-    from aerpaw_cmp.common.yamlfile import parse_yaml
-    from aerpaw_cmp.flight import settings as config
-
-    text = (ROOT / "docs" / "flight_yaml.md").read_text()
-    first, block = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)[:2]
-    usual = parse_yaml("flight: f\nlogs: [{path: a}]\n" + first[first.index("\nrt:") :], config.FlightFile)
-    assert {"rank", "report"} <= usual.model_fields_set  # no unknown key in them: models are strict
-    for shown in (usual.rt, usual.rss):
-        assert shown == type(shown)()
-        assert shown.model_fields_set >= set(type(shown).model_fields) - {"advanced", "foliage_model"}
-    log = config.LogSettings(path="a")
-    assert f"floor_db: {log.floor_db:g}" in first
-    assert f"antenna_height_m: {config.GroundNode(track=log).antenna_height_m:g}}}" in first
-    listed = parse_yaml("flight: f\nlogs: [{path: a}]\n" + block, config.FlightFile)
-    for knobs in (listed.rt.advanced, listed.rss.advanced):
-        assert knobs == type(knobs)()
-        assert knobs.model_fields_set == set(type(knobs).model_fields)
-
-
 def test_no_setting_is_without_effect() -> None:
     """Every key that a flight file may hold is read somewhere: a key that does nothing would be a promise not kept."""
     from aerpaw_cmp.flight import settings as config

@@ -577,7 +577,7 @@ def _scheduler(address: str, paths: Sequence[Path], progress: Progress) -> Itera
     if not address.startswith("tls://"):
         raise UsageError(
             f"--scheduler {address!r} is not protected: whoever reaches it runs programs as you, here and there",
-            expected="tls://HOST:PORT, with certificates in Dask's configuration (docs/howto/cluster.md)",
+            expected="tls://HOST:PORT, with certificates in Dask's configuration (docs/campaign.md)",
         )
     try:
         client = Client(address, timeout=CONNECT_S, set_as_default=False)

@@ -1,9 +1,9 @@
 """Why H is computed in float64
 
-The phase of a path is its length in wavelengths, less the whole ones. In float32 that number has an error of some
-thousandths of a turn at 1 km and 3.4 GHz, and small singular values drown in it: the second singular value of a 4 x 4
-line of sight is either rounded away or invented, and the rank at K = 1000 jumps where nothing in the scene does. Here
-lengths are rounded once to float32 and everything else is left as it is.
+The phase of a path is the fractional part of its length in wavelengths. In float32 this number has an error of some
+thousandths of a turn at 1 km and 3.4 GHz, which hides small singular values. The second singular value of a 4 x 4 line
+of sight is then either lost or wrong, and the rank at K = 1000 jumps although nothing in the scene changes. In this
+figure only the lengths are rounded to float32, once.
 """
 
 import matplotlib.pyplot as plt

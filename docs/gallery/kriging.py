@@ -1,7 +1,7 @@
 """Kriging of a field from a few samples
 
-Level over a square of the site at 60 m, once computed everywhere and once estimated from 60 random places by ordinary
-Kriging with the fitted correlation. The right picture is the standard deviation that Kriging states.
+Level over a square of the site at 60 m: computed everywhere, and estimated from 60 random positions by ordinary Kriging
+with the fitted correlation. The right picture is the standard deviation of the estimate.
 """
 
 import matplotlib.pyplot as plt

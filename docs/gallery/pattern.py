@@ -1,6 +1,6 @@
 """Antenna patterns
 
-Gain of the packaged patterns against elevation: what `link.*.pattern` may name. A measured one is read from a file.
+Gain of the packaged patterns against elevation: those of `antenna: {model: ...}`. Measured patterns are read from files.
 """
 
 import matplotlib.pyplot as plt

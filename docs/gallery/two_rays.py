@@ -1,8 +1,8 @@
 """Ground reflection against distance
 
-Level of a UAV at 30 m that flies away from a tower of 10 m over flat ground at 3.4 GHz: the direct ray alone, and with
-the ray off the ground. The closed form (`two_ray_dbm`) and the replay (image method, channel matrices) are two
-implementations; they lie on one another.
+Level of a UAV at 30 m that flies away from a tower of 10 m over flat ground at 3.4 GHz: direct ray alone, and with the
+ground reflection. The closed form (`two_ray_dbm`) and the replay (image method, channel matrices) are separate
+implementations with the same result.
 """
 
 import matplotlib.pyplot as plt

@@ -143,7 +143,7 @@ def test_the_documented_site_is_valid() -> None:
 
 
 def test_the_documented_differences_are_the_computed_ones() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "lake_wheeler.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "site.md").read_text(encoding="utf-8")
     notes = [note for note in load_site("lake_wheeler").notes if " lies " in note]
     assert len(notes) == 5
     for note in notes:

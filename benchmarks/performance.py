@@ -23,7 +23,10 @@ FIGURE = "performance_scaling.png"
 AXES = {
     "poses": ("Poses", "replay of 5 towers, 4 x 4 elements, 12 buildings, depth 2"),
     "towers": ("Towers", "replay of 10 000 poses, 4 x 4 elements, 12 buildings, depth 2"),
-    "faces": ("Faces of buildings", "paths and fields of 100 poses of one tower, depth 2, in an area that grows with the faces"),
+    "faces": (
+        "Faces of buildings",
+        "paths and fields of 100 poses of one tower, depth 2, in an area that grows with the faces",
+    ),
     "samples": ("Samples of one channel", "comparison with all intervals, without replay"),
     "report": ("Samples of a flight", "complete report, two channels, without audit"),
     "flights": ("Flights", "campaign: one tower, two channels, two settings, 130 s each, one worker"),
@@ -31,8 +34,9 @@ AXES = {
 }
 
 SEARCH_NOTE = (
-    "The path search is that of the bench scene (61 faces, 1000 positions, depth 2). From 2026-11-23 on, small searches "
-    "run in NumPy instead of compiled code, and PathSolver is called with smaller tables, so the ratios are lower."
+    "The path search is that of the bench scene (61 faces, 1000 positions, depth 2). From 2026-11-23 on, small "
+    "searches run in NumPy instead of compiled code, and PathSolver is called with smaller tables. This lowers the "
+    "ratios."
 )
 SEASON = {"flights": 200, "towers": 5, "settings": 20}
 CITY = {"faces": 50_000}
@@ -124,8 +128,8 @@ def season(scaling: dict[str, Any]) -> list[str]:
     return [
         f"- **A campaign**: {SEASON['flights']} flights x {SEASON['settings']} settings = {number(tasks)} tasks. A "
         f"task of one tower (two channels, 130 s, 260 samples each) costs {task_s:.2f} s of processor time. "
-        f"With {SEASON['towers']} towers at the same cost, this is {hours:.1f} h of one core, if all tasks cost the same "
-        f"(the campaign grew with power {power(scaling['flights']['power_cpu'])} in flights).{shared}"
+        f"With {SEASON['towers']} towers at the same cost, this is {hours:.1f} h of one core, if tasks cost the "
+        f"same (the campaign grew with power {power(scaling['flights']['power_cpu'])} in flights).{shared}"
     ]
 
 
@@ -298,8 +302,9 @@ def reports(run: dict[str, Any]) -> list[str]:
     return [
         "## A report", "",
         f"Processor time of the process for two channels ({short['flight']}). It is compared with "
-        f"`import sionna.rt, matplotlib.pyplot, pandas`, and with these imports without Sionna (medians{imports_of(short)}). "
-        "For the first report all caches on the disk are empty (kernels, paths, fonts, LLVM test):", "",
+        f"`import sionna.rt, matplotlib.pyplot, pandas`, and with these imports without Sionna (medians"
+        f"{imports_of(short)}). For the first report all caches on the disk are empty (kernels, paths, fonts, LLVM "
+        "test):", "",
         "| | seconds | x imports | x imports without Sionna | peak MiB |", "| --- | ---: | ---: | ---: | ---: |",
         *(
             f"| {name} | {row['cpu_s']:.1f} | {row['ratio']:.2f} | {row['ratio_light']:.2f} | {row['peak_mib']:.0f} |"
@@ -337,12 +342,12 @@ def page(history: list[dict[str, Any]]) -> str:
         "page before a large run. To measure your own machine:", "",
         "```", "aerpaw-cmp bench      # speed against error of the replay, about a minute", "```", "",
         "`make bench-all` makes this page: `python benchmarks/all.py` measures and appends to",
-        "`benchmarks/history.jsonl`, and `python benchmarks/performance.py` writes the page from it. The numbers are of",
-        "one machine and one run. Processor seconds count all threads and processes. Other work on the machine increases",
-        "them, so the load is given.", "",
+        "`benchmarks/history.jsonl`, and `python benchmarks/performance.py` writes the page from it. The numbers come",
+        "from one run on one machine. Processor seconds count all threads and processes. They increase with other work",
+        "on the machine, so the load is given.", "",
         f"Last run: {run['date']}, version {run['version']}, {machine['processor']}, {machine['cpus']} processors, "
         f"{machine['memory_gib']} GiB, {machine['system']}, Python {machine['python']}; load {run['load_before']} "
-        f"before, {run.get('load_after', '-')} after (of which the run causes 1 to 2), {run['seconds'] / 60:.1f} min in "
+        f"before, {run.get('load_after', '-')} after (the run causes 1 to 2), {run['seconds'] / 60:.1f} min in "
         f"all.{' Kernels of replays were compiled before the first row.' * ('load_after' in run)}", "",
         *([f"Not measured: {'; '.join(unmeasured)}.", ""] if unmeasured else []),
         *waits(run),

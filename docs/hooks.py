@@ -49,7 +49,7 @@ def gallery() -> str:
     """The page of all figures with their code."""
     parts = [
         "# Gallery",
-        "What do two-ray fading, Fresnel coefficients, an antenna pattern or Kriging look like with this package? `make docs` "
+        "What do two-ray fading, Fresnel coefficients or an antenna pattern look like with this package? `make docs` "
         "draws each figure with the code below it. Copy a script and change it: its "
         "variable `figure` is a Matplotlib figure.",
     ]

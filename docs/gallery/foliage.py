@@ -1,7 +1,7 @@
 """Loss through crowns
 
-The two models that `rt.foliage_model` offers, at 3.4 GHz, against the length of the path inside crowns. They differ by up
-to 2 dB, less than most measurements of one flight can distinguish.
+The two models of `rt.foliage_model` at 3.4 GHz against the length of the path inside crowns. They differ by up to 2 dB,
+less than most measurements of one flight can distinguish.
 """
 
 import matplotlib.pyplot as plt

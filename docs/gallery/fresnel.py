@@ -1,7 +1,7 @@
 """Reflection coefficients of ground and walls
 
-ITU-R P.2040: a half-space of ground, and a slab of concrete whose internal reflections cause the ripple. TM (vertical over
-ground) has the pseudo-Brewster angle, where the ground reflection of a vertical antenna nearly vanishes.
+ITU-R P.2040: a half-space of ground, and a slab of concrete whose internal reflections cause the ripple. TM
+(vertical over ground) has the pseudo-Brewster angle, where the ground reflection of a vertical antenna nearly vanishes.
 """
 
 import matplotlib.pyplot as plt

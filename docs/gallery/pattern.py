@@ -1,6 +1,6 @@
 """Antenna patterns
 
-Gain of the packaged patterns against elevation: those of `antenna: {model: ...}`. Measured patterns are read from files.
+Gain of the patterns of `antenna: {model: ...}` against elevation. Measured patterns are read from files.
 """
 
 import matplotlib.pyplot as plt

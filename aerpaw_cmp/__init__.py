@@ -1,7 +1,7 @@
 """Ingest AERPAW field logs, replay the flight by ray tracing, compare the two.
 
-The names below are the public face (docs/api.md); everything else may change. Importing this package loads nothing
-heavy: each name is imported when it is first used.
+The names below are stable (docs/api.md); everything else may change. Importing this package loads nothing heavy: each
+name is imported when it is first used.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 __version__ = "0.4.0"
 
-# Where each public name lives.
+# Module of each public name.
 _HOME = {
     "Array": "propagation.geometry",
     "BiExponential": "maps.variogram",
@@ -66,5 +66,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Public names first of all."""
-    return sorted({*globals(), *__all__})
+    """Return the public names only: imports and machinery of this file are noise in a notebook."""
+    return list(__all__)

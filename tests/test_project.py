@@ -143,6 +143,17 @@ def test_setup_says_what_to_do_without_python(tmp_path: Path) -> None:
     assert not (tmp_path / "venv").exists()
 
 
+def test_citation_changelog_and_package_state_one_version_and_date() -> None:
+    from aerpaw_cmp import __version__
+
+    (number, day), *_ = re.findall(r"^## (\S+) - (\d{4}-\d\d-\d\d)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert re.findall(r"^(?:version|date-released): (.*)$", citation, re.MULTILINE) == [number, day]
+    assert number == __version__
+    for page in ("README.md", "docs/paper.md", "docs/howto/questions.md", "CITATION.cff"):
+        assert "10.1109/OJVT.2025.3585537" in (ROOT / page).read_text(), page
+
+
 def test_no_setting_is_without_effect() -> None:
     """Every key that a flight file may hold is read somewhere: a key that does nothing would be a promise not kept."""
     from aerpaw_cmp.flight import settings as config

@@ -29,6 +29,7 @@ def test_every_public_name_exists_has_a_docstring_and_stands_in_the_page() -> No
         assert name == "__version__" or inspect.getdoc(value), name
         assert f"`{name}" in page or name == "__version__", f"docs/api.md does not name {name}"
     assert set(ac.__all__) - {"__version__"} == set(ac._HOME)
+    assert set(dir(ac)) == set(ac.__all__)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = ac.nothing
 

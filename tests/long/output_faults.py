@@ -87,10 +87,12 @@ def make_inputs(folder: Path, wanted: list[str] | None = None) -> dict[str, Job]
 
     plan = yaml.safe_load((SAMPLE / "flight.yaml").read_text(encoding="utf-8"))
     plan["flight"]["plan"] |= {
-        "waypoints": [{"east_m": -40, "north_m": 10, "height_m": 40}, {"east_m": 40, "north_m": 10, "height_m": 40}],
+        "waypoints": [{"east_m": -50, "north_m": 10, "height_m": 40}, {"east_m": 50, "north_m": 10, "height_m": 40}],
         "bad_lines": 0, "clock_shift_s": {}, "telemetry_interval_s": 0.2,
     }  # fmt: skip
     plan["logs"] = [log for log in plan["logs"] if "USRP" not in log["path"] or log["path"].startswith("LW1/USRP1")]
+    plan["flight"]["plan"]["offsets_db"] = {"LW1": {"USRP1": 0.0}}
+    del plan["link"]["channels"]["USRP2"]
     plan |= {"rt": {"engine": "image", "max_depth": 1, "audit_links": 0}, "rss": {"lag": "off"}}
     commands: dict[str, dict[str, list[str]]] = collections.defaultdict(dict)
     for seed, variant in enumerate(VARIANTS):

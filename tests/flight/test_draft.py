@@ -137,7 +137,7 @@ def test_a_name_that_is_no_text_is_left_out(logs: Path, capsys: pytest.CaptureFi
         pytest.skip("this file system takes UTF-8 names only")
     target = logs / "flight.yaml"
     assert main(["ingest", str(logs), "--timezone", ZONE, "--draft", str(target)]) == 0
-    assert "rename it" in capsys.readouterr().err
+    assert "rename the file" in capsys.readouterr().err
     load_flight(target)
 
 
@@ -256,7 +256,7 @@ def test_levels_without_positions_do_not_spoil_ranks_that_have_them(logs: Path) 
     text, remarks = draft(files, logs, DraftOptions(timezone=ZONE))
     assert [log.path for log in parse_yaml(text, FlightFile).logs] == ["UAV/modem_ri.csv"]
     assert any(remark.endswith("samples can be compared") and not remark.startswith("0") for remark in remarks)
-    assert any("USRP1_power_log.txt: it has no positions, and no telemetry is here" in remark for remark in remarks), (
+    assert any("USRP1_power_log.txt: it has no positions, and there is no telemetry" in remark for remark in remarks), (
         remarks
     )
 

@@ -183,7 +183,8 @@ def test_a_tower_stands_unless_a_place_wins_and_a_listed_one_wants_as_much_as_an
         near = [n for n, t in SITE.towers.items() if np.hypot(*(np.array(t.position_m) - at)[:2]) <= 77.0]
         assert (f"({', '.join(near)} possible)" if near else "no tower fits") in proposal.question
         assert (proposal.radius_m, proposal.tower["antenna_height_m"]) == (77.0, 10.0)
-        again = placer.propose(track)
+        assert proposal.position_m is not None
+        again = placer.propose(track, nodes={proposal.node: proposal.position_m})
         assert again is not None
         assert (again.node, again.tower) == (proposal.node, None)  # the same place has one name
     else:
@@ -192,7 +193,11 @@ def test_a_tower_stands_unless_a_place_wins_and_a_listed_one_wants_as_much_as_an
 
 def test_nodes_a_hundred_metres_apart_have_names_of_their_own() -> None:
     placer = _placer()
-    names = [placer._node(np.array([e, 0.0, 1.5]), 35.0, -78.0, 1.5, "").node for e in (0.0, 99.0, 101.0, 300.0, 102.0)]
+    names, nodes = [], {}
+    for east in (0.0, 99.0, 101.0, 300.0, 102.0):
+        placement = node._node(np.array([east, 0.0, 1.5]), (35.0, -78.0, 1.5), "", nodes)
+        nodes |= {} if placement.position_m is None else {placement.node: placement.position_m}
+        names.append(placement.node)
     assert names == ["NODE", "NODE", "NODE2", "NODE3", "NODE2"]
     for away, near in ((4990.0, True), (5010.0, False)):
         place = _place((placer.track.pose_at(np.array([placer.track.start_ns], "datetime64[ns]")).position_m[0, 0] + away,

@@ -1,6 +1,7 @@
-"""A first flight.yaml for logs that were just read: what can be told from them is filled in, the rest is asked for.
+"""A first flight.yaml for logs that were just read.
 
-Number of samples of a flight that a report would score, and why not more, before anything is replayed.
+A draft contains what the logs show, and a question where a user has to decide. A dry run counts the samples that a
+report would score, and explains why the others are not scored.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from .proposals import (
     CARRIER_HZ,
     POWER_DBM,
     Nodes,
+    Placement,
     Placer,
     Proposal,
     listed_places,
@@ -49,16 +51,16 @@ from .proposals import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DryRun:
-    """Outcome of a dry run.
+    """The result of a dry run.
 
     Parameters
     ----------
     samples : int
         Levels and ranks with a position, a value and the height that the settings ask for.
     refused : str
-        The message with which a report would stop; empty where it would not.
+        The message with which a report would stop. Empty if it would run.
     lost : tuple of str
-        Per series of which none, or less than half, is compared: which, and the reason.
+        Series of which less than half of the samples are compared, each with the reason.
     data : FlightData or None
         The gathered flight; None if the report would stop.
     """
@@ -70,7 +72,7 @@ class DryRun:
 
     @property
     def reason(self) -> str:
-        """Reason why nothing would be scored; empty where something is."""
+        """The reason why no sample would be scored. Empty if a sample is scored."""
         return "" if self.samples else self.refused or "; ".join(self.lost)
 
 
@@ -95,7 +97,7 @@ def dry_run(settings: FlightFile, folder: Path, files: Sequence[IngestedFile]) -
 
 
 def _counts(place: FloatArray, known: BoolArray, value: FloatArray, lowest_m: float | None) -> tuple[int, int, int]:
-    """Samples with a value; those of them with a position; those of them that are high enough."""
+    """Return the numbers of samples with a value, also with a position, and also high enough."""
     valued = np.isfinite(value)
     placed = valued & known
     high = placed if lowest_m is None else placed & (place[:, 2] >= lowest_m)
@@ -103,7 +105,7 @@ def _counts(place: FloatArray, known: BoolArray, value: FloatArray, lowest_m: fl
 
 
 def _loss(data: FlightData, time: Times, counts: tuple[int, int, int]) -> str:
-    """Give the reason why none, or less than half, of the values of a series is compared; empty for others."""
+    """Return the reason why less than half of the values of a series are compared. Empty if more are compared."""
     valued, placed, high = counts
     if not valued:
         return "no sample holds a value (out of coverage, or no report)"
@@ -144,11 +146,11 @@ class DraftOptions:
     Parameters
     ----------
     timezone, time_origin : str, optional
-        What zone-less clocks and relative times were read with.
+        Time zone of clocks without a zone, and origin of relative times.
     mapping : mapping
-        ``columns``, ``kind``, ``unit`` and ``ri_base`` that generic CSVs were read with.
+        ``columns``, ``kind``, ``unit`` and ``ri_base`` of generic CSV files.
     site : str
-        Packaged site, or the path of a site.yaml against the folder; what it remembers of antennas is used.
+        Packaged site, or path of a site.yaml relative to the folder. Its learned antennas are used.
     """
 
     timezone: str | None = None
@@ -163,103 +165,107 @@ def draft(
     options: DraftOptions = DraftOptions(),
     flight: NamedFlight | None = None,
 ) -> tuple[str, list[str]]:
-    """The text of a flight.yaml that names the logs.
+    """Return the text of a flight.yaml for logs, and remarks about it.
 
     Parameters
     ----------
     files : sequence of IngestedFile
-        As ``ingest`` read them.
+        Files that ``ingest`` has read.
     folder : Path
-        Of the flight.yaml; the paths in it are relative to it.
+        Folder of the flight.yaml. Paths in the text are relative to it.
     options : DraftOptions
     flight : NamedFlight, optional
-        The flight of the files; by default all are of one.
+        The flight of the files. By default all files belong to one flight.
 
     Returns
     -------
     str, list of str
-        The text, and what is left to check or was left out.
+        The text; and what the user should check, and what is not used.
 
     Raises
     ------
     UsageError
-        If no log has what a flight needs.
+        If no log contains levels or ranks of a flight.
     """
-    site = options.site
-    place = load_site(site_place(site, folder))
+    site = load_site(site_place(options.site, folder))
     own = files if flight is None else flight.own
-    flown, which = _carrier(own, _flown(own), place)
+    flown, which = _carrier(own, _flown(own), site)
     every = [stream for file in files for stream in file.result.streams]
-    entries = _Entries(
+    context = _Context(
         folder=folder,
+        options=options,
         flown=flown,
         which=which,
         unsure={} if flight is None else flight.unsure,
         has_level=_has_level(files, flown),
-        options=options,
         positioned=any(_has_positions(stream) for stream in every),
-        towers_known=tuple(place.towers),
-        placer=_placer(files, flown, place),
         locks=any(may_lose_lock(stream) for stream in every),
+        towers=tuple(site.towers),
+        placer=_placer(files, flown, site),
     )
-    # of copies, the one on the telemetry's clock, then the fullest
-    for file in sorted(files, key=lambda f: (not entries.leads(f), entries.is_utc(f), -_samples(f))):
-        entries.enter(file)
-    entries.sort(files)
-    if not entries.kinds & {"rss", "rank"}:
-        # a table of positions says which of its columns may be levels under a name that nobody knows
+    lines = _lines(files, context)
+    kinds = {stream.kind for line in lines for stream in line.compared}
+    out = sorted(remark for line in lines for remark in line.remarks)
+    if not kinds & {"rss", "rank"}:
+        # the warnings of a table of positions list the columns that may be levels under an unknown name
         unread = [text for file in files for text in file.result.warnings if "--map" in text]
         raise UsageError(
-            "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in (*entries.out, *unread)),
+            "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in (*out, *unread)),
             expected="telemetry and levels or ranks of one flight",
         )
-    parts = [
-        HEAD,
-        f"flight: {_name(entries.flown, files) if flight is None else flight.name}\n",
-        f"site: {site}  # or your own site.yaml?\n",
-    ]
-    if entries.towers:
-        parts += [
-            "towers:\n",
-            *(f"  {name}: {_plain(tower)}  # {about}\n" for name, (tower, about) in entries.towers.items()),
-        ]
-    if options.timezone:
-        parts.append(f"timezone: {options.timezone}\n")
-    parts += ["logs:\n", *entries.lines.values()]
-    parts += [_NO_TRACK] if entries.without_track else []
-    parts += [f"  # left out: {remark}\n" for remark in entries.out]
-    link = _DOWNLINK if entries.downlink and all(entries.downlink) else LINK
-    link = link.replace("20e6", f"{_bandwidth_mhz([file.path for file in own]):g}e6")
+    name = _name(flown, files) if flight is None else flight.name
+    parts = _first_lines(name, lines, out, context)
+    link = _link(lines, own)
 
     def text_with(known: Proposal) -> str:
-        lines = _learned_lines(known, link) if "rss" in entries.kinds else []
-        lines += [RANK] if "rank" in entries.kinds else []
-        return "".join([*parts, *lines, *_settings(entries, known)])
+        learned_lines = _learned_lines(known, link) if "rss" in kinds else []
+        rank = [RANK] if "rank" in kinds else []
+        return "".join([*parts, *learned_lines, *rank, *_settings(lines, context, known)])
 
-    # the draft is read and gathered as a report would: what it promises is true
-    proof = _proof(text_with(Proposal()), folder, {file.path: file for file in files}, list(entries.lines))
-    known, remark = _remembered(entries, site, folder, proof.data)
+    # a report would read and gather the draft in the same way, so what the remarks promise is true
+    proof = _proof(text_with(Proposal()), folder, [line.file for line in lines if line.text])
+    known, remarks = _remembered(lines, context, proof.data)
     text = text_with(known)
-    parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
-    entries.out += remark
+    parse_yaml(text, FlightFile)  # an error here is a bug of this module
     if proof.reason:
         text = text.replace(HEAD, f"{HEAD}# No sample of this draft can be compared: {proof.reason}.\n", 1)
-    # questions stand at the ends of lines, so that the file itself can be searched for them
+    # questions are at the ends of lines, so that a search in the file finds them
     checks = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
     proved = [f"no sample of this draft can be compared: {proof.reason}"]
     if not proof.reason:
         proved = [f"{counted(proof.samples, 'sample')} can be compared", *proof.lost]
-    return text, proved + checks + [f"left out: {remark}" for remark in entries.out]
+    return text, proved + checks + [f"left out: {remark}" for remark in (*out, *remarks)]
 
 
-def _proof(text: str, folder: Path, files: Mapping[str, IngestedFile], paths: Sequence[str]) -> DryRun:
-    """Dry run of the draft's report: the samples it would score; logs whose times the draft moves are read again."""
+def _first_lines(name: str, lines: Sequence[_Line], out: Sequence[str], context: _Context) -> list[str]:
+    """Return the lines from the head of a draft to the end of ``logs:``."""
+    parts = [HEAD, f"flight: {name}\n", f"site: {context.options.site}  # or your own site.yaml?\n"]
+    towers = {place.node: place for line in lines for place in line.places if place.tower is not None}
+    if towers:
+        parts.append("towers:\n")
+        parts += [f"  {node}: {_plain(place.tower or {})}  # {place.question}\n" for node, place in towers.items()]
+    if context.options.timezone:
+        parts.append(f"timezone: {context.options.timezone}\n")
+    parts += ["logs:\n", *(line.text for line in lines if line.text)]
+    if context.flown is None and not all(_has_positions(stream) for line in lines for stream in line.compared):
+        parts.append(_NO_TRACK)
+    return parts + [f"  # left out: {remark}\n" for remark in out]
+
+
+def _link(lines: Sequence[_Line], own: Sequence[IngestedFile]) -> str:
+    """Return ``link:``: a downlink if all levels are what a phone or modem reports of its cell."""
+    levels = [stream for line in lines for stream in line.compared if stream.kind == "rss"]
+    link = _DOWNLINK if levels and all(s.attributes.get("quantity") == "RSRP" for s in levels) else LINK
+    return link.replace("20e6", f"{_bandwidth_mhz([file.path for file in own]):g}e6")
+
+
+def _proof(text: str, folder: Path, files: Sequence[IngestedFile]) -> DryRun:
+    """Return the dry run of a draft's report. Logs whose times the draft changes are read again."""
     settings, read = parse_yaml(text, FlightFile), []
-    for log, path in zip(settings.logs, paths, strict=True):
-        moved = log.time_origin is not None and any("clock" in s.attributes for s in files[path].result.streams)
+    for log, file in zip(settings.logs, files, strict=True):
+        moved = log.time_origin is not None and any("clock" in s.attributes for s in file.result.streams)
         same = not moved and log.clock is None
-        again = files[path] if same else read_log(folder, log.path, log.options(settings.timezone), reader=log.reader)
-        read.append(again)
+        read.append(file if same else read_log(folder, log.path, log.options(settings.timezone), reader=log.reader))
     return dry_run(settings, folder, read)
 
 
@@ -270,10 +276,10 @@ class Draft:
     Parameters
     ----------
     name : str
-        Of the flight.
+        Name of the flight.
     text : str
     remarks : tuple of str
-        What is left to check, or was left out.
+        What the user should check, and what is not used.
     """
 
     name: str
@@ -282,23 +288,23 @@ class Draft:
 
 
 def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = DraftOptions()) -> list[Draft]:
-    """A flight.yaml for each flight that the logs are of, in the order of time; see :func:`draft`.
+    """Return a flight.yaml for each flight of the logs, in the order of time.
 
-    Where one flight alone is complete (levels or ranks, and positions) all logs stand in its draft, those that do not
-    belong to it as left out.
+    If only one flight is complete (levels or ranks, and positions), its draft lists all logs, and marks those of no
+    flight as not used. See :func:`draft`.
 
     Parameters
     ----------
     files : sequence of IngestedFile
-        Logs of one or of several flights.
+        Logs of one or several flights.
     folder : Path
-        Against which the paths are written.
+        Folder of the drafts. Paths in them are relative to it.
     options : DraftOptions
 
     Returns
     -------
     list of Draft
-        At least one; its remarks say what is left to check.
+        At least one draft.
     """
     groups = flights_by_name(files)
     written = []
@@ -322,11 +328,11 @@ class NamedFlight:
     ----------
     name : str
     files : list of IngestedFile
-        All that its draft names or leaves out.
+        Files that its draft lists as used or not used.
     own : list of IngestedFile
-        Those that belong to it.
+        Files that belong to the flight.
     unsure : mapping of str to str
-        Questions about those that may belong to another flight, by path.
+        Questions about files that may belong to another flight, by path.
     """
 
     name: str
@@ -336,25 +342,26 @@ class NamedFlight:
 
 
 def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, NamedFlight]:
-    """Flights that can be drafted, by name, in the order of time."""
+    """Return the flights that can be drafted, by name, in the order of time."""
     every = [flight for flight in flights(files) if flight.measured]
-    # one flight alone is complete: all other logs stand in its draft, as left out
-    complete = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
+    # without any track, each flight waits for its own
+    complete = [flight for flight in every if flight.complete] or every
     named: dict[str, NamedFlight] = {}
     for flight in complete or [Flight(list(files))]:
         name = _name(_flown(flight.files), flight.files)
-        # two flights of one minute, or a folder without times
+        # two flights started in the same minute, or the folder has no times
         taken = sum(other == name or other.startswith(f"{name}_") for other in named)
         name = f"{name}_{taken + 1}" if taken else name
+        # if one flight is complete, its draft lists all other logs as not used
         inside = flight.files if len(complete) > 1 else list(files)
         named[name] = NamedFlight(name=name, files=inside, own=flight.files, unsure=flight.unsure)
     return named
 
 
-# Samples below it are take-off, landing and waiting: at 2 m an airframe, its pilot and the grass decide the level.
+# Lower samples are take-off, landing and waiting: at 2 m the airframe, its pilot and the grass determine the level.
 MINIMUM_HEIGHT_M = 5
 
-# A flight that never got higher has no part that is better than its start.
+# A flight that never was higher has no part that is better than its start.
 _FLOWN_ABOVE_M = 15.0
 
 
@@ -364,18 +371,19 @@ _QUICK_AUDIT = 24
 _QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers to publish"
 
 
-# A node that is placed this well is seen from a flight some hundred metres away within some tens of degrees.
+# A flight some hundred metres away knows the direction of a node with this radius within some tens of degrees.
 _SURE_M = 100.0
 
 
-def _remembered(entries: _Entries, site: str, folder: Path, data: FlightData | None) -> tuple[Proposal, list[str]]:
-    """Return the learned antennas that fit; nothing, and a remark, if they cannot be read."""
+def _remembered(lines: Sequence[_Line], context: _Context, data: FlightData | None) -> tuple[Proposal, list[str]]:
+    """Return the learned antennas that fit, or an empty proposal and a remark if they cannot be read."""
     if data is None:
         return Proposal(), []
-    towers = () if entries.placer is None else tuple(entries.placer.site.towers)
-    nodes = Nodes(placed=frozenset(entries.sure), fixed=towers)
+    site = context.options.site
+    placed = [p.node for line in lines for p in line.places if p.tower is not None and p.radius_m <= _SURE_M]
+    nodes = Nodes(placed=frozenset(placed), fixed=() if context.placer is None else context.towers)
     try:
-        return propose(data, site_place(site, folder), str(Path(site).with_suffix("")), nodes), []
+        return propose(data, site_place(site, context.folder), str(Path(site).with_suffix("")), nodes), []
     except (InputError, UsageError) as error:
         return Proposal(), [f"learned antennas of site {site}: {error.found}; expected: {error.expected}"]
 
@@ -392,7 +400,7 @@ def _bandwidth_mhz(paths: Sequence[str]) -> float:
     >>> _bandwidth_mhz(["a/40m_fs5MHz.mat"]), _bandwidth_mhz(["a/log.txt"]), _bandwidth_mhz(["fs5MHz/a", "fs10MHz/a"])
     (5.0, 20.0, 20.0)
     """
-    # the last name counts: a folder of several rates contains folders of one
+    # the last name counts: a folder of several rates contains folders of one rate
     rates = {float(found[-1]) for path in paths if (found := _SAMPLING_RATE.findall(str(path)))}
     return rates.pop() if len(rates) == 1 else _SOUNDER_MHZ
 
@@ -401,7 +409,7 @@ _SOUNDER_MHZ = 20.0
 
 
 def _learned_lines(known: Proposal, link: str) -> list[str]:
-    """``antennas`` and ``link``."""
+    """Return the lines of ``antennas`` and ``link``."""
     if not known.antennas:
         return [link, *([f"# antennas: {known.antennas_about}\n"] if known.antennas_about else [])]
     assert known.carrier_hz is not None
@@ -411,41 +419,50 @@ def _learned_lines(known: Proposal, link: str) -> list[str]:
     ]
 
 
-def _settings(entries: _Entries, known: Proposal) -> list[str]:
-    """Lines for ``rt``, ``rss`` and ``rank`` that real logs ask for."""
-    lines = _replay_lines(entries, known)
-    low: dict[str, Any] = {"minimum_height_m": MINIMUM_HEIGHT_M} if entries.highest_m() > _FLOWN_ABOVE_M else {}
-    for kind in sorted(entries.kinds & {"rss", "rank"}, reverse=True):
+def _highest_m(lines: Sequence[_Line], flown: tuple[Stream, Span] | None) -> float:
+    """Return the greatest height [m] of the track, or of the logs with their own positions if there is no track."""
+    if flown is not None:
+        return _top_m(flown[0])
+    return max((_top_m(s) for line in lines for s in line.compared if _has_positions(s)), default=-np.inf)
+
+
+def _settings(lines: Sequence[_Line], context: _Context, known: Proposal) -> list[str]:
+    """Return the lines for ``rt``, ``rss`` and ``rank``."""
+    kinds = {stream.kind for line in lines for stream in line.compared}
+    written = _replay_lines(lines, context, known)
+    flown_high = _highest_m(lines, context.flown) > _FLOWN_ABOVE_M
+    low: dict[str, Any] = {"minimum_height_m": MINIMUM_HEIGHT_M} if flown_high else {}
+    for kind in sorted(kinds & {"rss", "rank"}, reverse=True):
         chosen: dict[str, Any] = dict(low)
         reasons = ["without take-off and landing"] if low else []
-        if kind == "rss" and entries.flown is not None:
+        if kind == "rss" and context.flown is not None:
             chosen |= {"field": "power"}
-            reasons.append("powers of paths added: phases of a real ground are not known")
-            if span := _span_of_offsets(entries.offsets_db):
+            reasons.append("powers of paths are added: phases of a real ground are not known")
+            if span := _span_of_offsets([offset for line in lines for offset in line.offsets_db]):
                 chosen |= span
-                reasons.append("the levels lie outside the usual span of offsets")
+                reasons.append("the levels are outside the usual search range of offsets")
         elif kind == "rank" and known.receiver:
             chosen |= {"receiver": known.receiver}
             reasons.append(known.receiver_about)
         if chosen:
-            lines.append(f"{kind}: {_plain(chosen)}  # {'; '.join(reasons)}\n")
-    return lines
+            written.append(f"{kind}: {_plain(chosen)}  # {'; '.join(reasons)}\n")
+    return written
 
 
-def _replay_lines(entries: _Entries, known: Proposal) -> list[str]:
-    """``rt``, where there is a track."""
-    if entries.flown is None:
+def _replay_lines(lines: Sequence[_Line], context: _Context, known: Proposal) -> list[str]:
+    """Return ``rt`` if there is a track."""
+    if context.flown is None:
         return []
-    alone = ", max_depth: 0" if known.antennas else ""  # the gains were learned beside line of sight alone
-    shaded, why = _shaded(entries)
+    alone = ", max_depth: 0" if known.antennas else ""  # the gains were learned with the direct path only
+    shaded, why = _shaded(lines, context)
     alone += shaded
-    if "rank" in entries.kinds:
+    if any(stream.kind == "rank" for line in lines for stream in line.compared):
         return [
             *why,
             "# rt.attitude: logged needs link.rank.uav mounted as seen from the aircraft's nose.\n",
             f"rt: {{audit_links: {_QUICK_AUDIT}{shaded}}}{_QUICK}\n",
         ]
-    frame, keys = entries.flown[0].frame, f"{alone}, audit_links: {_QUICK_AUDIT}"
+    frame, keys = context.flown[0].frame, f"{alone}, audit_links: {_QUICK_AUDIT}"
     if _has_attitude(frame):
         line = f"rt: {{attitude: logged{keys}}}{_QUICK}\n"
     elif _has_attitude(frame, ("yaw_deg",)):
@@ -458,16 +475,17 @@ def _replay_lines(entries: _Entries, known: Proposal) -> list[str]:
     return [*why, line]
 
 
-# Positions at which sight lines are looked along, and the share of lines from which woods or buildings count.
+# Number of positions whose sight lines are tested, and the share of blocked lines from which woods or buildings count.
 _SIGHTS, _SHADED_SHARE = 200, 0.01
 
 
-def _shaded(entries: _Entries) -> tuple[str, list[str]]:
-    """Keys of ``rt`` for links through woods or behind buildings, and comments with the share of their sight lines."""
-    if entries.placer is None:
+def _shaded(lines: Sequence[_Line], context: _Context) -> tuple[str, list[str]]:
+    """Return the keys of ``rt`` for links through woods or behind buildings, and comments with their share."""
+    if context.placer is None:
         return "", []
-    site, positions = entries.placer.site, entries.placer.positions_m(_SIGHTS)
-    names = sorted(entries.at_towers & set(site.towers))
+    site, positions = context.placer.site, context.placer.positions_m(_SIGHTS)
+    towers = {_key(s, line.entry)[0] for line in lines for s in line.compared if s.kind != "telemetry"}
+    names = sorted(towers & set(site.towers))
     if not names or not len(positions):
         return "", []
     wooded, hidden = (float(share) for share in np.mean([sight_shares(site, n, positions) for n in names], axis=0))
@@ -481,12 +499,12 @@ def _shaded(entries: _Entries) -> tuple[str, list[str]]:
     return keys, comments
 
 
-# Of the searched offsets about those that free space expects.
+# Search this far around the offsets that free space needs.
 _MARGIN_DB = 20.0
 
 
 def _span_of_offsets(offsets_db: Sequence[float]) -> dict[str, Any]:
-    """``span_db`` where the usual one would end near an expected offset."""
+    """Return ``span_db`` if the default search range would end near an expected offset."""
     usual = RssSettings().span_db
     if not offsets_db:
         return {}
@@ -497,7 +515,7 @@ def _span_of_offsets(offsets_db: Sequence[float]) -> dict[str, Any]:
 
 
 def _placer(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, site: Site) -> Placer | None:
-    """Proposals for nodes, where there is a track at the site."""
+    """Return the proposals for nodes. None if there is no track at the site."""
     if flown is None or lacks_height(flown[0]):
         return None
     listed = listed_places(Path(file.path).resolve().parent for file in files)
@@ -506,7 +524,7 @@ def _placer(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, si
 
 
 def _has_attitude(frame: Any, names: Sequence[str] = ("roll_deg", "pitch_deg", "yaw_deg")) -> bool:
-    """Check whether most telemetry rows know how the aircraft is turned."""
+    """Check whether most telemetry rows contain the attitude of the aircraft."""
     known = set(names) <= set(frame.columns) and frame[list(names)].notna().all(axis=1).mean() > 0.5
     return bool(known and frame["yaw_deg"].any())
 
@@ -515,9 +533,9 @@ _CLIPPED_SHARE = 0.01
 
 
 def receiver_floor_db(levels: Sequence[Stream]) -> float | None:
-    """The level [dB] below which the receivers of a log hear nothing; None where none shows.
+    """Return the floor of the receivers of a log [dB]. None if the levels do not show a floor.
 
-    A receiver at its floor writes its least level again and again: at least one sample in a hundred, and at least ten.
+    A receiver at its floor repeats its lowest level: in at least 1 % of the samples, and at least ten times.
     """
     floors = []
     for stream in levels:
@@ -528,320 +546,358 @@ def receiver_floor_db(levels: Sequence[Stream]) -> float | None:
     return max(floors) if floors else None
 
 
-@dataclass
-class _Entries:
-    """Lines of ``logs:``, and remarks on what stays out."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Context:
+    """The flight, its site and the options: the same for every log of a draft.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of flight.yaml.
+    options : DraftOptions
+    flown : (Stream, Span), optional
+        The telemetry that is the track, and its time span.
+    which : str
+        Question about the vehicle if several flew; otherwise empty.
+    unsure : mapping of str to str
+        Questions about files that may belong to another flight, by path.
+    has_level : bool
+        A log of the flight contains levels of the experiment.
+    positioned : bool
+        A log to compare contains its own positions.
+    locks : bool
+        The receiver is a sounder that can lose its lock.
+    towers : sequence of str
+        Towers of the site.
+    placer : Placer, optional
+        Proposals for nodes; None if there is no track at the site.
+    """
 
     folder: Path
-    flown: tuple[Stream, Span] | None
-    """The telemetry that gives the track, and its span."""
-    has_level: bool
     options: DraftOptions
-    lines: dict[str, str] = field(default_factory=dict)
-    """By the path as it was given."""
-    kinds: set[str] = field(default_factory=set)
-    at_towers: set[str] = field(default_factory=set)
-    """Towers of all levels and ranks."""
-    out: list[str] = field(default_factory=list)
-    without_track: bool = False
-    """A record was entered that needs a track, and there is none."""
-    entered: dict[tuple[str, ...], list[tuple[Span, str]]] = field(default_factory=dict)
-    """By tower, kind and channel: when, and from which log."""
-    contents: dict[str, str] = field(default_factory=dict)
-    """Path by SHA-256."""
-    positioned: bool = False
-    """Some log to compare has positions of its own."""
-    which: str = ""
-    """Question about the vehicle, where several flew."""
-    unsure: Mapping[str, str] = field(default_factory=dict)
-    """Questions about files that may be of another flight, by path."""
-    towers_known: Sequence[str] = ()
-    """Towers of the site."""
-    placer: Placer | None = None
-    locks: bool = False
-    """The receiver is a sounder that loses its lock."""
-    towers: dict[str, tuple[Mapping[str, Any], str]] = field(default_factory=dict)
-    """Nodes that the site does not have, and the question about each."""
-    offsets_db: list[float] = field(default_factory=list)
-    """Expected of each level."""
-    sure: set[str] = field(default_factory=set)
-    """Those of them whose place is known well enough for the directions of an antenna."""
-    downlink: list[bool] = field(default_factory=list)
-    """Of each level: what a phone or modem reports of its cell."""
-    tops_m: list[float] = field(default_factory=list)
-    """Greatest height of each log that has positions of its own and is compared at them."""
-
-    def highest_m(self) -> float:
-        """Greatest height [m] of the track, or of logs with positions of their own where there is no track."""
-        return max(self.tops_m, default=-np.inf) if self.flown is None else _top_m(self.flown[0])
+    flown: tuple[Stream, Span] | None
+    which: str
+    unsure: Mapping[str, str]
+    has_level: bool
+    positioned: bool
+    locks: bool
+    towers: Sequence[str]
+    placer: Placer | None
 
     @property
-    def _track(self) -> Stream | None:
+    def track(self) -> Stream | None:
+        """The telemetry that is the track."""
         return None if self.flown is None else self.flown[0]
 
     def leads(self, file: IngestedFile) -> bool:
         """Check whether the track is in this file."""
-        return any(s is self._track for s in file.result.streams)
+        return any(stream is self.track for stream in file.result.streams)
 
-    def sort(self, files: Sequence[IngestedFile]) -> None:
-        """Lines in the order of the files, telemetry first."""
-        order = [f.path for f in sorted(files, key=lambda f: not self.leads(f))]
-        self.lines = {path: self.lines[path] for path in order if path in self.lines}
-        self.out.sort()
-
-    def enter(self, file: IngestedFile) -> None:
-        """One log: a line of ``logs:``, or the reason why not."""
-        path = os.path.relpath(Path(file.holder or file.path).resolve(), self.folder)
-        path = str(Path(path, name_inside(file.path))) if file.holder else path
-        shown = one_line(path)
-        if (first := self.contents.setdefault(file.sha256, shown)) != shown:
-            self.out.append(f"{shown}: the same bytes as {first}")
-        elif any("\ud800" <= letter <= "\udfff" for letter in path):  # bytes that are no UTF-8, as Python holds them
-            self.out.append(f"{shown}: flight.yaml cannot hold a name that is not UTF-8; rename it")
-        else:
-            self._enter(file, path, shown)
-
-    def _enter(self, file: IngestedFile, path: str, shown: str) -> None:
-        streams = [s for s in file.result.streams if s.kind != "kpi"]  # no report compares these
-        entry, comment = _entry(file, path, self.towers_known)
-        origin = None if self.options.time_origin else self._origin(streams)
-        if self.placer is not None:
-            proper = (s for s in streams if not (self.has_level and is_own_radio(s)))
-            levels = [self._dated(s, origin) for s in proper if s.kind == "rss" and not is_ratio(s)]
-            if comment:
-                comment = self._place(file, entry, comment, levels, self.placer)
-            else:
-                comment = self._doubt(entry, levels, self.placer)
-        if self.is_utc(file):
-            entry["clock"] = "utc"
-            # the telemetry decides: the same numbers fit as UTC and not as local time
-            comment = _also(comment, "as local time it misses the telemetry, as UTC it meets it: is it UTC?")
-        refused = self._refused(streams, entry, shown, dated=origin is not None)
-        compared = [s for s in streams if s.name not in refused]
-        reasons = list(dict.fromkeys(refused.values()))
-        if not compared and reasons == [_RATIO] and all(may_lose_lock(s) for s in streams):
-            comment = "  # says when the receiver was in lock"
-            skip = [s.name for s in streams]
-            self.lines[file.path] = (
-                f"  - {_flow({'path': path, 'reader': file.result.reader, 'skip': skip})}{comment}\n"
-            )
-            return
-        if not compared:
-            self.out.append(f"{shown}: {'; '.join(reasons) or 'no samples'}")
-            return
-        self.out += [f"{shown}: {name}: {reason}" for name, reason in refused.items() if reason != _RATIO]
-        if all(s.kind == "telemetry" for s in compared):
-            # a track has no tower and no channel
-            entry, comment = {"path": path, "reader": file.result.reader}, ""
-        if self.options.time_origin and any("clock" in s.attributes for s in compared):
-            entry["time_origin"] = self.options.time_origin
-        elif origin is not None:
-            entry["time_origin"] = f"{origin.time.astype('datetime64[ms]')}Z"
-            comment = _also(comment, f"time_origin by tracks {origin.distance_m:.1f} m apart: the same flight?")
-        # what was said of its columns has to stand in the draft, or the report cannot read it
-        if file.result.reader == "generic_csv":
-            entry |= self.options.mapping
-        if refused:
-            entry["skip"] = sorted(refused)
-        comment = self._ask_heights_and_floor(compared, entry, path, comment)
-        asked = [self.which] if self.which and self.leads(file) else []
-        asked += [self.unsure[file.path]] if file.path in self.unsure else []
-        for question in (*asked, *questions(file, compared, self.options.timezone)):
-            comment = _also(comment, question)
-        self.lines[file.path] = f"  - {_flow(entry)}{comment}\n"
-        if self.placer is not None:
-            offsets = (self._offset_db(self._dated(s, origin), entry, self.placer) for s in compared)
-            self.offsets_db += [offset for offset in offsets if offset is not None]
-        self.kinds |= {s.kind for s in compared}
-        self.tops_m += [_top_m(s) for s in compared if _has_positions(s)]
-        self.at_towers |= {_key(s, entry)[0] for s in compared if s.kind in ("rss", "rank")}
-        self.downlink += [s.attributes.get("quantity") == "RSRP" for s in compared if s.kind == "rss"]
-        self.without_track |= self.flown is None and not all(_has_positions(s) for s in compared)
-
-    def _ask_heights_and_floor(self, compared: Sequence[Stream], entry: dict[str, Any], path: str, comment: str) -> str:
-        """Fill in a missing height and the floor of the receiver; gives what there is to ask.
-
-        Parameters
-        ----------
-        compared : sequence of Stream
-            Of the file, those that are compared.
-        entry : dict
-            Of the file in ``logs:``; receives height and floor.
-        path : str
-        comment : str
-            What is asked already.
-
-        Returns
-        -------
-        str
-        """
-        if any(lacks_height(s) for s in compared if s is self._track or _has_positions(s)):
-            height = height_in_name(path)
-            entry |= {} if height is None else {"height_m": height}
-            question = (
-                "no altitude in the log: which height_m?" if height is None else "height_m as the file's name says?"
-            )
-            comment = _also(comment, question)
-        levels = [
-            s for s in compared if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"
-        ]  # whole decibels repeat
-        if (floor := receiver_floor_db(levels)) is not None:
-            # a hundredth above: levels at or below the floor are out of coverage
-            entry["floor_db"] = round(floor + 0.01, 2)  # at the floor is below it
-            comment = _also(
-                comment, f"floor of the receiver at {floor:.1f} dB?" if comment else f"receiver floor {floor:.1f} dB?"
-            )
-        if any(is_ratio(s) for s in compared):
-            comment = _also(comment, "a ratio to the noise as a level?")
-        return comment
-
-    def _place(
-        self, file: IngestedFile, entry: dict[str, Any], comment: str, levels: Sequence[Stream], placer: Placer
-    ) -> str:
-        """Fill in the nodes that the levels fit; gives what is left to ask.
-
-        Parameters
-        ----------
-        file : IngestedFile
-        entry : dict
-            Of the file in ``logs:``; receives the nodes.
-        comment : str
-            The question where no level fits.
-        levels : sequence of Stream
-            Of the file.
-        placer : Placer
-
-        Returns
-        -------
-        str
-        """
-        places, memory = {}, site_place(self.options.site, self.folder)
-        # None: a log without cells is one level
-        for pci in entry.get("cells", [None]):
-            # the first of its kind: receivers of one node stand at one place
-            level = next((s for s in levels if pci is None or _cell_of(s) == pci), None)
-            if level is not None:
-                mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
-                log = file.sha256, mark
-                airframe = searching_airframe(memory, placer.site.towers, log) if is_sounder_power(level) else None
-                levels_on_track = placer.levels(level, self._floor_db(level), airframe)
-                places[pci] = placer.propose(levels_on_track, taught(memory, log, loses_lock=False))
-        for pci, place in places.items():
-            if place is None:
-                continue
-            if place.tower is not None:
-                self.towers[place.node] = place.tower, place.question
-                self.sure |= {place.node} if place.radius_m <= _SURE_M else set()
-            if pci is None:
-                entry["node"] = place.node
-                return f"  # {place.question}" if place.tower is None and place.question else ""
-            entry["cells"][pci] = place.node
-        return comment
-
-    def _doubt(self, entry: Mapping[str, Any], levels: Sequence[Stream], placer: Placer) -> str:
-        """Ask about a tower that a name gives and the levels contradict."""
-        for level in levels:
-            node = str(entry.get("node") or level.attributes.get("node"))
-            better = placer.contradiction(placer.levels(level, self._floor_db(level)), node)
-            if better is not None:
-                return f"  # the name says {node}, the levels fit {better} far better: which tower?"
-        return ""
-
-    def _floor_db(self, level: Stream) -> float:
-        if self.locks and is_sounder_power(level):
-            return LOCK_FLOOR_DB
-        floor = None if level.attributes.get("quantity") == "RSRP" else receiver_floor_db([level])
-        return -np.inf if floor is None else floor
-
-    def _offset_db(self, level: Stream, entry: Mapping[str, Any], placer: Placer) -> float | None:
-        if level.kind != "rss":
-            return None
-        home = entry.get("cells", {}).get(_cell_of(level))
-        node = home or entry.get("node") or level.attributes.get("node")
-        return placer.offset_db(placer.levels(level, self._floor_db(level)), str(node))
-
-    def _origin(self, streams: Sequence[Stream]) -> Origin | None:
-        """Origin of relative times whose positions lie on the track of the flight."""
-        if self.flown is None or not has_wall_clock(self.flown[1][0]):
-            return None
-        relative = [s for s in streams if s.attributes.get("clock") == "relative"]
-        return next((origin for s in relative if (origin := origin_of(s, self.flown[0])) is not None), None)
-
-    def _dated(self, stream: Stream, origin: Origin | None) -> Stream:
-        """A stream at the times that the draft gives it: its levels belong where the track was then."""
-        shift = self._shift(stream)
-        if origin is not None and stream.attributes.get("clock") == "relative":
-            shift += origin.time - np.datetime64(0, "ns")
-        return replace(stream, frame=stream.frame.assign(time=stream.frame["time"] + shift)) if shift else stream
-
-    def _refused(
-        self, streams: Sequence[Stream], entry: Mapping[str, Any], shown: str, *, dated: bool
-    ) -> dict[str, str]:
-        """Streams that stay out, by name, and why; the others are taken.
-
-        ``dated`` says that relative times have an origin now.
-        """
-        leading = _leading(streams)
-
-        def reason(stream: Stream) -> str | None:
-            span = stream_span(stream)
-            if span is None:
-                return "no samples"
-            shift = self._shift(stream)
-            span = span[0] + shift, span[1] + shift
-            if stream.name in leading:
-                return f"of the same receiver and cell as {leading[stream.name]}, which is compared"
-            why = self._reason(stream, span, dated=dated)
-            return why or (None if stream.kind == "telemetry" else self._enter_series(_key(stream, entry), span, shown))
-
-        # the fuller of two ranks is entered first, and the other refused as its double
-        ordered = sorted(streams, key=_missing)
-        return {stream.name: why for stream in ordered if (why := reason(stream)) is not None}
-
-    def _enter_series(self, key: tuple[str, ...], span: Span, shown: str) -> str | None:
-        """Enter a series; the reason where one of that tower, channel and time is there already."""
-        same = [source for when, source in self.entered.get(key, []) if meet(span, when)]
-        if same:
-            where = "another stream of the log" if same[0] == shown else same[0]
-            return f"{where} has {key[1]} of that tower and time already"
-        self.entered.setdefault(key, []).append((span, shown))
-        return None
-
-    def is_utc(self, file: IngestedFile) -> bool:
-        """Check whether a log whose clock has no zone meets the telemetry as UTC, and not as local time."""
-        return any(self._shift(stream) for stream in file.result.streams)
-
-    def _shift(self, stream: Stream) -> np.timedelta64:
-        """Time to be added to a clock in UTC that was read as local time; 0 of any other."""
+    def shift(self, stream: Stream) -> np.timedelta64:
+        """Return the time to add to a UTC clock that was read as local time. It is 0 for other clocks."""
         span = stream_span(stream)
+        # the log itself specifies its UTC offset: do not correct it
         if self.flown is None or span is None or stream.kind == "telemetry":
             return np.timedelta64(0, "m")
-        # an offset that the log itself writes is no guess of ours to mend
         trap = clock_trap(span, self.flown[1], self.options.timezone)
         written = stream.attributes.get("clock_from") == "written"
         hours = trap.hours if trap is not None and trap.is_utc and not written else 0.0
         return np.timedelta64(round(60 * hours), "m")
 
-    def _reason(self, stream: Stream, span: Span, *, dated: bool) -> str | None:
-        relative = not has_wall_clock(span[0])
-        if stream.kind == "telemetry":
-            if self.flown is None or stream is self.flown[0]:
-                return None
-            if relative and has_wall_clock(self.flown[1][0]):
-                return "the track is that of other telemetry"
-            return "the track is that of other telemetry" if meet(span, self.flown[1]) else _late(span, self.flown[1])
-        if self.flown is None and self.positioned and not _has_positions(stream):
-            return "it has no positions, and no telemetry is here"
-        same_clock = self.flown is not None and not has_wall_clock(self.flown[1][0])  # the track counts as the log does
-        if relative and not (dated or same_clock or _has_positions(stream)):
-            return "its times are relative; read it again with --time-origin"
-        if same_clock and not relative:
-            return "the times of the track are relative; read it again with --time-origin"
-        if self.flown is not None and not relative and not meet(span, self.flown[1]):
-            return _late(span, self.flown[1], self.options.timezone)
-        if self.has_level and is_own_radio(stream):
-            return "the telemetry radio, beside levels of the experiment"
-        return _RATIO if self.has_level and is_ratio(stream) else None
+    def span(self, stream: Stream) -> Span | None:
+        """Return the time span of a stream on the clock that the draft assumes. None if it has no samples."""
+        span, shift = stream_span(stream), self.shift(stream)
+        return None if span is None else (span[0] + shift, span[1] + shift)
+
+    def is_utc(self, file: IngestedFile) -> bool:
+        """Check whether a log without a zone overlaps the telemetry as UTC and not as local time."""
+        return any(self.shift(stream) for stream in file.result.streams)
+
+    def dated(self, stream: Stream, origin: Origin | None) -> Stream:
+        """Return a stream at the times that the draft assumes for it."""
+        shift = self.shift(stream)
+        if origin is not None and stream.attributes.get("clock") == "relative":
+            shift += origin.time - np.datetime64(0, "ns")
+        return replace(stream, frame=stream.frame.assign(time=stream.frame["time"] + shift)) if shift else stream
+
+    def floor_db(self, level: Stream) -> float:
+        """Return the floor of the receiver of a level [dB], or -inf if it is unknown."""
+        if self.locks and is_sounder_power(level):
+            return LOCK_FLOOR_DB
+        floor = None if level.attributes.get("quantity") == "RSRP" else receiver_floor_db([level])
+        return -np.inf if floor is None else floor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Line:
+    """One log of a draft: its line in ``logs:``, or the reasons why it is not used.
+
+    Parameters
+    ----------
+    file : IngestedFile
+    shown : str
+        Path relative to the flight.yaml, for messages.
+    text : str
+        The line with its questions; empty if the log is not used.
+    remarks : tuple of str
+        Streams that are not compared, with the reason.
+    entry : mapping
+        Keys of the line.
+    compared : tuple of Stream
+    places : tuple of Placement
+        Nodes that the levels of this log fit.
+    offsets_db : tuple of float
+        Offset that each level needs against free space.
+    """
+
+    file: IngestedFile
+    shown: str
+    text: str = ""
+    remarks: tuple[str, ...] = ()
+    entry: Mapping[str, Any] = field(default_factory=dict)
+    compared: tuple[Stream, ...] = ()
+    places: tuple[Placement, ...] = ()
+    offsets_db: tuple[float, ...] = ()
+
+
+def _lines(files: Sequence[IngestedFile], context: _Context) -> list[_Line]:
+    """Return a line per log: telemetry first, then in the order of the files."""
+    lines: list[_Line] = []
+    # copies of a log: use the one on the telemetry's clock, then the one with the most samples
+    for file in sorted(files, key=lambda f: (not context.leads(f), context.is_utc(f), -_samples(f))):
+        lines.append(_line(file, context, lines))
+    order = {file.path: number for number, file in enumerate(files)}
+    return sorted(lines, key=lambda line: (not context.leads(line.file), order[line.file.path]))
+
+
+def _line(file: IngestedFile, context: _Context, earlier: Sequence[_Line]) -> _Line:
+    """Return the line of one log. Logs that were used before it are not used twice."""
+    path = os.path.relpath(Path(file.holder or file.path).resolve(), context.folder)
+    path = str(Path(path, name_inside(file.path))) if file.holder else path
+    shown = one_line(path)
+    first = next((line.shown for line in earlier if line.file.sha256 == file.sha256), shown)
+    if first != shown:
+        return _Line(file=file, shown=shown, remarks=(f"{shown}: the same bytes as {first}",))
+    if any("\ud800" <= letter <= "\udfff" for letter in path):  # bytes that are not UTF-8, as Python represents them
+        remark = f"{shown}: flight.yaml cannot contain a name that is not UTF-8; rename the file"
+        return _Line(file=file, shown=shown, remarks=(remark,))
+    streams = [s for s in file.result.streams if s.kind != "kpi"]  # no report compares these
+    origin = None if context.options.time_origin else _origin(streams, context.flown)
+    entry, comment, places = _with_node(file, path, streams, origin, context, earlier)
+    if context.is_utc(file):
+        entry["clock"] = "utc"
+        comment = _also(comment, "as local time it misses the telemetry, as UTC it overlaps it: is it UTC?")
+    refused = _refused(streams, entry, shown, context, earlier, dated=origin is not None)
+    compared = [s for s in streams if s.name not in refused]
+    reasons = list(dict.fromkeys(refused.values()))
+    line = _Line(file=file, shown=shown, places=places)
+    if not compared and reasons == [_RATIO] and all(may_lose_lock(s) for s in streams):
+        skipped = {"path": path, "reader": file.result.reader, "skip": [s.name for s in streams]}
+        return replace(line, text=f"  - {_flow(skipped)}  # shows when the receiver was in lock\n")
+    if not compared:
+        return replace(line, remarks=(f"{shown}: {'; '.join(reasons) or 'no samples'}",))
+    if all(s.kind == "telemetry" for s in compared):
+        # a track has no tower and no channel
+        entry, comment = {"path": path, "reader": file.result.reader}, ""
+    if context.options.time_origin and any("clock" in s.attributes for s in compared):
+        entry["time_origin"] = context.options.time_origin
+    elif origin is not None:
+        entry["time_origin"] = f"{origin.time.astype('datetime64[ms]')}Z"
+        comment = _also(comment, f"time_origin by tracks {origin.distance_m:.1f} m apart: the same flight?")
+    # a report needs the mapping of columns to read the file
+    entry |= context.options.mapping if file.result.reader == "generic_csv" else {}
+    entry |= {"skip": sorted(refused)} if refused else {}
+    keys, asked = _heights_and_floor(compared, path, context.track, commented=bool(comment))
+    entry |= keys
+    asked += [context.which] if context.which and context.leads(file) else []
+    asked += [context.unsure[file.path]] if file.path in context.unsure else []
+    for question in (*asked, *questions(file, compared, context.options.timezone)):
+        comment = _also(comment, question)
+    line = replace(line, entry=entry, compared=tuple(compared), text=f"  - {_flow(entry)}{comment}\n")
+    nodes = _nodes([*earlier, line])
+    offsets = (_offset_db(context.dated(s, origin), entry, nodes, context) for s in compared)
+    return replace(
+        line,
+        remarks=tuple(f"{shown}: {name}: {reason}" for name, reason in refused.items() if reason != _RATIO),
+        offsets_db=tuple(offset for offset in offsets if offset is not None),
+    )
+
+
+def _heights_and_floor(
+    compared: Sequence[Stream], path: str, track: Stream | None, *, commented: bool
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the keys for a missing height and for the floor of the receiver, and the questions about them."""
+    keys: dict[str, Any] = {}
+    asked = []
+    if any(lacks_height(s) for s in compared if s is track or _has_positions(s)):
+        height = height_in_name(path)
+        keys |= {} if height is None else {"height_m": height}
+        asked.append(
+            "no altitude in the log: which height_m?" if height is None else "height_m as the file's name says?"
+        )
+    # RSRP is reported in whole decibels, so its lowest value repeats without a floor
+    levels = [s for s in compared if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"]
+    if (floor := receiver_floor_db(levels)) is not None:
+        # a hundredth above: levels at or below the floor are out of coverage
+        keys["floor_db"] = round(floor + 0.01, 2)
+        asked.append(
+            f"floor of the receiver at {floor:.1f} dB?" if commented or asked else f"receiver floor {floor:.1f} dB?"
+        )
+    if any(is_ratio(s) for s in compared):
+        asked.append("a ratio to the noise as a level?")
+    return keys, asked
+
+
+def _nodes(lines: Sequence[_Line]) -> dict[str, FloatArray]:
+    """Return the positions of the nodes that the levels of some logs fit, by name."""
+    return {p.node: p.position_m for line in lines for p in line.places if p.position_m is not None}
+
+
+def _with_node(
+    file: IngestedFile,
+    path: str,
+    streams: Sequence[Stream],
+    origin: Origin | None,
+    context: _Context,
+    earlier: Sequence[_Line],
+) -> tuple[dict[str, Any], str, tuple[Placement, ...]]:
+    """Return the keys of a log with its nodes, the question about them, and the nodes that its levels fit."""
+    entry, comment = _entry(file, path, context.towers)
+    placer = context.placer
+    if placer is None:
+        return entry, comment, ()
+    proper = (s for s in streams if not (context.has_level and is_own_radio(s)))
+    levels = [context.dated(s, origin) for s in proper if s.kind == "rss" and not is_ratio(s)]
+    if not comment:
+        return entry, _doubt(entry, levels, placer, context), ()
+    places: list[Placement] = []
+    for cell, level in _levels_of_nodes(entry, levels):
+        nodes = _nodes([*earlier, _Line(file=file, shown="", places=tuple(places))])
+        place = _placement(file, level, placer, context, nodes)
+        if place is None:
+            continue
+        places.append(place)
+        if cell is None:
+            entry["node"] = place.node
+            comment = f"  # {place.question}" if place.tower is None and place.question else ""
+        else:
+            entry["cells"][cell] = place.node
+    return entry, comment, tuple(places)
+
+
+def _levels_of_nodes(entry: Mapping[str, Any], levels: Sequence[Stream]) -> list[tuple[int | str | None, Stream]]:
+    """Return the first level of each cell of a log, or of the log if it has no cells (None).
+
+    Receivers of one node are at one position, so the first level suffices.
+    """
+    cells = entry.get("cells", [None])
+    first = {cell: next((s for s in levels if cell is None or _cell_of(s) == cell), None) for cell in cells}
+    return [(cell, level) for cell, level in first.items() if level is not None]
+
+
+def _placement(
+    file: IngestedFile, level: Stream, placer: Placer, context: _Context, nodes: Mapping[str, FloatArray]
+) -> Placement | None:
+    """Return the tower or position that a level fits. None if the level has too few samples."""
+    site = site_place(context.options.site, context.folder)
+    log = file.sha256, mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
+    airframe = searching_airframe(site, placer.site.towers, log) if is_sounder_power(level) else None
+    track = placer.levels(level, context.floor_db(level), airframe)
+    return placer.propose(track, taught(site, log, loses_lock=False), nodes)
+
+
+def _doubt(entry: Mapping[str, Any], levels: Sequence[Stream], placer: Placer, context: _Context) -> str:
+    """Return a question if a name specifies a tower that the levels contradict."""
+    for level in levels:
+        node = str(entry.get("node") or level.attributes.get("node"))
+        better = placer.contradiction(placer.levels(level, context.floor_db(level)), node)
+        if better is not None:
+            return f"  # the name says {node}, the levels fit {better} far better: which tower?"
+    return ""
+
+
+def _offset_db(
+    level: Stream, entry: Mapping[str, Any], nodes: Mapping[str, FloatArray], context: _Context
+) -> float | None:
+    """Return the offset that a level needs against free space [dB]. None if its node is unknown."""
+    if context.placer is None or level.kind != "rss":
+        return None
+    cell = entry.get("cells", {}).get(_cell_of(level))
+    node = str(cell or entry.get("node") or level.attributes.get("node"))
+    return context.placer.offset_db(context.placer.levels(level, context.floor_db(level)), node, nodes)
+
+
+def _origin(streams: Sequence[Stream], flown: tuple[Stream, Span] | None) -> Origin | None:
+    """Return the origin of relative times whose positions are on the track of the flight."""
+    if flown is None or not has_wall_clock(flown[1][0]):
+        return None
+    relative = [s for s in streams if s.attributes.get("clock") == "relative"]
+    return next((origin for s in relative if (origin := origin_of(s, flown[0])) is not None), None)
+
+
+def _refused(
+    streams: Sequence[Stream],
+    entry: Mapping[str, Any],
+    shown: str,
+    context: _Context,
+    earlier: Sequence[_Line],
+    *,
+    dated: bool,
+) -> dict[str, str]:
+    """Return the streams of a log that are not compared, by name, with the reason.
+
+    ``dated``: relative times have an origin.
+    """
+    leading = _leading(streams)
+    taken = [
+        (_key(s, line.entry), context.span(s), line.shown)
+        for line in earlier
+        for s in line.compared
+        if s.kind != "telemetry"
+    ]
+    refused = {}
+    # a log can contain two ranks: the one with more values comes first
+    for stream in sorted(streams, key=_missing):
+        span, key = context.span(stream), _key(stream, entry)
+        if span is None:
+            why: str | None = "no samples"
+        elif stream.name in leading:
+            why = f"of the same receiver and cell as {leading[stream.name]}, which is compared"
+        else:
+            why = _reason(stream, span, context, dated=dated)
+        if not why and stream.kind != "telemetry":
+            source = next((at for k, when, at in taken if k == key and when and span and meet(span, when)), None)
+            if source is not None:
+                where = "another stream of the log" if source == shown else source
+                why = f"{where} has {key[1]} of that tower and time already"
+            else:
+                taken.append((key, span, shown))
+        if why:
+            refused[stream.name] = why
+    return refused
+
+
+def _reason(stream: Stream, span: Span, context: _Context, *, dated: bool) -> str | None:
+    """Return the reason why a stream cannot be compared along the track of the flight. None if it can be compared."""
+    relative, flown = not has_wall_clock(span[0]), context.flown
+    if stream.kind == "telemetry":
+        if flown is None or stream is flown[0]:
+            return None
+        if meet(span, flown[1]) or (relative and has_wall_clock(flown[1][0])):
+            return "the track is that of other telemetry"
+        return _late(span, flown[1])
+    if flown is None and context.positioned and not _has_positions(stream):
+        return "it has no positions, and there is no telemetry"
+    same_clock = flown is not None and not has_wall_clock(flown[1][0])  # both times are relative
+    if relative and not (dated or same_clock or _has_positions(stream)):
+        return "its times are relative; read it again with --time-origin"
+    if same_clock and not relative:
+        return "the times of the track are relative; read it again with --time-origin"
+    if flown is not None and not relative and not meet(span, flown[1]):
+        return _late(span, flown[1], context.options.timezone)
+    if context.has_level and is_own_radio(stream):
+        return "the telemetry radio; the flight has levels of the experiment"
+    return _RATIO if context.has_level and is_ratio(stream) else None
 
 
 _RATIO = "a ratio to the noise, no level"
@@ -854,15 +910,15 @@ def _late(span: Span, flown: Span, timezone: str | None = None) -> str:
 
 
 def _missing(stream: Stream) -> int:
-    """Of two ranks of one modem, the one that was reported more often is taken: NR or LTE."""
+    """Return the number of missing values of a rank, 0 for other streams."""
     return int(stream.frame["rank"].isna().sum()) if stream.kind == "rank" else 0
 
 
 def _leading(streams: Sequence[Stream]) -> dict[str, str]:
-    """Streams that tell again what the RSRP of their receiver and cell tells, and the name of that RSRP."""
+    """Return the streams that repeat the RSRP of their receiver and cell in another quantity, with that RSRP's name."""
     leaders: dict[object, str] = {}
     same = {}
-    # RSRP first: RSSI and wideband power of a cell hold its load and its neighbours
+    # RSRP first: RSSI and wideband power of a cell include its load and its neighbours
     for stream in sorted(streams, key=lambda s: s.attributes.get("quantity") != "RSRP"):
         if stream.kind != "rss" or "quantity" not in stream.attributes:
             continue
@@ -875,7 +931,7 @@ def _leading(streams: Sequence[Stream]) -> dict[str, str]:
 
 
 def _key(stream: Stream, entry: Mapping[str, Any]) -> tuple[str, str]:
-    """Key by which a report tells series apart."""
+    """Return the tower and channel by which a report distinguishes series."""
     tower = str(entry.get("node") or stream.attributes.get("node"))
     if stream.kind == "rank":
         return tower, "rank"
@@ -883,7 +939,7 @@ def _key(stream: Stream, entry: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _top_m(stream: Stream) -> float:
-    """Greatest height above take-off [m]; minus infinity where none is known."""
+    """Return the greatest height above take-off [m], or -inf if no height is known."""
     if "altitude_m" not in stream.frame:
         return -np.inf
     return float(np.nanmax(stream.frame["altitude_m"].to_numpy(np.float64), initial=-np.inf))
@@ -894,7 +950,7 @@ def _has_positions(stream: Stream) -> bool:
 
 
 def _has_level(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None) -> bool:
-    """Check whether some stream of the flight is RSS in the proper sense."""
+    """Check whether a stream of the flight is a level of the experiment."""
     proper = (s for file in files for s in file.result.streams if not is_own_radio(s))
     levels = [s for s in proper if s.kind == "rss" and not is_ratio(s)]
     spans = [span for s in levels if (span := stream_span(s))]
@@ -906,7 +962,7 @@ def _samples(file: IngestedFile) -> int:
 
 
 def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
-    """The telemetry that most levels and ranks go with, first and last time; of equals, the longest."""
+    """Return the telemetry that overlaps most levels and ranks, and its time span. The longest wins a tie."""
     timed = [(stream, span, file) for file in files for stream in file.result.streams if (span := stream_span(stream))]
     measured = [span for s, span, _ in timed if s.kind != "telemetry" and has_wall_clock(span[0])]
     tracks = [(s, span, file) for s, span, file in timed if s.kind == "telemetry"]
@@ -920,28 +976,27 @@ def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
     def worth(flight: tuple[Stream, Span]) -> tuple[int, np.timedelta64]:
         return sum(meet(flight[1], span) for span in measured), flight[1][1] - flight[1][0]
 
-    # without any wall clock, a log that holds both levels and positions is a flight in its own time
-    # the longest of equals: it gives a position to most samples
+    # without a wall clock, a log with both levels and positions is a flight on its own clock
     return max(telemetry or relative[:1], key=worth, default=None)
 
 
-# Telemetry of one aircraft, as its autopilot and another program write it, stays within this [m].
+# Logs of one aircraft by its autopilot and by another program differ by less than this [m].
 _ONE_VEHICLE_M = 30.0
 
-# Log evidence a bin by which the levels must fit one vehicle better.
+# Log evidence per bin by which the levels must fit one vehicle better.
 _SURE_OF_VEHICLE = 0.1
 
 
 def _carrier(
     files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, site: Site
 ) -> tuple[tuple[Stream, Span] | None, str]:
-    """Of several vehicles at the time of the flight, the one whose track the levels fit best at any tower; a question.
+    """Choose the vehicle whose track fits the levels best at any tower. Also return a question if several flew.
 
     Parameters
     ----------
     files : sequence of IngestedFile
     flown : (Stream, Span), optional
-        Telemetry that the times of the logs choose.
+        Telemetry that overlaps most levels and ranks.
     site : Site
     """
     if flown is None:
@@ -956,7 +1011,7 @@ def _carrier(
     levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
     evidence = [max((Placer(site, s).evidence(level) for level in levels), default=-np.inf) for s, _ in tracks]
     order = np.argsort(evidence)
-    # all must have evidence: a track without levels of its own says nothing against another
+    # all must have evidence: a track without levels is no evidence against another
     sure = np.isfinite(evidence).all() and evidence[order[-1]] - evidence[order[-2]] > _SURE_OF_VEHICLE
     best = tracks[order[-1]] if sure else flown
     named = " and ".join(stream.name for stream, _ in tracks)
@@ -966,7 +1021,7 @@ def _carrier(
 
 
 def _apart_m(first: Stream, second: Stream) -> float:
-    """Median distance of two tracks while both were logged [m]; 0 where that is not known."""
+    """Return the median distance of two tracks while both were logged [m], or 0 if it is unknown."""
     (time, place), (at, other) = (positions_over_time(stream.frame) for stream in (first, second))
     if len(time) < 2 or len(at) < 2:
         return 0.0
@@ -976,39 +1031,39 @@ def _apart_m(first: Stream, second: Stream) -> float:
     return float(np.median(np.linalg.norm(here - there, axis=1))) if both.any() else 0.0
 
 
-# Of a log's cells, those told most often are proposed; in a city a phone hears a hundred.
+# Propose the cells with the most samples only: in a city a phone reports a hundred cells.
 MOST_CELLS = 6
 
 
-# Attributes that say whose level it is where no PCI does; channels, ports and antennas of one node are no cells.
+# Attributes that identify a cell without a PCI. Channels, ports and antennas of one node are not cells.
 _OF_CELL = re.compile(r"(cell|sector|[eg]nb|bs|base_station|e?ci|nci|[en]?cgi)(_.*)?")
 
 
 def _cell_of(stream: Stream) -> int | str | None:
-    """Key of a stream in ``cells:``: the PCI, else the stream's name where another number tells its cell."""
+    """Return the key of a stream in ``cells:``: its PCI, or its name if another attribute identifies the cell."""
     if "pci" in stream.attributes:
         return int(stream.attributes["pci"])
     return stream.name if any(map(_OF_CELL.fullmatch, stream.attributes)) else None
 
 
 def _cells(streams: Sequence[Stream]) -> list[int | str]:
-    """Cells of a log of several, those with a twentieth of the samples of the first and more."""
+    """Return the cells of a log with at least a twentieth of the samples of its most frequent cell."""
     counts = {cell: len(s.frame) for s in streams if (cell := _cell_of(s)) is not None}
     most = max(counts.values(), default=0)
     most_sampled = sorted(counts, key=lambda cell: -counts[cell])[:MOST_CELLS]
-    # numbers flush right are in their own order, and compare with names
+    # right-aligned numbers sort by value, and can be compared with names
     return sorted((cell for cell in most_sampled if 20 * counts[cell] >= most), key="{:>9}".format)
 
 
 def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[str, Any], str]:
-    """Keys of a log and a question about what had to be guessed."""
+    """Return the keys of a log and a question about its node, if that is a guess."""
     entry: dict[str, Any] = {"path": path, "reader": file.result.reader}
     need = [s for s in file.result.streams if s.kind in ("rss", "rank") and not s.attributes.get("node")]
     if not need:
         return entry, ""
     here = Path(file.path).resolve()
-    # a home folder may be called after a tower, too
-    near = named_tower("/".join(here.parts[-2:]), towers)  # of the file or its folder
+    # the names of the file and its folder only: a home folder may have the name of a tower
+    near = named_tower("/".join(here.parts[-2:]), towers)
     alone = towers[0] if len(towers) == 1 else None
     entry["node"] = near or named_tower(path, towers) or alone or next(iter(towers), "LW1")
     if cells := _cells(need):
@@ -1022,18 +1077,18 @@ def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[s
 
 
 def _also(comment: str, question: str) -> str:
-    """The comment behind a line of ``logs:`` with one more question."""
+    """Return the comment at the end of a line of ``logs:`` with one more question."""
     return f"{comment} {question}" if comment else f"  # {question}"
 
 
 def _plain(entry: Mapping[str, Any]) -> str:
-    """A mapping of plain names on one line."""
-    # never wrapped: a question follows the entry on its line
+    """Return a mapping of plain names on one line of YAML."""
+    # not wrapped: a question follows on the same line
     return str(yaml.safe_dump(dict(entry), default_flow_style=True, sort_keys=False, width=10_000)).strip()
 
 
 def _flow(entry: dict[str, Any]) -> str:
-    """A log's YAML mapping on one line, as a flight.yaml is read: a file may be called 1e6."""
+    """Return the YAML mapping of a log on one line, quoted if necessary: a file name can be 1e6."""
 
     def dumped(style: str | None) -> str:
         text = yaml.safe_dump(
@@ -1044,22 +1099,22 @@ def _flow(entry: dict[str, Any]) -> str:
 
     text = dumped(None)
     try:
-        # our reader follows YAML 1.2, the writer 1.1: a name such as 1e6 or 12:30 may come back as another
+        # our reader follows YAML 1.2, the writer 1.1: a name such as 1e6 or 12:30 can change
         as_read = len(text.splitlines()) == 1 and parse_yaml(text, LogSettings).path == entry["path"]
     except UsageError:
         as_read = False
     return text if as_read else dumped('"')
 
 
-# Times before it are relative, or of a clock that was never set: no flight is called by them.
+# Earlier times are relative, or from a clock that was never set: they do not name a flight.
 _FIRST_CLOCK = np.datetime64("1981")
 
 
 def _name(flown: tuple[Stream, Span] | None, files: Sequence[IngestedFile]) -> str:
-    """The time of take-off, else the log where it is one, else the folder."""
+    """Return the name of a flight: its first time, or else the name of its only log or of the folder."""
     if flown is None or flown[1][0] < _FIRST_CLOCK:
         place = Path(files[0].path).resolve()
         stem = place.stem if flown is not None and len(files) == 1 else place.parent.name
-        # what flight.name allows
+        # flight.name allows these letters
         return re.sub(r"[^A-Za-z0-9_.-]", "_", stem).lstrip("_.-") or "flight"
     return "flight_" + str(flown[1][0].astype("datetime64[m]")).replace("T", "_").replace(":", "")

@@ -1,8 +1,6 @@
-"""Proposals for a draft: the tower or place that the levels fit, and learned antennas of the site.
+"""Proposals for a draft: the tower or position that the levels of a log fit, and learned antennas of the site.
 
-Tower, or place, that the levels of a log fit: proposals for a draft.
-
-Learned antennas of a site for a flight: those that the levels of the flight itself support.
+Learned antennas are proposed only if the levels of the flight support them.
 """
 
 from __future__ import annotations
@@ -20,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from ...common.errors import InputError, UsageError
-from ...common.jsonable import named
 from ...common.units import FloatArray, spread_out
 from ...compare.gains import (
     BODY,
@@ -50,37 +47,37 @@ from ..settings import FlightFile
 from ..track import Track
 from ..training import among, flight_logs, marks_of
 
-# Log odds from which on a tower stands: of real flights and thirds at LW1 18 of 20 give more, all more than -3, and six
-# rovers -11 and less; from which on a listed place does, which somebody wrote down: the rovers' give -3 and more.
+# Smallest log odds of a tower, and of a listed position. Of 20 real flights and thirds at LW1, 18 have more than -0.5
+# and all have more than -3. Six rovers have -11 and less. The listed positions of the rovers have -3 and more.
 _TOWER_ODDS, _LISTED_ODDS = -0.5, -5.0
 
-# Log odds that antennas which flights taught must give more: thirds of LW1 flights give 8 to 57 in all where one or two
-# taught; of 165 places elsewhere 158 give less than the 5 at which a tower stands.
+# Log odds that learned antennas must add. Thirds of LW1 flights have 8 to 57 with antennas from one or two flights.
+# 158 of 165 positions elsewhere have less than the 5 that a tower needs.
 _TAUGHT_MORE = 5.5
 
-# Log evidence by which another tower must explain the levels better before a named one is doubted.
+# Log evidence by which another tower must explain the levels better than the tower in a name.
 CONTRADICTED = 8.0
 
-# Bins of a level that say which of two vehicles carried the radio, and the model that they are judged by.
+# Fewest bins of a level that show which of two vehicles carried the radio, and the model of the level.
 _FEWEST_OF_VEHICLE = 8
 _NEAR_FREE_SPACE = LevelModel(slope=2.0, slope_sd=0.3, elevation_sd_db=2.0, shadow_sd_db=2.0, scatter_sd_db=1.5)
 
-# Places of a list, and towers, whose log odds differ by less are all named.
+# Name all listed positions and towers whose log odds differ by less.
 _UNDECIDED = 3.0
 
-# Of the link that a draft proposes.
+# Carrier and power of the link that a draft proposes.
 CARRIER_HZ, POWER_DBM = 3.3e9, 40.0
 
-# Below it an airframe on the ground decides the level.
+# Below this height [m] the ground and the airframe determine the level.
 _LOW_M = 5.0
 
-# A place of a list that is farther from the track is not of this flight.
+# A listed position farther from the start of the track belongs to another flight.
 NEAR_M = 5000.0
 
 
 @dataclass(frozen=True, slots=True)
 class ListedPlace:
-    """A place of a position list: file name, line, latitude and longitude [deg]."""
+    """A position of a position list: file name, line, latitude and longitude [deg]."""
 
     file: str
     line: int
@@ -93,7 +90,10 @@ _MOST_BYTES = 20_000
 
 
 def listed_places(folders: Iterable[Path]) -> list[ListedPlace]:
-    """Places that position lists in some folders name: text files with ``position`` in the name, a pair a line."""
+    """Return the positions in the position lists of some folders.
+
+    A list is a text file with ``position`` in its name, and latitude and longitude on each line.
+    """
     paths = [path for folder in sorted(set(folders)) for path in sorted(folder.glob("*[Pp]osition*"))]
     places = []
     for path in paths:
@@ -113,44 +113,47 @@ class Placement:
     ----------
     node : str
     tower : mapping or None
-        Entry of ``towers`` in flight.yaml, where the site has no such tower.
+        Entry of ``towers`` in flight.yaml. None for a tower of the site, and for a node that an earlier log has.
     question : str
-        About the proposal.
+        Question about the proposal.
     radius_m : float
-        Of 90 % confidence about an estimated place; 0 of a known one.
+        Radius of the 90 % region of an estimated position; 0 for a known position.
+    position_m : (3,), optional
+        East, north and up of a node that the site does not have [m]; None if an earlier log has it.
     """
 
     node: str
     tower: Mapping[str, Any] | None
     question: str
     radius_m: float = 0.0
+    position_m: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Taught:
-    """Antennas of a tower and of an airframe that flights taught, and how levels scatter about them."""
+    """Learned antennas of a tower and an airframe, and the scatter of levels about them."""
 
     tower: MeasuredPattern
     uav: MeasuredPattern
     model: LevelModel
     moments: Moments | None = None
-    """Gain of both ends with its covariance, by which it must win against a gain of the flight's own."""
+    """Gain of both ends with its covariance, to compare it with an unknown gain."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Placer:
-    """Proposals for the logs of one flight."""
+    """Proposals of nodes for the logs of one flight, by its telemetry."""
 
     site: Site
     telemetry: Stream
     listed: Sequence[ListedPlace] = ()
-    nodes: dict[str, FloatArray] = field(default_factory=dict)
-    """Proposed so far: east and north."""
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def track(self) -> Track:
+        """The track of the flight."""
         frame = self.telemetry.frame[~unscored(self.telemetry.frame)]
         takeoff_m, ground = self.site.takeoff_ground_m, self.site.ground_under_m
-        self.track = Track(frame, self.site.frame, ground_m=takeoff_m, ground=ground)
+        return Track(frame, self.site.frame, ground_m=takeoff_m, ground=ground)
 
     @property
     def at_site(self) -> bool:
@@ -158,10 +161,10 @@ class Placer:
         return any(self._near(tower.latitude_deg, tower.longitude_deg) for tower in self.site.towers.values())
 
     def positions_m(self, count: int) -> FloatArray:
-        """About ``count`` positions (n, 3) of the flight [m], spread over it, above the ground."""
+        """Return about ``count`` positions (n, 3) of the flight in the air [m], at equal steps of rows."""
         times = self.telemetry.frame["time"]
         place = self.track.pose_at(times.iloc[spread_out(len(times), count)]).position_m
-        # in the air: on the ground everything is behind something
+        # on the ground every sight line is blocked
         return place[place[:, 2] > self.track.ground_m + _LOW_M]
 
     def levels(
@@ -171,13 +174,13 @@ class Placer:
         airframe: MeasuredPattern | None = None,
         node: MeasuredPattern | None = None,
     ) -> LevelTrack:
-        """Levels of a log where the UAV flew, with the gains of its airframe and of a node where they are known.
+        """Return the levels of a log along the flight, with the gains of airframe and node if they are known.
 
         Parameters
         ----------
         stream : Stream
         floor_db : float
-            Of the receiver; -inf where none is known.
+            Floor of the receiver, -inf if it is unknown.
         airframe, node : MeasuredPattern, optional
 
         Returns
@@ -190,7 +193,7 @@ class Placer:
         time = frame["time"].to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
         level = frame["rss_db"].to_numpy(np.float64)
         below_floor = frame["flag"].astype(str).str.contains("out_of_coverage").to_numpy()
-        # out of coverage is knowledge: the level was below the floor there
+        # out of coverage means that the level was below the floor
         level = np.where(np.isnan(level) & below_floor & np.isfinite(floor_db), floor_db, level)
         track = level_track(time, place, level, floor_db=floor_db)
         if not len(track.time_s):
@@ -199,15 +202,20 @@ class Placer:
         return track if airframe is None else replace(track, airframe_db=self._gain_db(track, airframe, node))
 
     def propose(
-        self, track: LevelTrack, taught: Mapping[str, Sequence[Taught]] = MappingProxyType({})
+        self,
+        track: LevelTrack,
+        taught: Mapping[str, Sequence[Taught]] = MappingProxyType({}),
+        nodes: Mapping[str, FloatArray] = MappingProxyType({}),
     ) -> Placement | None:
-        """Tower, listed place or estimated place that the levels fit; None where they are too few.
+        """Return the tower, listed position or estimated position that levels fit. None if there are too few levels.
 
         Parameters
         ----------
         track : LevelTrack
         taught : mapping of str to sequence of Taught
-            Gains of towers and airframe that other flights taught, by tower; none for those of its own log.
+            Gains of towers and airframe that were learned from other flights, by tower.
+        nodes : mapping of str to (3,)
+            Positions of the nodes that were proposed for other logs of the flight [m].
         """
         if len(track.level_db) < FEWEST:
             return None
@@ -216,7 +224,7 @@ class Placer:
         at = [np.asarray(tower.position_m) for tower in towers] + [self._local(place) for place in listed]
         odds = place_odds(track, np.array(at))
         odds_tower, odds_listed = odds[: len(towers)].copy(), odds[len(towers) :]
-        # the search takes longer than all else: only where a tower's antennas or a place of its own need it
+        # the search is the slowest step: only for learned antennas, or if no tower fits
         estimate = locate(track) if any(taught.values()) or odds_tower.max() < _TOWER_ODDS else None
         known = np.full(len(towers), -np.inf)
         for i, tower in enumerate(towers):
@@ -224,28 +232,29 @@ class Placer:
                 continue
             if gains := [each for each in taught.get(tower.name, ()) if self._supports(track, tower.name, each)]:
                 taught_odds = max(self._taught_odds(track, tower.name, each) for each in gains) - np.log(len(gains))
-                # as odds against any place, like those of the search
+                # odds against any position, as those of the search
                 taught_odds -= estimate.anywhere + _TAUGHT_MORE
                 known[i] = taught_odds if taught_odds >= _TOWER_ODDS else -np.inf
                 odds_tower[i] = max(odds_tower[i], taught_odds)
         if len(listed) and odds_listed.max() >= max(_LISTED_ODDS, odds_tower.max()):
-            # a list of rover places holds neighbours some metres apart: all likely lines are named
+            # positions in a list can be some metres apart: name all likely lines
             order = np.argsort(-odds_listed)
             place, least = listed[order[0]], odds_listed[order[0]] - _UNDECIDED
             undecided = [listed[i] for i in order[1:] if odds_listed[i] > least]
             also = "".join(f" or line {tie.line}" for tie in undecided)
             about = f"line {place.line} of {place.file}{also}: is the node there?"
-            return self._node(self._local(place), place.latitude_deg, place.longitude_deg, 1.5, about)
+            at_list = round(place.latitude_deg, 7), round(place.longitude_deg, 7), 1.5
+            return _node(self._local(place), at_list, about, nodes)
         best = int(odds_tower.argmax())
         if odds_tower[best] >= _TOWER_ODDS:
             how = "with the antennas that flights taught" if odds_tower[best] > odds[best] else "as well as any place"
             near = [i for i in np.argsort(-odds_tower) if odds_tower[i] > odds_tower[best] - _UNDECIDED]
             alike = [towers[i].name for i in near]
-            # a part of a flight that circles no tower fits several: that with learned antennas is the likeliest
+            # part of a flight can fit several towers: one with learned antennas is the most likely
             name = towers[max(near, key=lambda i: (known[i], towers[i].name in taught))].name
             asked = "is it this tower?" if len(alike) == 1 else f"is it {name}?"
             return Placement(name, None, f"the levels fit {' or '.join(alike)} {how}: {asked}")
-        assert estimate is not None  # no tower stands
+        assert estimate is not None  # no tower fits
         latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
         apart = [float(np.hypot(*(np.asarray(t.position_m) - estimate.place_m)[:2])) for t in towers]
         near = [t.name for t, d in zip(towers, apart, strict=True) if d <= estimate.radius90_m]
@@ -255,8 +264,8 @@ class Placer:
             f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where did the node stand?"
         )
         place = estimate.place_m
-        node = self._node(place, float(latitude[0]), float(longitude[0]), float(place[2]), about)
-        return replace(node, radius_m=estimate.radius90_m)
+        at_estimate = round(float(latitude[0]), 7), round(float(longitude[0]), 7), float(place[2])
+        return replace(_node(place, at_estimate, about, nodes), radius_m=estimate.radius90_m)
 
     def _supports(self, track: LevelTrack, tower: str, gains: Taught) -> bool:
         """Check whether levels support the learned antennas of a tower against a gain of their own."""
@@ -274,14 +283,14 @@ class Placer:
         return odds.fits
 
     def _taught_odds(self, track: LevelTrack, tower: str, gains: Taught) -> float:
-        """Log evidence of a tower with the antennas at both ends that flights taught."""
+        """Return the log evidence of a tower with learned antennas at both ends."""
         place, gain_db = self.site.towers[tower].position_m[None, :], self._gain_db(track, gains.uav, gains.tower)
         return float(fit_places(replace(track, airframe_db=gain_db), place, gains.model).evidence[0])
 
     def _gain_db(
         self, track: LevelTrack, airframe: MeasuredPattern, node: MeasuredPattern | None = None
     ) -> Callable[[FloatArray], FloatArray]:
-        """Gain of an airframe, and of a node, at each level of a track towards unit vectors (m, n, 3)."""
+        """Return a function: the gain of an airframe and a node at each level towards unit vectors (m, n, 3) [dB]."""
 
         def gain_db(towards: FloatArray) -> FloatArray:
             assert track.rotation is not None
@@ -291,7 +300,7 @@ class Placer:
         return gain_db
 
     def evidence(self, stream: Stream) -> float:
-        """Log evidence a bin of levels along this track at the best tower; -inf where they are too few."""
+        """Return the log evidence per bin of levels along this track at the best tower, or -inf for too few levels."""
         track = self.levels(stream)
         if len(track.level_db) < _FEWEST_OF_VEHICLE:
             return -np.inf
@@ -299,7 +308,7 @@ class Placer:
         return float(fit_places(track, towers, _NEAR_FREE_SPACE).evidence.max()) / len(track.level_db)
 
     def contradiction(self, track: LevelTrack, node: str) -> str | None:
-        """Tower that the levels fit far better than the one that is named; None where none does."""
+        """Return a tower that levels fit far better than the node in their name. None if there is no such tower."""
         if node not in self.site.towers or len(track.level_db) < FEWEST:
             return None
         names = list(self.site.towers)
@@ -307,25 +316,17 @@ class Placer:
         best = int(evidence.argmax())
         return names[best] if evidence[best] > evidence[names.index(node)] + CONTRADICTED else None
 
-    def offset_db(self, track: LevelTrack, node: str) -> float | None:
-        """Median of free space over the draft's link minus the level [dB]; None for an unknown node."""
-        place = self.nodes.get(node)
+    def offset_db(
+        self, track: LevelTrack, node: str, nodes: Mapping[str, FloatArray] = MappingProxyType({})
+    ) -> float | None:
+        """Return the median of free space over the draft's link minus the level [dB]. None for an unknown node."""
+        place = nodes.get(node)
         if node in self.site.towers:
             place = self.site.towers[node].position_m
         if place is None or not len(track.level_db):
             return None
         free = free_space_dbm(place[None, :], track.position_m, CARRIER_HZ, POWER_DBM)[:, 0]
         return float(np.median(free - track.level_db))
-
-    def _node(self, place: FloatArray, latitude: float, longitude: float, height: float, about: str) -> Placement:
-        # two channels of one rover are placed some metres apart
-        same = [name for name, placed in self.nodes.items() if np.hypot(*(placed[:2] - place[:2])) < 100.0]
-        name = same[0] if same else "NODE" + (str(len(self.nodes) + 1) if self.nodes else "")
-        tower = {"latitude_deg": round(latitude, 7), "longitude_deg": round(longitude, 7), "antenna_height_m": height}
-        if same:
-            return Placement(name, None, "")
-        self.nodes[name] = place
-        return Placement(name, tower, about)
 
     def _local(self, place: ListedPlace) -> FloatArray:
         east, north = self.site.frame.to_local(np.array([place.latitude_deg]), np.array([place.longitude_deg]))
@@ -335,10 +336,26 @@ class Placer:
         if not len(self.track):
             return False
         start = self.track.pose_at(np.array([self.track.start_ns], dtype="datetime64[ns]")).position_m[0]
-        # a list may hold angles that are none
+        # a list can contain numbers that are not angles
         with np.errstate(invalid="ignore"):
             east, north = self.site.frame.to_local(np.array([latitude_deg]), np.array([longitude_deg]))
         return bool(np.hypot(east[0] - start[0], north[0] - start[1]) < NEAR_M)
+
+
+# Two channels of one rover are placed some metres apart.
+_SAME_NODE_M = 100.0
+
+
+def _node(
+    position_m: FloatArray, at: tuple[float, float, float], question: str, nodes: Mapping[str, FloatArray]
+) -> Placement:
+    """Return the placement at a position (latitude, longitude [deg], height [m]): a new node, or one of ``nodes``."""
+    for name, placed in nodes.items():
+        if np.hypot(*(placed[:2] - position_m[:2])) < _SAME_NODE_M:
+            return Placement(name, None, "")
+    tower = dict(zip(("latitude_deg", "longitude_deg", "antenna_height_m"), at, strict=True))
+    name = "NODE" + (str(len(nodes) + 1) if nodes else "")
+    return Placement(name, tower, question, position_m=position_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,7 +363,7 @@ class Remembered:
     """Learned antennas of one tower and channel of a site."""
 
     name: str
-    """Of the entry."""
+    """Name of the entry."""
     entry: learned.Entry
     series: learned.LearnedSeries
     tower: SpherePattern
@@ -356,40 +373,40 @@ class Remembered:
 
     @property
     def level(self) -> learned.LearnedLevel:
-        """Level of the log; only of series that have it."""
+        """The learned level. Only for series that have it."""
         assert self.series.level is not None
         return self.series.level
 
     @property
     def spread(self) -> Spread:
-        """Error model of a level besides the standard deviation of the gains."""
+        """The error model of a level, without the standard deviation of the gains."""
         return spread_of(self.series.spread)
 
     @property
     def prior_variance_db2(self) -> float:
-        """Variance of the gains of both ends in directions that nobody has flown."""
+        """The variance of the gains of both ends in directions without learned samples [dB^2]."""
         return self.tower.largest_sd_db**2 + self.uav.largest_sd_db**2
 
     @cached_property
     def airframe(self) -> KnownProcess:
-        """Gain of the UAV with its covariance."""
+        """The gain of the UAV with its covariance."""
         return _process(self.uav, self.known, BODY)
 
     @cached_property
     def tower_antenna(self) -> KnownProcess:
-        """Gain of the tower's antenna with its covariance."""
+        """The gain of the tower's antenna with its covariance."""
         return _process(self.tower, self.tower_known, MAST)
 
     @property
     def teaches(self) -> bool:
-        """True if the airframe may be used at towers that its flights did not hear.
+        """True if the airframe can be used at other towers.
 
-        A receiver that loses its lock, and flights that do not predict each other, say nothing about other flights.
+        A receiver that loses its lock, and flights that do not predict each other, do not predict other flights.
         """
         return self.series.lock is None and self.series.shares_airframe
 
     def gain_db(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
-        """Gain of both ends (n,) and its standard deviation (n,) [dB]."""
+        """Return the gain of both ends (n,) and its standard deviation (n,) [dB]."""
         ends = {"uav": (self.uav, samples.at_uav), "tower": (self.tower, samples.at_tower)}
         pair_db, sd_db = pair_and_sd_db(ends)
         return pair_db + sum(pattern.gain_dbi(*sphere_angles(direction)) for pattern, direction in ends.values()), sd_db
@@ -419,7 +436,7 @@ def every_antenna(site: str | Path) -> list[Remembered]:
     Raises
     ------
     UsageError, InputError
-        Learned models that are damaged, or a table that is not as it was written.
+        If learned models are damaged, or a table was changed.
     """
     folder, out = learned.folder_of(site), []
     for name, entry in sorted(learned.read_learned(site).entries.items(), key=lambda item: item[1].made):
@@ -443,7 +460,7 @@ def every_antenna(site: str | Path) -> list[Remembered]:
 
 
 def remembered(site: str | Path) -> dict[str, Remembered]:
-    """Return the learned antennas of the towers of a site by ``tower.channel``, the latest made of each.
+    """Return the latest learned antennas of each ``tower.channel`` of a site.
 
     Raises
     ------
@@ -453,17 +470,17 @@ def remembered(site: str | Path) -> dict[str, Remembered]:
     return {f"{known.series.tower}.{known.series.channel}": known for known in every_antenna(site)}
 
 
-# Exponent of the distance beside antennas that were learned under free space.
+# Standard deviation of the path-loss exponent for antennas that were learned under free space.
 _TAUGHT_SLOPE_SD = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proposal:
-    """Learned antennas and receiver for a draft, by name, each with a sentence on what to expect."""
+    """Learned antennas and a receiver for a draft, by name, each with a sentence about the expected error."""
 
     antennas: Mapping[str, str] = field(default_factory=dict)
     antennas_about: str = ""
-    """Source and odds of the antennas; if none fits, the odds of the best one."""
+    """Source and odds of the antennas, or the odds of the best ones if none fit."""
     carrier_hz: float | None = None
     receiver: str | None = None
     receiver_about: str = ""
@@ -471,7 +488,7 @@ class Proposal:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nodes:
-    """Nodes of a draft that are no towers of the site and whose place is well known, and the towers of the site."""
+    """Nodes outside the site's towers at well-known positions, and the towers of the site."""
 
     placed: frozenset[str] = frozenset()
     fixed: Sequence[str] = ()
@@ -495,7 +512,7 @@ def propose(
         Its name in the names of the antennas.
     nodes : Nodes
     carrier_known : bool
-        The carriers of ``data`` are those of the experiment, and antennas of other bands do not fit.
+        True if the carriers of ``data`` are correct. Antennas of other bands are then not compared.
 
     Returns
     -------
@@ -504,7 +521,7 @@ def propose(
     Raises
     ------
     UsageError, InputError
-        As :func:`every_antenna`.
+        See :func:`every_antenna`.
     """
     ranked = {(s.tower, quantity_of(data, s)) for s in data.rank}
     entries = learned.read_learned(place).entries
@@ -517,14 +534,14 @@ def propose(
     if data.track is None or not data.rss or not entries:
         return ranks
     found = _antennas_for(data, every_antenna(place), site, nodes, carrier_known=carrier_known)
-    return replace(found, **named(ranks, "receiver receiver_about"))
+    return replace(found, receiver=ranks.receiver, receiver_about=ranks.receiver_about)
 
 
 def _antennas_for(
     data: FlightData, known: Sequence[Remembered], site: str, nodes: Nodes, *, carrier_known: bool
 ) -> Proposal:
     """Return the antennas of the entry with the largest odds, or of the airframe with the largest odds."""
-    # a ratio to the noise counts if there is no level
+    # a ratio to the noise is used only if there is no level
     levels = [s for s in data.rss if s.channel.lower() not in RATIOS] or list(data.rss)
     evidence = FlightEvidence([observed_series(data, series)[0].samples for series in levels])
     chosen: dict[str, dict[str, tuple[Remembered, Evidence]]] = {}
@@ -534,7 +551,7 @@ def _antennas_for(
             if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, band):
                 continue
             named_odds = _named_odds(data, series, item)
-            # what cannot teach another flight is not offered to another receiver, whose levels have another unit
+            # antennas that do not predict other flights are not offered to a receiver with another unit
             if named_odds < 0.0 and not item.teaches:
                 continue
             # antennas of another name must also win against their airframe at an unknown antenna
@@ -546,7 +563,7 @@ def _antennas_for(
                 best[key] = max(best.get(key, (item, odds)), (item, odds), key=lambda pair: pair[1].over_own)
     entry = max(chosen, key=lambda name: sum(e.over_own for _, e in chosen[name].values()), default="")
     fits = chosen.get(entry, {})
-    # channels of one flight are judged together: their antennas are those of one entry, and of one airframe
+    # judge the channels of a flight together: they need antennas of one entry, with one airframe
     odds = _pooled([odds for _, odds in fits.values()])
     if fits and odds.over_own >= LEAST_ODDS and odds.over_turned > -_MOUNTED_AS_LEARNED:
         first = next(iter(fits.values()))[0]
@@ -564,7 +581,7 @@ def _antennas_for(
 def _airframe_for(
     data: FlightData, known: Sequence[Remembered], site: str, evidence: FlightEvidence, *, band: float
 ) -> Proposal:
-    """Return the airframe alone that the levels support; without an antenna, the odds of the best one."""
+    """Return the airframe alone that the levels support, or a proposal with the odds of the best airframe only."""
     own, marks = set(flight_logs(data)), marks_of([data])
     tried: dict[str, tuple[Remembered, Evidence]] = {}
     for item in known:
@@ -586,12 +603,12 @@ def _airframe_for(
     )
 
 
-# Log odds of antennas of both ends before any level: with the names of its tower and channel, or of its receiver; and
-# with levels in another unit, which are those of another receiver. Levels of field flights decide by 13 and more, and
-# can refuse antennas of the same name; a short or smooth flight must not.
+# Prior log odds of antennas of both ends: with the same tower and channel or the same receiver, and with another unit
+# of level, which means another receiver. Levels of field flights add 13 and more, so they can refuse antennas of the
+# same name. A short or smooth flight cannot.
 _SAME_NAME, _OTHER_UNIT = 10.0, -3.0
 
-# Log odds that a known pair of antennas is mounted as it was, and not rotated by a quarter turn or more.
+# Prior log odds that known antennas are mounted as before, and not rotated by a quarter turn or more.
 _MOUNTED_AS_LEARNED = 3.0
 
 
@@ -616,7 +633,7 @@ def _pooled(each: Sequence[Evidence]) -> Evidence:
     return Evidence(over_own=own, over_turned=turned)
 
 
-# Larger odds are not told from certainty.
+# Larger odds are shown as "more than".
 _MOST_ODDS = 1000.0
 
 
@@ -639,35 +656,35 @@ def _odds(odds: Evidence) -> str:
 
 
 def searching_airframe(site: str | Path, towers: Collection[str], log: tuple[str, str]) -> SpherePattern | None:
-    """Return the airframe that was learned with nodes at many places, for the search of a node; None if none fits.
+    """Return the airframe that was learned with nodes at many positions, to search for a node. None if there is none.
 
-    Only for levels of the channel sounder: such an airframe was learned with a receiver that loses its lock.
+    Use it for levels of the channel sounder only: it was learned with a receiver that loses its lock.
 
     Parameters
     ----------
     site : str or Path
-        As :func:`.read_learned` takes it.
+        Name or path, as for :func:`.read_learned`.
     towers : collection of str
-        Of the site: what was learned with one of them says little about a search.
-    log : (SHA-256, mark)
-        Of the log, which must not have been learned from.
+        Towers of the site. Airframes learned with one of them are not used.
+    log : (SHA-256, fingerprint)
+        The log of the levels. Airframes learned from it are not used.
     """
     nodes = (ends for tower, each in taught(site, log, loses_lock=True).items() if tower not in towers for ends in each)
     return next((ends.uav for ends in nodes if isinstance(ends.uav, SpherePattern)), None)
 
 
 def taught(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[str, list[Taught]]:
-    """Return the learned antennas of both ends by tower; none if the learned models are damaged.
+    """Return the learned antennas of both ends by tower. Empty if the learned models are damaged.
 
     Parameters
     ----------
     site : str or Path
-    log : (SHA-256, mark)
-        A tower whose antennas were learned from this log has an empty list.
+    log : (SHA-256, fingerprint)
+        Antennas that were learned from this log are not returned.
     loses_lock : bool
-        Those of receivers that lose their lock, or all others.
+        True for receivers that lose their lock, False for all others.
     """
-    from ...compare.locate import LevelModel  # a draft's alone, and a report loads this module
+    from ...compare.locate import LevelModel  # only drafts need it, and reports load this module
 
     out: dict[str, list[Taught]] = {}
     with suppress(InputError, UsageError):
@@ -690,9 +707,9 @@ def taught(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[
 
 
 def offered(data: FlightData) -> FlightFile | None:
-    """Return the settings of a flight with the learned antennas that its levels support; None if none fits."""
+    """Return the settings of a flight with the learned antennas that its levels support. None if no antenna fits."""
     site = data.settings.site.file
-    own = frozenset(data.settings.towers)  # as the rovers of other flights were: placed by their own flight
+    own = frozenset(data.settings.towers)  # placed by their own flight, as the rovers of other flights were
     nodes = Nodes(placed=own, fixed=[name for name in data.site.towers if name not in own])
     try:
         known = propose(data, data.site_place, str(Path(site).with_suffix("")), nodes, carrier_known=True)
@@ -710,18 +727,18 @@ def errors_elsewhere(
     folder: Path,
     flown: tuple[FloatArray, FloatArray] | None = None,
 ) -> learned.Errors | None:
-    """Return the errors of learned antennas on held-out flights of the kind of a series; None without such antennas.
+    """Return the errors of learned antennas on held-out flights like that of a series. None without such antennas.
 
     Parameters
     ----------
     antennas : mapping of str to str
-        As the flight file names them.
+        Names of the antennas in the flight file.
     series : RssSeries
     folder : Path
-        Of the flight file.
+        Folder of the flight file.
     flown : (n, 3) and (n,), optional
-        Positions [m], and standard deviation of the learned gain there [dB]: a new height, or new directions, have the
-        errors of such.
+        Positions [m], and standard deviation of the learned gain there [dB]. They show whether the height or the
+        directions are new, which have larger errors.
 
     Returns
     -------
@@ -738,7 +755,7 @@ def errors_elsewhere(
     return _expected(named.entry, antenna, *(flown or ()))[0]
 
 
-# Directions whose standard deviation is so many times that of flown ones were not flown.
+# Directions are new if the standard deviation of the gain exceeds this multiple of that in learned directions.
 _UNSEEN_SD = 2.0
 
 
@@ -748,7 +765,7 @@ def _expected(
     position_m: FloatArray | None = None,
     sd_db: FloatArray | None = None,
 ) -> tuple[learned.Errors | None, str]:
-    """Return the errors to expect of an antenna of an entry, of its airframe alone for a series of None; their kind."""
+    """Return the expected errors of an antenna, or of the airframe alone (series None), and a phrase for their kind."""
     errors, usual = entry.errors, "on another flight"
     if errors is None:
         return None, usual
@@ -764,7 +781,7 @@ def _expected(
 
 
 def lock_elsewhere(antennas: Mapping[str, str], folder: Path) -> learned.LearnedLock | None:
-    """Return P(lock) of the receiver that the airframe of a flight was learned with; None if it never loses lock."""
+    """Return P(lock) of the receiver with which an airframe was learned. None if the receiver never loses its lock."""
     try:
         named = learned.find_named(antennas["uav"], folder)
     except (KeyError, InputError, UsageError):
@@ -773,5 +790,5 @@ def lock_elsewhere(antennas: Mapping[str, str], folder: Path) -> learned.Learned
 
 
 def _same_place(s: learned.LearnedSeries, tower: str, nodes: Nodes) -> bool:
-    """Check whether an antenna hangs at a tower, or at a node that other flights carried to their places."""
+    """Check whether an antenna belongs to a tower, or to a node at a well-known position."""
     return s.tower == tower or (tower in nodes.placed and s.tower not in nodes.fixed)

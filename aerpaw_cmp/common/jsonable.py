@@ -70,11 +70,6 @@ def _listed(array: AnyArray) -> Any:
     return json_safe(array.tolist() if array.dtype.kind != "M" else array.astype(str).tolist())
 
 
-def named(record: Any, names: str) -> dict[str, Any]:
-    """Return some fields of a record by name. ``names`` are separated by blanks."""
-    return {name: getattr(record, name) for name in names.split()}
-
-
 def fields_of(record: Any) -> dict[str, Any]:
     """Return the fields of a dataclass by name, without optional fields that are None."""
     return {

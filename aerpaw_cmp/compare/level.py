@@ -27,7 +27,6 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri  # every report loads this module: scipy.stats would take it 0.4 s more
 
 from ..common.geodesy import azimuth_rad, bearing_deg, elevation_rad
-from ..common.jsonable import named
 from ..common.units import BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
 from .offset import SPAN_DB, OffsetFit, grid_offset, identifiable_range, offset_curve, offset_grid
 from .receiver import brier_losses, log_losses, out_of_group
@@ -151,7 +150,10 @@ def compare_rss(
     simple = {name: _levels(levels)[order] for name, levels in (baselines or {}).items()}
     fits = {name: grid_offset(m, level, span_db=span_db) for name, level in simple.items()}
     return RssComparison(
-        **named(fit, "offset_db rmse_db n at_edge"),
+        offset_db=fit.offset_db,
+        rmse_db=fit.rmse_db,
+        n=fit.n,
+        at_edge=fit.at_edge,
         n_out_of_coverage=int((has_pose & ~use).sum()),
         n_measured_out=int((has_pose & ~np.isfinite(measured)).sum()),
         n_simulated_out=int((has_pose & ~np.isfinite(simulated)).sum()),

@@ -20,7 +20,6 @@ from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, field_
 
 from ..common.errors import UsageError
 from ..common.files import inside
-from ..common.jsonable import named
 from ..common.outputs import check_seal
 from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, carrier_fault, noise_floor_dbm, wavelength_m
 from ..common.yamlfile import StrictModel, load_yaml, nearest, nearest_zone
@@ -200,7 +199,9 @@ class LinkSettings(StrictModel):
         wavelength = wavelength_m(self.carrier_hz)
         arrays = {name: self.towers.get(name, self.tower).build(wavelength, folder) for name in tower_names}
         return Link(
-            **named(self, "carrier_hz transmit_power_dbm uav_transmits"),
+            carrier_hz=self.carrier_hz,
+            transmit_power_dbm=self.transmit_power_dbm,
+            uav_transmits=self.uav_transmits,
             tower_arrays=arrays,
             uav_array=self.uav.build(wavelength, folder),
             noise_floor_dbm=self.floor_dbm,
@@ -258,8 +259,10 @@ class LogSettings(StrictModel):
         return ReadOptions(
             timezone=self.timezone or timezone,
             ri_base=self.ri_base,
-            **named(self, "clock time_origin gps_rollovers columns kind node channel frequency_hz unit floor_db"),
-        )
+            clock=self.clock, time_origin=self.time_origin, gps_rollovers=self.gps_rollovers, columns=self.columns,
+            kind=self.kind, node=self.node, channel=self.channel, frequency_hz=self.frequency_hz, unit=self.unit,
+            floor_db=self.floor_db,
+        )  # fmt: skip
 
 
 class Waypoint(StrictModel):

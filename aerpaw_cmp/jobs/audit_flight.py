@@ -16,7 +16,6 @@ import numpy as np
 
 from ..common.content import content_digest
 from ..common.files import cache_folder
-from ..common.jsonable import named
 from ..common.stages import Progress, logged
 from ..common.text import counted
 from ..common.units import AnyArray, FloatArray, spread_out
@@ -89,7 +88,9 @@ def audit_replays(
         seconds=sum(r.replay.seconds for r in replays),
         paths=sum(len(r.replay.paths) for r in replays),
         settings={
-            **named(rt, "max_depth attitude foliage"),
+            "max_depth": rt.max_depth,
+            "attitude": rt.attitude,
+            "foliage": rt.foliage,
             "samples": max((r.replay.samples for r in replays), default=0) or rt.advanced.samples,
         },
         left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
@@ -225,13 +226,14 @@ def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -
     """A link of flight.yaml."""
     wavelength = reference.C_MPS / settings.carrier_hz
     return reference.ExpectedLink(
-        **named(settings, "carrier_hz transmit_power_dbm uav_transmits"),
+        carrier_hz=settings.carrier_hz, transmit_power_dbm=settings.transmit_power_dbm,
+        uav_transmits=settings.uav_transmits,
         towers={name: expected_array(settings.towers.get(name, settings.tower), wavelength, folder) for name in towers},
         uav=expected_array(settings.uav, wavelength, folder),
         # k T B at 290 K
         noise_floor_dbm=10 * math.log10(1.380649e-23 * 290 * (settings.bandwidth_hz or 1.0) * 1e3)
         + (settings.noise_figure_db or 0.0),
-    )
+    )  # fmt: skip
 
 
 def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> reference.ExpectedArray:

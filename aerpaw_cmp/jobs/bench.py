@@ -17,7 +17,6 @@ from shapely.geometry import Point, box
 
 from ..common.errors import parsing
 from ..common.geodesy import SiteFrame
-from ..common.jsonable import named
 from ..common.stages import Progress, begin_peak, logged, peak_mib
 from ..common.text import counted
 from ..common.units import wavelength_m
@@ -160,18 +159,19 @@ def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: S
         replay(site, link, poses[:BATCH], search, run=alone)  # compiles the kernels
     result, spent = _measured(lambda: replay(site, link, poses, search, run=alone))
     difference = compare(result, reference, np.arange(len(poses)), RANK_K)
-    errors = named(difference, "rss_max_error_db rss_rms_error_db")
+    errors = {"rss_max_error_db": difference.rss_max_error_db, "rss_rms_error_db": difference.rss_rms_error_db}
     return {
         "engine": search.engine,
         "samples": search.samples if sionna else None,
         "arrays": "float64",
         "depth": search.max_depth,
-        **named(difference, "missing_paths extra_paths coverage_differs"),
+        "missing_paths": difference.missing_paths, "extra_paths": difference.extra_paths,
+        "coverage_differs": difference.coverage_differs,
         **{name: value if np.isfinite(value) else None for name, value in errors.items()},
         **spent,
         "rank_disagreement": {f"{k:g}": share for k, share in difference.rank_disagreement.items()},
         "links_per_s": len(poses) * len(link.tower_arrays) / max(spent["seconds"], 1e-9),
-    }
+    }  # fmt: skip
 
 
 def _measured(action: Callable[[], T]) -> tuple[T, dict[str, float]]:
@@ -229,14 +229,15 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
         "seconds_sionna": theirs.search_seconds,
         "paths_image": difference.reference_paths - difference.missing_paths + difference.extra_paths,
         "paths_sionna": difference.reference_paths,
-        **named(difference, "missing_paths extra_paths rss_max_error_db"),
+        "missing_paths": difference.missing_paths, "extra_paths": difference.extra_paths,
+        "rss_max_error_db": difference.rss_max_error_db,
         "poses": poses,
         "samples": samples,
         "batch": BATCH,
         "faces": len(scene.faces),
         "depth": _DEPTH,
         "versions": sionna.engine_versions(),
-    }
+    }  # fmt: skip
 
 
 def path_search_ratios(

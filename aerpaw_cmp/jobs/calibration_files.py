@@ -17,7 +17,6 @@ import yaml
 
 from ..common.content import KEY, MARKS, union
 from ..common.gaussian import determining, gaussian_kernel
-from ..common.jsonable import named
 from ..common.units import spread_out
 from ..compare.calibration import Score, cruise_height_m, mean_rmse, with_one_more
 from ..compare.gains import Frame, Spread, directed, student_factor
@@ -242,7 +241,8 @@ def _record_of(
     return CalibrationData(
         name=calibration.settings.calibration,
         flights=calibration.names,
-        **named(calibration, "trained_on marks words warnings"),
+        trained_on=calibration.trained_on, marks=calibration.marks, words=calibration.words,
+        warnings=calibration.warnings,
         scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},
         controls={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.controls.items()},
         mounts=mounts,
@@ -253,7 +253,7 @@ def _record_of(
         antennas=tuple(maps.values()),
         settings_text=text,
         stages_s=stages_s,
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

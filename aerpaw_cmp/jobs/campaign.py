@@ -30,7 +30,6 @@ from pydantic import Field
 
 from ..common.errors import AerpawCmpError, InputError, UsageError, one_line, parsing
 from ..common.files import LARGEST_TABLE, read_bounded
-from ..common.jsonable import named
 from ..common.stages import PlannedStage, Progress, Stages
 from ..common.text import counted
 from ..common.units import FloatArray, finite_mean
@@ -274,8 +273,10 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mappin
     return RssRow(
         flight=task.flight,
         setting=task.setting,
-        **named(result, "tower channel unit simulated_dbm position_m"),
-        **named(score, "offset_db rmse_db correlation n n_out_of_coverage rmse_ci95_db lag_s"),
+        tower=result.tower, channel=result.channel, unit=result.unit, simulated_dbm=result.simulated_dbm,
+        position_m=result.position_m,
+        offset_db=score.offset_db, rmse_db=score.rmse_db, correlation=score.correlation, n=score.n,
+        n_out_of_coverage=score.n_out_of_coverage, rmse_ci95_db=score.rmse_ci95_db, lag_s=score.lag_s,
         at_search_edge=score.at_edge,
         offset_ci95_db=score.intervals.offset_db,
         correlation_ci95=score.intervals.correlation,
@@ -294,7 +295,7 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mappin
         heading_deg=result.geometry.get("heading_deg"),
         difference=offset.difference_moments(measured_db, result.simulated_dbm),
         **identity,
-    )
+    )  # fmt: skip
 
 
 def _rank_rows(task: Task, result: RankResult, identity: Mapping[str, Any]) -> list[RankRow]:
@@ -304,16 +305,18 @@ def _rank_rows(task: Task, result: RankResult, identity: Mapping[str, Any]) -> l
             flight=task.flight,
             setting=task.setting,
             tower=result.tower,
-            **named(score, "n best_k"),
+            n=score.n, best_k=score.best_k,
             best_k_ci95=score.curve.best_k_interval,
             k=k,
             n_out_of_coverage=fit.out_of_coverage,
-            **named(fit, "agreement agreement_ci95 kappa total_variation total_variation_ci95 wasserstein"),
+            agreement=fit.agreement, agreement_ci95=fit.agreement_ci95, kappa=fit.kappa,
+            total_variation=fit.total_variation, total_variation_ci95=fit.total_variation_ci95,
+            wasserstein=fit.wasserstein,
             commonest_agreement=result.further.commonest.agreement,
             **identity,
         )
         for k, fit in score.simulated.items()
-    ]
+    ]  # fmt: skip
 
 
 # --- what is kept, what is to do -------------------------------------------------------------------------------------
@@ -620,13 +623,16 @@ def repeats(rows: Sequence[RssRow]) -> list[Repeat]:
     """Every pair of flights that share a tower and channel, of the rows of one setting, in their order."""
     passes = [
         Pass(
-            **named(row, "flight position_m residual_db heading_deg"),
+            flight=row.flight,
+            position_m=row.position_m,
+            residual_db=row.residual_db,
+            heading_deg=row.heading_deg,
             link=f"{row.tower}\n{row.channel}",
             level_db=row.measured_db,
         )
         for row in rows
     ]
-    rule = named(CampaignData, "radius_m heading_within_deg")
+    rule = {"radius_m": CampaignData.radius_m, "heading_within_deg": CampaignData.heading_within_deg}
     pairs = PassTable(passes, CampaignData.cell_m).pairs(**rule)
     known = [int(np.isfinite(row.measured_db).sum()) for row in rows]
     ordered = sorted(pairs, key=lambda pair: (pair.first, pair.second))
@@ -634,16 +640,13 @@ def repeats(rows: Sequence[RssRow]) -> list[Repeat]:
 
 
 def _repeat(pair: PassPair, first: RssRow, second: RssRow, known: int) -> Repeat:
-    same = "n rmse_db rmse_ci95_db offset_db residual_rmse_db place_rmse_db place_correlation cells height_difference_m"
     return Repeat(
-        tower=first.tower,
-        channel=first.channel,
-        first=first.flight,
-        second=second.flight,
-        share=pair.n / max(known, 1),
-        single_db=pair.rmse_db / 2.0**0.5,
-        **named(pair, same),
-    )
+        tower=first.tower, channel=first.channel, first=first.flight, second=second.flight,
+        share=pair.n / max(known, 1), single_db=pair.rmse_db / 2.0**0.5,
+        n=pair.n, rmse_db=pair.rmse_db, rmse_ci95_db=pair.rmse_ci95_db, offset_db=pair.offset_db,
+        residual_rmse_db=pair.residual_rmse_db, place_rmse_db=pair.place_rmse_db,
+        place_correlation=pair.place_correlation, cells=pair.cells, height_difference_m=pair.height_difference_m,
+    )  # fmt: skip
 
 
 def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:

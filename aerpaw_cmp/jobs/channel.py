@@ -13,7 +13,6 @@ import numpy as np
 from ..common.content import union
 from ..common.errors import InputError, UsageError
 from ..common.geodesy import bearing_deg
-from ..common.jsonable import named
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
 from ..common.text import counted
@@ -169,7 +168,7 @@ def _refuse(size: int, what: str, room: int, further: str) -> None:
 
 
 def _chosen_link(settings: FlightFile, chosen: ChannelOptions) -> tuple[str, LinkSettings]:
-    links: dict[str, LinkSettings] = {**settings.link.channels, **named(settings.link, "rss rank")}
+    links: dict[str, LinkSettings] = {**settings.link.channels, "rss": settings.link.rss, "rank": settings.link.rank}
     name = chosen.link or next(iter(links))
     if name not in links:
         raise UsageError(f"the flight has no link {name!r}", expected="one of " + ", ".join(links))

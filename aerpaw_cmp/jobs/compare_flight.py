@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..common.errors import InputError
-from ..common.jsonable import named
 from ..common.stages import give_memory_back
 from ..common.units import BoolArray, FloatArray, IntArray, spread_out
 from ..compare import level as rss
@@ -197,8 +196,12 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         score, spans = rss.without_errors(score), []
     stated = _with_lock(case, score, stated_spread(replayed))
     return RssResult(
-        **named(series, "tower channel unit time"),
-        **named(case, "position_m geometry"),
+        tower=series.tower,
+        channel=series.channel,
+        unit=series.unit,
+        time=series.time,
+        position_m=case.position_m,
+        geometry=case.geometry,
         measured_db=levels.measured_db,
         simulated_dbm=np.where(levels.posed, levels.simulated_db, np.nan),
         posed=levels.posed,
@@ -306,7 +309,8 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
     wild = rss.outliers(levels.measured_db)
     detection = None if case.trained else _detection(case)
     further = RssFurther(
-        **named(score, "n_measured_out n_simulated_out identifiable_db"),
+        n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out,
+        identifiable_db=score.identifiable_db,
         block_length=score.intervals.autocorrelation.block_length,
         n_too_low=int((replayed.valid & ~levels.posed).sum()),
         n_no_pose=int((~replayed.valid).sum()),
@@ -323,7 +327,7 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
         trained_on=case.trained or None,
         rmse_bound=_bound(series, score),
         interval_notes=score.intervals.notes or None,
-    )
+    )  # fmt: skip
     if case.trained:
         return further
     return dataclasses.replace(
@@ -363,8 +367,12 @@ def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore 
         return None
     if lock is not None and detection is not None and detection.rmse_ci95_db[0] > lock.floor_rmse_db:
         return None
-    out = {} if errors is None else named(errors, "rmse_db free_space_rmse_db rmse_4s_db")
-    out |= {} if lock is None else named(lock, "floor_rmse_db free_space_floor_rmse_db")
+    out = {}
+    if errors is not None:
+        out["rmse_db"], out["free_space_rmse_db"] = errors.rmse_db, errors.free_space_rmse_db
+        out["rmse_4s_db"] = errors.rmse_4s_db
+    if lock is not None:
+        out["floor_rmse_db"], out["free_space_floor_rmse_db"] = lock.floor_rmse_db, lock.free_space_floor_rmse_db
     return out or None
 
 
@@ -401,7 +409,8 @@ def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> di
     return {
         name: ModelLevel(
             level_dbm=level,
-            **named(score.baselines[name], "offset_db rmse_db"),
+            offset_db=score.baselines[name].offset_db,
+            rmse_db=score.baselines[name].rmse_db,
             rmse_ci95_db=score.baseline_intervals[name],
         )
         for name, level in levels.items()
@@ -429,7 +438,7 @@ def _averaged(case: _Case) -> dict[str, dict[str, Fit]]:
     averages = {f"{w:g} s": partial(rss.local_mean_db, case.series.time, window_s=w) for w in _AVERAGING_WINDOWS_S}
     fits = rss.averaged_fits(case.levels.measured_db, simulations, averages, span_db=span_db)
     return {
-        name: {average: Fit(**named(fit, "offset_db rmse_db")) for average, fit in each.items()}
+        name: {average: Fit(offset_db=fit.offset_db, rmse_db=fit.rmse_db) for average, fit in each.items()}
         for name, each in fits.items()
     }
 

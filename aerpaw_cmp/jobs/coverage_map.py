@@ -19,7 +19,6 @@ import numpy as np
 
 from ..common.cf import file_attributes, netcdf_bytes
 from ..common.errors import InputError, UsageError, noting_interrupts
-from ..common.jsonable import named
 from ..common.outputs import file_digest
 from ..common.stages import PlannedStage, Progress, Stages, share_of
 from ..common.text import counted
@@ -803,7 +802,8 @@ def _correlation_panels(outcome: MapOutcome) -> Iterator[page.Correlation]:
 
 def _correlation(title: str, binned: BinnedCorrelation, **modelled: Any) -> page.Correlation:
     excluded = binned.excluded_constant
-    return page.Correlation(title=title, **named(binned, "distance_m correlation"), excluded=excluded, **modelled)
+    distance_m, correlation = binned.distance_m, binned.correlation
+    return page.Correlation(title=title, distance_m=distance_m, correlation=correlation, excluded=excluded, **modelled)
 
 
 def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
@@ -843,7 +843,8 @@ def _notes(outcome: MapOutcome) -> tuple[str, ...]:
 def _metrics(outcome: MapOutcome) -> dict[str, Any]:
     """Content of metrics.json beyond the tables of the page."""
     result: dict[str, Any] = {
-        **named(outcome, "paths tiles"),
+        "paths": outcome.paths,
+        "tiles": outcome.tiles,
         "settings": asdict(outcome.settings),
     }
     for key in ("zero", "missing"):
@@ -851,9 +852,10 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
             continue
         study = outcome.studies[key]
         result.setdefault("correlation", {})[f"z_{key}"] = {
-            **named(study.fit, "c1 c2 c3 c4 rmse degenerate message"),
-            **named(study.correlation, "positions excluded_constant"),
-        }
+            "c1": study.fit.c1, "c2": study.fit.c2, "c3": study.fit.c3, "c4": study.fit.c4, "rmse": study.fit.rmse,
+            "degenerate": study.fit.degenerate, "message": study.fit.message,
+            "positions": study.correlation.positions, "excluded_constant": study.correlation.excluded_constant,
+        }  # fmt: skip
     for mode, maps, change in _foliage_changes(outcome):
         result.setdefault("foliage", {})[mode] = [
             {"altitude_m": height, "mean_rss_loss_db": finite_mean(loss_db), "lost": float(lost.mean())}

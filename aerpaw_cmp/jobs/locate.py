@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import InputError, UsageError
-from ..common.jsonable import json_object, named
+from ..common.jsonable import json_object
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
 from ..compare.locate import UNKNOWN, LevelModel, LevelTrack, NodeEstimate, locate
@@ -142,7 +142,7 @@ def _numbers(site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -
     parts, names = estimate.regions.modes(), ("latitude_deg", "longitude_deg", "east_m", "north_m")
     angles = site.frame.to_geographic(*np.array([mode.place_m for mode in parts]).T)
     modes = [
-        dict(zip(names, (*at, *mode.place_m), strict=True)) | named(mode, "share radius_m")
+        dict(zip(names, (*at, *mode.place_m), strict=True)) | {"share": mode.share, "radius_m": mode.radius_m}
         for *at, mode in zip(*angles, parts, strict=True)
     ]
     region50_m, region90_m = (estimate.regions.radius_m(parts[0].place_m, part) for part in (0.5, 0.9))

@@ -13,7 +13,6 @@ import pandas as pd
 
 from ..common.cf import library
 from ..common.errors import UsageError, from_python
-from ..common.jsonable import named
 from ..common.text import counted, html_table
 from ..common.units import ComplexArray, FloatArray
 from ..common.yamlfile import parse_yaml
@@ -32,9 +31,6 @@ from .options import RunOptions
 
 # Tower and channel of an RSS series; tower and ``"rank"`` of a rank series.
 Series = tuple[str, str]
-
-
-_RANK_NUMBERS = "agreement kappa total_variation wasserstein"
 
 
 @from_python
@@ -374,8 +370,11 @@ class Comparison:
         """
         rows = [
             {
-                **named(item, "tower channel"),
-                **named(item.score, "n offset_db rmse_db"),
+                "tower": item.tower,
+                "channel": item.channel,
+                "n": item.score.n,
+                "offset_db": item.score.offset_db,
+                "rmse_db": item.score.rmse_db,
                 **dict(zip(("rmse_low_db", "rmse_high_db"), item.score.rmse_ci95_db, strict=True)),
                 "correlation": item.score.correlation,
                 "at_search_edge": item.score.at_edge,
@@ -389,10 +388,11 @@ class Comparison:
     def rank_to_frame(self) -> pd.DataFrame:
         """One row per tower and K: ``tower k n agreement kappa total_variation wasserstein``."""
         rows = [
-            {"tower": item.tower, "k": k, "n": item.score.n, **named(fit, _RANK_NUMBERS)}
+            {"tower": item.tower, "k": k, "n": item.score.n, "agreement": fit.agreement, "kappa": fit.kappa,
+             "total_variation": fit.total_variation, "wasserstein": fit.wasserstein}
             for item in self.result.rank
             for k, fit in item.score.simulated.items()
-        ]
+        ]  # fmt: skip
         table: pd.DataFrame = pd.DataFrame(rows)
         return table
 

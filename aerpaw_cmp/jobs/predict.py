@@ -24,7 +24,6 @@ from ..common.content import KEY, MARKS, union
 from ..common.errors import InputError, UsageError, parsing
 from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.geodesy import bearing_deg
-from ..common.jsonable import named
 from ..common.outputs import OutputFolder
 from ..common.stages import PlannedStage, Progress, Stages
 from ..common.text import counted
@@ -190,7 +189,9 @@ def predict(
     about = _model_fields(model, known, [receiver for receiver, _, _ in receivers.values()], table)
     cautioned = [f"{text}." for text in site.cautions(source.tower for source in sources.values())]
     page = PredictionPage(
-        **named(targets, "name kind heights_m"),
+        name=targets.name,
+        kind=targets.kind,
+        heights_m=targets.heights_m,
         site=site,
         table=table,
         units={f"{s.tower} {s.channel}": s.unit for s in sources.values()},

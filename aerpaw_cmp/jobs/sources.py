@@ -18,7 +18,6 @@ import pandas as pd
 
 from ..common.errors import InputError, UsageError, parsing
 from ..common.geodesy import azimuth_rad
-from ..common.jsonable import named
 from ..common.text import counted
 from ..common.units import BoolArray, FloatArray
 from ..compare.calibration import BIN_S, Correction, Observed, Predictor, between_blocks_db, by_degree
@@ -416,9 +415,14 @@ class Source:
         """As a flight has it; ``samples`` are those of all flights."""
         of_series = tuple(s for s in samples if (s.tower, s.channel) == (series.tower, series.channel))
         return cls(
-            **named(series, "tower channel unit link"),
-            **named(data, "site folder"),
-            **named(data.settings, "rt rss"),
+            tower=series.tower,
+            channel=series.channel,
+            unit=series.unit,
+            link=series.link,
+            site=data.site,
+            folder=data.folder,
+            rt=data.settings.rt,
+            rss=data.settings.rss,
             samples=of_series,
         )
 

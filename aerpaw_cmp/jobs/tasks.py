@@ -49,7 +49,6 @@ from pydantic import ConfigDict, TypeAdapter
 from ..common.content import trained_on
 from ..common.errors import AerpawCmpError, InputError, UsageError, parsing
 from ..common.files import LARGEST_TABLE, read_sealed, write_sealed
-from ..common.jsonable import named
 from ..common.outputs import file_digest
 from ..common.stages import Progress, logged
 from ..common.text import counted
@@ -272,7 +271,7 @@ def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> l
         If the site cannot.
     """
     entries = [
-        named(other_input, "role path sha256")
+        {"role": other_input.role, "path": other_input.path, "sha256": other_input.sha256}
         for other_input in other_inputs(settings, flight, logs_root)
         if other_input.role != "flight file"  # what it says stands in the settings, overrides included
     ]

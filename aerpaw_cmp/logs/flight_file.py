@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..common.errors import InputError, parsed, parsing
-from ..common.jsonable import named
 from ..common.outputs import OutputFile, Sink
 from .records import ReadResult, RejectedLine, RejectedReason, Stream
 
@@ -142,7 +141,10 @@ def _refuse_changed(content: bytes, path: str | Path) -> None:
 
 def _write_file(group: Any, file: IngestedFile, sink: Sink) -> None:
     result = file.result
-    known = named(result, "reader lines accepted blank warnings")
+    known = {
+        "reader": result.reader, "lines": result.lines, "accepted": result.accepted, "blank": result.blank,
+        "warnings": result.warnings,
+    }  # fmt: skip
     _write_json(group, "meta", {"path": file.path, "sha256": file.sha256, **known})
     _write_json(group, "rejected", [[line.number, line.reason, line.text] for line in result.rejected])
     _write_json(group, "reasons", [[item.reason, item.count, item.first, item.last] for item in result.reasons])
@@ -153,7 +155,7 @@ def _write_file(group: Any, file: IngestedFile, sink: Sink) -> None:
 
 def _write_stream(group: Any, stream: Stream, sink: Sink) -> None:
     columns = [{"name": str(name), "type": _type(stream.frame[name])} for name in stream.frame.columns]
-    known = {**named(stream, "kind name"), "columns": columns, "attributes": dict(stream.attributes)}
+    known = {"kind": stream.kind, "name": stream.name, "columns": columns, "attributes": dict(stream.attributes)}
     _write_json(group, "meta", known)
     for i, column in enumerate(columns):
         _write_column(group, f"C{i:05d}", stream.frame[column["name"]], column["type"])

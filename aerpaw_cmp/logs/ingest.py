@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.errors import AerpawCmpError, InputError, UsageError, one_line, parsing
-from ..common.jsonable import named
 from ..common.stages import duration
 from ..common.text import counted
 from . import files as archives
@@ -604,7 +603,9 @@ def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
     entries = [
         {
             "path": file.path,
-            **named(file.result, "reader lines accepted"),
+            "reader": file.result.reader,
+            "lines": file.result.lines,
+            "accepted": file.result.accepted,
             "rejected": file.result.rejected_count,
             "first_rejected": [asdict(line) for line in file.result.rejected[:_FIRST_REJECTED]],
             "blank": file.result.blank,

@@ -28,7 +28,6 @@ import numpy as np
 import pandas as pd
 
 from ..common.errors import UsageError
-from ..common.jsonable import named
 from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, IntArray
 from .readers import ReadOptions
@@ -714,7 +713,10 @@ def frame(
 
 def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Attribute]:
     """Attributes from the options, then those of the reader; what is unknown is left out."""
-    merged: dict[str, Attribute | None] = {**named(options, "node channel frequency_hz timezone"), **extra}
+    merged: dict[str, Attribute | None] = {
+        "node": options.node, "channel": options.channel, "frequency_hz": options.frequency_hz,
+        "timezone": options.timezone, **extra,
+    }  # fmt: skip
     return {name: value for name, value in merged.items() if value is not None}
 
 

@@ -18,7 +18,6 @@ import numpy as np
 from .. import __version__
 from ..common.content import content_digest
 from ..common.files import cache_folder, read_sealed, write_sealed
-from ..common.jsonable import named
 from ..common.text import counted
 from ..common.units import FloatArray, spread_out
 from ..common.versions import version
@@ -212,8 +211,6 @@ LAYOUT = 4
 # Written after the entry, before the SHA-256 of all preceding bytes.
 _SEAL = b"AERPAWCP"
 
-_COLUMNS = ("pose", "tower", "depth", "faces", "vertices_m")
-
 
 class PathCache:
     """Path sets as ``<sha256>.npz`` in one folder.
@@ -283,10 +280,17 @@ class PathCache:
             return None
         # never pickled: an entry of a shared folder must not run code
         with np.load(io.BytesIO(entry), allow_pickle=False) as columns:
-            return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
+            paths = PathSet(
+                pose=columns["pose"], tower=columns["tower"], depth=columns["depth"], faces=columns["faces"],
+                vertices_m=columns["vertices_m"],
+            )  # fmt: skip
+            return paths, float(columns["seconds"])
 
     def save(self, key: str, paths: PathSet, seconds: float) -> None:
         """Write an entry atomically."""
         entry = io.BytesIO()
-        np.savez(entry, seconds=np.float64(seconds), **named(paths, " ".join(_COLUMNS)))
+        np.savez(
+            entry, seconds=np.float64(seconds), pose=paths.pose, tower=paths.tower, depth=paths.depth,
+            faces=paths.faces, vertices_m=paths.vertices_m,
+        )  # fmt: skip
         write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)

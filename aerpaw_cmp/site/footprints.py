@@ -24,7 +24,6 @@ from shapely.geometry.base import BaseGeometry
 
 from ..common.errors import InputError, UsageError
 from ..common.geodesy import SiteFrame
-from ..common.jsonable import named
 from ..common.text import counted
 from ..common.units import FloatArray
 from ..common.yamlfile import dump_yaml
@@ -756,11 +755,13 @@ def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
     """Outlines and trees of maps in place of those of the base."""
     content |= {
         "buildings": [
-            _outline_dict(b.name, b.footprint) | named(b, "height_m material source") for b in imports.buildings
+            _outline_dict(b.name, b.footprint) | {"height_m": b.height_m, "material": b.material, "source": b.source}
+            for b in imports.buildings
         ],
         "forests": [
             _outline_dict(f.name, f.area)
-            | named(f, "trees_per_hectare minimum_spacing_m source height_m evergreen_share")
+            | {"trees_per_hectare": f.trees_per_hectare, "minimum_spacing_m": f.minimum_spacing_m, "source": f.source}
+            | {"height_m": f.height_m, "evergreen_share": f.evergreen_share}
             for f in imports.forests
         ],
         "geofences": [_outline_dict(g.name, g.area) for g in imports.geofences],

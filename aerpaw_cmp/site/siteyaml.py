@@ -23,7 +23,6 @@ from shapely.geometry import Point, Polygon
 
 from ..common.errors import AerpawCmpError, UsageError
 from ..common.geodesy import SiteFrame
-from ..common.jsonable import named
 from ..common.text import counted
 from ..common.units import FloatArray
 from ..common.yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines, named_files, nearest
@@ -392,18 +391,22 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     notes += _overlaps(buildings)
     forests = tuple(
         Forest(
-            **named(item, "name trees_per_hectare minimum_spacing_m source height_m trees evergreen_share"),
+            name=item.name, trees_per_hectare=item.trees_per_hectare, minimum_spacing_m=item.minimum_spacing_m,
+            source=item.source, height_m=item.height_m, trees=item.trees, evergreen_share=item.evergreen_share,
             area=outline,
             crown_base_fraction=model.trees.crown_base_fraction,
         )
         for item, outline in _outlines(model.forests, "forests", frame)
-    )
+    )  # fmt: skip
     forests += woods
     notes += _unmapped(towers, [item.footprint for item in buildings] + [item.area for item in forests])
     with _at("trees"):
         trees, of_stands = _trees(model.trees, forests, buildings, towers, notes)
     return Site(
-        **named(model, "name ground_material credit assumed"),
+        name=model.name,
+        ground_material=model.ground_material,
+        credit=model.credit,
+        assumed=model.assumed,
         frame=frame,
         towers=towers,
         buildings=buildings,
@@ -459,7 +462,10 @@ def _scene(model: SiteModel, folder: Path) -> tuple[TriangleScene | None, list[s
     what = model.scene
     scene = placed_scene(
         folder / what.path,
-        **named(what, "materials sha256 offset_m turn_deg"),
+        materials=what.materials,
+        sha256=what.sha256,
+        offset_m=what.offset_m,
+        turn_deg=what.turn_deg,
         ground_plane=model.ground_material if what.ground_plane else None,
     )
     return scene, list(scene.notes)
@@ -612,7 +618,9 @@ def _tower(
         ground = model.ground_offset_m or 0.0
     return Tower(
         name=name,
-        **named(chosen, "latitude_deg longitude_deg source"),
+        latitude_deg=chosen.latitude_deg,
+        longitude_deg=chosen.longitude_deg,
+        source=chosen.source,
         east_m=float(east),
         north_m=float(north),
         antenna_height_m=model.antenna_height_m or chosen.antenna_height_m or 10.0,
@@ -643,7 +651,10 @@ def _building(model: BuildingModel, footprint: Polygon, dem: Dem | None) -> Buil
     base = model.base_m
     if dem is not None:  # a floor is level: the ground under the middle
         base += float(np.nan_to_num(dem.ground_m(footprint.centroid.x, footprint.centroid.y)))
-    return Building(**named(model, "name height_m material source"), footprint=footprint, base_m=base)
+    return Building(
+        name=model.name, height_m=model.height_m, material=model.material, source=model.source,
+        footprint=footprint, base_m=base,
+    )  # fmt: skip
 
 
 def _trees(

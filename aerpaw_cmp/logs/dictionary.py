@@ -112,7 +112,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^(geom(etry)?|wkt|lat ?(lon|lng)|coordinates?|(gps )?(position|location))$",
     )),
     Quantity("accuracy", "doubt", (
-        r"^(gps |gnss )?[hpg]dop$", r"^eph$",
+        r"(^| )[hpg]dop$", r"(^| )eph$",
         r"^(gps |gnss |position |pos |location |horizontal |horiz )?((horizontal |horiz |h ?)?acc(uracy)?)( m)?$",
     )),
     # how high: the datum that the name tells; heights of home and of the terrain are not the aircraft's
@@ -162,14 +162,15 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^velocity ?(down|z)( mps)?$", r"^vd$", r"^vz$", r"^vel d m s$", r"^(osd )?z ?speed", r"^speed ?z$",
     ), "m/s", can_be=_SPEED),
     Quantity("fix", "count", (
-        r"^(gps )?fix( type)?$", r"^gpsfix$", r"^gps lock$",
+        r"^(gps )?fix( type)?$", r" fix type$", r"^gpsfix$", r"^gps lock$",
         r"^((is|data) )?valid$",
         r"^((has|is) )?(gps |gnss |pos(ition)? |loc(ation)? )?fix ?(type|ok|status|state|mode|quality|qual|valid)?$",
-        r"^((has|is) )?(gps|gnss|pos(ition)?|loc(ation)?) ?(fix ?type|status|state|mode|lock|quality|qual|valid|ok)$",
+        r"^((has|is) )?(gps|gnss|pos(ition)?|loc(ation)?) ?(fix ?type|status|state|mode|lock|valid|ok)$",
+        r"^(gps |gnss )?(pos(ition)? )?qual(ity)?( ind(icator)?)?$",
     )),
     Quantity("satellites", "count", (
         r"^(number of satellites?|satellites( used)?|num ?sats?|osd gpsnum|nsats?|numberofsatellites|gps count)$",
-        r"^((gps|gnss) )?(sats?|satellites?|num sats?)( (used|count|num|in use))?$",
+        r"^((gps|gnss) )?(sats?|satellites?|num sats?)( (used|count|num|in use))?$", r"(^| )satellites (visible|used)$",
     )),
     Quantity("battery_v", "count", (r"^(battery ?)?(volts?|voltage)( v)?$",), "V"),
     # who

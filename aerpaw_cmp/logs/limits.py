@@ -324,6 +324,8 @@ _MOST_DBM = {"RSRP": -20.0}
 # A lost reading is this near 0 dB and this far above all others, and at most this share of the readings is lost: no
 # path gains 20 dB from one reading to the next and loses it again.
 _LOST_DB, _FAR_DB, _LOST_SHARE = 1.0, 20.0, 0.2
+# Ends of the scales of phones, modems and 8-bit integers, which programs write for a reading that is missing.
+_LEAST_DB = (-127.0, -128.0, -140.0, -141.0, -150.0, -156.0, -157.0)
 # Levels that alternate from record to record: further apart than fading, and back with the next.
 _APART_DB, _BACK_SHARE, _FEW_ALTERNATE, _MOST_TURNS = 10.0, 0.2, 6, 5
 # Levels of one time that are of several sources: further apart than fading within a second of a coarse clock.
@@ -432,15 +434,19 @@ class _Check:
         self._flag(bad, "level_out_of_range", first, f"which is received nowhere ({known})", ["rss_db"])
 
     def _lost_readings(self) -> None:
-        """Flag a few levels near 0 dB far above all others: what a program writes for a reading that it lost."""
+        """Flag a few placeholders far from all other levels: what a program writes for a reading that it lost."""
         level = self._values("rss_db")
-        near = np.abs(level) <= _LOST_DB  # -1 is a common placeholder
-        if not near.any() or near.sum() > _LOST_SHARE * np.isfinite(level).sum():
-            return
-        if (highest := float(np.nanmax(level[~near]))) < -_LOST_DB - _FAR_DB:
-            first = f"{level[int(np.argmax(near))]:g} dB"
-            why = f"far above all others, which end at {highest:.1f} dB (a reading that was lost?)"
-            self._flag(near, "level_lost", first, why, ["rss_db"])
+        # -1 is a common placeholder, too
+        for lost, sign, word in ((np.abs(level) <= _LOST_DB, 1, "above"), (np.isin(level, _LEAST_DB), -1, "below")):
+            known = np.isfinite(level).sum()
+            if not lost.any() or lost.sum() > max(1, _LOST_SHARE * known) or known < _FEW_ROWS:
+                continue
+            nearest = sign * float(np.nanmax(sign * level[~lost]))
+            if np.min(sign * (level[lost] - nearest)) > _FAR_DB:
+                first = f"{level[int(np.argmax(lost))]:g} dB"
+                why = f"far {word} all others, which end at {nearest:.1f} dB (a reading that was lost?)"
+                self._flag(lost, "level_lost", first, why, ["rss_db"])
+                level = self._values("rss_db")
 
     def _two_levels(self) -> None:
         """Report a series whose levels take turns, or are several at one time: of several devices, SIMs or networks."""

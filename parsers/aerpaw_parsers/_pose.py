@@ -84,9 +84,12 @@ def without_fix(sheet: _sheet.Sheet) -> BoolArray:
     unfixed = np.zeros(len(sheet), dtype=bool)
     for i, meaning in enumerate(sheet.meanings):
         name = "" if meaning is None else meaning.quantity.name
+        words = sheet.plain[i]
+        if meaning is None and words in ("status", "state", "mode") and {*sheet.texts(i)} == {"A", "V"}:
+            unfixed |= np.array(sheet.texts(i)) == "V"  # as sentences of NMEA have it
         if name not in ("fix", "satellites", "accuracy"):
             continue
-        values, words = sheet.numbers(i), sheet.plain[i]
+        values = sheet.numbers(i)
         if name == "accuracy":
             # without a fix receivers write a DOP of 0, 99 or 99.99, or the largest number that they have
             of_dop = "dop" in words and bool((values < _MOST_DOP).any())

@@ -302,7 +302,7 @@ class Sheet:
         values = np.array([parsed[text][0] for text in texts], dtype=np.float64)
         told = {text: count for text, count in counts.items() if text.lower() not in NO_VALUE}
         words = {text: count for text, count in told.items() if math.isnan(parsed[text][0])}
-        if 2 * sum(words.values()) > sum(told.values()):
+        if meaning is not None and 2 * sum(words.values()) > sum(told.values()):
             self.notes[column] = (
                 f"column {self.names[column]!r}: {counted(sum(words.values()), 'cell')} without a number (the first: "
                 f"{next(iter(words))[:30]!r}) and read as missing"
@@ -413,7 +413,8 @@ _PAIR = re.compile(rf"(?:POINT ?Z? ?)?[\[(]? ?{_ONE} ?[ ,;] ?{_ONE}(?:[ ,].{{0,2
 
 def _split_places(sheet: Sheet) -> None:
     """Add columns of latitude and longitude where one column has both, such as ``GPS`` of EdgeTX."""
-    for i, name in enumerate(sheet.names if sheet.find("latitude_deg") is None else ()):
+    both = sheet.find("latitude_deg") is not None and sheet.find("longitude_deg") is not None
+    for i, name in enumerate(() if both else sheet.names):
         texts = sheet.texts(i)
         pairs = [_PAIR.fullmatch(text) for text in texts]
         if not any(pairs[:50]) or 2 * sum(map(bool, pairs)) <= sum(map(bool, texts)):

@@ -1,31 +1,47 @@
 """The notebooks of docs/examples run as they stand, and hold the outputs of a run."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "docs" / "examples"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+SIONNA = FOLDER / "score_sionna.ipynb"
 
 
 def cells(path: Path) -> list[dict[str, object]]:
     return [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
 
 
-def test_there_are_six() -> None:
-    assert len(NOTEBOOKS) == 6
+def source_of(cell: dict[str, object]) -> str:
+    return "".join(line for line in cell["source"] if not line.startswith("%"))  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_there_are_seven() -> None:
+    assert len(NOTEBOOKS) == 7
+
+
+@pytest.mark.parametrize("path", [p for p in NOTEBOOKS if p != SIONNA], ids=lambda path: path.stem)
 def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(FOLDER)
     monkeypatch.setenv("MPLBACKEND", "Agg")
     scope: dict[str, object] = {"__name__": "notebook"}
     for cell in cells(path):
-        source = "".join(line for line in cell["source"] if not line.startswith("%"))  # type: ignore[attr-defined]
-        exec(compile(source, str(path), "exec"), scope)
+        exec(compile(source_of(cell), str(path), "exec"), scope)
+
+
+@pytest.mark.sionna
+def test_the_notebook_with_sionna_runs(sionna: object) -> None:
+    """Scenes of the notebook would stay alive beside those of later tests, so the cells run in another process."""
+    source = "\n".join(source_of(cell) for cell in cells(SIONNA))
+    check = "assert len(card['levels']) == 5 and gain.shape[1] == 5 and (gain > 0).mean() > 0.95"
+    lines = [sys.executable, "-c", f"{source}\n{check}"]
+    subprocess.run(lines, cwd=FOLDER, env={**os.environ, "MPLBACKEND": "Agg"}, check=True)
 
 
 def test_the_code_of_the_python_page_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

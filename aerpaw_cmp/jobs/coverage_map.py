@@ -737,14 +737,12 @@ def _budget_layers(outcome: MapOutcome) -> Iterator[cells.Layer]:
     for mode, result in outcome.ordered():
         for row, height in enumerate(result.rss_altitudes_m):
             level, at = result.rss()[row], f"{job.in_name(height)}m_joint_{mode}"
-            where = f"{height:g} m, nearest tower, foliage {mode}"
+            where = {"height_m": height, "of": "nearest tower", "foliage": mode}
             if budget.level_dbm is not None:
-                margin = np.round(level - budget.level_dbm, 2)
-                yield cells.Layer(
-                    f"margin_mimo_h{at}", margin, "dB", f"Margin above {budget.level_dbm:.1f} dBm, {where}"
-                )
+                above, name = np.round(level - budget.level_dbm, 2), f"Margin above {budget.level_dbm:.1f} dBm"
+                yield cells.Layer(f"margin_mimo_h{at}", above, "dB", name, **where)
             if budget.noise_dbm is not None:
-                yield cells.Layer(f"snr_mimo_h{at}", np.round(level - budget.noise_dbm, 2), "dB", f"SNR, {where}")
+                yield cells.Layer(f"snr_mimo_h{at}", np.round(level - budget.noise_dbm, 2), "dB", "SNR", **where)
 
 
 def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
@@ -752,11 +750,8 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
     result, s = outcome.shown, outcome.settings
     raster = result.grid.raster
     for layer in _budget_layers(outcome):
-        quantity, _, where = layer.title.partition(", ")
-        above, _, foliage = where.partition(", nearest tower, foliage ")
-        yield page.MapLayer(
-            quantity=quantity, unit="dB", axes={"Foliage": foliage, "Height": above}, values=raster(layer.values)
-        )
+        axes = {"Foliage": layer.foliage, **page.at_height(layer.height_m)}
+        yield page.MapLayer(quantity=layer.quantity, unit="dB", axes=axes, values=raster(layer.values))
     for name, values in (("Singular-value spread", result.spread_db), ("Condition number", result.condition_db)):
         joint = values[..., result.serving, np.arange(len(result.grid))]
         for row, height in enumerate(result.rank_altitudes_m):
@@ -918,6 +913,5 @@ def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:
             values = layer.values if layer.classes else np.round(layer.values, 2)
             if layer.name.startswith(RATIOS):
                 values = np.minimum(values, job.RATIO_LIMIT_DB)
-            title = f"{layer.title}, foliage {mode}"
-            result.append(replace(layer, name=f"{layer.name}_{mode}", title=title, values=values))
+            result.append(replace(layer, name=f"{layer.name}_{mode}", foliage=mode, values=values))
     return result

@@ -9,6 +9,9 @@ from typing import Any
 
 from ..common.stages import Plan, Progress, Stages, logged
 
+# A sample is scored by the nearest predicted position of another program within this distance [m].
+AGAINST_DISTANCE_M = 5.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOptions:

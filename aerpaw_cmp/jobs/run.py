@@ -18,7 +18,7 @@ from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import PlannedStage, Stages
 from ..common.text import counted
 from ..common.yamlfile import input_files
-from .options import DEFAULT, JobOutcome, RunOptions
+from .options import AGAINST_DISTANCE_M, DEFAULT, JobOutcome, RunOptions
 
 _KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
 
@@ -200,7 +200,7 @@ class ReportOptions:
     recommend: Path | None = None
     learned: Path | str | None = None
     against: Sequence[Path] = ()
-    against_distance_m: float = 5.0
+    against_distance_m: float = AGAINST_DISTANCE_M
     figures: str = "none"
     style: str = "screen"
     export: Sequence[str] = ()

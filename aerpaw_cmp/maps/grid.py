@@ -259,17 +259,33 @@ class Layer:
         In index order; NaN (classes: 0) is out of coverage.
     unit : str
         Such as ``"dBm"``; ``"1"`` for classes and ratios.
-    title : str
-        For legends.
+    quantity : str
+        Such as ``"RSS MIMO"``.
     classes : tuple of str
-        Names of the values 0, 1, ... when the layer holds classes.
+        Names of the values 0, 1, ... of a layer of classes.
+    height_m : float
+        Height above ground [m]; NaN for a layer without a height.
+    of : str
+        The tower, ``"nearest tower"``, or empty.
+    foliage : str
+        The foliage mode, or empty.
     """
 
     name: str
     values: AnyArray
     unit: str
-    title: str
+    quantity: str
     classes: tuple[str, ...] = ()
+    height_m: float = math.nan
+    of: str = ""
+    foliage: str = ""
+
+    @property
+    def title(self) -> str:
+        """The text of a legend: quantity, height, tower and foliage."""
+        height = "" if math.isnan(self.height_m) else f"{self.height_m:g} m"
+        parts = self.quantity, height, self.of, self.foliage and f"foliage {self.foliage}"
+        return ", ".join(part for part in parts if part)
 
 
 # Section VII: ranks at 3 m as well, to highlight what blocks there; levels at three of the other heights.
@@ -527,7 +543,7 @@ def _rss_layers(result: MapResult, tower: str | None) -> list[Layer]:
     for antennas in kinds:
         for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
             name = f"rss_{antennas}_h{in_name(height)}m_{who}"
-            layers.append(Layer(name, values, "dBm", f"RSS {antennas.upper()}, {height:g} m{of}"))
+            layers.append(Layer(name, values, "dBm", f"RSS {antennas.upper()}", height_m=height, of=of))
     return layers
 
 
@@ -541,19 +557,17 @@ def _rank_layers(result: MapResult, tower: str | None) -> list[Layer]:
     for row, height in enumerate(result.rank_altitudes_m):
         at = f"h{in_name(height)}m_{who}"
         for column, k in enumerate(result.ks):
-            title = f"Rank, K = {k:g}, {height:g} m{of}"
-            layers.append(
-                Layer(f"rank_k{in_name(k, 0)}_{at}", ranks[row, column], "1", title, class_names(HIGHEST_RANK))
-            )
+            name, names = f"rank_k{in_name(k, 0)}_{at}", class_names(HIGHEST_RANK)
+            layers.append(Layer(name, ranks[row, column], "1", f"Rank, K = {k:g}", names, height, of))
         for name, title, values in ratios:
-            layers.append(Layer(f"{name}_{at}", values[row], "dB", f"{title}, {height:g} m{of}"))
+            layers.append(Layer(f"{name}_{at}", values[row], "dB", title, height_m=height, of=of))
     return layers
 
 
 def _label(tower: str | None) -> tuple[str, str]:
     """Return the parts of a layer's name and title that identify its tower."""
     # names of layers become columns, files in the KMZ and variables of NetCDF
-    return (re.sub(r"\W", "_", tower), f", {tower}") if tower else ("joint", ", nearest tower")
+    return (re.sub(r"\W", "_", tower), tower) if tower else ("joint", "nearest tower")
 
 
 def in_name(number: float, digits: int = 3) -> str:

@@ -324,6 +324,19 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
                  "In 90 %": SHARE, "Difference": 2, "95 %": 2},
         rows=[[*row[:11], None if row[11] is None else (row[11], row[12])] for row in every], look="dense",
     )  # fmt: skip
+    name, ours = verdict["prediction"], "ray tracing (this report)"
+    above = Table(
+        caption="Share of samples at or above a threshold. Levels without a reference in common with the log count "
+        "after the offset.",
+        columns={"Tower, channel": HEAD, "Threshold [dB]": 1, "Measured": SHARE, "Prediction": SHARE,
+                 "Ray tracing": SHARE},
+        rows=[
+            (f"{tower} {channel}".strip(), x["threshold_db"], x["measured"], x["predicted"], mine["predicted"])
+            for tower, channels in verdict["levels"].items()
+            for channel, entry in channels.items()
+            for x, mine in zip(*(entry["cards"][key]["exceedance"] for key in (name, ours)), strict=True)
+        ], look="tall",
+    )  # fmt: skip
     ranks = Table(
         caption="Ranks on the same samples.",
         columns={"Tower": HEAD, "Model": TEXT, "Samples": 0, "Kappa": 2, "Total variation": 3, "Agreement": SHARE},
@@ -334,10 +347,10 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
         ],
     )
     return Card(
-        title=verdict["prediction"],
+        title=name,
         text=[paragraph(bold(verdict["sentence"])), *verdict["remarks"]],
-        tables=[means, ranks],
-        parts=[Card(title=f"{verdict['prediction']}, channel by channel", tables=[channels], fold=True)],
+        tables=[means, above, ranks],
+        parts=[Card(title=f"{name}, channel by channel", tables=[channels], fold=True)],
     )
 
 

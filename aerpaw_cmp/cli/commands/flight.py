@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from typer import Argument, Option
 
 from ...common.text import counted
-from ...jobs.options import RunOptions
+from ...jobs.options import AGAINST_DISTANCE_M, RunOptions
 from ..app import DryRun, Export, Force, LogsRoot, command, output
 from ..shown import answered, number, print_files, records, say, show, table, warn_all
 
@@ -53,7 +53,7 @@ def report(
     ] = None,
     against_distance: Annotated[
         float, Option(min=0.01, help="Largest distance from a sample to a predicted position [m].")
-    ] = 5.0,
+    ] = AGAINST_DISTANCE_M,
     strict: Annotated[bool, Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
         Literal["none", "svg", "png", "pdf", "all"],

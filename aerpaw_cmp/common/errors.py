@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import wraps
+from itertools import pairwise
 from pathlib import Path
 from types import FunctionType
 from typing import Any, ParamSpec, TypeVar, cast
@@ -349,6 +350,8 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return "'aerpaw-cmp formats' lists what can be read" if unknown else ""
     if "--tower NAME=" in (error.expected or ""):
         return "the same command with --tower NAME=LATITUDE,LONGITUDE,HEIGHT"
+    if str(place) in (last for option, last in pairwise(arguments) if option == "--against"):
+        return f"correct {one_line(place.name)} (docs/referee.md lists the columns) and run the same command"
     if words[:1] in _OF_LOGS:
         return f"'aerpaw-cmp ingest {one_line(str(place))}' shows what the file contains"
     return f"the same command with another file than {one_line(place.name)}"

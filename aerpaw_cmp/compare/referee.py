@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..common.units import BoolArray, FloatArray
+from ..common.units import BoolArray, FloatArray, IntArray
 from .gains import BAND
 from .level import crps_normal, local_mean_db
 from .offset import grid_offset
@@ -51,8 +51,6 @@ class LevelCard:
         Share of samples above thresholds, as predicted where levels have a common reference, else after the offset.
     outages_missed, outages_invented : int
         Measured outages where a level was predicted; measured levels where none was predicted.
-    fitted_here : tuple of str
-        Names of the numbers that were fitted on the scored samples.
     """
 
     n: int
@@ -68,7 +66,6 @@ class LevelCard:
     exceedance: tuple[Exceedance, ...]
     outages_missed: int
     outages_invented: int
-    fitted_here: tuple[str, ...] = ("offset_db",)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,8 +82,6 @@ class PredictedLevel:
         Ends of the 90 % interval; by default those of the normal distribution of ``sd_db``.
     absolute : bool
         The levels have the reference of the measurement: no offset is needed.
-    asked : (n,) bool, optional
-        Samples that the prediction is about; by default those with a level.
     """
 
     level_db: FloatArray
@@ -94,11 +89,14 @@ class PredictedLevel:
     low_db: FloatArray | None = None
     high_db: FloatArray | None = None
     absolute: bool = True
-    asked: FloatArray | None = None
 
 
 def level_card(
-    time_s: FloatArray, measured_db: FloatArray, predicted: PredictedLevel, thresholds_db: Sequence[float]
+    time_s: FloatArray,
+    measured_db: FloatArray,
+    predicted: PredictedLevel,
+    thresholds_db: Sequence[float],
+    scored: BoolArray | None = None,
 ) -> LevelCard:
     """Return the card of a predicted level.
 
@@ -111,6 +109,8 @@ def level_card(
     predicted : PredictedLevel
     thresholds_db : sequence of float
         Measured levels whose exceedance is compared.
+    scored : (n,) bool, optional
+        Samples that the prediction is about: a NaN in its level there predicts an outage. Default: those with a level.
 
     Returns
     -------
@@ -122,32 +122,37 @@ def level_card(
         If no sample has both levels.
     """
     level = predicted.level_db
-    asked = np.isfinite(level) if predicted.asked is None else predicted.asked.astype(bool)
-    heard = np.isfinite(measured_db)
-    both = heard & np.isfinite(level) & asked
-    time, measured, expected = time_s[both], measured_db[both], level[both]
+    scored = np.isfinite(level) if scored is None else scored
+    heard, reached = np.isfinite(measured_db) & scored, np.isfinite(level) & scored
+    both = heard & reached
+    measured, expected = measured_db[both], level[both]
     fit = grid_offset(measured, expected, span_db=_RANGE_DB)
     error = measured - expected
-    slow = local_mean_db(time, measured + fit.offset_db, WINDOW_S) - local_mean_db(time, expected, WINDOW_S)
+    slow = local_mean_db(time_s[both], measured, WINDOW_S) - local_mean_db(time_s[both], expected, WINDOW_S)
     spread, varied = float(np.std(expected)), float(np.std(measured))
     covariance = float(np.mean((expected - expected.mean()) * (measured - measured.mean())))
-    shift = 0.0 if predicted.absolute else fit.offset_db
     absolute = predicted.absolute
     crps, inside = _distribution(error, predicted, both) if absolute else (None, None)
+    # an outage on either side is below any threshold
+    theirs = np.where(reached, level - (0.0 if absolute else fit.offset_db), -np.inf)[scored]
+    ours = np.where(heard, measured_db, -np.inf)[scored]
     return LevelCard(
         n=int(both.sum()),
         bias_db=float(error.mean()) if absolute else None,
         rmse_db=float(np.sqrt(np.mean(error**2))) if absolute else None,
         offset_db=fit.offset_db,
         rmse_offset_db=fit.rmse_db,
-        rmse_1s_db=float(np.sqrt(np.mean(slow**2))),
+        rmse_1s_db=float(np.sqrt(np.mean((slow + fit.offset_db) ** 2))),
         correlation=covariance / (spread * varied) if spread and varied else float("nan"),
         slope=covariance / spread**2 if spread else float("nan"),
         crps_db=crps,
         coverage_90=inside,
-        exceedance=tuple(_exceedance(x, measured_db[asked], level[asked] - shift) for x in thresholds_db),
-        outages_missed=int((asked & ~heard & np.isfinite(level)).sum()),
-        outages_invented=int((asked & heard & ~np.isfinite(level)).sum()),
+        exceedance=tuple(
+            Exceedance(threshold_db=x, predicted=float(np.mean(theirs >= x)), measured=float(np.mean(ours >= x)))
+            for x in thresholds_db
+        ),
+        outages_missed=int((reached & ~heard).sum()),
+        outages_invented=int((heard & ~reached).sum()),
     )
 
 
@@ -157,25 +162,66 @@ def _distribution(
     """Return CRPS and coverage of the 90 % band as predicted; None for what is not stated."""
     from scipy.special import ndtri
 
-    crps: float | None = None
-    half = None
+    crps = half_db = low_db = high_db = None
     if predicted.sd_db is not None and np.isfinite(predicted.sd_db[both]).all():
-        crps = float(np.mean(crps_normal(error_db, predicted.sd_db[both])))
-        half = float(ndtri(0.5 + 0.5 * BAND)) * predicted.sd_db[both]
+        sd_db = predicted.sd_db[both]
+        crps, half_db = float(np.mean(crps_normal(error_db, sd_db))), float(ndtri(0.5 + 0.5 * BAND)) * sd_db
+        low_db, high_db = -half_db, half_db
     if predicted.low_db is not None and predicted.high_db is not None:
-        measured = error_db + predicted.level_db[both]
-        inside = (measured >= predicted.low_db[both]) & (measured <= predicted.high_db[both])
-        return crps, float(np.mean(inside))
-    return crps, None if half is None else float(np.mean(np.abs(error_db) <= half))
+        low_db, high_db = (end[both] - predicted.level_db[both] for end in (predicted.low_db, predicted.high_db))
+    if low_db is None or high_db is None:
+        return crps, None
+    return crps, float(np.mean((error_db >= low_db) & (error_db <= high_db)))
 
 
-def _exceedance(threshold_db: float, measured_db: FloatArray, level_db: FloatArray) -> Exceedance:
-    """Return the shares of samples at or above a threshold; an outage on either side is below it."""
-    return Exceedance(
-        threshold_db=threshold_db,
-        predicted=float(np.mean(np.nan_to_num(level_db, nan=-np.inf) >= threshold_db)),
-        measured=float(np.mean(np.nan_to_num(measured_db, nan=-np.inf) >= threshold_db)),
-    )
+# The nose of a predicted point and that of a sample differ by less than this [deg].
+_TURNED_DEG = 45.0
+
+
+def nearest_points(
+    position_m: FloatArray,
+    heading_deg: FloatArray | None,
+    points_m: FloatArray,
+    yaw_deg: FloatArray | None,
+    reach_m: float | tuple[float, float, float],
+) -> tuple[IntArray, BoolArray]:
+    """Return the nearest predicted point (n,) of each sample, and whether it is near (n,).
+
+    Parameters
+    ----------
+    position_m : (n, 3)
+        East, north, up of the samples; a sample with a NaN is near no point.
+    heading_deg : (n,), optional
+        Headings of the nose at the samples.
+    points_m : (points, 3)
+    yaw_deg : (points,), optional
+        Headings that were predicted. Unless all points and any sample have one, headings do not count.
+    reach_m : float or (east, north, up)
+        Largest distance of a near point.
+
+    Returns
+    -------
+    index : (n,) int
+    near : (n,) bool
+    """
+    from scipy.spatial import cKDTree
+
+    samples, points = position_m / np.asarray(reach_m), points_m / np.asarray(reach_m)
+    if (
+        yaw_deg is not None
+        and heading_deg is not None
+        and np.isfinite(yaw_deg).all()
+        and np.isfinite(heading_deg).any()
+    ):
+        samples, points = (
+            np.column_stack([place, np.sin(np.radians(nose)), np.cos(np.radians(nose))])
+            / np.r_[1.0, 1.0, 1.0, np.full(2, 2.0 * np.sin(np.radians(_TURNED_DEG) / 2.0))]
+            for place, nose in ((samples, heading_deg), (points, yaw_deg))
+        )
+    known = np.isfinite(samples).all(axis=1)
+    index = np.asarray(cKDTree(points).query(np.where(known[:, None], samples, 0.0))[1])
+    apart = samples - points[index]
+    return index, known & (np.linalg.norm(apart[:, :3], axis=1) <= 1.0) & (np.linalg.norm(apart[:, 3:], axis=1) <= 1.0)
 
 
 # Share of the samples, and their least number, that mark the lowest level as a detection floor.

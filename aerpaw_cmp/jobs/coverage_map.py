@@ -737,12 +737,12 @@ def _budget_layers(outcome: MapOutcome) -> Iterator[cells.Layer]:
     for mode, result in outcome.ordered():
         for row, height in enumerate(result.rss_altitudes_m):
             level, at = result.rss()[row], f"{job.in_name(height)}m_joint_{mode}"
-            where = {"height_m": height, "of": "nearest tower", "foliage": mode}
+            layer = partial(cells.Layer, unit="dB", height_m=height, of="nearest tower", foliage=mode)
             if budget.level_dbm is not None:
                 above, name = np.round(level - budget.level_dbm, 2), f"Margin above {budget.level_dbm:.1f} dBm"
-                yield cells.Layer(f"margin_mimo_h{at}", above, "dB", name, **where)
+                yield layer(name=f"margin_mimo_h{at}", values=above, quantity=name)
             if budget.noise_dbm is not None:
-                yield cells.Layer(f"snr_mimo_h{at}", np.round(level - budget.noise_dbm, 2), "dB", "SNR", **where)
+                yield layer(name=f"snr_mimo_h{at}", values=np.round(level - budget.noise_dbm, 2), quantity="SNR")
 
 
 def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:

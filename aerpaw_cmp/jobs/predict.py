@@ -31,6 +31,7 @@ from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..compare.calibration import OFF, STATED_FIELDS, Base, Observed, by_degree, choose, fixed_base
 from ..compare.gains import BAND, LinkSamples, LostLock
 from ..compare.receiver import ForecastScore, score_forecast
+from ..compare.referee import nearest_points
 from ..flight.data import FlightData, site_place, unread
 from ..flight.drafting.proposals import remembered
 from ..flight.gains import flight_of
@@ -668,8 +669,8 @@ def run_predict(
         return JobOutcome(folder=folder, metrics=prediction_metrics(prediction.page), files=output.placed(written))
 
 
-# A sample is scored by the nearest predicted point within these distances whose nose differs by less.
-NEAR_M, _NEAR_UP_M, _TURNED_DEG = 30.0, 15.0, 45.0
+# A sample is scored by the nearest predicted point within these distances.
+NEAR_M, _NEAR_UP_M = 30.0, 15.0
 
 FEWEST = 20
 
@@ -772,22 +773,12 @@ def _rank_score(samples: RankSamples, part: pd.DataFrame) -> ForecastScore | Non
     return score_forecast(samples.rank[near], forecast, forecast.argmax(axis=1) + 1, every.mean(axis=0))
 
 
-def _nearest(position_m: FloatArray, heading_deg: FloatArray, part: pd.DataFrame) -> tuple[IntArray, Any]:
-    """Predicted point (n,) of each sample, and which of them are near."""
-    from scipy.spatial import cKDTree
-
-    scale = np.array([NEAR_M, NEAR_M, _NEAR_UP_M, 1.0, 1.0])
-    turn = 2.0 * np.sin(np.radians(_TURNED_DEG) / 2.0)
-
-    def coordinates(place: FloatArray, yaw_deg: FloatArray) -> FloatArray:
-        yaw = np.radians(yaw_deg)
-        nose = np.column_stack([np.sin(yaw), np.cos(yaw)]) / turn
-        return np.asarray(np.column_stack([place, np.nan_to_num(nose)]) / scale)
-
-    points = coordinates(part[["east_m", "north_m", "height_m"]].to_numpy(), part["yaw_deg"].to_numpy())
-    heading = heading_deg if part["yaw_deg"].notna().all() else np.full(len(heading_deg), np.nan)
-    distance, index = cKDTree(points).query(coordinates(position_m, heading))
-    return np.asarray(index), distance <= np.sqrt(2.0)
+def _nearest(position_m: FloatArray, heading_deg: FloatArray, part: pd.DataFrame) -> tuple[IntArray, BoolArray]:
+    """Return the predicted point (n,) of each sample, and which samples are near theirs (n,)."""
+    points = part[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
+    return nearest_points(
+        position_m, heading_deg, points, part["yaw_deg"].to_numpy(np.float64), (NEAR_M, NEAR_M, _NEAR_UP_M)
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

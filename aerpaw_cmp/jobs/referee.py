@@ -1,13 +1,9 @@
-"""Predictions of other programs beside ours and the baselines, scored on one flight by one card.
+"""Predictions of other programs, scored on one flight beside ours and the baselines.
 
-``report flight.yaml --against FILE``. Samples are matched to predictions by time where the file has times, else by
+``report flight.yaml --against FILE``. A prediction of any program is read as one table: CSV, NetCDF, a radio map in
+.npz, or the logs of an emulated flight. Samples are matched to predictions by time where the file has times, else by
 position. Every model is scored on the samples that the file predicts, so that the cards can be compared.
-
-Predictions of any program as one table: CSV, NetCDF, a radio map in .npz, or the logs of an emulated flight.
-
-Columns of a CSV and variables of a NetCDF file: ``time`` or ``time_utc``, or ``east_m north_m height_m``, or
-``latitude_deg longitude_deg height_m``; ``tower``; one of ``level_dbm``, ``level_db``, ``path_loss_db``; optionally
-``channel``, ``sd_db``, ``q05_db`` and ``q95_db``, ``rank``, ``p_rank1`` to ``p_rank4``. docs/referee.md has examples.
+docs/referee.md lists the columns and has examples.
 """
 
 from __future__ import annotations
@@ -15,7 +11,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +20,21 @@ import pandas as pd
 
 from ..common.errors import InputError, parsing
 from ..common.files import LARGEST_TABLE, read_input
-from ..common.jsonable import fields_of
+from ..common.jsonable import json_safe
 from ..common.native import read as read_native
 from ..common.outputs import file_digest
 from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..compare.rank import agreement, cohen_kappa, histogram, total_variation
 from ..compare.receiver import score_forecast
-from ..compare.referee import LevelCard, PredictedLevel, detection_floor_db, level_card, measured_thresholds
+from ..compare.referee import (
+    LevelCard,
+    PredictedLevel,
+    detection_floor_db,
+    level_card,
+    measured_thresholds,
+    nearest_points,
+)
 from ..compare.result import BASELINE_TITLE, FlightResult, RankResult, RssResult
 from ..compare.statistics import PairedDifference, paired_difference
 from ..flight.data import FlightData, load_data
@@ -43,12 +46,13 @@ from ..logs.readers import ReadOptions
 from ..propagation.field.sum import mean_pair_power, rss_dbm
 from ..site.site import Site
 from .calibrate import observe
+from .options import AGAINST_DISTANCE_M
 
 QUANTITIES = ("level_dbm", "level_db", "path_loss_db")
 RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
 _PLACE = ("east_m", "north_m", "height_m")
 _GEOGRAPHIC = ("latitude_deg", "longitude_deg", "height_m")
-_OPTIONAL = ("sd_db", "q05_db", "q95_db", "rank", *RANKS)
+_OPTIONAL = ("sd_db", "q05_db", "q95_db", "rank", "yaw_deg", *RANKS)
 
 _WANTED = (
     "time_utc, or east_m, north_m, height_m, or latitude_deg, longitude_deg, height_m; tower; level_dbm, level_db or "
@@ -77,9 +81,11 @@ class ForeignPrediction:
     table : DataFrame
         One row per prediction: ``time`` (datetime64[ns], NaT if unknown), ``east_m north_m height_m`` in the site
         frame (NaN if unknown), ``tower``, ``channel`` (empty: every channel of the tower), ``level`` [dB or dBm], and
-        those of ``sd_db q05_db q95_db rank p_rank1..4`` that the file has.
+        those of ``sd_db q05_db q95_db rank yaw_deg p_rank1..4`` that the file has.
     remarks : tuple of str
         Sentences on how the file was read.
+    unit : str
+        Unit of ``level_db``; empty for the unit of the log.
     """
 
     path: Path
@@ -87,6 +93,13 @@ class ForeignPrediction:
     quantity: str
     table: pd.DataFrame
     remarks: tuple[str, ...] = ()
+    unit: str = ""
+
+    def absolute(self, unit: str) -> bool:
+        """Check whether the levels need no offset to be compared with a log in a unit."""
+        if self.quantity == "level_db":
+            return self.unit in ("", unit)
+        return (self.quantity, unit) == ("level_dbm", "dBm")
 
     @property
     def timed(self) -> bool:
@@ -95,7 +108,7 @@ class ForeignPrediction:
 
 
 def read_foreign(path: Path, data: FlightData) -> ForeignPrediction:
-    """Return the prediction that a file or folder holds.
+    """Read the prediction in a file or folder.
 
     Parameters
     ----------
@@ -111,7 +124,7 @@ def read_foreign(path: Path, data: FlightData) -> ForeignPrediction:
     Raises
     ------
     InputError
-        If the file is damaged, or lacks a position, a tower, or a level with its unit.
+        If the file is damaged, or has no position, no tower, or no level with its unit.
     """
     if (path / "prediction.csv").is_file():  # a folder of 'predict'
         path = path / "prediction.csv"
@@ -161,7 +174,7 @@ def _check_rows(rows: int, path: Path) -> None:
 
 
 def _netcdf(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
-    """Variables along the dimensions of the level, one row per element."""
+    """Read variables along the dimensions of the level, one row per element."""
     with parsing(path, "a NetCDF file"):
         arrays, notes = read_native("netcdf", content)
     program = str(notes["attributes"].get("source", "NetCDF"))
@@ -196,21 +209,14 @@ def _netcdf(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
 
 def _since(values: AnyArray, unit: str, path: Path) -> AnyArray:
     """Return times of a CF unit such as ``seconds since 2025-06-10T14:00:00Z``."""
-    word, _, start = unit.partition(" since ")
-    sizes = {"second": 1.0, "minute": 60.0, "hour": 3600.0, "day": 86400.0}
-    sizes |= {"s": 1.0, "ms": 1e-3, "millisecond": 1e-3, "microsecond": 1e-6, "nanosecond": 1e-9}
+    size, _, start = unit.partition(" since ")
     with parsing(path, "a time unit such as 'seconds since 2025-06-10T14:00:00Z'"):
-        origin = pd.Timestamp(start)
-        origin = origin.tz_localize("UTC") if origin.tzinfo is None else origin.tz_convert("UTC")
-        name = word.strip().lower()
-        size = sizes.get(name) or sizes[name.rstrip("s")]
-        nanoseconds = np.round(np.asarray(values, dtype=np.float64) * size * 1e9)
-        stamps = origin.value + np.nan_to_num(nanoseconds).astype(np.int64)
-        return np.asarray(pd.DatetimeIndex(stamps.astype("datetime64[ns]"), tz="UTC"))
+        elapsed = pd.to_timedelta(np.asarray(values, dtype=np.float64), unit=size.strip().lower())  # type: ignore[call-overload]
+        return np.asarray(pd.to_datetime(start, utc=True) + elapsed)
 
 
 def _radio_map(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
-    """A radio map as ``np.savez(path_gain=..., cell_centers=..., tx_names=...)`` of Sionna RT writes it."""
+    """Read a radio map of Sionna RT, saved with ``np.savez(path_gain=..., cell_centers=..., tx_names=...)``."""
     with parsing(path, "an .npz with path_gain, cell_centers, tx_names"), np.load(io.BytesIO(content)) as book:
         missing = {"path_gain", "cell_centers", "tx_names"} - set(book.files)
         if missing:
@@ -239,14 +245,14 @@ def _radio_map(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]
 
 
 def _emulated(folder: Path, data: FlightData) -> ForeignPrediction:
-    """Levels and positions of the logs of an emulated flight, matched by position."""
+    """Read levels and positions from the logs of an emulated flight, which are matched by position."""
     if (folder / "flight.yaml").is_file():
         from ..flight.gains import load_with_learned
 
-        settings, home = load_with_learned(folder / "flight.yaml"), folder
+        settings = load_with_learned(folder / "flight.yaml")
     else:
-        settings, home = _drafted(folder, data), folder
-    twin = load_data(settings, home)
+        settings = _drafted(folder, data)
+    twin = load_data(settings, folder)
     if set(flight_logs(twin)) & set(flight_logs(data)):
         raise InputError(
             "logs of the scored flight itself",
@@ -271,12 +277,18 @@ def _emulated(folder: Path, data: FlightData) -> ForeignPrediction:
     table = table.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False)["level_db"].mean()
     quantity, table = _checked(table, folder, data.site)
     _check_towers(table, data, folder)
-    remark = f"{folder.name} is an emulated flight: {counted(len(table), 'level')} with a position."
-    return ForeignPrediction(path=folder, program="emulated flight", quantity=quantity, table=table, remarks=(remark,))
+    units, ours = (sorted({s.unit for s in of.rss}) for of in (twin, data))
+    remarks = [f"{folder.name} is an emulated flight: {counted(len(table), 'level')} with a position."]
+    if units != ours:
+        remarks.append(f"Its levels are in {', '.join(units)}, those of the flight in {', '.join(ours)}: no bias.")
+    return ForeignPrediction(
+        path=folder, program="emulated flight", quantity=quantity, table=table, remarks=tuple(remarks),
+        unit=units[0] if len(units) == 1 else "several units",
+    )  # fmt: skip
 
 
 def _drafted(folder: Path, data: FlightData) -> FlightFile:
-    """The flight file that a draft of the folder proposes for the site of the scored flight."""
+    """Return the flight file that a draft of the folder proposes for the site of the scored flight."""
     from ..common.yamlfile import parse_yaml
 
     site = str(data.site_place) if not Path(data.site_place).is_file() else str(Path(data.site_place).resolve())
@@ -322,9 +334,6 @@ def _checked(frame: pd.DataFrame, path: Path, site: Site) -> tuple[str, pd.DataF
     if "level" not in table:
         table["level"] = np.nan
     _check_levels(table["level"].to_numpy(np.float64), quantity, path)
-    if "yaw_deg" in frame and table["time"].isna().all():
-        # a turn on the spot has several levels at one position: samples are matched without their heading
-        table = table.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False, dropna=False).mean()
     _check_repeats(table, path)
     return quantity, table
 
@@ -334,7 +343,7 @@ def _numbers(column: Any) -> Any:
 
 
 def _times(frame: pd.DataFrame, path: Path) -> Any:
-    """Times (n,) as naive UTC datetime64[ns]; NaT without a column of times."""
+    """Return times (n,) as naive UTC datetime64[ns]; NaT without a column of times."""
     name = next((name for name in ("time_utc", "time") if name in frame), None)
     if name is None:
         return pd.Series(pd.NaT, index=frame.index, dtype="datetime64[ns]")
@@ -357,7 +366,7 @@ def _times(frame: pd.DataFrame, path: Path) -> Any:
 
 
 def _places(frame: pd.DataFrame, path: Path, site: Site) -> AnyArray:
-    """East, north, up (n, 3) in the site frame [m]; NaN without columns of positions."""
+    """Return east, north, up (n, 3) in the site frame [m]; NaN without columns of positions."""
     if set(_PLACE) <= set(frame):
         place = np.column_stack([_numbers(frame[name]) for name in _PLACE])
     elif set(_GEOGRAPHIC) <= set(frame):
@@ -390,10 +399,12 @@ def _check_levels(level: FloatArray, quantity: str, path: Path) -> None:
     if not len(known) or not quantity:
         return
     middle, what = float(np.median(known)), f"a median {quantity} of {np.median(known):.3g}"
-    if quantity == "level_dbm" and known.min() > 0.0 and known.max() < 1.0:
+    if known.min() > 0.0 and known.max() < 1.0:
         raise InputError(
-            what, expected="levels in dBm", cause="watts or milliwatts; 10 log10(P / 1 mW) is the level", path=path
-        )
+            what, expected="decibels",
+            cause="a linear gain or power; in decibels it is 10 log10(gain), or 10 log10(P / 1 mW) of P in watts or "
+            "milliwatts", path=path,
+        )  # fmt: skip
     if quantity == "level_dbm" and middle > 60.0:
         raise InputError(what, expected="received levels in dBm", cause="a path loss (path_loss_db)", path=path)
     if quantity == "path_loss_db" and middle < 0.0:
@@ -402,7 +413,8 @@ def _check_levels(level: FloatArray, quantity: str, path: Path) -> None:
 
 def _check_repeats(table: pd.DataFrame, path: Path) -> None:
     """Refuse two rows of one tower, channel and time (or position) with different levels."""
-    key = ["tower", "channel", *(["time"] if table["time"].notna().any() else list(_PLACE))]
+    place = [*_PLACE, *({"yaw_deg"} & set(table))]
+    key = ["tower", "channel", *(["time"] if table["time"].notna().any() else place)]
     repeated = table.duplicated([*key, "level"], keep="first")
     distinct = table[~repeated]
     twice = distinct.duplicated(key, keep=False) & distinct["level"].notna()
@@ -435,9 +447,6 @@ def split_by_series(table: pd.DataFrame, tower: str, channel: str) -> pd.DataFra
     return part if own.empty else own
 
 
-# A sample is scored by the nearest predicted position within this distance [m], if no option says otherwise.
-NEAR_M = 5.0
-
 # A sample is scored by the nearest predicted time within this [s], and at least half of the prediction's step.
 _NEAR_S = 0.5
 
@@ -456,12 +465,12 @@ class SeriesVerdict:
     tower, channel, unit : str
     matched, unmatched : int
         Samples of the flight with and without a prediction nearby.
+    floor_db : float or None
+        Detection floor that the predicted levels show (an emulated receiver).
     cards : mapping of str to LevelCard
-        The prediction first, then ours and the baselines, on the same samples.
+        The prediction first, then ours and the baselines, on the same samples. A model with too few levels has none.
     differences : mapping of str to PairedDifference
         RMSE of the prediction minus that of ours and of each baseline, each after one offset, with its interval.
-    floor_db : float, optional
-        Detection floor that the predicted levels show (an emulated receiver).
     """
 
     tower: str
@@ -469,14 +478,9 @@ class SeriesVerdict:
     unit: str
     matched: int
     unmatched: int
+    floor_db: float | None
     cards: Mapping[str, LevelCard]
     differences: Mapping[str, PairedDifference]
-    floor_db: float | None = None
-
-    @property
-    def name(self) -> str:
-        """Tower and channel as one label."""
-        return f"{self.tower} {self.channel}".strip()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -495,6 +499,13 @@ class RankVerdict:
     constant_log_score: float | None = None
 
 
+# Numbers of a card in the tables, with their heads.
+_HEADS = {
+    "bias_db": "bias dB", "rmse_db": "RMSE dB", "rmse_offset_db": "RMSE after offset dB", "rmse_1s_db": "RMSE 1 s dB",
+    "correlation": "correlation", "crps_db": "CRPS dB", "coverage_90": "inside 90 %",
+}  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
     """One prediction against one flight."""
@@ -505,33 +516,26 @@ class Verdict:
     series: tuple[SeriesVerdict, ...]
     ranks: tuple[RankVerdict, ...] = ()
     remarks: tuple[str, ...] = ()
-    fitted_here: tuple[str, ...] = field(default=("the offset of each model and channel",))
 
     def metrics(self) -> dict[str, Any]:
         """Return the entry of ``referee`` in metrics.json and of card.json."""
-        levels: dict[str, dict[str, Any]] = {}
+        levels: dict[str, dict[str, SeriesVerdict]] = {}
         for item in self.series:
-            levels.setdefault(item.tower, {})[item.channel] = {
-                "unit": item.unit,
-                "matched": item.matched,
-                "unmatched": item.unmatched,
-                "floor_db": item.floor_db,
-                "cards": {name: fields_of(card) for name, card in item.cards.items()},
-                "differences": {name: fields_of(pair) for name, pair in item.differences.items()},
-            }
-        ranks = {item.tower: fields_of(item) for item in self.ranks}
-        return {
+            levels.setdefault(item.tower, {})[item.channel] = item
+        heads = "prediction minus model dB", "95 % low", "95 % high"
+        result: dict[str, Any] = json_safe({
             "prediction": self.name,
             "sha256": self.sha256,
             "program": self.program,
-            "fitted_on_this_flight": list(self.fitted_here),
+            "fitted_on_this_flight": ["the offset of each model and channel"],
             "sentence": self.sentence(),
-            "remarks": list(self.remarks),
+            "remarks": self.remarks,
             "means": self.means(),
             "levels": levels,
-            "rank": ranks,
-            "table": {"columns": list(TABLE), "rows": [list(row.values()) for row in self.rows()]},
-        }
+            "rank": {item.tower: item for item in self.ranks},
+            "table": {"columns": ("series", "model", "n", *_HEADS.values(), *heads), "rows": list(self._rows())},
+        })  # fmt: skip
+        return result
 
     def means(self) -> list[dict[str, Any]]:
         """Return the means over channels of each model; None for a number that not every channel has."""
@@ -539,60 +543,51 @@ class Verdict:
         for model in dict.fromkeys(name for item in self.series for name in item.cards):
             cards = [item.cards[model] for item in self.series if model in item.cards]
             row: dict[str, Any] = {"model": model, "channels": len(cards)}
-            for key in ("bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "crps_db", "coverage_90"):
+            for key in _HEADS:
                 values = [getattr(card, key) for card in cards]
                 row[key] = None if None in values else float(np.mean(values))
             rows.append(row)
         return rows
 
-    def rows(self) -> Iterator[dict[str, Any]]:
-        """Yield one row per series and model for terminal, page and card.json, under the heads of :data:`TABLE`."""
+    def _rows(self) -> Iterator[tuple[Any, ...]]:
+        """Yield one row per series and model for page and card.json."""
         for item in self.series:
             for name, card in item.cards.items():
                 pair = item.differences.get(name)
-                low, high = (None, None) if pair is None else pair.difference_ci95_db
-                yield dict(
-                    zip(
-                        TABLE,
-                        (
-                            item.name, name, card.n, card.bias_db, card.rmse_db, card.rmse_offset_db, card.rmse_1s_db,
-                            card.correlation, card.crps_db, card.coverage_90,
-                            None if pair is None else pair.difference_db, low, high,
-                        ),
-                        strict=True,
-                    )
-                )  # fmt: skip
+                apart = (None,) * 3 if pair is None else (pair.difference_db, *pair.difference_ci95_db)
+                yield f"{item.tower} {item.channel}", name, card.n, *(getattr(card, key) for key in _HEADS), *apart
 
     def sentence(self) -> str:
         """Return the result in two sentences: error beside ours, and whether the difference is significant."""
         if not self.series:
             return f"{self.name}: ranks only."
-        mean = {name: float(np.mean([s.cards[name].rmse_offset_db for s in self.series])) for name in (self.name, OURS)}
-        pairs = [s.differences[OURS] for s in self.series]
-        words = {kind: sum(p.verdict == kind for p in pairs) for kind in ("better", "worse")}
-        decided = " and ".join(f"significantly {kind} on {n}" for kind, n in words.items() if n)
-        unit = counted(len(self.series), "channel")
         lost = sum(s.unmatched for s in self.series)
-        matched = sum(s.matched for s in self.series)
-        extent = f"All {counted(matched, 'sample')} have a prediction."
+        matched = counted(sum(s.matched for s in self.series), "sample")
+        extent = f"All {matched} have a prediction."
         if lost:
-            extent = f"{counted(matched, 'sample')} have a prediction, {counted(lost, 'sample')} have none."
+            extent = f"{matched} have a prediction, {counted(lost, 'sample')} have none."
+        both = [s for s in self.series if OURS in s.differences]
+        if not both:
+            rmse_db = np.mean([s.cards[self.name].rmse_offset_db for s in self.series])
+            return (
+                f"{self.name}: RMSE {rmse_db:.1f} dB after one offset per channel. Ray tracing has no level there. "
+                f"{extent}"
+            )
+        theirs, mine = (np.mean([s.cards[name].rmse_offset_db for s in both]) for name in (self.name, OURS))
+        words = {kind: sum(s.differences[OURS].verdict == kind for s in both) for kind in ("better", "worse")}
+        decided = " and ".join(f"significantly {kind} on {n}" for kind, n in words.items() if n)
         return (
-            f"{self.name}: RMSE {mean[self.name]:.1f} dB after one offset per channel, ray tracing {mean[OURS]:.1f} dB "
-            f"on the same samples ({unit}). It is {decided or 'on no channel significantly different from ray tracing'}"
-            f" (95 %). {extent}"
+            f"{self.name}: RMSE {theirs:.1f} dB after one offset per channel, ray tracing {mine:.1f} dB on the same "
+            f"samples ({counted(len(both), 'channel')}). It is "
+            f"{decided or 'on no channel significantly different from ray tracing'} (95 %). {extent}"
         )
 
 
-# Heads of the small table.
-TABLE = (
-    "series", "model", "n", "bias dB", "RMSE dB", "RMSE after offset dB", "RMSE 1 s dB", "correlation", "CRPS dB",
-    "inside 90 %", "prediction minus model dB", "95 % low", "95 % high",
-)  # fmt: skip
-
-
 def judged(
-    data: FlightData, result: FlightResult, given: Sequence[ForeignPrediction], near_m: float = NEAR_M
+    data: FlightData,
+    result: FlightResult,
+    given: Sequence[ForeignPrediction],
+    near_m: float = AGAINST_DISTANCE_M,
 ) -> list[Verdict]:
     """Score predictions of other programs on a flight.
 
@@ -619,10 +614,8 @@ def judged(
 
 def _verdict(given: ForeignPrediction, data: FlightData, result: FlightResult, near_m: float) -> Verdict:
     name = given.path.name
-    series = [
-        s for item in result.rss if given.quantity and (s := _series(given, item, data, name, near_m)) is not None
-    ]
-    ranks = [r for tower in result.rank if (r := _ranks(given, tower, name, near_m)) is not None]
+    series = [s for item in result.rss if given.quantity and (s := _series(given, item, data, near_m)) is not None]
+    ranks = [r for tower in result.rank if (r := _ranks(given, tower, near_m)) is not None]
     if not series and not ranks:
         raise InputError(
             f"fewer than {FEWEST} samples of the flight have a prediction nearby",
@@ -639,41 +632,31 @@ def _verdict(given: ForeignPrediction, data: FlightData, result: FlightResult, n
         )
     digest = "" if given.path.is_dir() else file_digest(given.path)
     return Verdict(
-        name=name,
-        sha256=digest,
-        program=given.program,
-        series=tuple(series),
-        ranks=tuple(ranks),
+        name=name, sha256=digest, program=given.program, series=tuple(series), ranks=tuple(ranks),
         remarks=tuple(remarks),
-    )
+    )  # fmt: skip
 
 
-def _series(
-    given: ForeignPrediction, item: RssResult, data: FlightData, name: str, near_m: float
-) -> SeriesVerdict | None:
+def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m: float) -> SeriesVerdict | None:
     part = split_by_series(given.table, item.tower, item.channel)
-    part = part[part["time"].notna()] if given.timed else part[part["east_m"].notna()]
-    if part.empty:
-        return None
-    index, near = _nearest(item.time, item.position_m, part, given.timed, near_m)
+    heading_deg = item.geometry.get("heading_deg")
+    predicted, near = _predicted(given, part, item.time, item.position_m, heading_deg, near_m)
     near &= item.posed
-    chosen = part.iloc[index]
-    level = np.where(near, chosen["level"].to_numpy(np.float64), np.nan)
+    name, absolute = given.path.name, given.absolute(item.unit)
+    level = predicted["level"]
     if given.quantity == "path_loss_db":
-        level = _power_dbm(data, item) - level
+        link = next(s.link for s in data.rss if (s.tower, s.channel) == (item.tower, item.channel))
+        level = link.transmit_power_dbm - level
     scored = near & np.isfinite(level) & np.isfinite(item.measured_db)
     if scored.sum() < FEWEST:
         return None
-    absolute = given.quantity == "level_db" or (item.unit == "dBm" and given.quantity == "level_dbm")
-
-    def column(key: str) -> FloatArray | None:
-        return np.where(near, chosen[key].to_numpy(np.float64), np.nan) if key in chosen else None
-
-    theirs = PredictedLevel(
-        level_db=level, sd_db=column("sd_db"), low_db=column("q05_db"), high_db=column("q95_db"),
-        absolute=absolute, asked=near.astype(np.float64),
-    )  # fmt: skip
-    models = {name: theirs, OURS: PredictedLevel(level_db=item.simulated_dbm, absolute=item.unit == "dBm")}
+    models = {
+        name: PredictedLevel(
+            level_db=level, sd_db=predicted.get("sd_db"), low_db=predicted.get("q05_db"),
+            high_db=predicted.get("q95_db"), absolute=absolute,
+        ),
+        OURS: PredictedLevel(level_db=item.simulated_dbm, absolute=item.unit == "dBm"),
+    }  # fmt: skip
     models |= {
         BASELINE_TITLE[key]: PredictedLevel(level_db=model.level_dbm, absolute=False)
         for key, model in item.baselines.items()
@@ -684,93 +667,78 @@ def _series(
     cards, errors = {}, {}
     for key, model in models.items():
         same = rows if key == name else rows & (np.isfinite(level) | ~np.isfinite(item.measured_db))
-        if (np.isfinite(model.level_db) & np.isfinite(item.measured_db) & same).sum() < FEWEST:
-            continue
-        cards[key] = level_card(seconds[same], item.measured_db[same], _part(model, same), thresholds)
-        errors[key] = np.where(scored, item.measured_db - model.level_db, np.nan)
-    pairs = {
-        key: paired_difference(errors[name], error, place_m=item.position_m)
-        for key, error in errors.items() if key != name
-    }  # fmt: skip
+        if (np.isfinite(model.level_db) & np.isfinite(item.measured_db) & same).sum() >= FEWEST:
+            cards[key] = level_card(seconds, item.measured_db, model, thresholds, same)
+            errors[key] = np.where(scored, item.measured_db - model.level_db, np.nan)
     return SeriesVerdict(
-        tower=item.tower, channel=item.channel, unit=item.unit, matched=int((near & item.posed).sum()),
-        unmatched=int((item.posed & ~near).sum()), cards=cards, differences=pairs,
-        floor_db=detection_floor_db(part["level"].to_numpy(np.float64)),
+        tower=item.tower, channel=item.channel, unit=item.unit, matched=int(near.sum()),
+        unmatched=int((item.posed & ~near).sum()), floor_db=detection_floor_db(part["level"].to_numpy(np.float64)),
+        cards=cards,
+        differences={
+            key: paired_difference(errors[name], error, place_m=item.position_m)
+            for key, error in errors.items() if key != name
+        },
     )  # fmt: skip
 
 
-def _part(model: PredictedLevel, rows: BoolArray) -> PredictedLevel:
-    """Return the samples ``rows`` of a prediction."""
-
-    def some(values: FloatArray | None) -> FloatArray | None:
-        return None if values is None else values[rows]
-
-    return PredictedLevel(
-        level_db=model.level_db[rows], sd_db=some(model.sd_db), low_db=some(model.low_db), high_db=some(model.high_db),
-        absolute=model.absolute, asked=some(model.asked),
-    )  # fmt: skip
-
-
-def _power_dbm(data: FlightData, item: RssResult) -> float:
-    """Transmit power of the link of a series [dBm]."""
-    return next(s.link.transmit_power_dbm for s in data.rss if (s.tower, s.channel) == (item.tower, item.channel))
-
-
-def _nearest(
-    time: Any, position_m: FloatArray, part: pd.DataFrame, timed: bool, near_m: float
-) -> tuple[IntArray, BoolArray]:
-    """Return the nearest predicted row (n,) of each sample, and whether it is near (n,)."""
-    if timed:
-        known = part["time"].to_numpy("datetime64[ns]")
-        order = np.argsort(known, kind="stable")
-        at = known[order]
-        after = np.clip(np.searchsorted(at, time), 1, len(at) - 1) if len(at) > 1 else np.zeros(len(time), dtype=int)
-        before = np.maximum(after - 1, 0)
-        closer = np.where(np.abs(at[after] - time) < np.abs(time - at[before]), after, before)
-        steps = np.diff(np.unique(at)) / np.timedelta64(1, "s")
-        most_s = max(_NEAR_S, 0.51 * float(np.median(steps)) if len(steps) else 0.0)
-        apart_s = np.abs(at[closer] - time) / np.timedelta64(1, "s")
-        return order[closer], np.asarray(apart_s <= most_s)
-    from scipy.spatial import cKDTree
-
-    place = part[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
-    posed: BoolArray = np.asarray(np.isfinite(position_m).all(axis=1))
-    distance, index = cKDTree(place).query(np.where(posed[:, None], position_m, 0.0))
-    return np.asarray(index), np.asarray(posed & (distance <= near_m))
-
-
-def _ranks(given: ForeignPrediction, item: RankResult, name: str, near_m: float) -> RankVerdict | None:
-    if not {"rank", *RANKS} & set(given.table):
-        return None
-    part = given.table[given.table["tower"] == item.tower]
-    part = part[part["time"].notna()] if given.timed else part[part["east_m"].notna()]
+def _predicted(
+    given: ForeignPrediction, part: pd.DataFrame, time: Any, position_m: FloatArray, heading_deg: Any, near_m: float
+) -> tuple[dict[str, FloatArray], BoolArray]:
+    """Return the numbers (n,) predicted for each sample, NaN if none is near, and whether one is near (n,)."""
+    part = part[(part["time"] if given.timed else part["east_m"]).notna()]
     if part.empty:
+        near: BoolArray = np.zeros(len(time), dtype=np.bool_)
+        return {"level": np.full(len(time), np.nan)}, near
+    if given.timed:
+        index, near = _nearest_times(time, part["time"].to_numpy("datetime64[ns]"))
+    else:
+        yaw_deg = part["yaw_deg"].to_numpy(np.float64) if "yaw_deg" in part else None
+        points = part[list(_PLACE)].to_numpy(np.float64)
+        index, near = nearest_points(position_m, heading_deg, points, yaw_deg, near_m)
+    names = [name for name in ("level", *_OPTIONAL) if name in part]
+    return {name: np.where(near, part[name].to_numpy(np.float64)[index], np.nan) for name in names}, near
+
+
+def _nearest_times(time: Any, known: Any) -> tuple[IntArray, BoolArray]:
+    """Return the nearest predicted time (n,) of each sample, and whether it is near (n,)."""
+    order = np.argsort(known, kind="stable")
+    at = known[order]
+    after = np.clip(np.searchsorted(at, time), min(1, len(at) - 1), len(at) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.where(np.abs(at[after] - time) < np.abs(time - at[before]), after, before)
+    steps = np.diff(np.unique(at)) / np.timedelta64(1, "s")
+    most_s = max(_NEAR_S, 0.51 * float(np.median(steps)) if len(steps) else 0.0)
+    return order[closer], np.asarray(np.abs(at[closer] - time) / np.timedelta64(1, "s") <= most_s)
+
+
+def _ranks(given: ForeignPrediction, item: RankResult, near_m: float) -> RankVerdict | None:
+    part = given.table[given.table["tower"] == item.tower]
+    predicted, near = _predicted(given, part, item.time, item.position_m, None, near_m)
+    p = np.column_stack([predicted[name] for name in RANKS]) if set(RANKS) <= set(predicted) else None
+    if "rank" in predicted:
+        rank = predicted["rank"]
+    elif p is not None:
+        rank = np.where(np.isfinite(p).all(axis=1), np.nan_to_num(p).argmax(axis=1) + 1.0, np.nan)
+    else:
         return None
-    index, near = _nearest(item.time, item.position_m, part, given.timed, near_m)
-    chosen, p = part.iloc[index], None
-    if set(RANKS) <= set(part):
-        p = chosen[list(RANKS)].to_numpy(np.float64)
-        predicted = np.where(np.isfinite(p).all(axis=1), np.nan_to_num(p).argmax(axis=1) + 1.0, np.nan)
-    if "rank" in part:
-        predicted = chosen["rank"].to_numpy(np.float64)
-    scored = near & np.isfinite(predicted) & np.isfinite(item.measured) & (item.measured > 0)
+    scored = near & np.isfinite(rank) & np.isfinite(item.measured) & (item.measured > 0)
     if scored.sum() < FEWEST:
         return None
     best = max(item.rank, key=lambda k: item.score.simulated[k].agreement)
-    models = {name: predicted, f"ray tracing, K = {best:g}": item.rank[best].astype(np.float64)}
+    models = {given.path.name: rank, f"ray tracing, K = {best:g}": item.rank[best].astype(np.float64)}
     measured = item.measured[scored]
     scores = {
         key: {
-            "kappa": cohen_kappa(measured, rank[scored]),
-            "total_variation": total_variation(histogram(measured), histogram(rank[scored])),
-            "agreement": agreement(measured, rank[scored]),
+            "kappa": cohen_kappa(measured, ranks[scored]),
+            "total_variation": total_variation(histogram(measured), histogram(ranks[scored])),
+            "agreement": agreement(measured, ranks[scored]),
         }
-        for key, rank in models.items()
+        for key, ranks in models.items()
     }
     log_score = constant = None
     if p is not None:
         stated = scored & np.isfinite(p).all(axis=1)
-        forecast = score_forecast(item.measured[stated], p[stated], predicted[stated], np.nanmean(p, axis=0))
+        forecast = score_forecast(item.measured[stated], p[stated], rank[stated], np.nanmean(p, axis=0))
         log_score, constant = forecast.log_score, forecast.constant_log_score
     return RankVerdict(
         tower=item.tower, matched=int(scored.sum()), unmatched=int((~near).sum()), scores=scores,
@@ -779,9 +747,23 @@ def _ranks(given: ForeignPrediction, item: RankResult, name: str, near_m: float)
 
 
 def _why_none(given: ForeignPrediction, result: FlightResult) -> str | None:
-    """Return the likely cause if no sample is near a prediction: another time zone, another day, another route."""
-    if not given.timed or not result.series:
-        return "a prediction of another route or with another height reference; --against-distance widens the search"
+    """Return the likely cause if no sample is near a prediction: another time zone, day, route or height datum."""
+    if not result.series:
+        return None
+    if not given.timed:
+        flown, points = (
+            place[np.isfinite(place).all(axis=1)]
+            for place in (np.vstack([s.position_m for s in result.series]), given.table[list(_PLACE)].to_numpy())
+        )
+        index, near = nearest_points(flown * [1, 1, 0], None, points * [1, 1, 0], None, 50.0)
+        apart_m = float(np.median((points[index] - flown)[near, 2])) if near.mean() > 0.5 else 0.0
+        if abs(apart_m) > 10.0:
+            return (
+                f"another height datum: the predicted positions are {abs(apart_m):.0f} m "
+                f"{'above' if apart_m > 0 else 'below'} the flight, whose heights count from the ground at the origin "
+                "(up) or from take-off (with latitude and longitude)"
+            )
+        return "a prediction of another route; --against-distance allows larger distances"
     flown = np.concatenate([item.time for item in result.series])
     theirs = given.table["time"].dropna().to_numpy("datetime64[ns]")
     apart_h = float((np.median(theirs.astype(np.int64)) - np.median(flown.astype(np.int64))) / 3.6e12)

@@ -13,7 +13,6 @@ from typing import Any
 
 from ..common.errors import UsageError, noting_interrupts
 from ..common.files import cache_folder
-from ..common.jsonable import json_safe
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import PlannedStage, Stages
 from ..common.text import counted
@@ -274,7 +273,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
 
             with stages("score predictions"):
                 verdicts = judged(data, flight_run.result, given, chosen.against_distance_m)
-            cards = [json_safe(verdict.metrics()) for verdict in verdicts]
+            cards = [verdict.metrics() for verdict in verdicts]
             record = replace(record, extra_metrics={**record.extra_metrics, "referee": cards})
         if target is not None:
             text, sentence = recommended_text(load_flight(flight), flight_run.ladder, flight)
@@ -366,9 +365,8 @@ def run_site_import(
     *,
     base: str | None = None,
     towers: Sequence[str] = (),
-    untagged: str | None = None,
-    trees: bool = False,
     force: bool = False,
+    **options: Any,
 ) -> list[str]:
     """Write a site.yaml from map files and return what was done to them.
 
@@ -382,12 +380,10 @@ def run_site_import(
         Site whose towers and settings are kept. Default: Lake Wheeler if no tower is named.
     towers : sequence of str
         ``NAME=LATITUDE,LONGITUDE,HEIGHT`` of antennas; the first is the origin if there is no base.
-    untagged : str, optional
-        What areas without a tag are: building, forest or geofence.
-    trees : bool
-        Woods are single trees at random places, not media.
     force : bool
         Replace a file that this tool did not write.
+    **options
+        For :func:`~aerpaw_cmp.site.footprints.import_site`: ``dem``, ``dem_crs``, ``untagged``, ``trees``.
 
     Returns
     -------
@@ -397,9 +393,9 @@ def run_site_import(
     from ..site.footprints import import_site, site_yaml
     from ..site.learned import carry_memory
 
-    inputs = [*files, *([] if base is None else [Path(base)])]
+    inputs = [*files, *(Path(name) for name in (base, options.get("dem")) if name is not None)]
     with OutputFile(out, own=is_sealed, inputs=inputs, force=force) as output:
-        model, actions = import_site(files, base=base, towers=towers, untagged=untagged, trees=trees)
+        model, actions = import_site(files, base=base, towers=towers, **options)
         text = site_yaml(model, header=["made by 'aerpaw-cmp site import' from map data", *actions])
         output.write(sealed(text))
     # antennas learned for a site belong to its towers, which named towers replace

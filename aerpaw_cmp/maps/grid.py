@@ -558,7 +558,7 @@ def _rank_layers(result: MapResult, tower: str | None) -> list[Layer]:
         at = f"h{in_name(height)}m_{who}"
         for column, k in enumerate(result.ks):
             name, names = f"rank_k{in_name(k, 0)}_{at}", class_names(HIGHEST_RANK)
-            layers.append(Layer(name, ranks[row, column], "1", f"Rank, K = {k:g}", names, height, of))
+            layers.append(Layer(name, ranks[row, column], "1", f"Rank, K = {k:g}", names, height_m=height, of=of))
         for name, title, values in ratios:
             layers.append(Layer(f"{name}_{at}", values[row], "dB", title, height_m=height, of=of))
     return layers

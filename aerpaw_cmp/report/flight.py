@@ -313,8 +313,8 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
     errors: dict[str, str | int] = {"Bias [dB]": 1, "RMSE [dB]": 1, "after offset": 1, "over 1 s": 1}
     means = Table(
         caption="Means over channels; a dash where the levels have no reference in common with the log, or no band.",
-        columns={"Model": HEAD, "Channels": 0, **errors, "CRPS [dB]": 2, "In 90 %": SHARE},
-        rows=[[row[key] for key in _MEANS] for row in verdict["means"]],
+        columns={"Model": HEAD, "Channels": 0, **errors, "Correlation": 2, "CRPS [dB]": 2, "In 90 %": SHARE},
+        rows=[list(row.values()) for row in verdict["means"]],
     )
     every = verdict["table"]["rows"]
     channels = Table(
@@ -334,6 +334,7 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
             (f"{tower} {channel}".strip(), x["threshold_db"], x["measured"], x["predicted"], mine["predicted"])
             for tower, channels in verdict["levels"].items()
             for channel, entry in channels.items()
+            if ours in entry["cards"]
             for x, mine in zip(*(entry["cards"][key]["exceedance"] for key in (name, ours)), strict=True)
         ], look="tall",
     )  # fmt: skip
@@ -352,9 +353,6 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
         tables=[means, above, ranks],
         parts=[Card(title=f"{name}, channel by channel", tables=[channels], fold=True)],
     )
-
-
-_MEANS = ("model", "channels", "bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "crps_db", "coverage_90")
 
 
 def models_card(data: ReportData) -> Card:

@@ -47,7 +47,7 @@ from .mapfiles import (
     read_map_file,
 )
 from .site import Building, Forest, Geofence
-from .siteyaml import SiteModel, extent_m, site_model
+from .siteyaml import SiteModel, build_site, extent_m, site_model
 from .trees import TALLEST_TREE_M, WIDEST_CROWN_M
 
 # OpenStreetMap's own rule of thumb for a storey.
@@ -60,6 +60,9 @@ FAR_M = 20_000.0
 
 # The area of a site without a base: the map within this square around the first tower, and this far around each tower.
 _AROUND_M, _NEAR_TOWER_M = 2000.0, 500.0
+
+# Elevations of a map: fewer make no surface, more are thinned (its time grows with the cube), and their error [m].
+_FEWEST_ELEVATIONS, _MOST_ELEVATIONS, _ELEVATION_SD_M = 3, 300, 1.0
 
 # Coordinates are rounded to this.
 _GRID_M = 0.001
@@ -109,6 +112,8 @@ class Footprints:
     forests: list[Forest] = field(default_factory=list)
     geofences: list[Geofence] = field(default_factory=list)
     trees: list[SingleTree] = field(default_factory=list)
+    ground: list[tuple[float, float, float]] = field(default_factory=list)
+    """East, north and elevation above sea level of points of the maps [m]."""
     credits: list[str] = field(default_factory=list)
     assumed: str = ""
     actions: list[str] = field(default_factory=list)
@@ -175,6 +180,9 @@ def import_footprints(
         if content.credit and content.credit not in result.credits:
             result.credits.append(content.credit)
         _sort(content, Path(path), frame, untagged, shapes, result.actions)
+        for place, height_m in content.ground:
+            east, north = frame.to_local(*place)
+            result.ground.append((float(east), float(north), height_m))
         for tree in content.trees:
             result.trees += _single_trees(tree, frame, result.actions)
     # heights before duplicates go: a part may have its height from an outline that repeats another
@@ -652,6 +660,8 @@ def import_site(
     *,
     base: str | Path | None = None,
     towers: Sequence[str] = (),
+    dem: str | Path | None = None,
+    dem_crs: str | None = None,
     **options: Any,
 ) -> tuple[SiteModel, list[str]]:
     """Return a site whose buildings, woods and geofences come from map files.
@@ -665,7 +675,12 @@ def import_site(
         Wheeler, if the map is there.
     towers : sequence of str
         ``NAME=LATITUDE,LONGITUDE,HEIGHT``: antennas [deg, deg, m above the ground]. They replace those of ``base``.
-        Without a base the first one is the origin and the ground is flat.
+        Without a base the first one is the origin. The ground is then a smooth surface through the elevations in the
+        map (tag ``ele``) if there are three or more, else flat.
+    dem : str or path, optional
+        Elevation model of the ground, heights above sea level. It replaces that of ``base``.
+    dem_crs : str, optional
+        Coordinate system of ``dem``, for ASCII grids.
     **options
         For :func:`import_footprints`.
 
@@ -677,15 +692,16 @@ def import_site(
     Raises
     ------
     UsageError
-        If no file or no tower is known, or a tower is not ``NAME=LATITUDE,LONGITUDE,HEIGHT``.
+        If no file or no tower is known, a tower is not ``NAME=LATITUDE,LONGITUDE,HEIGHT``, or elevations contradict.
     InputError
-        If the map cannot be read, or does not lie at the site.
+        If the map or the elevation model cannot be read, or does not lie at the site.
     """
     if not files:
         raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files")
     named_towers = _named_towers(towers)
+    relief = {} if dem is None else {"dem": {"path": str(Path(dem).resolve()), "crs": dem_crs}}
     if towers and base is None:
-        return _site_around(files, named_towers, options)
+        return _site_around(files, named_towers, relief, options)
     base = base or "lake_wheeler"
     model = site_model(base)
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
@@ -694,15 +710,19 @@ def import_site(
         content["towers"] = named_towers
     if model.dem is not None:  # the new file may lie in another folder
         content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
+    if relief:
+        content |= {**relief, "tower_ground": None}
     actions = _from_maps(content, import_footprints(files, frame, area_m=extent_m(model, frame), **options))
     imported = SiteModel.model_validate(content)
+    if relief:
+        build_site(imported)  # reports an elevation model of another place now
     return imported, [_kept_of_base(imported, base), *actions]
 
 
 def _site_around(
-    files: Sequence[str | Path], towers: dict[str, dict[str, float]], options: dict[str, Any]
+    files: Sequence[str | Path], towers: dict[str, dict[str, float]], relief: dict[str, Any], options: dict[str, Any]
 ) -> tuple[SiteModel, list[str]]:
-    """Return a site with flat ground whose origin is the first tower, and whose area is that of the map around it."""
+    """Return a site whose origin is the first tower, and whose area is that of the map around it."""
     first = next(iter(towers.values()))
     origin = {key: first[key] for key in ("latitude_deg", "longitude_deg")}
     frame = SiteFrame(**origin)
@@ -719,15 +739,27 @@ def _site_around(
         "towers": towers,
         "area_m": [math.floor(west), math.ceil(east), math.floor(south), math.ceil(north)],
         "trees": {},
+        **relief,
     }
     actions = _from_maps(content, imports)
+    known = [[round(value, 2) for value in (*point, _ELEVATION_SD_M)] for point in imports.ground if
+             reach.contains(Point(point[:2]))]  # fmt: skip
+    ground = "flat (the map has fewer than three elevations; --dem FILE names an elevation model)"
+    if relief:
+        ground = f"the elevation model {relief['dem']['path']}, whose heights count from the sea (dem.reference)"
+    elif len(known) >= _FEWEST_ELEVATIONS:
+        content |= {"ground_points": known[:: 1 + len(known) // _MOST_ELEVATIONS], "tower_ground": "surface"}
+        ground = f"a smooth surface through {len(content['ground_points'])} elevations of the map (tag ele)"
     west, east, south, north = content["area_m"]
-    ground = SiteModel.model_fields["ground_material"].default
+    material = SiteModel.model_fields["ground_material"].default
     about = (
-        f"the origin is tower {next(iter(towers))}; the ground is flat ({ground}); the area is {east - west} m x "
-        f"{north - south} m: the map within {_AROUND_M / 1000:g} km of the origin. Change them in the file"
+        f"the origin is tower {next(iter(towers))}; the ground is {ground}, of {material}; the area is {east - west} m "
+        f"x {north - south} m: the map within {_AROUND_M / 1000:g} km of the origin. Change them in the file"
     )
-    return SiteModel.model_validate(content), [about, *actions]
+    model = SiteModel.model_validate(content)
+    if relief or model.ground_points:
+        build_site(model)  # reports elevations that contradict, or lie elsewhere, now
+    return model, [about, *actions]
 
 
 def _named_towers(towers: Sequence[str]) -> dict[str, dict[str, float]]:

@@ -88,12 +88,15 @@ class MapFile:
     credit: str = ""
     outlines: list[Outline] = field(default_factory=list)
     trees: list[TreeLine] = field(default_factory=list)
+    ground: list[tuple[Position, float]] = field(default_factory=list)
+    """Positions with an elevation above sea level [m] (tag ``ele``)."""
     notes: list[str] = field(default_factory=list)
 
     def take(self, other: MapFile) -> None:
-        """Everything of a part of the file."""
+        """Take over everything in a part of the file."""
         self.outlines += other.outlines
         self.trees += other.trees
+        self.ground += other.ground
         self.notes += other.notes
 
     def note_no_areas(self, name: str, lines: Counter[str]) -> None:
@@ -372,6 +375,7 @@ class _Data:
     path: Path
     nodes: dict[str, Position] = field(default_factory=dict)
     trees: dict[str, dict[str, str]] = field(default_factory=dict)
+    ground: dict[str, float] = field(default_factory=dict)
     ways: dict[str, Element] = field(default_factory=dict)
     relations: dict[str, Element] = field(default_factory=dict)
 
@@ -403,6 +407,7 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: L
             result.notes.append(left_out(path, line_of(index), f"element {index + 1}", error))
     for identity, tags in data.trees.items():
         result.trees.append(TreeLine(f"{path.name}: node {identity}", tags, (data.nodes[identity],)))
+    result.ground += [(data.nodes[identity], height_m) for identity, height_m in data.ground.items()]
     lines: Counter[str] = Counter()
     used_ways = _relations(data, result, lines, line_of)
     for identity, way in data.ways.items():
@@ -426,8 +431,11 @@ def _sort(element: Element, index: int, data: _Data) -> None:
             return  # out ids, out tags: no position was asked for
         # ids as text: OSM XML has them so, Overpass as numbers
         data.nodes[identity] = lonlat((element.get("lon"), element.get("lat")), f"node {identity}", data.path)
-        if (element.get("tags") or {}).get("natural") == "tree":
+        tags = element.get("tags") or {}
+        if tags.get("natural") == "tree":
             data.trees[identity] = _osm_words(element)
+        if (height_m := metres(str(tags.get("ele", "")))) is not None:
+            data.ground[identity] = height_m
     elif element["type"] in ("way", "relation"):
         store = data.ways if element["type"] == "way" else data.relations
         given = {key: value for key, value in {**element, "index": index}.items() if value is not None and value != {}}
@@ -795,6 +803,8 @@ def _geometry(geometry: dict[str, Any], outline: Outline, result: MapFile, lines
         rows = [[points] if single == "Point" else points for points in several]
         source = outline.source
         result.trees += [TreeLine(source, outline.tags, tuple(lonlat(p, source, path) for p in row)) for row in rows]
+    elif single == "Point" and (height_m := metres(outline.tags.get("ele", ""))) is not None:
+        result.ground += [(lonlat(point, outline.source, path), height_m) for point in several]
     else:
         lines[kind] += 1
 

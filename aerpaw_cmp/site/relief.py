@@ -293,7 +293,8 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> D
         if data[:2] in (b"II", b"MM"):
             return _read_geotiff(data, frame)
         if crs is None:
-            raise UsageError("an ASCII grid names no coordinate system", expected="crs, such as EPSG:4326")
+            where = "crs in site.yaml, or --dem-crs of 'site import', such as EPSG:4326"
+            raise UsageError("an ASCII grid names no coordinate system", expected=where)
         return _read_ascii(data, path, frame, crs)
 
 

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.referee import PredictedLevel, detection_floor_db, level_card, measured_thresholds
+from aerpaw_cmp.compare.referee import (
+    PredictedLevel,
+    detection_floor_db,
+    level_card,
+    measured_thresholds,
+    nearest_points,
+)
+from aerpaw_cmp.compare.statistics import paired_difference
 
 N = 4000
 
@@ -53,8 +60,7 @@ def test_relative_levels_have_no_bias_and_exceed_after_the_offset() -> None:
 def test_outages_on_either_side_are_counted_and_lie_below_any_threshold() -> None:
     time, measured, level = series()
     measured[:100], level[50:300] = np.nan, np.nan
-    asked = np.ones(N)
-    card = level_card(time, measured, PredictedLevel(level_db=level, asked=asked), (-200.0,))
+    card = level_card(time, measured, PredictedLevel(level_db=level), (-200.0,), np.ones(N, dtype=bool))
     assert (card.outages_missed, card.outages_invented, card.n) == (50, 200, N - 300)
     assert card.exceedance[0].measured == pytest.approx(1.0 - 100 / N)
     assert card.exceedance[0].predicted == pytest.approx(1.0 - 250 / N)
@@ -72,3 +78,44 @@ def test_thresholds_are_those_of_an_snr_or_measured_deciles() -> None:
     assert measured_thresholds(np.array([1.0]), ratio=True) == (0.0, 10.0, 20.0)
     assert measured_thresholds(np.linspace(-100.0, 0.0, 101), ratio=False) == (-90.0, -50.0, -10.0)
     assert measured_thresholds(np.array([np.nan]), ratio=False) == ()
+
+
+def test_nearest_points_by_trying_all() -> None:
+    rng = np.random.default_rng(11)
+    points, samples = rng.uniform(0.0, 60.0, (80, 3)), rng.uniform(0.0, 60.0, (50, 3))
+    samples[3, 1] = np.nan
+    apart_m = np.linalg.norm(samples[:, None] - points, axis=2)
+    index, near = nearest_points(samples, None, points, None, 8.0)
+    assert near.tolist() == [bool(np.nanmin(row, initial=np.inf) <= 8.0) for row in apart_m]
+    assert 5 < near.sum() < 45
+    assert index[near].tolist() == np.argmin(apart_m[near], axis=1).tolist()
+
+
+def test_a_point_of_another_heading_is_not_near() -> None:
+    """Four headings are predicted at one position; a sample takes the one within 45 degrees of its nose."""
+    points, yaw = np.zeros((4, 3)), np.array([0.0, 90.0, 180.0, 270.0])
+    samples, heading = np.full((4, 3), 1.0), np.array([100.0, 350.0, 44.0, np.nan])
+    index, near = nearest_points(samples, heading, points, yaw, (30.0, 30.0, 15.0))
+    assert index[:3].tolist() == [1, 0, 0]
+    assert near.tolist() == [True, True, True, False]
+    _, near = nearest_points(samples, heading, points[:1], yaw[:1], (30.0, 30.0, 15.0))
+    assert near.tolist() == [False, True, True, False]
+    _, near = nearest_points(np.array([[0.0, 0.0, 14.9], [0.0, 0.0, 15.1]]), None, points, yaw, (30.0, 30.0, 15.0))
+    assert near.tolist() == [True, False]
+
+
+def test_crps_of_single_samples_in_closed_form() -> None:
+    """CRPS of N(0, s) at its mean is s (sqrt 2 - 1) / sqrt pi; far away it is the distance minus s / sqrt pi."""
+    time, level = np.zeros(1), np.zeros(1)
+    for measured, crps in ((0.0, 3.0 * (np.sqrt(2.0) - 1.0) / np.sqrt(np.pi)), (90.0, 90.0 - 3.0 / np.sqrt(np.pi))):
+        card = level_card(time, np.array([measured]), PredictedLevel(level_db=level, sd_db=np.full(1, 3.0)), ())
+        assert card.crps_db == pytest.approx(crps, abs=1e-9)
+
+
+def test_a_paired_difference_in_closed_form() -> None:
+    error = np.random.default_rng(2).normal(0.0, 3.0, 2000)
+    error -= error.mean()
+    pair = paired_difference(2.0 * error, error)
+    assert pair.difference_db == pytest.approx(np.sqrt(np.mean(error**2)), abs=1e-9)
+    assert pair.verdict == "worse"
+    assert paired_difference(error, error + 4.0).difference_db == pytest.approx(0.0, abs=1e-9)  # offsets are free

@@ -13,6 +13,7 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.jobs import referee
 
+PREDICTIONS = Path(__file__).parents[1] / "predictions"
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 
@@ -115,14 +116,29 @@ def test_half_a_route_is_counted_as_unmatched(flight: Path) -> None:
     assert any("are not scored" in remark for remark in card["remarks"])
 
 
-def test_a_radio_map_of_sionna_is_matched_by_position(flight: Path) -> None:
-    east, north = np.meshgrid(np.arange(-300.0, 301.0, 5.0), np.arange(-300.0, 301.0, 5.0))
-    centre = np.stack([east, north, np.full_like(east, 30.0)], axis=-1)
-    gain = 1e-4 / (1.0 + east**2 + north**2)
-    np.savez(flight / "map.npz", path_gain=gain[None], cell_centers=centre, tx_names=np.array(["LW1"]))
-    (card,) = scored(flight, flight / "map.npz", near="12")
-    assert card["levels"]["LW1"]["USRP1"]["cards"]["map.npz"]["bias_db"] is None
-    assert card["levels"]["LW1"]["USRP1"]["matched"] >= 20
+def test_files_in_the_manner_of_three_programs_are_scored(flight: Path) -> None:
+    """A table of MATLAB, a radio map of Sionna RT and the logs of an emulator, with invented numbers."""
+    names = "matlab_sigstrength.csv", "sionna_radio_map.npz", "emulator"
+    matlab, sionna, emulator = scored(flight, *(PREDICTIONS / name for name in names), near="12")
+    assert [card["prediction"] for card in (matlab, sionna, emulator)] == list(names)
+    for card in (matlab, sionna):
+        assert set(card["levels"]) == {"LW1", "LW3"}
+        entry = card["levels"]["LW1"]["USRP1"]
+        assert entry["matched"] >= 100
+        assert entry["unmatched"] > 0
+        # free space and 2 dB of noise: a little worse than free space itself
+        free_space = entry["cards"]["free space"]["rmse_offset_db"]
+        assert free_space < entry["cards"][card["prediction"]]["rmse_offset_db"] < free_space + 2.0
+        assert entry["cards"][card["prediction"]]["bias_db"] is None
+    assert (matlab["program"], sionna["program"]) == ("CSV", "radio map (.npz)")
+    assert emulator["program"] == "emulated flight"
+    assert set(emulator["levels"]) == {"LW1"}
+    assert any("Its levels are in dB, those of the flight in dB re full scale" in text for text in emulator["remarks"])
+    node = emulator["levels"]["LW1"]["USRP1"]["cards"]["emulator"]
+    assert node["bias_db"] is None
+    assert 0.3 < node["slope"] < 1.3  # 24 dB per decade were written, the sample falls by about 20
+    page = (flight / "out" / "report.html").read_text()
+    assert "Share of samples at or above a threshold" in page
 
 
 def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
@@ -157,15 +173,23 @@ def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
             "map coordinates (UTM)",
         ),
         (lambda f: f.rename(columns={"level_dbm": "path_loss_db"}), "a path gain; its negative is the loss"),
+        (lambda f: f.assign(level_db=10 ** (f.pop("level_dbm") / 10)), "a linear gain or power"),
+        (
+            lambda f, place: f.join(place.add([0.0, 0.0, 95.0])).drop(columns="time_utc").drop_duplicates(place.columns),
+            "another height datum: the predicted positions are 95 m above the flight",
+        ),
     ],
 )  # fmt: skip
 def test_a_prediction_that_cannot_be_scored_is_one_message(
     change, words: str, flight: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    table = ours(flight).query("channel == 'USRP1' and tower == 'LW1'")
+    table = ours(flight).query("channel == 'USRP1' and tower == 'LW1'").dropna(subset=["east_m", "simulated_dbm"])
+    place = table[["east_m", "north_m"]].assign(height_m=table["up_m"])
     frame = table[["time_utc", "tower"]].assign(level_dbm=table["simulated_dbm"])
-    change(frame).to_csv(flight / "bad.csv", index=False)
-    assert words in refused(flight, flight / "bad.csv", capsys)
+    change(frame, *([place] if change.__code__.co_argcount > 1 else [])).to_csv(flight / "bad.csv", index=False)
+    said = refused(flight, flight / "bad.csv", capsys)
+    assert words in said
+    assert "Next: correct bad.csv (docs/referee.md lists the columns) and run the same command" in said
 
 
 def test_damaged_files_are_one_message(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:

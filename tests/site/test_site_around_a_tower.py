@@ -73,3 +73,73 @@ def test_two_towers_of_one_name_are_refused(tmp_path: Path) -> None:
     twice = [f"roof={LATITUDE},{LONGITUDE},25"] * 2
     with pytest.raises(UsageError, match="two towers named 'roof'"):
         import_site([campus(tmp_path / "campus.geojson")], towers=twice)
+
+
+TOWERS = (f"roof={LATITUDE},{LONGITUDE},25", f"mast={LATITUDE},{LONGITUDE + 4e-3},12")
+M_PER_DEG = 111_320 * 0.8304  # of longitude at 33.86 degrees south
+
+
+def with_elevations(path: Path, elevations: dict[tuple[float, float], str]) -> Path:
+    content = json.loads(campus(path).read_text())
+    for (latitude, longitude), text in elevations.items():
+        point = {"type": "Point", "coordinates": [longitude, latitude]}
+        content["features"].append({"type": "Feature", "properties": {"ele": text}, "geometry": point})
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_elevations_of_the_map_shape_the_ground(tmp_path: Path) -> None:
+    """A slope of 50 m per 0.01 degrees to the east; one point lies 50 km away and does not count."""
+    grid = [(LATITUDE + a, LONGITUDE + b) for a in (-5e-3, 0.0, 5e-3) for b in (-6e-3, -2e-3, 2e-3, 6e-3)]
+    elevations = {place: f"{80 + 5000 * (place[1] - LONGITUDE):.1f} m" for place in grid} | {(-34.3, 151.2): "900"}
+    model, actions = import_site([with_elevations(tmp_path / "c.geojson", elevations)], towers=TOWERS)
+    (tmp_path / "site.yaml").write_text(site_yaml(model, header=actions))
+    roof, mast = load_site(tmp_path / "site.yaml").towers.values()
+    assert roof.position_m[2] == pytest.approx(25.0, abs=0.3)
+    assert mast.position_m[2] == pytest.approx(20.0 + 12.0, abs=0.7)
+    assert "a smooth surface through 12 elevations of the map" in actions[0]
+
+
+def test_elevations_of_an_osm_file_are_read(tmp_path: Path) -> None:
+    corners = [(LATITUDE, LONGITUDE), (LATITUDE, LONGITUDE + 4e-4), (LATITUDE + 4e-4, LONGITUDE + 4e-4)]
+    nodes = "".join(f'<node id="{i}" lat="{a}" lon="{b}"/>' for i, (a, b) in enumerate(corners))
+    tops = "".join(
+        f'<node id="{9 + i}" lat="{LATITUDE + d}" lon="{LONGITUDE - d}"><tag k="natural" v="peak"/><tag k="ele" v="{h}"/></node>'
+        for i, (d, h) in enumerate(((1e-3, "100"), (-1e-3, "110"), (3e-3, "high"), (5e-3, "120")))
+    )
+    way = "".join(f'<nd ref="{i}"/>' for i in (0, 1, 2, 0))
+    text = f'<osm version="0.6">{nodes}{tops}<way id="1">{way}<tag k="building" v="yes"/></way></osm>'
+    (tmp_path / "a.osm").write_text(text)
+    model, _ = import_site([tmp_path / "a.osm"], towers=TOWERS)
+    assert sorted(point[2] for point in model.ground_points) == [100.0, 110.0, 120.0]
+
+
+def test_two_elevations_are_too_few_and_that_is_reported(tmp_path: Path) -> None:
+    few = {(LATITUDE, LONGITUDE): "80", (LATITUDE, LONGITUDE + 1e-3): "90"}
+    model, actions = import_site([with_elevations(tmp_path / "c.geojson", few)], towers=TOWERS)
+    assert not model.ground_points
+    assert "the ground is flat (the map has fewer than three elevations; --dem FILE" in actions[0]
+
+
+def test_elevations_that_contradict_are_one_message(tmp_path: Path) -> None:
+    heights = {(LATITUDE, LONGITUDE + 1e-8 * i): h for i, h in enumerate(("80", "240", "80"))}
+    with pytest.raises(UsageError, match="contradict: 80 and 240 m"):
+        import_site([with_elevations(tmp_path / "c.geojson", heights)], towers=TOWERS)
+
+
+def test_an_elevation_file_is_the_ground(tmp_path: Path) -> None:
+    """Cells of 0.001 degrees; the ground rises by 1 m per column to the east."""
+    rows = "\n".join(" ".join(str(100 + column) for column in range(60)) for _ in range(60))
+    head = f"ncols 60\nnrows 60\nxllcorner {LONGITUDE - 0.03}\nyllcorner {LATITUDE - 0.03}\ncellsize 0.001\n"
+    (tmp_path / "ground.asc").write_text(head + rows)
+    chosen = {"towers": TOWERS, "dem": tmp_path / "ground.asc"}
+    model, actions = import_site([campus(tmp_path / "c.geojson")], dem_crs="EPSG:4326", **chosen)
+    (tmp_path / "site.yaml").write_text(site_yaml(model, header=actions))
+    roof, mast = load_site(tmp_path / "site.yaml").towers.values()
+    assert mast.position_m[2] - roof.position_m[2] == pytest.approx(4.0 + 12.0 - 25.0, abs=0.1)
+    assert "heights count from the sea" in actions[0]
+    with pytest.raises(UsageError, match="names no coordinate system"):
+        import_site([campus(tmp_path / "c.geojson")], **chosen)
+    (tmp_path / "ground.asc").write_text(head.replace("151.17", "12.17") + rows)
+    with pytest.raises(InputError, match=r"ground\.asc"):
+        import_site([campus(tmp_path / "c.geojson")], dem_crs="EPSG:4326", **chosen)

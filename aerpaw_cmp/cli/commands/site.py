@@ -47,6 +47,10 @@ def site_import(
         list[str] | None, Option(help="Scene: id=concrete, for a material without radio properties; repeatable.")
     ] = None,
     turn: Annotated[float, Option(help="Scene: angle of the x axis, counter-clockwise from east [deg].")] = 0.0,
+    dem: Annotated[
+        Path | None, Option(help="Map: elevation model of the ground (.asc, GeoTIFF), heights above the sea.")
+    ] = None,
+    dem_crs: Annotated[str | None, Option(help="Map: coordinate system of an .asc, such as EPSG:4326.")] = None,
     untagged: Annotated[
         Literal["building", "forest", "geofence"] | None, Option(help="Kind of the areas without a tag.")
     ] = None,
@@ -58,7 +62,7 @@ def site_import(
 
     scene = len(files) == 1 and site_scene.is_scene(files[0])
     of_scenes = {"--origin": origin, "--material": material, "--turn": turn}
-    of_maps = {"--untagged": untagged, "--trees": trees}
+    of_maps = {"--untagged": untagged, "--trees": trees, "--dem": dem, "--dem-crs": dem_crs}
     for option in (name for name, value in (of_maps if scene else of_scenes).items() if value):
         kinds = ("a Mitsuba scene", "map files") if scene else ("map files", "one Mitsuba XML")
         raise UsageError(f"{option} with {kinds[0]}", expected=f"{kinds[1]}, or no {option}")
@@ -69,8 +73,9 @@ def site_import(
         actions = site_scene.run_scene_import(files[0], out, facts, force=force)
     else:
         actions = run.run_site_import(
-            files, out, base=base, towers=tower or (), untagged=untagged, trees=trees, force=force
-        )
+            files, out, base=base, towers=tower or (), force=force, dem=dem, dem_crs=dem_crs, untagged=untagged,
+            trees=trees,
+        )  # fmt: skip
     if answered({"file": str(out), "base": base, "actions": actions}):
         return
     for line in actions:

@@ -166,7 +166,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^((is|data) )?valid$",
         r"^((has|is) )?(gps |gnss |pos(ition)? |loc(ation)? )?fix ?(type|ok|status|state|mode|quality|qual|valid)?$",
         r"^((has|is) )?(gps|gnss|pos(ition)?|loc(ation)?) ?(fix ?type|status|state|mode|lock|valid|ok)$",
-        r"^(gps |gnss )?(pos(ition)? )?qual(ity)?( ind(icator)?)?$",
+        r"^(gps|gnss|pos(ition)?) ?qual(ity)?( ind(icator)?)?$",
     )),
     Quantity("satellites", "count", (
         r"^(number of satellites?|satellites( used)?|num ?sats?|osd gpsnum|nsats?|numberofsatellites|gps count)$",

@@ -22,17 +22,7 @@ from . import files as archives
 from . import files as chunks
 from . import files as packed
 from .flight_file import IngestedFile, read_flight
-from .readers import (
-    DEEP_BYTES,
-    HEAD_BYTES,
-    Reader,
-    ReadOptions,
-    blaming,
-    by_name,
-    catalogue,
-    claims,
-    identify,
-)
+from .readers import DEEP_BYTES, HEAD_BYTES, Reader, ReadOptions, blaming, by_name, catalogue, claims, identify
 from .records import ReadResult, RejectedLine, RejectedReason, Stream, by_reason, has_wall_clock
 
 if TYPE_CHECKING:

@@ -240,6 +240,26 @@ def test_the_ten_lines_of_the_page_make_an_entry_that_is_scored(
     assert json.loads(capsys.readouterr().out)["unseen"]["missing"] == ["absent: absent.csv of nobody/absent"]
 
 
+def test_a_csv_of_the_referee_is_an_entry(place: Path, bench: tasks.Bench) -> None:
+    """The same numbers as level at a time, as level in dBm at a position and as path loss, without task and flight."""
+    table, frame = bench.rows("unseen"), guess(bench)
+    expected = published.score(bench, entry(place, frame.drop(columns="sd_db")), ["unseen"])["unseen"]
+    by_time = pd.DataFrame({"time_utc": table["time"], "tower": "T1", "level_dbm": frame["level_db"]})
+    by_place = table[["east_m", "north_m", "tower"]].assign(height_m=table["up_m"], path_loss_db=-frame["level_db"])
+    for name, given in (("time", by_time), ("place", by_place)):
+        scores = published.score(bench, entry(place, given, name), [])
+        assert scores["unseen"]["rmse_db"] == pytest.approx(expected["rmse_db"], abs=1e-9)
+        # a loss has no common reference with the tasks that count levels as they are
+        assert sorted(scores) == (["halves", "map", "sectors", "unseen"] if name == "time" else ["sectors", "unseen"])
+    with pytest.raises(UsageError, match="200 of 400 rows have no prediction"):
+        published.score(bench, entry(place, by_time.iloc[:200]), [])
+    with pytest.raises(InputError, match="expected towers of the flight: T1"):
+        published.score(bench, entry(place, by_time.assign(tower="LW9")), [])
+    learned = f"# trained_on: {bench.manifest.files['asked'].sha256}\n"
+    with pytest.raises(UsageError, match="a test flight"):
+        published.score(bench, entry(place, by_time, "learned", learned), [])
+
+
 def test_refusals_name_the_cause(place: Path, bench: tasks.Bench) -> None:
     good = guess(bench)
     asked = bench.manifest.files["asked"].sha256

@@ -640,7 +640,7 @@ def _verdict(given: ForeignPrediction, data: FlightData, result: FlightResult, n
 def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m: float) -> SeriesVerdict | None:
     part = split_by_series(given.table, item.tower, item.channel)
     heading_deg = item.geometry.get("heading_deg")
-    predicted, near = _predicted(given, part, item.time, item.position_m, heading_deg, near_m)
+    predicted, near = predicted_at(given, part, item.time, item.position_m, heading_deg, near_m)
     near &= item.posed
     name, absolute = given.path.name, given.absolute(item.unit)
     level = predicted["level"]
@@ -681,7 +681,7 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
     )  # fmt: skip
 
 
-def _predicted(
+def predicted_at(
     given: ForeignPrediction, part: pd.DataFrame, time: Any, position_m: FloatArray, heading_deg: Any, near_m: float
 ) -> tuple[dict[str, FloatArray], BoolArray]:
     """Return the numbers (n,) predicted for each sample, NaN if none is near, and whether one is near (n,)."""
@@ -713,7 +713,7 @@ def _nearest_times(time: Any, known: Any) -> tuple[IntArray, BoolArray]:
 
 def _ranks(given: ForeignPrediction, item: RankResult, near_m: float) -> RankVerdict | None:
     part = given.table[given.table["tower"] == item.tower]
-    predicted, near = _predicted(given, part, item.time, item.position_m, None, near_m)
+    predicted, near = predicted_at(given, part, item.time, item.position_m, None, near_m)
     p = np.column_stack([predicted[name] for name in RANKS]) if set(RANKS) <= set(predicted) else None
     if "rank" in predicted:
         rank = predicted["rank"]

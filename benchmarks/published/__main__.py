@@ -49,16 +49,16 @@ def entry_of(bench: Bench, name: str, tasks: list[str]) -> Entry | None:
 
 
 def score(bench: Bench, path: Path, tasks: list[str], *, accept_levels: bool = False) -> dict[str, Any]:
-    """Scores of a stranger's predictions.csv on every task it answers.
+    """Return the scores of a third-party CSV on every task that it answers.
 
     Raises
     ------
     UsageError, InputError
         What :func:`~.score.read_entry` and :func:`~.score.score_task` refuse; nothing that can be scored.
     """
-    entry = read_entry(path)
-    bench.chosen(list(dict.fromkeys(entry.frame["task"])))
     chosen = bench.chosen(tasks)
+    entry = read_entry(path, bench, chosen)
+    bench.chosen(list(dict.fromkeys(entry.frame["task"])))
     check_training(bench, entry, chosen)
     answered = [task for task in chosen if (entry.frame["task"] == task).any() and bench.tests(task)]
     peers = {name: peer for name in BASELINES if (peer := entry_of(bench, name, answered))}

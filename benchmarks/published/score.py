@@ -18,6 +18,8 @@ from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.compare.level import LevelSeries, level_scores
 from aerpaw_cmp.compare.receiver import constant_forecast, score_forecast
 from aerpaw_cmp.compare.statistics import bootstrap_means
+from aerpaw_cmp.jobs.options import AGAINST_DISTANCE_M
+from aerpaw_cmp.jobs.referee import predicted_at, read_foreign, split_by_series
 
 from .tasks import KEY, RANKS, SERIES, Bench
 
@@ -36,8 +38,8 @@ class Entry:
     head: Mapping[str, str]
 
 
-def read_entry(path: Path) -> Entry:
-    """A predictions.csv, with lines ``# key: value`` before its header.
+def read_entry(path: Path, bench: Bench, tasks: Sequence[str]) -> Entry:
+    """Read predictions.csv, or the CSV of ``report --against``; both may have lines ``# key: value`` above the header.
 
     Raises
     ------
@@ -51,6 +53,9 @@ def read_entry(path: Path) -> Entry:
     lines = text.splitlines()
     count = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
     head = {k.strip(): v.strip() for k, _, v in (line[1:].partition(":") for line in lines[:count])}
+    names = {name.strip().lower() for name in "".join(lines[count : count + 1]).split(",")}
+    if "tower" in names and not {"task", "flight"} & names:
+        return read_foreign_entry(path, bench, tasks, head)
     try:
         table = StringIO("\n".join(lines[count:]))
         frame = pd.read_csv(table, dtype=dict.fromkeys(KEY, str), keep_default_na=False, low_memory=False)
@@ -79,6 +84,40 @@ def read_entry(path: Path) -> Entry:
             line=count + row + 2,
         )
     return Entry(frame, head)
+
+
+def read_foreign_entry(path: Path, bench: Bench, tasks: Sequence[str], head: Mapping[str, str]) -> Entry:
+    """Match a CSV of ``report --against`` with the rows of the tasks, by time or else by position.
+
+    A task that the file does not predict completely is left out, unless no task is complete.
+
+    Raises
+    ------
+    InputError
+        What :func:`~aerpaw_cmp.jobs.referee.read_foreign` refuses.
+    """
+    parts: list[pd.DataFrame] = []
+    for task in tasks:
+        spec = bench.manifest.tasks[task]
+        wanted = RANKS if spec.kind == "rank" else ["level_db", "sd_db"]
+        for flight in bench.tests(task):
+            given = read_foreign(path, bench.flight(flight).data)
+            for (tower, channel), rows in bench.table(task, flight).groupby(["tower", "channel"], sort=False):
+                part = split_by_series(given.table, str(tower), "" if spec.kind == "rank" else str(channel))
+                found, _ = predicted_at(
+                    given, part, pd.to_datetime(rows["time"]).dt.tz_localize(None).to_numpy("datetime64[ns]"),
+                    rows[["east_m", "north_m", "up_m"]].to_numpy(np.float64), rows["heading_deg"].to_numpy(np.float64),
+                    AGAINST_DISTANCE_M,
+                )  # fmt: skip
+                # a loss has the reference of a level only where levels count about their mean error
+                loss = given.quantity == "path_loss_db"
+                level = np.full(len(rows), np.nan) if loss and not spec.own_offset else found["level"]
+                values = found | {"level_db": -level if loss else level}
+                parts.append(rows[KEY].assign(**{name: values[name] for name in wanted if name in values}))
+                parts[-1]["known"] = np.isfinite(values.get(wanted[0], np.full(len(rows), np.nan)))
+    frame = pd.concat(parts, ignore_index=True)
+    complete = frame.groupby("task")["known"].transform("all")
+    return Entry(frame[complete] if complete.any() else frame, head)
 
 
 def check_training(bench: Bench, entry: Entry, tasks: Sequence[str]) -> None:

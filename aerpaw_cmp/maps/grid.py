@@ -633,7 +633,7 @@ class LinkBudget:
                 )
         if self.threshold_dbm is not None:
             self._check_range("threshold", self.threshold_dbm, -200.0, 60.0, "dBm", "another unit than dBm")
-            if self.noise_dbm is not None and self.threshold_dbm < self.noise_dbm:
+            if self.noise_dbm is not None and self.threshold_dbm < round(self.noise_dbm, 1):
                 raise UsageError(
                     f"a threshold of {self.threshold_dbm:g} dBm below the noise floor of {self.noise_dbm:.1f} dBm",
                     expected="a level above the noise, or threshold_snr_db (--threshold-snr-db) with a negative SNR",

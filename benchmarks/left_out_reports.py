@@ -47,6 +47,7 @@ from aerpaw_cmp.jobs.calibrate import (
     Calibration,
     GroundFit,
     in_campaigns,
+    learned_healths,
     learned_locks,
     load_calibration,
     observe,
@@ -107,7 +108,8 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
     calibration = Calibration(
         settings=settings, flights=tuple(flights), campaigns=campaigns, observed=tuple(observed), scores=scores,
         controls={}, learned=learn([o.samples for o in observed], chosen), curve=(), ground=_NO_RAY, warnings=(),
-        words=(), locks=learned_locks(observed, chosen, learned), teaching=teaching(observed, campaigns, learned),
+        words=(), locks=learned_locks(observed, chosen, learned), health=learned_healths(observed, learned),
+        teaching=teaching(observed, campaigns, learned),
     )  # fmt: skip
     calibrated = Calibrated(settings, tuple(flights), (), calibration, ranked, "left out", campaigns)
     for name, made in site_entries(calibrated).items():

@@ -358,12 +358,18 @@ def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
     near = sea_m is not None and low_m > _GROUND_M and abs(low_m - sea_m) < _NEAR_GROUND_M
     if low_m > _FLOWN_M or (near and _takes_off(telemetry)):
         ground = "the ground of the take-off above the sea [m]" if sea_m is None else f"the ground is {sea_m:g} m up"
+        line = f"'takeoff_ground_m: {-(low_m if sea_m is None else sea_m):.0f}' under 'origin:' of the site file"
+        too_high = low_m > _FLOWN_M
+        expected, otherwise = (
+            (f"samples below {_FLOWN_M:.0f} m, or a log that begins on the ground", "add the rows of the take-off")
+            if too_high
+            else ("a UAV at rest before its climb is on the ground, at 0 m", "remove its rows before the climb")
+        )
         raise InputError(
-            f"the lowest height above take-off is {low_m:.0f} m",
-            expected=f"samples below {_FLOWN_M:.0f} m, or a log that begins on the ground",
-            cause="heights above sea level that are read as above take-off: "
-            f"write 'takeoff_ground_m: {-(low_m if sea_m is None else sea_m):.0f}' under 'origin:' of the site "
-            f"file (minus {ground}), or add the rows of the take-off to the log",
+            f"the lowest height above take-off is {low_m:.0f} m" + ("" if too_high else ", at rest before a climb"),
+            expected=expected,
+            cause=f"heights above sea level that are read as above take-off: write {line} (minus {ground}); "
+            f"if the log begins in the air, {otherwise}",
             path=path,
         )
     if near:

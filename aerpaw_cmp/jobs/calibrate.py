@@ -37,6 +37,7 @@ from ..compare.calibration import (
     learning_curve,
 )
 from ..compare.gains import FlightEvidence, GainOf, KnownProcess
+from ..compare.health import HeldOut, learned_health
 from ..compare.level import DetectionScore, learn_detection, score_detection
 from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ..flight.gains import flight_of, load_with_learned, mean_gain_db, sphere_angles
@@ -46,7 +47,7 @@ from ..flight.settings import AntennaSettings, load_pattern
 from ..flight.training import counted_once, flight_logs, marks_of
 from ..propagation.field.baselines import two_ray_dbm
 from ..report.calibration import sentences
-from ..site.learned import AIRFRAME_BAND, KnownDirections, LearnedLock, Source
+from ..site.learned import AIRFRAME_BAND, KnownDirections, LearnedHealth, LearnedLock, Source
 
 
 def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[str, Learned]) -> dict[str, LearnedLock]:
@@ -74,6 +75,42 @@ def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[st
         lock = _learned([o for o in able if o.samples.antenna == antenna], fits, pairs)
         if lock is not None:
             out[antenna] = lock
+    return out
+
+
+def learned_healths(observed: Sequence[Observed], fits: Mapping[str, Learned]) -> dict[str, LearnedHealth]:
+    """Return the health of each antenna (``tower.channel``) that held-out flights have.
+
+    Parameters
+    ----------
+    observed : sequence of Observed
+        Series of all flights.
+    fits : mapping of str to Learned
+        What was learned without each flight.
+    """
+    held: dict[tuple[str, str], HeldOut] = {}
+    for o in observed:
+        s, learned = o.samples, fits.get(o.samples.flight)
+        if learned is not None and s.antenna in learned.fit.antennas and np.isfinite(s.residual_db).any():
+            held[s.antenna, s.flight] = HeldOut(
+                time_s=s.time_s,
+                place_m=s.position_m,
+                measured_db=s.residual_db + o.free_space_db,
+                predicted_db=o.free_space_db + learned.mean(s),
+                floor_db=-math.inf if o.locked is None else LOCK_FLOOR_DB,
+                locked=o.locked,
+            )
+    offsets = {key: float(np.nanmean(h.measured_db - h.predicted_db)) for key, h in held.items()}
+    out = {}
+    for antenna in dict.fromkeys(antenna for antenna, _ in held):
+        tower = antenna.partition(".")[0]
+        flights = [flight for of, flight in held if of == antenna]
+        others = {of.partition(".")[2]: of for of, _ in held if of != antenna and of.partition(".")[0] == tower}
+        differences = {
+            name: [offsets[antenna, f] - offsets[other, f] for f in flights if (other, f) in offsets]
+            for name, other in others.items()
+        }
+        out[antenna] = learned_health([held[antenna, flight] for flight in flights], differences)
     return out
 
 
@@ -256,6 +293,8 @@ class Calibration:
     curve: tuple[CurvePoint, ...]
     locks: Mapping[str, LearnedLock]
     """By antenna, of receivers that lose their lock."""
+    health: Mapping[str, LearnedHealth]
+    """Errors of held-out flights by antenna."""
     teaching: frozenset[str]
     """Campaigns whose gain of the UAV predicts most of their own held-out flights: it may be used elsewhere."""
     warnings: tuple[str, ...]
@@ -363,7 +402,7 @@ def calibrate(
         scores = _score_all(observed, recipe, stages, fits)
         stages.progress("scores: controls")
         controls = _controls_of(observed, recipe, scores["flight_left_out"])
-        locks = learned_locks(observed, recipe, fits)
+        locks, health = learned_locks(observed, recipe, fits), learned_healths(observed, fits)
         taught = teaching(observed, campaigns, fits)
     with stages("curve"):
         curve = learning_curve(observed, recipe)
@@ -383,6 +422,7 @@ def calibrate(
         ground=ground,
         curve=curve,
         locks=locks,
+        health=health,
         teaching=taught,
         warnings=tuple(warnings),
         words=(

@@ -398,6 +398,7 @@ def _learned_series(
                 shares_airframe=name in calibration.teaching,
                 lock=_at_unit_gain(calibration.locks.get(antenna), *ends),
                 level=_level(calibration, first, *ends),
+                health=calibration.health.get(antenna),
             )
         )
     return series, tables

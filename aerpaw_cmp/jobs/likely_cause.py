@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from ..common.errors import InputError, UsageError
 from ..common.units import FloatArray
 from ..compare import level as rss
 from ..compare.causes import (
@@ -23,9 +24,8 @@ from ..compare.causes import (
 )
 from ..compare.gains import turned
 from ..compare.result import RssResult
-from ..compare.verdict import lock_lost, without_copies
+from ..compare.verdict import lock_lost, pooled_db, without_copies
 from ..flight.data import FlightData, RssSeries, Times
-from ..flight.drafting.proposals import errors_elsewhere
 from ..flight.gains import mean_gain_db
 from ..flight.replay import FlightReplay, Replayed, attitude_rotation, telemetry_time
 from ..flight.track import MISREAD
@@ -33,7 +33,7 @@ from ..logs.limits import path_of
 from ..logs.records import Stream
 from ..propagation.field.baselines import free_space_dbm
 from ..site.antennas import Isotropic
-from ..site.learned import SpherePattern
+from ..site.learned import LearnedSeries, SpherePattern, find_named
 from ..site.site import Site
 
 _Key = TypeVar("_Key")
@@ -71,6 +71,9 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
         for series, replayed, result in zip(data.rss, replays.rss, results, strict=True)
         if replayed.tower_m is None and not result.training and result.name in names
     ]
+    scores = [result.score for _, _, result in compared if result.score.n]
+    if scores and pooled_db([score.rmse_db for score in scores], [score.n for score in scores]) < _GOOD_DB:
+        return None, None
     evidence = [_evidence(data, *each, scaled=not meant) for each in compared]
     evidence = [_with_other(e, each, compared, evidence) for e, each in zip(evidence, compared, strict=True)]
     cause = flight_cause(evidence)
@@ -100,7 +103,12 @@ def _late_clock(evidence: Sequence[LevelEvidence], towers: Sequence[str]) -> Cau
         return None
     others = sorted(set(towers) - set(late))
     only = f"; those at {', '.join(others)} are not" if others else ""
-    return Cause(name="clock", sentence=f"{'. '.join(late.values())}{only}.", next_step="`rss: {lag: apply}`")
+    return Cause(
+        name="clock",
+        sentence=f"{'. '.join(late.values())}{only}.",
+        next_step="`rss: {lag: apply}`",
+        channels=tuple(e.name for e, at in zip(evidence, towers, strict=True) if at in late),
+    )
 
 
 _CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT` with two flights of this site"
@@ -165,6 +173,8 @@ _AS_TOLD, _ALIKE, _LONG_STEP_S, _LEAST_PATH_M = 0.2, 0.5, 3.0, 10.0
 _SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")
 
 
+# No cause is looked for below this RMSE: receivers and positions are not more exact.
+_GOOD_DB = 1.0
 _Compared = tuple[RssSeries, Replayed, RssResult]
 
 
@@ -181,14 +191,17 @@ def _with_other(
     return dataclasses.replace(e, swapped_db=other_db - e.predicted_db)
 
 
-def _usual_db(data: FlightData, series: RssSeries) -> tuple[float, float]:
-    """Return the RMSE of held-out flights of the learned antennas: mean, and mean + 2 SD [dB]; NaN without such."""
-    errors = errors_elsewhere(data.settings.antennas, series, data.folder)
-    # six held-out series of one campaign: 3.2 to 3.9 dB
-    return (math.nan, math.nan) if errors is None else (errors.rmse_db, errors.rmse_db * (1.0 + 2.0 * _USUAL_SD))
-
-
-_USUAL_SD = 0.08
+def _learned_series(data: FlightData, series: RssSeries) -> LearnedSeries | None:
+    """Return the learned antenna of a series that has a health; None for other antennas."""
+    antennas = data.settings.antennas
+    name = antennas.get(f"{series.tower}.{series.channel}")
+    if name is None or "uav" not in antennas:
+        return None
+    try:
+        found = find_named(name, data.folder).antenna("tower", series.link.carrier_hz)
+    except (InputError, UsageError):
+        return None
+    return found if found is not None and found.health is not None else None
 
 
 def _evidence(
@@ -241,7 +254,8 @@ def _evidence(
         serving=None if series.serving is None else series.serving[order],
         clock=None if replayed.clock is None else replayed.clock.result,
         limits_known=lock is not None,
-        usual_db=_usual_db(data, series),
+        learned=_learned_series(data, series),
+        transmit_power_dbm=series.link.transmit_power_dbm,
         distance_db=at_samples(link.distance_db),
         displaced_db=changed(link.displaced_db(known_db)),
         floored=any("floor_db" in data.settings.logs[log].model_fields_set for log in np.unique(series.log)),
@@ -324,7 +338,8 @@ class _Direct:
             return {}
         ground_m, levels = data.track.ground_m, {}
         mirrored_m = poses.position_m.copy()
-        mirrored_m[:, :2] = mirrored_m[0, :2] + (mirrored_m[:, :2] - mirrored_m[0, :2])[:, ::-1]
+        begin_m = data.track.pose_at(np.array([data.track.start_ns], dtype="datetime64[ns]")).position_m[0, :2]
+        mirrored_m[:, :2] = begin_m + (mirrored_m[:, :2] - begin_m)[:, ::-1]
         levels[_MIRRORED] = self._level(self.place_m, mirrored_m, poses.rotation)
         for meaning, scale in _HEIGHTS.items() if scaled else ():
             place = np.column_stack([poses.position_m[:, :2], ground_m + scale * (poses.position_m[:, 2] - ground_m)])

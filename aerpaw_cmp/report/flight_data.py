@@ -17,6 +17,7 @@ import numpy as np
 from ..common.text import counted
 from ..common.units import AnyArray, FloatArray, IntArray
 from ..common.versions import utc_now, versions
+from ..compare.causes import Cause
 from ..compare.result import APPLIED, NOT_APPLIED, ClockResult, FlightResult, RankResult, RssResult
 from ..flight.gains import antennas_used
 from ..logs.records import RejectedLine
@@ -235,7 +236,7 @@ def report_data(
     """
     settings = data.settings
     warnings = [
-        *clock_warnings(result.clocks),
+        *clock_warnings(result.clocks, result.likely_cause),
         *data.warnings,
         *(text for item in result.rss for text in rss_warnings(item)),
         *(text for item in result.rank for text in rank_warnings(item)),
@@ -270,11 +271,15 @@ def report_data(
 # --- what must be known before a number is believed ------------------------------------------------------------------
 
 
-def clock_warnings(clocks: Mapping[str, ClockResult]) -> tuple[str, ...]:
-    """Clocks that were corrected, should be, or cannot be judged; a correction that was not made comes first.
+def clock_warnings(clocks: Mapping[str, ClockResult], cause: Cause | None = None) -> tuple[str, ...]:
+    """Return sentences on clocks that were corrected, should be, or cannot be judged; refused corrections come first.
 
-    Receivers of one computer have one clock, and one sentence.
+    Receivers of one computer have one clock, and one sentence. A clock that is the likely cause has its sentence in the
+    first paragraph, perhaps with a drift instead of a constant lag.
     """
+    named = cause.channels if cause is not None and "clock" in cause.name.split(" or ") else ()
+    late = {channel.partition(" ")[0] for channel in named}
+    clocks = {receiver: clock for receiver, clock in clocks.items() if not (clock.shifted and receiver in late)}
     receivers: dict[str, list[str]] = {}
     for receiver in sorted(clocks, key=lambda receiver: clocks[receiver].applied != NOT_APPLIED):
         receivers.setdefault(_clock_warning(clocks[receiver]), []).append(receiver)

@@ -172,24 +172,33 @@ class LearnedAntenna(StrictModel):
 
 
 class LearnedHealth(StrictModel):
-    """Errors of held-out flights of one channel, by which faults of a later flight are judged; None: not measured.
+    """Errors of held-out flights of one channel, by which faults of a later flight are judged.
 
-    ``slow_sd_db`` is the SD of the correlated part of the error, with its correlation time and length; ``white_sd_db``
-    the SD of the rest of 4-s means. ``channel_difference_db`` are differences of the offset to other channels, by name.
-    ``run`` is the usual longest run of equal readings.
+    ``rmse_db`` is the mean RMSE of 1-s means over flights, with its SD. Means over 4 s have a correlated part
+    (``slow_sd_db``, with its correlation time and length) and a white part (``white_sd_db``). The usual offset is that
+    of :class:`LearnedLevel`.
     """
 
-    rmse_db: float | None = None
-    slow_sd_db: float | None = None
-    correlation_s: float | None = None
-    correlation_m: float | None = None
-    white_sd_db: float | None = None
-    offset_db: float | None = None
-    offset_sd_db: float | None = None
-    channel_difference_db: dict[str, float] = Field(default_factory=dict)
+    flights: int
+    rmse_db: Annotated[float, Field(gt=0)]
+    rmse_sd_db: Annotated[float, Field(gt=0)]
+    slow_sd_db: Annotated[float, Field(ge=0)]
+    correlation_s: Annotated[float, Field(gt=0)]
+    correlation_m: Annotated[float, Field(gt=0)]
+    white_sd_db: Annotated[float, Field(ge=0)]
+    step_chi2: float
+    """Largest chi-squared of a step of the level in these flights."""
     channel_difference_sd_db: dict[str, float] = Field(default_factory=dict)
+    """By other channel of the tower: SD over flights of the difference of both offsets."""
     below_lock_share: float | None = None
-    run: float | None = None
+    """Mean share of samples without lock; None for receivers that do not report their lock."""
+    run_s: float
+    """Usual longest time in which all readings are equal."""
+
+    @property
+    def most_rmse_db(self) -> float:
+        """RMSE that a healthy flight hardly exceeds: mean + 2 SD [dB]."""
+        return self.rmse_db + 2.0 * self.rmse_sd_db
 
 
 class LearnedSeries(StrictModel):

@@ -9,12 +9,13 @@ import pytest
 from scipy.optimize import lsq_linear, minimize_scalar
 from scipy.stats import multivariate_normal
 
-from aerpaw_cmp.compare import causes
+from aerpaw_cmp.compare import causes, noise
 from aerpaw_cmp.compare.causes import LevelEvidence, Trial, flight_cause, gains_by_direction
 from aerpaw_cmp.compare.result import APPLIED, ESTIMATED, ClockResult
 from aerpaw_cmp.jobs.likely_cause import heights_meant, is_simulated
 from aerpaw_cmp.logs.readers import ReadOptions, identify
 from benchmarks.planted_causes import NONE, TROUBLES, situation
+from tests.compare.test_health import HEALTH, TIME_S, errors, learned_series
 from tests.parsers import autopilots
 
 MEASURED_DB = -60.0
@@ -319,8 +320,8 @@ def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memories(
     """Dense covariances with unit normal coefficients, at the likeliest size of the noise."""
     generator, n = np.random.default_rng(4), 200
     design = np.column_stack([np.full(n, 100.0), 3.0 * generator.normal(size=(n, 2 if columns else 0))])
-    known, apart = causes._Memories(*memories), np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-    slow, fast, share = causes._SLOW[known.slow], causes._FAST[known.fast], causes._SLOW_SHARE[known.share]
+    known, apart = noise.Memories(*memories), np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    slow, fast, share = noise._SLOW[known.slow], noise._FAST[known.fast], noise._SLOW_SHARE[known.share]
     cover = share * slow**apart + (1.0 - share) * fast**apart
     residual = 3.0 + np.linalg.cholesky(cover) @ generator.normal(size=n)
 
@@ -331,13 +332,13 @@ def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memories(
     inverse = np.linalg.inv(cover)
     ridge = np.exp(exact.x) * np.eye(design.shape[1])
     left = residual - design @ np.linalg.solve(design.T @ inverse @ design + ridge, design.T @ inverse @ residual)
-    fit = causes._remembering(residual, design, known, climb=False)
+    fit = noise.fit_with_memories(residual, design, known, climb=False)
     assert fit.log_likelihood == pytest.approx(
         known.log_prior - exact.fun + 0.5 * n * np.log(2.0 * np.pi), abs=tolerance
     )
     np.testing.assert_allclose(fit.residual_db, left, atol=max(0.2 * tolerance, 1e-3))
-    best = causes._remembering(residual, design, known, climb=True)
-    assert best.log_likelihood >= max(causes._remembering(residual, design, near, climb=False).log_likelihood
+    best = noise.fit_with_memories(residual, design, known, climb=True)
+    assert best.log_likelihood >= max(noise.fit_with_memories(residual, design, near, climb=False).log_likelihood
                                       for near in best.memories.near)  # fmt: skip
 
 
@@ -348,7 +349,7 @@ def test_a_free_form_pays_for_its_numbers_and_a_wide_search_for_its_width() -> N
         generator.normal(size=300),
         np.column_stack([np.full(300, 100.0), generator.normal(size=(300, 20))]),
     )
-    free, bound = (causes._remembering(residual, x, causes._START, climb=True) for x in (design, design[:, :1]))
+    free, bound = (noise.fit_with_memories(residual, x, noise.START, climb=True) for x in (design, design[:, :1]))
     assert bound.log_likelihood - free.log_likelihood > 20.0
     value = np.linspace(-5.0, 5.0, 1001)
     peak = -0.5 * (value / 0.4) ** 2  # as wide as 0.4 times the root of 2 pi
@@ -460,8 +461,46 @@ def test_a_cause_brings_the_error_back_to_that_of_other_flights() -> None:
     pattern, time = 4.0 * np.sin(np.radians(2 * sound.uav_azimuth_deg)), 4.0 * np.sign(np.sin(sound.time_s / 17.0))
     e = replace(sound, antenna="learned", measured_db=sound.measured_db + pattern)
     for more, usual, named in ((0.0, 1.5, "pattern"), (time, 1.5, NONE), (0.0, 4.0, NONE)):
-        seen = replace(e, measured_db=e.measured_db + more, usual_db=(0.9 * usual, usual))
+        health = HEALTH.model_copy(update={"rmse_db": 0.9 * usual, "rmse_sd_db": 0.05 * usual})
+        learned = learned_series(health=health).model_copy(update={"level": None})
+        seen = replace(e, measured_db=e.measured_db + more, learned=learned)
         assert _named(seen) == named
+
+
+def _learned(change: str, size_db: float) -> list[LevelEvidence]:
+    """Two channels with learned antennas, the errors of a healthy flight, and a change of the first channel's level."""
+    time = TIME_S
+    azimuth = time * 360.0 / 97.0
+    change_db = {
+        "step": size_db * (time > 400.0), "level": np.full(len(time), size_db),
+        "antenna": size_db * np.sin(np.radians(2.0 * azimuth)),
+    }[change]  # fmt: skip
+    predicted = 12.0 * np.sin(time / 61.0)
+    return [
+        LevelEvidence(
+            name=f"LW1 {channel}", time_s=time, predicted_db=predicted, place_m=np.outer(time, [5.0, 0.0, 0.0]),
+            measured_db=predicted + 12.0 + errors(seed) + change_db * (channel == "a"), antenna="learned",
+            uav_azimuth_deg=azimuth, uav_elevation_deg=-20.0 - 10.0 * np.sin(time / 31.0), transmit_power_dbm=40.0,
+            tower_azimuth_deg=90.0 * np.sin(time / 53.0), learned=learned_series(channel),
+        )
+        for channel, seed in (("a", 12), ("b", 112))
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "size_db", "name"),
+    [("step", 0.0, NONE), ("step", 5.5, "gain step"), ("level", 7.0, "level"), ("antenna", 9.0, "pattern")],
+)
+def test_held_out_flights_decide_on_steps_and_levels(change: str, size_db: float, name: str) -> None:
+    channels = _learned(change, size_db)
+    cause = flight_cause(channels)
+    assert (NONE if cause is None else cause.name) == name
+    if cause is not None and name != "pattern":
+        assert "held-out flights" in cause.sentence
+        assert abs(cause.estimate) == pytest.approx(size_db, abs=2.5)
+    if name == "level":  # the offset of a flight with another error does not show that its gain differs
+        other = [replace(e, measured_db=e.measured_db + 5.0 * np.sign(np.sin(e.time_s / 3.0))) for e in channels]
+        assert flight_cause(other) is None
 
 
 @pytest.mark.parametrize("levels", ["few", "two"])

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from aerpaw_cmp.compare.causes import Cause
 from aerpaw_cmp.compare.result import ESTIMATED, FlightResult
 from aerpaw_cmp.flight.clock import ClockEstimate
 from aerpaw_cmp.flight.replay import _clock_of, telemetry_time
@@ -73,3 +74,10 @@ def test_towers_of_one_computer_have_one_sentence() -> None:
     first, second = clock_warnings({"LW1": clock, "LW2": other, "LW4": clock})
     assert first.startswith("LW1, LW4: the radio clock is 2.50 s ahead")
     assert second.startswith("LW2: ")
+
+
+def test_a_clock_that_is_the_likely_cause_has_one_sentence() -> None:
+    clocks = {name: _clock_of(SERIES, estimate("shifted"), apply=False).result for name in ("LW1", "LW2")}
+    cause = Cause(name="clock", sentence="the radio clock gains 2.0 %", next_step="", channels=("LW1 USRP1",))
+    (text,) = clock_warnings(clocks, cause)
+    assert text.startswith("LW2: ")

@@ -44,9 +44,10 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
         (True, "pattern or blocked", 0.4, True),
         (True, "lock", 0.4, False),
         (False, None, 0.4, False),
+        (True, None, 0.4, None),  # nothing is asked after an error below 1 dB
     ):
-        late = SimpleNamespace(clock=SimpleNamespace(shifted=shifted, in_words="0.40 s ahead"))
-        right = SimpleNamespace(clock=SimpleNamespace(shifted=False))
+        late = SimpleNamespace(name="LW1 A", clock=SimpleNamespace(shifted=shifted, in_words="0.40 s ahead"))
+        right = SimpleNamespace(name="LW2 A", clock=SimpleNamespace(shifted=False))
         named = None if other is None else Cause(name=other, sentence="", next_step="")
         monkeypatch.setattr(likely_cause, "flight_cause", lambda _, named=named: named)
         monkeypatch.setattr(likely_cause, "fall_without_lag_db", lambda _, fall_db=fall_db: fall_db)
@@ -59,12 +60,17 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
         )  # fmt: skip
         replays: Any = SimpleNamespace(rss=[SimpleNamespace(tower_m=None)] * 2)
         results: Any = [
-            SimpleNamespace(name=f"{name} A", measured_db=np.arange(9.0) * i, training=False)
+            SimpleNamespace(
+                name=f"{name} A",
+                measured_db=np.arange(9.0) * i,
+                training=False,
+                score=SimpleNamespace(rmse_db=0.9 if first is None else 2.0, n=9),
+            )
             for i, name in enumerate(("LW1", "LW2"), 1)
         ]
         cause, _ = likely_cause.cause_of(data, replays, results)
         said = "The radio clock at LW1 is 0.40 s ahead; those at LW2 are not."
-        assert (cause is not None and (cause.sentence, cause.next_step) == (said, "`rss: {lag: apply}`")) == first
+        assert (cause is not None and (cause.sentence, cause.next_step) == (said, "`rss: {lag: apply}`")) == bool(first)
 
 
 FLOOR_DB = -758.6  # what the sounder writes without a signal

@@ -1,0 +1,345 @@
+"""Health of a receiver: the errors of held-out flights, and the test of a later flight for a step of the level.
+
+Means of the error over 4 s have an offset, a correlated and a white part. The sizes of both parts come from flights
+that were predicted without being learned from: sizes that are fitted to a faulty flight would include its fault.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.units import FloatArray
+from ..site.learned import LearnedHealth, LearnedSeries
+from .level import floored_fit
+
+# Means over this time are judged [s]; over more where a flight has more than the largest number of them.
+BIN_S, _MOST_BINS = 4.0, 1000
+# Pairs of means up to this time and distance from each other determine the correlation.
+_LONGEST_S, _LONGEST_M = 100.0, 150.0
+# Standard deviation of the RMSE over flights as a share of the RMSE, and of the difference of two channels [dB], before
+# any flight was seen. Each counts as two flights. Six held-out series of one campaign have 8 % and 0.3 dB.
+_RMSE_SHARE, _DIFFERENCE_SD_DB = 0.08, 1.0
+_LEAST_SD_DB = 0.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldOut:
+    """Errors of one flight on one channel, predicted without that flight.
+
+    Parameters
+    ----------
+    time_s, place_m : (n,), (n, 3)
+        Instants in order [s] and positions of the UAV [m].
+    measured_db, predicted_db : (n,)
+        Before any offset; NaN where there is none.
+    floor_db : float
+        Both levels count as no lower than this [dB]; minus infinity without a floor.
+    locked : (n,), optional
+        1 in lock, 0 without, NaN unknown.
+    """
+
+    time_s: FloatArray
+    place_m: FloatArray
+    measured_db: FloatArray
+    predicted_db: FloatArray
+    floor_db: float = -math.inf
+    locked: FloatArray | None = None
+
+    @property
+    def error_db(self) -> FloatArray:
+        """Error (n,) with the floor on both sides [dB]."""
+        if self.floor_db == -math.inf:
+            return self.measured_db - self.predicted_db
+        offset_db = floored_fit(self.measured_db, self.predicted_db, self.floor_db).offset_db
+        predicted_db = np.maximum(self.predicted_db - offset_db, self.floor_db)
+        return np.asarray(np.maximum(self.measured_db, self.floor_db) - predicted_db)
+
+    @property
+    def longest_run_s(self) -> float:
+        """Longest time in which all readings are equal [s]."""
+        known = np.isfinite(self.measured_db)
+        time_s = self.time_s[known]
+        ends = np.flatnonzero(np.append(np.diff(self.measured_db[known]) != 0.0, True))
+        begins = np.append(0, ends[:-1] + 1)
+        return float((time_s[ends] - time_s[begins]).max(initial=0.0))
+
+
+def learned_health(flights: Sequence[HeldOut], differences_db: dict[str, list[float]]) -> LearnedHealth:
+    """Return the health of one channel from held-out flights.
+
+    Parameters
+    ----------
+    flights : sequence of HeldOut
+        At least one.
+    differences_db : dict of str to list of float
+        By other channel of the tower: the offset of this channel minus that of the other channel, per flight.
+    """
+    series = [binned(f.time_s, f.error_db) for f in flights]
+    seconds = [float(binned(f.time_s, f.error_db, 1.0)[1].std()) for f in flights]
+    numbers = _noise(series)
+    places = [_places(f) for f in flights]
+    apart = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in places]
+    locked = [f.locked for f in flights if f.locked is not None and np.isfinite(f.locked).any()]
+    steps = [
+        step_chi2(*each, noise=_noise([s for s in series if s is not each] or [each]))[1].max(initial=0.0)
+        for each in series
+    ]
+    values = {
+        "rmse_db": float(np.mean(seconds)),
+        "rmse_sd_db": _sd(seconds, _RMSE_SHARE * float(np.mean(seconds))),
+        "slow_sd_db": numbers.slow_sd_db,
+        "correlation_s": numbers.correlation_s,
+        "correlation_m": _decay(apart, [error for _, error in series], _LONGEST_M)[1],
+        "white_sd_db": numbers.white_sd_db,
+        "step_chi2": float(max(steps)),
+        "run_s": float(np.median([f.longest_run_s for f in flights])),
+    }
+    return LearnedHealth(
+        **{name: round(value, 3) for name, value in values.items()},
+        below_lock_share=round(float(np.mean([np.nanmean(each == 0.0) for each in locked])), 3) if locked else None,
+        channel_difference_sd_db={
+            other: round(_sd(each, _DIFFERENCE_SD_DB), 3) for other, each in differences_db.items() if each
+        },
+        flights=len(flights),
+    )
+
+
+def _sd(values: Sequence[float], prior: float) -> float:
+    """Return the standard deviation of values, with a guess that counts as two of them."""
+    spread = float(np.square(np.array(values) - np.mean(values)).sum())
+    return math.sqrt((2.0 * prior**2 + spread) / (len(values) + 1.0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noise:
+    """Parts of the error in means over 4 s: SD and correlation time of the correlated part, SD of the white part."""
+
+    slow_sd_db: float
+    correlation_s: float
+    white_sd_db: float
+
+    def whiten(self, time_s: FloatArray, columns: FloatArray) -> FloatArray:
+        """Return columns (n, k) in which the noise at instants (n,) is white, with unit variance."""
+        apart_s = np.abs(time_s[:, None] - time_s[None])
+        covariance = self.slow_sd_db**2 * np.exp(-apart_s / self.correlation_s)
+        covariance[np.diag_indices(len(time_s))] += max(self.white_sd_db, _LEAST_SD_DB) ** 2
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), columns))
+
+    def square(self, time_s: FloatArray, error_db: FloatArray) -> float:
+        """Return the square of whitened errors (n,) about the best offset."""
+        white = self.whiten(time_s, np.column_stack([np.ones(len(time_s)), error_db]))
+        unit = white[:, 0] / max(float(np.linalg.norm(white[:, 0])), 1e-12)
+        return float(np.square(white[:, 1] - unit * (unit @ white[:, 1])).sum())
+
+
+def binned(time_s: FloatArray, error_db: FloatArray, width_s: float = BIN_S) -> tuple[FloatArray, FloatArray]:
+    """Return the means (m,) over bins of time, about their own mean, and the instants (m,) of the bins."""
+    known = np.isfinite(error_db)
+    time_s, error_db = time_s[known], error_db[known]
+    if not len(time_s):
+        return time_s, error_db
+    width_s = max(width_s, float(np.ptp(time_s)) / _MOST_BINS)
+    _, place = np.unique(np.floor(time_s / width_s), return_inverse=True)
+    count = np.bincount(place)
+    mean_db = np.bincount(place, error_db) / count
+    return np.bincount(place, time_s) / count, mean_db - mean_db.mean()
+
+
+def _places(flight: HeldOut) -> FloatArray:
+    at, _ = binned(flight.time_s, flight.error_db)
+    return np.column_stack([np.interp(at, flight.time_s, axis) for axis in flight.place_m.T])
+
+
+def _noise(series: Sequence[tuple[FloatArray, FloatArray]]) -> Noise:
+    """Return the noise of some flights (instants, errors)."""
+    apart = [np.abs(time_s[:, None] - time_s[None]) for time_s, _ in series]
+    errors = [error for _, error in series]
+    variance, correlation_s = _decay(apart, errors, _LONGEST_S)
+    total = float(np.mean([error.var() for error in errors]))
+    variance = min(variance, total)
+    return Noise(
+        slow_sd_db=math.sqrt(variance), correlation_s=correlation_s, white_sd_db=math.sqrt(max(total - variance, 0.0))
+    )
+
+
+def _decay(apart: Sequence[FloatArray], errors: Sequence[FloatArray], longest: float) -> tuple[float, float]:
+    """Return variance and length of an exponential that fits the products of errors over their separations (n, n)."""
+    pairs = [np.triu(at < longest, 1) for at in apart]
+    separation = np.concatenate([at[near] for at, near in zip(apart, pairs, strict=True)])
+    product = np.concatenate([np.outer(e, e)[near] for e, near in zip(errors, pairs, strict=True)])
+    fits = []
+    for length in np.geomspace(0.04 * longest, longest, 30).tolist():
+        shape = np.exp(-separation / length)
+        variance = max(float(shape @ product) / max(float(shape @ shape), 1e-12), 0.0)
+        fits.append((float(np.square(product - variance * shape).sum()), variance, length))
+    return min(fits)[1:]
+
+
+# --- a later flight -------------------------------------------------------------------------------------------------
+
+# Chi-squared of a step of two channels that healthy flights exceed once in a thousand; more for each further channel.
+# Simulated healthy flights of 830 s: 95 % below 14 to 15, 99 % below 17 to 20.
+_STEP_CHI2, _FURTHER_CHI2 = 25.0, 4.0
+# A step must be this much better than a level that creeps, as twice a log likelihood.
+_BEFORE_CREEP = 6.0
+# The mean square of the whitened error of healthy flights is at most 1.2 at LW1.
+_MOST_SQUARE = 1.6
+_LEAST_EACH_SIDE = 10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judged:
+    """Error of one channel of a later flight, measured minus predicted, with the learned antenna that predicted it.
+
+    ``start_s`` is the instant at which ``time_s`` is 0, on a time scale that all channels of the flight share.
+    """
+
+    name: str
+    time_s: FloatArray
+    error_db: FloatArray
+    learned: LearnedSeries
+    unit: str
+    transmit_power_dbm: float
+    start_s: float = 0.0
+
+    @property
+    def health(self) -> LearnedHealth:
+        """Health of the channel; only of antennas that have one."""
+        assert self.learned.health is not None
+        return self.learned.health
+
+    @property
+    def noise(self) -> Noise:
+        """Usual noise of the channel."""
+        h = self.health
+        return Noise(slow_sd_db=h.slow_sd_db, correlation_s=h.correlation_s, white_sd_db=h.white_sd_db)
+
+    def square(self, error_db: FloatArray) -> float:
+        """Return the square of the whitened means of errors (n,) about the best offset."""
+        return self.noise.square(*binned(self.time_s, error_db))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """A step of the level: its instant [s], chi-squared over all channels, and its size by channel [dB]."""
+
+    at_s: float
+    chi2: float
+    sizes_db: dict[str, float]
+
+
+def step_chi2(time_s: FloatArray, error_db: FloatArray, *, noise: Noise) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return instants (m,), chi-squared (m,) and size (m,) [dB] of a step, by generalised least squares.
+
+    The last element is a level that creeps from the first to the last instant; it has the instant NaN.
+
+    Notes
+    -----
+    With the errors e, their covariance C, an offset and a column x, size = x'C^-1 e / x'C^-1 x of columns that are
+    orthogonal to the offset under C, and chi-squared = size^2 x'C^-1 x.
+    """
+    at = time_s[_LEAST_EACH_SIDE : len(time_s) - _LEAST_EACH_SIDE]
+    if not len(at):
+        return at, at, at
+    steps = (time_s[:, None] >= at[None]).astype(np.float64)
+    creep = (time_s - time_s[0]) / max(float(np.ptp(time_s)), 1e-9)
+    white = noise.whiten(time_s, np.column_stack([np.ones(len(time_s)), error_db, steps, creep]))
+    unit = white[:, 0] / np.linalg.norm(white[:, 0])
+    rest = white[:, 1:] - np.outer(unit, unit @ white[:, 1:])
+    power = np.maximum(np.square(rest[:, 1:]).sum(axis=0), 1e-12)
+    size = rest[:, 0] @ rest[:, 1:] / power
+    return np.append(at, math.nan), size**2 * power, size
+
+
+def step_of(channels: Sequence[Judged]) -> Step | None:
+    """Return the step that all channels of a flight show together; None if their errors are those of healthy flights.
+
+    A step must exceed what healthy flights show, must be likelier than a level that creeps, and must leave the error of
+    a healthy flight.
+    """
+    series = [binned(c.time_s, c.error_db) for c in channels]
+    least = _STEP_CHI2 + _FURTHER_CHI2 * max(len(channels) - 2, 0)
+    least = max(least, sum(c.health.step_chi2 for c in channels))
+    best, creep = _likeliest(channels, series)
+    if best is None or best.chi2 < max(least, creep + _BEFORE_CREEP):
+        return None
+    left = []
+    for channel, (time_s, error_db), size_db in zip(channels, series, best.sizes_db.values(), strict=True):
+        without = error_db - size_db * (time_s + channel.start_s >= best.at_s)
+        if channel.noise.square(time_s, without) > _MOST_SQUARE * len(time_s):
+            return None
+        left.append((time_s, without))
+    further, _ = _likeliest(channels, left)
+    return best if further is None or further.chi2 < least else None
+
+
+def _likeliest(
+    channels: Sequence[Judged], series: Sequence[tuple[FloatArray, FloatArray]]
+) -> tuple[Step | None, float]:
+    """Return the likeliest common step of all channels, and chi-squared of a level that creeps."""
+    each = [step_chi2(*of, noise=channel.noise) for channel, of in zip(channels, series, strict=True)]
+    if not each or any(len(at) < 2 for at, _, _ in each):
+        return None, 0.0
+    own_s = [at[:-1] + channel.start_s for channel, (at, _, _) in zip(channels, each, strict=True)]
+    at_s = own_s[0]
+    chi2 = np.sum([np.interp(at_s, own, c[:-1], 0.0, 0.0) for own, (_, c, _) in zip(own_s, each, strict=True)], axis=0)
+    best = float(at_s[chi2.argmax()])
+    sizes = {
+        channel.name: float(size_db[np.abs(own - best).argmin()])
+        for channel, own, (_, _, size_db) in zip(channels, own_s, each, strict=True)
+    }
+    return Step(at_s=best, chi2=float(chi2.max()), sizes_db=sizes), float(sum(c[-1] for _, c, _ in each))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OddLevel:
+    """A channel whose level differs from that of held-out flights [dB]; ``where`` also names what it is compared to."""
+
+    name: str
+    where: str
+    difference_db: float
+
+
+# An offset or a difference of offsets is odd from this number of standard deviations and decibels on.
+_ODD_SD, _ODD_DB = 3.5, 4.0
+
+
+def level_of(channels: Sequence[Judged]) -> OddLevel | None:
+    """Return the channel whose offset differs most from its usual one, by itself or against another channel.
+
+    The difference of two channels varies less than the offset of each, which depends on the gain that the flight used.
+    """
+    off = [_excess(c) for c in channels]
+    odd = []
+    for i, (c, mine) in enumerate(zip(channels, off, strict=True)):
+        for other, its in zip(channels[i + 1 :], off[i + 1 :], strict=True):
+            usual_sd_db = c.health.channel_difference_sd_db.get(other.learned.channel)
+            if other.learned.tower != c.learned.tower or usual_sd_db is None or mine is None or its is None:
+                continue
+            difference_db, sd_db = mine[0] - its[0], math.hypot(usual_sd_db, mine[1], its[1])
+            larger = abs(mine[0]) >= abs(its[0])
+            first, second, sign = (c, other, 1.0) if larger else (other, c, -1.0)
+            odd.append((abs(difference_db) / sd_db, OddLevel(
+                name=first.name, where=f"{first.name}, against {second.name},", difference_db=sign * difference_db
+            )))  # fmt: skip
+        if mine is not None and c.learned.level is not None:
+            sd_db = math.hypot(c.learned.level.sd_db, mine[1])
+            odd.append((abs(mine[0]) / sd_db, OddLevel(name=c.name, where=c.name, difference_db=mine[0])))
+    odd = [(ratio, level) for ratio, level in odd if ratio > _ODD_SD and abs(level.difference_db) > _ODD_DB]
+    return max(odd, key=lambda of: of[0])[1] if odd else None
+
+
+def _excess(channel: Judged) -> tuple[float, float] | None:
+    """Return the offset above the usual one and the standard deviation of its mean over this flight [dB]."""
+    level, noise = channel.learned.level, channel.noise
+    known = np.isfinite(channel.error_db)
+    if level is None or level.unit != channel.unit or not known.any():
+        return None
+    usual_db = level.offset_db + level.transmit_power_dbm - channel.transmit_power_dbm
+    length_s = max(float(np.ptp(channel.time_s[known])), noise.correlation_s)
+    sd_db = noise.slow_sd_db * math.sqrt(min(2.0 * noise.correlation_s / length_s, 1.0))
+    return float(channel.error_db[known].mean()) - usual_db, sd_db

@@ -187,6 +187,29 @@ def test_every_page_has_a_place_in_the_menu() -> None:
     assert [name for name in pages if name not in menu] == []
 
 
+def test_the_menu_has_four_kinds_of_page_and_at_most_45() -> None:
+    menu = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    assert re.findall(r"^  - ([^:]+):", menu, re.MULTILINE) == [
+        "Home",
+        "Tutorial",
+        "How to",
+        "Reference",
+        "Explanation",
+    ]
+    assert 30 < menu.count(".md") <= 45
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs").rglob("*.md")), ids=lambda page: page.stem)
+def test_a_page_opens_with_its_question_and_an_example(page: Path) -> None:
+    """The first paragraph asks, and a block of commands, output or settings comes before the second section."""
+    text = re.sub(r"\A---\n.*?\n---\n|<!--.*?-->", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    first, *sections = re.split(r"^## ", text, flags=re.MULTILINE)
+    paragraph = first.partition("\n\n")[2].strip().partition("\n\n")[0]
+    assert "?" in paragraph, paragraph
+    opening = first + "".join(sections[:1])
+    assert re.search(r"^(```|    \S)", opening, re.MULTILINE) or page.stem == "vocabulary", "no example"
+
+
 def test_each_claim_of_security_names_a_test_that_exists() -> None:
     table = (ROOT / "docs" / "security.md").read_text(encoding="utf-8").split("| claim | test |")[1].split("\n\n")[0]
     rows = [line for line in table.splitlines() if line.startswith("| ") and "---" not in line]

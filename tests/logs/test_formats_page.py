@@ -45,19 +45,23 @@ ROWS = {label(row): row for row in dictionary.QUANTITIES if row.role != "other"}
 
 
 def table() -> str:
-    lines = ["| quantity | names such as | unit | can be | is none |", "| --- | --- | --- | --- | --- |"]
+    lines = ["| quantity | names such as | unit | range | missing value |", "| --- | --- | --- | --- | --- |"]
     for name, row in ROWS.items():
         low, high = row.can_be
         limits = f"{low:g} .. {high:g}" if np.isfinite([low, high]).all() else ""
         names = ", ".join(f"`{example}`" for example in EXAMPLES[name])
         lines.append(f"| {name} | {names} | {row.unit} | {limits} | {', '.join(f'{value:g}' for value in row.none)} |")
-    lines += ["", "| program | known by the columns | its heights are above | angles |", "| --- | --- | --- | --- |"]
+    lines += [
+        "",
+        "| program | recognised by the columns | its heights are above | angles |",
+        "| --- | --- | --- | --- |",
+    ]
     for program in dictionary.PROGRAMS:
         signs = "; or ".join(", ".join(f"`{sign}`" for sign in sorted(part)) for part in program.signs[:2])
         lines.append(f"| {program.name} | {signs} | {program.datum} | {program.angles} |")
     none = ", ".join(f"{value:.0f}" for value in dictionary.UNAVAILABLE)
     units = ", ".join(f"`{unit}`" for unit in dictionary.UNITS)
-    return "\n".join([*lines, "", f"Everywhere none: {none}. Units: {units}, `ddmm.mmmm`.", ""])
+    return "\n".join([*lines, "", f"Missing value in any column: {none}. Units: {units}, `ddmm.mmmm`.", ""])
 
 
 def parts() -> tuple[str, str, str]:

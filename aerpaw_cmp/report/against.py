@@ -1,4 +1,4 @@
-"""Record and numbers of the prediction made before a flight, beside what the flight measured."""
+"""Record and scores of a prediction that was made before a flight."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..compare.verdict import Verdict, stated_errors
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgainstSeries(LevelSeries):
-    """Samples (n,) of one tower and channel that were predicted, offset and all; levels in the unit of the log [dB]."""
+    """The predicted samples of one tower and channel, shape (n,); levels are in the unit of the log [dB]."""
 
     sd_db: FloatArray
     own_offset: bool = False
@@ -25,21 +25,21 @@ class AgainstSeries(LevelSeries):
     high_db: FloatArray
     share_near: float
     start: np.datetime64 | None = None
-    """Instant of ``time_s`` 0 (UTC); None of logs with relative times."""
+    """Time of ``time_s`` 0 (UTC); None for logs with relative times."""
     common_db: FloatArray | float = 0.0
-    """Part of ``sd_db`` that the whole flight may share."""
+    """The part of ``sd_db`` that all samples of the flight may share [dB]."""
 
     lock: LostLock | None = None
-    """In place of ``sd_db``, of a receiver that loses its lock."""
+    """The error model of a receiver that loses its lock, used instead of ``sd_db``."""
 
     @property
     def stated(self) -> Verdict:
-        """True if the errors are as large as was stated."""
+        """Whether the errors are as large as the stated standard deviations."""
         return replace(stated_errors(self.error_db, self.sd_db, self.common_db), where=self.name)
 
     @property
     def scores(self) -> dict[str, float]:
-        """Scores as predicted; ``own_offset_rmse_db`` about the mean of the flight."""
+        """Scores of the prediction; ``own_offset_rmse_db`` is computed after the mean error is subtracted."""
         as_stated = StatedSpread(gain_sd_db=self.sd_db, spread=NO_SPREAD, lock=self.lock)
         scores = {
             **level_scores([self]),
@@ -57,7 +57,7 @@ class AgainstSeries(LevelSeries):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Against:
-    """A prediction and the flight that followed."""
+    """A prediction and the flight by which it is scored."""
 
     folder: str
     sentence: str
@@ -65,9 +65,9 @@ class Against:
     flights: tuple[str, ...]
     series: tuple[AgainstSeries, ...]
     ranks: Mapping[str, ForecastScore] = field(default_factory=dict)
-    """By tower."""
+    """Scores of the rank forecasts, by tower."""
     words: str
-    """Sentences on what the flight says of the prediction."""
+    """Sentences that compare the prediction with the flight."""
 
     @property
     def scores(self) -> dict[str, dict[str, float]]:
@@ -75,7 +75,7 @@ class Against:
         return {series.name: series.scores for series in self.series}
 
     def metrics(self) -> dict[str, Any]:
-        """``against`` of metrics.json."""
+        """Return ``against`` of metrics.json."""
         return {
             "prediction": self.folder,
             "generated": self.generated,

@@ -1,7 +1,7 @@
-"""The data of the linked views: what the page's script draws, as one block of packed arrays.
+"""Data of the linked views of a report, as one block of packed arrays for the script of the page.
 
-Every number of the page's script comes from here; it computes only what a span or a switch changes (offset, RMSE,
-correlation and histograms of the chosen samples), by the same formulas as :mod:`aerpaw_cmp.compare`.
+The script computes only numbers that depend on a selection (offset, RMSE, correlation and histograms of the selected
+samples), by the formulas of :mod:`aerpaw_cmp.compare`.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from .flight_words import instants, nearest_k, pretty
 from .packed import PackedArrays, packed, scene
 from .texts import k_key
 
-# Samples of all series together that the page holds; beyond them each series is thinned, extremes kept.
+# Largest number of samples of all series on a page. Longer series are thinned; extremes are retained.
 POINTS = 50_000
 
 TRACK_POINTS = 4000
 
 
 def payload(data: ReportData, charts: Sequence[Chart] = (), limit: int = POINTS) -> dict[str, Any]:
-    """Everything the script needs, as plain values.
+    """Return all data of the script as plain values.
 
     Parameters
     ----------
     data : ReportData
     charts : sequence of Chart
     limit : int
-        Samples of all series together.
+        Largest number of samples of all series.
     """
     start, arrays = start_of(data), PackedArrays()
     total = sum(len(p.time) for p in data.rss) + sum(len(p.time) for p in data.rank)
 
     def share(n: int) -> int:
-        # 200: a short series beside a very long one keeps its course
+        # at least 200, so that a short series next to a very long one retains its shape
         return n if total <= limit else max(200, limit * n // total)
 
     rss_settings = data.settings.get("rss") or {}
@@ -65,7 +65,7 @@ def payload(data: ReportData, charts: Sequence[Chart] = (), limit: int = POINTS)
 
 
 def _place(panel: RssResult | RankResult, pick: IntArray, arrays: PackedArrays) -> dict[str, int]:
-    """Places of the UAV, and those of a tower that moves."""
+    """Return positions of the UAV, and of a tower that moves."""
     ends = [("", panel.position_m), *([] if panel.tower_m is None else [("tower_", panel.tower_m)])]
     return {
         f"{whose}{axis}": arrays.add(places[pick])
@@ -80,7 +80,7 @@ AXES = ("east", "north", "up")
 def _rss(
     panel: RssResult, source: Source | None, start: np.datetime64, arrays: PackedArrays, limit: int
 ) -> dict[str, Any]:
-    # of the residual too: its largest errors are what a reader looks for
+    # retain the extremes of the residual, too, because readers look for the largest errors
     pick = keep_extremes([panel.measured_db, panel.residual_db], limit) if len(panel.time) else np.arange(0)
     models = [{"name": "ray tracing", **_fit(panel.score), "level": arrays.add(panel.simulated_dbm[pick]),
                "learned_here": panel.training}]  # fmt: skip
@@ -107,14 +107,14 @@ def _rss(
         channel |= {
             "files": list(source.files),
             "file": arrays.add(source.file[pick]),
-            # a 32-bit float holds no line number beyond 16 million
+            # a 32-bit float cannot store line numbers above 16 million
             "line": arrays.add(source.line[pick], "f8"),
         }
     return channel
 
 
 def _beside(data: ReportData, panel: RssResult, start: np.datetime64) -> dict[str, Any]:
-    """The second channel of a tower and the spans in which the two part, as in the paper's Fig. 15."""
+    """Return the second channel of a tower and the segments in which both differ, as in the paper's Fig. 15."""
     for pair in data.pairs:
         if pair.tower == panel.tower and panel.channel in (pair.first, pair.second):
             ends = [seconds_since(np.array(instants(pair.time, span)), start).tolist() for span in pair.score.spans]

@@ -1,4 +1,4 @@
-"""report.html of a flight: what its template shows, in one record; and the folder of the results around it."""
+"""report.html of a flight, its metrics.json, and the folder of its results."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ from .flight_data import RANKS, InputFile, ReportData, start_of
 from .page import about, json_text, merge, rendered, write_figures, write_file
 from .texts import clock, coded, cut, duration, interval, k_key, minute, number, percent
 
-# Rejected lines shown per file; the flight file holds all.
+# Rejected lines shown per file; the flight file contains all.
 _REJECTED_SHOWN = 20
 
-# Figures that are drawn as files: none, or every one in a format or in all.
+# Formats in which figures are written as files.
 FIGURES = ("none", "svg", "png", "pdf", "all")
 
 # --- metrics.json ---------------------------------------------------------------------------------------------------
 
 
 def metrics(data: ReportData) -> dict[str, Any]:
-    """The numbers of a report under their stable names; plain JSON values only.
+    """Return the numbers of a report under their stable names, as plain JSON values.
 
-    Keys keep one order: that of the report. ``extra_metrics`` of the data is merged in last, key by key.
+    ``extra_metrics`` of the data is merged last, key by key.
     """
     rss: dict[str, dict[str, Any]] = {}
     for item in data.rss:
@@ -106,7 +106,7 @@ def _rss_metrics(series: RssResult) -> dict[str, Any]:
 
 
 def clock_metrics(clock: ClockResult) -> dict[str, Any]:
-    """``clock.<receiver>`` of metrics.json: numbers, verdict, whether applied, and the checks it rests on."""
+    """Return ``clock.<receiver>`` of metrics.json: numbers, verdict, whether it was applied, and its checks."""
     return {
         **clock.checks,
         "radio_minus_telemetry_s": clock.radio_minus_telemetry_s, "ci95_s": clock.ci95_s, "verdict": clock.verdict,
@@ -298,7 +298,7 @@ _AGAINST = ("rmse_db", "rmse_4s_db", "own_offset_rmse_db", "bias_db", "crps_db",
 
 
 def referee_card(data: ReportData) -> Card:
-    """Return the card of predictions of other programs, each beside ray tracing and the baselines."""
+    """Return the card that compares predictions of other programs with ray tracing and the baselines."""
     return Card(
         title="Predictions of other programs",
         id="referee",
@@ -417,7 +417,7 @@ def serving_card(data: ReportData) -> Card:
         f"of {number(serving.n, 0)} samples; always naming the cell that served most hits "
         f"{percent(serving.majority_share, 1)}.",
         "The prediction is no better than that." if serving.hit_share <= serving.majority_share else "",
-        "The whole matrix stands in metrics.json, serving.",
+        "The complete matrix is in metrics.json, key serving.",
     )  # fmt: skip
     return Card(title="Serving cells", id="serving", link="Serving cells", fold=True, text=[text], tables=[table])
 
@@ -458,7 +458,7 @@ def engine_card(data: ReportData) -> Card:
         title="Replay engine and its audit", id="engine", link="Engine", fold=True,
         text=[*text, "This replay was not audited." if audit is None else words.audit_summary(audit)],
         tables=[] if audit is None else [_audited_paths(audit), *_audited_fields(audit.fields)],
-        parts=[Card(title=f"Left out of the replay: {len(e.left_out)}", fold=True, text=[e.left_out])],
+        parts=[Card(title=f"Not modelled in the replay: {len(e.left_out)}", fold=True, text=[e.left_out])],
     )  # fmt: skip
 
 
@@ -466,7 +466,7 @@ def _audited_paths(a: AuditResult) -> Table:
     return Table(
         caption="Paths and levels of the two engines on a spread of links.",
         columns={"Reference": HEAD, "Links": 0, "Paths missing": 0,
-                 "Paths only in our engine (Sionna did not sample them)": 0, "Largest RSS difference [dB]": 3,
+                 "Paths that Sionna RT did not sample": 0, "Largest RSS difference [dB]": 3,
                  **{f"Other rank at K = {k_key(k)}": RIGHT for k in a.rank_disagreement},
                  "Time": RIGHT, "Time of the reference": RIGHT},
         rows=[(a.reference, a.links, a.missing_paths, a.extra_paths, a.rss_max_error_db,
@@ -488,7 +488,7 @@ def _audited_fields(f: FieldAudit | None) -> list[Table]:
          number(f.rss_max_error_db, 6, "dB"), "", "", "",
          f"H: {f.h_max_error:.1e} of its size; other rank: {number(f.rank_differs, 0)}; missing, impossible paths: "
          f"{number(f.missing_paths, 0)}, {number(f.phantom_paths, 0)}"),
-        ("Attitude, turned a second time", f"{number(f.attitude_rows, 0)} telemetry rows", "", "",
+        ("Attitude, computed a second time", f"{number(f.attitude_rows, 0)} telemetry rows", "", "",
          f"{f.attitude_max_rad:.1e} rad", "", ""),
     ]  # fmt: skip
     passed = (
@@ -496,15 +496,15 @@ def _audited_fields(f: FieldAudit | None) -> list[Table]:
         "second implementation (float64)."
     )
     failed = Markup("<b>{} failed:</b> {}.").format(counted(f.failed, "check"), "; ".join(f.failures))
-    doubtful = f"{number(f.doubtful, 0)} paths or links were not judged, since rounding decides them."
+    doubtful = f"{number(f.doubtful, 0)} paths or links were not checked, because rounding decides them."
     note = paragraph(
         failed if f.failed else passed, doubtful if f.doubtful else "", f"Not covered: {'; '.join(f.not_covered)}.",
         "The second implementation alone checks foliage, array layouts and patterns that Sionna does not have. Both "
         "references use the paths of the array centre.",
     )  # fmt: skip
     return [Table(
-        caption="The fields, whose code both engines share, checked by Sionna RT's own coefficients and by a second "
-        "implementation written from the recommendations.",
+        caption="Both engines share the code of the fields. It is checked against the coefficients of Sionna RT and "
+        "against a second implementation, written from the recommendations.",
         columns={"Against": HEAD, "Checked": TEXT, "Power, worst": RIGHT, "Power, RMS": RIGHT, "Phase, worst": RIGHT,
                  "Phase, RMS": RIGHT, "Also": TEXT},
         rows=rows if f.attitude_rows else rows[:2], notes=[note],
@@ -545,8 +545,8 @@ def _rejected(f: InputFile) -> Table:
 
 
 def method_card(data: ReportData, files: Sequence[str]) -> Card:
-    """Return the card of the method, the notes of site and flight, and the columns of the files beside the page."""
-    notes = list(dict.fromkeys([*data.site.notes, *data.notes]))  # a flight repeats what its site says
+    """Return the card of the method, the notes of site and flight, and the columns of the files."""
+    notes = list(dict.fromkeys([*data.site.notes, *data.notes]))  # a flight repeats the notes of its site
     heads = {"Column": HEAD, "Unit": TEXT, "Meaning": TEXT}
     tables = [
         Table(caption=f"Columns of {name}.", columns=heads, rows=described(columns))
@@ -557,11 +557,11 @@ def method_card(data: ReportData, files: Sequence[str]) -> Card:
     return Card(
         title="Method and files", id="method", link="Method", fold=True, text=[Markup(rendered("method"))],
         parts=[Card(text=[Markup("<h3>Notes</h3>"), notes] if notes else []),
-               Card(title="Files beside this page and their columns", fold=True, text=beside, tables=tables)],
+               Card(title="Files of this report and their columns", fold=True, text=beside, tables=tables)],
     )  # fmt: skip
 
 
-# Cards in the order of the page. A new card is one function more.
+# Cards in the order of the page. A new card is a further function.
 CARDS = (
     result_card, channels_card, against_card, referee_card, models_card, serving_card, ranks_card, engine_card,
     inputs_card,
@@ -569,13 +569,13 @@ CARDS = (
 
 
 def page(data: ReportData, files: Sequence[str]) -> str:
-    """Return the whole page.
+    """Return the page.
 
     Parameters
     ----------
     data : ReportData
     files : sequence of str
-        Names of the files beside the page.
+        Names of the other files of the report.
     """
     charts = charts_of(data)
     linked = payload(data, charts) if data.rss or data.rank else None
@@ -598,7 +598,7 @@ def page(data: ReportData, files: Sequence[str]) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WrittenReport:
-    """The files, ``report.html`` first, and the record with the seconds that its writing took."""
+    """The files, ``report.html`` first, and the record with the seconds of all stages."""
 
     files: tuple[Path, ...]
     data: ReportData
@@ -619,19 +619,19 @@ def write_report(
     ----------
     data : ReportData
     folder : path
-        Empty; that of :meth:`aerpaw_cmp.common.outputs.OutputFolder.filling`, say.
+        An empty folder, such as that of :meth:`aerpaw_cmp.common.outputs.OutputFolder.filling`.
     drawn : str
         One of :data:`FIGURES`.
     style : {"screen", "paper"}
     exports : sequence of str
-        Formats of :data:`aerpaw_cmp.report.exports.FORMATS` for the samples, besides the CSVs.
+        Formats of :data:`aerpaw_cmp.report.exports.FORMATS` for the samples, in addition to CSV.
     stages : Stages, optional
-        Times the stage "report"; all its seconds are then those of the record.
+        Times the stage "report"; its seconds are stored in the record.
 
     Returns
     -------
     WrittenReport
-        Files: ``report.html`` first, the CSVs (header only when they have no rows), the figures, ``metrics.json``.
+        ``report.html``, the CSV files (only a header if they have no rows), the figures, ``metrics.json``.
 
     Raises
     ------
@@ -644,7 +644,7 @@ def write_report(
         specs = [] if drawn == "none" else figures.figure_specs(data)
         formats = FORMATS if drawn == "all" else (drawn,)
         for name, text in (("rss.csv", csv_text(RSS, data.rss)), ("rank.csv", csv_text(RANK, data.rank))):
-            # written even without rows: a reader finds the same files in every report
+            # write it without rows, too, so that every report has the same files
             written.append(write_file(folder / name, text))
         _, pictures = write_figures(specs, folder / "figures", formats, style, stages.progress)
     written += pictures

@@ -1,8 +1,7 @@
-"""The record that a flight's report shows: its parts around the numbers (:mod:`aerpaw_cmp.compare.result`).
+"""The record that a flight's report shows: the numbers of :mod:`aerpaw_cmp.compare.result` and their context.
 
-Each part that a flight may lack is optional: a flight with rank only has ``rss=()``, one without a path anywhere has
-NaN numbers, never invented ones. Times are naive ``datetime64[ns]`` in UTC. A missing number is NaN (in
-``metrics.json``: ``null``).
+Parts that a flight may not have are optional: a flight with rank only has ``rss=()``, and a flight without any path has
+NaN numbers. Times are naive ``datetime64[ns]`` in UTC. A missing number is NaN (in ``metrics.json``: ``null``).
 """
 
 from __future__ import annotations
@@ -49,9 +48,9 @@ GEOMETRY = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputFile:
-    """An input; the account of a log has ``lines == accepted + rejected + blank``.
+    """An input file; for a log, ``lines == accepted + rejected + blank``.
 
-    ``rejected_lines`` may hold all of them or a sample; ``rejected`` is the count.
+    ``rejected`` is the number of rejected lines; ``rejected_lines`` may contain only some of them.
     """
 
     path: str
@@ -65,12 +64,12 @@ class InputFile:
     warnings: tuple[str, ...] = ()
     rejected_lines: tuple[RejectedLine, ...] = ()
     learned_on: tuple[str, ...] = ()
-    """SHA-256 of the logs that this file was learned from; none of other files."""
+    """SHA-256 of the logs that this file was learned from; empty for other files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """The flown line: ``time`` (n,), positions (n,) in the site frame [m]."""
+    """The track of the UAV: ``time`` (n,), positions (n,) in the site frame [m]."""
 
     time: AnyArray
     east_m: FloatArray
@@ -80,7 +79,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Waypoint:
-    """A named moment of the flight, e.g. ``A`` to ``F`` of the paper."""
+    """A named point of the flight, such as ``A`` to ``F`` of the paper."""
 
     label: str
     time: np.datetime64
@@ -91,28 +90,28 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """Origin of samples in the logs: names of the files, and per sample its file's number and its line, (n,)."""
+    """The origin of samples in the logs: names of the files, and the number of file and line of each sample, (n,)."""
 
     files: tuple[str, ...]
     file: IntArray
     line: IntArray
 
 
-# Kind of drawn paths beside a number of reflections: any further one, as over an edge.
+# Kind of a path that is not a number of reflections, such as a diffracted path.
 FURTHER = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PosePaths:
-    """Propagation paths of some poses of a tower, to be drawn.
+    """The propagation paths that a page draws for some poses of a tower.
 
     Parameters
     ----------
     tower : str
     time : (poses,) datetime64[ns]
-        Samples of the tower's first channel.
+        Times of the poses, from the first channel of the tower.
     lines : tuple of tuples
-        Per pose its paths: points (corners, 3) [m] from tower to UAV, and the number of reflections or another kind.
+        Paths of each pose: points (corners, 3) from tower to UAV [m], and the number of reflections or the kind.
     """
 
     tower: str
@@ -122,39 +121,39 @@ class PosePaths:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportData(FlightResult):
-    """Everything a report shows: the numbers of the flight, and what stands around them.
+    """The content of a report: the numbers of the flight and their context.
 
     Parameters
     ----------
     title, flight : str
-        Headline, and the short name that is the folder's name too.
+        Headline, and the short name, which is also the name of the folder.
     site : Site
     generated : str
-        UTC, ISO 8601.
+        Time at which the report was made (UTC, ISO 8601).
     versions : mapping of str to str
     inputs : tuple of InputFile
     track, waypoints
-        The flown line, and its named moments.
+        The track of the UAV, and its named points.
     sources : mapping of str to Source
-        Where the samples stand in the logs, by tower and channel.
+        Origin of the samples in the logs, by tower and channel.
     synthetic : bool
-        The logs were made by ``aerpaw-cmp simulate``; said on the first screen.
+        True if the logs were made by ``aerpaw-cmp simulate``, which the first screen states.
     warnings : tuple of str
-        What the reader must know before believing a number, one sentence each.
+        Sentences about limits of the numbers.
     doubts : tuple of str
-        Clauses on clocks and heights for the first words.
+        Clauses about clocks and heights for the summary.
     cautions : tuple of str
-        Sentences on settings that do not fit; they come before all other cautions.
+        Sentences about settings that do not fit, which are shown before all warnings.
     antennas : tuple of str
         Sentences that name the antennas of the replay.
     notes : tuple of str
         Remarks for the end of the report.
     settings : mapping
-        The checked flight.yaml, nested mappings of plain values.
+        The checked flight.yaml as nested mappings of plain values.
     stages_s : mapping of str to float
-        Seconds per named stage.
+        Seconds of each stage.
     extra_metrics : mapping
-        Merged into ``metrics.json`` last, key by key.
+        Further content of ``metrics.json``, merged last, key by key.
     """
 
     title: str
@@ -177,16 +176,16 @@ class ReportData(FlightResult):
     extra_metrics: Mapping[str, Any] = field(default_factory=dict)
     paths: tuple[PosePaths, ...] = ()
     against: Against | None = None
-    """What was predicted before the flight, where a prediction is named."""
+    """The prediction made before the flight, if a prediction is named."""
 
     @property
     def moments(self) -> list[tuple[str, np.datetime64]]:
-        """Label and instant of each waypoint."""
+        """Label and time of each waypoint."""
         return [(waypoint.label, waypoint.time) for waypoint in self.waypoints]
 
 
 def start_of(data: ReportData) -> np.datetime64:
-    """The instant that is zero on every time axis: the first of the track, or of any panel."""
+    """Return the zero of all time axes: the first time of the track, or of any series."""
     times = [] if data.track is None or not len(data.track.time) else [data.track.time[0]]
     times += [item.time[0] for item in data.series if len(item.time)]
     if not times:
@@ -195,7 +194,7 @@ def start_of(data: ReportData) -> np.datetime64:
 
 
 def used_towers(data: ReportData) -> list[str]:
-    """Towers that a panel of the report names, or all."""
+    """Return the towers with a series in the report, or all towers."""
     used = dict.fromkeys(item.tower for item in data.series)
     return [name for name in used if name in data.site.towers] or list(data.site.towers)
 
@@ -203,7 +202,7 @@ def used_towers(data: ReportData) -> list[str]:
 # Poses per tower whose paths are drawn.
 POSES = 300
 
-# Paths of each further kind that are drawn of a pose.
+# Paths of other kinds that are drawn for a pose.
 SHORTEST = 8
 
 
@@ -215,20 +214,20 @@ def report_data(
     other_inputs: Sequence[InputFile] = (),
     paths: Sequence[PosePaths] = (),
 ) -> ReportData:
-    """Everything a report shows.
+    """Return the content of a report.
 
     Parameters
     ----------
     data : FlightData
         Settings, site, logs and track.
     result : FlightResult
-        The numbers.
+        Numbers of the flight.
     notes : sequence of str
-        Remarks beside those of the flight file.
+        Remarks in addition to those of the flight file.
     other_inputs : sequence of InputFile
-        Files besides the logs: settings, site, antennas.
+        Files other than logs: settings, site, antennas.
     paths : sequence of PosePaths
-        Paths at the samples, for the page that shows them.
+        Paths that the page draws.
 
     Returns
     -------
@@ -268,14 +267,14 @@ def report_data(
     )
 
 
-# --- what must be known before a number is believed ------------------------------------------------------------------
+# --- warnings --------------------------------------------------------------------------------------------------------
 
 
 def clock_warnings(clocks: Mapping[str, ClockResult], cause: Cause | None = None) -> tuple[str, ...]:
-    """Return sentences on clocks that were corrected, should be, or cannot be judged; refused corrections come first.
+    """Return sentences about clocks that were or should be corrected, or could not be checked.
 
-    Receivers of one computer have one clock, and one sentence. A clock that is the likely cause has its sentence in the
-    first paragraph, perhaps with a drift instead of a constant lag.
+    Corrections that were not made come first. Receivers of one computer share a clock and a sentence. A clock that is
+    the likely cause has its sentence in the summary, perhaps with a drift instead of a constant lag.
     """
     named = cause.channels if cause is not None and "clock" in cause.name.split(" or ") else ()
     late = {channel.partition(" ")[0] for channel in named}
@@ -287,42 +286,44 @@ def clock_warnings(clocks: Mapping[str, ClockResult], cause: Cause | None = None
 
 
 def _clock_warning(clock: ClockResult) -> str:
-    """Sentence on what one receiver's clock does to its numbers; "" when there is nothing to know."""
+    """Return the sentence about the clock of one receiver; empty if the clock is right."""
     if clock.applied == NOT_APPLIED:
-        return f"rss.lag: apply was asked for, but the radio clock was not corrected: {clock.reason}."
+        return f"rss.lag: apply is set, but the radio clock was not corrected: {clock.reason}."
     if clock.applied == APPLIED:
         return f"the radio clock is {clock.in_words}; it was corrected."
     if clock.shifted:
-        return f"the radio clock is {clock.in_words}; it was not corrected (rss.lag: apply would)."
+        return f"the radio clock is {clock.in_words}; it was not corrected. Set rss.lag: apply to correct it."
     if clock.verdict == "cannot tell":
         return f"the radio clock could not be checked: {clock.reason}."
     return ""
 
 
 def rss_warnings(result: RssResult) -> tuple[str, ...]:
-    """A channel that could not be compared, or whose offset is no result."""
+    """Return warnings about a channel that could not be compared, or whose offset is at the end of its search range."""
     if result.score.n == 0:
         return (f"{result.name}: no sample could be compared; its numbers are missing, not zero.",)
     if result.score.at_edge:
         return (
-            f"{result.name}: the best offset lies at the edge of the searched span, so it and its RMSE are no result. "
+            f"{result.name}: the best offset is at the end of its search range, so offset and RMSE are not valid. "
             "Widen rss.span_db, and check the transmit power and the unit of the log.",
         )
     return ()
 
 
 def rank_warnings(result: RankResult) -> tuple[str, ...]:
-    """Warnings that the reader must know of the rank of one tower before believing its numbers."""
+    """Return warnings about the rank at one tower."""
     out = []
     if left_out := result.n_samples - len(result.time):
         of = counted(result.n_samples, "sample")
-        out.append(f"Rank {result.tower}: {left_out} of {of} left out: too low, or without a pose.")
+        out.append(
+            f"Rank {result.tower}: {left_out} of {of} were not used: the UAV was too low, or its position is unknown."
+        )
     if result.score.n == 0:
         out.append(f"Rank {result.tower}: the modem reported no rank at any compared pose.")
     if result.score.staleness.verdict == "held":
         out.append(
             f"Rank {result.tower}: the modem holds each report for about {result.score.staleness.hold_s:.1f} s; "
-            f"{counted(result.score.n, 'sample')} hold {counted(result.score.staleness.n_reports, 'report')}."
+            f"{counted(result.score.n, 'sample')} contain {counted(result.score.staleness.n_reports, 'report')}."
         )
     return tuple(out)
 
@@ -331,7 +332,7 @@ def rank_warnings(result: RankResult) -> tuple[str, ...]:
 
 
 def _inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tuple[InputFile, ...]:
-    """The account of every log."""
+    """Return the account of every log."""
     return tuple(
         InputFile(
             path=log.path,
@@ -347,7 +348,7 @@ def _inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tu
 
 
 def track_of(data: FlightData) -> Track | None:
-    """The flown line: telemetry's, or the rank log's own positions."""
+    """Return the track from the telemetry, or from positions in the rank log."""
     if data.track is not None and len(data.track):
         step_ns = max((data.track.end_ns - data.track.start_ns) // 2000, 500_000_000)
         time = np.arange(data.track.start_ns, data.track.end_ns + 1, step_ns).astype("datetime64[ns]")
@@ -361,7 +362,7 @@ def track_of(data: FlightData) -> Track | None:
 
 
 def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
-    """Waypoints of the plan or the report settings, each at the moment the track comes nearest."""
+    """Return the waypoints of the plan or of the report settings, each at the time at which the track is nearest."""
     plan = data.settings.flight.plan
     points = data.settings.report.waypoints or (plan.waypoints if plan else [])
     track = track_of(data)
@@ -372,7 +373,7 @@ def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
         if not point.label:
             continue
         distance = np.linalg.norm(line_m[start:] - (point.east_m, point.north_m, point.height_m), axis=1)
-        # the first moment it comes as near as it ever will (within 2 m): later visits belong to later waypoints
+        # take the first time within 2 m of the nearest approach, because later visits belong to later waypoints
         near = np.flatnonzero(distance <= np.nanmin(distance) + 2.0)
         index = start + int(near[0])
         out.append(
@@ -387,7 +388,7 @@ def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
 
 
 def pose_paths(data: FlightData, replays: FlightReplay) -> tuple[PosePaths, ...]:
-    """Paths of each tower's first series at about :data:`POSES` of its poses, spread over the flight."""
+    """Return paths of the first series of each tower at about :data:`POSES` poses, spread over the flight."""
     by_tower: dict[str, PosePaths] = {}
     for (_, series), replayed in zip(data.series, replays.all, strict=True):
         if series.tower not in by_tower and replayed.valid.any():

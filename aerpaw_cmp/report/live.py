@@ -1,4 +1,4 @@
-"""The page of ``tap --web``: one file that asks only the tap for more; the map behind the flight stands inside."""
+"""The page of ``tap --web``: one file that contains its map and requests data only from the tap."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _POLICY = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveMap:
-    """Predicted rank and level (heights, north, east) over the site, for one tower.
+    """The predicted rank and level over the site for one tower, shape (heights, north, east).
 
     Parameters
     ----------
     title : str
-        Of the flight.
+        Title of the flight.
     site : Site
     tower : str
     k : float
@@ -36,9 +36,9 @@ class LiveMap:
     heights_m, east_m, north_m : sequence of float
         Axes of the grid, evenly spaced east and north [m].
     rank : (heights, north, east) int
-        0: no path.
+        Rank; 0 without a path.
     level_dbm : (heights, north, east) float
-        [dBm]; NaN: no path.
+        Level [dBm]; NaN without a path.
     """
 
     title: str
@@ -52,7 +52,7 @@ class LiveMap:
     level_dbm: FloatArray
 
     def content(self) -> dict[str, Any]:
-        """Plain values for the script."""
+        """Return plain values for the script."""
         arrays = PackedArrays()
         rank, level = arrays.add(np.clip(self.rank, 0, 4), "u1"), arrays.add_steps(self.level_dbm, 0.1)
         step = float(self.east_m[1] - self.east_m[0]) if len(self.east_m) > 1 else 20.0
@@ -73,14 +73,14 @@ class LiveMap:
 
 
 def live_page(background: LiveMap | None, title: str) -> tuple[bytes, str]:
-    """The page and its Content-Security-Policy.
+    """Return the page and its Content-Security-Policy.
 
     Parameters
     ----------
     background : LiveMap, optional
-        None: no prediction, so the page shows what was measured, without a map.
+        Without a prediction the page shows the measurement alone, without a map.
     title : str
-        Words beside the heading.
+        Text next to the heading.
     """
     style, code = script("live.css"), script("common.js", "live.js")
     text = (

@@ -1,4 +1,4 @@
-"""locate.html with metrics.json: the regions of a ground node's place on the site."""
+"""locate.html with metrics.json: the regions that contain a ground node, on the map of the site."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from .texts import minute
 def write_locate(
     numbers: Mapping[str, Any], regions: Regions, track_m: FloatArray, site: Site, folder: Path
 ) -> list[Path]:
-    """Write the page and all files beside it; the page first.
+    """Write the page and its files, and return their paths, the page first.
 
     Parameters
     ----------
     numbers : mapping
-        Content of metrics.json; ``modes`` are places, the likeliest first.
+        Content of metrics.json; ``modes`` are positions, the likeliest first.
     regions : Regions
     track_m : (n, 2 or more)
-        [m]
+        East, north of the flight [m].
     site : Site
     folder : Path
 

@@ -15,10 +15,10 @@ from ..common.units import AnyArray, FloatArray, spread_out
 from ..site.scenes import drawn_buildings
 from ..site.site import Building, Site
 
-# What stands for NaN in an array of each integer kind.
+# Value that represents NaN in an array of each integer kind.
 NONE = {"u1": 255, "u2": 65_535, "i2": -32_768}
 
-# the most negative number stands for NaN, so the range is even about zero
+# The most negative number represents NaN, so the range is symmetric.
 LARGEST = 32_767
 
 
@@ -27,7 +27,7 @@ _TREES = 1500
 
 
 class PackedArrays:
-    """Arrays of a page, each stored once, one after the other at multiples of eight bytes.
+    """The arrays of a page, each stored once, one after the other at multiples of eight bytes.
 
     Examples
     --------
@@ -45,7 +45,7 @@ class PackedArrays:
         self._size = 0
 
     def add(self, values: AnyArray, kind: str = "f4") -> int:
-        """Number under which the values stand, little endian; equal arrays share one."""
+        """Store values in little endian and return their number; equal arrays share a number."""
         raw = np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()
         key = (kind, raw)
         if key not in self._known:
@@ -58,17 +58,17 @@ class PackedArrays:
         return self._known[key]
 
     def add_steps(self, values: FloatArray, step: float) -> int:
-        """Values as 16-bit multiples of ``step``; what is not finite is none."""
+        """Store values as 16-bit multiples of ``step`` and return their number; NaN and infinities are missing."""
         return self.add(_steps_of(values, step), "i2")
 
     def content(self) -> dict[str, Any]:
-        """``{"data": base64 of the deflated block, "arrays": [[kind, offset, length], ...]}``."""
+        """Return ``{"data": base64 of the deflated block, "arrays": [[kind, offset, length], ...]}``."""
         block = zlib.compress(b"".join(self._parts), 9)
         return {"data": base64.b64encode(block).decode("ascii"), "arrays": [list(entry) for entry in self._table]}
 
 
 def _steps_of(values: FloatArray, step: float) -> AnyArray:
-    """Values as multiples of ``step``, those beyond 16 bits at the end of the range; NaN and infinities are none.
+    """Return values as multiples of ``step``, clipped to 16 bits; NaN and infinities are missing.
 
     Examples
     --------
@@ -83,7 +83,7 @@ def _steps_of(values: FloatArray, step: float) -> AnyArray:
 
 
 def step_for(values: FloatArray, finest: float = 0.01) -> float:
-    """Least step that holds all values in 16 bits: ``finest``, or that times a power of ten.
+    """Return the smallest step that stores all values in 16 bits: ``finest`` times a power of ten.
 
     Examples
     --------
@@ -92,13 +92,13 @@ def step_for(values: FloatArray, finest: float = 0.01) -> float:
     """
     array = np.asarray(values, dtype=np.float64)
     reach = float(np.abs(array[np.isfinite(array)]).max(initial=0.0))
-    # less a rounding of the logarithm: what fits exactly must not get a step ten times as coarse
+    # subtract a rounding error of the logarithm, or a value at the limit would get a step ten times as coarse
     tens = int(np.ceil(np.log10(max(reach / (LARGEST * finest), 1.0)) - 1e-12))
     return float(finest * 10.0**tens)
 
 
 def outline(area: Polygon) -> FloatArray:
-    """Corners (n, 2) of an area as one line that also runs round its holes, so that filling it leaves them empty."""
+    """Return the corners (n, 2) of an area as one line that includes its holes, so that a fill leaves them empty."""
     area = shapely.orient_polygons(area)
     outer = np.asarray(area.exterior.coords)[:, :2]
     holes = [part for ring in area.interiors for part in (np.asarray(ring.coords)[:, :2], outer[:1])]
@@ -106,7 +106,7 @@ def outline(area: Polygon) -> FloatArray:
 
 
 def walls(building: Building) -> list[FloatArray]:
-    """Wall rectangles and roof of a prism as polygons (n, 3)."""
+    """Return wall rectangles and roof of a prism as polygons (n, 3)."""
     base, top = building.base_m, building.base_m + building.height_m
     result = []
     for ring in (building.footprint.exterior, *building.footprint.interiors):
@@ -118,23 +118,26 @@ def walls(building: Building) -> list[FloatArray]:
 
 
 def listed(points: Any) -> Any:
-    """Points as nested lists, rounded to 0.1 m."""
+    """Return points as nested lists, rounded to 0.1 m."""
     return np.round(np.asarray(points, dtype=np.float64), 1).tolist()
 
 
 def at_height(line_m: FloatArray, up_m: float) -> FloatArray:
-    """A line (n, 2) in the plane at a height, (n, 3)."""
+    """Return a line (n, 2) at a height, shape (n, 3)."""
     return np.column_stack([line_m, np.full(len(line_m), up_m)])
 
 
 def ends_of_scale(values: FloatArray, most: float) -> list[float]:
-    """Ends of a colour scale: 1 % and ``most`` % of finite values, half a unit about a constant, 0 and 1 of none."""
+    """Return the ends of a colour scale: the 1 % and ``most`` % quantiles of finite values.
+
+    The ends are half a unit around a constant, and 0 and 1 without values.
+    """
     low, high = (float(v) for v in np.percentile(values, [1.0, most])) if len(values) else (0.0, 1.0)
     return [low, high] if high > low else [low - 0.5, low + 0.5]
 
 
 def packed(value: Any, arrays: PackedArrays) -> Any:
-    """A chart with its arrays in the page's block."""
+    """Return a chart whose arrays are replaced by their numbers in the block of the page."""
     if isinstance(value, np.ndarray):
         # 32-bit floats have seven digits: beyond 1e5 a time would lose hundredths of a second
         return arrays.add(value, "f8" if value.max(initial=0.0) > 1e5 else "f4")
@@ -144,7 +147,7 @@ def packed(value: Any, arrays: PackedArrays) -> Any:
 
 
 def scene(site: Site, most_trees: int = _TREES) -> dict[str, Any]:
-    """Towers, buildings, trees and forests as plain lists, rounded to 0.1 m."""
+    """Return towers, buildings, trees and forests as plain lists, rounded to 0.1 m."""
     trees, pick = site.trees, spread_out(len(site.trees), most_trees)
     columns = ("east_m", "north_m", "ground_m", "height_m", "crown_diameter_m", "crown_base_m")
     return {
@@ -161,6 +164,6 @@ def scene(site: Site, most_trees: int = _TREES) -> dict[str, Any]:
 
 
 def plan_of(site: Site) -> dict[str, Any]:
-    """:func:`scene` for a plan: no trees (foliage is in the levels), roofs alone of buildings."""
+    """Return :func:`scene` for a plan: no trees, because levels include foliage, and only the roofs of buildings."""
     solid = scene(site)
     return {**solid, "trees": [], "buildings": [faces[-1:] for faces in solid["buildings"]]}

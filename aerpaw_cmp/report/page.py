@@ -1,7 +1,7 @@
-"""The base of every page: shell, files of a folder of results, names, numbers and instants as text.
+"""The base of every page: template engine, files of a folder of results, and figures.
 
-A page is one file that needs nothing else and no network; without a script its figures still stand. Every text that
-comes from a log or a configuration is escaped by the template engine.
+A page is one file that needs no other file and no network; its figures are shown without scripts, too. The template
+engine escapes every text that comes from a log or a configuration.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from .texts import coded
 
 
 def links_of(by_tower: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], Any]:
-    """Numbers by tower and channel, of ``rss`` in metrics.json."""
+    """Return numbers by tower and channel from ``rss`` of metrics.json."""
     return {(tower, name): numbers for tower, channels in by_tower.items() for name, numbers in channels.items()}
 
 
 def merge(into: dict[str, Any], numbers: Mapping[str, Any]) -> None:
-    """Put ``other`` into ``into``, key by key; what is only in ``into`` stays."""
+    """Merge ``numbers`` into ``into``, key by key; keys that only ``into`` has are unchanged."""
     for key, value in numbers.items():
         if isinstance(value, Mapping) and isinstance(into.get(key), dict):
             merge(into[key], value)
@@ -40,16 +40,15 @@ def merge(into: dict[str, Any], numbers: Mapping[str, Any]) -> None:
 
 
 def json_text(numbers: Mapping[str, Any], indent: int | None = 2) -> str:
-    """Numbers as the text of a file."""
+    """Return numbers as JSON text of a file."""
     return json.dumps(numbers, indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def write_file(path: Path, content: str | bytes | Iterator[str]) -> Path:
-    """Write one file of a folder of results; its own folder is made when missing, but not that one's parent.
+    """Write one file of a folder of results and return its path.
 
-    Text may come in pieces.
-
-    The set becomes whole, and errors become messages, in :class:`~aerpaw_cmp.common.outputs.OutputFolder`.
+    Text may come in pieces. The folder of the file is created if its parent exists.
+    :class:`~aerpaw_cmp.common.outputs.OutputFolder` writes the folder atomically and turns errors into messages.
     """
     path.parent.mkdir(exist_ok=True)
     pieces = iter([content]) if isinstance(content, (str, bytes)) else content
@@ -61,7 +60,7 @@ def write_file(path: Path, content: str | bytes | Iterator[str]) -> Path:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Made:
-    """Instant (UTC, ISO 8601), versions and seconds of the stages: what every page and its metrics.json end with."""
+    """The time (UTC, ISO 8601), versions and seconds of the stages that every page and its metrics.json contain."""
 
     generated: str = field(default_factory=utc_now)
     versions: Mapping[str, str] = field(default_factory=versions)
@@ -69,7 +68,7 @@ class Made:
 
 
 def about(page: Any) -> dict[str, Any]:
-    """The entries of metrics.json on when and how a page was made; ``page`` has the fields of :class:`Made`."""
+    """Return the entries of metrics.json on time, versions and stages; ``page`` has the fields of :class:`Made`."""
     return {
         "generated": page.generated,
         "commit": commit(),
@@ -78,25 +77,25 @@ def about(page: Any) -> dict[str, Any]:
     }
 
 
-# ``script``: 'none', or the digest of the page's one script. Lets a browser refuse whatever would be loaded or run
-# besides, should a hostile log ever get past the escaping.
+# ``script`` is 'none' or the digest of the script of the page. The browser then refuses any other script or file, if a
+# hostile log should ever pass the escaping.
 _CONTENT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {script}"
 
 
 def digest(text: str) -> str:
-    """A script or style as a content policy names it."""
+    """Return the digest by which a content policy names a script or style."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
 
 
 def picture_uri(picture: Picture) -> str:
-    """A picture as a data URI: its small PNG where it has one, else the SVG."""
+    """Return a picture as a data URI: its small PNG if there is one, otherwise its SVG."""
     kind, content = ("png", picture.inline) if picture.inline else ("svg+xml", picture.formats["svg"])
     return f"data:image/{kind};base64," + base64.b64encode(content).decode("ascii")
 
 
 @cache
 def environment() -> Any:
-    """The template engine: everything escaped, an undefined name is an error."""
+    """Return the template engine, which escapes all text and fails on undefined names."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -111,13 +110,13 @@ def environment() -> Any:
 
 
 def script(*names: str) -> str:
-    """Scripts of the page, one after the other."""
+    """Return the text of scripts, one after the other."""
     folder = resources.files("aerpaw_cmp.report") / "templates"
     return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
 
 
 def rendered(template: str, scripts: Sequence[str] = (), **content: Any) -> str:
-    """Render a template with its scripts and the content policy that lets a browser run them alone."""
+    """Render a template with its scripts and a content policy that allows only these scripts."""
     code = script(*scripts) if scripts else ""
     policy = _CONTENT_POLICY.format(script=digest(code) if code else "'none'")
     text: str = (
@@ -129,12 +128,12 @@ def rendered(template: str, scripts: Sequence[str] = (), **content: Any) -> str:
 
 
 def as_json(content: Mapping[str, Any]) -> str:
-    """Text for a script element: no name can close it."""
+    """Return JSON text for a script element, which no text inside can close."""
     return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def embedded(content: Mapping[str, Any] | None) -> Markup:
-    """The data of a page's script, inside the page; empty without any."""
+    """Return the data of the script of a page; empty if there are none."""
     return Markup(as_json(content)) if content else Markup("")
 
 
@@ -145,19 +144,19 @@ def write_figures(
     kind: str = "screen",
     progress: Progress = logged,
 ) -> tuple[list[Picture], list[Path]]:
-    """Draw figures and write each in its formats; gives the pictures and the files.
+    """Draw figures, write each in its formats, and return the pictures and the files.
 
     Parameters
     ----------
     specs : sequence of FigureSpec
     folder : Path
-        Made when missing.
+        Created if it does not exist.
     formats : sequence of str
-        Of matplotlib, as ``"svg"``, ``"png"``, ``"pdf"``.
+        Formats of matplotlib, such as ``"svg"``, ``"png"``, ``"pdf"``.
     kind : str
         Style, as in :func:`render`.
     progress : Progress
-        Share of the figures that are drawn.
+        Is called with the share of the figures that are drawn.
 
     Returns
     -------

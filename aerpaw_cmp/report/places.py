@@ -1,4 +1,4 @@
-"""The data of the live canvas of predict, plan, locate and calibrate: values at places, or over a sphere."""
+"""Data of the canvas of predict, plan, locate and calibrate: values at positions, or over a sphere."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from ..site.site import Site
 from .flight_data import RANKS
 from .packed import PackedArrays, ends_of_scale, listed, plan_of, step_for
 
-# Values that a page holds; beyond them each group is thinned.
+# Largest number of values on a page; larger groups are thinned.
 MOST_VALUES = 1_500_000
 
-# Name of a layer of ranks, and of what is drawn about it.
+# Name of a layer of ranks, and names of the ends of its interval.
 LIKELIEST = "likeliest rank"
 BAND = ("low", "high")
 
-# What an azimuth is counted from, counter-clockwise.
+# Names of azimuths 0, 90, 180 and 270 degrees, counter-clockwise.
 COMPASS = ("E", "N", "W", "S")
 BODY = ("forward", "left", "aft", "right")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Places:
-    """Values at points, one group of them to choose.
+    """A group of values at positions, which the reader selects.
 
     Parameters
     ----------
     name : str
     at : (n, 3)
-        East, north, up [m]; unit vectors where ``around`` is given.
+        East, north, up [m]; unit vectors if ``around`` is given.
     values : mapping of str to (n,)
-        By name with unit. :data:`BAND` is drawn about the first over time, not listed.
+        Values by name with unit. :data:`BAND` is the interval of the first over time and is not listed.
     around : tuple of str
         Names of the directions 0, 90, 180, 270 degrees of a sphere.
     cell_m : float
-        Side of the cells of a grid.
+        Side of the cells of a grid [m].
     time_s : (n,), optional
-        Of points along a route.
+        Times of points along a route [s].
     dots : (m, 3)
         Unit vectors that are marked on the sphere.
     """
@@ -63,21 +63,21 @@ def payload(
     lines: Iterable[FloatArray] = (),
     rings: Iterable[FloatArray] = (),
 ) -> dict[str, Any]:
-    """Everything the script needs, as plain values.
+    """Return all data of the script as plain values.
 
     Parameters
     ----------
     groups : sequence of Places
     site : Site, optional
     lines : iterable of (k, 2 or more)
-        Routes, flown or proposed [m].
+        East, north of flown or proposed routes [m].
     rings : iterable of (k, 2)
-        Outlines of where a route may run [m].
+        Outlines of the area in which a route may run [m].
 
     Returns
     -------
     dict
-        As JSON can hold it; arrays stand packed in ``packed``.
+        Values that JSON can store; arrays are in ``packed``.
     """
     arrays, total = PackedArrays(), sum(group.at.shape[0] * len(group.values) for group in groups)
     alike: dict[tuple[str, str], list[FloatArray]] = {}
@@ -97,7 +97,7 @@ def payload(
 
 
 def _scale(group: str, layer: str) -> tuple[str, str]:
-    """Key of a colour scale: a quantity shares it at all heights, a deviation before and after a flight."""
+    """Return the key of a colour scale, which a quantity shares at all heights, and before and after a flight."""
     return group.partition(", ")[0], layer.partition(" ")[0]
 
 
@@ -110,7 +110,7 @@ def _group(
     layers = []
     for name, column in group.values.items():
         values = np.asarray(column, dtype=np.float64)[pick]
-        # probabilities lie between 0 and 1, where steps of a hundredth can be seen
+        # probabilities lie between 0 and 1, where steps of 0.01 would be visible
         step = step_for(values, 1e-4 if "probability" in name else 0.01)
         packed = {"step": step, "values": arrays.add_steps(values, step)}
         layers.append({"name": name, "range": ranges[_scale(group.name, name)], **packed})

@@ -1,4 +1,4 @@
-"""plan.html with metrics.json, the chosen route as files, and the map of expected standard deviations."""
+"""plan.html with metrics.json, the recommended route as files, and the map of expected standard deviations."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from .texts import minute, number
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanPage(Made):
-    """Content of the page of ``plan``.
+    """The content of the page of ``plan``.
 
-    ``candidates`` and ``curve`` hold rows of metrics.json; ``outline_m`` (k, 2) and ``holes_m`` bound where a route may
-    run; ``track_m`` (n, 3); ``place_m`` (m, 3) with ``before_db`` and ``after_db`` (m,), seen from ``seen_from_m`` (3,)
-    where the target is all directions.
+    ``candidates`` and ``curve`` are rows of metrics.json. ``outline_m`` (k, 2) and ``holes_m`` bound the area in which
+    a route may run [m]. ``track_m`` (n, 3) is the recommended route. ``place_m`` (m, 3) are the points of the target
+    with their standard deviations ``before_db`` and ``after_db`` (m,). If the target is all directions, they are
+    directions from ``seen_from_m`` (3,).
     """
 
     target: str
@@ -48,12 +49,12 @@ class PlanPage(Made):
 
 
 def _sd_now_db(data: PlanPage) -> float:
-    """Root mean square of the standard deviations before the flight [dB]."""
+    """Return the root mean square of the standard deviations before the flight [dB]."""
     return float(np.sqrt(np.mean(data.before_db**2)))
 
 
 def plan_metrics(data: PlanPage) -> dict[str, Any]:
-    """The numbers of the page under stable names."""
+    """Return the numbers of the page under stable names."""
     return json_object(
         target=data.target, sentence=data.sentence, antennas=data.antennas, flights=data.flights,
         candidates=data.candidates, warnings=data.warnings,
@@ -77,14 +78,14 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
                "beat a lawnmower of the same length."],
     )  # fmt: skip
     curve = Table(
-        caption="What a shorter or longer flight leaves: the best of three candidates, flown for a part of the battery "
-        "or beyond it. A longer flight may hold the shorter one.",
+        caption="Expected standard deviation after a shorter or longer flight: the best of three candidates, flown for "
+        "a part of the battery or beyond it. A longer flight may contain the shorter one.",
         columns={"Time [min]": 1, "Length [km]": 1, "SD [dB]": 2},
         rows=[(p["minutes"], p["length_m"] / 1000, p["sd_db"]) for p in data.curve],
     )  # fmt: skip
     known = f"Known flights: {', '.join(data.flights)}."
     if not data.flights:
-        known = "No flight is known: antennas are as the model assumes them."
+        known = "No flight is known: antennas are those that the model assumes."
     return Page(
         kind="plan", title=f"Next flight, target {data.target}", verdict=data.sentence, cautions=data.warnings,
         about=[f"{known} Antennas: {', '.join(data.antennas)}. Made {minute(data.generated)}. "
@@ -96,7 +97,7 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
 
 
 def write_plan(data: PlanPage, folder: Path) -> list[Path]:
-    """Write the page and all files beside it; the page first."""
+    """Write the page and its files, and return their paths, the page first."""
     shown = payload(list(_groups(data)), data.site, lines=[data.track_m], rings=[data.outline_m, *data.holes_m])
     written = write_page(folder, "plan", plan_page(data, shown), plan_metrics(data))
     written += [write_file(folder / name, text) for name, text in data.files.items()]

@@ -1,6 +1,6 @@
-"""A site as a plan, and as a page that turns it in 3-D under the mouse.
+"""A site as a plan, and as a page that shows it in 3-D.
 
-The page is one file with its script inside; it draws on a canvas and loads nothing.
+The page is one file that contains its script and loads no other file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ TREES_IN_PAGE = 5000
 
 
 def view_limits(site: Site) -> FloatArray:
-    """(3, 2) lowest and highest east, north, up of everything that stands there, with a margin [m]."""
+    """Return the lowest and highest east, north and up of all objects with a margin, shape (3, 2) [m]."""
     points = [tower.position_m for tower in site.towers.values()]
     areas = [(b.footprint, b.base_m + b.height_m) for b in drawn_buildings(site)]
     areas += [(forest.area, 0.0) for forest in site.forests] + [(fence.area, 0.0) for fence in site.geofences]
@@ -48,7 +48,7 @@ def view_limits(site: Site) -> FloatArray:
 
 
 def plan(site: Site) -> Figure:
-    """Plan view with everything on it, to scale."""
+    """Return the plan of all objects, to scale."""
     limits = view_limits(site)
     width, height = np.ptp(limits[:2], axis=1)
     shape = float(np.clip(width / height, 0.45, 2.2))
@@ -63,7 +63,7 @@ def plan(site: Site) -> Figure:
 
 
 def _view_of(site: Site) -> dict[str, Any]:
-    """The site as plain lists for the page, rounded to 0.1 m."""
+    """Return the site as plain lists for the page, rounded to 0.1 m."""
     shown = scene(site, TREES_IN_PAGE)
     walled = zip(drawn_buildings(site), shown["buildings"], strict=True)
     return {
@@ -75,7 +75,7 @@ def _view_of(site: Site) -> dict[str, Any]:
 
 
 def viewer(site: Site) -> str:
-    """The page that shows the site in 3-D."""
+    """Return the page that shows the site in 3-D."""
     content = _view_of(site)
     return rendered(
         "site_view",
@@ -93,7 +93,7 @@ def write_site_view(site: Site, folder: str | Path) -> list[Path]:
     ----------
     site : Site
     folder : path
-        Made when missing.
+        Created if it does not exist.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Numbers, intervals and instants as the text of pages; names of columns, keys and files."""
+"""Text of pages for numbers, intervals and times; names of keys and files."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ k_key = number_key
 
 
 def iso_time(time: Any) -> Any:
-    """Instants as ISO 8601 text with milliseconds and ``Z``; empty where not a time."""
+    """Return times as ISO 8601 text with milliseconds and ``Z``; the text is empty for NaT."""
     instants = np.asarray(time, dtype="datetime64[ns]")
-    # half a unit added: numpy truncates, and a stored 0.9999999 s must not lose a millisecond
+    # add half a unit, because numpy truncates and a stored 0.9999999 s must not lose a millisecond
     text = np.datetime_as_string((instants + np.timedelta64(500_000, "ns")).astype("datetime64[ms]"), timezone="UTC")
     return np.where(np.isnat(instants), "", text)
 
 
 def safe_name(text: str) -> str:
-    """A part of a file name from any text.
+    """Return a part of a file name from any text.
 
     Examples
     --------
@@ -37,7 +37,7 @@ def safe_name(text: str) -> str:
 
 
 def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
-    """A number for a table; an en dash where there is none.
+    """Return a number as text; a missing number is an en dash.
 
     Examples
     --------
@@ -46,13 +46,16 @@ def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
     """
     if value is None or not math.isfinite(value):
         return "–"
-    rounded = round(value, decimals) + 0.0  # what rounds to zero has no sign
+    rounded = round(value, decimals) + 0.0  # a number that rounds to zero has no sign
     text = f"{rounded:,.{decimals}f}".replace(",", "\u202f").replace("-", "\u2212")
     return f"{text}\u202f{unit}" if unit else text
 
 
 def interval(value: tuple[float | None, float | None] | None, decimals: int = 1) -> str:
-    """An interval as ``[low, high]``, a bound as ``≥ low``, or nothing; "cannot tell" where there is neither."""
+    """Return an interval as ``[low, high]`` and a bound as ``≥ low``.
+
+    The text is empty for None and "cannot tell" if both ends are missing.
+    """
     if value is None:
         return ""
     low, high = (math.nan if end is None else end for end in value)
@@ -64,12 +67,12 @@ def interval(value: tuple[float | None, float | None] | None, decimals: int = 1)
 
 
 def percent(share: float | None, decimals: int = 0) -> str:
-    """A share as a percentage; an en dash where there is none."""
+    """Return a share as a percentage; a missing share is an en dash."""
     return number(None if share is None else 100 * share, decimals, "%")
 
 
 def minute(instant: str) -> str:
-    """An ISO 8601 instant of UTC to the minute; any other text as it is.
+    """Return an ISO 8601 time of UTC to the minute; other text is returned unchanged.
 
     Examples
     --------
@@ -81,7 +84,7 @@ def minute(instant: str) -> str:
 
 
 def duration(seconds: float | None) -> str:
-    """Seconds with three digits that count, in ms below one second.
+    """Return seconds with three significant digits, in ms below one second.
 
     Examples
     --------
@@ -95,9 +98,9 @@ def duration(seconds: float | None) -> str:
 
 
 def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Nested settings as dotted names and plain text, without those that are not set; a bound as ``≥ low``.
+    """Yield nested settings as dotted names and plain text, without settings that are None.
 
-    What is listed, as the logs of a flight, has a numbered row each.
+    A bound is ``≥ low``. Each entry of a list of records, such as the logs of a flight, has a numbered row.
 
     Examples
     --------
@@ -118,7 +121,7 @@ def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, st
 
 
 def _plain(name: str, value: Any) -> str | None:
-    """Text of one setting or number; None where it is not set or empty."""
+    """Return the text of one setting or number; None if it is not set or empty."""
     if "ci95" in name and isinstance(value, (list, tuple)) and None in value:
         return None if value[0] is None else f"≥ {short(value[0])}"
     if isinstance(value, (list, tuple)):
@@ -127,7 +130,7 @@ def _plain(name: str, value: Any) -> str | None:
 
 
 def clock(instant: Any, start: Any) -> str:
-    """Time of day (UTC), or seconds after ``start`` where the log has relative times only.
+    """Return the time of day (UTC), or seconds after ``start`` if the log has relative times only.
 
     Examples
     --------
@@ -142,18 +145,18 @@ def clock(instant: Any, start: Any) -> str:
 
 
 def more(rows: Sequence[Any], limit: int) -> str:
-    """Words for a caption where a table does not show all rows.
+    """Return a note for the caption of a table that does not show all rows.
 
     Examples
     --------
     >>> more([1, 2, 3], 2), more([1, 2], 2)
-    (' (the first 2 of 3; the files beside this page hold all)', '')
+    (' (the first 2 of 3; the files in this folder contain all)', '')
     """
-    return f" (the first {limit} of {len(rows)}; the files beside this page hold all)" if len(rows) > limit else ""
+    return f" (the first {limit} of {len(rows)}; the files in this folder contain all)" if len(rows) > limit else ""
 
 
 def short(value: Any) -> str:
-    """A value as text; numbers to 6 digits, which metrics.json holds in full; an en dash where there is none."""
+    """Return a value as text with at most 6 digits; None is an en dash. metrics.json has all digits."""
     if value is None:
         return "–"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
@@ -165,7 +168,7 @@ def cut(text: str, most: int = 120) -> str:
 
 
 def coded(text: str) -> Markup:
-    """Text whose parts between backquotes are commands or keys; all of it escaped.
+    """Return an escaped text whose parts between backquotes are set as code.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""calibration.html with metrics.json: antennas over the sphere, where flights looked, held-out scores."""
+"""calibration.html with metrics.json: learned antennas over the sphere, directions of the flights, held-out scores."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class AntennaMap:
     Parameters
     ----------
     name : str
-        Such as ``LW1.USRP1 tower``.
+        A name such as ``LW1.USRP1 tower``.
     theta_deg, azimuth_deg : (t,), (p,)
     gain_dbi, sd_db : (t, p)
     level_db : float
-        What was taken from the learned gain for a mean of 0 dBi.
+        Level that was subtracted from the learned gain for a mean of 0 dBi.
     flown : (m, 3)
-        Unit vectors of the directions that flights looked in.
+        Unit vectors of the directions that flights measured.
     """
 
     name: str
@@ -49,7 +49,7 @@ class AntennaMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationData(Made):
-    """The record of a calibration; ``scores`` and ``controls`` hold rows with flight, tower, channel, RMSE."""
+    """The record of a calibration; ``scores`` and ``controls`` contain rows with flight, tower, channel, RMSE."""
 
     name: str
     flights: Sequence[str]
@@ -63,9 +63,9 @@ class CalibrationData(Made):
     strengths: Mapping[str, Any]
     ground: Mapping[str, Any] | None
     curve: Sequence[Mapping[str, Any]]
-    """Error by number of flights that were learned from, fewest first; none with fewer than three flights."""
+    """Error by number of training flights, fewest first; empty with fewer than three flights."""
     one_more_rmse_db: float
-    """To expect with one flight more, extrapolated [dB]; NaN without a curve."""
+    """Expected error with one more flight, extrapolated [dB]; NaN without a curve."""
     antennas: Sequence[AntennaMap]
     rank: Mapping[str, Any] | None = None
     settings_text: str = ""
@@ -81,7 +81,7 @@ HELPS: dict[str, tuple[str, str]] = {
     ),
     "worse": (
         "The learned antennas are significantly worse ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
-        "leave them out of flight.yaml; check node, channel and gain of the logs",
+        "do not use them in flight.yaml; check node, channel and gain of the logs",
     ),
     "not significant": (
         "The difference of {effect:+.1f} dB is not significant (95 %: {low:+.1f} to {high:+.1f} dB).",
@@ -90,39 +90,40 @@ HELPS: dict[str, tuple[str, str]] = {
     "no interval": ("The difference is {effect:+.1f} dB; two flights give no interval.", "add a third flight"),
 }
 
-# Body frame against frames that do not turn, by :func:`~aerpaw_cmp.compare.verdict.antenna_or_place`.
+# Body frame against frames that do not rotate with the UAV, by :func:`~aerpaw_cmp.compare.verdict.antenna_or_place`.
 FRAMES: dict[str, tuple[str, str]] = {
     "antenna": (
-        "What was learned turns with the UAV, as an antenna does: {where} the error is {size:.1f} dB larger "
+        "The learned gain rotates with the UAV, as an antenna does: {where} the error is {size:.1f} dB larger "
         "(95 %: {near:.1f} to {far:.1f} dB).",
         "",
     ),
     "place": (
-        "What was learned belongs to places: {where} the error is {size:.1f} dB smaller "
+        "The learned gain belongs to places: {where} the error is {size:.1f} dB smaller "
         "(95 %: {near:.1f} to {far:.1f} dB).",
-        "fly the same places with other headings",
+        "fly over the same places with other headings",
     ),
     "not separable": (
-        "Antenna and place are not separable: {where} the error differs by {size:.1f} dB, not significantly.",
+        "Effects of antenna and place cannot be separated: {where} the error differs by {size:.1f} dB, not "
+        "significantly.",
         "",
     ),
-    "no interval": ("Antenna and place are not separable with two flights.", ""),
+    "no interval": ("Effects of antenna and place cannot be separated with two flights.", ""),
 }
 
 WRONG_FRAMES = {
     "world frame at the UAV": "in a frame fixed to the ground",
-    "heading turned the wrong way": "with the heading turned the wrong way",
+    "heading turned the wrong way": "with the heading rotated the wrong way",
 }
 
 
 def helps(scores: Sequence[Score]) -> Verdict:
-    """The learned antennas against the best baseline on the flights left out."""
+    """Compare the learned antennas with the best baseline on held-out flights."""
     name = min(BASELINES, key=lambda key: mean_rmse(scores, key))
     return by_flight(_errors(scores), _errors(scores, name), name)
 
 
 def frame(controls: Mapping[str, Sequence[Score]]) -> Verdict:
-    """Antenna or memory of the place, without patterns."""
+    """Test whether an antenna or an effect of the place explains the levels, without measured patterns."""
     body = _errors(controls.get("body frame, no patterns", ()))
     return antenna_or_place(
         [by_flight(body, _errors(controls.get(name, ())), where) for name, where in WRONG_FRAMES.items()]
@@ -139,14 +140,14 @@ def sentences(
     ground_m: tuple[float, float] | None,
     curve: Sequence[CurvePoint],
 ) -> tuple[str, ...]:
-    """The first words of page and terminal, then further sentences.
+    """Return the summary of page and terminal, then further sentences.
 
     Parameters
     ----------
     scores, controls : mapping of str to sequence of Score
-        By what was left out, and by wrong or simpler model.
+        Scores by what was held out, and by wrong or simpler model.
     ground_m : (float, float), optional
-        Heights of roughness that the data allow; None where no ground was fitted.
+        Range of the roughness height that the data allow [m]; None if no ground was fitted.
     curve : sequence of CurvePoint
 
     Returns
@@ -161,7 +162,7 @@ def sentences(
     ends = sorted(map(abs, turned.interval))
     helped, _, step = said_of(verdict, HELPS).partition(" Next: ")
     first = (
-        f"Flights left out: RMSE {mean_rmse(left_out):.1f} dB with learned antennas; "
+        f"Held-out flights: RMSE {mean_rmse(left_out):.1f} dB with learned antennas; "
         f"{BASELINES[verdict.where]}: {mean_rmse(left_out, verdict.where):.1f} dB.",
         helped,
         f"Largest error: {worst.flight}, {worst.tower} {worst.channel}, {worst.rmse_db:.1f} dB.",
@@ -175,18 +176,18 @@ def _further(scores: Mapping[str, Sequence[Score]], ground_m: tuple[float, float
     left_out, sectors = scores["flight_left_out"], scores["sector_left_out"]
     if sectors:
         base, error = mean_rmse(sectors, "free_space_rmse_db"), mean_rmse(sectors)
-        yield f"Directions that no training flight has seen: RMSE {error:.1f} dB; free space: {base:.1f} dB."
+        yield f"Directions that no training flight measured: RMSE {error:.1f} dB; free space: {base:.1f} dB."
         gain = mean_rmse(left_out, "free_space_rmse_db") - mean_rmse(left_out)
         if gain > 0:
             share = min(max((base - error) / gain, 0.0), 1.0)
-            yield f"{100 * share:.0f} % of the gain over free space carries over to these directions."
+            yield f"{100 * share:.0f} % of the improvement over free space remains in these directions."
     if not scores["heading_left_out"]:
-        yield "No heading could be left out: the flights share one."
+        yield "No heading could be held out, because all flights have the same one."
     if ground_m is not None and math.isinf(ground_m[0]):
-        yield "A coherent ground ray is not in the data."
+        yield "The data show no coherent ground ray."
     elif ground_m is not None:
         low, high = (100.0 * end for end in ground_m)
-        yield f"Roughness of the ground that the data allow: {low:.1f} cm " + (
+        yield f"The data allow a roughness of the ground of {low:.1f} cm " + (
             "or more." if math.isinf(high) else f"to {high:.1f} cm."
         )
 
@@ -196,22 +197,22 @@ def _of_curve(points: Sequence[CurvePoint]) -> Iterator[str]:
         counts, errors = (", ".join(texts) for texts in ([str(p.flights) for p in points],
                                                          [f"{p.rmse_db:.2f}" for p in points]))  # fmt: skip
         more = with_one_more(points)
-        yield f"Learned from {counts} other flights, the error on a flight left out is {errors} dB."
-        yield (f"One flight more would bring about {points[-1].rmse_db - more:.2f} dB ({more:.2f} dB, extrapolated).")
+        yield f"Learned from {counts} other flights, the error on a held-out flight is {errors} dB."
+        yield f"One more flight would reduce it by {points[-1].rmse_db - more:.2f} to {more:.2f} dB (extrapolated)."
 
 
 SPLIT_TITLE = {
-    "flight_left_out": "each flight left out",
+    "flight_left_out": "each flight",
     "altitude_left_out": "and its cruising height",
     "heading_left_out": "and an eighth of the compass of headings",
     "sector_left_out": "and a sector of 60 degrees at the tower",
     "route_left_out": "a segment of the flight's own route",
-    "other_flights": "flights that had no part (--score)",
+    "other_flights": "other flights (--score)",
 }
 
 
 def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
-    """The numbers of the page under stable names."""
+    """Return the numbers of the page under stable names."""
     return json_object(
         calibration=data.name,
         flights=data.flights, trained_on=data.trained_on, marks=data.marks, scores=data.scores,
@@ -227,13 +228,13 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
 
 
 def _directions(antenna: AntennaMap) -> FloatArray:
-    """Unit vectors (t, p, 3) of the grid."""
+    """Return unit vectors of the grid, shape (t, p, 3)."""
     t, p = np.radians(antenna.theta_deg)[:, None], np.radians(antenna.azimuth_deg)[None, :]
     return np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
 
 
 def _share_seen(antenna: AntennaMap, within_deg: float = 10.0) -> float:
-    """Share of the sphere within some degrees of a direction that a flight looked in."""
+    """Return the share of the sphere within ``within_deg`` of a direction that a flight measured."""
     grid = _directions(antenna)
     near = np.zeros(grid.shape[:2], bool)
     for part in np.array_split(antenna.flown, max(1, len(antenna.flown) // 500)):
@@ -247,7 +248,7 @@ def _mean(rows: Sequence[Mapping[str, Any]], key: str = "rmse_db") -> float:
 
 
 def _groups(data: CalibrationData) -> Iterator[Places]:
-    """Each antenna over the sphere."""
+    """Yield each antenna over the sphere."""
     for a in data.antennas:
         yield Places(
             name=a.name,
@@ -259,7 +260,7 @@ def _groups(data: CalibrationData) -> Iterator[Places]:
 
 
 def scores_card(data: CalibrationData) -> Card:
-    """Return the card of held-out errors, by what was left out and by flight and channel."""
+    """Return the card of held-out errors, by what was held out and by flight and channel."""
     each = {"as logged": 2, "4 s means": 2}
     baselines = dict.fromkeys(BASELINES.values(), 2)
     rows = {**data.scores, **{f"control: {name}": scores for name, scores in data.controls.items()}}
@@ -280,7 +281,7 @@ def scores_card(data: CalibrationData) -> Card:
     )  # fmt: skip
     every = Table(
         caption="RMSE in dB after the flight's own offset; \"offset of the training flights\": with their mean offset.",
-        columns={"Left out": TEXT, "Flight": HEAD, "Tower": TEXT, "Channel": TEXT, **each,
+        columns={"Held out": TEXT, "Flight": HEAD, "Tower": TEXT, "Channel": TEXT, **each,
                  "offset of the training flights": 2, **baselines, "samples": 0},
         rows=_rows(data.scores, ("flight", "tower", "channel", "rmse_db", "rmse_4s_db", "rmse_shared_offset_db",
                                  *BASELINES, "n")),
@@ -290,7 +291,7 @@ def scores_card(data: CalibrationData) -> Card:
 
 
 def _rows(splits: Mapping[str, Sequence[Mapping[str, Any]]] | None, keys: Sequence[str]) -> list[tuple[Any, ...]]:
-    """Return a row per score: what was left out, then its numbers by key."""
+    """Return a row per score: what was held out, then its numbers by key."""
     known = (splits or {}).items()
     return [(SPLIT_TITLE.get(split, split), *(row[key] for key in keys)) for split, of in known for row in of]
 
@@ -313,9 +314,9 @@ def gains_card(data: CalibrationData) -> Card:
         return Card()
     seen = ", ".join(f"{percent(_share_seen(a))} of the sphere of {a.name}" for a in data.antennas)
     text = (
-        f"Flights saw directions within 10 degrees of {seen}. Elsewhere the gain is a guess, and its standard "
-        "deviation says so. The level is normalised to a mean of 0 dBi over the sphere: it is not identified beside "
-        "the offsets."
+        f"Flights measured directions within 10 degrees of {seen}. Elsewhere the gain is extrapolated, with a large "
+        "standard deviation. The level is normalised to a mean of 0 dBi over the sphere, because offsets can replace "
+        "it."
     )
     shown = Positions(view="places", data=payload(list(_groups(data))))
     return Card(title="Gain of the antennas", positions=shown, text=[text])
@@ -324,7 +325,7 @@ def gains_card(data: CalibrationData) -> Card:
 def ground_card(data: CalibrationData) -> Card:
     """Return the card of the likelihood of a coherent ground ray."""
     table = Table(
-        caption="Log likelihood of a coherent ground ray against none, by height of roughness (0: a mirror).",
+        caption="Log likelihood of a coherent ground ray against none, by height of roughness (0: smooth).",
         columns={"roughness": RIGHT, "log likelihood": 1},
         rows=[(str(row[0]), row[1]) for row in (data.ground or {}).get("rows", ())],
     )  # fmt: skip
@@ -334,10 +335,10 @@ def ground_card(data: CalibrationData) -> Card:
 def rank_card(data: CalibrationData) -> Card:
     """Return the card of the receiver's held-out forecasts of the rank."""
     table = Table(
-        caption="A receiver fitted on the other flights; log score in nats per report, less is better; the constant "
-        "forecast is the shares of the flights that were fitted. Total variation: of the expected histogram.",
-        columns={"Left out": TEXT, "Flight": HEAD, "Tower": TEXT, "kappa": 2, "log score": 3, "constant": 3,
-                 "total variation": 3, "agreement": 2, "always the commonest": 2},
+        caption="A receiver fitted on the other flights; log score in nats per report, lower is better. The constant "
+        "forecast has the shares of the training flights. Total variation is that of the expected histogram.",
+        columns={"Held out": TEXT, "Flight": HEAD, "Tower": TEXT, "kappa": 2, "log score": 3, "constant": 3,
+                 "total variation": 3, "agreement": 2, "most frequent rank": 2},
         rows=_rows(data.rank, ("flight", "tower", "kappa", "log_score", "constant_log_score",
                                "total_variation_expected",
                                "agreement", "majority_agreement")),

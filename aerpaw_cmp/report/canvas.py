@@ -1,8 +1,9 @@
-"""Figures of a report: finished arrays in, matplotlib figures out.
+"""Matplotlib figures of a report, drawn from finished arrays.
 
-No pyplot and no global state: every figure is a :class:`matplotlib.figure.Figure` of its own, drawn inside
-:func:`style`. Colours are told apart in grey as well, by lightness, line style, marker or hatch. Clouds of points
-are rasterised and long lines thinned (extremes kept), so that an SVG stays small however long the flight.
+There is no pyplot and no global state: every figure is a separate :class:`matplotlib.figure.Figure`, drawn inside
+:func:`style`. Colours also differ in lightness, line style, marker or hatch, so that they can be distinguished in
+grey. Clouds of points are rasterised and long lines thinned (extremes are retained), so that an SVG of a long flight
+stays small.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Okabe & Ito's palette (jfly.uni-koeln.de/color), chosen here for distinct lightness too
+# Palette of Okabe and Ito (jfly.uni-koeln.de/color), selected for distinct lightness.
 MEASURED = "#56B4E9"
 SECOND = "#7A3FA0"
 SIMULATED = "#111111"
@@ -50,7 +51,7 @@ _RASTER_DPI = 130
 
 @dataclass(frozen=True, slots=True)
 class FigureSpec:
-    """A figure that can be drawn: file name, the function that draws it, and its words where a page shows it."""
+    """A figure to draw: file name, the function that draws it, and its text on a page."""
 
     name: str
     draw: Callable[[], Figure]
@@ -60,7 +61,7 @@ class FigureSpec:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A drawn figure: the picture by format ("png", "svg", "pdf"), and the smaller PNG that a page holds."""
+    """A drawn figure: the picture by format ("png", "svg", "pdf"), and the smaller PNG inside a page."""
 
     spec: FigureSpec
     formats: Mapping[str, bytes]
@@ -77,9 +78,10 @@ _IEEE_WIDTH_IN = 7.16
 
 @contextmanager
 def style(kind: str = "screen") -> Iterator[None]:
-    """The look of every figure, without touching the user's settings.
+    """Apply the look of every figure without changing the settings of the user.
 
-    ``paper``: Times-like letters of the size of an IEEE page once a figure is scaled to its width, fonts embedded.
+    The style ``paper`` embeds fonts and has Times-like letters of the right size when a figure is scaled to the width
+    of an IEEE page.
     """
     import matplotlib
 
@@ -87,12 +89,12 @@ def style(kind: str = "screen") -> Iterator[None]:
         "font.family": "sans-serif",
         "font.sans-serif": ["DejaVu Sans"],
         "font.size": 9.0,
-        "text.usetex": False,  # a matplotlibrc of the working folder, a stranger's perhaps, would run LaTeX
-        "text.parse_math": False,  # names are drawn as they are: a waypoint may be called A_$
+        "text.usetex": False,  # a third-party matplotlibrc in the working folder could run LaTeX
+        "text.parse_math": False,  # a waypoint may be called A_$
         "axes.titlesize": 10.0,
         "axes.titleweight": "bold",
         "axes.titlelocation": "left",
-        "axes.titley": 1.0,  # else every axis is measured for the place of its title
+        "axes.titley": 1.0,  # otherwise every axis is measured for the position of its title
         "axes.spines.top": False,
         "axes.spines.right": False,
         "axes.axisbelow": True,
@@ -106,17 +108,17 @@ def style(kind: str = "screen") -> Iterator[None]:
         "hatch.linewidth": 0.5,
         "figure.dpi": 100.0,
         "savefig.dpi": _RASTER_DPI,
-        "svg.fonttype": "path",  # the page must look the same where the font is missing
-        "svg.hashsalt": "aerpaw-cmp",  # same numbers, same bytes
+        "svg.fonttype": "path",  # the page must look the same if the font is missing
+        "svg.hashsalt": "aerpaw-cmp",  # the same numbers give the same bytes
         "path.simplify": True,
-        "figure.autolayout": False,  # the layout is set here, and is switched off again when it is done
+        "figure.autolayout": False,  # the layout is set here, and is switched off when it is done
         "figure.constrained_layout.use": False,
     }
     if kind == "paper":
         settings |= {
             "font.family": "serif",
             "font.serif": ["Liberation Serif", "Times New Roman", "Nimbus Roman", "DejaVu Serif"],
-            "font.size": 10.3,  # 8 pt once scaled to the width of the page
+            "font.size": 10.3,  # 8 pt after scaling to the width of the page
             "axes.titleweight": "normal",
             "pdf.fonttype": 42,
             "savefig.dpi": 300.0,
@@ -126,7 +128,7 @@ def style(kind: str = "screen") -> Iterator[None]:
 
 
 def subplots(size: tuple[float, float], *shape: int, **options: Any) -> tuple[Figure, Any]:
-    """A figure [inch] whose parts do not overlap, and its axes, as :meth:`matplotlib.figure.Figure.subplots` makes."""
+    """Return a figure whose parts do not overlap, and its axes; ``size`` is in inches."""
     from matplotlib.figure import Figure
 
     fig = Figure(figsize=size, layout="constrained")
@@ -137,18 +139,20 @@ def placed(
     size: tuple[float, float], rows: int, columns: int, *, gap_in: tuple[float, float] = (0.15, 0.4),
     right_in: float = 0.15, bottom_in: float = 0.9, **options: Any,
 ) -> tuple[Figure, Any]:  # fmt: skip
-    """A figure and its axes (rows, columns), all places in inches: to measure a grid takes as long as to draw it.
+    """Return a figure and its axes (rows, columns) at fixed positions.
+
+    Measuring a grid of axes takes as long as drawing it, so all positions are in inches.
 
     Parameters
     ----------
     size : (width, height)
     rows, columns : int
     gap_in : (across, up)
-        Between axes.
+        Distance between axes.
     right_in, bottom_in : float
         Margins, for a colour bar and for a legend.
     options
-        Of :meth:`matplotlib.figure.Figure.subplots`.
+        Options of :meth:`matplotlib.figure.Figure.subplots`.
 
     Returns
     -------
@@ -168,9 +172,10 @@ def placed(
 
 
 def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
-    """The figure in some of :data:`FORMATS`; on paper as wide as two columns of an IEEE page.
+    """Return the figure in some of :data:`FORMATS`.
 
-    Beside them :data:`INLINE`, the same picture of 256 colours at most: a third of the bytes, and the same to the eye.
+    In the style ``paper`` it is as wide as two columns of an IEEE page. The result also contains :data:`INLINE`, the
+    same picture with at most 256 colours, which has a third of the bytes and no visible difference.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.ticker import AutoLocator
@@ -186,30 +191,30 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
         if isinstance(locator, AutoLocator):
             locator.set_params(min_n_ticks=3)
     images = {name: io.BytesIO() for name in formats}
-    # the canvases themselves: Figure.savefig draws everything once more, unseen, before each file
+    # use the canvases, because Figure.savefig draws an additional, hidden figure before each file
     agg = FigureCanvasAgg(fig)
     agg.draw()  # the layout is made here
     picture = Image.fromarray(np.asarray(agg.buffer_rgba())).convert("RGB")
     if "png" in images:
         picture.save(images["png"], "PNG", compress_level=2, dpi=(dots_per_inch, dots_per_inch))
     if INLINE in images:
-        # an octree takes a tenth of the time of a median cut, and fewer pixels are far off; level 9 gains 5 %
+        # an octree needs a tenth of the time of a median cut, and fewer pixels differ much; level 9 saves a further 5 %
         few = picture.quantize(256, method=Image.Quantize.FASTOCTREE)
         few.save(images[INLINE], "PNG", compress_level=6)
-    fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
+    fig.set_layout_engine("none")  # a second layout would cost as much as a drawing
     if "svg" in images:
         from matplotlib.backends.backend_svg import FigureCanvasSVG
 
         FigureCanvasSVG(fig).print_svg(images["svg"], metadata={"Date": None})
     if "pdf" in images:
-        from matplotlib.backends.backend_pdf import FigureCanvasPdf  # loads fontTools: as much as a figure
+        from matplotlib.backends.backend_pdf import FigureCanvasPdf  # loads fontTools, which takes as long as a figure
 
         FigureCanvasPdf(fig).print_pdf(images["pdf"], metadata={"CreationDate": None})
     return {name: file.getvalue() for name, file in images.items()}
 
 
 def render(spec: FigureSpec, formats: Sequence[str] = ("png",), kind: str = "screen") -> Picture:
-    """Draw a figure and forget it; its pictures stay."""
+    """Draw a figure and return its pictures."""
     with style(kind):
         files = save_as(spec.draw(), (*formats, INLINE) if "png" in formats else formats, kind)
     return Picture(spec, {name: files[name] for name in formats}, files.get(INLINE, b""))
@@ -219,7 +224,7 @@ def render(spec: FigureSpec, formats: Sequence[str] = ("png",), kind: str = "scr
 
 
 def seconds_since(time: AnyArray, start: np.datetime64) -> FloatArray:
-    """Instants as seconds after ``start``."""
+    """Return times as seconds after ``start``."""
     return np.asarray((np.asarray(time) - start) / np.timedelta64(1, "s"), dtype=np.float64)
 
 
@@ -227,16 +232,16 @@ _CLOCK_STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200,
 
 
 def _clock_ticks(low_s: float, high_s: float, start: np.datetime64, most: int = 9) -> tuple[FloatArray, list[str]]:
-    """Ticks at round times of day.
+    """Return ticks at round times of day.
 
     Parameters
     ----------
     low_s, high_s : float
         Ends of the axis, seconds after ``start``.
     start : datetime64
-        UTC.
+        Zero of the axis (UTC).
     most : int
-        Ticks at most, about.
+        Approximate largest number of ticks.
 
     Returns
     -------
@@ -257,7 +262,7 @@ def _clock_ticks(low_s: float, high_s: float, start: np.datetime64, most: int = 
 
 
 def time_axis(ax: Axes, start: np.datetime64) -> None:
-    """Label and ticks of a time axis whose curves are drawn, seconds after ``start``: UTC, where the logs have it."""
+    """Set label and ticks of a time axis in seconds after ``start``, in UTC if the logs have it."""
     if not has_wall_clock(start):
         ax.set_xlabel("Time after the first sample [s]")
         return
@@ -268,19 +273,19 @@ def time_axis(ax: Axes, start: np.datetime64) -> None:
 
 
 def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
-    """Indices of at most about ``limit`` samples, with the smallest and largest of each array in each stretch.
+    """Return indices of about ``limit`` samples, with the smallest and largest value of each array in each segment.
 
     Parameters
     ----------
     values : sequence of (n,)
-        Arrays whose extremes must stay; NaN counts as no extreme.
+        Arrays whose extremes are retained; NaN is ignored.
     limit : int
-        Samples wanted.
+        Number of samples.
 
     Returns
     -------
     (m,) int
-        Rising; all of them when n <= limit.
+        Indices in rising order; all of them if n <= limit.
 
     Examples
     --------
@@ -290,7 +295,7 @@ def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
     n = len(values[0])
     if n <= limit:
         return np.arange(n)
-    # each stretch gives two samples per array, its smallest and its largest
+    # each segment yields two samples per array, its smallest and its largest
     per = -(-n // max(1, limit // (2 * len(values))))
     starts = np.arange(0, n, per)
     # a thinned line must end where the flight ends
@@ -304,9 +309,9 @@ def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
 
 
 def thinned(at: FloatArray, values: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
-    """A line (n,) with at most about ``limit`` points that looks the same: both extremes of each stretch are kept.
+    """Return a line (n,) with about ``limit`` points that looks the same.
 
-    NaN in the values breaks the line and is kept as a break.
+    The extremes of each segment are retained. NaN in the values breaks the line, and breaks are retained.
 
     Examples
     --------
@@ -319,14 +324,16 @@ def thinned(at: FloatArray, values: FloatArray, limit: int = POINTS_PER_LINE) ->
 
 
 def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
-    """Rows of a cloud of points that are drawn: all up to ``limit``; of more, evenly spread ones and every extreme.
+    """Return the rows of a cloud of points that are drawn.
+
+    All are drawn up to ``limit``. Larger clouds are thinned evenly, and all extremes are retained.
 
     Parameters
     ----------
     values : (n,)
-        The ordinate, in the order of the abscissa; NaN is no extreme.
+        Ordinate in the order of the abscissa; NaN is ignored.
     limit : int
-        Points wanted.
+        Number of points.
 
     Examples
     --------
@@ -342,16 +349,16 @@ def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
 
 
 def dots(ax: Axes, at: FloatArray, values: FloatArray, size: float = 2.0, **options: Any) -> None:
-    """A cloud of points, thinned and rasterised.
+    """Draw a cloud of points, thinned and rasterised.
 
     Parameters
     ----------
     ax : Axes
     at, values : (n,)
     size : float
-        Of a dot.
+        Size of a dot.
     options
-        Of :meth:`matplotlib.axes.Axes.plot`.
+        Options of :meth:`matplotlib.axes.Axes.plot`.
     """
     rows = cloud(values)
     options = {"marker": ".", **options}
@@ -359,20 +366,20 @@ def dots(ax: Axes, at: FloatArray, values: FloatArray, size: float = 2.0, **opti
 
 
 def runs(mask: BoolArray) -> list[tuple[int, int]]:
-    """Stretches of True as (first, last) indices, both inside.
+    """Return segments of True as (first, last) indices, both included.
 
     Examples
     --------
     >>> runs(np.array([True, False, True, True]))
     [(0, 0), (2, 3)]
     """
-    # zeros at both ends: a stretch that begins or ends with the flight has its edges, too
+    # add zeros at both ends, so that a segment that begins or ends with the flight has two edges
     edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
     return list(zip(np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist(), strict=True))
 
 
 def lonely(level: FloatArray) -> BoolArray:
-    """Finite samples whose neighbours are both missing.
+    """Check whether finite samples have two missing neighbours.
 
     Examples
     --------
@@ -417,12 +424,12 @@ def draw_out_of_coverage(
     bars.set_rasterized(len(spans) > 300)
 
 
-# More spans than this are joined where no eye could part them.
+# With more spans than this, spans closer than a pixel are joined.
 _SPANS = 2000
 
 
 def _apart(spans: list[tuple[int, int]], seconds: FloatArray) -> list[tuple[int, int]]:
-    """Spans with those joined that are nearer than a pixel, where there are very many."""
+    """Join spans that are closer than a pixel if there are more than :data:`_SPANS`."""
     if len(spans) <= _SPANS:
         return spans
     least = float(seconds[-1] - seconds[0]) / _SPANS
@@ -438,16 +445,16 @@ def _apart(spans: list[tuple[int, int]], seconds: FloatArray) -> list[tuple[int,
 def draw_waypoints(
     ax: Axes, waypoints: Iterable[tuple[str, np.datetime64]], start: np.datetime64, *, names: bool = True
 ) -> None:
-    """Vertical lines at the named moments of the flight.
+    """Draw vertical lines at the named times of the flight.
 
     Parameters
     ----------
     ax : Axes
-        Its x axis is seconds.
+        Its x axis is in seconds.
     waypoints : iterable of (str, datetime64)
-        Label and instant of each.
+        Label and time of each waypoint.
     start : datetime64
-        Where its seconds begin.
+        Zero of the x axis.
     names : bool
         Write the labels, too.
     """
@@ -462,7 +469,7 @@ def draw_waypoints(
 
 
 def legend_below(ax: Axes, columns: int = 4) -> None:
-    """A legend under the axes, where it hides no data."""
+    """Draw a legend below the axes, where it hides no data."""
     handles, labels = ax.get_legend_handles_labels()
     if handles:
         ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns, borderaxespad=0.0)
@@ -472,7 +479,7 @@ def legend_below(ax: Axes, columns: int = 4) -> None:
 
 
 def draw_credit(ax: Axes, site: Site) -> None:
-    """Name whose map is drawn, in small type in a corner: in lines, as panels beside each other may be narrow."""
+    """Write the source of the map in a corner, in several lines because panels may be narrow."""
     if site.credit:
         ax.text(
             0.995, 0.005, textwrap.fill(site.credit, 20), transform=ax.transAxes, ha="right", va="bottom", fontsize=5,
@@ -482,7 +489,7 @@ def draw_credit(ax: Axes, site: Site) -> None:
 
 
 def draw_site(ax: Axes, site: Site) -> None:
-    """Forests, trees, buildings, geofences and towers on a plan (east, north) [m].
+    """Draw forests, trees, buildings, geofences and towers on a plan (east, north) [m].
 
     Parameters
     ----------
@@ -507,7 +514,7 @@ def draw_site(ax: Axes, site: Site) -> None:
     }  # fmt: skip
     for label, (polygons, look) in areas.items():
         for number, polygon in enumerate(polygons):
-            # one path of all rings, so that holes stay empty
+            # one path with all rings, so that holes stay empty
             rings = [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
             outline = Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
             ax.add_patch(PathPatch(outline, **look, label=label if number == 0 else None))
@@ -524,13 +531,13 @@ def draw_site(ax: Axes, site: Site) -> None:
 
 
 def draw_tower(ax: Axes, tower: Tower, **look: Any) -> None:
-    """The mark of a tower on a plan."""
+    """Draw the symbol of a tower on a plan."""
     look = {"marker": "^", "markersize": 9, "color": TOWER, "markeredgecolor": "white", "zorder": 5, **look}
     ax.plot(tower.east_m, tower.north_m, linestyle="none", **look)
 
 
 def _draw_crowns(ax: Axes, trees: Trees) -> None:
-    """Crowns to scale, each with a dot where the trunk stands."""
+    """Draw crowns to scale, each with a dot at the trunk."""
     from matplotlib.collections import EllipseCollection
 
     wide, places = trees.crown_diameter_m, np.column_stack([trees.east_m, trees.north_m])
@@ -545,7 +552,7 @@ def _draw_crowns(ax: Axes, trees: Trees) -> None:
 
 
 def plan_axes(ax: Axes) -> None:
-    """Labels and equal scale of a plan."""
+    """Set labels and equal scales of a plan."""
     ax.set_aspect("equal", adjustable="box")
     ax.set(xlabel="East of the site origin [m]", ylabel="North of the site origin [m]")
 
@@ -553,17 +560,17 @@ def plan_axes(ax: Axes) -> None:
 def frame_around(
     ax: Axes, east: FloatArray, north: FloatArray, *, margin: float = 0.08, least_m: float = 60.0, shape: float = 1.0
 ) -> None:
-    """Limits of a plan around points, with a margin and a least extent [m]; ``shape`` is width over height.
+    """Set the limits of a plan around points, with a margin and a minimum extent.
 
     Parameters
     ----------
     ax : Axes
     east, north : (n,)
-        Points [m]; NaN does not count.
+        Points [m]; NaN is ignored.
     margin : float
         Share of the extent on each side.
     least_m : float
-        Least width and height.
+        Minimum width and height [m].
     shape : float
         Width over height of the plan.
     """
@@ -575,25 +582,25 @@ def frame_around(
     east, north = east[good], north[good]
     width = max(float(np.ptp(east)) * (1 + 2 * margin), least_m)
     height = max(float(np.ptp(north)) * (1 + 2 * margin), least_m)
-    # equal scales: what one axis needs, the other gets in proportion
+    # scales are equal, so the other axis grows in proportion
     width, height = max(width, height * shape), max(height, width / shape)
     middle_east, middle_north = (east.min() + east.max()) / 2, (north.min() + north.max()) / 2
     ax.set_xlim(middle_east - width / 2, middle_east + width / 2)
     ax.set_ylim(middle_north - height / 2, middle_north + height / 2)
     for name in (text for text in ax.texts if isinstance(text, Annotation)):
-        # names stand right of and above their towers, and would hang over these two edges
+        # names are to the right of and above their towers, and would cross these two edges
         if name.xy[0] > middle_east + width / 4:
             name.set(x=-6, ha="right")
         if name.xy[1] > middle_north + 0.4 * height:
             name.set(y=-4, va="top")
         if name.xy[0] > middle_east and name.xy[1] < middle_north - 0.4 * height:
-            # the map's credit stands in that corner
+            # that corner contains the credit of the map
             for credit in (text for text in ax.texts if text.get_gid() == "credit"):
                 credit.set(x=0.005, ha="left")
 
 
 def plan_shape(east: FloatArray, north: FloatArray) -> float:
-    """Width over height of the area that points cover, kept between 0.8 and 2."""
+    """Return width over height of the area of points, clipped to 0.8 to 2."""
     good = np.isfinite(east) & np.isfinite(north)
     if not good.any():
         return 1.0
@@ -601,7 +608,7 @@ def plan_shape(east: FloatArray, north: FloatArray) -> float:
 
 
 def beyond(values: FloatArray, low: float, high: float) -> str:
-    """Ends of a colour scale from ``low`` to ``high`` that values pass: its colours mean "or more" there.
+    """Return the ends of a colour scale that values exceed, where a colour means "or more".
 
     Examples
     --------
@@ -613,20 +620,22 @@ def beyond(values: FloatArray, low: float, high: float) -> str:
 
 
 def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither", cax: Any = None) -> Any:
-    """A colour bar that an SVG holds as one picture, without seams; with arrows where values lie beyond.
+    """Return a colour bar that an SVG stores as one picture, without seams.
+
+    It has arrows at ends that values exceed.
 
     Parameters
     ----------
     fig : Figure
     mappable : ScalarMappable
-        What the colours stand for.
+        Object whose colours the bar explains.
     ax : Axes or sequence of Axes
-        Beside which it stands.
+        The bar is drawn next to these axes.
     label : str
     extend : {"neither", "min", "max", "both"}
-        Ends beyond which values lie.
+        Ends that values exceed.
     cax : Axes, optional
-        The bar's own, of a figure that is :func:`placed`.
+        Axes of the bar in a figure that is :func:`placed`.
 
     Returns
     -------
@@ -640,13 +649,13 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
 
 
 def legend_of(ax: Axes, shown: Callable[[str], bool]) -> tuple[list[Any], list[str]]:
-    """Handles and labels of the legend entries that a rule wants."""
+    """Return handles and labels of the legend entries that ``shown`` accepts."""
     pairs = [(handle, label) for handle, label in zip(*ax.get_legend_handles_labels(), strict=True) if shown(label)]
     return [handle for handle, _ in pairs], [label for _, label in pairs]
 
 
 def robust_limits(ax: Axes, levels: Sequence[FloatArray], around: float | None = None) -> None:
-    """Ordinate limits that a few two-ray nulls cannot stretch: the 0.2 to 99.8 % range and a margin."""
+    """Set ordinate limits to the 0.2 to 99.8 % range and a margin, so that a few two-ray nulls do not widen them."""
     values = np.concatenate([level[np.isfinite(level)] for level in levels])
     if not len(values):
         ax.set_ylim(-1.0, 1.0)

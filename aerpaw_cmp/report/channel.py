@@ -1,4 +1,4 @@
-"""Channel along a route as files: NetCDF, arrays for Sionna, a DeepMIMO scenario, MATLAB, a table for an emulator."""
+"""Channel along a route as files: NetCDF, arrays for Sionna, a DeepMIMO scenario, and a table for an emulator."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ..propagation.replay import PathTable, Replay, frequency_responses, impulse
 _LINK, _PORTS = ("time", "tower"), ("rx", "tx")
 _PATH = ("path", *_LINK)
 _SITE, _ARRAY = "site frame, azimuth from east, counter-clockwise", "array frame, from the boresight, counter-clockwise"
-# Dimensions along which the file grows: with each part, and with the link that has most paths.
+# Dimensions along which the file grows with each part, and with the link with most paths.
 _GROWS = ("time", "path")
 
 
@@ -39,15 +39,15 @@ class Along:
     name : str
     poses : Poses
     time_s : (poses,)
-        Since ``start``.
+        Time since ``start`` [s].
     start : datetime64, optional
-        UTC; None of a route that was not flown.
+        Start of the flight (UTC); None for a route that was not flown.
     number : (poses,), optional
-        The number of each pose, if the route has no times.
+        Number of each pose, if the route has no times.
     towers_m : (poses, 3), optional
-        Places of a tower that moves.
+        Positions of a tower that moves [m].
     velocity_mps, tower_mps : (poses, 3), optional
-        Of the UAV where the times say it, and of a tower that moves.
+        Velocity of the UAV, if it follows from the times, and of a tower that moves [m/s].
     remarks : tuple of str
     """
 
@@ -62,7 +62,7 @@ class Along:
     remarks: tuple[str, ...] = ()
 
     def part(self, rows: slice) -> Along:
-        """Some of the poses."""
+        """Return some of the poses."""
         arrays = {"time_s": self.time_s, "number": self.number, "towers_m": self.towers_m,
                   "velocity_mps": self.velocity_mps, "tower_mps": self.tower_mps}  # fmt: skip
         some: Any = {name: None if values is None else values[rows] for name, values in arrays.items()}
@@ -77,18 +77,18 @@ class Channel:
     ----------
     along : Along
     link : str
-        Which link of the flight file.
+        Name of the link in the flight file.
     replay : Replay
     table : PathTable
     summed : {"coherent", "power"}
-        How the level of a link adds up its paths.
+        Sum over the paths of a link that yields its level.
     level_db, level_sd_db : (poses, towers), optional
         Calibrated level and its standard deviation, in the unit of the log.
     level_unit : str
     trained_on : tuple of str
-        SHA-256 of the logs that taught the level.
+        SHA-256 of the logs from which the level was learned.
     offsets_hz : (subcarriers,), optional
-        Of the frequency response.
+        Frequencies of the frequency response relative to the carrier [Hz].
     """
 
     along: Along
@@ -104,22 +104,22 @@ class Channel:
 
     @property
     def carrier_hz(self) -> float:
-        """Carrier of the link."""
+        """Carrier of the link [Hz]."""
         return self.replay.ends.link.carrier_hz
 
     @property
     def doppler_hz(self) -> FloatArray | None:
-        """Doppler shift (paths,); None without a velocity."""
+        """Doppler shift (paths,) [Hz]; None without a velocity."""
         own, other = self.along.velocity_mps, self.along.tower_mps
         return None if own is None else self.table.doppler_hz(self.carrier_hz, own, 0.0 if other is None else other)
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences on what the numbers lack."""
+        """Sentences about limits of the numbers."""
         return [*self.along.remarks, *self.replay.left_out]
 
     def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
-        """Values per path (paths, ...) as (most paths of a link, poses, towers, ...); None of None."""
+        """Return values per path (paths, ...) as (most paths of a link, poses, towers, ...); None remains None."""
         return None if values is None else self.table.by_link(values, self.replay.ends, fill)
 
 
@@ -150,7 +150,7 @@ def channel_dataset(channel: Channel) -> Dataset:
         described["time"] |= {"long_name": "number of the pose: the route has no times", "units": "1"}
     if channel.level_db is not None:
         described["level_db"]["comment"] = f"unit: {channel.level_unit}; the paths and H do not use what was learned"
-        # of the levels alone: no other variable of the file is learned from logs
+        # only the levels are learned from logs, no other variable of the file
         for name in ("level_db", "level_sd_db"):
             described[name][KEY] = " ".join(channel.trained_on)
     return data
@@ -162,7 +162,10 @@ def _face_flags(channel: Channel) -> dict[str, Any]:
 
 
 def _quantities(channel: Channel) -> Iterator[tuple[str, AnyArray | None, tuple[str, ...], str, str]]:
-    """Name, values, dimensions, unit and meaning of each quantity of a file; values are None where it has none."""
+    """Yield name, values, dimensions, unit and meaning of each quantity of a file.
+
+    Values are None for a quantity that the channel does not have.
+    """
     table, replay, of, sd = channel.table, channel.replay, channel.by_link, channel.level_sd_db
     ends, ports, offsets, speed = replay.ends, (*_LINK, *_PORTS), channel.offsets_hz, channel.along.velocity_mps
     cfr = None if offsets is None else frequency_responses(table, ends, offsets)
@@ -209,7 +212,7 @@ def _variable(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: st
     """Return dimensions, values, attributes and encoding of a variable."""
     about = {"long_name": meaning, **({"units": unit} if unit else {})}
     if np.iscomplexobj(values):
-        # digits of a phase do not deflate: level 1 removes only the zeros
+        # digits of a phase cannot be compressed, and level 1 removes the zeros
         return dimensions, values, about, {"complevel": 1, **({"_FillValue": 0.0} if name == "gain" else {})}
     missing: Any = {"i": values.dtype.type(-1), "f": np.nan}.get(values.dtype.kind)
     of_links = dimensions[: len(_PATH)] == _PATH or dimensions == _LINK
@@ -222,24 +225,24 @@ def _variable(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: st
 def write_channel(
     parts: Iterable[Channel], folder: Path, formats: Sequence[str], stages: Stages
 ) -> tuple[list[Path], dict[str, Any]]:
-    """Write parts of a channel that follow each other, each as it comes.
+    """Write consecutive parts of a channel as they come.
 
     Parameters
     ----------
     parts : iterable of Channel
-        One alone where a format is not of :data:`STREAMED`.
+        A single part if a format is not in :data:`STREAMED`.
     folder : Path
     formats : sequence of str
-        Of :data:`FORMATS`.
+        Names of :data:`FORMATS`.
     stages : Stages
-        Times "write".
+        Times the stage "write".
 
     Returns
     -------
     list of Path
-        The file to open of each format.
+        The main file of each format.
     dict
-        What was written, for ``--json``.
+        Summary of the files, for ``--json``.
     """
     poses, paths, omitted = 0, 0, list[Any]()
     with ExitStack() as stack:
@@ -279,7 +282,7 @@ def _netcdf(folder: Path) -> Any:
 
 
 def _arrays(channel: Channel) -> dict[str, Any]:
-    """Gains and delays in Sionna's axis order, and what they belong to."""
+    """Return gains and delays in the axis order of Sionna, with their towers and times."""
     a, tau = impulse_responses(channel.table, channel.replay.ends)
     arrays = {
         "a": a,
@@ -301,9 +304,9 @@ def _write_npz(channel: Channel, folder: Path) -> Path:
 
 
 def _write_csv(channel: Channel, folder: Path) -> Path:
-    """A row per instant and tower: the level of the link, delay and Doppler shift of its strongest path."""
+    """Write a row per time and tower: the level of the link, delay and Doppler shift of its strongest path."""
     path, table, (poses, towers) = folder / "channel.csv", channel.table, channel.replay.has_path.shape
-    # the strongest path of a link comes last, the first of equals
+    # the strongest path of a link comes last; of equal paths, the first one
     order = np.argsort(-(np.abs(table.gain) ** 2).mean(axis=(1, 2)), kind="stable")[::-1]
     strongest = np.full((poses, towers), -1)
     strongest[table.pose[order], table.tower[order]] = order
@@ -315,15 +318,15 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
     shown: dict[str, Any] = {"time": np.repeat(time, towers), "tower": np.tile(channel.replay.towers, poses)}
     shown["gain_db"] = gain_db.ravel().round(3)
     for name, values in (("delay_s", table.delay_s), ("doppler_hz", channel.doppler_hz)):
-        # row -1, of no path, is the appended one
+        # row -1 is the appended NaN of a link without paths
         shown[name] = np.nan if values is None else np.append(values, np.nan)[strongest].ravel()
-    # parts follow each other in one file, which the first one begins
+    # parts are appended to the file that the first part begins
     guarded(pd.DataFrame(shown)).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")
     return path
 
 
 def _write_deepmimo(channel: Channel, folder: Path) -> Path:
-    """A scenario of DeepMIMO 4: towers transmit to the poses, first port to first port, elevations from the zenith."""
+    """Write a scenario of DeepMIMO 4: towers transmit to the poses, port 1 to port 1, elevations from the zenith."""
     table, ends, link = channel.table, channel.replay.ends, channel.replay.ends.link
     scenario = folder / "deepmimo" / (re.sub(r"[^a-z0-9]+", "_", channel.along.name.lower()).strip("_") or "flight")
     scenario.mkdir(parents=True)
@@ -352,7 +355,7 @@ def _write_deepmimo(channel: Channel, folder: Path) -> Path:
 
 
 def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    """Content of params.json that the loader asks for; all else of its device sets has its defaults."""
+    """Return the part of params.json that the loader requires; other settings of its device sets have defaults."""
     sets = {
         f"txrx_set_{number}": {"name": name, "id": number, f"is_{name}": True, "num_points": every,
                                "num_active_points": active, f"is_{'rx' if name == 'tx' else 'tx'}": False}
@@ -363,9 +366,9 @@ def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]
     return {"version": "4.0", "rt_params": rays, "scene": {"num_scenes": 1}, "materials": {}, "txrx_sets": sets}
 
 
-# Writers of a part by the name of their format; each gives the file to open. A NetCDF file grows.
+# Writers of a part by the name of their format, which return the main file. A NetCDF file grows.
 _WRITERS = {"npz": _write_npz, "deepmimo": _write_deepmimo, "csv": _write_csv}
 FORMATS = ("netcdf", *_WRITERS)
 
-# Those that take a channel part by part; the others are held in memory.
+# Formats that are written part by part. Others need the complete channel in memory.
 STREAMED = {"netcdf", "csv"}

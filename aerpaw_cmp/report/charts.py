@@ -1,7 +1,7 @@
-"""Charts that the script of a page draws: marks over two axes, arrays beside plain values; a table of cells.
+"""Charts that the script of a page draws, and the table of serving cells.
 
-A mark is a ``band`` (x, low, high), a ``line`` (x, y) or ``dots`` (x, y, and whiskers low to high). ``rows`` are names
-in place of an ordinate.
+A chart has marks over two axes: a ``band`` (x, low, high), a ``line`` (x, y) or ``dots`` (x, y, and whiskers low to
+high). ``rows`` are names instead of an ordinate.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
     from .against import AgainstSeries
 
 
-# Means of a forecast along the flight: as many as a page can show.
+# Number of means of a forecast along the flight, about one per pixel.
 _FORECAST_COLUMNS = 600
 
-# Curves of a figure are told apart in grey, too.
+# Line styles, so that curves can be distinguished in grey.
 _LINES = ("-", (0, (5, 2)), (0, (1, 1.3)), (0, (6, 2, 1, 2)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
 COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chart:
-    """A chart of a page: its section, its words, and what the script draws."""
+    """A chart of a page: its section, its text, and the content that the script draws."""
 
     section: str
     title: str
@@ -47,7 +47,7 @@ class Chart:
 
 
 def drawn(panels: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Charts of one kind by their titles as a figure, at most three in a row."""
+    """Return charts of one kind by their titles as a figure, at most three in a row."""
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
     fig, axes = placed((9.2, 0.6 + 3.2 * rows), rows, columns, gap_in=(0.7, 0.8))
@@ -74,7 +74,7 @@ def drawn(panels: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 def charts_of(data: ReportData) -> list[Chart]:
-    """Every chart that the data allow, in reading order."""
+    """Return every chart that the data allow, in reading order."""
     charts = []
     for panel in data.rss:
         score = panel.further.detection
@@ -149,7 +149,7 @@ def _costs(models: Sequence[ModelRow]) -> dict[str, Any]:
 
 
 def _predicted(series: AgainstSeries) -> dict[str, Any]:
-    """Levels over time with the band that was predicted."""
+    """Return levels over time with the predicted band."""
     return {
         "x": _time_axis(series.start),
         "y": {"label": "Level [dB]"},
@@ -162,13 +162,13 @@ def _predicted(series: AgainstSeries) -> dict[str, Any]:
 
 
 def _time_axis(start: np.datetime64 | None) -> dict[str, str]:
-    """Abscissa in seconds after an instant, None where it is not known."""
+    """Return the abscissa in seconds after ``start``; without ``start`` the log has relative times."""
     begun = "" if start is None else str(start.astype("datetime64[ms]"))
     return {"label": "" if begun else "Time after the first sample [s]", "start": begun}
 
 
 def flown(data: ReportData) -> list[Chart]:
-    """Measured and simulated levels of every channel of a flight over time, for the page of a map."""
+    """Return measured and simulated levels of every channel of a flight over time, for the page of a map."""
     start, caption = start_of(data), "Ray tracing is drawn less the offset of the channel."
     known = start if has_wall_clock(start) else None
     return [
@@ -185,7 +185,7 @@ def flown(data: ReportData) -> list[Chart]:
 
 
 def _detection(score: DetectionScore) -> dict[str, Any]:
-    """Share of detected samples over the probability that the predicted level gave them."""
+    """Return the share of detected samples against the predicted probability."""
     said, seen, _ = 100.0 * np.array(score.reliability, dtype=np.float64).T
     ends = np.array([0.0, 100.0])
     return {
@@ -199,7 +199,7 @@ def _detection(score: DetectionScore) -> dict[str, Any]:
 
 
 def _forecast(data: ReportData, panel: RankResult) -> dict[str, Any]:
-    """Probability of each rank along the flight, one band upon the other."""
+    """Return the probability of each rank along the flight as stacked bands."""
     assert panel.probability is not None
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
@@ -220,16 +220,16 @@ def _forecast(data: ReportData, panel: RankResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# Cells with a row of their own; the others stand together.
+# Cells with a row of their own. The others are added up.
 MOST_CELLS = 16
 OTHER = "others"
 
 
 def shown_confusion(serving: ServingComparison, most: int = MOST_CELLS) -> tuple[list[str], AnyArray]:
-    """Names and counts (cells, cells + 1) of a matrix that can be read; the last column: no cell predicted.
+    """Return names and counts of a readable matrix, shape (cells, cells + 1); the last column has no predicted cell.
 
-    Cells that neither served nor were predicted are left out. Of more than ``most``, those of fewest samples are added
-    up as "others"; that row and column meet in hits and misses alike, so their cell has no frame.
+    Cells that neither served nor were predicted are not shown. If there are more than ``most``, the cells with fewest
+    samples are added up as "others". That row and column contain hits and misses, so their cell has no frame.
     """
     counts = np.asarray(serving.confusion)
     weight = counts.sum(axis=1) + counts[:, :-1].sum(axis=0)

@@ -1,4 +1,4 @@
-"""diff.html and diff.json: changes between two reports of one flight, and the sentences that say what they mean."""
+"""diff.html and diff.json: changes between two reports of one flight, and sentences about them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from .flight_words import count
 from .page import json_text, write_file
 from .texts import cut, interval, minute, number, short
 
-# Differences up to this count as none: the tables hold four decimals, offsets one.
+# Differences up to this are ignored, because the tables have four decimals, and one for offsets.
 TOLERANCE_DB = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """A named value of either report; None where a report has no such entry."""
+    """A named value of two reports; None if a report has no such entry."""
 
     key: str
     first: Any
@@ -36,7 +36,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputEntry:
-    """A file that either report was made from; ``what`` is added, removed or changed."""
+    """An input file of one of the reports; ``what`` is added, removed or changed."""
 
     role: str
     path: str
@@ -45,7 +45,7 @@ class InputEntry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportSide:
-    """One of the two reports: where it was found, when made, by which version."""
+    """One of the two reports: its folder, when it was made, and by which version."""
 
     folder: str
     flight: str
@@ -60,17 +60,17 @@ class ReportDiff:
     Parameters
     ----------
     settings, versions : tuple of Entry
-        Those that differ.
+        Values that differ.
     inputs : tuple of InputEntry
-        Those that differ.
+        Input files that differ.
     levels, ranks : tuple
-        On common samples.
+        Differences on common samples.
     pooled : PairedDifference, optional
-        RMSE over all links.
+        Difference in RMSE over all links.
     links_first_only, links_second_only : tuple of str
-        Links that one report alone has.
+        Links that only one report has.
     remarks : tuple of str
-        What the comparison could not do, and what looks wrong.
+        Limits of the comparison, and numbers that look wrong.
     """
 
     first: ReportSide
@@ -87,7 +87,7 @@ class ReportDiff:
 
     @property
     def differences(self) -> tuple[str, ...]:
-        """Every way in which numbers differ beyond the tolerance, one clause each; empty: they do not."""
+        """Clauses about numbers that differ by more than the tolerance; empty if there are none."""
         return tuple(_differences(self))
 
 
@@ -116,7 +116,7 @@ def _level_clauses(level: LevelDifference) -> Iterator[str]:
 
 
 def _alone(samples: Overlap) -> str:
-    """Number of samples that are in one report alone, in words."""
+    """Return the number of samples that only one report has, as text."""
     sides = ((samples.only_first, "first"), (samples.only_second, "second"))
     return ", ".join(f"{counted(n, 'sample')} only in the {name}" for n, name in sides if n)
 
@@ -131,14 +131,14 @@ def _rank_clauses(rank: RankDifference) -> Iterator[str]:
 
 
 def diff_metrics(diff: ReportDiff) -> dict[str, Any]:
-    """Everything as plain JSON: verdict, differences, and the fields of the record."""
+    """Return verdict, differences and the fields of the record as plain JSON values."""
     return json_object(
         verdict=verdict(diff), differs=bool(diff.differences), differences=diff.differences, **fields_of(diff)
     )
 
 
 def diff_page(diff: ReportDiff) -> str:
-    """Return the whole page."""
+    """Return the page."""
     first, second = diff.first, diff.second
     both = "" if second.flight == first.flight else f" and {second.flight}"
     made = [f"{side.folder}, made {minute(side.generated)} by {side.version}." for side in (first, second)]
@@ -159,7 +159,7 @@ def numbers_card(diff: ReportDiff) -> Card:
 
 
 def _both(pair: Any, decimals: int) -> str:
-    """Values of the first and of the second report in one cell."""
+    """Return the values of the first and of the second report in one cell."""
     return f"{number(pair.first, decimals)}, {number(pair.second, decimals)}"
 
 
@@ -243,12 +243,12 @@ def _entries(caption: str, entries: Sequence[Entry]) -> Table:
 
 
 def write_diff(diff: ReportDiff, folder: Path) -> list[Path]:
-    """Write ``diff.html`` and ``diff.json``; gives the files, page first."""
+    """Write ``diff.html`` and ``diff.json``, and return the files, the page first."""
     numbers = json_text(diff_metrics(diff))
     return [write_file(folder / "diff.html", diff_page(diff)), write_file(folder / "diff.json", numbers)]
 
 
-# Sentence on two reports, by the verdict of the paired interval. No other sentence of a diff says better or worse.
+# Sentences about two reports, by the verdict of the paired interval. Only they contain "better" and "worse".
 DIFFERENCE = {
     "better": "The second is significantly better: {difference:+.2f} dB {interval} (95 %).",
     "worse": "The second is significantly worse: {difference:+.2f} dB {interval} (95 %).",
@@ -256,12 +256,12 @@ DIFFERENCE = {
     "no interval": "The difference is {difference:+.2f} dB; too few independent samples for an interval.",
 }
 
-# Differences that stand in the first sentence where RMSE agree.
+# Number of differences in the first sentence if the RMSE are equal.
 _NAMED = 2
 
 
 def verdict(diff: ReportDiff) -> str:
-    """The result in one or two sentences."""
+    """Return the result in one or two sentences."""
     changed = {"setting": len(diff.settings), "input": len(diff.inputs), "version": len(diff.versions)}
     listed = ", ".join(counted(n, name) for name, n in changed.items() if n)
     also = f" Changed: {listed}." if listed else " Settings, inputs and versions are the same."
@@ -273,7 +273,7 @@ def verdict(diff: ReportDiff) -> str:
 
 
 def _site_alone(diff: ReportDiff) -> bool:
-    """Check whether all that changed is the site: its key of the flight file, that file, and its own."""
+    """Check whether only the site changed: its key of the flight file, the flight file, and the file of the site."""
     settings = [entry.key.split(".")[0] == "site" for entry in diff.settings]
     inputs = [entry.role.startswith("site file") for entry in diff.inputs]
     others = [entry for entry in diff.inputs if not entry.role.startswith(("site file", "flight file"))]
@@ -281,7 +281,7 @@ def _site_alone(diff: ReportDiff) -> bool:
 
 
 def _numbers(diff: ReportDiff) -> str:
-    """Sentence on the RMSE over all links; where those agree, the first differences."""
+    """Return a sentence about the RMSE over all links, or the first differences if the RMSE are equal."""
     scored, pooled = [level for level in diff.levels if level.rmse.n], diff.pooled
     if pooled is None or all(abs(item.rmse.difference_db) <= TOLERANCE_DB for item in scored):
         more = len(diff.differences) - _NAMED

@@ -1,10 +1,10 @@
-"""Samples along a flight as files that other programs open: ``write_exports(export, folder, formats)``.
+"""Samples along a flight as files for other programs: ``write_exports(export, folder, formats)``.
 
-An :class:`Export` holds one table of points per kind (``rss``, ``rank``): one row per sample with its link, instant,
-place and values, and per value column its unit and meaning. The values are those of ``rss.csv`` and ``rank.csv``,
-rounded as there, with latitude and longitude beside them. A missing number is NaN; a rank of 0 is a code, "no path".
-Each format is one function ``write_X(export, folder)``: NetCDF after CF-1.11, and tracks for Google Earth coloured by
-level, residual and rank (one folder per link and quantity; only the first is switched on; out of coverage is grey).
+An :class:`Export` contains one table of points per kind (``rss``, ``rank``): one row per sample with its link, time,
+position and values, and the unit and meaning of each column. The values are those of ``rss.csv`` and ``rank.csv`` with
+the same rounding, and latitude and longitude. A missing number is NaN; a rank of 0 means "no path". Each format is
+one function ``write_X(export, folder)``: NetCDF after CF-1.11, and tracks for Google Earth coloured by level, residual
+and rank, with one folder per link and quantity, of which the first is visible. Samples out of coverage are grey.
 Maps over a grid are written by :mod:`aerpaw_cmp.maps.export`.
 """
 
@@ -33,14 +33,14 @@ from .columns import DECIMALS, RANK, RSS, Column, tables
 from .flight_data import ReportData, Track
 from .texts import iso_time
 
-# 1 mm.
+# 8 decimals of a degree are 1 mm.
 _DEGREE_DECIMALS = 8
 
-# Units as UDUNITS reads them; those of logs that are not dBm are ratios.
+# Units for UDUNITS; levels of logs that are not in dBm are ratios.
 _UDUNITS = {"": "1", "m": "m", "s": "s", "dBm": DBM}
 
 
-# What names a link.
+# Columns that identify a link.
 LINK = ("flight", "tower", "channel")
 PLACES = {
     "latitude_deg": ("degrees_north", "WGS84 latitude"),
@@ -53,14 +53,14 @@ PLACES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Points:
-    """Samples of one kind.
+    """The samples of one kind.
 
     Parameters
     ----------
     kind : str
         Name of files and layers: ``"rss"``, ``"rank"``.
     table : pandas.DataFrame
-        ``time`` (UTC), :data:`LINK`, unit, :data:`PLACES`, ``columns``; links one below the other, each in time order.
+        ``time`` (UTC), :data:`LINK`, unit, :data:`PLACES`, ``columns``; links follow each other, each in time order.
     columns : tuple of Column
     """
 
@@ -72,14 +72,14 @@ class Points:
         return len(self.table)
 
     def links(self) -> Iterator[tuple[str, str, str, Any]]:
-        """Flight, tower, channel and table of each link, in their order."""
+        """Yield flight, tower, channel and table of each link, in their order."""
         for key, rows in self.table.groupby(list(LINK), sort=False, observed=True):
             yield *map(str, key), rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Export:
-    """Everything that is exported of a flight.
+    """The exported content of a flight.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class Export:
     sets : tuple of Points
     track : Track, optional
     clock : bool
-        Instants are UTC; else they count from 1970-01-01, because the logs have relative times and no origin.
+        True if times are UTC. Otherwise they count from 1970-01-01, because the logs have relative times.
     synthetic : bool
     """
 
@@ -103,7 +103,7 @@ class Export:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Remarks that whoever opens a file must know."""
+        """Remarks for every user of a file."""
         texts = [
             "Heights (up_m) are metres above the ground at the site origin.",
             "A missing number is out of coverage or unknown; a simulated rank of 0 means that there is no path.",
@@ -117,7 +117,7 @@ class Export:
         return tuple(texts)
 
     def towers(self) -> Iterator[tuple[str, float, float, float]]:
-        """Name, latitude, longitude [deg] and height above the ground at the origin [m]."""
+        """Yield name, latitude, longitude [deg] and height above the ground at the origin [m]."""
         for tower in self.site.towers.values():
             latitude, longitude = latitude_longitude(self.site.frame, tower.east_m, tower.north_m)
             yield tower.name, float(latitude), float(longitude), float(tower.position_m[2])
@@ -126,7 +126,7 @@ class Export:
 def points_table(
     kind: str, flight: str, columns: Sequence[Column], links: Iterable[tuple[Any, dict[str, Any]]], frame: SiteFrame
 ) -> Iterator[Points]:
-    """The points of the links of a flight one below the other; nothing without links.
+    """Yield the points of the links of a flight; yields nothing without links.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def points_table(
     flight : str
     columns : sequence of Column
     links : iterable of (times, dict)
-        Instants (n,) of a link and its further columns: arrays (n,), or one value for all rows.
+        Times (n,) of a link and its further columns: arrays (n,), or one value for all rows.
     frame : SiteFrame
 
     Yields
@@ -166,7 +166,7 @@ def points_table(
 
 
 def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[FloatArray, FloatArray]:
-    """WGS84 latitude and longitude [deg] of positions (n,), NaN where a position is unknown."""
+    """Return WGS84 latitude and longitude of positions (n,) [deg], NaN if a position is unknown."""
     known = np.isfinite(east_m) & np.isfinite(north_m)
     latitude, longitude = frame.to_geographic(np.where(known, east_m, 0.0), np.where(known, north_m, 0.0))
     return (
@@ -179,7 +179,7 @@ def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[Flo
 
 
 def of_report(data: ReportData) -> Export:
-    """The samples of a flight."""
+    """Return the samples of a flight."""
     kinds = {"rss": tables(RSS, data.rss), "rank": tables(RANK, data.rank)}
     sets = tuple(p for kind, of in kinds.items() for p in points_table(kind, data.flight, *of, data.site.frame))
     times = [points.table["time"].to_numpy() for points in sets] + ([] if data.track is None else [data.track.time])
@@ -191,7 +191,7 @@ def of_report(data: ReportData) -> Export:
     )  # fmt: skip
 
 
-# Stands for a missing code in NetCDF; attribute ``_FillValue``.
+# Code of a missing value in NetCDF (attribute ``_FillValue``).
 _NO_CODE = -1
 
 
@@ -199,7 +199,7 @@ _TITLES = {"rss": "Received level, measured and replayed", "rank": "Channel rank
 
 
 def write_netcdf(export: Export, folder: Path) -> list[Path]:
-    """``<kind>.nc``: trajectories as a contiguous ragged array, one per link."""
+    """Write ``<kind>.nc``: trajectories as a contiguous ragged array, one per link."""
     paths = []
     for points in export.sets:
         path = folder / f"{points.kind}.nc"
@@ -209,7 +209,7 @@ def write_netcdf(export: Export, folder: Path) -> list[Path]:
 
 
 def _points_dataset(export: Export, points: Points) -> Dataset:
-    """The samples of one kind as variables with dimensions trajectory (links) and obs."""
+    """Return the samples of one kind as variables with dimensions trajectory (links) and obs."""
     links = list(points.links())
     texts = {
         "link": ("flight, tower and channel", [f"{f} {f'{t} {c}'.strip()}" for f, t, c, _ in links]),
@@ -245,7 +245,7 @@ def _points_dataset(export: Export, points: Points) -> Dataset:
 
 
 def _seconds(export: Export, times: Any) -> tuple[Any, dict[str, str]]:
-    """Seconds after the first whole second, and their attributes."""
+    """Return seconds after the first whole second, and their attributes."""
     known = times[~np.isnat(times)]
     start = known.min().astype("datetime64[s]") if len(known) and export.clock else np.datetime64("1970-01-01", "s")
     attributes = {
@@ -262,7 +262,7 @@ def _seconds(export: Export, times: Any) -> tuple[Any, dict[str, str]]:
 
 
 def _values(column: Column, values: Any) -> tuple[Any, ...]:
-    """Values, attributes and encoding of a quantity or of codes."""
+    """Return values, attributes and encoding of a quantity or of codes."""
     shared = {"long_name": column.meaning, "coordinates": "time latitude longitude up", "grid_mapping": "crs"}
     if column.flags:
         codes = np.where(np.isfinite(values), values, _NO_CODE).astype(np.int8)
@@ -273,7 +273,7 @@ def _values(column: Column, values: Any) -> tuple[Any, ...]:
     return values, {**shared, "units": unit, **comment}, {"_FillValue": np.nan}
 
 
-# Points of all coloured lines together: more, and Google Earth gets slow.
+# Largest number of points of all coloured lines, because Google Earth becomes slow with more.
 POINTS = 24_000
 TRACK_POINTS = 5_000
 
@@ -292,7 +292,7 @@ class _Shown:
 
 
 def write_kmz(export: Export, folder: Path) -> list[Path]:
-    """``samples.kmz``."""
+    """Write ``samples.kmz``."""
     shown = list(_shown(export))
     scales = {item.scale.key: item.scale for item in shown}
     budget = POINTS // max(1, len(shown))
@@ -316,14 +316,14 @@ def _shown(export: Export) -> Iterator[_Shown]:
         points = next(item for item in export.sets if item.kind == kind)
         columns = {c.name: c for c in points.columns}
         for (_, tower, channel, rows), (name, scale) in itertools.product(points.links(), scales.items()):
-            if name.startswith("simulated_rank") and rows[name].isna().all():  # a K of other links
+            if name.startswith("simulated_rank") and rows[name].isna().all():  # that K belongs to other links
                 continue
             shown = f"{tower} {channel}".strip() + f", {_LEVELS.get(name, columns[name].meaning)}"
             yield _Shown(name=shown, column=columns[name], scale=scale, rows=rows)
 
 
 def _styles(scale: Scale) -> str:
-    """One line style per colour; KML writes alpha, blue, green, red."""
+    """Return one line style per colour. KML writes alpha, blue, green, red."""
     return "".join(
         f'<Style id="{scale.key}{i}"><LineStyle><color>ff{c[5:7]}{c[3:5]}{c[1:3]}</color><width>4</width></LineStyle>'
         "</Style>"
@@ -340,7 +340,7 @@ def _towers(export: Export) -> str:
 
 
 def _flown(export: Export) -> str:
-    """The flown line: with a clock as a track that the time slider moves along; nothing of less than two places."""
+    """Return the track: with a clock as a track for the time slider, and empty with fewer than two positions."""
     if (line := export.track) is None:
         return ""
     known = np.flatnonzero(np.isfinite(line.east_m) & np.isfinite(line.north_m) & ~np.isnat(line.time))
@@ -360,7 +360,7 @@ def _flown(export: Export) -> str:
 
 
 def _lines(shown: _Shown, budget: int, *, clock: bool, visible: bool) -> Iterator[str]:
-    """A link's lines, one a stretch of one colour."""
+    """Yield the lines of a link, one per segment of one colour."""
     rows = shown.rows[shown.rows["latitude_deg"].notna() & shown.rows["time"].notna()]
     if len(rows) < 2:
         return
@@ -370,7 +370,7 @@ def _lines(shown: _Shown, budget: int, *, clock: bool, visible: bool) -> Iterato
     times, bins = iso_time(rows["time"].to_numpy()), shown.scale.bin_of(values)
     starts = np.flatnonzero(np.concatenate([[True], bins[1:] != bins[:-1]]))
     for first, after in zip(starts, [*starts[1:], len(rows) - 1], strict=True):
-        last = int(after)  # a line ends where the next begins, so that no gap shows
+        last = int(after)  # a line ends where the next one begins, so that there is no gap
         if last <= first:
             continue
         number = int(bins[first])
@@ -382,7 +382,7 @@ def _lines(shown: _Shown, budget: int, *, clock: bool, visible: bool) -> Iterato
 
 
 def _label(shown: _Shown, values: AnyArray, number: int) -> str:
-    """Text of a line's balloon: its values, or the name of its class."""
+    """Return the text of a line: its values, or the name of its class."""
     known = values[np.isfinite(values)]
     if shown.scale.edges is None or not len(known):
         return shown.scale.labels[number]
@@ -400,7 +400,7 @@ def _legend(scale: Scale) -> bytes:
 
 # --- colours ---------------------------------------------------------------------------------------------------------
 
-# Colours of a scale of numbers.
+# Number of colours of a scale of numbers.
 LEVELS = 10
 # Grey: no value.
 OUT = CLASS_COLOURS[0]
@@ -408,7 +408,7 @@ OUT = CLASS_COLOURS[0]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scale:
-    """Colours of one quantity: ``edges`` (m + 1,) between them, or none where its values are classes."""
+    """The colours of one quantity: ``edges`` (m + 1,) between them, or None if its values are classes."""
 
     key: str
     title: str
@@ -417,7 +417,7 @@ class Scale:
     edges: FloatArray | None = None
 
     def bin_of(self, values: FloatArray) -> IntArray:
-        """Number of each value's colour (n,); the last is out of coverage."""
+        """Return the number of the colour of each value (n,); the last is out of coverage."""
         known = np.isfinite(values)
         if self.edges is None:
             number = np.clip(np.nan_to_num(values).astype(np.int64), 0, len(self.colours) - 2) - 1
@@ -435,7 +435,7 @@ RANKS = Scale(
 
 
 def _scales_of(export: Export) -> dict[str, dict[str, Scale]]:
-    """By kind and column: levels share one scale, residuals another, ranks their classes."""
+    """Return scales by kind and column: levels share one scale, residuals another, ranks have classes."""
     scales: dict[str, dict[str, Scale]] = {}
     for points in export.sets:
         names = {c.name for c in points.columns}
@@ -452,7 +452,7 @@ def _scales_of(export: Export) -> dict[str, dict[str, Scale]]:
 
 
 def _level_scale(levels: FloatArray) -> Scale:
-    """Steps of whole numbers between the 2nd and 98th percentile."""
+    """Return steps of whole numbers between the 2nd and 98th percentile."""
     low, high = np.percentile(levels, [2, 98]) if len(levels) else (-100.0, -60.0)
     step = _round_step((high - low) / LEVELS)
     edges = (np.floor(low / step) + np.arange(LEVELS + 1)) * step
@@ -460,7 +460,7 @@ def _level_scale(levels: FloatArray) -> Scale:
 
 
 def _residual_scale(apart: FloatArray) -> Scale:
-    """Symmetric about zero, to the 98th percentile of the size."""
+    """Return a scale symmetric about zero, up to the 98th percentile of the magnitude."""
     most = float(np.percentile(apart, 98)) if len(apart) else 5.0
     step = _round_step(2 * most / (LEVELS - 1))
     edges = (np.arange(LEVELS) - (LEVELS - 1) / 2) * step
@@ -468,11 +468,11 @@ def _residual_scale(apart: FloatArray) -> Scale:
 
 
 def _round_step(step: float) -> float:
-    """The next step up of 1, 2, 5 times a power of ten."""
+    """Round a step up to 1, 2 or 5 times a power of ten."""
     if not step > 0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(step))
-    # a step that is 2 but for rounding must not become 5
+    # a step of 2 with a rounding error must not become 5
     return float(next(m for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9)) * power)
 
 
@@ -490,7 +490,7 @@ def _numbers(key: str, title: str, edges: AnyArray, palette: str) -> Scale:
 
 
 FORMATS = ("kmz", "netcdf")
-# By format: the modules that it needs besides the default installation.
+# Modules that a format needs in addition to the default installation.
 _NEEDS = {"netcdf": ("netCDF4", "xarray")}
 
 ALL = "all"
@@ -498,12 +498,12 @@ FOLDER = "exports"
 
 
 def chosen_formats(names: Iterable[str], known: Iterable[str] = FORMATS) -> tuple[str, ...]:
-    """The formats that a user writes: names of known ones, also joined by commas; ``all`` for every one.
+    """Return the formats that a user names, also joined by commas; ``all`` names every format.
 
     Raises
     ------
     UsageError
-        An unknown name; a format that is named and whose library is not installed.
+        For an unknown name, or a format whose library is not installed.
 
     Examples
     --------
@@ -523,7 +523,7 @@ def chosen_formats(names: Iterable[str], known: Iterable[str] = FORMATS) -> tupl
 
 
 def _missing_module(name: str) -> str:
-    """The module that a format needs and that is not there."""
+    """Return the missing module of a format, or an empty text."""
     return next((module for module in _NEEDS.get(name, ()) if importlib.util.find_spec(module) is None), "")
 
 
@@ -534,11 +534,11 @@ def write_exports(export: Export, folder: Path, formats: Iterable[str], progress
     ----------
     export : Export
     folder : Path
-        Of the results; the folder of the exports is made when missing.
+        Folder of the results; the folder of the exports is created inside.
     formats : iterable of str
-        Of :data:`FORMATS`.
+        Names of :data:`FORMATS`.
     progress : Progress
-        Told of a format whose library is missing (asked for as ``all``).
+        Is called for a format of ``all`` whose library is missing.
 
     Returns
     -------
@@ -548,7 +548,7 @@ def write_exports(export: Export, folder: Path, formats: Iterable[str], progress
     ------
     OSError
         If the disk does not take a file.
-    """
+    """If a file cannot be written.
     pass
     pass
 

@@ -1,4 +1,4 @@
-"""Figures of a flight as files, and both channels of a tower, which a map's page shows too."""
+"""Figures of a flight as files, and both channels of a tower, which the page of a map shows, too."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 
 def figure_specs(data: ReportData) -> list[FigureSpec]:
-    """Every figure that the data allow; where two names became one file name, a number is added."""
+    """Return every figure that the data allow. A number is added to equal file names."""
     used: dict[str, int] = {}
     result = []
     for spec in (*_track_and_level(data), *channel_specs(data), *_ranks(data)):
@@ -79,7 +79,7 @@ def _ranks(data: ReportData) -> Iterator[FigureSpec]:
 
 
 def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
-    """Both channels of each tower in one panel (the paper's Fig. 15)."""
+    """Yield figures with both channels of a tower in one panel (the paper's Fig. 15)."""
     panels = {(panel.tower, panel.channel): panel for panel in data.rss if panel.score.n}
     for pair in data.pairs:
         both = [panels[pair.tower, name] for name in (pair.first, pair.second) if (pair.tower, name) in panels]
@@ -92,7 +92,7 @@ def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
 
 
 def _draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
-    """The way of a tower that moves; its mark stands in the middle of it."""
+    """Draw the track of a tower that moves; its symbol is at the middle of the track."""
     if (way := panel.tower_m) is not None:
         some = spread_out(len(way), POINTS_PER_LINE)
         label = f"way of {panel.tower}"
@@ -100,7 +100,7 @@ def _draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
 
 
 def trajectory(data: ReportData, track: Track) -> Figure:
-    """The flight on the plan of the whole site, and closer, coloured by height."""
+    """Draw the flight on the plan of the site, and enlarged with the height as colour."""
     fig, (site_plan, close) = subplots((9.2, 5.4), 1, 2, width_ratios=(1.0, 1.35))
     draw_site(site_plan, data.site)
     draw_site(close, data.site)
@@ -109,7 +109,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
         _draw_node(site_plan, panel)
         _draw_node(close, panel)
     flown = np.column_stack([track.east_m, track.north_m])
-    some = spread_out(len(flown), POINTS_PER_LINE)  # of a plan the shape counts, not the extremes
+    some = spread_out(len(flown), POINTS_PER_LINE)  # the shape of a plan matters, not its extremes
     site_plan.plot(*flown[some].T, color="#0072B2", linewidth=1.0, label="flight", zorder=4)
     points = close.scatter(
         track.east_m, track.north_m, c=track.up_m, cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,
@@ -119,7 +119,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     frame_around(site_plan, *np.concatenate([flown, *places.values()]).T, least_m=200.0, shape=0.75)
     extent, centre = np.nanmax([*np.ptp(flown, axis=0), 100.0]), np.nanmean(flown, axis=0)
     used = (places[name] for name in used_towers(data))
-    # a tower far from the flight would shrink it to a dot
+    # a tower far from the flight would reduce the flight to a dot
     near = [place for place in used if np.linalg.norm(place - centre) < extent]
     ways = [node.tower_m[:, :2] for node in nodes if node.tower_m is not None]
     frame_around(close, *np.concatenate([flown, *near, *ways]).T)
@@ -139,7 +139,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
 
 
 def altitude(data: ReportData, track: Track) -> Figure:
-    """Height over time, with waypoints and the ground speed below."""
+    """Draw height over time, with waypoints."""
     start = start_of(data)
     seconds = seconds_since(track.time, start)
     fig, ax = subplots((9.2, 2.9))
@@ -156,7 +156,7 @@ def altitude(data: ReportData, track: Track) -> Figure:
 
 
 def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
-    """Measurement as logged, simulation and baselines less their offsets over time, and the residual under them."""
+    """Draw the measured level as logged, simulation and baselines minus their offsets, and the residual over time."""
     start, score = start_of(data), panel.score
     seconds = seconds_since(panel.time, start)
     fig, (ax, below) = subplots((9.2, 5.6), 2, 1, sharex=True, height_ratios=(2.6, 1.0))
@@ -172,7 +172,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
         colour, dashes = BASELINE[name]
         ax.plot(
             *thinned(seconds, _moved(baseline.level_dbm, baseline.offset_db)), color=colour, linestyle=dashes,
-            linewidth=1.2, zorder=2.5 if name == "two_ray" else 3.7,  # its dense fringes would hide the rest
+            linewidth=1.2, zorder=2.5 if name == "two_ray" else 3.7,  # its dense fringes would hide the other lines
             label=f"{pretty(name)} (own offset)",
         )  # fmt: skip
     label = f"ray tracing, {_offset(score.offset_db)}"
@@ -182,7 +182,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
         band = panel.stated.columns(simulated)
         low, high = (band[f"simulated_{end}_dbm"][some] for end in ("low", "high"))
         ax.fill_between(seconds[some], low, high, color=SIMULATED, alpha=0.15, linewidth=0, label="90 % band", zorder=1)
-    alone = lonely(simulated)  # a line shows no single point between two gaps
+    alone = lonely(simulated)  # a line does not show a single point between two gaps
     ax.plot(seconds[alone], simulated[alone], linestyle="none", marker=".", markersize=4, color=SIMULATED)
     draw_waypoints(ax, data.moments, start)
     robust_limits(ax, [measured, simulated])
@@ -210,12 +210,12 @@ def _offset(offset_db: float) -> str:
 
 
 def _moved(level_dbm: FloatArray, offset_db: float) -> FloatArray:
-    """A simulated level among the levels of the log."""
+    """Return a simulated level on the scale of the log."""
     return level_dbm - offset_db if np.isfinite(offset_db) else level_dbm
 
 
 def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssResult]) -> Figure:
-    """Both channels of a tower and the ray tracing over time, spans in which they part shaded (the paper's Fig. 15)."""
+    """Draw both channels of a tower and the ray tracing; segments in which they differ are shaded (Fig. 15)."""
     start, (first, second) = start_of(data), panels
     fig, ax = subplots((9.2, 3.6))
     for span in pair.score.spans:
@@ -240,7 +240,7 @@ def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssR
 
 
 def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: FloatArray, title: str) -> None:
-    """Ranks at their positions: colour and marker differ; 0 has no path, NaN is not drawn.
+    """Draw ranks at their positions, with a colour and a marker for each. NaN is not drawn.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: F
     east, north : (n,)
         Positions [m].
     rank : (n,)
-        0 to 4; NaN unknown.
+        Rank 0 to 4; 0 has no path, NaN is unknown.
     title : str
     """
     draw_site(ax, site)
@@ -264,7 +264,7 @@ def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: F
         ax.scatter(
             east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **style,
             label=f"{'no path' if value == 0 else f'rank {value}'} ({count(number)})",
-            zorder=3.0 + 1.0 / number,  # the rarer a rank, the higher it lies: a few points must not vanish under many
+            zorder=3.0 + 1.0 / number,  # rare ranks lie on top, so that a few points are visible among many
         )  # fmt: skip
     ax.set_title(title)
     handles, labels = legend_of(ax, lambda label: label.startswith(("rank", "no path")))
@@ -276,14 +276,14 @@ def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: F
 
 
 def rank_maps(data: ReportData, panel: RankResult) -> Figure:
-    """Measured rank and the rank of every K along the flight."""
+    """Draw the measured rank and the rank of every K along the flight."""
     maps = [("Measured (reported RI)", panel.measured)]
     maps += [(f"Ray tracing, K = {k_key(k)}", rank.astype(float)) for k, rank in panel.rank.items()]
     columns = 2 if len(maps) > 1 else 1
     rows = -(-len(maps) // columns)
     east, north, _ = panel.position_m.T
     shape = plan_shape(east, north)
-    # title, axis label and a legend of two lines take 1.6 inches
+    # title, axis label and a legend of two lines need 1.6 inches
     fig, axes = subplots((9.2, rows * (3.9 / shape + 1.6)), rows, columns, squeeze=False)
     for ax, (title, rank) in zip(axes.ravel(), maps, strict=False):
         _rank_map(ax, data.site, east, north, rank, title)
@@ -294,7 +294,7 @@ def rank_maps(data: ReportData, panel: RankResult) -> Figure:
 
 
 def rank_histograms(panel: RankResult) -> Figure:
-    """Shares of rank 1 to 4, measured beside every K, with intervals where known."""
+    """Draw the shares of rank 1 to 4, measured and for every K, with intervals if known."""
     fig, ax = subplots((9.2, 3.4))
     reported = int(np.isfinite(panel.measured).sum())
     score = panel.score
@@ -323,13 +323,13 @@ def rank_histograms(panel: RankResult) -> Figure:
 
 
 def _at_label(k: float, fit: RankFit) -> str:
-    """Legend entry of one K."""
+    """Return the legend entry of one K."""
     distance = "" if not np.isfinite(fit.total_variation) else f" (total variation {fit.total_variation:.2f})"
     return f"K = {k_key(k)}{distance}"
 
 
 def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
-    """Measured rank and the rank of every K over time, one row each; SINR and singular values under them."""
+    """Draw the measured rank and the rank of every K over time in rows, above SINR and singular values."""
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
     rows = 1 + len(panel.rank)
@@ -358,7 +358,7 @@ def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
 
 
 def _draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankResult) -> None:
-    """Reported ranks as ticks; those held over from an earlier report are smaller and grey."""
+    """Draw reported ranks as ticks. Ranks held over from an earlier report are smaller and grey."""
     held_over = ~panel.score.staleness.fresh
     for mask, label, colour, size in (
         (~held_over, "measured", "#0072B2", 7),
@@ -372,7 +372,7 @@ def _draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankResult) -> Non
 
 
 def _draw_singular_values(ax: Axes, seconds: FloatArray, panel: RankResult) -> None:
-    """Singular values relative to the largest, with every threshold K."""
+    """Draw singular values relative to the largest, with every threshold K."""
     values = panel.singular_ratio_db
     for column, colour in enumerate(("#111111", "#0072B2", "#9AD0F0")[: values.shape[1]]):
         dots(ax, seconds, values[:, column], color=colour, label=f"σ{chr(0x2082 + column)}/σ₁")
@@ -392,6 +392,6 @@ def _draw_singular_values(ax: Axes, seconds: FloatArray, panel: RankResult) -> N
             zorder=6,
         )
     lowest = [-20 * np.log10(k) for k in panel.rank] + values[np.isfinite(values)].tolist()
-    ax.set_ylim(max(min(lowest, default=-20.0) - 6.0, -110.0), 2.0)  # below -110 dB lies nothing but rounding
+    ax.set_ylim(max(min(lowest, default=-20.0) - 6.0, -110.0), 2.0)  # values below -110 dB are rounding errors
     ax.set_ylabel("Singular value\nover largest [dB]")
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)

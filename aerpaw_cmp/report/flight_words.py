@@ -1,4 +1,4 @@
-"""The sentences of a flight's report: what the numbers say, and the first screen with its four numbers."""
+"""Sentences of a flight's report, and the numbers of its first screen."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from .flight_data import ReportData
 
 
 def filled(texts: Sequence[str], **facts: Any) -> list[str]:
-    """Texts with numbers and names put in."""
+    """Return texts with numbers and names filled in."""
     known = {name: Printed(fact) if isinstance(fact, float) else fact for name, fact in facts.items()}
     return [text.format_map(known) for text in texts]
 
 
 def said_of(verdict: Verdict, table: Mapping[str, tuple[str, str]], **facts: Any) -> str:
-    """Sentence and action that a page's table has for the cause of a verdict; nothing where the table has none."""
+    """Return sentence and next step from a table by the cause of a verdict; empty if the table has no such cause."""
     if verdict.cause not in table:
         return ""
     low, high = verdict.interval
@@ -43,17 +43,17 @@ AS_SET = "as set in flight.yaml"
 
 
 def pretty(name: str) -> str:
-    """A baseline's name in words."""
+    """Return the title of a baseline."""
     return BASELINE_TITLE.get(name, name.replace("_", " "))
 
 
 def with_article(name: str) -> str:
-    """A baseline's name inside a sentence."""
+    """Return the title of a baseline for use inside a sentence."""
     return f"a {pretty(name)}" if name in ("constant", "log_distance") else pretty(name)
 
 
 def count(n: int) -> str:
-    """A whole number, thousands set apart as in the tables.
+    """Return an integer with a separator of thousands, as in the tables.
 
     Examples
     --------
@@ -64,7 +64,7 @@ def count(n: int) -> str:
 
 
 def signed(value: float) -> str:
-    """A number with its sign, as in the tables.
+    """Return a number with its sign, as in the tables.
 
     Examples
     --------
@@ -84,7 +84,7 @@ def _within(value: Interval, bound: str | None) -> str:
 
 
 def headline(data: ReportData) -> str:
-    """One paragraph: what was compared with what."""
+    """Return the paragraph about the compared flight, towers and samples."""
     parts = []
     if data.rss:
         towers = list(dict.fromkeys(panel.tower for panel in data.rss))
@@ -95,20 +95,20 @@ def headline(data: ReportData) -> str:
         samples = sum(len(panel.time) for panel in data.rank)
         parts.append(f"channel rank at {_listed([panel.tower for panel in data.rank])} ({counted(samples, 'sample')})")
     if not parts:
-        return "This flight holds no radio measurement that could be compared; only its track and inputs are shown."
+        return "This flight has no radio measurement that can be compared; only its track and inputs are shown."
     engine = "" if data.engine is None else f" by the {data.engine.engine} engine"
     kind = "A synthetic" if data.synthetic else "The"
     return f"{kind} flight {data.flight} was replayed{engine} at {data.site.name} and compared: {' and '.join(parts)}."
 
 
-# --- the first words -----------------------------------------------------------------------------------------------
+# --- summary -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judged:
-    """Ray tracing against one baseline: pooled RMSE [dB], and on how many channels a paired interval decides.
+    """The comparison of ray tracing with one baseline: pooled RMSE [dB], and numbers of channels.
 
-    ``judged`` channels have an interval; on ``better`` and ``worse`` of them it excludes zero.
+    ``judged`` channels have an interval. It excludes zero on ``better`` and on ``worse`` of them.
     """
 
     ray_db: float
@@ -121,10 +121,10 @@ class Judged:
     unit: str = "channels"
 
 
-# What may follow the two errors, and when: the first whose condition holds. No other sentence says better or worse.
+# Sentences after the two errors; the first whose condition is true is used. Only they contain "better" and "worse".
 SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
     (lambda f: not f.name, "No baseline could be scored."),
-    (lambda f: not f.judged, "The flight is too short to tell the two apart."),
+    (lambda f: not f.judged, "The flight is too short to distinguish them."),
     (lambda f: f.better > 0 and f.worse > 0,
      "Ray tracing is significantly better on {better} and worse{of} (95 %)."),
     (lambda f: f.worse > 0, "Ray tracing is significantly worse{of} (95 %)."),
@@ -132,7 +132,7 @@ SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
     (bool, "The difference is not significant{of} (95 %)."),
 )  # fmt: skip
 
-# Sentence on the ranking of settings, by what the intervals say of those behind the first.
+# Sentences about a ranking of settings, by the verdicts of the intervals of all settings but the first.
 RANKING: tuple[tuple[Callable[[set[str]], bool], str], ...] = (
     (lambda said: said == {"no interval"}, "Too few flights for an interval of the difference to another setting."),
     (lambda said: said == {"worse"}, "Every other setting is significantly worse (95 %)."),
@@ -141,18 +141,18 @@ RANKING: tuple[tuple[Callable[[set[str]], bool], str], ...] = (
 
 
 def ranking_sentence(verdicts: Mapping[str, str], most: int) -> str:
-    """Sentence on what the intervals say of the settings behind the first, by name; at most ``most`` are named."""
+    """Return the sentence about the settings that are not significantly worse; at most ``most`` are named."""
     alike = [name for name, word in verdicts.items() if word != "worse"]
     named = ", ".join(alike[:most]) + (f" and {len(alike) - most} more" if len(alike) > most else "")
     return next(text for holds, text in RANKING if holds(set(verdicts.values()))).format(named=named)
 
 
-NOTHING_COMPARED = "Nothing could be compared: no sample has a measurement, a pose and a path at once."
+NOTHING_COMPARED = "Nothing could be compared: no sample has a measurement, a pose and a path."
 TOO_FEW_COMPARED = "Nothing could be compared: no channel has 20 samples with measurement, pose and path (at most {n})."
 
 
 def first_sentence(facts: Judged) -> str:
-    """The two errors, and what the paired intervals allow to say.
+    """Return the sentence with two errors and the verdict of the paired intervals.
 
     Examples
     --------
@@ -166,7 +166,7 @@ def first_sentence(facts: Judged) -> str:
     return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{baseline}. {significance}"
 
 
-# What the interval over all channels says: error, best baseline, interval. ``no interval`` has none.
+# Sentences by the verdict over all channels, with error, best baseline and interval.
 _DECIDED = {
     "better": "Ray tracing (RMSE {ray}) is {size:.2f} dB better than {name} {ends}{over} (95 %).",
     "worse": "Ray tracing (RMSE {ray}) is {size:.2f} dB worse than {name} {ends}{over} (95 %).",
@@ -174,12 +174,12 @@ _DECIDED = {
         "Ray tracing: RMSE {ray}; {name}: {other}. The difference {ends}{over} is not significant (95 %)."
     ),
     "equal": "Ray tracing (RMSE {ray}) and {name} differ by less than 0.01 dB{over} (95 %).",
-    "no interval": "Ray tracing: RMSE {ray}; {name}: {other}. The flight is too short to tell the two apart.",
+    "no interval": "Ray tracing: RMSE {ray}; {name}: {other}. The flight is too short to distinguish them.",
 }
 
 
 def flight_sentence(verdict: FlightVerdict, floor_db: float | None = None) -> str:
-    """The error of ray tracing, and what the interval over all channels says of the best baseline.
+    """Return the error of ray tracing and its comparison with the best baseline over all channels.
 
     Examples
     --------
@@ -203,8 +203,8 @@ def flight_sentence(verdict: FlightVerdict, floor_db: float | None = None) -> st
 
 
 def expected_sentence(panels: Sequence[RssResult]) -> str:
-    """The error to expect on another flight; nothing unless every scored channel has it from flights left out."""
-    # a receiver that can lose its lock has the error with its floor, too, and that is its error
+    """Return the expected error on another flight; empty unless all scored channels have errors of held-out flights."""
+    # for a receiver that can lose its lock, the error with its floor counts
     given = [panel.further.elsewhere or {} for panel in panels]
     known = [entry.get("floor_rmse_db", entry.get("rmse_db", math.nan)) for entry in given]
     error = math.sqrt(sum(value**2 for value in known) / len(known)) if known else math.nan
@@ -214,20 +214,20 @@ def expected_sentence(panels: Sequence[RssResult]) -> str:
 NO_CAUSE = "No likely cause was identified."
 FEW_SAMPLES = "No cause can be identified in fewer than {n} samples."
 TWO_LEVELS = "No cause can be identified: the log has two levels only."
-ONE_PLACE = "No model predicts a change of 1 dB, as at one place: this flight tells no models apart."
-BEYOND_SPAN = "No error can be given: the best offset lies beyond the searched span."
-BEYOND = "The best offset of {name} lies beyond the searched span."
+ONE_PLACE = "No model predicts a change of 1 dB during this flight, so models cannot be distinguished."
+BEYOND_SPAN = "There is no error to report: the best offset is outside its search range."
+BEYOND = "The best offset of {name} is outside its search range."
 
 
 def instants(time: AnyArray, span: ErrorSpan) -> tuple[np.datetime64, np.datetime64]:
-    """Begin and end of a span of a series that was sampled at these times (n,)."""
+    """Return begin and end of a segment of a series with these sample times (n,)."""
     first = time.min()
     begin, end = (first + np.timedelta64(round(seconds * 1e9), "ns") for seconds in (span.start_s, span.end_s))
     return begin, end
 
 
 def audit_summary(audit: AuditResult) -> str:
-    """The audit in a few sentences: the card, the page, the terminal and metrics.json have these words alone.
+    """Return the summary of the audit for page, terminal and metrics.json.
 
     Parameters
     ----------
@@ -247,25 +247,25 @@ def audit_summary(audit: AuditResult) -> str:
         texts.append(f"Checks failed: {count(len(fields.failures))}.")
     if audit.read_from_cache_of:
         day = audit.read_from_cache_of
-        texts.append(f"Read from the cache of {day}, made of the same inputs; --audit makes it anew.")
+        texts.append(f"Read from the cache of {day} for the same inputs; --audit computes it again.")
     return " ".join(texts)
 
 
 def audit_paths(audit: AuditResult) -> str:
-    """Paths that one engine alone has, and the level that they make: half a sentence of the card and of the summary."""
+    """Return a clause about paths that only one engine found, and about their effect on the level."""
     parts = [f"{counted(audit.missing_paths, 'path')} missing"]
     if audit.extra_paths:
         tested = audit.fields is not None and not audit.fields.phantom_paths
         parts.append(
-            f"{count(audit.extra_paths)} only in our engine ({audit.reference} did not sample them"
-            + ("; each passed a second test)" if tested else ")")
+            f"{count(audit.extra_paths)} that {audit.reference} did not sample"
+            + (" (each passed a second test)" if tested else "")
         )
     if math.isfinite(audit.rss_max_error_db):
         parts.append(f"RSS of the two engines within {audit.rss_max_error_db:.2g} dB")
     return ", ".join(parts)
 
 
-# Outlying samples that move an RMSE by more than this [dB] are named.
+# Outliers that change an RMSE by more than this are named [dB].
 _MOVED_DB = 0.3
 
 
@@ -274,7 +274,7 @@ def _listed(names: list[str]) -> str:
 
 
 def verdicts(rss: Sequence[RssResult], rank: Sequence[RankResult]) -> list[str]:
-    """One or two sentences per panel: how well the ray tracing predicts, and against what."""
+    """Return one or two sentences per series about the error of ray tracing and of baselines."""
     return [rss_verdict(panel) for panel in rss] + [rank_verdict(panel) for panel in rank]
 
 
@@ -305,7 +305,7 @@ def models_verdict(models: Sequence[ModelRow]) -> str:
 
 
 def training_sentence(names: Sequence[str], what: str) -> str:
-    """First words of a report on a log that something was learned from: no error of it is a prediction's."""
+    """Return the summary of a report on a training log, whose errors are not those of a prediction."""
     of = _listed(list(names)) if len(names) < 3 else f"{len(names)} channels"
     were = "was" if what == "the receiver" else "were"
     return (
@@ -320,12 +320,14 @@ def _learned_from(digests: Sequence[str]) -> str:
 
 
 def rss_verdict(panel: RssResult) -> str:
-    """Sentences on how well one channel is predicted, and whether the baselines do better."""
+    """Return sentences about the error of one channel and of the baselines."""
     if panel.training:
         return training_sentence([panel.name], "the antennas") + _learned_from(panel.further.trained_on or ())
     score = panel.score
     if score.n == 0 or not math.isfinite(score.rmse_db):
-        return f"{panel.name}: nothing to score; {counted(len(panel.time), 'sample')} out of coverage on one side."
+        return (
+            f"{panel.name}: nothing to score, because all of {counted(len(panel.time), 'sample')} are out of coverage."
+        )
     text = (
         f"{panel.name}: RMSE of ray tracing {score.rmse_db:.1f} dB"
         f"{_within(score.rmse_ci95_db, panel.further.rmse_bound)} "
@@ -343,22 +345,22 @@ def rss_verdict(panel: RssResult) -> str:
 
 
 def _detection_words(panel: RssResult) -> str:
-    """Sentences added for a receiver that loses its lock or ends at a floor: both parts of its score."""
+    """Return sentences about the detection of a receiver that loses its lock or ends at a floor."""
     score = panel.further.detection
     if score is None:
         return ""
     floor = f"{Printed(score.floor_db):.0f}"
     return (
         f" The receiver detected the signal in {100 * score.n_detected / score.n:.0f} % of "
-        f"{counted(score.n, 'sample')}: the Brier score is {score.brier:.2f} by the predicted level "
-        f"({learned_on(score)}), {score.constant_brier:.2f} by "
+        f"{counted(score.n, 'sample')}: the Brier score of the predicted level is {score.brier:.2f} "
+        f"({learned_on(score)}), and {score.constant_brier:.2f} for "
         f"that share alone. With lower levels counted as {floor}: RMSE {score.rmse_db:.1f} dB (free space: "
         f"{score.free_space_rmse_db:.1f} dB)."
     )
 
 
 def learned_on(score: DetectionScore) -> str:
-    """Origin of a probability of detection, in words."""
+    """Return the origin of a probability of detection as text."""
     return {
         "other flights": "learned on other flights",
         "held-out segments": "learned in other segments of this flight",
@@ -366,44 +368,44 @@ def learned_on(score: DetectionScore) -> str:
 
 
 def _snr_words(panel: RssResult) -> str:
-    """Sentence added for a ratio to the noise: its error with nothing fitted."""
+    """Return the sentence about a signal-to-noise ratio, whose error is stated without a fitted offset."""
     snr = panel.further.snr
     if snr is None:
         return ""
     return (
-        f" As a signal-to-noise ratio over {snr.noise_dbm:.1f} dBm of noise, nothing fitted, it is "
-        f"{signed(snr.mean_error_db)} dB from the replay in the mean ({snr.rmse_db:.1f} dB RMSE)."
+        f" As a signal-to-noise ratio over {snr.noise_dbm:.1f} dBm of noise, without a fitted offset, its mean difference "
+        f"from the replay is {signed(snr.mean_error_db)} dB (RMSE {snr.rmse_db:.1f} dB)."
     )
 
 
 def rank_verdict(panel: RankResult) -> str:
-    """Sentence on the K that comes nearest to the modem, and how near."""
+    """Return the sentence about the K whose ranks are closest to those of the modem."""
     k = nearest_k(panel)
     if k is None:
-        return f"{panel.tower} rank: nothing to score; no sample has both a reported rank and a simulated one."
+        return f"{panel.tower} rank: nothing to score, because no sample has both a reported and a simulated rank."
     best, logs = panel.score.simulated[k], panel.further.trained_on
     learned = f" {training_sentence([panel.tower], 'the receiver')}{_learned_from(logs)}" if logs else ""
-    agree = f" and agrees pose by pose in {100 * best.agreement:.0f} %" if math.isfinite(best.agreement) else ""
+    agree = f" and agrees per position in {100 * best.agreement:.0f} %" if math.isfinite(best.agreement) else ""
     kappa = f" (kappa {best.kappa:.2f}; 0 is chance{_kappa_references(panel)})" if math.isfinite(best.kappa) else ""
     return (
-        f"{panel.tower} rank: of the K shown, K = {k:.10g} comes nearest to the reported distribution "
+        f"{panel.tower} rank: of the tested K, K = {k:.10g} is closest to the reported distribution "
         f"(total variation {best.total_variation:.2f}){agree}{kappa}.{_ground_error(panel, k)}{learned}"
     )
 
 
 def _ground_error(panel: RankResult, k: float) -> str:
-    """Sentence on how far the agreement hangs on a ground that is known at points alone."""
+    """Return the sentence about the effect of a ground that is known only at some points."""
     sd = (panel.further.agreement_sd_by_ground or {}).get(f"{k:g}")
     if sd is None:
         return ""
     return (
-        f" Grounds within the errors of the known heights change the agreement by +-{100 * sd:.0f} percentage points "
-        "(one standard deviation): smaller differences say nothing."
+        f" Errors of the known ground heights change the agreement by +-{100 * sd:.0f} percentage points "
+        "(one standard deviation), so smaller differences are not significant."
     )
 
 
 def nearest_k(panel: RankResult) -> float | None:
-    """The K whose distribution comes nearest to the reported one; None where nothing could be scored."""
+    """Return the K whose distribution is closest to the reported one, or None if nothing could be scored."""
     distance = {
         k: fit.total_variation for k, fit in panel.score.simulated.items() if math.isfinite(fit.total_variation)
     }
@@ -411,59 +413,59 @@ def nearest_k(panel: RankResult) -> float | None:
 
 
 def _kappa_references(panel: RankResult) -> str:
-    """Agreement that needs no model, and the one that the modem's agreement with itself allows, in words."""
+    """Return clauses about the agreement of a constant guess, and of the modem with itself."""
     words = ""
     commonest = panel.further.commonest
     if commonest.rank:
-        words += f"; always saying {commonest.rank} would agree in {100 * commonest.agreement:.0f} %"
+        words += f"; always guessing {commonest.rank} agrees in {100 * commonest.agreement:.0f} %"
     repeat = panel.further.repeat.get("same_heading") or panel.further.repeat.get("any_heading")
     if repeat is not None and repeat.n and math.isfinite(repeat.kappa):
-        words += f"; the modem repeats itself at the same places to kappa {repeat.kappa:.2f}"
+        words += f"; repeated visits of the modem at the same positions have kappa {repeat.kappa:.2f}"
     return words
 
 
 def cautions(data: ReportData) -> list[str]:
-    """Sentences to be known before a number is believed: the list under the first paragraph, gravest first."""
+    """Return warnings about the limits of the numbers, the most serious first."""
     texts = [*data.cautions]
     audit = None if data.engine is None else data.engine.audit
     if audit is not None and audit.fields is not None and audit.fields.failed:
         texts.append(
-            "The audit of the field failed, so no level or rank below can be relied on: "
+            "The audit of the field failed, so levels and ranks are not reliable: "
             + "; ".join(audit.fields.failures[:3])
             + (f"; and {audit.fields.failed - 3} more" if audit.fields.failed > 3 else "")
             + "."
         )
     if data.synthetic:
-        texts.append("The logs are synthetic: they were made by simulation to show the tool, and measure nothing.")
+        texts.append("The logs are synthetic: they were simulated to show the tool and are not a measurement.")
     texts += [f"{text}." for text in data.doubts]
     for panel in data.rss:
         texts += _rss_cautions(panel)
     texts += [
-        f"{panel.name} stays within 1 dB, whatever is predicted: it does not count in the first sentence."
+        f"{panel.name} varies by less than 1 dB, so the summary does not include it."
         for panel in data.rss
         if is_dead(panel) and not all(map(is_dead, data.rss))
     ]
     texts += [
-        f"{panel.name} and {copy.name} hold the same levels: they are one measurement."
+        f"{panel.name} and {copy.name} have the same levels, so they count as one measurement."
         for panel, copy in combinations(data.rss, 2)
         if panel.score.n and np.array_equal(panel.measured_db, copy.measured_db, equal_nan=True)
     ]
     if data.engine is not None and audit is None:
         why = data.engine.not_audited
         texts.append(
-            f"Not audited against Sionna RT: {why}" if why else "The replay was not audited against the other engine."
+            f"Not audited against Sionna RT: {why}" if why else "The replay was not audited against Sionna RT."
         )
     if audit is not None and audit.missing_paths:
         texts.append(audit_summary(audit))
     texts += data.warnings
     rejected = sum(f.rejected for f in data.inputs)
     if rejected:
-        texts.append(f"{counted(rejected, 'log line was', 'log lines were')} rejected; see the account of the inputs.")
+        texts.append(f"{counted(rejected, 'log line was', 'log lines were')} rejected; see the table of inputs.")
     return list(dict.fromkeys(texts))
 
 
-# Closer to the tower's antenna than this a level cannot be compared [m]: the far field of an array of 0.7 m begins at
-# 11 m (2 D^2 / lambda at 3.3 GHz), and a GPS error of 3 m changes the level of free space by more than 2 dB.
+# Levels closer to the antenna of the tower than this cannot be compared [m]. The far field of an array of 0.7 m begins
+# at 11 m (2 D^2 / lambda at 3.3 GHz), and a GPS error of 3 m changes the level of free space by more than 2 dB.
 _NEAR_M = 10.0
 
 
@@ -472,22 +474,22 @@ def _rss_cautions(panel: RssResult) -> list[str]:
     compared = panel.geometry["distance_m"][panel.posed & np.isfinite(panel.measured_db)]
     if (near := int((compared < _NEAR_M).sum())) > 0:
         texts.append(
-            f"{panel.name}: {near} of {counted(len(compared), 'sample')} lie within {_NEAR_M:g} m of the tower's "
-            f"antenna, the nearest at {np.nanmin(compared):.1f} m: too near. In the near field free space does not "
-            "hold, and position errors change the level by several dB. Check the tower's position and antenna_height_m."
+            f"{panel.name}: {near} of {counted(len(compared), 'sample')} are within {_NEAR_M:g} m of the antenna of "
+            f"the tower, the nearest at {np.nanmin(compared):.1f} m. The free-space model is not valid in the near field, and "
+            "position errors change the level by several dB. Check the position of the tower and its antenna_height_m."
         )
     if lock is not None:
         share, floor = 100 - 100 * lock.n_detected / lock.n, f"{Printed(lock.floor_db):.0f}"
         texts.append(
             f"{panel.name} lost its lock in {share:.0f} % of the samples; levels below {floor} {panel.unit} count as "
-            f"{floor} in the first sentence, and as logged in the tables."
+            f"{floor} in the summary, and as logged in the tables."
         )
     if 0 < score.n < FEWEST:
         texts.append(f"{panel.name}: only {counted(score.n, 'sample')} scored, too few for a verdict.")
     if score.n_out_of_coverage > 0.2 * len(panel.time):
         share = 100 * score.n_out_of_coverage / len(panel.time)
-        texts.append(f"{panel.name}: {share:.0f} % of the samples are out of coverage and not part of the RMSE.")
-    if score.rmse_db - further.rmse_without_outliers_db > _MOVED_DB:  # NaN moves nothing
+        texts.append(f"{panel.name}: {share:.0f} % of the samples are out of coverage and not included in the RMSE.")
+    if score.rmse_db - further.rmse_without_outliers_db > _MOVED_DB:  # false for NaN
         without = counted(further.n_outliers, "outlier")
         texts.append(f"{panel.name}: RMSE {further.rmse_without_outliers_db:.1f} dB without {without}.")
     return texts
@@ -496,17 +498,17 @@ def _rss_cautions(panel: RssResult) -> list[str]:
 # Offsets of at least this size, or below zero, are explained [dB].
 _LARGE_OFFSET_DB = 20.0
 
-# Reason of such an offset, by the unit of the log.
+# Reasons of such an offset, by the unit of the log.
 OFFSETS = {
-    "dB re full scale": "the log is relative to full scale, and the offset turns it into dBm",
-    "dB": "the log is a ratio to the noise, and the offset holds the level of that noise",
-    "dBm": "the transmit power, gains or losses of the settings are not those of the flight; RSRP is the level of one "
-    "subcarrier alone",
+    "dB re full scale": "the log is relative to full scale, and the offset converts it to dBm",
+    "dB": "the log is a signal-to-noise ratio, and the offset includes the noise level",
+    "dBm": "the transmit power, gains or losses in flight.yaml are not those of the flight; note that RSRP is the level "
+    "of one subcarrier",
 }
 
 
 def offset_sentences(panels: Sequence[RssResult]) -> list[str]:
-    """Reason of negative and of large offsets, a sentence for each unit of the logs.
+    """Return sentences about the reasons of negative and large offsets, one for each unit.
 
     Examples
     --------
@@ -523,12 +525,12 @@ def offset_sentences(panels: Sequence[RssResult]) -> list[str]:
     ]  # fmt: skip
 
 
-NO_INTERVAL = "no interval can be given"
+NO_INTERVAL = "no interval"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Headline:
-    """One number of the first screen: what it is, its value with unit, its interval or range, its reference."""
+    """One number of the first screen, with its label, interval and reference."""
 
     label: str
     value: str
@@ -536,14 +538,14 @@ class Headline:
     reference: str
 
 
-# Words of a first paragraph at most.
+# Largest number of words of a summary.
 MOST_WORDS = 60
 
 
 def paragraph(data: ReportData) -> str:
-    """First words: error and best baseline, the error on another flight, one cause, one next step.
+    """Return the summary: error and best baseline, expected error on another flight, one cause, one next step.
 
-    Page, terminal and metrics.json have them alike; cautions (:func:`.flight.cautions`) are a list of their own.
+    Page, terminal and metrics.json have the same summary. Warnings (:func:`cautions`) are separate.
     """
     panels = scored(data.rss)
     error = _level_sentence(data.verdict, panels) if panels else _rank_sentence(data.rank)
@@ -555,7 +557,7 @@ def paragraph(data: ReportData) -> str:
         parts = [error, before_flight(data.against.scores), advice]
     elif error:
         none = _without_cause(data.verdict, panels) if panels else ""
-        # the step of such a flight is a wider span, whatever its cause
+        # the next step of such a flight is always a wider search range
         beyond = next((BEYOND.format(name=p.name) for p in data.rss if p.score.at_edge), "")
         cause = beyond or data.cause or none
         parts = [error, expected_sentence(panels), cause, advice]
@@ -574,12 +576,12 @@ def _level_sentence(pooled: FlightVerdict | None, panels: Sequence[RssResult]) -
     return flight_sentence(pooled, next((lock.floor_db for p in panels if (lock := lock_lost(p))), None))
 
 
-# After an error of so few decibels a sentence on its cause reads like a fault.
+# A sentence about causes after an RMSE below this would read like a failure.
 _SMALL_ERROR_DB = 3.0
 
 
 def _without_cause(pooled: FlightVerdict | None, panels: Sequence[RssResult]) -> str:
-    """Return the sentence of a flight without a likely cause; none after a good result."""
+    """Return the sentence of a flight without a likely cause, which is empty after a good result."""
     if is_one_place(panels):
         return ONE_PLACE
     good = pooled is not None and (pooled.rmse_db <= _SMALL_ERROR_DB or pooled.ci95_db[1] < 0.0)
@@ -592,7 +594,7 @@ def _without_cause(pooled: FlightVerdict | None, panels: Sequence[RssResult]) ->
 
 
 def _training(data: ReportData) -> str:
-    """The sentence of a training flight; nothing where nothing was learned from the logs of this one."""
+    """Return the sentence of a training flight; empty if nothing was learned from its logs."""
     for panels, what in ((data.rss, "the antennas"), (data.rank, "the receiver")):
         learned = [panel for panel in panels if panel.further.trained_on]
         if learned:
@@ -602,7 +604,7 @@ def _training(data: ReportData) -> str:
 
 
 def _baseline_sentence(panels: Sequence[RssResult]) -> str:
-    """Sentence on what a model without anything learned leaves on the panels of a training flight."""
+    """Return the sentence about the error of the best baseline on a training flight."""
     errors = baseline_errors([panel for panel in panels if panel.training])
     if not errors:
         return ""
@@ -611,7 +613,7 @@ def _baseline_sentence(panels: Sequence[RssResult]) -> str:
 
 
 def _pooled(panels: Sequence[RssResult]) -> float:
-    """RMSE of the ray tracing over all samples of several series [dB]."""
+    """Return the RMSE of ray tracing over all samples of several series [dB]."""
     return pooled_db([p.score.rmse_db for p in panels], [p.score.n for p in panels])
 
 
@@ -621,7 +623,7 @@ def judge(
     verdicts: Sequence[Mapping[str, str]],
     unit: str = "channels",
 ) -> Judged:
-    """Ray tracing against the baseline that matters most: the best of those that it loses to, else the best of all.
+    """Compare ray tracing with the best baseline that is better than it, or otherwise with the best baseline.
 
     Parameters
     ----------
@@ -630,9 +632,9 @@ def judge(
     baselines_db : mapping of str to float
         Pooled RMSE of each baseline that all series have [dB].
     verdicts : sequence of mapping
-        By baseline, what the paired interval of a series says.
+        Verdict of the paired interval of each series, by baseline.
     unit : str
-        What a series is, in words.
+        Plural name of a series.
 
     Returns
     -------
@@ -648,13 +650,13 @@ def judge(
 
 
 def _most_telling(every: Sequence[Judged]) -> Judged:
-    """The comparison to be said first: the best baseline that ray tracing loses to, else the best one."""
+    """Return the comparison with the best baseline that is better than ray tracing, or with the best baseline."""
     lost = [entry for entry in every if entry.worse > entry.better]
     return min(lost or every, key=lambda comparison: comparison.other_db)
 
 
 def _forecast_of(panel: RankResult) -> ForecastScore | None:
-    """Score of the fitted receiver's forecast of the rank, where there is one."""
+    """Return the score of the rank forecast by the fitted receiver, or None."""
     score = panel.further.receiver
     known = score is not None and math.isfinite(score.kappa) and math.isfinite(score.log_score_gain)
     return score if known else None
@@ -663,7 +665,7 @@ def _forecast_of(panel: RankResult) -> ForecastScore | None:
 def _forecast_sentence(panel: RankResult, score: ForecastScore) -> str:
     return (
         f"Rank at {panel.tower} by the receiver learned on other flights: kappa {score.kappa:.2f} (0 is chance), "
-        f"{_log_score(score)}. It agrees in {100 * score.agreement:.0f} % of samples; always guessing the commonest "
+        f"{_log_score(score)}. It agrees in {100 * score.agreement:.0f} % of samples; always guessing the most frequent rank "
         f"agrees in {100 * score.majority_agreement:.0f} %."
     )
 
@@ -696,14 +698,14 @@ def _rank_sentence(panels: Sequence[RankResult]) -> str:
             agree = f" Per position they agree in {100 * at.agreement:.0f} % of samples{guess}."
             return (
                 f"Rank at {panel.tower} (K = {k:.10g}, best of {len(panel.score.simulated)} thresholds): predicted and "
-                f"reported shares differ by {points(at.total_variation)} in all."
+                f"reported shares differ by {points(at.total_variation)} in total."
                 + (agree if math.isfinite(at.agreement) else "")
             )
     return ""
 
 
 def headlines(data: ReportData) -> list[Headline]:
-    """At most four numbers, each with its interval and what it must be held against."""
+    """Return at most four numbers, each with its interval and its reference."""
     lines = []
     panels = scored(data.rss)
     if panels:
@@ -723,7 +725,7 @@ def headlines(data: ReportData) -> list[Headline]:
 
 
 def _audit(audit: AuditResult) -> Headline:
-    """Failed checks of the audit; paths that the other engine did not sample are no fault of ours."""
+    """Return the failed checks of the audit, which do not include paths that Sionna RT did not sample."""
     fields = audit.fields
     extent = f"{counted(audit.links, 'link')} against {audit.reference}"
     if fields is None:
@@ -783,14 +785,14 @@ def _rank(panel: RankResult, k: float) -> Headline:
         value=points(at.total_variation),
         interval="between predicted and reported shares"
         + (f" (95 %: {100 * low:.0f} to {100 * high:.0f})" if known else ""),
-        reference=f"{agree}; always saying {commonest.rank}: {100 * commonest.agreement:.0f} %"
+        reference=f"{agree}; always guessing {commonest.rank}: {100 * commonest.agreement:.0f} %"
         if commonest.rank
         else agree,
     )
 
 
 def points(share: float) -> str:
-    """A difference of shares in whole percentage points.
+    """Return a difference of shares in percentage points.
 
     Examples
     --------
@@ -801,10 +803,8 @@ def points(share: float) -> str:
 
 
 def before_flight(scores: Mapping[str, Mapping[str, float]]) -> str:
-    """Sentence of a report's first paragraph on the prediction made before the flight; nothing without levels."""
+    """Return the sentence about the prediction made before the flight; empty without levels."""
     if not scores:
         return ""
     error, inside = (float(np.mean([row[key] for row in scores.values()])) for key in ("rmse_db", "coverage_90"))
-    return (
-        f"Predicted before this flight: RMSE {error:.1f} dB; the 90 % band holds {100 * inside:.0f} % of the samples."
-    )
+    return f"Predicted before this flight: RMSE {error:.1f} dB; the 90 % band contains {100 * inside:.0f} % of the samples."

@@ -1,4 +1,4 @@
-"""prediction.html with metrics.json, prediction.csv and prediction.nc; sentences before and after the flight."""
+"""prediction.html with metrics.json, prediction.csv and prediction.nc, and sentences before and after the flight."""
 
 from __future__ import annotations
 
@@ -36,43 +36,52 @@ TITLES = {
     "replay": "ray tracing with the flights' own settings",
     "free space": "free space",
     "none": "a constant level",
-    "memory": "antennas that the site remembers",
+    "memory": "learned antennas of the site",
     "prior": "ray tracing with isotropic antennas, before any flight",
 }
 
 FLAGS = {
-    "outside_flown": "outside the flown places: the standard deviation is that of the model alone",
+    "outside_flown": "outside the flown area: the standard deviation is that of the model alone",
     "out_of_coverage": "no path",
     "no_position": "no position",
 }
 
-# Share of points outside the flown places that the first words name.
+# Share of points outside the flown area above which the summary names it.
 MANY = 0.2
 
-# The chosen model on what was left out, by the paired interval.
+# Sentences about the selected model on held-out data, by the paired interval.
 AGAINST_FREE_SPACE = {
-    "better": ("On {over} left out it is {size:.1f} dB better than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
-    "worse": ("On {over} left out it is {size:.1f} dB worse than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
+    "better": ("On held-out {over} it is {size:.1f} dB better than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
+    "worse": ("On held-out {over} it is {size:.1f} dB worse than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
     "not significant": (
-        "On {over} left out the difference from free space [{low:+.1f}, {high:+.1f}] is not significant (95 %).",
+        "On held-out {over} the difference from free space [{low:+.1f}, {high:+.1f}] is not significant (95 %).",
         "",
     ),
     "no interval": ("The flight is too short for an interval of the difference from free space.", ""),
     "two flights": (
-        "On {over} left out the RMSE differs from free space by {effect:+.1f} dB; two flights give no interval.",
+        "On held-out {over} the RMSE differs from free space by {effect:+.1f} dB; two flights give no interval.",
         "",
     ),
 }
 
-# The residual field, by the interval of the difference of the CRPS; ``off`` where it holds zero.
+# Sentences about the residual field, by the interval of the difference in CRPS; ``off`` if it includes zero.
 FIELD = {
-    "better": ("The residual field is on: it lowers the CRPS by {size:.2f} dB on held-out samples.", ""),
-    "worse": ("The residual field is off: it raises the CRPS by {size:.2f} dB on held-out samples.", ""),
-    "off": ("The residual field is off: the CRPS differs by {size:.2f} dB, not significantly.", ""),
+    "better": (
+        "The residual field (a spatial correction) is on: it lowers the CRPS by {size:.2f} dB on held-out samples.",
+        "",
+    ),
+    "worse": (
+        "The residual field (a spatial correction) is off: it raises the CRPS by {size:.2f} dB on held-out samples.",
+        "",
+    ),
+    "off": (
+        "The residual field (a spatial correction) is off: the CRPS differs by {size:.2f} dB, not significantly.",
+        "",
+    ),
 }
 
-HELD_OUT = "90 % intervals hold {inside:.0f} % of the held-out samples."
-# Stated standard deviations on what was left out, by :func:`~aerpaw_cmp.compare.verdict.stated_errors`.
+HELD_OUT = "90 % intervals contain {inside:.0f} % of the held-out samples."
+# Sentences about the stated standard deviations on held-out data, by :func:`~aerpaw_cmp.compare.verdict.stated_errors`.
 STATED: dict[str, tuple[str, str]] = {
     "none": (HELD_OUT, ""),
     "no interval": ("", ""),
@@ -87,28 +96,29 @@ STATED: dict[str, tuple[str, str]] = {
         "",
     ),
     "biased": (
-        HELD_OUT + " Measured lies {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) above predicted.",
-        "check the gain of the flights that were learned from",
+        HELD_OUT
+        + " The measured level is {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) above the predicted one.",
+        "check the gain of the training flights",
     ),
 }
 
-# The same on the flight that followed.
+# Sentences about the stated standard deviations on the flight after the prediction.
 FLOWN: dict[str, tuple[str, str]] = {
     "none": ("", "`aerpaw-cmp predict` with this flight for the next route"),
-    "no interval": ("Too few samples to judge the intervals.", ""),
+    "no interval": ("There are too few samples to test the intervals.", ""),
     "narrow": (
         "Intervals of {where} are too narrow: errors are {effect:.1f} times as large as stated "
         "(95 %: {low:.1f} to {high:.1f}).",
-        "add this flight to those that are learned from",
+        "add this flight to the training flights",
     ),
     "wide": (
         "Intervals of {where} are too wide: errors are {effect:.1f} times as large as stated "
         "(95 %: {low:.1f} to {high:.1f}).",
-        "add this flight to those that are learned from",
+        "add this flight to the training flights",
     ),
     "biased": (
-        "Likely cause at {where}: another offset, measured {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) "
-        "above predicted.",
+        "Likely cause at {where}: another offset; the measured level is {effect:+.1f} dB "
+        "(95 %: {low:+.1f} to {high:+.1f} dB) above the predicted one.",
         "check transmit power and receiver gain of this flight",
     ),
 }
@@ -119,16 +129,16 @@ EXPECTED = (
     "lie within \u00b1{band:.1f} dB."
 )
 LOCK = "The receiver is in lock for {percent:.0f} % of them (P(lock) of each point: `p_lock` in prediction.csv)."
-REMEMBERED = "No flight is named: antennas and levels are those that the site remembers."
+REMEMBERED = "No flight is named: antennas and levels are those learned at this site."
 OUTSIDE = {
-    "flown": "{percent:.0f} % of the points lie outside the flown places.",
-    "remembered": "{percent:.0f} % of the points lie in directions that the remembered flights hardly saw.",
+    "flown": "{percent:.0f} % of the points are outside the flown area.",
+    "remembered": "{percent:.0f} % of the points are in directions that few training samples have.",
 }
-PLAN = "Next: `aerpaw-cmp plan` names the flight that helps most."
+PLAN = "Next: `aerpaw-cmp plan` finds the flight that reduces the standard deviation most."
 
 
 def heading_words(yaw_deg: FloatArray) -> str:
-    """Heading for which a prediction holds.
+    """Return the heading to which a prediction applies.
 
     Examples
     --------
@@ -149,25 +159,25 @@ def first_words(
     lock: float | None = None,
     origin: str = REMEMBERED,
 ) -> str:
-    """First paragraph of terminal, page and metrics.json: one error with its band, best baseline, one next step.
+    """Return the summary of terminal, page and metrics.json: error with band, best baseline, next step.
 
     Parameters
     ----------
     correction : Correction, optional
-        None: the memory of the site is the source.
+        None if the prediction uses the learned models of the site.
     outside : float
-        Share of points outside the flown places, or in directions that flights hardly saw.
+        Share of points outside the flown area, or in directions with few training samples.
     expected_db : float
-        Stated standard deviation of a mean over 4 s (of a sample, where a receiver loses its lock) on a new flight,
-        root mean square over the points [dB].
+        Stated standard deviation of a mean over 4 s on a new flight, root mean square over the points [dB]. For a
+        receiver that loses its lock it is that of a sample.
     band_db : float
         Half of the 90 % interval of a sample, mean over the points [dB].
     heading : str
-        As :func:`heading_words` has it.
+        Text of :func:`heading_words`.
     lock : float, optional
-        Mean probability of lock, of a receiver that loses it.
+        Mean probability of lock, for a receiver that loses it.
     origin : str
-        Sentence on what predicts, if there is no correction.
+        Sentence about the source of the prediction, if there is no correction.
 
     Returns
     -------
@@ -191,14 +201,14 @@ def first_words(
 
 
 def cautions(correction: Correction, outside: float) -> list[str]:
-    """Sentences under the first paragraph: places never flown, intervals on what was left out, model and field."""
+    """Return warnings about the flown area, intervals on held-out data, model and residual field."""
     texts = filled([OUTSIDE["flown"]], percent=100.0 * outside) if outside > MANY else []
     texts += [_stated(correction).partition(" Next: ")[0], f"Model: {TITLES[correction.base]}."]
     return [text for text in (*texts, said_of(field(correction), FIELD)) if text]
 
 
 def memory_cautions(known: Sequence[tuple[Entry, LearnedSeries]], outside: float) -> list[str]:
-    """The same of a prediction without flights: what the site remembers, by entry."""
+    """Return warnings for a prediction without flights, with the learned models of the site by entry."""
     each: dict[str, list[str]] = {}
     for entry, series in known:
         each.setdefault(entry.about(), []).append(f"{series.tower} {series.channel}")
@@ -207,7 +217,7 @@ def memory_cautions(known: Sequence[tuple[Entry, LearnedSeries]], outside: float
 
 
 def prior_words(carrier_hz: float, power_dbm: float) -> str:
-    """Return the sentence on a prediction before any flight."""
+    """Return the sentence about a prediction before any flight."""
     return (
         f"No flight is known: ray tracing with isotropic antennas, {carrier_hz / 1e9:g} GHz, {power_dbm:g} dBm "
         "transmitted. Next: fly once, then `aerpaw-cmp predict --with flight.yaml`."
@@ -215,7 +225,7 @@ def prior_words(carrier_hz: float, power_dbm: float) -> str:
 
 
 def prior_caution(offset_db: float, antennas_db: float, shadowing_db: float, fading_db: float) -> str:
-    """Return the sentence on the parts of the standard deviation before any flight.
+    """Return the sentence about the parts of the standard deviation before any flight.
 
     Parameters
     ----------
@@ -233,13 +243,13 @@ def prior_caution(offset_db: float, antennas_db: float, shadowing_db: float, fad
 
 
 def _stated(correction: Correction) -> str:
-    """Sentence and step on the stated standard deviations on what was left out."""
+    """Return the sentence and next step about the stated standard deviations on held-out data."""
     error, sd = correction.held_out[correction.base, correction.title]
     return said_of(stated_errors(error, sd), STATED, inside=100.0 * _inside_share(error, sd))
 
 
 def _inside_share(error: FloatArray, sd: FloatArray) -> float:
-    """Share of errors inside their 90 % interval."""
+    """Return the share of errors inside their 90 % interval."""
     good = np.isfinite(error)
     return float(np.mean(np.abs(error[good]) <= 1.6449 * sd[good])) if good.any() else float("nan")
 
@@ -250,7 +260,7 @@ def _against_free_space(correction: Correction) -> Verdict:
         correction.held_out[key][0] for key in ((correction.base, correction.title), ("free space", OFF))
     )
     if len(correction.flights) > 1:
-        # a mean over few flights, as of calibrate: samples of one flight share its offset and its weather
+        # compare by flight, as calibrate does, because samples of one flight share its offset and its weather
         parts = correction.held_out_parts
         verdict = by_flight(_by_part(error, parts), _by_part(free_space, parts))
         return replace(verdict, cause="two flights") if verdict.cause == "no interval" else verdict
@@ -267,7 +277,7 @@ def _by_part(error: FloatArray, parts: Sequence[tuple[str, int]]) -> Iterator[tu
 
 
 def field(correction: Correction) -> Verdict:
-    """CRPS with the best residual field minus that without one."""
+    """Return the difference in CRPS between the best residual field and no residual field."""
     base = correction.base
     title = min((t for b, t in correction.crps_db if b == base and t != OFF), key=lambda t: correction.crps_db[base, t])
     difference = crps_difference(correction.held_out, (base, title))
@@ -277,20 +287,20 @@ def field(correction: Correction) -> Verdict:
 
 
 def against_words(series: Sequence[AgainstSeries], ranks: Mapping[str, ForecastScore]) -> str:
-    """Sentences on what a flight says of the prediction made before it: levels, then ranks by tower."""
+    """Return sentences that compare a prediction with a later flight: levels, then ranks by tower."""
     levels = [after_flight({s.name: s.scores for s in series}, [s.stated for s in series])] if series else []
     return " ".join([*levels, *(rank_after_flight(tower, score) for tower, score in ranks.items())])
 
 
 def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Verdict]) -> str:
-    """Sentences on what a flight says of the prediction made before it.
+    """Return sentences that compare predicted levels with a later flight.
 
     Parameters
     ----------
     scores : mapping of str to mapping
-        By tower and channel.
+        Scores by tower and channel.
     stated : sequence of Verdict
-        Of each, by :func:`~aerpaw_cmp.compare.verdict.stated_errors`.
+        Verdict of :func:`~aerpaw_cmp.compare.verdict.stated_errors` for each of them.
 
     Returns
     -------
@@ -306,7 +316,7 @@ def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Ver
 
 
 def rank_after_flight(tower: str, score: ForecastScore) -> str:
-    """Sentence on what a flight says of the ranks that were predicted before it."""
+    """Return the sentence that compares predicted ranks with a later flight."""
     return (
         f"Rank at {tower}, predicted before this flight: kappa {score.kappa:.2f} (0 is chance), log score "
         f"{score.log_score:.2f}; the mean of the prediction, without positions: {score.constant_log_score:.2f}."
@@ -315,7 +325,7 @@ def rank_after_flight(tower: str, score: ForecastScore) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictionPage(Made):
-    """Content of a page of ``predict``; ``table`` as prediction.csv has it, ``rows`` of candidates and their errors."""
+    """The content of the page of ``predict``; ``table`` has the columns of prediction.csv."""
 
     name: str
     kind: str
@@ -336,25 +346,25 @@ class PredictionPage(Made):
 
     @property
     def levels(self) -> pd.DataFrame:
-        """Rows that have a level, of all towers and channels."""
+        """Rows with a level, of all towers and channels."""
         levels: pd.DataFrame = self.table[self.table["channel"] != "rank"]
         return levels
 
     @property
     def series(self) -> list[tuple[str, pd.DataFrame]]:
-        """Rows of each tower and channel that has levels."""
+        """Name and rows of each tower and channel with levels."""
         each = self.levels.groupby(["tower", "channel"], sort=False, observed=True)
         return [(f"{t} {c}", part) for (t, c), part in each]
 
 
 def outside_share(table: pd.DataFrame) -> float:
-    """Share of the levels with a position that are flagged as outside the flown places."""
+    """Return the share of levels with a position that are outside the flown area."""
     flag = table["flag"][(table["channel"] != "rank") & (table["flag"] != "no_position")]
     return float((flag == "outside_flown").mean())
 
 
 def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
-    """The numbers of the page under stable names."""
+    """Return the numbers of the page under stable names."""
     series = {
         name: {
             "unit": data.units.get(name, ""),
@@ -386,7 +396,7 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
 def prediction_page(data: PredictionPage, numbers: Mapping[str, Any], shown: Mapping[str, Any]) -> Page:
     """Return the page from its numbers; ``shown`` is the data of its map."""
     about = f"Learned from {', '.join(data.flights)}. " if data.flights else ""
-    about += f"Made {minute(data.generated)}. prediction.csv beside this page holds every point."
+    about += f"Made {minute(data.generated)}. prediction.csv in the same folder contains every point."
     return Page(
         kind="prediction", title=data.name, verdict=data.verdict, cautions=data.warnings, about=[about],
         cards=[Card(title="Map", positions=Positions(view="places", data=shown)),
@@ -396,14 +406,14 @@ def prediction_page(data: PredictionPage, numbers: Mapping[str, Any], shown: Map
 
 def _levels_card(numbers: Mapping[str, Any], *, lock: bool) -> Card:
     columns: dict[str, str | int] = {"Tower, channel": HEAD, "Unit": TEXT, "Points": 0, "Level": 1, "SD [dB]": 1,
-                        **({"P(lock)": 2} if lock else {}), "Outside flown places": SHARE}  # fmt: skip
+                        **({"P(lock)": 2} if lock else {}), "Outside flown area": SHARE}  # fmt: skip
     keys = ("unit", "points", "mean_level_db", "mean_sd_db", *(["mean_p_lock"] if lock else []), "share_outside_flown")
     levels = Table(
         caption="Means over all points. The standard deviation is that of one sample.", columns=columns,
         rows=[(name, *(series[key] for key in keys)) for name, series in numbers["series"].items()],
     )  # fmt: skip
     ranks = Table(
-        caption="Mean probability of each rank over all points, by the receiver that flights taught.",
+        caption="Mean probability of each rank over all points, by the learned receiver.",
         columns={"Tower": HEAD, **{f"rank {rank}": 2 for rank in RANKS}},
         rows=[(tower, *share.values()) for tower, share in numbers["ranks"].items()],
     )  # fmt: skip
@@ -414,31 +424,31 @@ def _model_card(data: PredictionPage) -> Card:
     chosen = bold(data.chosen["title"])
     if not data.candidates:
         text = paragraph(
-            "No flight is named:", Markup("{}.").format(chosen), "The standard deviation holds the gains of both "
-            "antennas, the flight's own shadowing, the offset of a new flight and fading.",
+            "No flight is named:", Markup("{}.").format(chosen), "The standard deviation includes the gains of both "
+            "antennas, the shadowing and the offset of a new flight, and fading.",
         )  # fmt: skip
         return Card(title="Model", id="model", text=[text])
     errors = Table(
-        caption=f"Errors of 4 s means on {data.chosen['left_out']} left out, dB; new flights about their own mean.",
+        caption=f"Errors of 4 s means on held-out {data.chosen['left_out']} [dB], without the mean error of each flight.",
         columns={"Model": HEAD, "Residual field": TEXT, "RMSE": 2, "CRPS": 3}, look="dense",
         rows=[(row["base"], row["field"], row["rmse_db"], row["crps_db"]) for row in data.candidates],
     )  # fmt: skip
-    scales = Table(caption="As fitted.", columns={"Name": HEAD, "Value": 2}, rows=list(data.model.items()))
+    scales = Table(caption="Fitted values.", columns={"Name": HEAD, "Value": 2}, rows=list(data.model.items()))
     text = paragraph(
-        "Chosen on what was left out of the named flights:", Markup("{}.").format(chosen),
-        f"Standard deviations are multiplied by {number(data.chosen['sd_factor'], 2)}, the ratio of seen to stated "
-        "errors there.",
+        "Selected by errors on held-out parts of the named flights:", Markup("{}.").format(chosen),
+        f"Standard deviations are multiplied by {number(data.chosen['sd_factor'], 2)}, the ratio of observed to stated "
+        "errors on these parts.",
     )  # fmt: skip
     parts = [Card(title="Residual field: strengths and scales", fold=True, tables=[scales])]
     return Card(title="Model", id="model", text=[text], tables=[errors], parts=parts)
 
 
-# Rows of prediction.csv that are rounded and written together: bounds the memory.
+# Rows of prediction.csv that are written at a time, which limits the memory.
 _ROWS_AT_ONCE = 100_000
 
 
 def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], list[str]]:
-    """Write the page and all files beside it; also what could not be written, and why.
+    """Write the page and its files, and return them with reasons why a file could not be written.
 
     Parameters
     ----------
@@ -503,7 +513,7 @@ def _dataset(data: PredictionPage) -> Dataset:
 
 
 def _groups(data: PredictionPage) -> Iterator[Places]:
-    """Each tower and channel, each receiver of ranks: at each height of a grid, or at all points."""
+    """Yield each tower and channel, and each receiver of ranks, at each height of a grid or at all points."""
     groups: list[tuple[str, dict[str, ArrayLike], pd.DataFrame]] = []
     for name, part in data.series:
         level = {f"level [{data.units.get(name, 'dB')}]": part["level_db"], "standard deviation [dB]": part["sd_db"]}

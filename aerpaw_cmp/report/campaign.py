@@ -34,14 +34,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RssRow:
-    """RSS of one flight, setting, tower and channel.
+    """The RSS of one flight, setting, tower and channel.
 
-    ``offset_db`` and ``rmse_db`` come from this row's own samples; ``pooled_offset_db`` is shared as the campaign's
-    ``calibration`` says, ``pooled_rmse_db`` what it leaves on this row; ``held_out_offset_db`` comes from the other
-    flights of the same setting, tower and channel, ``held_out_rmse_db`` is what that leaves here (NaN without another).
-    ``baselines`` are RMSE [dB] by name, each with an offset of its own; ``span_db`` is that of the
-    offset search. Arrays (n,) are at the samples, NaN where a side is missing; they are kept for the first setting
-    only, elsewhere they are empty and ``difference`` stands for them.
+    ``offset_db`` and ``rmse_db`` come from the samples of this row. ``pooled_offset_db`` is shared as the
+    ``calibration`` of the campaign specifies, and ``pooled_rmse_db`` is the RMSE with it. ``held_out_offset_db`` comes
+    from the other flights of the same setting, tower and channel, and ``held_out_rmse_db`` is the RMSE with it (NaN
+    without another flight).
+    ``baselines`` are RMSE by name [dB], each with its own offset. ``span_db`` is the search range of the offset. Arrays
+    (n,) are at the samples, NaN if a side is missing. They are stored for the first setting only; for others they are
+    empty and ``difference`` replaces them.
     """
 
     flight: str
@@ -69,17 +70,17 @@ class RssRow:
     position_m: FloatArray = field(repr=False)
     heading_deg: FloatArray | None = field(repr=False, default=None)
     start_ns: int = 0
-    """First instant, nanoseconds after 1970-01-01."""
+    """First time, nanoseconds after 1970-01-01."""
     difference: Moments | None = None
     pooled_offset_db: float = float("nan")
     pooled_rmse_db: float = float("nan")
     held_out_offset_db: float = float("nan")
     held_out_rmse_db: float = float("nan")
     logs: tuple[str, ...] = ()
-    """SHA-256 of the logs that hold the samples."""
+    """SHA-256 of the logs that contain the samples."""
     mark: str = field(repr=False, default="")
     verdicts: Mapping[str, str] = field(default_factory=dict)
-    """By baseline, what the paired interval says about the ray tracing."""
+    """Verdict of the paired interval for each baseline."""
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -88,7 +89,7 @@ class RssRow:
 
     @property
     def moments(self) -> Moments:
-        """Of simulated minus measured over the scored samples."""
+        """Moments of simulated minus measured level over the scored samples."""
         return self.difference or difference_moments(self.measured_db, self.simulated_dbm)
 
     @property
@@ -98,13 +99,13 @@ class RssRow:
 
     @property
     def residual_db(self) -> FloatArray:
-        """Measurement after this row's own offset, minus simulation (n,)."""
+        """Measured level plus the offset of this row, minus the simulated level (n,)."""
         return self.measured_db + self.offset_db - self.simulated_dbm
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankRow:
-    """Rank of one flight, setting, tower and K."""
+    """The rank of one flight, setting, tower and K."""
 
     flight: str
     setting: str
@@ -121,15 +122,15 @@ class RankRow:
     best_k: float
     best_k_ci95: Interval | None
     commonest_agreement: float = float("nan")
-    """Agreement of always saying the commonest rank: what a model has to beat."""
+    """Agreement of always guessing the most frequent rank, the baseline of a model."""
     logs: tuple[str, ...] = ()
-    """SHA-256 of the logs that hold the reports."""
+    """SHA-256 of the logs that contain the reports."""
     mark: str = field(repr=False, default="")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
-    """A flight (and setting) that gave no numbers, and why; ``traceback`` for whoever mends it, never on the page."""
+    """A flight and setting without numbers, and the reason; ``traceback`` is for developers and never on the page."""
 
     flight: str
     setting: str
@@ -139,9 +140,9 @@ class Failure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PooledOffset:
-    """One shared offset.
+    """An offset that several rows share.
 
-    ``spread_db`` is the standard deviation of the members' own offsets (NaN for one member), ``range_db`` their
+    ``spread_db`` is the standard deviation of the offsets of the members (NaN for one member), ``range_db`` their
     extremes; ``own_rmse_db`` and ``pooled_rmse_db`` are means over the members.
     """
 
@@ -159,26 +160,26 @@ class PooledOffset:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Repeat:
-    """Two flights over the same places, one tower and channel.
+    """Two flights over the same area, one tower and channel.
 
     Parameters
     ----------
     rmse_db : float
         RMS difference of the two measurements after the best constant ``offset_db`` (second minus first) [dB].
     share : float
-        Pairs over samples of the first flight: a few pairs near the launch pad speak for that place only.
+        Pairs divided by samples of the first flight. A few pairs near the launch pad represent only that position.
     single_db : float
-        ``rmse_db / sqrt(2)``: the share of one pass, if both err alike and independently.
+        ``rmse_db / sqrt(2)``: the error of one pass, if both have equal and independent errors.
     residual_rmse_db : float
-        The same difference after the simulation's own difference has been taken off.
+        The same difference after the difference of the simulation has been subtracted.
     place_rmse_db : float
-        RMS difference of the mean residuals per cell of the plan, whatever the heights.
+        RMS difference of the mean residuals per cell of the plan, at all heights.
     place_correlation : float
-        Correlation of the mean residuals per cell of the plan: near 1, the model errs the same way on both flights.
+        Correlation of the mean residuals per cell of the plan. Near 1, the model has the same errors on both flights.
     cells : int
-        Cells that both flights have.
+        Cells that both flights visit.
     height_difference_m : float
-        Median over those cells [m].
+        Median height difference over these cells [m].
     """
 
     tower: str
@@ -200,9 +201,9 @@ class Repeat:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankTransfer:
-    """Total variation of one flight at the K that the other flights would have chosen.
+    """The total variation of one flight at the K that the other flights select.
 
-    ``k`` has the least mean total variation on ``chosen_on`` among the K of the flight files; ``own_k`` on the
+    ``k`` has the smallest mean total variation on ``chosen_on`` among the K of the flight files, and ``own_k`` on the
     flight itself.
     """
 
@@ -219,21 +220,21 @@ class RankTransfer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettingRank:
-    """One setting against the one of least mean error, over flights.
+    """One setting compared with the setting of smallest mean error, over flights.
 
     Parameters
     ----------
     setting : str
     link : str
-        Tower and channel that it is about; empty: all.
+        Tower and channel; empty for all.
     n_flights : int
         Flights with an error under this setting.
     mean_db : float
-        Mean over flights of the mean error over towers and channels [dB]: held out where there is another flight.
+        Mean over flights of the mean error over towers and channels [dB]. It is held out if there is another flight.
     quantiles_db : tuple of float
-        0, 10, 25, 50, 75, 90 and 100 % of the flights.
+        Quantiles of 0, 10, 25, 50, 75, 90 and 100 % over flights.
     difference_db, difference_ci95_db : float, Interval or None
-        Mean over flights of this minus the first setting, on the links that both scored; None for the first itself.
+        Mean over flights of this minus the first setting, on links that both scored; None for the first setting.
     n_paired : int
         Flights in that difference.
     verdict : str
@@ -253,7 +254,7 @@ class SettingRank:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceMap:
-    """Mean residual of cells of the plan over flights, towers and channels.
+    """The mean residual of cells of the plan over flights, towers and channels.
 
     ``cells`` (n, 2) are column and row in multiples of the cell from the origin; ``mean_db`` (n,) is the mean over
     flights, towers and channels of the mean residual of each in the cell.
@@ -265,22 +266,22 @@ class PlaceMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Season:
-    """Result of all flights together.
+    """The result of all flights together.
 
     Parameters
     ----------
     held_out : bool
-        Whether the errors are held out; with one flight they are its own.
+        True if the errors are held out. With one flight they are its own.
     started : mapping of str to str
-        First instant of a flight, UTC, ISO 8601; none for logs with relative times.
+        First time of each flight (UTC, ISO 8601); missing for logs with relative times.
     ranking : tuple of SettingRank
-        Over all links, best first, then for each link where there are several.
+        Over all links, best first, then for each link if there are several.
     nodes : tuple of NodeOffset
-        Of the first setting, or of soundings between towers.
+        Offsets of nodes under the first setting, or of soundings between towers.
     places : PlaceMap, optional
-        Of the first setting.
+        Residuals of the first setting.
     reports : mapping of str to str
-        Address of a flight's report, against the campaign's folder.
+        Address of the report of a flight, relative to the folder of the campaign.
     """
 
     held_out: bool = False
@@ -297,10 +298,10 @@ class Season:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignData(Made):
-    """Everything the page shows. ``settings`` are overrides by label; ``flights`` the names in order.
+    """The content of the page. ``settings`` are overrides by label; ``flights`` are names in order.
 
-    Two samples count as taken at the same place within ``radius_m`` with headings that agree within
-    ``heading_within_deg``; residuals are gathered by place in cells of ``cell_m``.
+    Two samples have the same position if they are within ``radius_m`` and their headings agree within
+    ``heading_within_deg``. Residuals are averaged in cells of ``cell_m``.
     """
 
     radius_m: ClassVar[float] = 3.0
@@ -325,7 +326,7 @@ class CampaignData(Made):
 
     @property
     def reference(self) -> str:
-        """The setting that repeatability and the season are drawn for: the first."""
+        """The first setting, for which repeatability and figures of the campaign are drawn."""
         return next(iter(self.settings), "")
 
     @property
@@ -334,10 +335,10 @@ class CampaignData(Made):
         return tuple(row for row in self.rss if row.setting == self.reference)
 
 
-# Warnings of flights that stand one by one.
+# Largest number of warnings of flights that are listed one by one.
 FEW = 8
 
-# Sentence and next step by :func:`~aerpaw_cmp.compare.verdict.campaign_verdict`.
+# Sentence and next step by the cause of :func:`~aerpaw_cmp.compare.verdict.campaign_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
     "outlying error": (
         "Flight {where} stands out: its RMSE is {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) that of the others.",
@@ -348,8 +349,8 @@ CAUSES: dict[str, tuple[str, str]] = {
         "check transmit power, receiver gain and cables of {where}",
     ),
     "gain step": (
-        "The offset steps by {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) at {where} on.",
-        "compare the flights before and after apart; check the gain of that receiver",
+        "The offset steps by {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) at {where} and later.",
+        "compare the flights before and after it separately; check the gain of that receiver",
     ),
     "none": (
         "No flight and no link stands out. Largest error: {flight}, {error:.1f} dB ({link}).",
@@ -357,21 +358,21 @@ CAUSES: dict[str, tuple[str, str]] = {
     ),
 }
 
-# Settings that a sentence names.
+# Largest number of settings in a sentence.
 _FEW_SETTINGS = 4
 
-# Below this share of samples with a pair, a repeatability floor is that of a few places.
+# Below this share of samples with a pair, repeatability is that of a few positions.
 _FEW_PAIRS = 0.25
 
 
 def rss_flights(data: CampaignData) -> list[str]:
-    """Flights that have RSS, and those that failed: a flight with rank alone has no RMSE to miss."""
+    """Return the flights that have RSS or failed. Flights with rank alone have no RMSE."""
     ranked = {row.flight for row in data.rank} - {row.flight for row in data.rss}
     return [name for name in data.flights if name not in ranked]
 
 
 def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
-    """Mean RMSE over the links of each setting and flight [dB]; NaN where there is none."""
+    """Return the mean RMSE over the links of each setting and flight [dB], NaN if there is none."""
     known: dict[tuple[str, str], list[float]] = {}
     for row in data.rss:
         if np.isfinite(row.rmse_db):
@@ -384,13 +385,13 @@ def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
 
 
 def headline(data: CampaignData) -> list[str]:
-    """The result in a few sentences."""
+    """Return the result in a few sentences."""
     out = [*step_words(data), *_ranked_words(data)]
     for setting in data.settings:
         moved = [t for t in data.rank_transfers if t.setting == setting]
         if moved:
             out.append(
-                f"Rank, {setting}: at the K that the other flights choose, the total variation is "
+                f"Rank, {setting}: at the K that the other flights select, the total variation is "
                 + ", ".join(f"{t.total_variation:.3f} on {t.flight} (K = {k_key(t.k)})" for t in moved)
                 + "."
             )
@@ -400,11 +401,11 @@ def headline(data: CampaignData) -> list[str]:
             mean = float(np.mean([p.rmse_db for p in pairs]))
             share = 100 * float(np.mean([p.share for p in pairs]))
             out.append(
-                f"Two flights at the same places differ by {mean:.1f} dB RMS after one constant "
+                f"Two flights at the same positions differ by {mean:.1f} dB RMS after one constant "
                 f"({counted(sum(p.n for p in pairs), 'pair')}, {share:.0f} % of the samples)."
             )
         else:
-            out.append("No two flights pass the same places within the radius, so there is no repeatability floor.")
+            out.append("No two flights visit the same positions within the radius, so repeatability is not known.")
     return out
 
 
@@ -432,7 +433,7 @@ def step_words(data: CampaignData) -> list[str]:
 
 
 def _ranked_words(data: CampaignData) -> list[str]:
-    """Sentences on what the ranking by held-out error shows, and what it does not."""
+    """Return sentences about the ranking by held-out error."""
     ranking = data.season.over_all()
     if len(ranking) < 2 or not data.season.held_out:
         return []
@@ -444,23 +445,23 @@ def _ranked_words(data: CampaignData) -> list[str]:
 
 
 def warnings(data: CampaignData) -> list[str]:
-    """Warnings that must be known before the numbers are believed."""
+    """Return warnings about the limits of the numbers."""
     out = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures[:FEW]]
     if len(data.failures) > FEW:
-        out = [f"{len(data.failures)} flights or settings gave no numbers: they stand under Failures."]
+        out = [f"{len(data.failures)} flights or settings have no numbers; see Failures."]
     out += [
-        f"{row.flight}, {row.setting}, {row.link}: its antennas were learned from this very log, so it is not scored."
+        f"{row.flight}, {row.setting}, {row.link}: its antennas were learned from this log, so it is not scored."
         for row in data.rss
         if LEARNED_HERE in row.fitted
     ]
     out += [
-        f"{row.flight}, {row.setting}, {row.link}: the best offset lies at the edge of the searched span."
+        f"{row.flight}, {row.setting}, {row.link}: the best offset is at the end of its search range."
         for row in data.rss
         if row.at_search_edge
     ]
     out += [
         f"{pair.tower} {pair.channel}: only {100 * pair.share:.0f} % of the samples of {pair.first} have a pair on "
-        f"{pair.second}; their repeatability speaks for those places, not for the flights."
+        f"{pair.second}; their repeatability is valid for these positions only."
         for pair in data.repeats
         if 0 < pair.share < _FEW_PAIRS
     ]
@@ -470,12 +471,12 @@ def warnings(data: CampaignData) -> list[str]:
         if len(group.units) > 1
     ]
     if data.synthetic:
-        out.append("Synthetic flights, made by simulation, that measure nothing: " + ", ".join(data.synthetic) + ".")
+        out.append("Simulated flights, which are not measurements: " + ", ".join(data.synthetic) + ".")
     return list(dict.fromkeys(out))
 
 
 def worst_flights(data: CampaignData) -> list[tuple[str, float, str]]:
-    """Flights under the first-ranked setting, largest error first: name, mean error over links [dB], worst link."""
+    """Return flights under the first setting by error, largest first: name, mean error over links [dB], worst link."""
     order = data.season.over_all()
     return _by_error([row for row in data.rss if order and row.setting == order[0].setting], "held_out_rmse_db")
 
@@ -491,7 +492,7 @@ def _by_error(rows: Sequence[RssRow], name: str) -> list[tuple[str, float, str]]
 
 
 def verdict(data: CampaignData) -> list[str]:
-    """Ray tracing against the baselines under the first setting, and what each mean error is for."""
+    """Return sentences about ray tracing and the baselines under the first setting."""
     rows = [row for row in data.rss if row.setting == next(iter(data.settings)) and np.isfinite(row.rmse_db) and row.n]
     if not rows:
         return []
@@ -511,7 +512,7 @@ def verdict(data: CampaignData) -> list[str]:
 
 
 def cause(data: CampaignData) -> Verdict:
-    """The trouble of the season under the first setting."""
+    """Return the likely cause of errors of the campaign under the first setting."""
     rows = [row for row in data.reference_rows if np.isfinite(row.rmse_db) and row.n]
     errors: dict[str, list[float]] = {}
     offsets: dict[str, dict[str, float]] = {}
@@ -523,7 +524,7 @@ def cause(data: CampaignData) -> Verdict:
 
 
 def against_baselines(row: RssRow) -> str:
-    """Baselines that the ray tracing is significantly better and worse than, in one cell."""
+    """Return the baselines that ray tracing is significantly better and worse than, in one cell."""
     parts = [
         f"{word} than " + ", ".join(pretty(name) for name, decision in row.verdicts.items() if decision == word)
         for word in ("worse", "better")
@@ -532,12 +533,12 @@ def against_baselines(row: RssRow) -> str:
     return "; ".join(parts) or ("not significant" if row.verdicts else "\u2013")
 
 
-# Nodes of a figure: those that step first, then those that vary most.
+# Number of nodes in a figure: those with steps first, then those that vary most.
 _NODES_SHOWN = 12
 
 
 def season_nodes(data: CampaignData) -> Figure:
-    """Offset of nodes over the dates, less what all share; steps as bars of their intervals."""
+    """Draw the offsets of nodes over the dates, minus their common part, with steps as bars of their intervals."""
     fig, ax = subplots((9.2, 3.6))
     order = sorted(data.season.nodes, key=lambda node: (not node.steps, -np.ptp(node.offset_db or (0.0,))))
     dates = sorted({night for node in data.season.nodes for night in node.night})
@@ -558,7 +559,7 @@ def season_nodes(data: CampaignData) -> Figure:
 
 
 def season_places(data: CampaignData) -> Figure:
-    """Mean residual of each cell of the plan over flights, all towers and channels."""
+    """Draw the mean residual of each cell of the plan over flights, towers and channels."""
     shown = data.season.places
     assert shown is not None
     cells = shown.cells
@@ -570,7 +571,7 @@ def season_places(data: CampaignData) -> Figure:
     extent = np.array([first[0], last[0], first[1], last[1]]) * data.cell_m
     fig, ax = subplots((7.0, 5.0))
     ax.set_facecolor("#F4F4F4")
-    # no grey in it: a grey middle would turn dark on a dark page, between two light neighbours
+    # the palette has no grey, because a grey middle would be dark on a dark page, between two light neighbours
     mesh = ax.imshow(
         image, origin="lower", extent=tuple(extent), cmap="Spectral_r", vmin=-reach, vmax=reach, interpolation="none",
         zorder=2,
@@ -587,34 +588,34 @@ def season_places(data: CampaignData) -> Figure:
 
 
 def figure_specs(data: CampaignData) -> Iterator[FigureSpec]:
-    """Figures of the season, where the campaign has numbers for them."""
+    """Yield the figures of the campaign for which there are numbers."""
     if any(len(node.night) > 1 for node in data.season.nodes):
         yield FigureSpec(
-            "season_nodes", partial(season_nodes, data), "Offsets over the season",
-            "Offset of each node over the dates, less what all nodes share (weather, a transmitter). A bar: the 95 % "
-            f"interval of a step. Of more than {_NODES_SHOWN} nodes those that step, then those that vary most.",
+            "season_nodes", partial(season_nodes, data), "Offsets over the campaign",
+            "Offset of each node over the dates, minus the part that all nodes share (weather, a transmitter). Bars: "
+            f"95 % intervals of steps. At most {_NODES_SHOWN} nodes are shown: those with steps, then those that vary most.",
         )  # fmt: skip
     if data.season.places is not None:
         yield FigureSpec(
-            "season_places", partial(season_places, data), "Where the simulation errs, over all flights",
+            "season_places", partial(season_places, data), "Where the simulation is wrong, over all flights",
             f"Mean over flights of the mean residual in cells of {data.cell_m:g} m, “{data.reference}”, all towers and "
             "channels.",
         )  # fmt: skip
 
 
-# Warnings that stand on the page at all.
+# Largest number of warnings on the page.
 MANY = 200
 
-# Flights of a table that has a column or a heading for each.
+# Largest number of flights in a table with a column or a heading for each.
 _FEW_FLIGHTS = 20
 
-# Rows of a table on the page; the files beside it hold all.
+# Rows of a table on the page. The files in the same folder contain all rows.
 ROWS_SHOWN = 300
 
-# From so many rows on campaign.json is written without indentation.
+# With more rows than this, campaign.json is written without indentation.
 _COMPACT_ROWS = 2000
 
-# Fields of a row that are samples, not numbers of a table.
+# Fields of a row that contain samples.
 ARRAYS = ("measured_db", "simulated_dbm", "position_m", "heading_deg")
 
 
@@ -623,7 +624,7 @@ def _entries(items: Iterable[Any], without: Sequence[str]) -> list[dict[str, Any
 
 
 def campaign_metrics(data: CampaignData) -> dict[str, Any]:
-    """The numbers of the page under stable names; what does not exist is None."""
+    """Return the numbers of the page under stable names; missing numbers are None."""
     failed = {f.flight for f in data.failures}
     result = {
         "campaign": data.name,
@@ -657,7 +658,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
 
 
 def _campaign_frame(data: CampaignData) -> pd.DataFrame:
-    """One row per flight, setting, tower and channel (``kind`` rss) or K (``kind`` rank), and per failure."""
+    """Return one row per flight, setting, tower and channel (``kind`` rss) or K (``kind`` rank), and per failure."""
     rows = [
         {"kind": "rss", **cells(row), **{f"{name}_rmse_db": error for name, error in row.baselines.items()},
          "fitted": " ".join(row.fitted)}
@@ -680,7 +681,7 @@ _CSV_COLUMNS = [
 
 
 def _errors_of_pairs(data: CampaignData) -> list[tuple[Any, float, float]]:
-    """Each pair of flights with the RMSE of both under the reference setting."""
+    """Return each pair of flights with the RMSE of both under the first setting."""
     rmse = {row.key: row.rmse_db for row in data.reference_rows}
 
     def error(pair: Repeat, flight: str) -> float:
@@ -740,9 +741,9 @@ def _mean_errors(data: CampaignData) -> Table:
 
 def _transfers(data: CampaignData) -> Table:
     return Table(
-        caption="Rank: K chosen on the other flights, and what it leaves here (transferred), beside the best K of "
-        f"the flight itself (fitted here){more(data.rank_transfers, ROWS_SHOWN)}.",
-        columns={"Setting": TEXT, "Flight": HEAD, "Tower": TEXT, "Chosen on": TEXT, "K": RIGHT,
+        caption="Rank: total variation with the K of the other flights (transferred), and with the best K of the "
+        f"flight itself (fitted here){more(data.rank_transfers, ROWS_SHOWN)}.",
+        columns={"Setting": TEXT, "Flight": HEAD, "Tower": TEXT, "Selected on": TEXT, "K": RIGHT,
                  "Total variation, transferred": RIGHT, "Kappa": 2, "Own K": RIGHT, "Total variation, fitted here": 3},
         rows=[(t.setting, t.flight, t.tower, ", ".join(t.chosen_on), k_key(t.k), bold(number(t.total_variation, 3)),
                t.kappa, k_key(t.own_k), t.own_total_variation) for t in data.rank_transfers[:ROWS_SHOWN]],
@@ -750,17 +751,17 @@ def _transfers(data: CampaignData) -> Table:
 
 
 def season_card(data: CampaignData, pictures: Sequence[Picture]) -> Card:
-    """Return the card of the season: its figures, and steps of offsets."""
+    """Return the card of the campaign over time: its figures, and steps of offsets."""
     steps = any(picture.spec.name == "season_nodes" for picture in pictures)
     table = Table(
-        caption="Steps of offsets: date of the first, size with its 95 % interval, date on which the old level was "
-        "back. “Shows”: the step that its first date shows with a chance of 90 %. campaign.json has every date.",
-        columns={"Node": HEAD, "Dates": 0, "Std. dev. [dB]": 2, "Shows [dB]": 1, "Steps": TEXT},
+        caption="Steps of offsets: date, size with 95 % interval, and date of the return to the old level. “Detects”: "
+        "step that is detected on its first date with a probability of 90 %. campaign.json has every date.",
+        columns={"Node": HEAD, "Dates": 0, "Std. dev. [dB]": 2, "Detects [dB]": 1, "Steps": TEXT},
         rows=[(n.node, len(n.night), n.sd_db, n.smallest_db, "; ".join(map(_step, n.steps)) or "none")
               for n in data.season.nodes] if steps else [],
     )  # fmt: skip
     parts = [Card(tables=[table])]
-    return Card(title="Over the season", id="season", chart=pictures, parts=parts) if pictures else Card()
+    return Card(title="Over the campaign", id="season", chart=pictures, parts=parts) if pictures else Card()
 
 
 def _step(step: Step) -> str:
@@ -770,7 +771,7 @@ def _step(step: Step) -> str:
 
 def failures_card(data: CampaignData) -> Card:
     """Return the card of flights and settings without numbers."""
-    first = f", the first {ROWS_SHOWN} of {len(data.failures)}; all stand in campaign.csv"
+    first = f", the first {ROWS_SHOWN} of {len(data.failures)}; campaign.csv contains all"
     table = Table(
         caption=f"Flights and settings without numbers{first if len(data.failures) > ROWS_SHOWN else ''}.",
         columns={"Flight": HEAD, "Setting": TEXT, "Why": TEXT}, look="tall",
@@ -780,15 +781,15 @@ def failures_card(data: CampaignData) -> Card:
 
 
 def offsets_card(data: CampaignData) -> Card:
-    """Return the card of shared offsets, and of pairs of flights at the same places."""
+    """Return the card of shared offsets, and of pairs of flights at the same positions."""
     title = "Offsets and repeatability"
     return Card(title=title, id="offsets", link="Offsets", fold=True, tables=[_pooled(data), _pairs(data)])
 
 
 def _pooled(data: CampaignData) -> Table:
     return Table(
-        caption=f"Offsets shared per {data.calibration} (added to the measurement), the spread of the members' own "
-        f"offsets, and the mean RMSE that either leaves{more(data.pooled, ROWS_SHOWN)}.",
+        caption=f"Offsets shared per {data.calibration} (added to the measurement), the offsets of the members, "
+        f"and the mean RMSE with each{more(data.pooled, ROWS_SHOWN)}.",
         columns={"Setting": TEXT, "Group": HEAD, "Members": 0, "Shared offset [dB]": RIGHT, "Own offsets [dB]": 1,
                  "Std. dev. [dB]": 2, "RMSE, own offsets [dB]": 2, "RMSE, shared [dB]": 2},
         rows=[(g.setting, g.group, len(g.members), number(g.offset_db) + (" (edge)" if g.at_search_edge else ""),
@@ -799,14 +800,14 @@ def _pooled(data: CampaignData) -> Table:
 def _pairs(data: CampaignData) -> Table:
     pairs = _errors_of_pairs(data)
     return Table(
-        caption=f"Two flights at the same places (within {number(data.radius_m, 0, 'm')}, headings within "
-        f"{number(data.heading_within_deg, 0)}°), beside the RMSE of the setting “{data.reference}”. “After the "
-        f"model”: what their residuals still differ by. “By place”: mean residuals in cells of "
-        f"{number(data.cell_m, 0, 'm')}, whatever the heights; a correlation near 1 says that the model errs the same "
-        f"way on both flights{more(pairs, ROWS_SHOWN)}.",
+        caption=f"Two flights at the same positions (within {number(data.radius_m, 0, 'm')}, headings within "
+        f"{number(data.heading_within_deg, 0)}°), and the RMSE of the setting “{data.reference}”. “After the "
+        f"model”: difference of their residuals. “By cell”: mean residuals in cells of "
+        f"{number(data.cell_m, 0, 'm')} at all heights. With a correlation near 1 the model has the same errors on "
+        f"both flights{more(pairs, ROWS_SHOWN)}.",
         columns={"Link": HEAD, "Flights": TEXT, "Pairs": 0, "Share": SHARE, "Differ by [dB]": RIGHT, "95 %": 1,
-                 "One pass (÷√2)": 1, "After the model": 1, "RMSE of both": RIGHT, "By place: RMS": 1, "Correlation": 2,
-                 "Cells": 0, "Height apart": RIGHT},
+                 "One pass (÷√2)": 1, "After the model": 1, "RMSE of both": RIGHT, "By cell: RMS": 1, "Correlation": 2,
+                 "Cells": 0, "Height difference": RIGHT},
         rows=[
             (f"{r.tower} {r.channel}", f"{r.first}, {r.second}", r.n, r.share, bold(number(r.rmse_db)),
              r.rmse_ci95_db or "", r.single_db, r.residual_rmse_db, f"{number(a)}, {number(b)}", r.place_rmse_db,
@@ -825,7 +826,7 @@ def _levels(data: CampaignData) -> Table:
     rows: Sequence[RssRow] = data.rss
     few = ""
     if len(rows) > ROWS_SHOWN:
-        few = f"; the {ROWS_SHOWN} rows of largest error of {len(rows)}, all stand in campaign.csv"
+        few = f"; the {ROWS_SHOWN} rows of largest error of {len(rows)}; campaign.csv contains all"
         rows = sorted(rows, key=lambda r: -np.nan_to_num(r.rmse_db, nan=-1.0))[:ROWS_SHOWN]
     models = list(dict.fromkeys(name for row in data.rss for name in row.baselines))
     return Table(
@@ -876,14 +877,14 @@ def settings_of(data: CampaignData, files: Sequence[str]) -> Card:
     return replace(settings_card(data, {"workers": data.workers}), tables=[table], text=[beside])
 
 
-# Cards in the order of the page, after the figures. A new card is one function more.
+# Cards in the order of the page, after the figures. A new card is a further function.
 CARDS = (failures_card, offsets_card, rows_card)
 
 
 def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
-    """Return the whole page."""
+    """Return the page."""
     known, failed = warnings(data), len({failure.flight for failure in data.failures})
-    beyond = [f"{len(known) - MANY} more stand in campaign.json."] if len(known) > MANY else []
+    beyond = [f"{len(known) - MANY} more are in campaign.json."] if len(known) > MANY else []
     lead = "Soundings between towers."
     if data.flights:
         failures = f" ({failed} with failures)" if failed else ""
@@ -898,9 +899,9 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
 
 
 def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
-    """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``; gives the files, page first.
+    """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``; return the files, the page first.
 
-    Pairs of flights at the same places stand in ``pairs.csv``, all of them; campaign.json has the telling ones.
+    ``pairs.csv`` contains all pairs of flights at the same positions; campaign.json those with the most cells.
     """
     folder = Path(folder)
     indent = 2 if len(data.rss) + len(data.rank) < _COMPACT_ROWS else None
@@ -923,21 +924,21 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
 
 # --- pairs of flights at the same places -----------------------------------------------------------------------------
 
-# Pairs that campaign.json lists; of more, those with the most places.
+# Largest number of pairs in campaign.json. If there are more, those with the most cells are listed.
 LISTED_PAIRS = 1000
 
-# The file with all of them.
+# File with all pairs.
 _PAIR_TABLE = "pairs.csv"
 
 
 def telling(pairs: Sequence[Repeat], most: int = LISTED_PAIRS) -> list[Repeat]:
-    """All pairs, or of more than ``most`` those with the most places, in their order."""
+    """Return all pairs, or the ``most`` pairs with the most cells, in their order."""
     chosen = sorted(range(len(pairs)), key=lambda i: (-pairs[i].n, i))[:most]
     return [pairs[i] for i in sorted(chosen)]
 
 
 def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
-    """Per tower and channel: pairs of flights, those that meet, their places, and how much they differ [dB]."""
+    """Return numbers of pairs of flights and common cells per tower and channel, and their differences [dB]."""
     groups: dict[tuple[str, str], list[Repeat]] = {}
     for pair in pairs:
         groups.setdefault((pair.tower, pair.channel), []).append(pair)
@@ -961,7 +962,7 @@ def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
 
 
 def cells(record: Any) -> dict[str, Any]:
-    """Fields of a record as cells of a table; an interval ``x_ci95`` becomes ``x_low`` and ``x_high``."""
+    """Return the fields of a record as cells of a table; an interval ``x_ci95`` becomes ``x_low`` and ``x_high``."""
     out: dict[str, Any] = {}
     for entry in dataclasses.fields(record):
         value = getattr(record, entry.name)

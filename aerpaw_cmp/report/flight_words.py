@@ -373,8 +373,8 @@ def _snr_words(panel: RssResult) -> str:
     if snr is None:
         return ""
     return (
-        f" As a signal-to-noise ratio over {snr.noise_dbm:.1f} dBm of noise, without a fitted offset, its mean difference "
-        f"from the replay is {signed(snr.mean_error_db)} dB (RMSE {snr.rmse_db:.1f} dB)."
+        f" As a signal-to-noise ratio over {snr.noise_dbm:.1f} dBm of noise, without a fitted offset, its mean "
+        f"difference from the replay is {signed(snr.mean_error_db)} dB (RMSE {snr.rmse_db:.1f} dB)."
     )
 
 
@@ -475,8 +475,9 @@ def _rss_cautions(panel: RssResult) -> list[str]:
     if (near := int((compared < _NEAR_M).sum())) > 0:
         texts.append(
             f"{panel.name}: {near} of {counted(len(compared), 'sample')} are within {_NEAR_M:g} m of the antenna of "
-            f"the tower, the nearest at {np.nanmin(compared):.1f} m. The free-space model is not valid in the near field, and "
-            "position errors change the level by several dB. Check the position of the tower and its antenna_height_m."
+            f"the tower, the nearest at {np.nanmin(compared):.1f} m. The free-space model is not valid in the near "
+            "field, and position errors change the level by several dB. Check position and antenna_height_m of the "
+            "tower."
         )
     if lock is not None:
         share, floor = 100 - 100 * lock.n_detected / lock.n, f"{Printed(lock.floor_db):.0f}"
@@ -502,8 +503,8 @@ _LARGE_OFFSET_DB = 20.0
 OFFSETS = {
     "dB re full scale": "the log is relative to full scale, and the offset converts it to dBm",
     "dB": "the log is a signal-to-noise ratio, and the offset includes the noise level",
-    "dBm": "the transmit power, gains or losses in flight.yaml are not those of the flight; note that RSRP is the level "
-    "of one subcarrier",
+    "dBm": "the transmit power, gains or losses in flight.yaml are not those of the flight; note that RSRP is the "
+    "level of one subcarrier",
 }
 
 
@@ -665,8 +666,8 @@ def _forecast_of(panel: RankResult) -> ForecastScore | None:
 def _forecast_sentence(panel: RankResult, score: ForecastScore) -> str:
     return (
         f"Rank at {panel.tower} by the receiver learned on other flights: kappa {score.kappa:.2f} (0 is chance), "
-        f"{_log_score(score)}. It agrees in {100 * score.agreement:.0f} % of samples; always guessing the most frequent rank "
-        f"agrees in {100 * score.majority_agreement:.0f} %."
+        f"{_log_score(score)}. It agrees in {100 * score.agreement:.0f} % of samples; always guessing the most "
+        f"frequent rank agrees in {100 * score.majority_agreement:.0f} %."
     )
 
 
@@ -807,4 +808,5 @@ def before_flight(scores: Mapping[str, Mapping[str, float]]) -> str:
     if not scores:
         return ""
     error, inside = (float(np.mean([row[key] for row in scores.values()])) for key in ("rmse_db", "coverage_90"))
-    return f"Predicted before this flight: RMSE {error:.1f} dB; the 90 % band contains {100 * inside:.0f} % of the samples."
+    within = f"{100 * inside:.0f} % of the samples"
+    return f"Predicted before this flight: RMSE {error:.1f} dB; the 90 % band contains {within}."

@@ -1,8 +1,8 @@
-"""map.html of the `map` job with metrics.json: finished maps and tables, sentences, figures, data of the page's script.
+"""map.html of the `map` job with metrics.json: maps and tables, sentences, figures, data of the script.
 
-All maps of a page lie on one grid. Row 0 is the south, column 0 the west. A position without any path ("Z") is NaN
-in a map of levels and 0 in a map of ranks. What the script shows of a layer (share covered, median, shares of ranks) it
-computes from integers with a step; :func:`layer_numbers` returns the same numbers for metrics.json from the maps.
+All maps of a page have one grid. Row 0 is the south, column 0 the west. A position without any path is NaN in a map of
+levels and 0 in a map of ranks. The script computes the numbers of a layer (share in coverage, median, shares of ranks)
+from integers with a step. :func:`layer_numbers` returns the same numbers for metrics.json from the maps.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Name of the map in which the nearest tower serves.
+# Name of the map of the nearest tower.
 JOINT = "joint"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RssMap:
-    """RSS [dBm] of one tower, or of the nearest tower (``tower="joint"``), at one height.
+    """The RSS of one tower, or of the nearest tower (``tower="joint"``), at one height.
 
-    ``rss_dbm`` (rows, columns) with NaN for Z; ``coverage`` is the share of positions with a path.
+    ``rss_dbm`` (rows, columns) is NaN out of coverage [dBm]; ``coverage`` is the share of positions with a path.
     """
 
     tower: str
@@ -62,9 +62,11 @@ class RssMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankMap:
-    """Rank (rows, columns) for one K at one height, 0 for Z; ``share`` (5,) of Z and rank 1 to 4.
+    """The rank for one K at one height, shape (rows, columns).
 
-    Without K the rank is the most probable one of a learned receiver, and ``share`` its mean probabilities.
+    Rank 0 is out of coverage; ``share`` (5,) contains the shares of ranks 0 to 4.
+
+    Without K, the rank is the most probable rank of a learned receiver, and ``share`` its mean probabilities.
     """
 
     k: float | None
@@ -76,26 +78,26 @@ class RankMap:
 
     @property
     def source(self) -> str:
-        """K, or the learned receiver."""
+        """K, or the name of the learned receiver."""
         return "learned receiver" if self.k is None else f"K = {k_key(self.k)}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapLayer:
-    """One layer that the page can show.
+    """A layer of the page.
 
     Parameters
     ----------
     quantity, unit : str
         Layers of one quantity share a colour scale and can be subtracted.
     axes : mapping of str to str
-        What tells it from the others of its quantity: "Tower", "Antennas", "Foliage", "K", "Height", with their value.
+        Values that distinguish layers of a quantity, by "Tower", "Antennas", "Foliage", "K", "Height".
     values : (rows, columns)
-        From the south-west; NaN out of coverage.
+        Values from the south-west; NaN out of coverage.
     classes : tuple of str
-        Names of the values 0, 1, ... where the layer holds classes.
+        Names of the values 0, 1, ... of a layer of classes.
     difference : bool
-        Its zero means something: a scale around it.
+        True for a colour scale centred on zero.
     """
 
     quantity: str
@@ -107,7 +109,7 @@ class MapLayer:
 
 
 def at_height(altitude_m: float) -> dict[str, str]:
-    """The axis of a height, for :class:`MapLayer`."""
+    """Return the axis of a height, for :class:`MapLayer`."""
     return {"Height": f"{altitude_m:g} m"}
 
 
@@ -126,9 +128,9 @@ class Correlation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapError:
-    """Mean absolute error of one method for one K and height, under one way of evaluation.
+    """The mean absolute error of one method for one K and height, in one kind of evaluation.
 
-    ``evaluation`` is e.g. ``"leave one out"``, ``"blocks"``, ``"altitude held out"``, ``"along a flight"``.
+    ``evaluation`` is ``"leave one out"``, ``"blocks"``, ``"altitude held out"`` or ``"along a flight"``.
     """
 
     evaluation: str
@@ -142,7 +144,7 @@ class MapError:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperRow:
-    """A number that the paper states, beside ours, and where to see it."""
+    """A number of the paper next to ours, and where ours is shown."""
 
     where: str
     what: str
@@ -153,37 +155,37 @@ class PaperRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapsData(Made):
-    """Everything the page of a `map` job shows.
+    """The content of the page of the `map` job.
 
     Parameters
     ----------
     title, name : str
-        Headline and short name.
+        Headline, and short name.
     site : Site
     east_m, north_m : (columns,), (rows,)
         Centres of the cells [m].
     borders_m : tuple of (2, 2) arrays
         Lines between the areas of two towers (Voronoi), east and north [m].
     rank : tuple of RankMap
-        The nearest tower serving; ``rank_by_tower`` each alone, for the linked map.
+        Ranks of the nearest tower; ``rank_by_tower`` has those of each tower, for the linked map.
     corrected : tuple of RssMap
-        Of each link, raw and corrected by flights (``antennas``): for figures; the linked map has them in ``layers``.
+        Levels of each link, raw and corrected by flights (``antennas``), for figures; ``layers`` has them for the map.
     corrected_rank : tuple of RankMap
-        Of each tower with a learned receiver: the traced ranks of every K and those of the receiver.
+        Ranks of each tower with a learned receiver: traced ranks of every K, and those of the receiver.
     flown_m : tuple of (n, 2)
-        Tracks of those flights, east and north [m].
+        Tracks of the correcting flights, east and north [m].
     outside_flown : float
-        Share of positions further from those flights than a correction reaches.
+        Share of positions outside the range of the correction.
     corrected_words : str
-        First words of the prediction that corrected the levels.
+        Summary of the prediction that corrected the levels.
     budget : str
-        Power, noise floor and threshold in one sentence, if they are not the paper's.
+        Sentence with power, noise floor and threshold, if they differ from the paper.
     flights : tuple of ReportData
-        Those that ``--with`` names, replayed and compared.
+        Flights of ``--with``, replayed and compared.
     layers : tuple of MapLayer
-        Besides RSS and rank.
+        Layers other than RSS and rank.
     metrics : mapping
-        Written to ``metrics.json`` after the tables of this page.
+        Content of ``metrics.json`` that follows the tables of this page.
     """
 
     title: str
@@ -214,21 +216,21 @@ class MapsData(Made):
 
 LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
 
-# Sentence and next step by :func:`~aerpaw_cmp.compare.verdict.coverage_verdict`.
+# Sentence and next step by the cause of :func:`~aerpaw_cmp.compare.verdict.coverage_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
     "none": (LEAST + ".", "`aerpaw-cmp plan` for a flight that measures it"),
     "trees": (LEAST + "; trees take most of the rest.", "fly higher, or {thinner}"),
     "blocked": (LEAST + "; buildings and terrain take most of the rest.", "fly higher, or add a tower"),
-    "no path": ("No path arrives at any position at {where}.", "check the towers and the area of the site"),
+    "no path": ("There is no path to any position at {where}.", "check the towers and the area of the site"),
     "extrapolated": (
-        LEAST + ". {outside:.0f} % of the positions lie outside the flown places: there the correction is a guess.",
-        "`aerpaw-cmp plan` names the flight that helps most",
+        LEAST + ". {outside:.0f} % of the positions are outside the flown area, where the correction is extrapolated.",
+        "`aerpaw-cmp plan` finds the flight that reduces the standard deviation most",
     ),
 }
 
 
 def first_words(data: MapsData) -> str:
-    """Coverage at the best and at the worst height, what takes the rest, and what to do next."""
+    """Return the summary: coverage at the best and worst height, the cause of gaps, and the next step."""
     heights = coverage(data)
     if not heights:
         return ""
@@ -244,12 +246,12 @@ def first_words(data: MapsData) -> str:
     )
     best = max(heights, key=lambda height: height.covered)
     more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if best.covered > worst.covered else ""
-    measured = "" if data.corrected else "Nothing here was measured. "
+    measured = "" if data.corrected else "The map contains no measurement. "
     return f"{data.budget}{measured}{more}{sentence}"
 
 
 def coverage(data: MapsData) -> list[Coverage]:
-    """Each height of the map of the nearest tower, with the most trees that were mapped."""
+    """Return the coverage of the nearest tower at each height, with most of the mapped trees."""
     shown = [item for item in data.rss if item.tower == JOINT] or list(data.rss)
     if not shown:
         return []
@@ -269,7 +271,7 @@ def coverage(data: MapsData) -> list[Coverage]:
 
 
 def warnings(data: MapsData) -> list[str]:
-    """Warnings that must be known before the maps are believed."""
+    """Return warnings about the limits of the maps."""
     out = [f"{text}." for text in data.site.cautions()]
     if data.corrected_words:
         out.append(f"Corrected: {data.corrected_words}")
@@ -286,7 +288,7 @@ def warnings(data: MapsData) -> list[str]:
 
 
 def notes(data: MapsData) -> list[str]:
-    """Notes on how the maps were made."""
+    """Return notes about the computation of the maps."""
     how = list(_made(data)) if "foliage" in data.settings else []
     return [*data.site.notes, *how, *data.notes]
 
@@ -294,8 +296,8 @@ def notes(data: MapsData) -> list[str]:
 def _made(data: MapsData) -> Iterator[str]:
     s = data.settings
     yield (
-        f"Foliage {', '.join(s['foliage'])}: opaque stops whatever touches a crown or a trunk (the paper); attenuating "
-        "takes ITU-R P.833 over the path's length in crowns; none leaves the trees out."
+        f"Foliage {', '.join(s['foliage'])}: opaque blocks paths that touch a crown or a trunk (the paper); "
+        "attenuating applies ITU-R P.833 over the length of the path in crowns; none ignores trees."
     )
     yield "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element."
     yield f"Spread, condition number, correlation and interpolation are those of foliage {data.rss[0].foliage}."
@@ -303,12 +305,12 @@ def _made(data: MapsData) -> Iterator[str]:
 
 T = TypeVar("T")
 MISSING: dict[str, Any] = {"facecolor": "#F2F2F2", "edgecolor": "#888888", "hatch": "//////", "linewidth": 0.0}
-# Maps side by side, at most.
+# Largest number of maps in a row.
 COLUMNS = 6
 
 
 def grouped(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
-    """Items under their keys, in the order of first appearance."""
+    """Return items under their keys, in the order of first appearance."""
     result: dict[Any, list[T]] = {}
     for item in items:
         result.setdefault(key(item), []).append(item)
@@ -319,12 +321,12 @@ def grouped(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
 
 
 def half_width(at_m: FloatArray) -> float:
-    """Half of the spacing of cell centres [m]; 15 where there is one cell only."""
+    """Return half of the spacing of cell centres [m], or 15 for a single cell."""
     return float(at_m[1] - at_m[0]) / 2 if len(at_m) > 1 else 15.0
 
 
 def extent_m(data: MapsData) -> tuple[float, float, float, float]:
-    """Outer edges of the grid: west, east, south, north [m]."""
+    """Return the outer edges of the grid: west, east, south, north [m]."""
     (west, east), (south, north) = (
         (float(at[0]) - half_width(at), float(at[-1]) + half_width(at)) for at in (data.east_m, data.north_m)
     )
@@ -332,26 +334,26 @@ def extent_m(data: MapsData) -> tuple[float, float, float, float]:
 
 
 def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | None = None, **options: Any) -> Any:
-    """One map: cells as an image, hatched where NaN, with what stands there and the borders of the towers.
+    """Draw a map with cells as an image, hatched at NaN, with buildings, forests, towers and borders.
 
     Parameters
     ----------
     ax : Axes
     data : MapsData
-        Site, axes of the grid and borders.
+        The site, the axes of the grid and the borders.
     values : (rows, columns)
-        Of the cells, from south to north; NaN out of coverage.
+        Values of the cells from south to north; NaN out of coverage.
     highlight : str, optional
-        The only tower that counts: no borders are drawn then.
+        The only tower of the map, without borders.
     options
-        Of :meth:`matplotlib.axes.Axes.imshow`.
+        Options of :meth:`matplotlib.axes.Axes.imshow`.
 
     Returns
     -------
     matplotlib.image.AxesImage
-        For a colour bar.
+        The image, for a colour bar.
     """
-    ax.patch.set(**MISSING)  # cells without a value are transparent, so the hatched ground shows
+    ax.patch.set(**MISSING)  # cells without a value are transparent and show the hatched background
     image = ax.imshow(values, origin="lower", extent=extent_m(data), interpolation="none", zorder=1, **options)
     _draw_overlay(ax, data.site, highlight)
     for line in data.borders_m if highlight is None else ():
@@ -367,7 +369,7 @@ def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | N
 
 
 def _draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
-    """Outlines of buildings and forests, and the towers; only the named tower when one is named."""
+    """Draw outlines of buildings and forests, and the towers, or only ``highlight``."""
     from matplotlib.collections import PolyCollection
 
     draw_credit(ax, site)
@@ -383,7 +385,7 @@ def _draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
 
 
 def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
-    """Legend entries of what :func:`draw_map` draws."""
+    """Return legend entries of the objects that :func:`draw_map` draws."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -399,12 +401,12 @@ def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
 
 
 def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure, list[Axes]]:
-    """A figure with room for ``count`` maps, a legend and a margin on the right [inch], outer axes labelled."""
+    """Return a figure with ``count`` maps, a legend and a margin on the right [inch], and labels on outer axes."""
     west, east, south, north = extent_m(data)
     columns = min(count, COLUMNS)
     rows = -(-count // columns)
     columns = -(-count // rows)
-    width = min((7.4 - 0.15 * columns) / columns, 3.2)  # what a colour bar and the labels leave
+    width = min((7.4 - 0.15 * columns) / columns, 3.2)  # the rest is for the colour bar and the labels
     height = float(np.clip(width * (north - south) / (east - west), 0.8, 6.5))
     fig, grid = placed(
         (9.2, rows * (height + 0.35) + 1.0),
@@ -430,7 +432,7 @@ def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure
 
 
 def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]) -> Figure:
-    """Each tower alone and all jointly, for one antenna choice and height, on one colour scale [dBm]."""
+    """Draw the maps of each tower and of all together, for one antenna choice and height, on one colour scale [dBm]."""
     fig, axes = map_axes(data, len(maps), 1.0)
     image = None
     for ax, shown in zip(axes, maps, strict=True):
@@ -447,7 +449,7 @@ def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]
 
 
 def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
-    """Rank at every height for one K."""
+    """Draw the rank at every height for one K."""
     from matplotlib.colors import BoundaryNorm, ListedColormap
     from matplotlib.patches import Patch
 
@@ -463,18 +465,21 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
 
 
 def distribution(members: Sequence[RssMap]) -> dict[str, Any]:
-    """Distribution of RSS of each tower and jointly at one height, positions out of coverage counted as below."""
+    """Return the distribution of RSS of each tower and of all together at one height.
+
+    Positions out of coverage count as below all levels.
+    """
     marks = []
     for shown in members:
         level = np.sort(shown.rss_dbm[np.isfinite(shown.rss_dbm)])
         share = (shown.rss_dbm.size - len(level) + np.arange(1, len(level) + 1)) / shown.rss_dbm.size
-        some = spread_out(len(level), 400)  # steps of a four-hundredth cannot be seen
+        some = spread_out(len(level), 400)  # steps of 1/400 are not visible
         marks.append({"kind": "line", "name": shown.tower, "x": level[some], "y": 100.0 * share[some]})
     return {"x": {"label": "RSS [dBm]"}, "y": {"label": "Positions below [%]", "ends": [0, 100]}, "marks": marks}
 
 
 def rank_shares(members: Sequence[RankMap]) -> dict[str, Any]:
-    """Shares of Z and rank 1 to 4 about each height, one upon the other."""
+    """Return stacked shares of ranks and of positions out of coverage at each height."""
     members = sorted(members, key=lambda member: member.altitude_m)
     at = np.array([member.altitude_m for member in members])
     half = np.diff(at) / 2.0 if len(at) > 1 else np.array([5.0])
@@ -490,7 +495,7 @@ def rank_shares(members: Sequence[RankMap]) -> dict[str, Any]:
 
 
 def correlation(curve: Correlation) -> dict[str, Any]:
-    """Correlation against distance and its model."""
+    """Return the correlation against distance, and its model."""
     marks: list[Any] = [{"kind": "dots", "name": "data", "x": curve.distance_m, "y": curve.correlation}]
     if curve.fit is not None:
         name = curve.fit_label or "model"
@@ -499,7 +504,7 @@ def correlation(curve: Correlation) -> dict[str, Any]:
 
 
 def error_curves(members: Sequence[MapError], worst: float) -> dict[str, Any]:
-    """MAE against height for every method; ``worst`` of all panels sets the scale."""
+    """Return MAE against height for every method; ``worst`` of all panels sets the scale."""
     marks = []
     for method, rows in grouped(sorted(members, key=lambda e: e.altitude_m), lambda e: e.method).items():
         at, mae = np.array([[row.altitude_m, row.mae] for row in rows]).T
@@ -510,7 +515,7 @@ def error_curves(members: Sequence[MapError], worst: float) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plate:
-    """Panels of one kind: a figure as a file, and a chart of the page each; ``panels`` by their titles."""
+    """Panels of one kind, by title: a figure as a file, and a chart of the page each."""
 
     name: str
     section: str
@@ -525,7 +530,7 @@ class Plate:
 
     @property
     def charts(self) -> list[Chart]:
-        """Charts of the page."""
+        """The charts of the page."""
         return [
             Chart(
                 section=self.section, title=f"{self.title}: {name}", caption="" if i else self.caption, content=content
@@ -535,7 +540,7 @@ class Plate:
 
 
 def plates(data: MapsData) -> Iterator[Plate]:
-    """Distributions, shares, correlation and errors: all that is no map."""
+    """Yield distributions, shares, correlation and errors: all figures other than maps."""
     for words, maps in grouped((*data.rss, *data.corrected), lambda m: f"{m.antennas}{_under(m.foliage)}").items():
         yield Plate(
             name=f"rss_cdf_{safe_name(words)}", section="rss", title=f"Distribution of RSS, {words}",
@@ -577,18 +582,18 @@ def plates(data: MapsData) -> Iterator[Plate]:
 
 
 def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
-    """One colour scale for all maps [dBm]: the 1 to 99.5 % range, to whole 5 dB."""
+    """Return one colour scale for all maps: the 1 to 99.5 % range, rounded to 5 dB [dBm]."""
     parts = [entry.rss_dbm[np.isfinite(entry.rss_dbm)] for entry in maps]
     finite = np.concatenate(parts) if parts else np.zeros(0)
     if not len(finite):
         return -100.0, -50.0
-    # a few cells beside a tower are far above all others and would take most colours
+    # a few cells next to a tower are far above all others and would use most colours
     low, high = np.percentile(finite, [1.0, 99.5])
     return float(5 * np.floor(low / 5)), float(max(5 * np.ceil(high / 5), 5 * np.floor(low / 5) + 5))
 
 
 def figure_specs(data: MapsData) -> list[FigureSpec]:
-    """Every figure that the data allow, in reading order."""
+    """Return every figure that the data allow, in reading order."""
     flown = [
         replace(spec, name=f"{spec.name}_{safe_name(flight.flight)}")
         for flight in data.flights for spec in channel_specs(flight)
@@ -617,7 +622,7 @@ def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
         yield FigureSpec(f"rank_map_learned_{safe_name(tower)}", partial(rank_grid, data, learned))
 
 
-# Base64 that the layers may take; beyond it layers of single towers are left out, then cells.
+# Limit of base64 for the layers. Above it, layers of single towers are not included, then cells are thinned.
 MOST_BYTES = 4_000_000
 
 _LATTICE = 9
@@ -632,7 +637,7 @@ _RANK_CLASSES = ("Z", *map(str, RANKS))
 
 
 def page_layers(data: MapsData) -> list[MapLayer]:
-    """Every layer that the page can show, quantities in their order."""
+    """Return every layer of the page, sorted by quantity."""
     rss = [
         MapLayer(
             quantity="RSS", unit="dBm", axes={"Tower": m.tower, "Antennas": m.antennas, **_foliage_height(m)},
@@ -665,7 +670,7 @@ def _foliage_height(m: RssMap | RankMap) -> dict[str, str]:
 
 
 def layer_numbers(layer: MapLayer) -> dict[str, Any]:
-    """Numbers of a layer on the page: share covered, percentiles, shares of classes (None where there is none)."""
+    """Return numbers of a layer: share in coverage, percentiles, shares of classes; None if missing."""
     finite = layer.values[np.isfinite(layer.values)]
     result: dict[str, Any] = {
         "quantity": layer.quantity,
@@ -675,7 +680,7 @@ def layer_numbers(layer: MapLayer) -> dict[str, Any]:
     }
     if layer.classes:
         counts = np.bincount(finite.astype(np.int64), minlength=len(layer.classes)).astype(np.float64)
-        if layer.classes[0] == _RANK_CLASSES[0]:  # no path is a class of its own
+        if layer.classes[0] == _RANK_CLASSES[0]:  # class 0 is "no path"
             counts[0] = layer.values.size - len(finite)
         return result | {"share": dict(zip(layer.classes, counts / layer.values.size, strict=True))}
     names = ("min", "p10", "median", "p90", "max")
@@ -687,15 +692,15 @@ def layer_numbers(layer: MapLayer) -> dict[str, Any]:
 
 
 def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST_BYTES) -> dict[str, Any]:
-    """Everything the script needs, as plain values, in at most about ``most_bytes`` of base64.
+    """Return all data of the script as plain values, in about ``most_bytes`` of base64.
 
     Parameters
     ----------
     data : MapsData
     charts : sequence of Chart
     most_bytes : int
-        Where all layers need more, those of single towers but RSS are left out, then all of single towers, then
-        every second (third, ...) cell of each row and column is kept; ``left_out`` says which.
+        If all layers need more, layers of single towers other than RSS are not included, then all of single towers.
+        Then every second (third, ...) cell of each row and column is retained. ``left_out`` names the missing layers.
     """
     layers = page_layers(data)
     tries: list[tuple[str, Sequence[MapLayer], int]] = [("", layers, 1)]
@@ -707,7 +712,7 @@ def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST
     while True:
         for words, chosen, every in tries:
             content = _packed(data, charts, chosen, every)
-            # measured after packing: how far the block deflates depends on the maps
+            # measure after packing, because the compressed size depends on the maps
             if len(content["packed"]["data"]) <= most_bytes:
                 return content | {"left_out": words, "stride": every}
         stride += 1
@@ -740,7 +745,7 @@ def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer],
 
 
 def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, stride: int) -> dict[str, Any]:
-    """One quantity: its axes, and per combination of their values the number of its array."""
+    """Return one quantity: its axes, and the number of its array for each combination of their values."""
     axes: dict[str, list[str]] = {}
     for layer in layers:
         for axis, value in layer.axes.items():
@@ -771,14 +776,14 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
 
 
 def _place(axis: str, value: str) -> float:
-    """Order of the values of an axis: all towers together first, heights and K rising, others as they came."""
+    """Return the order of a value of an axis: all towers together first, heights and K rising, others unchanged."""
     if axis == "Tower":
         return 0.0 if value == JOINT else 1.0
     return float(value.removesuffix(" m")) if axis in ("Height", "K") else 0.0
 
 
 def _range(values: FloatArray, kind: str) -> list[float]:
-    """Ends of the colour scale that all layers of a quantity share: 1 and 99.5 %, even about zero for differences."""
+    """Return the colour scale of a quantity: 1 and 99.5 %, symmetric for differences."""
     if kind == DIFFERENCE and len(values):
         reach = float(np.percentile(np.abs(values), 99)) or float(np.abs(values).max()) or 1.0
         return [-reach, reach]
@@ -786,7 +791,7 @@ def _range(values: FloatArray, kind: str) -> list[float]:
 
 
 def _class_colours(classes: Sequence[str]) -> list[str]:
-    """A colour per class: those of ranks, else well apart in hue and lightness."""
+    """Return a colour per class: the colours of ranks, or colours that differ in hue and lightness."""
     if tuple(classes) == _RANK_CLASSES:
         return ["", *(CLASS_COLOURS[rank] for rank in RANKS)]
     if not classes:
@@ -796,7 +801,7 @@ def _class_colours(classes: Sequence[str]) -> list[str]:
 
 
 def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dict[str, Any]:
-    """Latitude and longitude [deg] over the area as polynomials of east and north, for the script.
+    """Return polynomials of east and north for latitude and longitude over the area [deg], for the script.
 
     Returns
     -------
@@ -812,7 +817,7 @@ def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dic
     """
     ends = np.array([[east_m[0], east_m[-1]], [north_m[0], north_m[-1]]], dtype=np.float64)
     middle = ends.mean(axis=1)
-    # of one row of cells the reach is 0, by which the script would divide
+    # for one row of cells the reach is 0, and the script divides by it
     reach = np.maximum(np.ptp(ends, axis=1) / 2, 100.0)
     u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, _LATTICE), np.linspace(-1, 1, _LATTICE)))
     east, north = middle[0] + u * reach[0], middle[1] + v * reach[1]
@@ -829,7 +834,7 @@ def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dic
 
 
 def maps_metrics(data: MapsData) -> dict[str, Any]:
-    """The numbers of the page under stable names; ``data.metrics`` is merged in last."""
+    """Return the numbers of the page under stable names; ``data.metrics`` is merged last."""
     columns, rows = len(data.east_m), len(data.north_m)
     numbers = json_object(
         name=data.name,
@@ -860,7 +865,7 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
 
 
 def result_card(data: MapsData) -> Card:
-    """Return the card of the shares in coverage, and of the paper's numbers beside ours."""
+    """Return the card of the shares in coverage, and of the numbers of the paper next to ours."""
     paper = Table(
         caption="What the paper (arXiv 2502.10324) states, and what this run gives.",
         columns={"Where": HEAD, "What": TEXT, "Paper": TEXT, "Here": TEXT, "Figure": TEXT},
@@ -870,7 +875,7 @@ def result_card(data: MapsData) -> Card:
 
 
 def coverage_table(data: MapsData) -> Table:
-    """Return the share of positions in coverage, a column per height; rows that are 100.0 % everywhere are one."""
+    """Return the share of positions in coverage by height. Rows with 100.0 % everywhere share one row."""
     heights = sorted({m.altitude_m for m in data.rss})
     rows: list[Sequence[str | None]] = []
     full = 0
@@ -923,7 +928,7 @@ def interpolation_card(data: MapsData) -> Card:
 
 
 def error_tables(errors: Sequence[MapError]) -> list[Table]:
-    """Return a table for each way of evaluation: a row per method and K, a column per height."""
+    """Return a table for each kind of evaluation: a row per method and K, a column per height."""
     tables = []
     for evaluation, members in grouped(errors, lambda e: e.evaluation).items():
         heights = sorted({e.altitude_m for e in members})
@@ -943,12 +948,12 @@ def error_tables(errors: Sequence[MapError]) -> list[Table]:
     return tables
 
 
-# Cards in the order of the page. A new card is one function more.
+# Cards in the order of the page. A new card is a further function.
 CARDS = (result_card, levels_card, flights_card, ranks_card, interpolation_card)
 
 
 def maps_page(data: MapsData, files: Sequence[str]) -> str:
-    """Return the whole page."""
+    """Return the page."""
     charts = [chart for plate in plates(data) for chart in plate.charts]
     charts += [chart for flight in data.flights for chart in flown(flight)]
     linked = payload(data, charts) if data.rss or data.rank or data.layers else None
@@ -959,10 +964,10 @@ def maps_page(data: MapsData, files: Sequence[str]) -> str:
     extent += [counted(len(data.rank), "rank map")] if data.rank else []
     about = f"Predicted coverage and channel rank over {data.site.name}: {', '.join(extent)}."
     if data.corrected:
-        about += " Levels corrected by flights stand beside the ray tracing, with their standard deviation."
+        about += " The map has levels of ray tracing, and levels corrected by flights with their standard deviation."
     beside = paragraph(
-        f"Beside this page: {', '.join(files)}; every map and chart as a picture in figures/ with --figures png, svg "
-        "or pdf. Method: D. Lee, O. Ozdemir, A. Ram, I. Guvenc, arXiv 2502.10324."
+        f"Files in the same folder: {', '.join(files)}. With --figures png, svg or pdf, figures/ contains every map "
+        "and chart. Method: D. Lee, O. Ozdemir, A. Ram, I. Guvenc, arXiv 2502.10324."
     )
     settings = settings_card(data, data.settings)
     remarks = Card(title="Notes", text=[notes(data), beside])
@@ -975,7 +980,7 @@ def maps_page(data: MapsData, files: Sequence[str]) -> str:
 
 
 def write_maps(data: MapsData, folder: str | Path, drawn: str = "none") -> list[Path]:
-    """Write ``map.html``, ``metrics.json`` and figures in one format, all or none; gives the files, the page first."""
+    """Write ``map.html``, ``metrics.json`` and figures in one format, all or none; return the files, the page first."""
     folder = Path(folder)
     written = [write_file(folder / "metrics.json", json_text(maps_metrics(data)))]
     specs = [] if drawn == "none" else figure_specs(data)

@@ -429,7 +429,7 @@ def _model_card(data: PredictionPage) -> Card:
         )  # fmt: skip
         return Card(title="Model", id="model", text=[text])
     errors = Table(
-        caption=f"Errors of 4 s means on held-out {data.chosen['left_out']} [dB], without the mean error of each flight.",
+        caption=f"Errors of 4 s means on held-out {data.chosen['left_out']} [dB], without the mean of each flight.",
         columns={"Model": HEAD, "Residual field": TEXT, "RMSE": 2, "CRPS": 3}, look="dense",
         rows=[(row["base"], row["field"], row["rmse_db"], row["crps_db"]) for row in data.candidates],
     )  # fmt: skip

@@ -119,7 +119,7 @@
     if (r) rows.push(["Rank reports", number(r.n, 0)], ["Agreement", number(100 * r.agreement, 0, "%")]);
     cells(at("span"), rows);
     const shown = rss(), held = shown ? get(shown.time).length : 0;
-    at("thinned").textContent = shown && held < shown.of ? `${held} of ${shown.of} samples are in this page (extremes kept); the tables beside it hold all.` : "";
+    at("thinned").textContent = shown && held < shown.of ? `${held} of ${shown.of} samples are in this page (extremes are retained); rss.csv and rank.csv contain all.` : "";
   }
 
   // --- charts over time -----------------------------------------------------------------------------------------------

@@ -307,9 +307,9 @@
     at("scale").closest("label").hidden = quantity().kind === "classes" || state.difference;
     at("choices-b").hidden = !state.difference;
     selects(at("axes-a"), "a"); selects(at("axes-b"), "b");
-    at("steps").textContent = `Values are kept in this page in steps of ${quantity().kind === "classes" ? "one class" : quantity().step + (quantity().unit ? " " + quantity().unit : "")}; the tables beside it hold them in full.`
+    at("steps").textContent = `This page stores values in steps of ${quantity().kind === "classes" ? "one class" : quantity().step + (quantity().unit ? " " + quantity().unit : "")}; the tables beside it hold them in full.`
       + (data.left_out ? ` Left out of this page for its size: ${data.left_out}.` : "")
-      + (data.stride > 1 ? " Numbers of the layer are those of the cells kept." : "");
+      + (data.stride > 1 ? " Numbers of the layer are those of the cells in this page." : "");
   }
   function setDifference(on) {
     state.difference = on && Object.keys(quantity().layers).length > 1;

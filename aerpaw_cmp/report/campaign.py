@@ -593,7 +593,8 @@ def figure_specs(data: CampaignData) -> Iterator[FigureSpec]:
         yield FigureSpec(
             "season_nodes", partial(season_nodes, data), "Offsets over the campaign",
             "Offset of each node over the dates, minus the part that all nodes share (weather, a transmitter). Bars: "
-            f"95 % intervals of steps. At most {_NODES_SHOWN} nodes are shown: those with steps, then those that vary most.",
+            f"95 % intervals of steps. At most {_NODES_SHOWN} nodes are shown: nodes with steps, then those that vary "
+            "most.",
         )  # fmt: skip
     if data.season.places is not None:
         yield FigureSpec(

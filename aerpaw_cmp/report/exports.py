@@ -547,11 +547,8 @@ def write_exports(export: Export, folder: Path, formats: Iterable[str], progress
     Raises
     ------
     OSError
-        If the disk does not take a file.
-    """If a file cannot be written.
-    pass
-    pass
-
+        If a file cannot be written.
+    """
     writers = {"kmz": write_kmz, "netcdf": write_netcdf}
     place = folder / FOLDER
     written: list[Path] = []

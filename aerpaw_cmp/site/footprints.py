@@ -1,9 +1,9 @@
-"""Buildings, forests and geofences from map files: classified, projected, repaired, with a list of what was done.
+"""Buildings, forests and geofences from map files: classified, projected, repaired, with a list of all actions.
 
-Heights: the ``height`` tag, else ``building:levels`` times 3 m, else that of the outline around a part, else a default,
-which is counted. Parts of a building keep the ground
-before its outline. Overlapping buildings of one height become one; of different heights the higher keeps the ground.
-Holes stay. Slivers and duplicates go. Single trees keep their tagged sizes; tree rows become trees along their line.
+The height of a building is that of the ``height`` tag, or ``building:levels`` times 3 m, or that of the outline around
+a part, or a default that is counted. Parts of a building replace its outline on their ground. Overlapping buildings of
+equal height are joined; otherwise the higher one covers the ground. Holes are retained. Slivers and duplicates are
+removed. Single trees have their tagged sizes, and tree rows become trees along their line.
 """
 
 from __future__ import annotations
@@ -50,40 +50,40 @@ from .site import Building, Forest, Geofence
 from .siteyaml import SiteModel, build_site, extent_m, site_model
 from .trees import TALLEST_TREE_M, WIDEST_CROWN_M
 
-# OpenStreetMap's own rule of thumb for a storey.
+# Storey height that OpenStreetMap suggests.
 _LEVEL_M = 3.0
-# Two storeys: a barn, a house.
+# Two storeys, as of a barn or a house.
 _DEFAULT_HEIGHT_M = 6.0
 TALLEST_M = 300.0
-# Outlines farther from the origin are not of this site.
+# Outlines farther from the origin do not belong to the site.
 FAR_M = 20_000.0
 
-# The area of a site without a base: the map within this square around the first tower, and this far around each tower.
+# Area of a site without a base: the map within this square around the first tower, and this distance from each tower.
 _AROUND_M, _NEAR_TOWER_M = 2000.0, 500.0
 
-# Elevations of a map: fewer make no surface, more are thinned (its time grows with the cube), and their error [m].
+# Least and largest number of elevations for a surface (its time grows with the cube), and their error [m].
 _FEWEST_ELEVATIONS, _MOST_ELEVATIONS, _ELEVATION_SD_M = 3, 300, 1.0
 
-# Coordinates are rounded to this.
+# Grid of coordinates.
 _GRID_M = 0.001
 
-# Areas narrower than this everywhere are drawing errors; vertices closer to a straight line are dropped too.
+# Narrower areas are drawing errors, and vertices closer to a straight line are removed.
 _SLIVER_M = 0.3
 
 _MINIMUM_AREA_M2 = 2.0
 _SAME_HEIGHT_M = 0.25
 
-# Height of a wood that states none, the mean of all stands by LiDAR at Lake Wheeler.
+# Height of a wood without a stated height: the mean of all forest stands by LiDAR at Lake Wheeler.
 _DEFAULT_CANOPY_M = 20.0
-# Share of trees that keep their leaves by OpenStreetMap's tags of a wood.
+# Share of evergreen trees by tags of OpenStreetMap.
 _EVERGREEN = {"evergreen": 1.0, "needleleaved": 1.0, "mixed": 0.5}
 
-# Forests are cut off this far outside the area of the site: trees there shadow nothing.
+# Margin of forests outside the area of the site, beyond which trees shade no path.
 _FOREST_MARGIN_M = 1000.0
 
-# The thickest trunk known is 42 m around.
+# The thickest known trunk has a girth of 42 m.
 _WIDEST_GIRTH_M = 45.0
-# Distance of the trees of a row without a tagged crown diameter: the default crowns touch.
+# Distance of the trees of a row without a tagged crown diameter, at which default crowns touch.
 _ROW_SPACING_M = 10.0
 
 _MAXIMUM_ROW_TREES = 10_000
@@ -91,7 +91,7 @@ _MAXIMUM_ROW_TREES = 10_000
 
 @dataclass(frozen=True, slots=True)
 class SingleTree:
-    """A tree of a map file in the site frame [m]; sizes that it does not state are None."""
+    """A tree of a map file in the site frame [m]; sizes that are not stated are None."""
 
     east_m: float
     north_m: float
@@ -102,10 +102,10 @@ class SingleTree:
 
 @dataclass(slots=True)
 class Footprints:
-    """Elements found in map files, in the site frame, and the actions taken on them.
+    """The elements of map files in the site frame, and the actions on them.
 
-    ``actions`` are sentences for the user; those that ask for a look begin with ``warning:``. ``credits`` name those
-    whose data they are; ``assumed`` tells of sizes that the maps do not state.
+    ``actions`` are sentences for the user; those that need a check begin with ``warning:``. ``credits`` name the sources of
+    the data. ``assumed`` describes sizes that the maps do not state.
     """
 
     buildings: list[Building] = field(default_factory=list)
@@ -121,7 +121,7 @@ class Footprints:
 
 @dataclass(slots=True)
 class _Shape:
-    """A projected outline on its way to a record."""
+    """A projected outline before it becomes a record."""
 
     name: str
     source: str
@@ -129,7 +129,7 @@ class _Shape:
     height_m: float = 0.0
     stated: bool = False
     assumed: bool = False
-    """Neither height nor levels are in the map."""
+    """True if the map has neither height nor levels."""
     material: str = "concrete"
     part: bool = False
     evergreen: float = 0.0
@@ -143,20 +143,20 @@ def import_footprints(
     trees: bool = False,
     area_m: tuple[float, float, float, float] | None = None,
 ) -> Footprints:
-    """Outlines of map files as records of the site.
+    """Return the outlines of map files as records of the site.
 
     Parameters
     ----------
     files : sequence of paths
-        GeoJSON, OSM XML, Overpass JSON, KML or KMZ, told by content.
+        GeoJSON, OSM XML, Overpass JSON, KML or KMZ, recognised by content.
     frame : SiteFrame
-        Of the site that they belong to.
+        Frame of the site.
     untagged : {"building", "forest", "geofence"}, optional
-        What areas without a known tag are. By default a KML area is a geofence and others are left out.
+        Kind of areas without a known tag. By default a KML area is a geofence and other areas are skipped.
     trees : bool
-        Forests are single trees at random places; by default media with a height.
+        True if forests become single trees at random positions. By default they are media with a height.
     area_m : (east_min, east_max, north_min, north_max), optional
-        Of the site; forests are cut off :data:`_FOREST_MARGIN_M` outside.
+        Area of the site; forests are cut off :data:`_FOREST_MARGIN_M` outside.
 
     Returns
     -------
@@ -165,9 +165,9 @@ def import_footprints(
     Raises
     ------
     InputError
-        Unreadable file, swapped coordinates, a file of another place, heights that cannot be metres, or no area.
+        For an unreadable file, swapped coordinates, a file of another place, heights that cannot be metres, or no area.
     UsageError
-        ``untagged`` is no kind of area.
+        If ``untagged`` is not a kind of area.
     """
     if untagged is not None and untagged not in get_args(Kind):
         raise UsageError(f"untagged areas as '{untagged}'", expected="one of " + ", ".join(get_args(Kind)))
@@ -185,7 +185,7 @@ def import_footprints(
             result.ground.append((float(east), float(north), height_m))
         for tree in content.trees:
             result.trees += _single_trees(tree, frame, result.actions)
-    # heights before duplicates go: a part may have its height from an outline that repeats another
+    # inherit heights before duplicates are removed, because a part may inherit from a duplicate
     _inherit(shapes["building"], result.actions)
     _warn_of_feet(shapes["building"], result.actions)
     near = None if area_m is None else box(area_m[0], area_m[2], area_m[1], area_m[3]).buffer(_FOREST_MARGIN_M)
@@ -210,7 +210,7 @@ def _sort(
     shapes: dict[Kind, list[_Shape]],
     actions: list[str],
 ) -> None:
-    """Each outline of a file to the shapes of its kind; what has none is counted."""
+    """Add each outline of a file to the shapes of its kind, and count outlines of unknown kind."""
     skipped: Counter[str] = Counter()
     for outline in content.outlines:
         bare = untagged if main_tag(outline.tags) == "untagged" else None
@@ -237,7 +237,7 @@ def _sort(
 
 
 def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[SingleTree]:
-    """A tree with its tagged sizes, or those of a row, a crown's diameter apart."""
+    """Return a tree with its tagged sizes, or the trees of a row."""
     notes: list[str] = []
     height = positive_metres(tree.tags, ("height", "est_height"), notes)
     if height is not None and height > TALLEST_TREE_M:
@@ -249,7 +249,7 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
         crown = None
     girth = positive_metres(tree.tags, ("circumference",), notes)
     if girth is not None and girth > _WIDEST_GIRTH_M:
-        # a number without unit that no tree reaches in metres or in feet is in centimetres
+        # a number without unit that no tree reaches in metres or feet is in centimetres
         bare = metres(f"{tree.tags['circumference'].strip()} m") is not None
         if bare and 3.3 * _WIDEST_GIRTH_M < girth <= 100.0 * _WIDEST_GIRTH_M:
             notes.append(
@@ -260,12 +260,12 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
             notes.append(f"a trunk {girth:g} m around; feet or centimetres? The site's default is used")
             girth = None
     points = np.stack(frame.to_local(*np.array(tree.positions, dtype=np.float64).reshape(-1, 2).T), axis=1)
-    # a torn number of degrees projects to infinity
+    # a truncated number of degrees projects to infinity
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points) or float(np.hypot(*points.mean(axis=0))) > FAR_M:
         actions.append(f"{tree.source}: a tree left out, it does not stand at the site")
         return []
-    # a tree row is mapped as a line
+    # a tree row is a line in the map
     if len(points) > 1:
         points = _along(points, crown or _ROW_SPACING_M)
         notes.append(f"{counted(len(points), 'tree')} placed along the row, {crown or _ROW_SPACING_M:g} m apart")
@@ -275,18 +275,18 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
 
 
 def _along(line_m: FloatArray, spacing_m: float) -> FloatArray:
-    """Points (n, 2) on a line (corners, 2) from its beginning to its end, about ``spacing_m`` apart."""
+    """Return points on a line (corners, 2) from its begin to its end, about ``spacing_m`` apart, shape (n, 2)."""
     line = LineString(line_m)
     count = min(max(round(line.length / max(spacing_m, 0.5)), 1), _MAXIMUM_ROW_TREES)
     return np.asarray(shapely.get_coordinates(line.interpolate(np.linspace(0.0, 1.0, count + 1), normalized=True)))
 
 
 def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> list[_Shape]:
-    """Forests without what lies far outside the site."""
+    """Return forests without the parts far outside the site."""
     near_shapes = []
     for shape in shapes:
         inside = shape.area if near is None else _areas_only(shape.area.intersection(near))
-        # less is rounding of the cut, not worth a line
+        # a smaller part is a rounding error and is not reported
         if inside.area < 0.999 * shape.area.area:
             lost = (shape.area.area - inside.area) / 1e4
             actions.append(
@@ -301,7 +301,7 @@ def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> 
 def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float | None) -> None:
     actions = result.actions
     buildings = _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions)
-    # woods have no height that could decide: the first in the file keeps the ground
+    # the first wood in the file covers the ground, because woods have no height that could decide
     woods = _first_keeps(_without_duplicates(shapes["forest"], actions), actions)
     for name, shape, area in _parts(buildings, actions):
         result.buildings.append(
@@ -310,7 +310,7 @@ def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float 
     for name, shape, area in _parts(woods, actions):
         wood = Forest(name, area, source=shape.source, evergreen_share=shape.evergreen)
         result.forests.append(
-            # 0 is "not stated"
+            # 0 means not stated
             wood if canopy_m is None else replace(wood, height_m=round(shape.height_m, 2) or canopy_m)
         )
     for name, _, area in _parts(shapes["geofence"], actions):
@@ -332,13 +332,13 @@ def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float 
 
 
 def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
-    """Refuses a file whose outlines all lie elsewhere, and says so when swapping would bring them here."""
+    """Refuse a file whose outlines are all far away, and report if swapped coordinates would be near."""
     positions = [p for outline in content.outlines for outer, _ in outline.parts for p in outer]
     positions += [p for tree in content.trees for p in tree.positions]
     if not positions:
         return
     latitude, longitude = np.array(positions).T
-    # one outline near is enough: a file may reach beyond the site
+    # one near outline is sufficient, because a file may extend beyond the site
     if _distance_m(latitude, longitude, frame).min() <= FAR_M:
         return
     centre = f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}"
@@ -366,20 +366,20 @@ def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
 
 
 def _distance_m(latitude: Any, longitude: Any, frame: SiteFrame) -> Any:
-    """Rough distance [m] from the origin; inf where it is no position on Earth."""
+    """Return the approximate distance from the origin [m], or inf for an impossible position."""
     good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
-    north = np.where(good, latitude, 0.0) - frame.latitude_deg  # a torn number may be 1e306
-    # the short way round the Earth
+    north = np.where(good, latitude, 0.0) - frame.latitude_deg  # a truncated number may be 1e306
+    # use the shorter way around the Earth
     turn = (np.where(good, longitude, 0.0) - frame.longitude_deg + 180) % 360 - 180
     east = turn * math.cos(math.radians(frame.latitude_deg))
     return np.where(good, 111_200 * np.hypot(north, east), np.inf)
 
 
 def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape | None:
-    """The outline in metres, valid; None (and a line in ``actions``) when nothing is left."""
+    """Return the valid outline in metres, or None and a line in ``actions`` if nothing remains."""
     areas, notes = [], []
     for outer, holes in outline.parts:
-        # no outline spans half of the Earth: it goes over 180 degrees
+        # no outline spans half of the Earth, so it crosses 180 degrees
         if max(np.abs(np.diff([p[1] for p in outer])), default=0) > 180:
             notes.append("crosses the antimeridian; its parts were joined")
         ring = _ring(outer, frame)
@@ -391,7 +391,7 @@ def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape |
         if len(inner) < len(holes):
             notes.append("a hole with fewer than 3 distinct points was left out")
         if inner:
-            # holes joined first: two that overlap would make an outline that is not valid
+            # join holes first, because overlapping holes would make the outline invalid
             without = shapely.union_all([_repaired(hole, notes, "a hole was repaired") for hole in inner])
             if not without.intersects(area):
                 notes.append("a hole outside its outline was left out")
@@ -425,7 +425,7 @@ def _why_no_ring(positions: Sequence[Position]) -> str:
 
 
 def _ring(positions: Sequence[Position], frame: SiteFrame) -> Polygon | None:
-    # a ring repeats its first point, and some repeat all
+    # a ring repeats its first point, and some repeat all points
     if len(set(positions)) < 3:
         return None
     latitude, longitude = np.array(positions).T
@@ -441,7 +441,7 @@ def _repaired(ring: Polygon, notes: list[str], note: str) -> BaseGeometry:
         notes.append(f"a ring that crosses itself at more than {MAX_CROSSINGS} places was left out")
         return Polygon()
     notes.append(f"{note} ({shapely.is_valid_reason(ring).split('[')[0].lower()})")
-    # "structure" keeps what the ring runs round; "linework" would make holes of what it runs round twice
+    # "structure" retains areas that a ring encloses twice; "linework" would make holes of them
     return _areas_only(shapely.make_valid(ring, method="structure"))
 
 
@@ -475,15 +475,15 @@ def _describe(shape: _Shape, outline: Outline, path: Path, actions: list[str]) -
         )
     shape.height_m = height
     shape.material = material_of(tags)
-    # 3.28 feet a metre: such a ratio of height to storeys is no accident
+    # a metre has 3.28 feet, so such a ratio of height to storeys is suspicious
     if height > 2 * _LEVEL_M and levels and 2.7 <= height / (levels * _LEVEL_M) <= 4.5:
         shape.stated = False  # counted by _warn_of_feet
         actions.append(f"warning: {shape.source}: {height:g} m for {levels:g} levels; are these feet?")
 
 
 def _inherit(shapes: list[_Shape], actions: list[str]) -> None:
-    """Parts without a height are as high as the building whose outline holds them."""
-    # whole buildings whose height the map states
+    """Set the height of parts without a height to that of the building whose outline contains them."""
+    # complete buildings with a stated height
     known = [shape for shape in shapes if not (shape.part or shape.assumed)]
     tree = shapely.STRtree([shape.area for shape in known])
     for part in (shape for shape in shapes if shape.part and shape.assumed):
@@ -494,7 +494,7 @@ def _inherit(shapes: list[_Shape], actions: list[str]) -> None:
 
 
 def _assumed_heights(shapes: list[_Shape]) -> str:
-    """One line on the buildings whose height no map says."""
+    """Return one line about buildings whose height is in no map."""
     assumed = [shape for shape in shapes if shape.assumed]
     if not assumed:
         return ""
@@ -516,7 +516,7 @@ def _describe_wood(shape: _Shape, tags: Mapping[str, str], actions: list[str]) -
 
 
 def _warn_of_feet(shapes: list[_Shape], actions: list[str]) -> None:
-    """A country site where most stated heights are tower blocks was probably drawn in feet."""
+    """Warn if most stated heights are those of tower blocks, because the map is probably in feet."""
     stated = [shape.height_m for shape in shapes if shape.stated]
     if len(stated) >= 3 and float(np.median(stated)) > 20 and max(shape.area.area for shape in shapes) < 50_000:
         actions.append(
@@ -529,7 +529,7 @@ def _warn_of_feet(shapes: list[_Shape], actions: list[str]) -> None:
 
 
 def _without_duplicates(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
-    """Drops outlines that cover the same ground as an earlier one, parts those of parts; a stated height is kept."""
+    """Drop outlines that cover the same ground as an earlier outline; a stated height is retained."""
     tree = shapely.STRtree([shape.area for shape in shapes])
     duplicates: set[int] = set()
     for i, shape in enumerate(shapes):
@@ -537,7 +537,7 @@ def _without_duplicates(shapes: list[_Shape], actions: list[str]) -> list[_Shape
             continue
         for j in sorted(int(k) for k in tree.query(shape.area) if k > i and int(k) not in duplicates):
             other = shapes[j]
-            # of like size first: an intersection is dear
+            # compare sizes first, because an intersection is slow
             ratio = shape.area.area / max(other.area.area, 1e-9)
             alike = shape.part == other.part and 0.98 < ratio < 1.02
             if not (alike and shape.area.intersection(other.area).area > 0.98 * shape.area.area):
@@ -550,12 +550,12 @@ def _without_duplicates(shapes: list[_Shape], actions: list[str]) -> list[_Shape
 
 
 def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
-    """Sets of shapes whose areas overlap, directly or by way of others."""
+    """Return sets of shapes whose areas overlap, directly or through other shapes."""
     if not shapes:
         return []
     areas = np.array([shape.area for shape in shapes], dtype=object)
     first, second = shapely.STRtree(areas).query(areas, predicate="intersects")
-    # neighbours share a wall, and rounding an area of it
+    # neighbours share a wall, and rounding errors along it
     overlap = shapely.area(shapely.intersection(areas[first], areas[second])) > 0.01
     pairs = coo_array((overlap[overlap], (first[overlap], second[overlap])), shape=(len(shapes), len(shapes)))
     groups: dict[int, list[_Shape]] = {}
@@ -565,7 +565,7 @@ def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
 
 
 def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
-    """Outlines without the ground of their parts: where parts are mapped, theirs are the heights."""
+    """Return outlines without the ground of their parts, because parts have better heights."""
     parts = [shape for shape in shapes if shape.part]
     if not parts:
         return shapes
@@ -582,7 +582,7 @@ def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
 
 
 def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
-    """Disjoint shapes: of one height and material merged, lower ones cut where they lie under higher ones."""
+    """Return disjoint shapes: equal height and material are joined, lower ones are cut below higher ones."""
     disjoint: list[_Shape] = []
     for group in _groups(shapes):
         disjoint += group if len(group) == 1 else _higher_first(group, actions)
@@ -591,7 +591,7 @@ def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
 
 def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
     disjoint: list[_Shape] = []
-    # from the highest down: what is under a higher roof is not seen
+    # begin with the highest, because a shape below a higher roof is not visible
     for shape in sorted(group, key=lambda shape: -shape.height_m):
         over = [higher for higher in disjoint if higher.area.intersects(shape.area)]
         free = _areas_only(shape.area.difference(shapely.union_all([higher.area for higher in over])))
@@ -614,7 +614,7 @@ def _alike(first: _Shape, second: _Shape) -> bool:
 
 
 def _first_keeps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
-    """Forests do not overlap: trees would stand twice as dense."""
+    """Return forests without overlaps, which would double the density of trees."""
     disjoint: list[_Shape] = []
     for group in _groups(shapes):
         covered: BaseGeometry = Polygon()
@@ -629,11 +629,11 @@ def _first_keeps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
 
 
 def _parts(shapes: list[_Shape], actions: list[str]) -> list[tuple[str, _Shape, Polygon]]:
-    """Single polygons with unique names, without slivers and needless vertices."""
+    """Return single polygons with unique names, without slivers and redundant vertices."""
     parts: list[tuple[str, _Shape, Polygon]] = []
     used: set[str] = set()
     for shape in shapes:
-        # rounded here to what site.yaml keeps: rounding coordinates one by one can make a ring cross itself
+        # round to the precision of site.yaml here, because rounding coordinates separately can make a ring cross itself
         for part in shapely.get_parts(_areas_only(shapely.set_precision(shape.area, _GRID_M))):
             plain = part.simplify(_SLIVER_M / 2)
             plain = plain if isinstance(plain, Polygon) and plain.is_valid and not plain.is_empty else part
@@ -671,7 +671,7 @@ def import_site(
     files : sequence of paths
         Map files.
     base : str or path, optional
-        Packaged site or site.yaml from which towers and settings are kept. Without ``towers`` the default is Lake
+        Packaged site or site.yaml that provides towers and settings. Without ``towers`` the default is Lake
         Wheeler, if the map is there.
     towers : sequence of str
         ``NAME=LATITUDE,LONGITUDE,HEIGHT``: antennas [deg, deg, m above the ground]. They replace those of ``base``.
@@ -687,14 +687,14 @@ def import_site(
     Returns
     -------
     SiteModel, list of str
-        The settings (see :func:`site_yaml`), and what was done.
+        The settings (see :func:`site_yaml`), and the list of actions.
 
     Raises
     ------
     UsageError
         If no file or no tower is known, a tower is not ``NAME=LATITUDE,LONGITUDE,HEIGHT``, or elevations contradict.
     InputError
-        If the map or the elevation model cannot be read, or does not lie at the site.
+        If the map or the elevation model cannot be read, or is not at the site.
     """
     if not files:
         raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files")
@@ -708,7 +708,7 @@ def import_site(
     content = model.model_dump()
     if towers:
         content["towers"] = named_towers
-    if model.dem is not None:  # the new file may lie in another folder
+    if model.dem is not None:  # the new file may be in another folder
         content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
     if relief:
         content |= {**relief, "tower_ground": None}
@@ -784,7 +784,7 @@ def _named_towers(towers: Sequence[str]) -> dict[str, dict[str, float]]:
 
 
 def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
-    """Outlines and trees of maps in place of those of the base."""
+    """Replace outlines and trees of the base by those of maps, and return the actions."""
     content |= {
         "buildings": [
             _outline_dict(b.name, b.footprint) | {"height_m": b.height_m, "material": b.material, "source": b.source}
@@ -805,7 +805,7 @@ def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
 
 
 def _kept_of_base(model: SiteModel, base: str | Path) -> str:
-    """Sentence on the data that an import takes over from its base."""
+    """Return the sentence about data of the base that an import retains."""
     origin = f"{model.origin.latitude_deg:.6f}, {model.origin.longitude_deg:.6f}"
     ground = "flat ground" if model.dem is None else f"the elevation model {model.dem.path}"
     return (
@@ -822,7 +822,7 @@ def _tree_dict(tree: SingleTree) -> dict[str, Any]:
 
 
 def _outline_dict(name: str, area: Polygon) -> dict[str, Any]:
-    """Name and polygon as site.yaml writes them."""
+    """Return name and polygon in the form of site.yaml."""
 
     def ring(line: Any) -> list[tuple[float, float]]:
         return [(round(float(x), 3), round(float(y), 3)) for x, y in list(line.coords)[:-1]]
@@ -831,14 +831,14 @@ def _outline_dict(name: str, area: Polygon) -> dict[str, Any]:
 
 
 def _printable(text: str) -> str:
-    """Without control characters, which map data may hold and YAML refuses even in comments."""
+    """Return a text without control characters, which YAML refuses even in comments."""
     return "".join(character if character.isprintable() else "?" for character in text)
 
 
 def site_yaml(model: SiteModel, *, header: Sequence[str] = ()) -> str:
-    """The text of a site.yaml that :func:`~aerpaw_cmp.site.siteyaml.load_site` reads back to the same site.
+    """Return the text of a site.yaml that :func:`~aerpaw_cmp.site.siteyaml.load_site` reads as the same site.
 
-    ``header`` lines become comments at the top (what the import did).
+    ``header`` lines become comments at the top, such as the actions of an import.
     """
     content = model.model_dump(mode="json", exclude_defaults=True)
     text = "".join(f"# {_printable(line)}\n" for entry in header for line in str(entry).splitlines())

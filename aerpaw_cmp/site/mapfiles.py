@@ -36,13 +36,13 @@ from ..common.text import counted
 from ..logs import files
 from .materials import MATERIALS
 
-# As OpenStreetMap's licence asks for it.
+# The licence of OpenStreetMap requires this text.
 OSM_CREDIT = "(c) OpenStreetMap contributors, ODbL"
 
-# Latitude, longitude [deg].
+# Latitude and longitude [deg].
 Position = tuple[float, float]
 
-# What reading one element may raise: the element is left out and listed, the others stay.
+# Exceptions of an element that cannot be read. It is skipped and listed, and the others are used.
 BROKEN_ELEMENT = (InputError, TypeError, KeyError, AttributeError, IndexError, ValueError, OverflowError)
 
 
@@ -53,15 +53,15 @@ class Outline:
     Parameters
     ----------
     name : str
-        Its name, or file and id.
+        Name of the area, or file and id.
     source : str
         File name and id.
     tags : mapping of str to str
-        As in the file.
+        Tags of the file.
     parts : list of (outer ring, hole rings)
         Positions in degrees, as written.
     broken : list of str
-        What was wrong while reading it.
+        Errors in the area.
     """
 
     name: str
@@ -82,7 +82,7 @@ class TreeLine:
 
 @dataclass(slots=True)
 class MapFile:
-    """All outlines and trees of a file, sentences about what is neither, and whose data they are where that shows."""
+    """The outlines and trees of a file, sentences about other elements, and the source of the data if it is known."""
 
     kind: str
     credit: str = ""
@@ -93,40 +93,40 @@ class MapFile:
     notes: list[str] = field(default_factory=list)
 
     def take(self, other: MapFile) -> None:
-        """Take over everything in a part of the file."""
+        """Add the contents of a part of the file."""
         self.outlines += other.outlines
         self.trees += other.trees
         self.ground += other.ground
         self.notes += other.notes
 
     def note_no_areas(self, name: str, lines: Counter[str]) -> None:
-        """A note on what of a file ``name`` bounds no area, counted by its kind."""
+        """Add a note about elements of a file ``name`` that bound no area, counted by kind."""
         if lines:
             listed = ", ".join(f"{count} {what}" for what, count in lines.most_common())
             self.notes.append(f"{name}: left out, not areas: {listed}")
 
 
-# A ring that crosses itself more often is no outline that could be repaired: the time to try grows without bound.
+# A ring with more self-intersections is not repaired, because the time to try has no limit.
 MAX_CROSSINGS = 1000
 
 
 def is_tangled(ring: Polygon) -> bool:
-    """Check whether a ring crosses itself at more than :data:`MAX_CROSSINGS` places; in pieces, with an early end."""
+    """Check whether a ring has more than :data:`MAX_CROSSINGS` self-intersections, in pieces and with an early end."""
     line = np.asarray(ring.exterior.coords)[:, :2]
     segments = shapely.linestrings(np.stack([line[:-1], line[1:]], axis=1))
-    # too few pairs to cross so often
+    # there are too few pairs for so many intersections
     if len(segments) * (len(segments) - 1) // 2 <= MAX_CROSSINGS:
         return False
     tree, crossings = shapely.STRtree(segments), 0
     for start in range(0, len(segments), 64):
         crossings += tree.query(segments[start : start + 64], predicate="crosses").shape[1]
-        if crossings > 2 * MAX_CROSSINGS:  # every place is seen from both sides
+        if crossings > 2 * MAX_CROSSINGS:  # every intersection is found from both sides
             return True
     return False
 
 
 def lonlat(point: Any, where: str, path: Path) -> Position:
-    """A position written longitude first; InputError when it is none."""
+    """Return a position that is written longitude first; raise InputError if it is not valid."""
     try:
         longitude, latitude = float(point[0]), float(point[1])
     except (TypeError, ValueError, IndexError, KeyError, OverflowError):
@@ -137,7 +137,7 @@ def lonlat(point: Any, where: str, path: Path) -> Position:
 
 
 def reason(error: Exception) -> str:
-    """Give the reason why an element cannot be used, in words."""
+    """Return the reason why an element cannot be used."""
     if isinstance(error, InputError):
         return error.found
     if isinstance(error, KeyError):
@@ -146,18 +146,18 @@ def reason(error: Exception) -> str:
 
 
 def left_out(path: Path, line: int | None, what: str, error: Exception) -> str:
-    """The line of the list about an element that cannot be used.
+    """Return the line of the list about an element that cannot be used.
 
     Parameters
     ----------
     path : Path
-        The map.
+        Map file.
     line : int or None
-        Where the element stands.
+        Line of the element.
     what : str
-        The element.
+        Name of the element.
     error : Exception
-        Why it cannot be used.
+        Reason why it cannot be used.
 
     Returns
     -------
@@ -176,7 +176,7 @@ _FOREST_TAGS = (("landuse", "forest"), ("natural", "wood"), ("landcover", "trees
 _NOT = ("no", "", "none", "false", "0")
 _UNITS_M = {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": _FOOT_M}
 _UNIT_WORDS = {"metre": "m", "meter": "m", "foot": "ft", "feet": "ft"}
-# OSM's words for what P.2040 has under another name, or nearly.
+# Words of OpenStreetMap for materials that P.2040 has under another or a similar name.
 _MATERIAL_WORDS = {
     "steel": "metal",
     "aluminium": "metal",
@@ -187,7 +187,7 @@ _MATERIAL_WORDS = {
 
 
 def kind_of(tags: Mapping[str, str]) -> Kind | None:
-    """Kind of an area, or None when its tags do not say.
+    """Return the kind of an area, or None if its tags have none.
 
     Examples
     --------
@@ -199,7 +199,7 @@ def kind_of(tags: Mapping[str, str]) -> Kind | None:
         return "building"
     if any(tags.get(key) == value for key, value in _FOREST_TAGS):
         return "forest"
-    # not OSM's: keys of our own exports and of hand-made GeoJSON
+    # keys of our own exports and of hand-made GeoJSON
     word = tags.get("kind", tags.get("type", ""))
     for kind in ("building", "forest", "geofence"):
         if word == kind or (kind == "geofence" and kind in tags):
@@ -213,7 +213,7 @@ def is_part(tags: Mapping[str, str]) -> bool:
 
 
 def below_ground(tags: Mapping[str, str]) -> bool:
-    """Check whether nothing of a building stands above the ground.
+    """Check whether no part of a building is above the ground.
 
     Examples
     --------
@@ -224,7 +224,7 @@ def below_ground(tags: Mapping[str, str]) -> bool:
     """
     if "underground" in (tags.get("location", "").lower(), tags.get("parking", "").lower()):
         return True
-    # below zero things lie under others
+    # objects with a negative layer are below others
     layer = _number(tags.get("layer", ""))
     if tags.get("tunnel", "no").lower() not in _NOT or (layer is not None and layer < 0):
         return True
@@ -233,7 +233,7 @@ def below_ground(tags: Mapping[str, str]) -> bool:
 
 
 def main_tag(tags: Mapping[str, str]) -> str:
-    """The tag that tells most about an area of no known kind; ``untagged`` where none says what it is.
+    """Return the most informative tag of an area of unknown kind, or ``untagged``.
 
     Examples
     --------
@@ -250,15 +250,15 @@ _TELLING = ("highway", "landuse", "natural", "waterway", "leisure", "amenity", "
 
 
 def material_of(tags: Mapping[str, str]) -> str:
-    """Material of the walls, by name in ``materials``."""
+    """Return the material of the walls, by name in ``materials``."""
     word = tags.get("building:material", "").lower()
     return _MATERIAL_WORDS.get(word, word if word in MATERIALS else "concrete")
 
 
 def metres(text: str) -> float | None:
-    r"""Length of a tag [m], or None: ``12``, ``12 m``, ``350 cm``, ``40 ft``, ``40'``, ``39'4"``, ``12,5``.
+    r"""Return the length of a tag [m], or None: ``12``, ``12 m``, ``350 cm``, ``40 ft``, ``40'``, ``39'4"``, ``12,5``.
 
-    ``1,200`` is None: a thousand or a comma?
+    ``1,200`` is None, because the comma can be a decimal comma or separate thousands.
 
     Examples
     --------
@@ -270,7 +270,7 @@ def metres(text: str) -> float | None:
         text = text.replace(typed, plain)
     if re.search(r"\d,\d{3}(?!\d)", text):
         return None
-    # a decimal comma, now that thousands are refused
+    # a comma is a decimal comma here, because thousands were refused above
     text = text.replace(",", ".")
     if match := re.fullmatch(r"(-?\d+(?:\.\d+)?)\s*(m|cm|km|ft|metre|meter|foot|feet)?s?\.?", text):
         unit = match.group(2) or "m"
@@ -281,21 +281,21 @@ def metres(text: str) -> float | None:
 
 
 def positive_metres(tags: Mapping[str, str], keys: tuple[str, ...], notes: list[str]) -> float | None:
-    """The first usable length among some tags; a value that cannot be used is one sentence in ``notes``.
+    """Return the first valid length among some tags; an invalid value adds a sentence to ``notes``.
 
-    Of several values (``8;12``) the largest holds; ``~12`` is 12.
+    The largest of several values (``8;12``) is used; ``~12`` is 12.
     """
     for key in keys:
         written = tags.get(key, "").strip()
         if not written:
             continue
-        # OSM joins several values by semicolons
+        # OpenStreetMap joins several values by semicolons
         parts = [metres(part.strip().lstrip("~")) for part in written.split(";")]
         lengths = [value for value in parts if value is not None]
         if len(lengths) < len(parts):
             notes.append(f"the {key} '{written}' is not a length")
             continue
-        # exports of databases write 0 or -1 for "unknown"
+        # exports of databases write 0 or -1 for unknown values
         if max(lengths) <= 0:
             notes.append(f"the {key} '{written}' is not above 0, as where nobody knows it")
             continue
@@ -305,7 +305,7 @@ def positive_metres(tags: Mapping[str, str], keys: tuple[str, ...], notes: list[
     return None
 
 
-# OSM's ``roof:height`` is that of the roof alone.
+# ``roof:height`` of OpenStreetMap is the height of the roof alone.
 _OTHER_HEIGHTS = re.compile(
     "roof:|min|base|ground|eave|ceil|level|floor|stor|sourc|method|accura|confid|varian|std|tree|canopy|veg|antenna|unit|elev"
 )
@@ -317,7 +317,7 @@ _STOREYS = re.compile(r"(building)?levels|(n|num|no|noof|numberof)?(floors|stor(
 
 
 def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
-    """Height of a building [m] by any of the names that programs give it, in the unit of the name or of the value.
+    """Return the height of a building by any of the names that programs use, in the unit of the name or value [m].
 
     Examples
     --------
@@ -327,7 +327,7 @@ def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
     names = [name for name in tags if re.search("height|hgt|hght", name.lower())]
     names = [name for name in names if not _OTHER_HEIGHTS.search(name.lower())]
     first = ("height", "building:height", "height_m", "est_height")
-    # OSM's own key first; foreign columns after it, in the file's order
+    # the key of OpenStreetMap comes first, then other columns in the order of the file
     for name in sorted(names, key=lambda n: first.index(n) if n in first else len(first)):
         named = _UNIT_AT_END.search(name.lower())
         unit = named[1] if named else "ft" if _FEET.search(name.lower()) else tags.get(f"{name}_unit", "")
@@ -340,7 +340,7 @@ def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
 
 
 def levels_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
-    """Number of levels; of several (``2;3``) the largest."""
+    """Return the number of levels; the largest of several (``2;3``)."""
     named = (value.strip() for name, value in tags.items() if _STOREYS.fullmatch(re.sub(r"[^a-z]", "", name.lower())))
     written = next(filter(None, named), "")
     if not written:
@@ -348,7 +348,7 @@ def levels_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
     parts = [_number(part) for part in written.split(";")]
     numbers = [value for value in parts if value is not None]
     if len(numbers) < len(parts) or max(numbers) <= 0:
-        if written != "0":  # a ground floor that some mappers do not count
+        if written != "0":  # some mappers do not count the ground floor
             notes.append(f"the number of levels '{written}' is no positive number")
         return None
     if len(numbers) > 1:
@@ -381,23 +381,23 @@ class _Data:
 
 
 def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: LineOf) -> MapFile:
-    """Outlines and trees of OSM elements in Overpass's shape.
+    """Return outlines and trees of OpenStreetMap elements in the form of Overpass.
 
     Parameters
     ----------
     kind : str
-        Of the file, for messages.
+        Kind of the file, for messages.
     elements : iterable of dict
         ``type``, ``id``, ``tags``, and ``lat lon``, ``nodes`` or ``geometry``, ``members``.
     path : Path
-        For messages.
+        File, for messages.
     line_of : callable
-        Line of the element of an index, asked for those that cannot be used.
+        Returns the line of an element by its index, for elements that cannot be used.
 
     Returns
     -------
     MapFile
-        Outlines, trees, and a note per thing that was left out.
+        Outlines, trees, and a note for each skipped element.
     """
     result, data = MapFile(kind, OSM_CREDIT), _Data(path)
     for index, element in enumerate(elements):
@@ -411,7 +411,7 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: L
     lines: Counter[str] = Counter()
     used_ways = _relations(data, result, lines, line_of)
     for identity, way in data.ways.items():
-        # a way without tags is part of a relation, or nothing
+        # a way without tags is part of a relation, or not used
         if way.get("tags") and identity not in used_ways:
             try:
                 _way_outline(identity, way, data, result, lines)
@@ -422,14 +422,14 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: L
 
 
 def _sort(element: Element, index: int, data: _Data) -> None:
-    """Puts an element under its id. One that comes twice keeps the tags and points of both."""
+    """Store an element under its id; an element that occurs twice has the tags and points of both."""
     if element.get("visible") == "false" or element.get("action") == "delete":
         return
     identity = str(element.get("id", f"without id, element {index + 1}"))
     if element["type"] == "node":
         if element.get("lat") is None and element.get("lon") is None:
-            return  # out ids, out tags: no position was asked for
-        # ids as text: OSM XML has them so, Overpass as numbers
+            return  # "out ids" and "out tags" contain no positions
+        # ids are text in OSM XML and numbers in Overpass
         data.nodes[identity] = lonlat((element.get("lon"), element.get("lat")), f"node {identity}", data.path)
         tags = element.get("tags") or {}
         if tags.get("natural") == "tree":
@@ -439,7 +439,7 @@ def _sort(element: Element, index: int, data: _Data) -> None:
     elif element["type"] in ("way", "relation"):
         store = data.ways if element["type"] == "way" else data.relations
         given = {key: value for key, value in {**element, "index": index}.items() if value is not None and value != {}}
-        # "out body; >; out skel;" gives a way with tags, then once more without
+        # "out body; >; out skel;" contains a way with tags, and again without tags
         store[identity] = {**store.get(identity, {}), **given}
 
 
@@ -461,7 +461,7 @@ def _way_outline(identity: str, way: Element, data: _Data, result: MapFile, line
         result.trees.append(TreeLine(outline.source, outline.tags, tuple(ring)))
         result.notes += [f"{outline.source}: {fault}" for fault in outline.broken]
         return
-    # with "out geom" there are positions and no ids: a ring closes by place
+    # "out geom" has positions but no ids, so a ring closes by position
     references = way.get("nodes") or ring
     if not references or references[0] != references[-1]:
         if kind_of(outline.tags) is None:
@@ -474,7 +474,7 @@ def _way_outline(identity: str, way: Element, data: _Data, result: MapFile, line
 
 
 def _points(way: Element, data: _Data, outline: Outline) -> list[Position]:
-    """Positions of a way that are known; what is missing goes to ``outline.broken``."""
+    """Return the known positions of a way; missing ones are added to ``outline.broken``."""
     if isinstance(way.get("geometry"), list):
         points = [point for point in way["geometry"] if point]
         if len(points) < len(way["geometry"]):
@@ -496,16 +496,16 @@ def _points(way: Element, data: _Data, outline: Outline) -> list[Position]:
 
 
 def _relations(data: _Data, result: MapFile, lines: Counter[str], line_of: LineOf) -> set[str]:
-    """Adds multipolygons; gives the ways that are part of them and must not come again, with their holes filled."""
+    """Add multipolygons and return the ways that are part of them and must not be added again."""
     used_ways: set[str] = set()
     for identity, relation in data.relations.items():
         tags = _osm_words(relation)
-        # sites, routes and the like collect things and bound no area
+        # other relations, such as sites and routes, bound no area
         if tags.get("type") not in ("multipolygon", "boundary"):
             if kind_of({k: v for k, v in tags.items() if k != "type"}):
                 lines[f"relations of type '{tags.get('type', '')}'"] += 1
             continue
-        # old relations leave the role of an outer way empty
+        # old relations have an empty role for an outer way
         outer = [str(m.get("ref")) for m in relation.get("members") or [] if m.get("role") in ("outer", "", None)]
         own = [ref for ref in outer if (data.ways.get(ref) or {}).get("tags")]
         kind = kind_of({k: v for k, v in tags.items() if k != "type"})
@@ -538,7 +538,7 @@ def _multipolygon(relation: Element, data: _Data, outline: Outline) -> None:
             if member.get("type") == "relation":
                 outline.broken.append(f"its member relation {member.get('ref')} was left out")
             continue
-        # Overpass gives a member's line with the relation, XML by its id
+        # Overpass has the line of a member in the relation, XML by its id
         way = member if isinstance(member.get("geometry"), list) else data.ways.get(str(member.get("ref")))
         if way is None:
             outline.broken.append(f"way {member.get('ref')} is not in the file")
@@ -553,7 +553,7 @@ def _multipolygon(relation: Element, data: _Data, outline: Outline) -> None:
         outer, inner = _join_rings(lines["outer"] + lines[""], outline), _join_rings(lines["inner"], outline)
     if not outer and not outline.broken:
         outline.broken.append("it has no outline in the file; end the Overpass query with 'out geom;'")
-    # a hole belongs to all rings but those that stand in it, such as an island of trees in a clearing
+    # a hole belongs to all rings except those inside it, such as an island of trees in a clearing
     outline.parts += [(ring, [hole for hole in inner if not _inside(ring, hole)]) for ring in outer]
 
 
@@ -563,13 +563,13 @@ def _inside(ring: list[Position], shell: list[Position]) -> bool:
     shapes = [Polygon(line) for line in (ring, shell)]
     if any(not shape.is_valid and is_tangled(shape) for shape in shapes):
         return False
-    # a ring that crosses itself covers nothing until it is repaired
+    # a ring that crosses itself covers no area until it is repaired
     inner, outer = (shapely.make_valid(shape) for shape in shapes)
     return bool(inner.area < outer.area and shapely.covers(outer, inner))
 
 
 def _by_nesting(rings: list[list[Position]]) -> tuple[list[list[Position]], list[list[Position]]]:
-    """Outer rings and holes: a ring inside an odd number of others is a hole."""
+    """Split rings into outer rings and holes; a ring inside an odd number of others is a hole."""
     depth = [sum(_inside(ring, other) for other in rings if other is not ring) for ring in rings]
     return (
         [ring for ring, around in zip(rings, depth, strict=True) if around % 2 == 0],
@@ -578,11 +578,11 @@ def _by_nesting(rings: list[list[Position]]) -> tuple[list[list[Position]], list
 
 
 def _join_rings(lines: list[list[Position]], outline: Outline) -> list[list[Position]]:
-    """Closed rings from pieces that share end points."""
+    """Return closed rings from pieces that share end points."""
     rings, open_ = [], [list(line) for line in lines if len(line) > 1]
     while open_:
         ring = open_.pop()
-        # pieces come in any order and direction
+        # pieces have any order and direction
         while ring[0] != ring[-1] and (index := _next_piece(ring, open_)) is not None:
             piece = open_.pop(index)
             if ring[-1] in (piece[0], piece[-1]):
@@ -597,20 +597,20 @@ def _join_rings(lines: list[list[Position]], outline: Outline) -> list[list[Posi
 
 
 def _next_piece(ring: list[Position], pieces: list[list[Position]]) -> int | None:
-    """Number of the first piece that begins or ends where the ring does."""
+    """Return the index of the first piece that begins or ends at an end of the ring."""
     ends = {ring[0], ring[-1]}
     return next((i for i, piece in enumerate(pieces) if ends & {piece[0], piece[-1]}), None)
 
 
-# A map of a whole county is smaller; a site needs a few kilometres.
+# A map of a county is smaller, and a site needs a few kilometres.
 MAX_BYTES = 256 * 1024 * 1024
 
-# Tags of an XML map file, begin and end: each becomes an object in memory.
+# Largest number of begin and end tags of an XML map file, because each becomes an object in memory.
 MAX_TAGS = 1_500_000
 
 FORMATS = "GeoJSON, OSM XML, Overpass JSON, KML or KMZ"
 
-# How GeoJSON and KML made of OpenStreetMap give themselves away: its name, its ids, its tags of ids.
+# Marks of GeoJSON and KML that come from OpenStreetMap: its name, its ids, its tags of ids.
 _OF_OSM = re.compile(rb'openstreetmap|"osm_(way_)?id"|"(way|relation|node)/[0-9]+"', re.IGNORECASE)
 
 _OTHER_KINDS: tuple[tuple[bytes, str, str], ...] = (
@@ -625,19 +625,19 @@ _OTHER_KINDS: tuple[tuple[bytes, str, str], ...] = (
 
 @parsed(FORMATS)
 def read_map_file(path: str | Path) -> MapFile:
-    """Outlines of a map file; its kind is told by content.
+    """Return the outlines of a map file, whose format is recognised by its content.
 
     Raises
     ------
     InputError
-        No such file, none of the formats, or not WGS84.
+        If there is no such file, it has none of the formats, or is not WGS84.
     """
     path = Path(path)
     data = read_input(path, MAX_BYTES, "a map file")
-    # by content: browsers save a KMZ as .zip or .kml
+    # browsers save a KMZ as .zip or .kml, so look at the content
     if data.startswith(b"PK\x03\x04"):
         data = _unzipped(data, path)
-    # a byte-order mark and blank lines may stand before the first sign
+    # skip a byte-order mark and blank lines
     start = data[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
     if not data.strip():
         raise InputError("the file is empty", expected=FORMATS, path=path)
@@ -659,7 +659,7 @@ def read_map_file(path: str | Path) -> MapFile:
 
 
 def _unzipped(data: bytes, path: Path) -> bytes:
-    """The main KML file of a KMZ archive."""
+    """Return the main KML file of a KMZ archive."""
     try:
         members = files.archive_members(data, path)
     except InputError as error:
@@ -667,7 +667,7 @@ def _unzipped(data: bytes, path: Path) -> bytes:
     maps = {name.lower(): member for name, member in members.items() if name.lower().endswith(".kml")}
     if not maps:
         raise InputError("an archive without a .kml file", expected="KMZ", path=path)
-    # what Google Earth opens: doc.kml, else the first
+    # Google Earth opens doc.kml, or otherwise the first file
     main = maps.get("doc.kml") or next(iter(maps.values()))
     if main.size > MAX_BYTES:
         raise InputError(f"{main.name} has {main.size} bytes", expected=f"at most {MAX_BYTES}", path=path)
@@ -679,7 +679,7 @@ def _from_json(data: bytes, path: Path) -> MapFile:
         text = data.decode("utf-8-sig")
         content = json.loads(text)
     except json.JSONDecodeError as error:
-        # an error at the very end is a text that ends too early
+        # an error at the end means that the text is truncated
         cause = "the file was cut off" if error.pos >= len(text.rstrip()) - 1 else None
         raise InputError(f"not JSON: {error.msg}", cause=cause, path=path, line=error.lineno) from None
     except UnicodeDecodeError as error:
@@ -689,7 +689,7 @@ def _from_json(data: bytes, path: Path) -> MapFile:
         ) from None
     if isinstance(content, dict) and isinstance(content.get("elements"), list):
         result = read_elements("Overpass JSON", content["elements"], path, _lines_of(text, "elements"))
-        # Overpass answers with status 200 and a remark when it ran out of time
+        # Overpass answers with status 200 and a remark if it ran out of time
         if remark := content.get("remark"):
             result.notes.append(f"warning: {path.name}: the Overpass server says: {str(remark)[:200]}")
         return result
@@ -699,7 +699,7 @@ def _from_json(data: bytes, path: Path) -> MapFile:
 
 
 def _lines_of(text: str, member: str) -> Callable[[int], int | None]:
-    """Line of the n-th element of a list in a JSON text; the text is read again, once, when the first is asked for."""
+    """Return a function for the line of the n-th element of a list in JSON, which reads the text again once."""
     decoder, gap = json.JSONDecoder(), re.compile(r"[\s,]*")
 
     @cache
@@ -749,7 +749,7 @@ def _geojson(content: dict[str, Any], path: Path, line_of: Callable[[int], int |
 
 
 def _check_crs(crs: Any, path: Path) -> None:
-    """GeoJSON of before RFC 7946 may name a coordinate system; only WGS84 can be used."""
+    """Refuse coordinate systems other than WGS84, which GeoJSON of before RFC 7946 may name."""
     named = crs.get("properties") if isinstance(crs, dict) else crs
     name = str(named.get("name", "CRS84") if isinstance(named, dict) else named or "CRS84")
     # 4979 is WGS84 with heights
@@ -766,7 +766,7 @@ def _feature(feature: Any, number: int, result: MapFile, lines: Counter[str], pa
     is_feature = feature.get("type") == "Feature"
     properties = (feature.get("properties") or {}) if is_feature else {}
     tags = _words(properties)
-    # some exporters, osmtogeojson among them, keep OSM's tags in an object of their own
+    # some exporters, such as osmtogeojson, store the tags of OpenStreetMap in a nested object
     if isinstance(nested := properties.get("tags"), dict):
         tags.update(_words(nested))
     identity = str(feature.get("id", tags.get("@id", number)))
@@ -798,7 +798,7 @@ def _geometry(geometry: dict[str, Any], outline: Outline, result: MapFile, lines
     if single == "Polygon":
         for rings in several:
             _polygon(rings, outline, path)
-    # points and lines are trees only where they say so
+    # points and lines are trees only if their tags say so
     elif (single, natural) in (("Point", "tree"), ("LineString", "tree_row")):
         rows = [[points] if single == "Point" else points for points in several]
         source = outline.source
@@ -822,7 +822,7 @@ def _polygon(rings: list[Any], outline: Outline, path: Path) -> None:
 def _from_xml(data: bytes, path: Path) -> MapFile:
     if b"<html" in data[:4096].lower():
         raise InputError("a web page", expected=FORMATS, cause="the server's message was saved, not the map", path=path)
-    # counted before parsing: a parser would have filled the memory by then
+    # count before parsing, because a parser would fill the memory
     if (tags := data.count(b"<")) > MAX_TAGS:
         raise InputError(
             f"the XML has {tags} tags",
@@ -840,7 +840,7 @@ def _from_xml(data: bytes, path: Path) -> MapFile:
 
 
 def _xml_lines(data: bytes, name: str | None) -> Callable[[int], int | None]:
-    """Line of the n-th outermost element of a name, or child of the root; read again, once, when one is asked for."""
+    """Return a function for the line of the n-th element of a name, or child of the root, which reads again once."""
 
     @cache
     def lines() -> list[int]:
@@ -862,7 +862,7 @@ def _xml_lines(data: bytes, name: str | None) -> Callable[[int], int | None]:
 
 
 def _osm_elements(root: ElementTree.Element) -> Iterator[dict[str, Any]]:
-    """OSM XML as Overpass elements."""
+    """Yield OSM XML as Overpass elements."""
     for item in root:
         element: dict[str, Any] = {
             "type": plain_tag(item.tag),
@@ -913,11 +913,11 @@ _PLACEMARK_PARTS = {*_NO_AREAS, "Polygon", "Data", "SimpleData"}
 
 
 def _kml_height(polygons: list[ElementTree.Element], outline: Outline) -> None:
-    """Height tag of polygons drawn above the ground, extruded or not, where the placemark's data name none."""
+    """Set the height of polygons drawn above the ground, if the data of the placemark have none."""
     modes = {mode for polygon in polygons for mode in kml.modes_of(polygon)}
     heights = (place[2] for polygon in polygons for place in kml.places_of(polygon) if place[2:])
     highest = max(filter(isfinite, heights), default=0.0)
-    # heights above sea level say nothing of a building
+    # heights above sea level are not heights of a building
     if modes == {"relativeToGround"} and highest > 0.0:
         outline.tags = {"height": f"{highest:g}", **outline.tags}
 

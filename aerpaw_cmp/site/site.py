@@ -1,7 +1,7 @@
-"""The site model: plain, frozen records in the site frame (east, north, up; metres).
+"""The site model: frozen records in the site frame (east, north, up; metres).
 
-``up`` is height above the ground at the site origin. The traced ground is the plane ``up = 0`` unless a
-tower's own ground height says otherwise (one reflecting plane per tower).
+``up`` is height above the ground at the site origin. The traced ground is the plane ``up = 0``, or one reflecting
+plane per tower if towers have their own ground heights.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from .relief import Dem
 
 @dataclass(frozen=True, slots=True)
 class Tower:
-    """A fixed node.
+    """A fixed node, which is a tower of the testbed.
 
     Parameters
     ----------
     name : str
-        Such as ``"LW1"``.
+        A name such as ``"LW1"``.
     latitude_deg, longitude_deg : float
-        WGS84.
+        Position in WGS84.
     east_m, north_m : float
-        The same in the site frame.
+        Position in the site frame.
     antenna_height_m : float
         Height of the array centre above the ground at the tower.
     ground_m : float
         Height of the ground at the tower above the ground at the origin.
     source : str
-        Where the coordinates come from.
+        Source of the coordinates.
     """
 
     name: str
@@ -50,13 +50,13 @@ class Tower:
 
     @property
     def position_m(self) -> FloatArray:
-        """Array centre (3,) in the site frame [m]."""
+        """Array centre in the site frame, shape (3,) [m]."""
         return np.array([self.east_m, self.north_m, self.ground_m + self.antenna_height_m])
 
 
 @dataclass(frozen=True, slots=True)
 class Building:
-    """A prism: footprint (east, north) [m], flat roof at ``base_m + height_m``."""
+    """A prism: footprint (east, north) [m] with a flat roof at ``base_m + height_m``."""
 
     name: str
     footprint: Polygon
@@ -68,27 +68,29 @@ class Building:
 
 @dataclass(frozen=True, slots=True)
 class Forest:
-    """A wooded area (east, north) [m]: single trees placed at random, or with a height a medium (a stand).
+    """A wooded area (east, north) [m].
+
+    Without a height it contains single trees at random positions. With a height it is one medium, a forest stand.
 
     Parameters
     ----------
     name : str
     area : Polygon
     trees_per_hectare, minimum_spacing_m : float
-        Of the placement.
+        Density and minimum distance of the trees that are placed.
     source : str
     height_m : float, optional
-        Of the canopy above the ground.
+        Height of the canopy above the ground.
     trees : bool
-        With a height: trees are placed too, for opaque foliage alone. Without one they always are.
+        True if a forest with a height also has single trees, which only opaque foliage uses.
     evergreen_share : float
-        Of the trees, those that keep their leaves: 0 to 1.
+        Share of the trees that keep their leaves, 0 to 1.
     crown_base_fraction : float
-        Height of the crowns' base as a share of the canopy's.
+        Height of the base of the crowns divided by the height of the canopy.
     base_m : float
-        Up of the ground below it, where the site has no elevation model.
+        Height of the ground below the forest, if the site has no elevation model.
     filled : float
-        Share of the canopy's prism that is canopy.
+        Share of the prism of the canopy that is filled with leaves.
     """
 
     name: str
@@ -125,13 +127,13 @@ class Trees:
 
     @classmethod
     def none(cls) -> Trees:
-        """No tree."""
+        """Return trees without any tree."""
         return cls(**{column.name: np.zeros(0) for column in fields(cls)})
 
 
 @dataclass(frozen=True, slots=True)
 class Geofence:
-    """An area to draw (east, north) [m]; it does not take part in the replay."""
+    """An area to draw (east, north) [m], which the replay ignores."""
 
     name: str
     area: Polygon
@@ -139,42 +141,42 @@ class Geofence:
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Everything the replay and the maps know about a place.
+    """The site of a flight, for the replay and for maps.
 
     Parameters
     ----------
     name : str
         Title of the site.
     frame : SiteFrame
-        Where the origin lies.
+        Frame with the position of the origin.
     towers : mapping of str to Tower
-        In drawing order.
+        Towers in drawing order.
     buildings, forests, geofences : tuples
-        May be empty.
+        Objects of the site, which may be empty.
     trees : Trees
         Placed trees (from forests without a height and single points).
     opaque_trees : Trees
-        The same, and those of stands that carry trees.
+        Placed trees, and those of forest stands that have trees.
     ground_material : str
-        Name in ``site.materials``.
+        Name of a material in ``site.materials``.
     area_m : (east_min, east_max, north_min, north_max)
         Extent for maps.
     credit : str
-        Whose map it is: shown wherever buildings and forests are drawn.
+        Source of the map, which is shown wherever buildings and forests are drawn.
     assumed : str
-        Sizes on the map that nobody measured.
+        Sizes on the map that are assumed.
     notes : tuple of str
-        For the report.
+        Remarks for the report.
     disagreements : tuple of str
-        Clauses on ground heights that the site file states and its elevation model contradicts.
+        Clauses about ground heights of the site file that its elevation model contradicts.
     takeoff_ground_m : float
-        Up of the take-off point, from which ``altitude_m`` of logs counts.
+        Height of the take-off point, which is the zero of ``altitude_m`` in logs.
     ground_above_sea_m : float or None
         Height of the ground at the origin above the geoid or the ellipsoid; None if the site file has none.
     dem : Dem or None
-        Ground heights; blocks lines of sight.
+        Ground heights, which block lines of sight.
     scene : TriangleScene or None
-        Open surfaces in the site frame, which stand in for the ground plane. Buildings stand beside them.
+        Open surfaces in the site frame that replace the ground plane. Buildings are added to them.
     """
 
     name: str
@@ -198,18 +200,20 @@ class Site:
 
     @property
     def wooded(self) -> bool:
-        """True if trees or stands can shade a path."""
+        """True if trees or forest stands can shade a path."""
         return len(self.trees) > 0 or any(forest.height_m is not None for forest in self.forests)
 
     @property
     def mapped(self) -> bool:
-        """True if a map says what stands there: nothing drawn is nothing known otherwise."""
+        """True if the site comes from a map, so that an area without objects is known to be empty."""
         return bool(self.forests or self.buildings or len(self.trees) or self.scene is not None)
 
     def ground_under_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Up of the ground (n,) [m]: the terrain's, else of the nearest tower's plane; in a scene that of take-off.
+        """Return the height of the ground, shape (n,) [m].
 
-        A plane above up = 0 ends at its tower: who flies lower beside it flies over lower ground between them.
+        It is that of the terrain, or otherwise that of the plane of the nearest tower, and in a scene that of take-off.
+
+        A plane above up = 0 ends at its tower, because a UAV below it flies over lower ground between towers.
         """
         ground = np.full(len(east_m), self.takeoff_ground_m if self.scene is not None else 0.0)
         if self.scene is None and self.towers:
@@ -222,7 +226,7 @@ class Site:
         return np.where(np.isnan(terrain), ground, terrain)
 
     def cautions(self, towers: Iterable[str] | None = None) -> list[str]:
-        """Return clauses on errors of the site that spoil every number at some towers; all towers by default."""
+        """Return clauses about errors of the site that affect all numbers at some towers (default: all towers)."""
         names = self.towers if towers is None else towers
         chosen = [self.towers[name] for name in dict.fromkeys(names) if name in self.towers]
         clauses = list(self.disagreements)
@@ -248,14 +252,14 @@ class Site:
         return clauses
 
     def under(self, foliage: str) -> Site:
-        """The site as a kind of foliage sees it: to ``opaque`` a stand that carries trees is those trees."""
+        """Return the site for a kind of foliage: for ``opaque``, a forest stand with trees is replaced by its trees."""
         if foliage != "opaque" or not any(forest.height_m is not None and forest.trees for forest in self.forests):
             return self
         woods = tuple(replace(forest, height_m=None) if forest.trees else forest for forest in self.forests)
         return replace(self, trees=self.opaque_trees, forests=woods)
 
     def _repr_html_(self) -> str:
-        """Towers and their places, for notebooks."""
+        """Return towers and their positions as HTML for notebooks."""
         rows = [(name, *(f"{metres:.1f}" for metres in tower.position_m)) for name, tower in self.towers.items()]
         caption = f"{self.name}: {counted(len(self.buildings), 'building')}, {counted(len(self.trees), 'tree')}"
         return html_table(("tower", "east [m]", "north [m]", "up [m]"), rows, caption)

@@ -1,8 +1,8 @@
-"""site.yaml to a :class:`~aerpaw_cmp.site.site.Site`, and the packaged sites.
+"""Reader of site.yaml, the packaged sites, and the list of files of a site.
 
-docs/site.md shows every key. Polygons are ``polygon_m`` (east, north) or ``polygon_deg`` (latitude, longitude).
+docs/site.md describes every key. Polygons are ``polygon_m`` (east, north) or ``polygon_deg`` (latitude, longitude).
 
-Files that a site is made of: the site.yaml and what it names. No output may replace one; a report names each.
+The files of a site are site.yaml and the files that it names. Outputs never replace them, and reports name each.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ from .scenes import placed_scene, without_traps
 from .site import Building, Forest, Geofence, Site, Tower, Trees
 from .trees import CrownDiameter, TreeHeight, TreeSizes, TrunkDiameter, join_trees, place_trees, trees_at, wanted_trees
 
-# Sites that come with the package, by name.
+# Packaged sites by name.
 PACKAGED = ("lake_wheeler",)
 
-# A tower farther from the origin and from the area is refused.
+# A tower is refused if it is farther from the origin and from the area.
 _FAR_TOWER_M = 10_000.0
 
-# An outline that reaches farther from the origin is refused.
+# An outline is refused if it extends farther from the origin.
 _FAR_POLYGON_M = 100_000.0
 
-# Buildings that overlap by less, everywhere, are not told of.
+# Overlaps of buildings up to this width cause no warning.
 OVERLAP_M = 0.5
 
-# A tower with nothing of the map nearer stands outside it.
+# A tower is outside the map if no object of the map is nearer.
 _MAPPED_M = 500.0
 
-# No tree is placed at random closer to a tower: masts stand clear.
+# No tree is placed at random closer to a tower, because masts are free of trees.
 MAST_CLEARANCE_M = 8.0
 
-# A higher building or mast is in feet or centimetres; no structure on Earth reaches it.
+# A building or mast above this is in feet or centimetres, because no structure on Earth is so high.
 TALLEST_M = 1000.0
 
 Latitude = Annotated[float, Field(ge=-90, le=90)]
@@ -77,7 +77,7 @@ def _known_material(name: str) -> str:
     try:
         material(name)
     except UsageError as error:
-        raise ValueError(str(error)) from None  # pydantic adds the place
+        raise ValueError(str(error)) from None  # pydantic adds the location
     return name
 
 
@@ -85,7 +85,7 @@ _MaterialName = Annotated[str, AfterValidator(_known_material)]
 
 
 def _problem(shape: Polygon) -> str | None:
-    """Fault of an outline; None where it has none."""
+    """Return the error of an outline, or None if it is valid."""
     if len(set(shape.exterior.coords)) < 3:
         return "has fewer than 3 distinct points"
     if not shape.is_valid or shape.area < 1e-3:
@@ -159,7 +159,7 @@ class PolygonModel(StrictModel):
         return self
 
     def polygon(self, frame: SiteFrame) -> Polygon:
-        """In the site frame [m]; UsageError when it is not a simple polygon near the site."""
+        """Return the polygon in the site frame [m]; raise UsageError unless it is a simple polygon near the site."""
         if self.polygon_m is not None:
             _check_near(self.polygon_m, self.name)
             shape = Polygon(self.polygon_m, self.holes_m)
@@ -167,7 +167,7 @@ class PolygonModel(StrictModel):
             shape = Polygon(_ring_from_degrees(self.polygon_deg or [], frame, self.name))
         if problem := _problem(shape):
             raise UsageError(f"the polygon of '{self.name}' {problem}")
-        # one order of corners: equal outlines are equal, and their names of walls with them
+        # use one order of corners, so that equal outlines have equal names of walls
         return shapely.normalize(shape)
 
 
@@ -181,7 +181,7 @@ class BuildingModel(PolygonModel):
 
 
 class ForestModel(PolygonModel):
-    """A wooded area; with a height a medium, and then with ``trees`` single trees for opaque foliage."""
+    """A wooded area, which is a medium if it has a height, and then has single trees if ``trees`` is true."""
 
     trees_per_hectare: _NotNegative = 100.0
     minimum_spacing_m: _NotNegative = 4.0
@@ -195,7 +195,7 @@ OutlineT = TypeVar("OutlineT", bound=PolygonModel)
 
 
 class SingleTreeModel(StrictModel):
-    """A tree with sizes of its own; what is absent is as of all trees."""
+    """A tree with its own sizes. Missing sizes are those of all trees."""
 
     at_m: tuple[float, float]
     height_m: TreeHeight | None = None
@@ -241,7 +241,7 @@ class CoverageModel(StrictModel):
 
 
 class SiteModel(StrictModel):
-    """The whole of site.yaml."""
+    """The content of site.yaml."""
 
     name: str
     origin: OriginModel
@@ -269,18 +269,18 @@ def load_site(
     coordinates: str | None = None,
     tower_ground: Ground | None = None,
 ) -> Site:
-    """A site by the name of a packaged one, or from a site.yaml.
+    """Return a packaged site by its name, or a site from a site.yaml.
 
     Parameters
     ----------
     name_or_path : str or Path
-        ``"lake_wheeler"`` or a file.
+        ``"lake_wheeler"`` or the path of a file.
     coordinates : str, optional
-        Which published positions to use where a tower has several; overrides the file.
+        Published positions to use if a tower has several; overrides the file.
     tower_ground : {"flat", "offsets", "surface", "dem"}, optional
-        ``flat`` puts the ground everywhere at up = 0 (the paper), ``offsets`` that of each tower at its stated
-        height, ``surface`` takes towers, buildings and trees from a smooth surface through ``ground_points``, ``dem``
-        from the elevation model. Overrides the file, where it is ``dem`` when there is one, else ``flat``.
+        ``flat`` sets the ground to up = 0 everywhere (the paper). ``offsets`` uses the stated height of each tower.
+        ``surface`` puts towers, buildings and trees on a smooth surface through ``ground_points``, and ``dem`` on the
+        elevation model. Overrides the file, whose default is ``dem`` if it has one, and ``flat`` otherwise.
 
     Returns
     -------
@@ -289,7 +289,7 @@ def load_site(
     Raises
     ------
     UsageError
-        No such site, or the file is wrong (path and line are named).
+        If there is no such site, or its file has an error (the message has path and line).
     """
     path, model, line_of = _find(name_or_path)
     changes: dict[str, Any] = {"coordinates": coordinates, "tower_ground": tower_ground}
@@ -304,7 +304,7 @@ def load_site(
 
 
 class _PlacedError(UsageError):
-    """A message about one key of a site.yaml."""
+    """An error about one key of a site.yaml."""
 
     def __init__(self, error: UsageError, location: Location) -> None:
         super().__init__(error.found, expected=error.expected, cause=error.cause)
@@ -313,7 +313,7 @@ class _PlacedError(UsageError):
 
 @contextmanager
 def _at(*location: Any) -> Iterator[None]:
-    """Messages from inside are about this key, unless they name a file or a nearer key."""
+    """Attach this key to errors from inside, unless they name a file or a nearer key."""
     try:
         yield
     except UsageError as error:
@@ -323,7 +323,7 @@ def _at(*location: Any) -> Iterator[None]:
 
 
 def known_grounds(name_or_path: str | Path) -> tuple[Ground, ...]:
-    """Values of ``tower_ground`` that a site has the data for."""
+    """Return the values of ``tower_ground`` for which a site has data."""
     model = site_model(name_or_path)
     offsets = any(tower.ground_offset_m for tower in model.towers.values())
     has_data = {"flat": True, "offsets": offsets, "surface": bool(model.ground_points), "dem": model.dem is not None}
@@ -331,7 +331,7 @@ def known_grounds(name_or_path: str | Path) -> tuple[Ground, ...]:
 
 
 def site_model(name_or_path: str | Path) -> SiteModel:
-    """The checked settings of a packaged site or a site.yaml, before trees are placed."""
+    """Return the checked settings of a packaged site or a site.yaml, before trees are placed."""
     return _find(name_or_path)[1]
 
 
@@ -351,19 +351,19 @@ def _find(name_or_path: str | Path) -> tuple[str, SiteModel, LineOf]:
 
 
 def packaged_name(name: str) -> str:
-    """The name of a packaged site as its file has it: lake-wheeler, Lake Wheeler."""
+    """Return the file name of a packaged site for names such as lake-wheeler or Lake Wheeler."""
     return name.lower().replace("-", "_").replace(" ", "_")
 
 
 @cache
 def _packaged(name: str) -> tuple[SiteModel, LineOf]:
-    """The settings of a packaged site: no caller changes them, and a campaign asks for them at each of its flights."""
+    """Return the settings of a packaged site, cached because a campaign requests them for each flight."""
     with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / f"{name}.yaml") as file:
         return load_yaml_and_lines(file, SiteModel)
 
 
 def build_site(model: SiteModel, folder: Path | None = None) -> Site:
-    """The site of a checked model; places the trees. ``folder`` is where relative paths start."""
+    """Return the site of a checked model with placed trees; relative paths start at ``folder``."""
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
     with _at("dem"):
         dem = _dem(model, frame, folder or Path())
@@ -430,13 +430,13 @@ def _ground_above_sea_m(model: SiteModel, dem: Dem | None) -> float | None:
     return None if dem is None else float(dem.absolute_m(0.0, 0.0))
 
 
-# Elevation models and surveys agree within this [m]; geoid and ellipsoid do not.
+# Largest difference between elevation models and surveys [m]. That of geoid and ellipsoid is larger.
 _HEIGHTS_AGREE_M = 5.0
 
 
 def _disagreements(model: SiteModel, towers: Mapping[str, Tower], dem: Dem | None) -> tuple[str, ...]:
-    """Return clauses on ground heights that the file states and its elevation model contradicts."""
-    # a surface through points contradicts none of its own points
+    """Return clauses about ground heights of the file that its elevation model contradicts."""
+    # a surface through points agrees with its own points
     if dem is None or model.dem is None:
         return ()
     pairs = []
@@ -454,7 +454,7 @@ def _disagreements(model: SiteModel, towers: Mapping[str, Tower], dem: Dem | Non
 
 
 def _scene(model: SiteModel, folder: Path) -> tuple[TriangleScene | None, list[str]]:
-    """The scene of triangles, where the site has one, and what was repaired in it."""
+    """Return the scene of triangles, if the site has one, and a list of repairs."""
     if model.scene is None:
         return None, []
     if model.dem is not None:
@@ -472,13 +472,13 @@ def _scene(model: SiteModel, folder: Path) -> tuple[TriangleScene | None, list[s
 
 
 def extent_m(model: SiteModel, frame: SiteFrame) -> Area:
-    """East and north that maps of the site cover: ``area_m``, else 500 m around the towers."""
+    """Return the area of maps of the site: ``area_m``, or 500 m around the towers."""
     return _checked_area(model.area_m, *_tower_places(model, frame).tolist())
 
 
 def _tower_places(model: SiteModel, frame: SiteFrame) -> FloatArray:
-    """East and north (2, towers) of the towers [m]."""
-    # the notes are dropped: build_site makes them once
+    """Return east and north of the towers, shape (2, towers) [m]."""
+    # the notes are not used here, because build_site collects them
     places = [_chosen_position(name, tower, model.coordinates, frame, []) for name, tower in model.towers.items()]
     return np.transpose([frame.to_local(place.latitude_deg, place.longitude_deg) for place in places])
 
@@ -490,7 +490,7 @@ def _outlines(models: list[OutlineT], key: str, frame: SiteFrame) -> Iterator[tu
 
 
 def _dem(model: SiteModel, frame: SiteFrame, folder: Path) -> Dem | None:
-    # said at that key: the file has no 'dem' whose line could be shown
+    # name this key, because the file has no line with the key dem
     if model.tower_ground == "dem" and model.dem is None:
         with _at("tower_ground"):
             raise UsageError("tower_ground is 'dem', but there is no elevation model", expected="the key 'dem'")
@@ -502,17 +502,17 @@ def _dem(model: SiteModel, frame: SiteFrame, folder: Path) -> Dem | None:
     return read_dem(folder / model.dem.path, frame, crs=model.dem.crs)
 
 
-# The surface reaches so far beyond the area of the site.
+# Margin of the surface around the area of the site.
 _SURFACE_MARGIN_M = 250.0
 
 
 def ground_surface(model: SiteModel, frame: SiteFrame) -> Surface:
-    """The surface through the ``ground_points`` of a site, which covers its area and its towers.
+    """Return the surface through the ``ground_points`` of a site, which covers its area and its towers.
 
     Raises
     ------
     UsageError
-        Too few points, two that contradict, or points of another place.
+        If there are too few points, two contradict each other, or they are far from the site.
     """
     points = np.array(model.ground_points, dtype=np.float64).reshape(-1, 4)
     if len(points):
@@ -543,10 +543,10 @@ def _on_ground(trees: Trees, dem: Dem | None) -> Trees:
 
 
 def _check_tower(tower: Tower, area: Area | None, frame: SiteFrame) -> None:
-    """A tower kilometres off is a slip of the pen, not a site."""
+    """Refuse a tower kilometres from the site, which is a typing error."""
     away = math.hypot(tower.east_m, tower.north_m)
     if area is not None:
-        # a large map may have its origin in a corner
+        # the origin of a large map may be in a corner
         away = min(away, math.hypot(_outside(tower.east_m, *area[:2]), _outside(tower.north_m, *area[2:])))
     if not away <= _FAR_TOWER_M:
         raise UsageError(
@@ -564,20 +564,20 @@ def _why_far(tower: Tower, frame: SiteFrame) -> str:
         ("the sign of the longitude is wrong: west is negative", (latitude, -longitude)),
         ("the sign of the latitude is wrong: south is negative", (-latitude, longitude)),
     ):
-        # swapped, a latitude may be none
+        # a latitude can become invalid when both are swapped
         if abs(position[0]) <= 90 and float(np.hypot(*frame.to_local(*position))) <= _FAR_TOWER_M:
             return cause
     return "a digit is wrong, or it belongs to another site"
 
 
 def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
-    """Warnings of buildings that stand in each other: walls inside walls reflect what they should not."""
+    """Return warnings about overlapping buildings, whose inner walls cause wrong reflections."""
     if len(buildings) < 2:
         return []
     shapes = [building.footprint for building in buildings]
     former, latter = shapely.STRtree(shapes).query(shapes, predicate="intersects")
     pairs = [(int(i), int(j)) for i, j in zip(former, latter, strict=True) if i < j]
-    # outlines simplified by 'site import' may still overlap by some decimetres
+    # outlines that site import simplified may overlap by some decimetres
     overlapping = [(i, j) for i, j in pairs if not shapes[i].intersection(shapes[j]).buffer(-OVERLAP_M / 2).is_empty]
     if not overlapping:
         return []
@@ -587,7 +587,7 @@ def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
 
 
 def _unmapped(towers: Mapping[str, Tower], shapes: list[Polygon]) -> list[str]:
-    """Name the towers of a mapped site that have nothing of the map near: the ground there is unknown, not bare."""
+    """Return warnings about towers without any object of the map nearby, where the ground is unknown."""
     place = shapely.union_all(shapes)
     bare = [t.name for t in towers.values() if place.distance(Point(t.east_m, t.north_m)) > _MAPPED_M]
     if not shapes or not bare:
@@ -633,7 +633,7 @@ def _chosen_position(
 ) -> PositionModel:
     if model.latitude_deg is not None and model.longitude_deg is not None:
         return PositionModel(latitude_deg=model.latitude_deg, longitude_deg=model.longitude_deg, source=model.source)
-    # the first that the file names is the one that its author trusts
+    # the first one in the file is the one that its author trusts
     key = next(iter(model.positions)) if source_name is None else source_name
     if key not in model.positions:
         raise UsageError(f"tower '{name}' has no position '{key}'", expected="one of " + ", ".join(model.positions))
@@ -649,7 +649,7 @@ def _chosen_position(
 
 def _building(model: BuildingModel, footprint: Polygon, dem: Dem | None) -> Building:
     base = model.base_m
-    if dem is not None:  # a floor is level: the ground under the middle
+    if dem is not None:  # a floor is level, so use the ground under the middle
         base += float(np.nan_to_num(dem.ground_m(footprint.centroid.x, footprint.centroid.y)))
     return Building(
         name=model.name, height_m=model.height_m, material=model.material, source=model.source,
@@ -664,8 +664,8 @@ def _trees(
     towers: Mapping[str, Tower],
     notes: list[str],
 ) -> tuple[Trees, Trees]:
-    """Trees that stand for themselves, and those of stands, which only opaque foliage sees."""
-    # nothing is placed inside houses or on masts
+    """Return the trees of the site, and the trees of forest stands, which only opaque foliage uses."""
+    # do not place trees inside houses or on masts
     clear = shapely.union_all(
         [building.footprint for building in buildings]
         + [Point(tower.east_m, tower.north_m).buffer(MAST_CLEARANCE_M) for tower in towers.values()]
@@ -688,7 +688,7 @@ def _trees(
 
 
 def _single(models: list[SingleTreeModel], sizes: TreeSizes) -> Trees:
-    """Trees with sizes of their own; crowns begin at the same share of the height as everywhere."""
+    """Return trees with their own sizes; crowns begin at the same share of the height as those of all trees."""
     for index, model in enumerate(models):
         with _at("trees", "single", index):
             _check_near([model.at_m], "trees.single")
@@ -696,7 +696,7 @@ def _single(models: list[SingleTreeModel], sizes: TreeSizes) -> Trees:
     drawn = trees_at(east, north, sizes)
 
     def own(name: str) -> FloatArray:
-        # NaN is "as of all trees"
+        # NaN means the size of all trees
         stated = np.array([np.nan if (size := getattr(m, name)) is None else size for m in models], dtype=np.float64)
         return np.where(np.isnan(stated), getattr(drawn, name), stated)
 
@@ -719,7 +719,7 @@ def _checked_area(area: Area | None, east: Sequence[float], north: Sequence[floa
 
 
 def _check_near(points_m: list[tuple[float, float]], name: str) -> None:
-    # before polygons are made: coordinates of a map grid are valid outlines, elsewhere
+    # check before polygons are made, because coordinates of a map grid are valid outlines elsewhere
     away = max(math.hypot(*point) for point in points_m)
     if away > _FAR_POLYGON_M:
         raise UsageError(
@@ -753,14 +753,14 @@ def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: 
 
 
 def inputs_of_site(site: str | Path, folder: Path = Path()) -> list[Path]:
-    """The site file, as it is named in a folder, and what it names; none where it is wrong, which its reader says."""
+    """Return the site file and the files that it names; empty if its reader reports an error."""
     with suppress(AerpawCmpError, OSError):
         return [place for _, _, place in site_files(str(site), folder)]
     return []
 
 
 def site_files(name: str, folder: Path) -> Iterator[tuple[str, str, Path]]:
-    """Name, role and place of the site file, as it is named in a folder, and of what it names."""
+    """Yield name, role and path of the site file and of the files that it names."""
     path = folder / name
     if not path.is_file():
         _site_model(name, 0, 0)
@@ -775,8 +775,8 @@ def site_files(name: str, folder: Path) -> Iterator[tuple[str, str, Path]]:
         yield text, f"site: {key}", place
 
 
-# by size and time, too: a site that is edited between two tasks is read again
+# the key has size and time, so that a site that is edited between two tasks is read again
 @lru_cache(maxsize=16)
 def _site_model(site: str | Path, _size: int, _mtime_ns: int) -> SiteModel:
-    """A site file as checked; a campaign asks for the same one with every task."""
+    """Return a checked site file, cached because a campaign requests it with every task."""
     return site_model(site)

@@ -104,8 +104,8 @@ class SingleTree:
 class Footprints:
     """The elements of map files in the site frame, and the actions on them.
 
-    ``actions`` are sentences for the user; those that need a check begin with ``warning:``. ``credits`` name the sources of
-    the data. ``assumed`` describes sizes that the maps do not state.
+    ``actions`` are sentences for the user; those that need a check begin with ``warning:``. ``credits`` name the
+    sources of the data. ``assumed`` describes sizes that the maps do not state.
     """
 
     buildings: list[Building] = field(default_factory=list)

@@ -1,14 +1,14 @@
-"""Scenes of meshes: PLY files, and Mitsuba scenes as Sionna RT reads them.
+"""Scenes of meshes: PLY files, and Mitsuba scenes in the dialect of Sionna RT.
 
-Triangles and radio materials of a Mitsuba scene, as Sionna RT reads them; without Mitsuba.
+Triangles and radio materials of a Mitsuba scene are read without Mitsuba.
 
-Read are shapes of type ``ply`` in the coordinates of the scene, as every scene of Sionna RT and of AERPAW has them, and
-the materials ``itu-radio-material``, ``radio-material``, ``absorber-radio-material`` or any other whose id begins with
-``itu_`` or ``mat-itu_``. A scene may name files in its own folder only.
+Supported are shapes of type ``ply`` in the coordinates of the scene, as in all scenes of Sionna RT and AERPAW, and the
+materials ``itu-radio-material``, ``radio-material``, ``absorber-radio-material`` or any other whose id begins with
+``itu_`` or ``mat-itu_``. A scene may name only files in its own folder.
 
-Triangles of PLY files in their three formats (ASCII, binary of either byte order); pure functions of bytes.
+Triangles come from PLY files in three formats (ASCII, and binary of both byte orders).
 
-Polygons become fans of triangles; one that is not flat is counted, since how it is cut then decides its shape.
+Polygons become fans of triangles. Polygons that are not flat are counted, because the fan then changes their shape.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from ..common.text import counted
 from ..common.units import AnyArray, FloatArray, IntArray
 from .materials import CROWN, material, stated_name
 
-# Bytes within which a PLY header ends; a longer one is no header.
+# Largest size of a PLY header.
 _LARGEST_HEADER = 65_536
 
-# Bytes of one mesh file.
+# Largest size of a mesh file in bytes.
 _LARGEST_FILE = 2**30
 
-# A polygon whose corners depart further [m] from the plane of its first three is not flat.
+# A polygon is not flat if a corner is farther from the plane of its first three corners [m].
 _FLAT_M = 1e-3
 
 _TYPES = {
@@ -49,7 +49,7 @@ _TYPES = {
 
 @dataclass(frozen=True, slots=True)
 class RawMesh:
-    """Contents of a mesh file: vertices (n, 3), triangles (m, 3) int, and how many of its polygons were not flat."""
+    """The contents of a mesh file: vertices (n, 3), triangles (m, 3) int, and the number of polygons that were not flat."""
 
     vertices: FloatArray
     triangles: IntArray
@@ -61,16 +61,16 @@ class _Element:
     name: str
     count: int
     properties: tuple[tuple[str, str, str], ...]
-    """(name, type, type of the list's length or "")"""
+    """Name, type, and type of the length of a list or an empty text."""
 
 
 def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
-    """A PLY file and its bytes (for a digest).
+    """Return a PLY file and its bytes (for a digest).
 
     Raises
     ------
     InputError
-        No such file, too large, or damaged.
+        If there is no such file, or it is too large or damaged.
     """
     data = read_input(path, _LARGEST_FILE, "a mesh")
     with parsing(path, "a mesh"):
@@ -78,7 +78,7 @@ def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
 
 
 def check(mesh: RawMesh, path: Path) -> RawMesh:
-    """The mesh, if every index names a vertex and every used vertex is a place."""
+    """Return the mesh if every index names a vertex and every used vertex is finite."""
     if len(mesh.triangles):
         low, high = int(mesh.triangles.min()), int(mesh.triangles.max())
         if low < 0 or high >= len(mesh.vertices):
@@ -94,10 +94,10 @@ def check(mesh: RawMesh, path: Path) -> RawMesh:
 
 
 def read_ply(data: bytes, path: Path) -> RawMesh:
-    """A PLY file."""
+    """Read a PLY file."""
     kind, elements, start = _header(data, path)
     body = _Body(data, ">" if kind == "binary_big_endian" else "<", start, path)
-    if kind == "ascii":  # the words as numbers of one kind: from here on a binary file
+    if kind == "ascii":  # convert words to numbers of one type, so that the rest is the same as for a binary file
         body = _Body(_numbers(data[start:].split(), path).tobytes(), "=", 0, path)
         elements = [replace(e, properties=tuple((n, "f8", k and "f8") for n, _, k in e.properties)) for e in elements]
     vertices: FloatArray = np.zeros((0, 3))
@@ -139,7 +139,7 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
 
 
 def _declare(words: list[str], elements: list[_Element]) -> None:
-    """An element of the header, or a property of its last one; IndexError, KeyError, ValueError where it is neither."""
+    """Read an element of the header, or a property of its last element; raise IndexError, KeyError or ValueError for others."""
     if words[:1] == ["element"]:
         elements.append(_Element(words[1], int(words[2]), ()))
     elif words[:1] == ["property"]:
@@ -158,7 +158,7 @@ def _numbers(words: list[bytes], path: Path) -> FloatArray:
 
 @dataclass(slots=True)
 class _Body:
-    """Bytes behind the header, read from ``place`` on."""
+    """The bytes after the header, which are read from ``place``."""
 
     data: bytes
     order: str
@@ -166,8 +166,8 @@ class _Body:
     path: Path
 
     def take(self, kind: Any, count: int, element: _Element) -> AnyArray:
-        """The next ``count`` items of a type."""
-        # numpy's own order is that of this machine
+        """Return the next ``count`` items of a type."""
+        # the order of numpy is that of this machine
         what = np.dtype(kind).newbyteorder(self.order)
         if count < 0 or self.place + count * what.itemsize > len(self.data):
             raise InputError(
@@ -180,15 +180,15 @@ class _Body:
         return values
 
     def read(self, element: _Element) -> dict[str, Any]:
-        """Values of each property, a row an entry: an array, or a list of arrays where lists differ in length."""
+        """Return the values of each property by row: an array, or a list of arrays if lists differ in length."""
         least = sum(np.dtype(length or kind).itemsize for _, kind, length in element.properties)
         begun = self.place
         if not element.count or not least:
             return {name: np.zeros((0, 1)) for name, *_ in element.properties}
-        # a header that promises more than the file holds ends here, before memory is asked for it
-        self.take(("V", least), element.count, element)  # or no row need be looked at
+        # a header that promises more than the file contains fails here, before memory is requested
+        self.take(("V", least), element.count, element)  # fail before a row is read
         self.place = begun
-        # most meshes are triangles throughout: lists as long as the first are read as one table
+        # most meshes have triangles only, so lists as long as the first are read as one table
         first, fields = self._row(element), list[Any]()
         for i, ((_, kind, length), values) in enumerate(zip(element.properties, first, strict=True)):
             fields += [(f"length {i}", length)] if length else []
@@ -203,7 +203,7 @@ class _Body:
         return {name: [row[i] for row in several] for i, (name, *_) in enumerate(element.properties)}
 
     def _row(self, element: _Element) -> list[AnyArray]:
-        """Values of the properties of the next entry."""
+        """Return the values of the properties of the next entry."""
         return [
             self.take(kind, int(self.take(length, 1, element)[0]) if length else 1, element)
             for _, kind, length in element.properties
@@ -217,7 +217,7 @@ def _vertices(element: _Element, columns: dict[str, Any], path: Path) -> FloatAr
 
 
 def _polygons(element: _Element, columns: dict[str, Any], path: Path) -> list[IntArray]:
-    """Corners of the polygons, those of one size together."""
+    """Return the corners of the polygons, grouped by size."""
     lists = [name for name, _, length in element.properties if length]
     which = next((name for name in lists if name in ("vertex_indices", "vertex_index")), None)
     if which is None:
@@ -225,13 +225,13 @@ def _polygons(element: _Element, columns: dict[str, Any], path: Path) -> list[In
     corners, by_size = columns[which], dict[int, list[AnyArray]]()
     for row in [corners] if isinstance(corners, np.ndarray) else corners:
         by_size.setdefault(row.shape[-1], []).append(row.reshape(-1, row.shape[-1]))
-    # no index is as large: what is no number becomes one that no vertex has
+    # no index is so large: a value that is not a number becomes an index that no vertex has
     polygons = {size: np.concatenate(rows) for size, rows in by_size.items() if size >= 3}
     return [np.where(np.abs(rows) < 2**53, rows, -1).astype(np.int64) for rows in polygons.values()]
 
 
 def _fans(polygons: list[IntArray], vertices: FloatArray, path: Path) -> tuple[IntArray, int]:
-    """Triangles (n, 3) of polygons, and how many of those are not flat."""
+    """Return the triangles of polygons (n, 3), and the number of polygons that are not flat."""
     triangles: list[IntArray] = []
     bent = 0
     for group in polygons:
@@ -244,19 +244,19 @@ def _fans(polygons: list[IntArray], vertices: FloatArray, path: Path) -> tuple[I
             height = np.einsum("pki,pi->pk", points - points[:, :1], normal / np.where(size > 0.0, size, 1.0))
             bent += int((np.abs(height).max(axis=1) > _FLAT_M).sum())
         for k in range(1, corners - 1):
-            # a fan from the first corner
+            # a fan around the first corner
             triangles.append(group[:, [0, k, k + 1]])
     return (np.concatenate(triangles) if triangles else np.zeros((0, 3), dtype=np.int64)), bent
 
 
-# Of a slab without a stated thickness, as in Sionna RT.
+# Thickness of a slab without a stated one, as in Sionna RT.
 _DEFAULT_THICKNESS_M = 0.1
 
 _LARGEST_XML = 256 * 2**20
-# Munich, a scene of Sionna's, has 40 000.
+# The scene Munich of Sionna RT has 40 000.
 _MOST_TRIANGLES = 20_000_000
 
-# Names and materials of meshes that are vegetation, as words: no street, no treehouse.
+# Names and materials of vegetation, as complete words, so that "street" and "treehouse" do not match.
 _VEGETATION = re.compile(
     r"(?<![a-z])(trees?|canop(y|ies)|crowns?|foliage|vegetation|lea(f|ves)|hedges?|bush(es)?|shrubs?|trunks?)(?![a-z])"
 )
@@ -264,24 +264,24 @@ _VEGETATION = re.compile(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleScene:
-    """A scene as triangles.
+    """A scene of triangles.
 
     Parameters
     ----------
     vertices_m : (vertices, 3)
-        East, north, up.
+        East, north, up [m].
     triangles : (triangles, 3) int
         Indices of vertices.
     shape : (triangles,) int
         Index into ``shapes`` and ``materials``.
     shapes : tuple of str
-        Names.
+        Names of the shapes.
     materials : tuple of str
-        Of each shape, as :func:`aerpaw_cmp.site.materials.material` knows them.
+        Material of each shape, by its name in :func:`aerpaw_cmp.site.materials.material`.
     notes : tuple of str
-        What was repaired or not modelled.
+        Repairs, and parts that are not modelled.
     sha256 : str
-        Of the scene's files.
+        Digest of the files of the scene.
     """
 
     vertices_m: FloatArray
@@ -298,7 +298,7 @@ class TriangleScene:
 
 @dataclass(slots=True)
 class _Reading:
-    """Data collected so far."""
+    """The data read so far."""
 
     path: Path
     folder: Path
@@ -320,9 +320,9 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
     Parameters
     ----------
     path : str or Path
-        The XML file.
+        XML file.
     materials : mapping of str to str, optional
-        Radio materials of those of the scene, by id, that are none: ``{"wall": "concrete"}``.
+        Radio materials for materials of the scene without radio properties, by id: ``{"wall": "concrete"}``.
 
     Returns
     -------
@@ -331,15 +331,15 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
     Raises
     ------
     InputError
-        The XML or a mesh cannot be read, a file outside the scene's folder is named, there is no triangle.
+        If the XML or a mesh cannot be read, a file outside the folder of the scene is named, or there is no triangle.
     UsageError
-        Materials that say nothing about radio.
+        If materials have no radio properties.
     """
     path = Path(path)
     root, data = _root(path)
     parameters = dict(materials or {})
     for name in parameters.values():
-        material(name)  # or say what is wrong with it
+        material(name)  # raises an error for an unknown material
     radio, unknown, notes = _materials(root, parameters, path)
     reading = _Reading(path, path.parent.resolve(), radio)
     reading.digest.update(data)
@@ -384,11 +384,11 @@ def _root(path: Path) -> tuple[ElementTree.Element, bytes]:
 def _materials(
     root: ElementTree.Element, parameters: Mapping[str, str], path: Path
 ) -> tuple[dict[str, str], dict[str, str], list[str]]:
-    """Radio material by id; type by id of those that are none; notes."""
+    """Return radio materials by id, the types of other materials by id, and notes."""
     radio: dict[str, str] = {}
     unknown: dict[str, str] = {}
     rough: list[str] = []
-    # those of the scene first: a shape may carry one of its own without a name
+    # materials of the scene first, because a shape may have its own material without a name
     for number, bsdf in enumerate((*root.findall("./bsdf"), *root.findall(".//shape/bsdf"))):
         name = bsdf.get("id") or bsdf.get("name") or f"unnamed {number + 1}"
         bsdf.set("id", name)
@@ -414,12 +414,12 @@ def _materials(
 
 
 def _radio_material(bsdf: ElementTree.Element, name: str, path: Path) -> str | None:
-    """Name of the radio material that a bsdf is, None where it says nothing about radio."""
+    """Return the name of the radio material of a bsdf, or None if it has no radio properties."""
     kind, plain = bsdf.get("type", ""), name.removeprefix("mat-")
     thickness = _float(bsdf, "thickness", _DEFAULT_THICKNESS_M, path)
     stated = bsdf.find("string[@name='type']")
     if kind == "itu-radio-material" or plain.startswith(("itu_", "itu-")):
-        # Blender's exporter names materials so, and Sionna takes the name for the kind
+        # the exporter of Blender uses such names, from which Sionna RT derives the type
         itu = plain[4:] if plain.startswith(("itu_", "itu-")) else plain
         if stated is not None:
             itu = stated.get("value", "")
@@ -464,7 +464,7 @@ def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, st
         reading.skipped[kind] = reading.skipped.get(kind, 0) + 1
         return
     name = shape.get("id") or f"shape {len(reading.names) + 1}"
-    # an empty transform moves nothing, and exporters write it
+    # exporters write empty transforms, which have no effect
     if len(shape.find("transform[@name='to_world']") or ()):
         raise InputError(
             f"the shape '{name}' is moved by a to_world",
@@ -489,12 +489,12 @@ def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, st
 
 
 def _of_shape(reading: _Reading, shape: ElementTree.Element, name: str, unknown: Mapping[str, str]) -> str:
-    """Radio material of a shape."""
+    """Return the radio material of a shape."""
     inner = shape.find("bsdf")
-    # a shape may refer to media and emitters as well
+    # a shape may also refer to media and emitters
     refs = [item.get("id", "") for item in shape.findall("ref") if item.get("name", "bsdf") == "bsdf"]
     which = inner.get("id", "") if inner is not None else (refs[0] if refs else "")
-    # before its material is asked for: leaves often have one that says nothing about radio
+    # check before its material, because leaves often have a material without radio properties
     if _VEGETATION.search(f"{name} {which}".lower()):
         return CROWN
     if which in reading.radio:
@@ -534,6 +534,6 @@ def _mesh(reading: _Reading, shape: ElementTree.Element, name: str) -> RawMesh:
             path=reading.path,
         )
     mesh, data = read_mesh(place)
-    # digests of digests: where one file ends cannot be shifted into the next
+    # digests of digests, so that bytes cannot move from one file to the next
     reading.digest.update(hashlib.sha256(data).digest())
     return mesh

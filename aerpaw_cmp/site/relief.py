@@ -1,13 +1,13 @@
-"""Ground heights: elevation models, and a smooth surface through points.
+"""Ground heights: digital elevation models, and a smooth surface through points.
 
-Digital elevation model: ground heights, profiles under lines, and which lines the ground blocks.
+A digital elevation model has ground heights, profiles below straight lines, and a test which lines the ground blocks.
 
-The ground it shapes reflects (:mod:`aerpaw_cmp.propagation.search.terrain`).
+Reflections from this ground are in :mod:`aerpaw_cmp.propagation.search.terrain`.
 
-A smooth ground through points of known height: a Gaussian process, its standard deviation, and draws of it.
+The smooth surface is a Gaussian process through points of known height, with a standard deviation and random draws.
 
-The covariance of two places falls with their distance as a Matern function of order 3/2 (slopes are continuous,
-curvature is not); its variance and length are those under which the points are most likely.
+The covariance of two positions is a Matern function of order 3/2 of their distance (slopes are continuous, curvature
+is not). Its variance and length maximise the likelihood of the points.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ..common.text import counted
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 
 EARTH_RADIUS_M = 6_371_000.0
-# Ground on Earth lies between; other values are gaps that the file does not declare, or other units.
+# Range of ground heights on Earth. Other values are undeclared gaps or other units.
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 
 MAX_BYTES = 512 * 1024 * 1024
@@ -41,7 +41,7 @@ _SAMPLES_AT_ONCE = 1_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilledPatch:
-    """Neighbouring cells of one height with a cliff all around: probably a gap that was filled with a number.
+    """Neighbouring cells of equal height with a cliff around them, probably a gap that was filled with a number.
 
     Parameters
     ----------
@@ -58,30 +58,30 @@ class FilledPatch:
     jump_m: float
 
 
-# A patch of one height is suspicious from this number of cells on (at exactly 0 m: from one on) ...
+# A patch of equal height is suspicious from this number of cells (one cell at exactly 0 m) ...
 _FILLED_CELLS = 4
-# ... if the ground around it is further away than this [m]: four cells of a slope in whole metres are not.
+# ... if the ground around it differs by more than this [m], unlike four cells of a slope in whole metres.
 _FILLED_JUMP_M = 20.0
-# Cells on each side of a position among which its patch is searched.
+# Cells on each side of a position in which its patch is searched.
 _WINDOW_CELLS = 300
 
 
 @dataclass(frozen=True, slots=True)
 class Dem:
-    """Heights on a regular grid, asked for in the site frame.
+    """Heights on a regular grid, queried in the site frame.
 
     Parameters
     ----------
     height_m : (rows, columns)
-        Heights at cell centres, first row southernmost, NaN where unknown.
+        Heights at cell centres, southernmost row first, NaN if unknown.
     west, south : float
         Centre of the first cell, in the units of ``crs``.
     step_x, step_y : float
         Cell size in the units of ``crs``, both positive.
-    crs : str
+    A name that pyproj knows, such as ``EPSG:4326`` (degrees), or ``local`` for metres of the site frame.
         Any that pyproj knows, such as ``EPSG:4326`` (degrees), or ``local`` for metres of the site frame.
     frame : SiteFrame
-        Of the site.
+        Frame of the site.
     """
 
     height_m: FloatArray
@@ -100,20 +100,20 @@ class Dem:
             from pyproj.exceptions import CRSError
 
             try:
-                # or a crs of degrees would take latitude first
+                # a crs in degrees would otherwise have latitude first
                 transformer = Transformer.from_crs("EPSG:4326", self.crs, always_xy=True)
             except CRSError:
                 raise UsageError(f"unknown crs '{self.crs}'", expected="such as EPSG:4326 or EPSG:26917") from None
             object.__setattr__(self, "_to_grid", transformer)
             end = self.west + self.step_x * self.height_m.shape[1], self.south + self.step_y * self.height_m.shape[0]
-            # a little beyond 360 and 90: the outer cells of a global grid reach over
+            # allow a little more than 360 and 90, because the outer cells of a global grid extend beyond
             if transformer.target_crs.is_geographic and (max(abs(self.west), abs(end[0])) > 361 or abs(end[1]) > 91):
                 raise InputError(
                     f"the grid runs to {end[0]:g}, {end[1]:g} degrees",
                     expected=f"coordinates of {self.crs}",
                     cause="they are metres or feet: another crs",
                 )
-        # up counts from the ground at the origin, whatever datum the grid has
+        # up is measured from the ground at the origin, independent of the datum of the grid
         object.__setattr__(self, "_origin_m", float(self.absolute_m(0.0, 0.0)))
         if np.isnan(self._origin_m):
             gap = self._covers_origin()
@@ -126,13 +126,13 @@ class Dem:
             )
 
     def _covers_origin(self) -> bool:
-        """Check whether the origin lies within the grid, whatever its cells hold."""
+        """Check whether the origin is within the grid, including cells without a height."""
         column, row = self._cell(0.0, 0.0)
         rows, columns = self.height_m.shape
         return bool(0 <= column <= columns - 1 and 0 <= row <= rows - 1)
 
     def _cell(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Column and row, with fractions, of places."""
+        """Return column and row of positions, with fractions."""
         x, y = unmasked(east_m), unmasked(north_m)
         if self._to_grid is not None:
             latitude, longitude = self.frame.to_geographic(x, y)
@@ -140,27 +140,27 @@ class Dem:
         return (x - self.west) / self.step_x, (y - self.south) / self.step_y
 
     def absolute_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:
-        """Height of the ground in the grid's own reference [m]; bilinear, NaN outside."""
+        """Return the height of the ground in the reference of the grid [m]: bilinear, NaN outside."""
         rows, columns = self.height_m.shape
         column, row = self._cell(east_m, north_m)
         inside = (column >= 0) & (column <= columns - 1) & (row >= 0) & (row <= rows - 1)
         column, row = np.where(inside, column, 0.0), np.where(inside, row, 0.0)
-        # the last row has no neighbour beyond it: it is the far end of the cell before
+        # the last row is the far end of the cell before it, because it has no further neighbour
         i = np.minimum(row.astype(np.int64), max(rows - 2, 0))
         j = np.minimum(column.astype(np.int64), max(columns - 2, 0))
         u, v = row - i, column - j
         h = self.height_m
-        # by differences: level ground is level to the last digit
+        # use differences, so that level ground is level to the last digit
         south = h[i, j] + v * (h[i, j + 1] - h[i, j])
         north = h[i + 1, j] + v * (h[i + 1, j + 1] - h[i + 1, j])
         return np.where(inside, south + u * (north - south), np.nan)
 
     def ground_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:
-        """Up of the ground [m]: 0 at the origin of the site; NaN outside the grid."""
+        """Return the height of the ground in the site frame [m]: 0 at the origin, NaN outside the grid."""
         return self.absolute_m(east_m, north_m) - self._origin_m
 
     def filled_patch(self, east_m: float, north_m: float) -> FilledPatch | None:
-        """Return the patch of cells around a position if its gap was probably filled with a number, else None."""
+        """Return the patch of cells around a position if it is probably a filled gap, otherwise None."""
         from scipy.ndimage import binary_dilation, label
 
         column, row = (int(np.rint(value)) for value in self._cell(east_m, north_m))
@@ -168,7 +168,7 @@ class Dem:
         if not (0 <= row < rows and 0 <= column < columns):
             return None
         height = float(self.height_m[row, column])
-        # a window bounds the work on large grids; only a patch that fills the window needs all of the grid
+        # a window limits the work on large grids; only a patch that fills the window needs the complete grid
         for reach in (_WINDOW_CELLS, max(rows, columns)):
             top, left = max(row - reach, 0), max(column - reach, 0)
             window = self.height_m[top : row + reach + 1, left : column + reach + 1]
@@ -185,8 +185,8 @@ class Dem:
         return FilledPatch(height_m=height, cells=cells, jump_m=jump) if jump > _FILLED_JUMP_M else None
 
     def slope(self, east_m: FloatArray, north_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rise of the ground per metre to the east and to the north, from points 1/64 of a cell apart."""
-        # within one cell the surface is bilinear, so a short step gives its slope exactly
+        """Return the slope of the ground to the east and to the north, from points 1/64 of a cell apart."""
+        # the surface is bilinear within a cell, so a short step has its exact slope
         step = self.cell_m / 128
         return (
             (self.ground_m(east_m + step, north_m) - self.ground_m(east_m - step, north_m)) / (2 * step),
@@ -194,7 +194,7 @@ class Dem:
         )
 
     def profiles(self, source_m: FloatArray, target_m: FloatArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-        """Ground under straight lines, at two samples per cell.
+        """Yield the ground below straight lines, at two samples per cell.
 
         Parameters
         ----------
@@ -204,15 +204,15 @@ class Dem:
         Yields
         ------
         some : (k,) int
-            Lines of like length.
+            Indices of lines of similar length.
         share : (samples, k)
-            Of the way from source to target, 0 and 1 included; shorter lines repeat their last sample.
+            Share of the way from source to target, with 0 and 1; shorter lines repeat their last sample.
         ground_m : (samples, k)
-            Up of the ground; NaN where it is unknown.
+            Height of the ground; NaN if it is unknown.
         """
         way = (target_m - source_m)[:, :2]
         count = np.maximum(np.ceil(np.hypot(*way.T) / (self.cell_m / 2)).astype(np.int64), 2)
-        # lines of like length together: a batch is as long as its longest
+        # group lines of similar length, because a batch is as long as its longest line
         order = np.argsort(count)
         begin = 0
         while begin < len(order):
@@ -227,29 +227,29 @@ class Dem:
             begin = stop
 
     def clear(self, source_m: FloatArray, target_m: FloatArray, *, tolerance_m: float | FloatArray = 0.0) -> BoolArray:
-        """Mask of the straight lines that stay above the ground.
+        """Check whether straight lines stay above the ground.
 
         Parameters
         ----------
         source_m, target_m : (links, 3)
             East, north, up [m].
         tolerance_m : float or (links,)
-            Ground at most this much above a line does not block it; under the ends themselves none does.
+            Ground that is higher than a line by at most this does not block it. Ground below the ends never blocks.
 
         Returns
         -------
         ndarray of bool, (links,)
-            True where no sample, one per half cell, lies lower than the ground. Unknown ground does not block. The
-            Earth's bulge (0.08 m half-way along 2 km) is counted, refraction is not.
+            True if no sample, two per cell, is lower than the ground. Unknown ground does not block. The curvature of
+            the Earth (0.08 m half-way along 2 km) is included, refraction is not.
         """
         source, target = np.asarray(source_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
         tolerance, free = np.broadcast_to(tolerance_m, len(source)), np.ones(len(source), dtype=bool)
         for some, share, ground in self.profiles(source, target):
             start, way = source[some], target[some] - source[some]
-            # height of the Earth's curve over the chord; up is measured from a plane
+            # height of the curved Earth above the chord, because up is measured from a plane
             bulge = share * (1 - share) * np.hypot(*way[:, :2].T) ** 2 / (2 * EARTH_RADIUS_M)
             intrusion = ground + bulge - (start[:, 2] + share * way[:, 2])
-            # an antenna may stand in a cell whose mean lies above its foot
+            # an antenna may be in a cell whose mean is above its foot
             free[some] = ~((intrusion > tolerance[some]) & (share > 0.0) & (share < 1.0)).any(axis=0)
         return free
 
@@ -265,16 +265,16 @@ class Dem:
 
 
 def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> Dem:
-    """An elevation model: ESRI ASCII grid (``.asc``), or GeoTIFF with the extra ``aerpaw-cmp[geo]``.
+    """Read an elevation model: ESRI ASCII grid (``.asc``), or GeoTIFF with the extra ``aerpaw-cmp[geo]``.
 
     Parameters
     ----------
     path : str or Path
-        The grid, heights in metres.
+        Grid with heights in metres.
     frame : SiteFrame
-        Of the site.
+        Frame of the site.
     crs : str, optional
-        Needed for ASCII grids, which name none; ``local`` means metres of the site frame.
+        Required for ASCII grids, which do not name one; ``local`` means metres of the site frame.
 
     Returns
     -------
@@ -283,9 +283,9 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> D
     Raises
     ------
     InputError
-        Not such a file, or the site is not on it.
+        If the file has another format, or does not contain the site.
     UsageError
-        No crs for an ASCII grid; rasterio is missing for a GeoTIFF.
+        If an ASCII grid has no crs, or rasterio is missing for a GeoTIFF.
     """
     path = Path(path)
     data = read_input(path, MAX_BYTES, "an elevation model")
@@ -302,7 +302,7 @@ def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str) -> Dem:
     lines = data.decode("utf-8-sig").splitlines()
     header, begin = _ascii_header(lines, path)
     rows, columns, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
-    # ESRI's default
+    # default of ESRI
     gap = header.get("nodata_value", -9999.0)
     values: list[FloatArray] = []
     for number, line in enumerate(lines[begin:], start=begin + 1):
@@ -317,7 +317,7 @@ def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str) -> Dem:
             path=path,
             line=len(lines),
         )
-    # heights are those of cell centres; a corner lies half a cell off
+    # heights belong to cell centres, half a cell from a corner
     west = header.get("xllcenter", header.get("xllcorner", 0.0) + step / 2)
     south = header.get("yllcenter", header.get("yllcorner", 0.0) + step / 2)
     return Dem(
@@ -327,7 +327,7 @@ def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str) -> Dem:
 
 
 def _ascii_header(lines: list[str], path: Path) -> tuple[dict[str, float], int]:
-    """Values of the header, and the number of its lines."""
+    """Return the values of the header, and its number of lines."""
     header: dict[str, float] = {}
     begin = 0
     while begin < len(lines) and (word := lines[begin].split()) and word[0][0].isalpha() and word[0].lower() != "nan":
@@ -359,7 +359,7 @@ def _ascii_cells(line: str, gap: float, path: Path, number: int) -> FloatArray:
 
 
 def _plausible(height_m: FloatArray, path: Path | None = None, line: int | None = None) -> FloatArray:
-    """The heights, if each is a gap or one that ground on Earth can have."""
+    """Return the heights if each is a gap or possible on Earth."""
     wrong = height_m[(height_m < LOWEST_M) | (height_m > HIGHEST_M)]
     if wrong.size:
         raise InputError(
@@ -380,10 +380,10 @@ def _read_geotiff(data: bytes, frame: SiteFrame) -> Dem:
     arrays, notes = read("geotiff", data)
     band, unit = arrays["band"], notes["unit"]
     step_east, shear_east, west, shear_north, step_north, north = notes["transform"]
-    # a north-up raster has a negative step to the north: rows run south
+    # a raster with north up has a negative step to the north, because rows run south
     if notes["crs"] is None or shear_east or shear_north or step_east <= 0 or step_north >= 0:
         raise InputError("the GeoTIFF is not georeferenced north-up", cause="gdalwarp makes it so")
-    # foot, feet, ft
+    # units foot, feet and ft
     if unit.startswith(("f", "us survey f")):
         raise InputError(f"heights in '{unit}'", expected="metres", cause="gdal_calc or gdal_translate converts")
     band = _plausible(band)
@@ -395,39 +395,39 @@ def _read_geotiff(data: bytes, frame: SiteFrame) -> Dem:
     )  # fmt: skip
 
 
-# Cells of the surface as an elevation model, and how many at most.
+# Cells of the surface as an elevation model, and their largest number.
 _CELL_M, _MOST_CELLS = 25.0, 40_000
 
-# Lengths and standard deviations [m] that are tried.
+# Candidate lengths and standard deviations [m].
 _LENGTHS_M = np.geomspace(30.0, 2000.0, 9)
-# Both in steps of some 65 %.
+# Both have steps of about 65 %.
 _DEVIATIONS_M = np.geomspace(1.0, 50.0, 9)
 
-# Heights at places this near are of one place; they contradict where they differ by so many standard deviations.
+# Heights at positions this close belong to one position, and contradict if they differ by this many standard deviations.
 _SAME_PLACE_M, _CONTRADICTION = 1.0, 4.0
 
-# Waves of which a drawn surface is the sum.
+# Number of waves in a drawn surface.
 _WAVES = 500
 
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """Ground through points.
+    """The ground through points.
 
     Parameters
     ----------
     place_m : (n, 2)
         East, north of the points [m].
     height_m, error_m : (n,)
-        Their heights in any one reference, and the standard deviations of these [m].
+        Their heights in one reference, and the standard deviations of the heights [m].
     deviation_m, length_m : float
-        Of the process.
+        Standard deviation and length of the process.
     level_m : float
-        Its mean.
+        Mean of the process [m].
     frame : SiteFrame
-        Of the site.
+        Frame of the site.
     reach_m : (east_min, east_max, north_min, north_max)
-        What the elevation model covers.
+        Area of the elevation model [m].
     """
 
     place_m: FloatArray
@@ -440,11 +440,11 @@ class Surface:
     reach_m: tuple[float, float, float, float]
 
     def dem(self, drawn: np.random.Generator | None = None) -> Dem:
-        """The most likely surface as an elevation model, or one drawn from those that the points allow."""
+        """Return the most likely surface as an elevation model, or one that is drawn from its distribution."""
         return next(self.dems([drawn]))
 
     def dems(self, draws: Iterable[np.random.Generator | None]) -> Iterator[Dem]:
-        """:meth:`dem` of each, the covariance of cells and points computed once."""
+        """Yield :meth:`dem` for each draw, with the covariance of cells and points computed once."""
         west, east, south, north = self.reach_m
         cell = max(_CELL_M, float(np.sqrt((east - west) * (north - south) / _MOST_CELLS)))
         columns, rows = (int(np.ceil(span / cell)) + 1 for span in (east - west, north - south))
@@ -457,11 +457,11 @@ class Surface:
         for drawn in draws:
             off = self.height_m - self.level_m
             prior = np.zeros(len(place))
-            # a draw of the process, moved by what the points say of it: one solve, no factor of the whole grid
+            # correct a draw of the process at the points, which needs one solve and no factor of the complete grid
             if drawn is not None:
                 waves = self._waves(drawn)
                 prior = waves.on_grid(across, along).ravel()
-                # heights of points have errors of their own, which each draw throws anew
+                # heights of points have errors, which are drawn for each surface
                 off = off + drawn.normal(0.0, self.error_m) - waves(self.place_m)
             height = self.level_m + prior + near @ factor.solve(off)
             yield Dem(
@@ -470,10 +470,10 @@ class Surface:
             )  # fmt: skip
 
     def sd_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Standard deviation (places,) of the surface [m]."""
+        """Return the standard deviation of the surface, shape (places,) [m]."""
         near = self._between(np.column_stack([east_m, north_m]))
         known = (self._factor().whiten(near.T) ** 2).sum(axis=0)
-        # rounding at a point itself
+        # rounding errors at a point can be negative
         return np.asarray(np.sqrt(np.maximum(self.deviation_m**2 - known, 0.0)))
 
     def _between(self, place_m: FloatArray) -> FloatArray:
@@ -483,8 +483,8 @@ class Surface:
         return Factor.of(self._between(self.place_m) + np.diag(self.error_m**2))
 
     def _waves(self, random: np.random.Generator) -> _Waves:
-        """A draw before any point is known: waves whose vectors have the process' spectrum, Student's t of 3."""
-        # of order 3/2 in the plane: a normal over the root of chi-squared of 3 by 3
+        """Return a draw of the process without points: waves whose vectors have its spectrum, Student's t of 3."""
+        # order 3/2 in the plane: a normal divided by the root of chi-squared of 3 by 3
         vector = random.standard_normal((2, _WAVES)) / (self.length_m * np.sqrt(random.chisquare(3, _WAVES) / 3.0))
         height = self.deviation_m * np.sqrt(2.0 / _WAVES)
         return _Waves(vector, random.uniform(0.0, 2.0 * np.pi, _WAVES), height)
@@ -492,7 +492,7 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class _Waves:
-    """Sum of cosines of one height [m] with wave vectors (2, waves) [rad/m] and phases (waves,)."""
+    """A sum of cosines of equal height [m] with wave vectors (2, waves) [rad/m] and phases (waves,)."""
 
     vector: FloatArray
     phase: FloatArray
@@ -502,7 +502,7 @@ class _Waves:
         return np.asarray(self.height_m * np.cos(place_m @ self.vector + self.phase).sum(axis=1))
 
     def on_grid(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """The same (north, east) where lines of a grid cross: cosines of the lines alone, by cos(a + b)."""
+        """Return the sum on a grid (north, east), from cosines of its lines, by cos(a + b)."""
         east, north = east_m[:, None] * self.vector[0], north_m[:, None] * self.vector[1] + self.phase
         return np.asarray(self.height_m * (np.cos(north) @ np.cos(east).T - np.sin(north) @ np.sin(east).T))
 
@@ -513,15 +513,15 @@ def _matern(distance_m: FloatArray, length_m: float) -> FloatArray:
 
 
 def surface_through(points_m: FloatArray, frame: SiteFrame, reach_m: tuple[float, float, float, float]) -> Surface:
-    """The surface through points (n, 4) of east, north, height, standard deviation [m].
+    """Return the surface through points of east, north, height and standard deviation, shape (n, 4) [m].
 
     Parameters
     ----------
     points_m : (n, 4)
-        At least three.
+        Three points or more.
     frame : SiteFrame
     reach_m : (east_min, east_max, north_min, north_max)
-        What the elevation model is to cover.
+        Area of the elevation model [m].
 
     Returns
     -------
@@ -530,7 +530,7 @@ def surface_through(points_m: FloatArray, frame: SiteFrame, reach_m: tuple[float
     Raises
     ------
     UsageError
-        Too few points, or two that contradict.
+        If there are too few points, or two contradict each other.
     """
     if len(points_m) < 3:
         raise UsageError(f"ground_points has {counted(len(points_m), 'point')}", expected="3 or more")
@@ -552,7 +552,7 @@ def surface_through(points_m: FloatArray, frame: SiteFrame, reach_m: tuple[float
 
 @lru_cache(maxsize=8)
 def _likeliest(points: bytes) -> tuple[float, float, float]:
-    """Length, deviation and mean [m] of the process of points; kept, for each stage of a report asks."""
+    """Return length, deviation and mean of the process of points [m], cached because every stage of a report needs it."""
     rows = np.frombuffer(points).reshape(-1, 4)
     place, height, error = rows[:, :2], rows[:, 2], rows[:, 3]
     apart = cdist(place, place)
@@ -566,8 +566,8 @@ def _likeliest(points: bytes) -> tuple[float, float, float]:
 
 
 def _likelihood(covariance: FloatArray, height_m: FloatArray, error_m: FloatArray) -> tuple[float, float]:
-    """Log likelihood of the points under a process, and its most likely mean [m]."""
+    """Return the log likelihood of the points under a process, and its most likely mean [m]."""
     factor = Factor.of(covariance + np.diag(error_m**2))
-    # generalised least squares: near points count as one
+    # generalised least squares, in which close points count as one
     level = float(np.average(height_m, weights=factor.solve(np.ones(len(height_m)))))
     return factor.log_likelihood(height_m - level), level

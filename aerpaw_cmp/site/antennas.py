@@ -5,8 +5,8 @@ scaled so that ``|E_theta|^2 + |E_phi|^2`` is the gain over isotropic (linear). 
 phi the azimuth from x towards y in the device frame: x boresight, y left, z up.
 
 Measured fields are interpolated on a torus: a full circle of theta (through both poles) times a full circle of phi.
-Along a great circle through a pole the components ``E_theta`` and ``E_phi`` go on smoothly once the second half has its
-sign turned, so cubic splines periodic in both angles meet no seam at the poles or at +/-180 degrees.
+Along a great circle through a pole, ``E_theta`` and ``E_phi`` are smooth if the sign of the second half is inverted.
+Cubic splines that are periodic in both angles therefore have no seam at the poles or at +/-180 degrees.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from ..logs.matfile import read_arrays
 # Peak directivity of a half-wave dipole (2.15 dBi): 4 / Cin(2 pi).
 _HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
 
-# A mean gain below -20 dB is a field in other units, or normalised; measured antennas lie near 0.5.
+# A mean gain below -20 dB is a field in other units, or normalised. Measured antennas are near 0.5.
 _MINIMUM_EFFICIENCY = 0.01
 
-# No element has more gain; a file that says so holds something else.
+# No element has more gain. A file with more has other units.
 HIGHEST_DBI = 60.0
 
 
@@ -52,19 +52,19 @@ def _zeros(theta_rad: ArrayLike, phi_rad: ArrayLike) -> ComplexArray:
 
 @dataclass(frozen=True, slots=True)
 class Isotropic:
-    """Unit gain everywhere, polarised along theta."""
+    """An antenna with unit gain in all directions, polarised along theta."""
 
     name: str = "iso"
 
     def field(self, theta_rad: FloatArray, phi_rad: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """(1, 0) everywhere."""
+        """Return (1, 0) for all directions."""
         zeros = _zeros(theta_rad, phi_rad)
         return zeros + 1.0, zeros
 
 
 @dataclass(frozen=True, slots=True)
 class HalfWaveDipole:
-    """Half-wave dipole along z, 2.15 dBi (Balanis, Antenna Theory, eq. 4-84).
+    """A half-wave dipole along z with 2.15 dBi (Balanis, Antenna Theory, eq. 4-84).
 
     Source: Balanis eq. 4-84.
     """
@@ -72,11 +72,11 @@ class HalfWaveDipole:
     name: str = "hw_dipole"
 
     def field(self, theta_rad: FloatArray, phi_rad: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """``cos(pi/2 cos theta) / sin theta``; 0 along the wire."""
+        """Return ``cos(pi/2 cos theta) / sin theta``, which is 0 along the wire."""
         zeros = _zeros(theta_rad, phi_rad)
         theta = np.asarray(theta_rad, dtype=np.float64)
         sine = np.sin(theta)
-        # along the wire both the numerator and the sine vanish; the limit of their ratio is 0
+        # along the wire both the numerator and the sine vanish; the limit of the ratio is 0
         safe = np.where(np.abs(sine) < 1e-9, 1.0, sine)
         shape = np.where(np.abs(sine) < 1e-9, 0.0, np.cos(np.pi / 2 * np.cos(theta)) / safe)
         return zeros + math.sqrt(_HALF_WAVE_DIPOLE_GAIN) * shape, zeros
@@ -84,12 +84,12 @@ class HalfWaveDipole:
 
 @dataclass(frozen=True, slots=True)
 class TR38901:
-    """Element of 3GPP TR 38.901 table 7.3-1: 8 dBi, 65 degrees half-power width, at most 30 dB down."""
+    """An element of 3GPP TR 38.901 table 7.3-1: 8 dBi, 65 degrees half-power width, at most 30 dB attenuation."""
 
     name: str = "tr38901"
 
     def field(self, theta_rad: FloatArray, phi_rad: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """All in E_theta: the slant is the array's."""
+        """Return all of the field in E_theta, because the slant belongs to the array."""
         zeros = _zeros(theta_rad, phi_rad)
         theta_deg = np.degrees(np.asarray(theta_rad, dtype=np.float64))
         phi_deg = wrap_degrees(np.degrees(phi_rad))
@@ -105,13 +105,13 @@ class MeasuredPattern:
     Parameters
     ----------
     name : str
-        For reports.
+        Name for reports.
     e_theta, e_phi : (thetas, phis) complex
-        Samples at theta = 0 to pi and phi = 0 to below 2 pi, both equally spaced, ends of theta included; an even
-        number of phis. The scale is the square root of gain. ``e_phi`` None stands for a gain grid without
-        polarisation: its amplitude goes into E_theta.
+        Samples at theta = 0 to pi and phi = 0 to below 2 pi, both equally spaced, with both ends of theta and an even
+        number of phis. The scale is the square root of gain. If ``e_phi`` is None, the pattern is a gain grid without
+        polarisation, whose amplitude is in E_theta.
     frequency_hz : float or None
-        Of the measurement.
+        Frequency of the measurement.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class MeasuredPattern:
     efficiency : float
         Mean gain over the sphere (radiation efficiency times mismatch).
     trained_on, marks : tuple of str
-        SHA-256 and marks of the logs that it was learned from, as its file says: on those it must not be scored.
+        SHA-256 and fingerprints of the logs that it was learned from, on which it must not be scored.
     """
 
     trained_on: tuple[str, ...] = ()
@@ -136,18 +136,18 @@ class MeasuredPattern:
             raise UsageError(f"pattern '{name}' has {thetas} x {phis} samples", expected="3 or more x an even number")
         samples = np.abs(e_theta) ** 2 + (0.0 if e_phi is None else np.abs(e_phi) ** 2)
         self.peak_gain_dbi = float(db_from_power(samples.max()))
-        # a null of exactly zero is -300 dBi, not minus infinity
+        # a null of exactly zero becomes -300 dBi, not minus infinity
         self.least_gain_dbi = float(db_from_power(max(samples.min(), 1e-30)))
         self.efficiency = _sphere_mean(samples)
         if e_phi is None:
             amplitude = np.abs(e_theta)
             for row in (0, -1):  # a pole is one direction
                 amplitude[row] = np.sqrt((amplitude[row] ** 2).mean())
-            # an amplitude without polarisation has no direction to turn
+            # an amplitude without polarisation has no direction to rotate
             self._layers = [_spline(_torus(amplitude, +1).real)]
         else:
             theta_part, phi_part = _single_valued_poles(e_theta, e_phi)
-            # beyond a pole both unit vectors point the other way
+            # beyond a pole both unit vectors are inverted
             torus = [_torus(theta_part, -1), _torus(phi_part, -1)]
             self._layers = [_spline(layer) for part in torus for layer in (part.real, part.imag)]
 
@@ -155,25 +155,25 @@ class MeasuredPattern:
         return f"MeasuredPattern({self.name!r}, peak {self.peak_gain_dbi:.2f} dBi, efficiency {self.efficiency:.2f})"
 
     def field(self, theta_rad: FloatArray, phi_rad: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """Cubic splines through the samples."""
+        """Return the field by cubic splines through the samples."""
         from scipy.ndimage import map_coordinates
 
         theta, phi = np.broadcast_arrays(np.asarray(theta_rad, dtype=float), np.asarray(phi_rad, dtype=float))
         rows, columns = self._layers[0].shape
         full = 2 * np.pi
-        # in samples, not radians: rows and columns of the torus
+        # in units of rows and columns of the torus
         at = np.stack([(theta % full).ravel() * (rows / full), (phi % full).ravel() * (columns / full)])
         parts = [
             map_coordinates(layer, at, order=3, mode="grid-wrap", prefilter=False).reshape(theta.shape)
             for layer in self._layers
         ]
         if len(parts) == 1:
-            # a cubic spline swings below zero beside a deep null, and an amplitude cannot
+            # a cubic spline can be negative next to a deep null, and an amplitude cannot
             return np.maximum(parts[0], 0.0).astype(np.complex128), _zeros(theta, phi)
         return parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]
 
     def gain_dbi(self, theta_rad: ArrayLike, phi_rad: ArrayLike) -> FloatArray:
-        """Gain [dBi] in a direction."""
+        """Return the gain in a direction [dBi]."""
         e_theta, e_phi = self.field(unmasked(theta_rad), unmasked(phi_rad))
         return db_from_power(np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2)
 
@@ -185,22 +185,22 @@ def _spline(torus: FloatArray) -> FloatArray:
 
 
 def _torus(half: ComplexArray | FloatArray, sign: int) -> AnyArray:
-    """Rows theta 0..pi continued to 2 pi: the far half of each great circle is the meridian at phi + pi."""
+    """Continue rows of theta 0..pi to 2 pi: the far half of each great circle is the meridian at phi + pi."""
     opposite = np.roll(half, half.shape[1] // 2, axis=1)
     return np.concatenate([half, sign * opposite[-2:0:-1]], axis=0)
 
 
 def _sphere_mean(gain: FloatArray) -> float:
-    """Mean over the sphere of rows theta = 0..pi: exact where the gain is linear in cos theta between rows."""
+    """Return the mean over the sphere of rows theta = 0..pi, exact if the gain is linear in cos theta between rows."""
     theta = np.linspace(0, np.pi, gain.shape[0])
     edges = np.concatenate([[0.0], (theta[1:] + theta[:-1]) / 2, [np.pi]])
-    # area of the band about each row: at a pole it is not zero, as the sine there would be
+    # area of the band around each row, which is not zero at a pole
     weight = np.cos(edges[:-1]) - np.cos(edges[1:])
     return float((gain.mean(axis=1) * weight).sum() / 2)
 
 
 def _pole_vectors(e_theta: ComplexArray, e_phi: ComplexArray, row: int, slope: float) -> tuple[complex, complex, float]:
-    """Mean field (x, y) of a row next to or at a pole, and which share of its power that mean carries."""
+    """Return the mean field (x, y) of a row at or next to a pole, and the share of its power in the mean."""
     phi = np.arange(e_theta.shape[1]) * (2 * np.pi / e_theta.shape[1])
     x = slope * e_theta[row] * np.cos(phi) - e_phi[row] * np.sin(phi)
     y = slope * e_theta[row] * np.sin(phi) + e_phi[row] * np.cos(phi)
@@ -210,13 +210,13 @@ def _pole_vectors(e_theta: ComplexArray, e_phi: ComplexArray, row: int, slope: f
 
 
 def _single_valued_poles(e_theta: ComplexArray, e_phi: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Pole rows replaced by the one field vector that they measure from many sides."""
+    """Replace the rows of the poles by the one field vector that they measure from many sides."""
     e_theta, e_phi = e_theta.copy(), e_phi.copy()
     phi = np.arange(e_theta.shape[1]) * (2 * np.pi / e_theta.shape[1])
     for row, next_row, slope in ((0, 1, 1.0), (-1, -2, -1.0)):
         x, y, _ = _pole_vectors(e_theta, e_phi, row, slope)
         near_x, near_y, _ = _pole_vectors(e_theta, e_phi, next_row, slope)
-        if (x * np.conj(near_x) + y * np.conj(near_y)).real < 0:  # files name the pole's row from either side
+        if (x * np.conj(near_x) + y * np.conj(near_y)).real < 0:  # files write the row of a pole from either side
             x, y = -x, -y
         e_theta[row] = slope * (x * np.cos(phi) + y * np.sin(phi))
         e_phi[row] = y * np.cos(phi) - x * np.sin(phi)
@@ -225,13 +225,13 @@ def _single_valued_poles(e_theta: ComplexArray, e_phi: ComplexArray) -> tuple[Co
 
 # ---------------------------------------------------------------- AERPAW text files
 
-# As they begin without spaces and points, which differ from file to file of one lab.
+# Begin of the column names without spaces and points, which differ between files of one lab.
 _COLUMNS = ("phi", "theta", "etotal", "e(phi)amp", "e(theta)amp", "e(phi)phase", "e(theta)phase")
 
 
 @dataclass(slots=True)
 class _Rows:
-    """Numbers of a text file (rows, 7) with their lines."""
+    """The numbers of a text file (rows, 7) with their lines."""
 
     values: FloatArray
     lines: list[int] = field(default_factory=list)
@@ -240,7 +240,7 @@ class _Rows:
 
 @parsed("an antenna pattern file")
 def read_pattern_text(path: str | Path) -> MeasuredPattern:
-    """An AERPAW antenna text file: complex E_phi and E_theta over phi x theta.
+    """Read an AERPAW antenna text file with complex E_phi and E_theta over phi x theta.
 
     Parameters
     ----------
@@ -251,19 +251,19 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
     Returns
     -------
     MeasuredPattern
-        With E_phi and E_theta where ``polarised``.
+        Pattern with E_phi and E_theta.
 
     Raises
     ------
     InputError
-        Missing angles, wrong units, a truncated line, or more power out than in; with the line.
+        For missing angles, wrong units, a truncated line, or more power out than in; the message has the line.
 
     Notes
     -----
-    The sense of phi is told by the poles, where the two components must be one vector seen from all sides: that shows
-    whether E_phi points along increasing phi. Where it points against it, as in AERPAW's files, phi is the angle of a
-    turntable and azimuth is -phi (``rad_pat.mat`` lists the same measurement so). Poles that radiate too little to tell
-    are taken for AERPAW's.
+    The sense of phi follows from the poles, where the two components must be one vector seen from all sides. This shows
+    whether E_phi points along increasing phi. If it points against it, as in files of AERPAW, phi is the angle of a
+    turntable and azimuth is -phi (``rad_pat.mat`` lists the same measurement in this way). If the poles radiate too
+    little to decide, the sense of AERPAW is used.
     """
     path = Path(path)
     rows = _read_rows(path)
@@ -273,7 +273,7 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
     fields = np.moveaxis(amplitude_from_db(amplitude_db) * np.exp(1j * phase), -1, 0)
     e_theta, e_phi = _unfold(fields) if folded else fields
     along = _points_along_phi(e_theta.T, e_phi.T)
-    # phi is then a turntable's angle: azimuth runs against it
+    # phi is then the angle of a turntable, and azimuth has the opposite sense
     if not along:
         e_theta, e_phi = _mirrored(e_theta), _mirrored(e_phi)
     pattern = MeasuredPattern(path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
@@ -281,14 +281,14 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
     return pattern
 
 
-# What the reader of antenna files accepts: the expectation of its refusals.
+# Formats that the reader of antenna files accepts, for messages.
 READABLE = (
     "one of: AERPAW's text ('Phi Theta E Total. dB ...', radians and dBi), MSI Planet (.msi, .pln), a sphere as CSV "
     "(azimuth_deg,elevation_deg,gain_dbi), or an azimuth and an elevation cut as two CSV files "
     "(azimuth_deg,gain_dbi and elevation_deg,gain_dbi)"
 )
 
-# Signs of formats that are not read, each with the program or standard that writes it.
+# Signs of unsupported formats, each with the program or standard that writes it.
 _FOREIGN = (
     (r"\s*(REVNUM|REVDAT)\s*:,", "an NSMA antenna file (.adf, WG16.99.050): save it as MSI Planet"),
     (r"(?s).{0,400}?(//CST Farfield|Theta \[deg\.?\]\s+Phi)", "a far field of CST: save gain in dBi as a sphere CSV"),
@@ -313,7 +313,7 @@ _FREQUENCY = re.compile(
 
 
 def _read_rows(path: Path) -> _Rows:
-    # spreadsheets put a byte-order mark in front, which would hide the first header
+    # spreadsheets write a byte-order mark, which would hide the first header
     text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig")
     rows = _Rows(np.zeros((0, 7)))
     values: list[list[float]] = []
@@ -343,11 +343,11 @@ def _read_rows(path: Path) -> _Rows:
 
 
 def _check_last_line(text: str, rows: _Rows, path: Path) -> None:
-    """A file without a last line end whose last number is shorter than all above it was cut off inside that number."""
+    """Refuse a file whose last line has no line end and a shorter last number than all others, because it is truncated."""
     if not rows.lines or text.endswith(("\n", "\r")):
         return
     lines = text.splitlines()
-    # digits behind the point of the last cell: all rows of a lab's file have as many
+    # number of decimals of the last cell, which is equal in all rows of a file
     places = [len(lines[number - 1].split()[-1].rpartition(".")[2]) for number in rows.lines]
     if len(places) > 1 and len(set(places[:-1])) == 1 and places[-1] < places[0]:
         raise InputError(
@@ -359,7 +359,7 @@ def _check_last_line(text: str, rows: _Rows, path: Path) -> None:
 
 
 def _check_header(line: str, path: Path, number: int) -> None:
-    # headers differ in blanks and points from file to file
+    # headers differ in blanks and points between files
     columns = [re.sub(r"[\s.]", "", cell.lower()) for cell in line.split("\t")]
     if len(columns) != 7 or not all(cell.startswith(column) for cell, column in zip(columns, _COLUMNS, strict=True)):
         cause = "the columns are not separated by tabs" if len(columns) == 1 else None
@@ -391,7 +391,7 @@ def _check_units(rows: _Rows, path: Path) -> None:
     for columns, what in (((0, 1), "angles"), ((5, 6), "phases")):
         largest = np.abs(values[:, columns]).max(axis=1)
         worst = int(largest.argmax())
-        # a tenth beyond a turn is rounding of a table, more is degrees
+        # 0.1 beyond a full circle is rounding of a table, and more means degrees
         if largest[worst] > 2 * np.pi + 0.1:
             raise InputError(
                 f"{what} reach {largest[worst]:g}",
@@ -408,7 +408,7 @@ def _check_units(rows: _Rows, path: Path) -> None:
             path=path,
             line=rows.lines[worst],
         )
-    # the file says the sum, too: a check of units that costs nothing
+    # the file also contains the sum, which checks the units
     total = db_from_power(power_from_db(values[:, 3]) + power_from_db(values[:, 4]))
     wrong = np.flatnonzero(np.abs(total - values[:, 2]) > 0.05)
     if len(wrong):
@@ -423,12 +423,14 @@ def _check_units(rows: _Rows, path: Path) -> None:
 
 
 def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
-    """Give whether theta is a full circle, and rows as (phis, thetas, 7); both angles complete and equally spaced."""
-    # five digits: float32 angles of one grid line differ in the seventh
+    """Return whether theta is a full circle, and rows as (phis, thetas, 7) with complete and equally spaced angles."""
+    # five digits, because float32 angles of one grid line differ in the seventh
     key = np.round(rows.values[:, :2], 5)
     phi, at_phi = np.unique(key[:, 0], return_inverse=True)
     theta, at_theta = np.unique(key[:, 1], return_inverse=True)
-    if len(theta) < 3 or len(phi) * len(theta) > 2 * len(key) + 1000:  # no grid; and a table of them might not fit
+    if (
+        len(theta) < 3 or len(phi) * len(theta) > 2 * len(key) + 1000
+    ):  # not a grid, and a table of the angles could be too large
         raise InputError(
             f"{len(key)} rows with {len(phi)} values of phi and {len(theta)} of theta",
             expected="a grid over the sphere: every phi with every theta",
@@ -448,7 +450,7 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
             path=path,
             line=None if what == "missing" else rows.lines[np.flatnonzero((at_phi == i) & (at_theta == j))[1]],
         )
-    # theta from -pi on: phi then runs half a circle only
+    # theta begins at -pi, so phi covers half a circle only
     folded = theta[0] < -0.1
     span = np.pi if folded else 2 * np.pi
     phi_expected = np.arange(len(phi)) * (span / len(phi))
@@ -463,25 +465,27 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
                 cause="angles are missing",
                 path=path,
             )
-    # rows may come in any order
+    # rows may have any order
     order = np.empty((len(phi), len(theta)), dtype=np.int64)
     order[at_phi, at_theta] = np.arange(len(key))
     return bool(folded), rows.values[order]
 
 
 def _unfold(folded: ComplexArray) -> ComplexArray:
-    """(2, phis to pi, thetas -pi..pi) to (2, phis to 2 pi, thetas 0..pi); negative theta is the meridian at phi + pi.
+    """Convert (2, phis to pi, thetas -pi..pi) to (2, phis to 2 pi, thetas 0..pi).
 
-    Some files keep spherical components there, some those of the cut, which differ in sign. Where phi wraps round,
-    and along each meridian next to the poles, the field goes on smoothly; that tells the two apart.
+    Negative theta is the meridian at phi + pi.
+
+    Some files have spherical components there, and some those of the cut, which differ in sign. The field is smooth where
+    phi wraps around, and along each meridian next to the poles, which distinguishes both cases.
     """
-    # theta is zero there
+    # theta is zero here
     middle = folded.shape[2] // 2
     near, far = folded[:, :, middle:].copy(), folded[:, :, middle::-1].copy()
     inner = slice(1, -1)
     if _apart(far[:, 0, inner], near[:, -1, inner]) > _apart(-far[:, 0, inner], near[:, -1, inner]):
         far = -far
-    for pole, next_row in ((0, 1), (-1, -2)):  # a pole's row may be named from either half
+    for pole, next_row in ((0, 1), (-1, -2)):  # the row of a pole may be written from either half
         if _apart(near[:, :, pole], near[:, :, next_row]) > _apart(-near[:, :, pole], near[:, :, next_row]):
             near[:, :, pole] *= -1
         far[:, :, pole] = -near[:, :, pole]
@@ -493,42 +497,42 @@ def _apart(first: ComplexArray, second: ComplexArray) -> float:
 
 
 def _mirrored(half: ComplexArray) -> ComplexArray:
-    """(phis, thetas) with phi turned into -phi."""
-    # reversed, phi 0 would be last: it stays first
+    """Return (phis, thetas) with phi replaced by -phi."""
+    # phi 0 remains first
     return np.roll(half[::-1], 1, axis=0)
 
 
 def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
-    """Check whether E_phi points along increasing phi: only then is the field near the poles one vector."""
+    """Check whether E_phi points along increasing phi, in which case the field near the poles is one vector."""
     scores = []
-    # with the right sign the rows at both poles are one vector seen from all sides
+    # with the right sign, the rows at both poles are one vector seen from all sides
     for sign in (1.0, -1.0):
         score = 0.0
         for row, slope in ((0, 1.0), (1, 1.0), (-2, -1.0), (-1, -1.0)):
             power = float((np.abs(e_theta[row]) ** 2 + np.abs(e_phi[row]) ** 2).mean())
             score += power * _pole_vectors(e_theta, sign * e_phi, row, slope)[2]
         scores.append(score)
-    # clearly better, or AERPAW's own sense is taken
+    # without a clear difference the sense of AERPAW is used
     return scores[0] > 1.05 * scores[1] + 1e-6
 
 
 def check_power(
     pattern: MeasuredPattern, path: Path, *, most_db: float = 0.5, cause: str = "the values are not gain over isotropic"
 ) -> None:
-    """Refuse a pattern of any format that radiates more than it is fed, almost nothing, or linear numbers.
+    """Refuse a pattern that radiates more than it is fed, almost nothing, or has linear numbers.
 
     Parameters
     ----------
     pattern : MeasuredPattern
     path : Path
-        For the message.
+        File, for the message.
     most_db : float
-        Greatest mean gain over the sphere; an antenna without loss has 0 dB, the rest is error of the measurement.
+        Largest mean gain over the sphere. An antenna without loss has 0 dB, and the rest is measurement error.
     cause : str
-        Likely cause of a mean gain out of range, unless the values are linear.
+        Likely cause of a mean gain out of range, if the values are not linear.
     """
-    # without a gain below that of an isotropic antenna none can lie above it
-    # linear gains read as dBi lie between 0 and a few: no antenna is above isotropic everywhere
+    # if no gain is below that of an isotropic antenna, none can be above it
+    # linear gains that are read as dBi lie between 0 and a few, but no antenna is above isotropic everywhere
     linear = pattern.least_gain_dbi >= 0.0 and pattern.peak_gain_dbi - pattern.least_gain_dbi > most_db
     if linear or not _MINIMUM_EFFICIENCY <= pattern.efficiency <= power_from_db(most_db):
         raise InputError(
@@ -544,7 +548,7 @@ def check_power(
 
 
 def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
-    """A gain grid of ``rad_pat.mat``: dBi over elevation x azimuth, without polarisation.
+    """Read a gain grid of ``rad_pat.mat``: dBi over elevation x azimuth, without polarisation.
 
     Parameters
     ----------
@@ -556,14 +560,14 @@ def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
     Returns
     -------
     MeasuredPattern
-        All amplitude in E_theta, real.
+        Pattern with all amplitude in E_theta, real.
 
     Raises
     ------
     InputError
-        Not such a file, missing angles, degrees and radians mixed up, or more power out than in.
+        For another file, missing angles, mixed degrees and radians, or more power out than in.
     UsageError
-        No such grid.
+        If there is no such grid.
     """
     path = Path(path)
     with about_file(path):
@@ -583,7 +587,7 @@ def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
         )
     if gain.max() > HIGHEST_DBI:
         raise InputError(f"'{variable}' reaches {gain.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", path=path)
-    # the second modulo: 359.9999999 rounds to 360, which is 0
+    # the second modulo is needed because 359.9999999 rounds to 360, which is 0
     by_azimuth = np.argsort(np.round(azimuth % 360.0, 6) % 360.0)
     gain = gain[np.argsort(-elevation)][:, by_azimuth]
     pattern = MeasuredPattern(variable, np.sqrt(power_from_db(gain)).astype(np.complex128), None)
@@ -592,7 +596,7 @@ def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
 
 
 def _grid_of(content: Mapping[str, Any], variable: str, shape: tuple[int, int], path: Path) -> FloatArray:
-    """The grid of that name, if it has a row per elevation and a column per azimuth."""
+    """Return the grid of that name if it has a row per elevation and a column per azimuth."""
     sizes = {key: value.shape for key, value in content.items() if isinstance(value, np.ndarray)}
     grids = sorted(key for key, size in sizes.items() if size == shape)
     if variable in grids:
@@ -618,7 +622,7 @@ def _check_angles(elevation: FloatArray, azimuth: FloatArray, path: Path) -> Non
         ("elevation (theta2)", np.sort(elevation), wanted_elevation),
         ("azimuth (phi2)", np.sort(np.round(azimuth % 360.0, 6) % 360.0), wanted_azimuth),
     ):
-        if len(axis) >= 3 and np.abs(axis - grid).max() <= 0.05:  # false for NaN too
+        if len(axis) >= 3 and np.abs(axis - grid).max() <= 0.05:  # false for NaN, too
             continue
         causes = (
             (len(axis) >= 3 and 0 < np.abs(axis).max() < 7, "radians instead of degrees"),

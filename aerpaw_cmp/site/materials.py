@@ -17,8 +17,8 @@ from ..common.units import VACUUM_PERMITTIVITY_F_PER_M
 # Lowest and highest frequency [GHz], a, b, c, d.
 Band = tuple[float, float, float, float, float, float]
 
-# Usual thickness of a wall or roof [m], None of a half-space (no second face echoes); P.2040-4 table 3, whose bands
-# above 100 GHz are left out.
+# Usual thickness of a wall or roof [m], None for a half-space (without an echo of a second face). P.2040-4 table 3,
+# without its bands above 100 GHz.
 _TABLE: dict[str, tuple[float | None, Band]] = {
     "vacuum": (None, (0.001, 100.0, 1.0, 0.0, 0.0, 0.0)),
     "concrete": (0.3, (1.0, 100.0, 5.24, 0.0, 0.0462, 0.7822)),
@@ -46,11 +46,11 @@ class Material:
     Parameters
     ----------
     name : str
-        Without the ``itu_`` prefix.
+        Name without the prefix ``itu_``.
     band : Band
-        Constants, and the frequencies of which they are.
+        Constants, and the frequencies for which they are valid.
     thickness_m : float or None
-        Thickness of a wall of it; None is a half-space.
+        Thickness of a wall of this material; None is a half-space.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Material:
         )
 
     def conductivity_s_per_m(self, frequency_hz: float) -> float:
-        """Conductivity [S/m] at a frequency [Hz]; UsageError outside the table's band.
+        """Return the conductivity at a frequency [S/m].
 
         Source: ITU-R P.2040 table 3.
         """
@@ -80,35 +80,35 @@ class Material:
         return float(c * (frequency_hz / 1e9) ** d)
 
     def relative_permittivity(self, frequency_hz: float) -> complex:
-        """Complex relative permittivity at a frequency [Hz]; the imaginary part is negative (loss).
+        """Return the complex relative permittivity at a frequency, whose imaginary part is negative (loss).
 
         Source: arXiv 2502.10324 eq. 5; ITU-R P.2040 table 3.
 
         Raises
         ------
         UsageError
-            Outside the frequencies of the table.
+            If the frequency is outside the table.
         """
         _, _, a, b, _, _ = self._band(frequency_hz)
         loss = self.conductivity_s_per_m(frequency_hz) / (2 * math.pi * frequency_hz * VACUUM_PERMITTIVITY_F_PER_M)
         return complex(a * (frequency_hz / 1e9) ** b, -loss)
 
 
-# Names that :func:`material` knows.
+# Names for :func:`material`.
 MATERIALS: tuple[str, ...] = tuple(_TABLE)
 
-# Of vegetation in a scene of triangles: it becomes a medium, nothing reflects off it.
+# Name of vegetation in a scene of triangles, which becomes a medium without reflections.
 CROWN = "vegetation"
 
 
 def material(name: str) -> Material:
-    """A material of ITU-R P.2040 by name, or one that its name describes.
+    """Return a material of ITU-R P.2040 by name, or one that its name describes.
 
     Parameters
     ----------
     name : str
-        Such as ``"concrete"``, ``"itu_concrete"`` or ``"itu-concrete"``; with a thickness of its own [m]
-        ``"concrete with thickness=0.1"``; one of constant permittivity and conductivity [S/m]
+        A name such as ``"concrete"``, ``"itu_concrete"`` or ``"itu-concrete"``. A thickness [m] can be stated in
+        ``"concrete with thickness=0.1"``, and a constant permittivity and conductivity [S/m] in
         ``"constant with permittivity=3.5 conductivity=0.02 thickness=0.1"``.
 
     Returns
@@ -118,7 +118,7 @@ def material(name: str) -> Material:
     Raises
     ------
     UsageError
-        Unknown name; the nearest known one is named.
+        For an unknown name; the message contains the most similar one.
 
     Examples
     --------
@@ -134,7 +134,7 @@ def material(name: str) -> Material:
     plain, _, numbers = name.partition(" with ")
     if numbers:
         return _stated(plain, numbers, name)
-    # Sionna, Blender and people write one name in three ways
+    # Sionna, Blender and users write one name in three ways
     key = name.strip().lower().replace("-", "_").replace(" ", "_").removeprefix("itu_")
     if key not in _TABLE:
         near = difflib.get_close_matches(key, _TABLE, n=1, cutoff=0.4)
@@ -148,7 +148,7 @@ def material(name: str) -> Material:
 
 
 def _stated(plain: str, numbers: str, name: str) -> Material:
-    """A material whose name says its numbers."""
+    """Return a material whose name contains its numbers."""
     # permittivity and conductivity of a material of the table follow from the carrier
     allowed = {"thickness"} if plain != CONSTANT else {"thickness", "permittivity", "conductivity"}
     try:
@@ -169,11 +169,11 @@ def _stated(plain: str, numbers: str, name: str) -> Material:
     return Material(stated_name(band[2], band[4], thickness), band, None if thickness is None else thickness or 1e-9)
 
 
-# Begins the name of a material that is not of ITU-R P.2040; its numbers follow.
+# Begin of the name of a material that is not in ITU-R P.2040; its numbers follow.
 CONSTANT = "constant"
 
 
 def stated_name(permittivity: float, conductivity_s_per_m: float, thickness_m: float | None) -> str:
-    """Name of a material of constant permittivity and conductivity."""
+    """Return the name of a material of constant permittivity and conductivity."""
     end = "" if thickness_m is None else f" thickness={thickness_m:.9g}"
     return f"{CONSTANT} with permittivity={permittivity:.9g} conductivity={conductivity_s_per_m:.9g}{end}"

@@ -49,7 +49,7 @@ _TYPES = {
 
 @dataclass(frozen=True, slots=True)
 class RawMesh:
-    """The contents of a mesh file: vertices (n, 3), triangles (m, 3) int, and the number of polygons that were not flat."""
+    """The contents of a mesh file: vertices (n, 3), triangles (m, 3) int, and the number of bent polygons."""
 
     vertices: FloatArray
     triangles: IntArray
@@ -139,7 +139,7 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
 
 
 def _declare(words: list[str], elements: list[_Element]) -> None:
-    """Read an element of the header, or a property of its last element; raise IndexError, KeyError or ValueError for others."""
+    """Read an element of the header, or a property of its last element; other lines raise an error."""
     if words[:1] == ["element"]:
         elements.append(_Element(words[1], int(words[2]), ()))
     elif words[:1] == ["property"]:

@@ -403,7 +403,7 @@ _LENGTHS_M = np.geomspace(30.0, 2000.0, 9)
 # Both have steps of about 65 %.
 _DEVIATIONS_M = np.geomspace(1.0, 50.0, 9)
 
-# Heights at positions this close belong to one position, and contradict if they differ by this many standard deviations.
+# Heights at positions this close belong to one position. They contradict above this many standard deviations.
 _SAME_PLACE_M, _CONTRADICTION = 1.0, 4.0
 
 # Number of waves in a drawn surface.
@@ -552,7 +552,7 @@ def surface_through(points_m: FloatArray, frame: SiteFrame, reach_m: tuple[float
 
 @lru_cache(maxsize=8)
 def _likeliest(points: bytes) -> tuple[float, float, float]:
-    """Return length, deviation and mean of the process of points [m], cached because every stage of a report needs it."""
+    """Return length, deviation and mean of the process of points [m], cached for all stages of a report."""
     rows = np.frombuffer(points).reshape(-1, 4)
     place, height, error = rows[:, :2], rows[:, 2], rows[:, 3]
     apart = cdist(place, place)

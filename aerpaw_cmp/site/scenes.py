@@ -38,9 +38,9 @@ Mesh = tuple[FloatArray, IntArray]
 
 
 def building_mesh(building: Building) -> Mesh:
-    """Walls and roof of a building: vertices (n, 3) [m] and triangles (m, 3)."""
+    """Return walls and roof of a building as vertices (n, 3) [m] and triangles (m, 3)."""
     low, high = building.base_m - WALL_DEPTH_M, building.base_m + building.height_m
-    footprint = shapely.orient_polygons(building.footprint)  # outer ring counter-clockwise, holes clockwise
+    footprint = shapely.orient_polygons(building.footprint)  # the outer ring is counter-clockwise, holes are clockwise
     vertices, triangles, count = [], [], 0
     for ring in (footprint.exterior, *footprint.interiors):
         line = np.asarray(ring.coords)[:-1, :2]
@@ -48,7 +48,7 @@ def building_mesh(building: Building) -> Mesh:
         vertices.append(np.column_stack([np.tile(line, (2, 1)), np.repeat([low, high], n)]))
         a = np.arange(n)
         b = (a + 1) % n
-        # the outer ring runs counter-clockwise, so these corners do so seen from outside
+        # the outer ring is counter-clockwise, so these corners are counter-clockwise from outside
         walls = np.concatenate([np.stack([a, b, b + n], axis=1), np.stack([a, b + n, a + n], axis=1)])
         triangles.append(walls + count)
         count += 2 * n
@@ -56,7 +56,7 @@ def building_mesh(building: Building) -> Mesh:
     roof = np.stack([np.asarray(part.exterior.coords)[:3, :2] for part in parts])
     flat = roof.reshape(-1, 2)
     edge, other_edge = roof[:, 1] - roof[:, 0], roof[:, 2] - roof[:, 0]
-    # the triangulation promises no sense, and a roof must look up
+    # the triangulation has no defined sense, and the normal of a roof must point up
     turn = edge[:, 0] * other_edge[:, 1] < edge[:, 1] * other_edge[:, 0]
     order = np.arange(len(flat)).reshape(-1, 3)
     order[turn] = order[turn][:, ::-1]
@@ -66,12 +66,12 @@ def building_mesh(building: Building) -> Mesh:
 
 
 def rectangle(west_m: float, east_m: float, south_m: float, north_m: float, up_m: float) -> Mesh:
-    """A level rectangle that looks up.
+    """Return a horizontal rectangle whose normal points up.
 
     Parameters
     ----------
     west_m, east_m, south_m, north_m, up_m : float
-        Its sides and its height.
+        Sides and height of the rectangle [m].
 
     Returns
     -------
@@ -83,17 +83,17 @@ def rectangle(west_m: float, east_m: float, south_m: float, north_m: float, up_m
 
 
 def site_meshes(site: Site) -> dict[str, Mesh]:
-    """Meshes of the buildings by material, and of the ground where no scene brings its own.
+    """Return meshes of the buildings by material, and of the ground if the site has no scene.
 
     Parameters
     ----------
     site : Site
-        Any.
+        The site.
 
     Returns
     -------
     dict of str to Mesh
-        Materials of ITU-R P.2040.
+        Meshes by material of ITU-R P.2040.
     """
     pieces: dict[str, list[Mesh]] = {}
     if site.scene is None:
@@ -111,13 +111,13 @@ def _joined(parts: list[Mesh]) -> Mesh:
     return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(triangles)
 
 
-# A ground plane that is added reaches this many times the size of the scene beyond it.
+# Size of an added ground plane beyond the scene, in sizes of the scene.
 _PLANE_MARGIN = 10.0
 
-# A scene whose level surfaces cover less of its plan than this has no ground.
+# A scene whose horizontal surfaces cover a smaller share of its plan has no ground.
 GROUND_SHARE = 0.5
 
-# Upward part of the normal above which a surface can be ground.
+# Vertical part of the normal above which a surface can be ground.
 LEVEL = 0.7
 
 
@@ -130,27 +130,27 @@ def placed_scene(
     turn_deg: float = 0.0,
     ground_plane: str | None = None,
 ) -> TriangleScene:
-    """A Mitsuba scene, turned and moved into the site frame.
+    """Return a Mitsuba scene, rotated and moved into the site frame.
 
     Parameters
     ----------
     path : Path
-        The XML file.
+        XML file.
     materials : mapping of str to str, optional
         As in :func:`aerpaw_cmp.site.mitsuba.read_scene`.
     sha256 : str, optional
-        What the scene's files must have.
+        Required digest of the files of the scene.
     offset_m : (east, north, up)
-        Where its origin lies.
+        Position of its origin [m].
     turn_deg : float
-        How far it is turned counter-clockwise from above, about its origin.
+        Rotation about its origin, counter-clockwise from above.
     ground_plane : str, optional
-        Material of a plane that is added at its lowest point.
+        Material of a plane that is added at the lowest point of the scene.
 
     Returns
     -------
     TriangleScene
-        In the site frame [m].
+        Scene in the site frame [m].
 
     Raises
     ------
@@ -173,9 +173,9 @@ def placed_scene(
 
 
 def with_ground(scene: TriangleScene, name: str) -> TriangleScene:
-    """The scene on a level rectangle at its lowest point, which reaches far beyond it."""
+    """Return the scene on a horizontal rectangle at its lowest point, which extends far beyond it."""
     low, high = bounds(scene)
-    # so far that no reflection between points of the scene falls off its edge
+    # so far that no reflection between points of the scene misses it
     reach = _PLANE_MARGIN * float(max(*(high - low)[:2], 100.0))
     mesh = rectangle(low[0] - reach, high[0] + reach, low[1] - reach, high[1] + reach, low[2])
     return added(scene, *mesh, "ground plane", material(name).name)
@@ -184,7 +184,7 @@ def with_ground(scene: TriangleScene, name: str) -> TriangleScene:
 def added(
     scene: TriangleScene, vertices_m: np.ndarray, triangles: np.ndarray, name: str, of_material: str
 ) -> TriangleScene:
-    """The scene with one more shape.
+    """Return the scene with one more shape.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def added(
     triangles : (t, 3) int
         Rows of ``vertices_m``.
     name, of_material : str
-        Of the shape.
+        Name and material of the shape.
 
     Returns
     -------
@@ -211,30 +211,30 @@ def added(
 
 
 def bounds(scene: TriangleScene) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest coordinates (3,) [m] of what the triangles use."""
+    """Return the lowest and highest coordinates of all triangles, shape (3,) [m]."""
     used = scene.vertices_m[np.unique(scene.triangles)]
     return used.min(axis=0), used.max(axis=0)
 
 
 def ground_share(scene: TriangleScene) -> float:
-    """Share of the plan that has a level surface somewhere above or below it."""
+    """Return the share of the plan that has a horizontal surface at any height."""
     corners = scene.vertices_m[scene.triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(across, axis=1)
-    # either side up: files turn triangles as they like
+    # either side may be up, because files have both senses
     level = corners[np.abs(across[:, 2]) > LEVEL * np.maximum(size, 1e-300)]
     low, high = bounds(scene)
     return float(shapely.union_all(shapely.polygons(level[:, :, :2])).area / (high - low)[:2].prod())
 
 
-# A mesh this narrow in plan whose box comes this near to an antenna is its mast, bracket or housing.
+# A mesh this narrow in plan, and this close to an antenna, is its mast, bracket or housing.
 _MAST_M, _TOUCHES_M = 4.0, 0.5
 
 
 def without_traps(
     scene: TriangleScene, antennas_m: Mapping[str, FloatArray]
 ) -> tuple[TriangleScene, tuple[Forest, ...], list[str]]:
-    """A scene without meshes that are no mirrors or would hide an antenna from everything.
+    """Remove meshes that are not mirrors or would enclose an antenna.
 
     Parameters
     ----------
@@ -245,12 +245,12 @@ def without_traps(
     Returns
     -------
     TriangleScene
-        Without vegetation, and without what an antenna stands in or on.
+        Scene without vegetation, and without meshes around or below an antenna.
     tuple of Forest
-        Each part of a mesh of vegetation as a medium: its outline from above, from its lowest to its highest corner, as
-        full as its volume says. Trunks are left out.
+        Each part of a mesh of vegetation as a medium: its outline from above, from its lowest to its highest corner,
+        filled according to its volume. Trunks are removed.
     list of str
-        What was done.
+        List of actions.
     """
     notes: list[str] = []
     out = np.zeros(len(scene.shapes), dtype=np.bool_)
@@ -258,7 +258,7 @@ def without_traps(
         corners = scene.vertices_m[scene.triangles[scene.shape == number]]
         low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
         for tower, place in antennas_m.items():
-            # the box first: most meshes are nowhere near an antenna
+            # test the box first, because most meshes are far from all antennas
             if np.any(place < low - _TOUCHES_M) or np.any(place > high + _TOUCHES_M):
                 continue
             inside = _encloses(corners, place)
@@ -270,7 +270,7 @@ def without_traps(
                     "mirror"
                 )
     green = np.array([name == CROWN for name in scene.materials])
-    # thin cylinders: they shade centimetres, and a convex outline of them would be a wood
+    # trunks shade only centimetres, and their convex outline would be a wood
     trunk = green & np.array(["trunk" in name.lower() for name in scene.shapes])
     woods = [wood for number in np.flatnonzero(green & ~trunk).tolist() for wood in _media(scene, number)]
     if green.any():
@@ -283,13 +283,13 @@ def without_traps(
 
 
 def _encloses(corners_m: FloatArray, place_m: FloatArray) -> bool:
-    """Check whether a point lies in a mesh of triangles (n, 3, 3): lines upward meet it an odd number of times."""
+    """Check whether a point is in a mesh of triangles (n, 3, 3), which lines upward cross an odd number of times."""
     across = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
-    # area vectors of a closed mesh add up to zero
+    # the area vectors of a closed mesh add up to zero
     if np.linalg.norm(across.sum(axis=0)) > 1e-3 * np.linalg.norm(across, axis=1).sum():
-        return False  # open, such as terrain
+        return False  # an open mesh, such as terrain
     votes = 0
-    for shift in ((1e-4, 2e-4), (-3e-4, 1e-4), (2e-4, -3e-4)):  # an edge that one line meets, the others miss
+    for shift in ((1e-4, 2e-4), (-3e-4, 1e-4), (2e-4, -3e-4)):  # if one line meets an edge, the others do not
         a, b, c = (corners_m[:, k] - place_m - np.array([*shift, 0.0]) for k in range(3))
         turns = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))])
         over = (turns > 0).all(axis=0) | (turns < 0).all(axis=0)
@@ -299,7 +299,7 @@ def _encloses(corners_m: FloatArray, place_m: FloatArray) -> bool:
 
 
 def _media(scene: TriangleScene, number: int) -> Iterator[Forest]:
-    """Connected parts of a mesh of vegetation as media."""
+    """Yield the connected parts of a mesh of vegetation as media."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -314,7 +314,7 @@ def _media(scene: TriangleScene, number: int) -> Iterator[Forest]:
         low, high = float(mine[..., 2].min()), float(mine[..., 2].max())
         if outline.geom_type != "Polygon" or not high > low:
             continue
-        # sixths of determinants about any point: the divergence theorem
+        # one sixth of determinants about any point, by the divergence theorem
         volume = abs(float(np.linalg.det(mine - mine.mean(axis=(0, 1))).sum())) / 6.0
         yield Forest(
             name=scene.shapes[number] if index == 0 else f"{scene.shapes[number]} ({index + 1})", area=outline,
@@ -326,19 +326,18 @@ def _media(scene: TriangleScene, number: int) -> Iterator[Forest]:
 _DRAWN_SIMPLER_M = 0.5
 _DRAWN_M2 = 10.0
 _DRAWN_TALLER_M = 1.0
-# Of the prisms that stand for a scene in pictures: how much simpler, from which area and height
-# on, and how many at most.
+# Largest number of prisms that represent a scene in pictures.
 _DRAWN_MOST = 3000
 
-# A part of a shape that covers more of the plan than this is ground, however hilly.
+# A part of a shape that covers a larger share of the plan is ground, including hills.
 _GROUND_PART = 0.25
 
 
 def drawn_buildings(site: Site) -> tuple[Building, ...]:
-    """Buildings that pictures show: those of the site, and for a scene of triangles the outlines of its shapes.
+    """Return buildings for pictures: those of the site, and the outlines of the shapes of a scene of triangles.
 
-    Prisms from the lowest to the highest corner of each part; level shapes and those under most of the plan are ground.
-    Only pictures use them.
+    Prisms extend from the lowest to the highest corner of each part. Horizontal shapes and those below most of the plan
+    are ground. Only pictures use them.
     """
     return site.buildings if site.scene is None else (*site.buildings, *_outlines(site.scene))
 
@@ -361,9 +360,9 @@ def _outlines(scene: TriangleScene) -> tuple[Building, ...]:
             simple = outline.simplify(_DRAWN_SIMPLER_M)
             if mine.size and simple.geom_type == "Polygon" and _DRAWN_M2 < simple.area < _GROUND_PART * ground_m2:
                 outlines.append((scene.shapes[shape], simple, float(mine.max())))
-    # the largest only: a browser draws no hundred thousand prisms
+    # only the largest, because a browser cannot draw 100 000 prisms
     outlines = sorted(outlines, key=lambda drawn: -drawn[1].area)[:_DRAWN_MOST]
-    # down to the lowest corner of anything under it: roofs are often shapes of their own
+    # extend to the lowest corner of anything below, because roofs are often separate shapes
     feet = np.array([top for *_, top in outlines])
     boxes = shapely.buffer([outline for _, outline, _ in outlines], 0.5)
     box, corner = shapely.STRtree(shapely.points(scene.vertices_m[:, :2])).query(boxes, predicate="contains")

@@ -1,8 +1,7 @@
-"""Trees: seeded random placement in forests, sizes, single trees.
+"""Trees: random placement in forests with a seed, sizes, and single trees.
 
-A tree is the paper's (arXiv 2502.10324, section V): a trunk cylinder with a cone of vegetation on it, 20 m high and
-10 m across at its widest. The paper does not print the height of the crown's base; a quarter of the height is
-assumed here.
+A tree is that of the paper (arXiv 2502.10324, section V): a trunk cylinder below a cone of vegetation, 20 m high and
+10 m wide. The paper does not print the height of the base of the crown, which is assumed to be a quarter of the height.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ from ..common.units import BoolArray, FloatArray
 from ..common.yamlfile import StrictModel
 from .site import Forest, Trees
 
-# Of one forest.
+# Largest number of trees of a forest.
 _MAXIMUM_TREES = 2_000_000
 
-_STALLED_ROUNDS = 12  # batches of darts in a row that add less than a thousandth: the forest is full
+_STALLED_ROUNDS = 12  # consecutive batches that add less than a thousandth, after which the forest is full
 
 
-# Beyond the tallest, widest and thickest trees on Earth [m]: larger sizes are feet or centimetres.
+# Larger than the tallest, widest and thickest trees on Earth [m], so larger sizes are feet or centimetres.
 TALLEST_TREE_M = 120.0
 WIDEST_CROWN_M = 90.0
 THICKEST_TRUNK_M = 15.0
@@ -40,7 +39,7 @@ TrunkDiameter = Annotated[float, Field(gt=0, le=THICKEST_TRUNK_M)]
 
 
 class TreeSizes(StrictModel):
-    """Sizes of trees; the crown's base lies at a share of the height."""
+    """The sizes of trees; the base of the crown is at a share of the height."""
 
     height_m: TreeHeight = 20.0
     crown_diameter_m: CrownDiameter = 10.0
@@ -52,18 +51,18 @@ PAPER_SIZES = TreeSizes()
 
 
 def trees_at(east_m: FloatArray, north_m: FloatArray, sizes: TreeSizes) -> Trees:
-    """Trees of one size at given points (n,) [m].
+    """Return trees of one size at given points (n,) [m].
 
     Parameters
     ----------
     east_m, north_m : (n,)
-        Trunks [m].
+        Positions of the trunks [m].
     sizes : TreeSizes
 
     Returns
     -------
     Trees
-        Of n trees.
+        The n trees.
     """
     count = len(east_m)
     return Trees(
@@ -78,7 +77,7 @@ def trees_at(east_m: FloatArray, north_m: FloatArray, sizes: TreeSizes) -> Trees
 
 
 def join_trees(parts: Sequence[Trees]) -> Trees:
-    """All trees of several sets, in order."""
+    """Return all trees of several sets, in order."""
     if not parts:
         return Trees.none()
     return Trees(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Trees)})
@@ -91,44 +90,44 @@ def place_trees(
     seed: int = 0,
     keep_clear: BaseGeometry | None = None,
 ) -> Trees:
-    """Trees at random places of a forest, no two closer than its minimum spacing.
+    """Return trees at random positions in a forest, with at least its minimum spacing.
 
     Parameters
     ----------
     forest : Forest
-        ``trees_per_hectare`` times the free area is the wanted number.
+        The number of trees is ``trees_per_hectare`` times the free area.
     sizes : TreeSizes, optional
-        The paper's tree by default.
+        Sizes of the trees; those of the paper by default.
     seed : int
-        Same seed and forest, same trees; forests do not influence each other.
+        The same seed and forest have the same trees. Forests do not affect each other.
     keep_clear : shapely geometry, optional
-        No trunk stands in it (buildings, masts).
+        Area without trunks (buildings, masts).
 
     Returns
     -------
     Trees
-        Fewer than wanted when they do not fit (see :func:`wanted_trees`).
+        The trees, which are fewer if they do not fit (see :func:`wanted_trees`).
 
     Notes
     -----
-    Darts are thrown in batches. Of two darts that are too close the earlier stays, as if they had been thrown one
-    by one (random sequential addition), but whole batches are decided at once.
+    Random positions are drawn in batches. Of two positions that are too close the earlier one is used, as in random
+    sequential addition, but complete batches are decided at once.
     """
     area = forest.area if keep_clear is None else shapely.difference(forest.area, keep_clear)
-    # of the name, not of the order: a forest that is added leaves the others' trees where they are
+    # the seed uses the name, not the order, so that an added forest does not move the trees of others
     random = np.random.default_rng([seed, zlib.crc32(forest.name.encode())])
     points = _scatter(area, wanted_trees(forest, keep_clear), forest.minimum_spacing_m, random)
     return trees_at(points[:, 0], points[:, 1], sizes)
 
 
 def wanted_trees(forest: Forest, keep_clear: BaseGeometry | None = None) -> int:
-    """Number of trees that a forest's density asks for."""
+    """Return the number of trees for the density of a forest."""
     area = forest.area if keep_clear is None else shapely.difference(forest.area, keep_clear)
     return round(forest.trees_per_hectare * float(area.area) / 10_000.0)
 
 
 def _scatter(area: BaseGeometry, count: int, spacing_m: float, random: np.random.Generator) -> FloatArray:
-    """Up to ``wanted`` random points (n, 2) in an area, at least ``spacing_m`` apart."""
+    """Return at most ``count`` random points in an area, at least ``spacing_m`` apart, shape (n, 2)."""
     placed = np.zeros((0, 2))
     if count <= 0 or area.is_empty:
         return placed
@@ -141,7 +140,7 @@ def _scatter(area: BaseGeometry, count: int, spacing_m: float, random: np.random
     shapely.prepare(area)
     east_min, north_min, east_max, north_max = area.bounds
     low, span = np.array([east_min, north_min]), np.array([east_max - east_min, north_max - north_min])
-    # of the bounding box: so many darts are thrown that about enough hit
+    # draw enough positions in the bounding box that about the required number is in the area
     share = area.area / max(float(span.prod()), 1e-300)
     stalled = 0
     while len(placed) < count and stalled < _STALLED_ROUNDS:
@@ -153,17 +152,17 @@ def _scatter(area: BaseGeometry, count: int, spacing_m: float, random: np.random
                 darts = darts[cKDTree(placed).query(darts, distance_upper_bound=spacing_m)[0] >= spacing_m]
             darts = darts[_first_come(darts, spacing_m)]
         added = darts[:missing]
-        # random packing ends near half of the area: the last trees would take for ever
+        # random packing ends near half of the area, so the last trees would take very long
         stalled = stalled + 1 if len(added) < 1e-3 * count else 0
         placed = np.concatenate([placed, added])
     return placed
 
 
 def _first_come(points: FloatArray, spacing_m: float) -> BoolArray:
-    """Mask of the points (n, 2) that stay when each is refused by any earlier kept one closer than ``spacing_m``."""
+    """Return a mask of points (n, 2) that have no earlier selected point closer than ``spacing_m``."""
     keep = np.zeros(len(points), dtype=bool)
     open_ = np.ones(len(points), dtype=bool)
-    # strictly closer: two trees at exactly the spacing both stand
+    # strictly closer, because two trees at exactly the spacing are allowed
     pairs = cKDTree(points).query_pairs(np.nextafter(spacing_m, 0), output_type="ndarray") if len(points) else None
     if pairs is None or not len(pairs):
         return open_
@@ -173,7 +172,7 @@ def _first_come(points: FloatArray, spacing_m: float) -> BoolArray:
         live = open_[early] & open_[late]
         early, late = early[live], late[live]
         waiting[late] = True
-        chosen = open_ & ~waiting  # nothing earlier is still undecided nearby
+        chosen = open_ & ~waiting  # no earlier point nearby is undecided
         keep |= chosen
         open_ &= ~chosen
         open_[late[chosen[early]]] = False

@@ -343,7 +343,7 @@ def _read_rows(path: Path) -> _Rows:
 
 
 def _check_last_line(text: str, rows: _Rows, path: Path) -> None:
-    """Refuse a file whose last line has no line end and a shorter last number than all others, because it is truncated."""
+    """Refuse a truncated file, whose last line has no line end and a shorter last number than all others."""
     if not rows.lines or text.endswith(("\n", "\r")):
         return
     lines = text.splitlines()
@@ -476,8 +476,8 @@ def _unfold(folded: ComplexArray) -> ComplexArray:
 
     Negative theta is the meridian at phi + pi.
 
-    Some files have spherical components there, and some those of the cut, which differ in sign. The field is smooth where
-    phi wraps around, and along each meridian next to the poles, which distinguishes both cases.
+    Some files have spherical components there, and some those of the cut, which differ in sign. The field is smooth
+    where phi wraps around, and along each meridian next to the poles, which distinguishes both cases.
     """
     # theta is zero here
     middle = folded.shape[2] // 2

@@ -1,9 +1,9 @@
-"""Antenna files of any kind that is known by its content: measured spheres, one great circle, planning tools' cuts.
+"""Antenna files of all kinds, recognised by content: measured spheres, one great circle, cuts of planning tools.
 
-Written: Sionna RT's custom pattern, MSI Planet's cuts, a table over the sphere.
+The formats for writing are the custom pattern of Sionna RT, cuts of MSI Planet, and a table over the sphere.
 
-Cuts say nothing between them: a sphere is made of a horizontal and a vertical one by horizontal projection
-interpolation (F. Gil et al., IEEE Trans. Antennas Propag. 47, 1999, doi:10.1109/8.774131), which gives both cuts back.
+Cuts contain no values between them. A sphere is computed from a horizontal and a vertical cut by horizontal projection
+interpolation (F. Gil et al., IEEE Trans. Antennas Propag. 47, 1999, doi:10.1109/8.774131), which retains both cuts.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from ..common.units import FloatArray, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power, read_pattern_text
 from .learned import BAND, SPHERE_COLUMNS, SpherePattern, planning_cuts, read_sphere_csv, sphere_csv, sphere_grid
 
-# A half-wave dipole over an isotropic antenna.
+# Gain of a half-wave dipole over an isotropic antenna.
 _DBI_OF_DBD = 2.15
 STEP_DEG = 3.0
 
-# Values of a cut may lie this far beyond the peak, and the peak this far from both cuts [dB].
+# Values of a cut may exceed the peak by this, and the peak may differ from both cuts by this [dB].
 _RIPPLE_DB = 1.0
 
-# Greatest mean gain over the sphere of a pattern made of two cuts [dB]: 0.5 dB for the measurement, 0.5 dB for the
+# Largest mean gain over the sphere of a pattern from two cuts [dB]: 0.5 dB for the measurement, 0.5 dB for the
 # interpolation, which changed the mean of ten sector antennas and arrays by -0.3 to +0.2 dB.
 _MOST_OF_CUTS_DB = 1.0
-# The same for a learned antenna: its level is not known, and cuts through its only lobe added 3.7 dB.
+# Limit for a learned antenna, whose level is not known. Cuts through its only lobe added 3.7 dB.
 _MOST_OF_LEARNED_CUTS_DB = 5.0
 _PLANET = re.compile(r"(?im)^\s*(HORIZONTAL|VERTICAL)\s+(\d{1,4})\s*$")
 _GAIN = re.compile(r"(?im)^\s*GAIN\s+([-+]?\d{1,3}(?:\.\d{1,6})?)\s*(dBd|dBi)?\s*$")
@@ -42,13 +42,13 @@ _GAIN_TABLE = re.compile(r"(?im)^\s*Frequency\s+E ?Total\. ?dB\s*$")
 
 @parsed("an antenna pattern file")
 def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> MeasuredPattern:
-    """An antenna pattern: AERPAW's text over the sphere or along one great circle, MSI Planet (.msi, .pln).
+    """Read an antenna pattern: text of AERPAW over the sphere or along one great circle, or MSI Planet (.msi, .pln).
 
     Parameters
     ----------
     path : str or Path
     carrier_hz : float, optional
-        Which frequency of a file with several.
+        Frequency, for a file with several frequencies.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> M
     Raises
     ------
     InputError
-        Another kind of file, missing angles or units; with the line where there is one.
+        For another kind of file, and missing angles or units; the message has the line if there is one.
     """
     path = Path(path)
     text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
@@ -80,21 +80,23 @@ def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> M
 
 
 def _planet(text: str, path: Path) -> MeasuredPattern:
-    """Return the pattern of an MSI Planet file; cuts run clockwise from the front, and from the front downwards.
+    """Return the pattern of an MSI Planet file.
+
+    Cuts run clockwise from the front, and from the front downwards.
 
     Raises
     ------
     InputError
-        No gain, a cut that is not a full circle, or cuts from which no antenna of the stated gain results.
+        If there is no gain, a cut is not a full circle, or the cuts do not have the stated gain.
     """
     gain = _GAIN.search(text)
     if gain is None:
         raise InputError("no line 'GAIN value dBi'", expected="GAIN in dBi or dBd", path=path)
-    # MSI Planet's own default is dBd
+    # dBd is the default of MSI Planet
     peak_dbi = float(gain[1]) + (0.0 if (gain[2] or "dBd").lower() == "dbi" else _DBI_OF_DBD)
     cuts: dict[str, FloatArray] = {}
     for cut in _PLANET.finditer(text):
-        # the header says how many lines follow; what stands behind them is the next cut's
+        # the header has the number of lines, and later lines belong to the next cut
         rows = _pairs(text[cut.end() :].split("\n"), int(cut[2]), path)
         cuts[cut[1].upper()] = _each_degree(rows, cut[1], path)
     carrier, learned = _FREQUENCY.search(text), bool(trained_on(text))
@@ -113,9 +115,9 @@ def _planet(text: str, path: Path) -> MeasuredPattern:
 
 
 def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float, path: Path) -> dict[str, FloatArray]:
-    """Gain [dBi] of cuts that hold attenuations below the peak, of whichever sign the program wrote."""
+    """Return the gain of cuts with attenuations below the peak, of either sign [dBi]."""
     values = np.concatenate(list(cuts.values()))
-    # attenuations have one sign, whichever; both signs are gains about a level
+    # attenuations have one sign; values of both signs are gains relative to a level
     if min(-values.min(), values.max()) > _RIPPLE_DB:
         raise InputError(
             f"values from {values.min():g} to {values.max():g} dB below the peak",
@@ -134,7 +136,7 @@ def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float, path: Path) -> dic
 
 
 def _pairs(lines: list[str], count: int, path: Path) -> FloatArray:
-    """Angle and value of the first lines that hold any."""
+    """Return angle and value of the first lines with numbers."""
     rows = []
     for line in [line for line in lines if line.strip()][:count]:
         cells = line.split()
@@ -150,14 +152,17 @@ def _pairs(lines: list[str], count: int, path: Path) -> FloatArray:
 
 
 def _each_degree(rows: FloatArray, cut: str, path: Path) -> FloatArray:
-    """Values at 0 to 359 degrees of a cut over a full circle; half a vertical circle stands for both halves."""
+    """Return values at 0 to 359 degrees of a cut over a full circle.
+
+    Half of a vertical circle is used for both halves.
+    """
     angle, value = rows[:, 0] % 360.0, rows[:, 1]
     if not np.isfinite(rows).all() or np.abs(value).max() > 10 * HIGHEST_DBI:
         raise InputError(f"cut {cut} reaches {np.abs(value).max():g} dB", expected="attenuation in dB", path=path)
-    if np.ptp(rows[:, 0]) <= 180.0 and np.abs(rows[:, 0]).max() <= 90.0:  # front half alone: the back as the front
+    if np.ptp(rows[:, 0]) <= 180.0 and np.abs(rows[:, 0]).max() <= 90.0:  # a front half is used for the back, too
         angle, value = np.concatenate((angle, (180.0 - rows[:, 0]) % 360.0)), np.concatenate((value, value))
     order = np.argsort(angle, kind="stable")
-    # round the circle: the gap over the front counts too
+    # the gap across the front counts, too
     if np.diff(np.append(angle[order], angle[order][0] + 360.0)).max() > 15.0:
         raise InputError(f"cut {cut} has gaps above 15 deg", expected="a full circle", path=path)
     return np.asarray(np.interp(np.arange(360.0), angle[order], value[order], period=360.0))
@@ -173,7 +178,7 @@ def _from_cuts(
     most_db: float = _MOST_OF_CUTS_DB,
     cause: str = "the values are not gain over isotropic",
 ) -> MeasuredPattern:
-    """Return the sphere of two cuts [dBi at each degree]; see the module text."""
+    """Return the sphere of two cuts [dBi at each degree]; the module describes the method."""
     for cut in ("HORIZONTAL", "VERTICAL"):
         if cut not in cuts:
             raise InputError(f"no cut {cut}", expected="a horizontal and a vertical cut", path=path)
@@ -181,11 +186,11 @@ def _from_cuts(
     theta, phi = _grid()
     below = np.degrees(theta) - 90.0
     around = np.degrees(phi)
-    # how far round the back: it weighs the vertical cut's front against its back
+    # share of the back, by which the front of the vertical cut is weighted against its back
     share = np.minimum(around, 360.0 - around) / 180.0  # 0 in front, 1 behind
-    # planning tools count clockwise, azimuth here counter-clockwise
+    # planning tools count clockwise, and azimuth is counter-clockwise here
     level = _at(horizontal, -around)[None, :] + (1.0 - share)[None, :] * (_at(vertical, below) - horizontal[0])[:, None]
-    # a vertical cut that is the same in front and behind knows nothing of the back: the horizontal cut gives its level
+    # a vertical cut with equal front and back does not contain the back, whose level comes from the horizontal cut
     same = np.allclose(vertical, vertical[(180 - np.arange(360)) % 360], atol=1e-6)
     behind = horizontal[0 if same else 180]
     level = level + share[None, :] * (_at(vertical, 180.0 - below) - behind)[:, None]
@@ -220,7 +225,7 @@ def _pattern(
 
 
 def _great_circle(text: str, name: str, path: Path, carrier_hz: float | None) -> MeasuredPattern:
-    """AERPAW's total gain along one great circle at several frequencies, theta from -pi to pi; both halves blended."""
+    """Return total gain of AERPAW along one great circle at several frequencies, with both halves blended."""
     rows = [line.split() for line in text.splitlines() if re.match(r"\s*\d{6,}(?:\.\d+)?\s", line)]
     table = np.array([[float(cell) for cell in row[:3]] for row in rows if len(row) >= 3])
     if not len(table):
@@ -232,35 +237,35 @@ def _great_circle(text: str, name: str, path: Path, carrier_hz: float | None) ->
             raise InputError(f"{len(frequencies)} frequencies", expected="a carrier that says which", path=path)
         frequency = float(frequencies[np.argmin(np.abs(frequencies - carrier_hz))])
     cut = table[table[:, 0] == frequency]
-    # -pi and pi, or a row written twice: interpolation needs ascending angles
+    # -pi and pi, or a repeated row: interpolation needs ascending angles
     _, once = np.unique(np.round(cut[:, 1], 6), return_index=True)
     angle, gain = cut[once, 1], cut[once, 2]
     if len(angle) < 8 or angle[0] > -3.1 or angle[-1] < 3.1 or np.diff(angle).max() > 0.3:
         raise InputError(f"{len(angle)} angles at {frequency / 1e6:g} MHz", expected="theta from -pi to pi", path=path)
     theta, phi = _grid()
     share = np.minimum(np.degrees(phi), 360.0 - np.degrees(phi)) / 180.0
-    # the circle's two halves: blended round the axis, since nothing says what lies between
+    # blend the two halves of the circle around the axis, because there are no values between them
     front, back = np.interp(theta, angle, gain), np.interp(-theta, angle, gain)
     level = (1.0 - share) * front[:, None] + share * back[:, None]
-    # one circle leaves more of the sphere to the interpolation than two cuts do
+    # one circle leaves more of the sphere to the interpolation than two cuts
     return _pattern(level, name, path, frequency, _MOST_OF_LEARNED_CUTS_DB, "the values are not gain over isotropic")
 
 
-# Columns of a cut by the first letters of its angle: degrees clockwise from the front, degrees below the horizon.
+# Columns of a cut by the first letters of the angle: degrees clockwise from the front, or below the horizon.
 _CUT_ANGLES = {"az": -1.0, "phi": -1.0, "el": -1.0, "th": 1.0, "zen": 1.0}
 
 
 @parsed("a cut of an antenna pattern")
 def read_cut_files(azimuth: Path, elevation: Path) -> MeasuredPattern:
-    """A pattern of two CSV files of an angle [deg] and a gain [dBi], as users of Sionna RT keep them.
+    """Read a pattern from two CSV files with an angle [deg] and a gain [dBi].
 
     Parameters
     ----------
     azimuth : Path
-        Angles counter-clockwise from the front, a full circle: ``azimuth_deg,gain_dbi`` (or ``phi_deg``).
+        Angles counter-clockwise from the front over a full circle: ``azimuth_deg,gain_dbi`` (or ``phi_deg``).
     elevation : Path
-        Through the front: ``elevation_deg`` up from the horizon or ``theta_deg`` down from the zenith; a half circle
-        stands for both halves.
+        Cut through the front: ``elevation_deg`` up from the horizon or ``theta_deg`` down from the zenith. A half circle
+        is used for both halves.
 
     Returns
     -------
@@ -269,7 +274,7 @@ def read_cut_files(azimuth: Path, elevation: Path) -> MeasuredPattern:
     Raises
     ------
     InputError
-        Other columns, gaps, cuts that differ in front.
+        For other columns, gaps, and cuts that differ in front.
     """
     cuts = {"HORIZONTAL": _cut_file(azimuth, ("az", "phi")), "VERTICAL": _cut_file(elevation, ("el", "th", "zen"))}
     apart = abs(float(cuts["HORIZONTAL"][0] - cuts["VERTICAL"][0]))
@@ -284,7 +289,7 @@ def read_cut_files(azimuth: Path, elevation: Path) -> MeasuredPattern:
 
 
 def _cut_file(path: Path, angles: tuple[str, ...]) -> FloatArray:
-    """Gain [dBi] at each degree, as :func:`_planet` has it, of a CSV file with a header."""
+    """Return the gain at each degree of a CSV file with a header, as :func:`_planet` does [dBi]."""
     text = read_input(path, LARGEST_TABLE, "a cut of an antenna pattern").decode("utf-8-sig", errors="replace")
     header, *lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")] or [""]
     names = [name.strip().lower() for name in header.split(",")]
@@ -301,9 +306,9 @@ def _cut_file(path: Path, angles: tuple[str, ...]) -> FloatArray:
 
 
 def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: float | None = None) -> str:
-    """Text of a pattern in the format that the ending of a file says: ``.py`` (Sionna RT), ``.msi``, ``.csv``.
+    """Return the text of a pattern in the format of a file ending: ``.py`` (Sionna RT), ``.msi``, ``.csv``.
 
-    What the pattern was learned from goes along as comments.
+    Comments contain the logs from which the pattern was learned.
 
     Parameters
     ----------
@@ -311,7 +316,7 @@ def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: floa
     name : str
     target : Path
     carrier_hz : float, optional
-        For ``.msi``, where the pattern has no frequency of its own.
+        Frequency for ``.msi``, if the pattern has none.
 
     Returns
     -------
@@ -320,7 +325,7 @@ def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: floa
     Raises
     ------
     UsageError
-        Another ending; ``.msi`` without a frequency.
+        For another ending, and for ``.msi`` without a frequency.
     """
     notes = getattr(pattern, "notes", "") or f"trained_on: {' '.join(pattern.trained_on)}" * bool(pattern.trained_on)
     lines = tuple(line.lstrip("# ") for line in notes.splitlines())
@@ -332,7 +337,9 @@ def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: floa
         return planning_cuts(pattern, name, frequency, lines)
     theta, phi, _ = sphere_grid(STEP_DEG)
     if target.suffix == ".csv":
-        check_power(pattern, target)  # what the reader of spheres asks: two cuts may make more power than goes in
+        check_power(
+            pattern, target
+        )  # the reader of spheres requires it, because two cuts may radiate more power than is fed
         at = np.meshgrid(np.radians(theta), np.radians(phi), indexing="ij")
         sd = pattern.gain_sd_db(*at) if isinstance(pattern, SpherePattern) else np.zeros(at[0].shape)
         return sphere_csv(pattern.gain_dbi(*at), sd, lines)
@@ -345,14 +352,14 @@ def _sionna_module(pattern: MeasuredPattern, name: str, target: Path, notes: tup
     import base64
 
     theta, phi, _ = sphere_grid(STEP_DEG)
-    # closed at 360 deg: the module that is written interpolates within its table, not round its end
+    # closed at 360 deg, because the written module interpolates within its table and not across its end
     at = np.meshgrid(np.radians(theta), np.radians(np.append(phi, 360.0)), indexing="ij")
     table = np.stack([part for field in pattern.field(*at) for part in (field.real, field.imag)], axis=-1)
     template = Path(__file__).with_name("sionna_pattern.txt").read_text(encoding="utf-8")
     return template.format(
         name=re.sub(r"\W", "_", name),
         module=re.sub(r"\W", "_", target.stem),
-        # notes stand in a docstring: a quote or a backslash of a file name would end it
+        # a quote or a backslash of a file name would end the docstring
         notes="\n".join(re.sub(r'["\\]', "'", note) for note in notes),
         table=base64.b64encode(table.astype("<f4").tobytes()).decode("ascii"),
         shape=table.shape,

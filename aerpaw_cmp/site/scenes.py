@@ -1,10 +1,8 @@
-"""A scene of triangles in the site frame, and whether it has a ground.
+"""The site as triangles, one mesh per material, and scenes of triangles in the site frame.
 
-The site as triangles, one mesh per material.
-
-Walls begin below the ground and nothing has a bottom face, so no two triangles lie in one plane by accident. All
-outward normals follow the right-hand rule. The replay's image engine takes its faces from the site itself; meshes are
-for ray tracers, pictures and other programs.
+Walls begin below the ground and prisms have no bottom face, so that no two triangles are in one plane by accident. All
+outward normals follow the right-hand rule. The image engine of the replay uses the faces of the site; meshes are for
+ray tracers, pictures and other programs.
 """
 
 from __future__ import annotations
@@ -26,10 +24,10 @@ from .materials import CROWN, material
 from .mitsuba import TriangleScene, read_scene
 from .site import Building, Forest, Site
 
-# Walls reach this far below the base of a building.
+# Depth of walls below the base of a building.
 WALL_DEPTH_M = 0.5
 
-# The ground reaches this far beyond the area: reflections must not fall off its edge.
+# Margin of the ground around the area, so that no reflection misses it.
 _GROUND_MARGIN_M = 3000.0
 
 

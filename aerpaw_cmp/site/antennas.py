@@ -626,7 +626,7 @@ def _check_angles(elevation: FloatArray, azimuth: FloatArray, path: Path) -> Non
             continue
         causes = (
             (len(axis) >= 3 and 0 < np.abs(axis).max() < 7, "radians instead of degrees"),
-            (len(set(axis.tolist())) < len(axis), "a direction stands twice, such as 0 and 360 deg"),
+            (len(set(axis.tolist())) < len(axis), "a direction occurs twice, such as 0 and 360 deg"),
             (len(axis) >= 3 and np.abs(axis - 90 - grid).max() <= 0.05, "zenith angles in place of elevation"),
             (True, "angles are missing"),
         )

@@ -263,7 +263,7 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
     # a truncated number of degrees projects to infinity
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points) or float(np.hypot(*points.mean(axis=0))) > FAR_M:
-        actions.append(f"{tree.source}: a tree left out, it does not stand at the site")
+        actions.append(f"{tree.source}: a tree is skipped, because it is not at the site")
         return []
     # a tree row is a line in the map
     if len(points) > 1:
@@ -345,7 +345,7 @@ def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
     first = f"latitude {latitude[0]:.5f}, longitude {longitude[0]:.5f}"
     if _distance_m(longitude, latitude, frame).min() <= FAR_M:
         raise InputError(
-            f"the positions are of another place ({first})",
+            f"the positions belong to another place ({first})",
             expected=f"near the site's origin {centre}",
             cause="latitude and longitude are swapped",
             path=path,
@@ -355,7 +355,7 @@ def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
     raise InputError(
         f"the nearest position is {away / 1000:.0f} km from the site ({first})"
         if math.isfinite(away)
-        else f"the positions are no latitudes and longitudes ({first})",
+        else f"the positions are not latitudes and longitudes ({first})",
         expected=f"WGS84 degrees near the site's origin {centre}, or a site where the map is: --base SITE, or "
         "--tower NAME=LATITUDE,LONGITUDE,HEIGHT of its antenna",
         cause="the area crosses the antimeridian (180 deg)"
@@ -438,7 +438,7 @@ def _repaired(ring: Polygon, notes: list[str], note: str) -> BaseGeometry:
     if ring.is_valid:
         return ring
     if is_tangled(ring):
-        notes.append(f"a ring that crosses itself at more than {MAX_CROSSINGS} places was left out")
+        notes.append(f"a ring that crosses itself at more than {MAX_CROSSINGS} places is skipped")
         return Polygon()
     notes.append(f"{note} ({shapely.is_valid_reason(ring).split('[')[0].lower()})")
     # "structure" retains areas that a ring encloses twice; "linework" would make holes of them
@@ -811,7 +811,7 @@ def _kept_of_base(model: SiteModel, base: str | Path) -> str:
     return (
         f"kept from the base '{base}': the name '{model.name}', the origin {origin}, the towers "
         f"{', '.join(model.towers)} with their positions and antennas, {ground} of {model.ground_material}, tree "
-        "sizes; change them in the file, or name a base of your own with --base"
+        "sizes. Change them in the file, or name another base with --base"
     )
 
 

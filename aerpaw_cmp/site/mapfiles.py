@@ -1,12 +1,10 @@
-"""Outlines from map files, as they are: GeoJSON, OSM XML, Overpass JSON, KML, KMZ. Cleaning is :mod:`.footprints`' job.
+"""Outlines, single trees and tree rows of map files: GeoJSON, OSM XML, Overpass JSON, KML, KMZ.
 
-An element that cannot be used is left out and listed, with its line; only a file that is no map file is an error.
+Elements are returned unchanged, and :mod:`.footprints` cleans them. An element that cannot be used is skipped and
+listed with its line. Only a file that is not a map file is an error.
 
-Contents of map files before cleaning: outlines, single trees, tree rows; and checks of their positions.
-
-Meaning of the tags of map data: what stands there, how high, of what. OpenStreetMap's words.
-
-OpenStreetMap's model - nodes, ways, relations - as outlines, whether it came as OSM XML or as Overpass JSON.
+The file also reads the tags of OpenStreetMap (kind of an object, height, material), and converts its model of nodes,
+ways and relations to outlines, for OSM XML and Overpass JSON.
 """
 
 from __future__ import annotations
@@ -297,7 +295,7 @@ def positive_metres(tags: Mapping[str, str], keys: tuple[str, ...], notes: list[
             continue
         # exports of databases write 0 or -1 for unknown values
         if max(lengths) <= 0:
-            notes.append(f"the {key} '{written}' is not above 0, as where nobody knows it")
+            notes.append(f"the {key} '{written}' is not above 0, so it is unknown")
             continue
         if len(lengths) > 1 or written.startswith("~"):
             notes.append(f"the {key} '{written}' is taken as {max(lengths):g} m")
@@ -349,10 +347,10 @@ def levels_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
     numbers = [value for value in parts if value is not None]
     if len(numbers) < len(parts) or max(numbers) <= 0:
         if written != "0":  # some mappers do not count the ground floor
-            notes.append(f"the number of levels '{written}' is no positive number")
+            notes.append(f"the number of levels '{written}' is not a positive number")
         return None
     if len(numbers) > 1:
-        notes.append(f"of the levels '{written}' the largest holds")
+        notes.append(f"the largest of the levels '{written}' is used")
     return max(numbers)
 
 

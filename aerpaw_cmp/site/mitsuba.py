@@ -469,7 +469,7 @@ def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, st
         raise InputError(
             f"the shape '{name}' is moved by a to_world",
             expected="meshes in the coordinates of the scene, as Sionna RT's own",
-            cause="apply the transform where the scene was made (Blender: Object, Apply), and export it anew",
+            cause="apply the transform where the scene was made (Blender: Object, Apply), and export it again",
             path=reading.path,
         )
     mesh = _mesh(reading, shape, name)

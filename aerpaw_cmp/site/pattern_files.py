@@ -264,8 +264,8 @@ def read_cut_files(azimuth: Path, elevation: Path) -> MeasuredPattern:
     azimuth : Path
         Angles counter-clockwise from the front over a full circle: ``azimuth_deg,gain_dbi`` (or ``phi_deg``).
     elevation : Path
-        Cut through the front: ``elevation_deg`` up from the horizon or ``theta_deg`` down from the zenith. A half circle
-        is used for both halves.
+        Cut through the front: ``elevation_deg`` up from the horizon or ``theta_deg`` down from the zenith. A half
+        circle is used for both halves.
 
     Returns
     -------

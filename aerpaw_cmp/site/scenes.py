@@ -264,8 +264,8 @@ def without_traps(
                 out[number] = True
                 where = "inside" if inside else "at"
                 notes.append(
-                    f"the antenna of {tower} stands {where} mesh {scene.shapes[number]}, which hides nothing and is no "
-                    "mirror"
+                    f"the antenna of {tower} is {where} mesh {scene.shapes[number]}, which therefore does not block or "
+                    "reflect"
                 )
     green = np.array([name == CROWN for name in scene.materials])
     # trunks shade only centimetres, and their convex outline would be a wood

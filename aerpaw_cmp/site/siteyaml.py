@@ -66,7 +66,7 @@ Ring = Annotated[list[tuple[float, float]], Field(min_length=3)]
 
 def _not_too_high(height_m: float) -> float:
     if height_m > TALLEST_M:
-        raise ValueError(f"{height_m:g} m is higher than anything that stands on Earth; feet or centimetres?")
+        raise ValueError(f"{height_m:g} m is higher than any structure on Earth; is it in feet or centimetres?")
     return height_m
 
 
@@ -446,8 +446,8 @@ def _disagreements(model: SiteModel, towers: Mapping[str, Tower], dem: Dem | Non
         if tower.ground_offset_m is not None:
             pairs.append((f"the ground of tower {name}", tower.ground_offset_m, float(towers[name].ground_m)))
     return tuple(
-        f"{what} is stated as {stated:.1f} m, the elevation model has {modelled:.1f} m: probably one of the two is "
-        "of another datum"
+        f"{what} is stated as {stated:.1f} m, the elevation model has {modelled:.1f} m: probably their vertical "
+        "datums differ"
         for what, stated, modelled in pairs
         if abs(stated - modelled) > _HEIGHTS_AGREE_M
     )

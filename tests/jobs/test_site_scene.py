@@ -180,8 +180,8 @@ def test_masts_hide_nothing_and_meshes_of_trees_are_media(tmp_path: Path, capsys
     arguments = ["site", "import", str(tmp_path / "twin.xml"), "--origin", "35.7,-78.7", "--tower", "T=0,0,10"]
     assert main([*arguments, "-o", str(out)]) == 0
     first = capsys.readouterr().err.splitlines()[:3]
-    assert first[0] == "the antenna of T stands inside mesh mast, which hides nothing and is no mirror"
-    assert first[1] == "the antenna of T stands at mesh sector, which hides nothing and is no mirror"
+    assert first[0] == "the antenna of T is inside mesh mast, which therefore does not block or reflect"
+    assert first[1] == "the antenna of T is at mesh sector, which therefore does not block or reflect"
     assert first[2].startswith("vegetation is a medium, not a mirror: 1 mesh; 1 mesh of trunks")
     site = load_site(out)
     assert all(text in site.notes for text in first)

@@ -275,7 +275,7 @@ ELEVATION, AZIMUTH = np.linspace(90, -90, 7), np.arange(12) * 30.0
         (ELEVATION, AZIMUTH, "transpose", "'g' has 12 x 7 values.*rows and columns are swapped"),
         (np.where(ELEVATION == 0, np.nan, ELEVATION), AZIMUTH, "", "elevation .* runs from nan"),
         (90 - ELEVATION, AZIMUTH, "", "zenith angles in place of elevation"),
-        (ELEVATION, np.linspace(0, 360, 13), "", "a direction stands twice, such as 0 and 360"),
+        (ELEVATION, np.linspace(0, 360, 13), "", "a direction occurs twice, such as 0 and 360"),
         (ELEVATION[:4], AZIMUTH, "", "elevation .*angles are missing"),
         (ELEVATION, AZIMUTH[:8], "", "azimuth .*angles are missing"),
         (np.radians(ELEVATION), AZIMUTH, "", "radians instead of degrees"),

@@ -263,8 +263,8 @@ def test_parts_of_a_building_have_their_own_heights(tmp_path: Path) -> None:
         ({"building:levels": "2;3"}, 9, "the largest of the levels"),
         ({"NumFloors": "3"}, 9, ""),
         ({"no_of_storeys": "3"}, 9, ""),
-        ({"building:levels": "-1"}, 6, "no positive number"),
-        ({"building:levels": "three"}, 6, "no positive number"),
+        ({"building:levels": "-1"}, 6, "not a positive number"),
+        ({"building:levels": "three"}, 6, "not a positive number"),
     ],
 )
 def test_unusual_heights_are_used_or_said(tmp_path: Path, tags: dict[str, Any], metres: float, words: str) -> None:

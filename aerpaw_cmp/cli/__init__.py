@@ -1,6 +1,6 @@
-"""Arguments, exit codes, progress: the only room that prints.
+"""Arguments, exit codes and progress of the commands, the only package that prints.
 
-A module per group of commands; :mod:`aerpaw_cmp.cli.app` says how one is added.
+There is a module per group of commands. :mod:`aerpaw_cmp.cli.app` describes how to add a command.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from .app import Interrupted, app
 from .commands import flight, live, logs, machine, planning, reports, site
 from .shown import say
 
-# The modules whose commands there are: importing them registers these.
+# The modules of the commands, which register their commands when they are imported.
 GROUPS = (logs, flight, reports, planning, live, site, machine)
 
 
 @cache
 def _program() -> Any:
-    """The commands as click knows them, made once: 50 ms for whoever calls :func:`main` often."""
+    """Return the commands as a click program, cached because making it takes 50 ms."""
     return typer.main.get_command(app)
 
 
 def _refused(error: Any) -> UsageError:
-    """The usage error of a wrong option or argument, with the first example of the command."""
+    """Return the usage error of a wrong option or argument, with the first example of the command."""
     text = str(error.format_message()).replace("Value error, ", "").replace("Input should be ", "expected ")
     command = getattr(getattr(error, "ctx", None), "command", None)
     _, _, examples = (getattr(command, "epilog", None) or "").partition("Examples:\n  ")
@@ -35,19 +35,24 @@ def _refused(error: Any) -> UsageError:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command line and give its exit code; ``__main__`` turns exceptions into messages."""
+    """Run the command line and return its exit code.
+
+    ``__main__`` turns exceptions into messages.
+    """
     say.quiet = say.as_json = False
     try:
-        # click would print errors and exit by itself
+        # standalone mode would print errors and exit
         result = _program()(args=arguments, prog_name="aerpaw-cmp", standalone_mode=False)
     except Interrupted as interrupted:
         raise interrupted.error from None
     except typer.Abort as error:
-        if isinstance(error.__cause__, EOFError):  # click's word for "no answer to a question"; none is asked here
+        if isinstance(
+            error.__cause__, EOFError
+        ):  # click raises it for an unanswered question, and no command asks questions
             raise error.__cause__ from None
         raise KeyboardInterrupt from error
     except Exception as error:
-        # typer may vendor click: what counts is the shape of a usage error, not its module
+        # typer may contain its own click, so test the attributes of a usage error, not its module
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):
             raise _refused(error) from error
         raise

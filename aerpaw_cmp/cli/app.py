@@ -1,4 +1,4 @@
-"""The command line itself and what its commands have in common.
+"""The command line, and options that its commands share.
 
 A command is a function in a module of this package::
 
@@ -6,8 +6,8 @@ A command is a function in a module of this package::
     def diff(first: Annotated[Path, Argument(help="...")], force: Force = False) -> int:
         from ..jobs.diff import run_diff  # here, so that help and completion load nothing
 
-and a line of :mod:`aerpaw_cmp.common.text`. What it returns is the exit code; nothing is 0. ``-h``, ``--json``,
-``--quiet`` and the examples below the options come with the decorator; :func:`.answered` prints the object.
+and a line of :mod:`aerpaw_cmp.common.text`. It returns the exit code, or None for 0. The decorator adds ``-h``,
+``--json``, ``--quiet`` and the examples below the options. :func:`.answered` prints the JSON object.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .shown import print_plan, say
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
-# no rich markup: "[default: ...]" is text; no pretty exceptions: __main__ turns them into messages
+# no rich markup, because "[default: ...]" is text; no pretty exceptions, because __main__ turns them into messages
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -78,7 +78,7 @@ Quiet = Annotated[
 
 
 def output(text: str, metavar: str = "DIR") -> Any:
-    """The option of where results go; ``text`` names the default."""
+    """Return the option of the output folder or file, whose default is in ``text``."""
     return Option("-o", "--out", metavar=metavar, help=text)
 
 
@@ -96,13 +96,13 @@ def command(
     ----------
     name : str
     examples : sequence of str
-        Whole command lines, shown below the options; a test parses them.
+        Complete command lines, shown below the options and parsed by a test.
     of : typer.Typer
         The program, or a group of commands such as ``site_app``.
     text : str, optional
-        One line of help; without it that of :data:`aerpaw_cmp.common.text.COMMANDS`.
+        One line of help; the default is that of :data:`aerpaw_cmp.common.text.COMMANDS`.
     kind : type, optional
-        Reads the arguments in its own way.
+        Class that reads the arguments.
     """
     epilog = "\b\nExamples:\n" + "\n".join(f"  {line}" for line in examples)
     register = of.command(name, cls=kind, help=COMMANDS[name] if text is None else text, epilog=epilog)
@@ -115,7 +115,7 @@ def command(
 
 
 class Interrupted(BaseException):
-    """A command that was interrupted; ``error`` is the interrupt with what it says of what is kept."""
+    """An interrupted command; ``error`` contains the message about stored results."""
 
     def __init__(self, error: KeyboardInterrupt) -> None:
         super().__init__(str(error))
@@ -123,20 +123,20 @@ class Interrupted(BaseException):
 
 
 def _bare(hint: Any) -> Any:
-    """A hint without the ``Optional`` that Python 3.10 puts around options whose default is None."""
+    """Return a hint without the ``Optional`` that Python 3.10 adds to options whose default is None."""
     inner = get_args(hint)[:1]
     return inner[0] if get_origin(hint) is Union and get_origin(inner[0]) is Annotated else hint
 
 
 def _with_manners(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function with ``--json``, ``--quiet`` and an interrupt that reaches :func:`aerpaw_cmp.cli.main`."""
+    """Return the function with ``--json``, ``--quiet`` and interrupts that reach :func:`aerpaw_cmp.cli.main`."""
 
     @functools.wraps(function)
     def run(*, as_json: bool = False, quiet: bool = False, **arguments: Any) -> Any:
         say.as_json, say.quiet = as_json, quiet
         for option, value in arguments.items():
             for number in value if isinstance(value, (list, tuple)) else (value,):
-                # click reads 'nan' as a number, and no comparison with a least or largest value refuses it
+                # click accepts nan, which passes every comparison with a minimum or maximum
                 if isinstance(number, float) and not math.isfinite(number):
                     raise UsageError(f"--{option.replace('_', '-')} {number}", expected="a finite number")
         try:
@@ -145,9 +145,9 @@ def _with_manners(function: Callable[..., Any]) -> Callable[..., Any]:
             print_plan(ended.plan)
             return 0
         except KeyboardInterrupt as error:
-            raise Interrupted(error) from None  # typer would make a silent exit code of it
+            raise Interrupted(error) from None  # typer would turn it into a silent exit code
 
-    # resolved: annotations are texts here, which typer would evaluate in its own module
+    # resolve annotations here, because typer would evaluate these texts in its own module
     hints = {name: _bare(hint) for name, hint in get_type_hints(function, include_extras=True).items()}
     hints |= {"as_json": Json, "quiet": Quiet}
     kind = inspect.Parameter.KEYWORD_ONLY

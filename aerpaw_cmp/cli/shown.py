@@ -18,16 +18,16 @@ _EVERY_S = 30.0
 
 
 def show(text: object, *, to_stderr: bool = False) -> None:
-    """Print lines, on standard output or error: the words of strangers' files in them are shown, never obeyed."""
+    """Print lines on standard output or error, with control characters of file contents escaped."""
     print(printable(str(text)), file=sys.stderr if to_stderr else sys.stdout, flush=True)
 
 
 class ProgressLines:
-    """Progress on standard error, so that standard output stays clean.
+    """Progress on standard error, so that standard output contains only results.
 
-    On a terminal a share is a bar with the time left; elsewhere every quarter is a line. What stands behind a tab in
-    the text may change from call to call: it is shown with the bar, and elsewhere every half minute. With ``quiet``
-    nothing is said but what :meth:`warn` gets; with ``as_json`` standard output holds one object.
+    On a terminal a share is a bar with the remaining time; elsewhere every quarter is a line. Text after a tab may
+    change between calls. It is shown with the bar, and elsewhere every half minute. With ``quiet`` only :meth:`warn`
+    prints. With ``as_json`` standard output contains one object.
     """
 
     def __init__(self) -> None:
@@ -38,12 +38,12 @@ class ProgressLines:
         self.quiet = self.as_json = False
 
     def __call__(self, text: str, fraction: float | None = None, /) -> None:
-        """Show a line, or how far something is."""
+        """Show a line, or the share that is done."""
         if self.quiet:
             return
         if fraction is None:
             self.warn(text)
-        elif self._bar is not None or sys.stderr.isatty():  # while a bar stands, rich 13.7 says that it is none
+        elif self._bar is not None or sys.stderr.isatty():  # while a bar is shown, rich 13.7 reports that there is none
             self._draw(text, fraction)
         else:
             name, _, tail = text.partition("\t")
@@ -53,7 +53,7 @@ class ProgressLines:
                 show(f"{name} {100 * fraction:.0f} %{tail and ': ' + tail}", to_stderr=True)
 
     def warn(self, text: str) -> None:
-        """Show a line, also where all else is quiet."""
+        """Show a line, with ``quiet`` as well."""
         self.end()
         show(text, to_stderr=True)
 
@@ -70,7 +70,7 @@ class ProgressLines:
             self.end()
 
     def end(self) -> None:
-        """Leave the bar as it stands."""
+        """Leave the bar in its present state."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
@@ -89,36 +89,36 @@ def _bar() -> Any:
     return progress.Progress(*columns, console=Console(stderr=True))
 
 
-# What all commands of this process say on standard error.
+# Progress and warnings of all commands of this process, on standard error.
 say = ProgressLines()
 
 
-# Warnings of a page that are also said on the terminal.
+# Largest number of warnings of a page on the terminal.
 _WARNINGS = 10
 
 
 def warn_all(texts: Sequence[str]) -> None:
-    """Say the first warnings of a page, and how many more it has."""
+    """Print the first warnings of a page, and the number of further ones."""
     for text in texts[:_WARNINGS]:
         say.warn(f"warning: {one_line(text)}")
     if len(texts) > _WARNINGS:
         say.warn(f"and {counted(len(texts) - _WARNINGS, 'more warning')}, all on the page")
 
 
-# Version of what ``--json`` prints (docs/reference/json.md): it rises when a key is renamed or removed.
+# Version of the output of ``--json`` (docs/reference/json.md), which increases when a key is renamed or removed.
 SCHEMA = 1
 
 
 def answered(value: dict[str, Any]) -> bool:
-    """Print the one object, with the version of its schema, where ``--json`` asks for it; False where lines are."""
+    """Print the JSON object with the version of its schema if ``--json`` is set, and return whether it is."""
     if say.as_json:
-        # NaN is no JSON, and a browser refuses all of it: whoever calls makes null of it
+        # JSON has no NaN, and browsers refuse it, so callers replace it by null
         print(json.dumps({"schema": SCHEMA, **value}, indent=1, allow_nan=False), flush=True)
     return say.as_json
 
 
 def print_plan(plan: Any) -> None:
-    """Print what a command would do: a table of stages with their seconds, or one object."""
+    """Print the plan of a command: a table of stages with their seconds, or one object."""
     if answered(plan.as_dict()):
         return
     rows = [[stage.name, stage.work, number(stage.seconds, "{:.1f}")] for stage in plan.stages]
@@ -127,7 +127,7 @@ def print_plan(plan: Any) -> None:
 
 
 def print_files(paths: Sequence[Path]) -> None:
-    """Print the files that were written: a line each, or one object."""
+    """Print the written files: a line for each, or one object."""
     if not answered({"files": [str(path) for path in paths]}):
         for path in paths:
             show(path)
@@ -138,18 +138,18 @@ _FIXED = 20
 
 
 def table(columns: list[str], rows: list[list[str]], title: str | None = None, width: int | None = None) -> None:
-    """A table; where the terminal is too narrow for it, a paragraph per row."""
+    """Print a table, or a paragraph per row if the terminal is too narrow."""
     from rich.cells import cell_len
     from rich.console import Console
     from rich.table import Table
 
-    # before widths are taken: an escape is longer than the character
+    # escape before widths are measured, because an escape is longer than the character
     rows = [[one_line(cell) for cell in row] for row in rows]
     columns, title = [one_line(name) for name in columns], title and one_line(title)
-    # without a terminal rich takes 80 columns
+    # without a terminal, rich uses 80 columns
     console = Console(width=width if width or sys.stdout.isatty() else 160)
     needs = [max(map(cell_len, [*name.split(), *(row[i] for row in rows)])) for i, name in enumerate(columns)]
-    # 3: a border, and a blank on either side of a cell
+    # 3 is a border and a blank on each side of a cell
     roomy = sum(max(need, cell_len(name)) + 3 for need, name in zip(needs, columns, strict=True)) < console.width
     if sum(min(need, _FIXED) + 3 for need in needs) + 1 > console.width:
         _paragraphs(columns, rows, title, console.width)
@@ -158,13 +158,13 @@ def table(columns: list[str], rows: list[list[str]], title: str | None = None, w
     for column, need in zip(columns, needs, strict=True):
         table.add_column(column, overflow="fold", width=None if roomy or need > _FIXED else need)
     for row in rows:
-        # rich takes [words] for styles, also those of a log
+        # rich would read [words] in a log as styles
         table.add_row(*[cell.replace("[", r"\[") for cell in row])
     console.print(table)
 
 
 def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, width: int) -> None:
-    """Rows as text: the first cell, then names and values."""
+    """Return rows as text: the first cell, then names and values."""
     import textwrap
 
     if title:
@@ -173,7 +173,7 @@ def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, wi
         lines = [""]
         for name, cell in zip(columns[1:], row[1:], strict=True):
             item = f"{name} {cell}"
-            if lines[-1] and len(lines[-1]) + len(item) + 7 > width:  # 7: indent and separator
+            if lines[-1] and len(lines[-1]) + len(item) + 7 > width:  # 7 is the indent and the separator
                 lines.append("")
             lines[-1] += f" | {item}" if lines[-1] else item
         show(row[0])
@@ -182,19 +182,19 @@ def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, wi
 
 
 def number(value: float | None, form: str) -> str:
-    """A number as ``form`` says, a dash where there is none."""
+    """Return a number with a format, or a dash if it is missing."""
     return "-" if value is None else form.format(value)
 
 
 def records(items: Sequence[Any], columns: Mapping[str, str], title: str | None = None) -> None:
-    """A table of records or mappings; nothing without any.
+    """Print a table of records or mappings; print nothing without items.
 
     Parameters
     ----------
     items : sequence
-        A row each.
+        One item per row.
     columns : mapping of str to str
-        By head, what a cell shows: ``name``, ``name.of.a.part`` or, with a format, ``name:.2f``.
+        Content of the cells by heading: ``name``, ``name.of.a.part`` or, with a format, ``name:.2f``.
     title : str, optional
         Line above the table.
     """

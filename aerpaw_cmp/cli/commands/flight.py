@@ -33,7 +33,8 @@ def report(
     out: Annotated[Path | None, output("Output folder  [default: reports/<flight>]")] = None,
     logs_root: LogsRoot = None,
     audit: Annotated[
-        str | None, Option(help="Number of audited links, 'full' or 'none'; audits anew  [default: rt.audit_links]")
+        str | None,
+        Option(help="Number of audited links, 'full' or 'none'; ignores the cache  [default: rt.audit_links]"),
     ] = None,
     recommend: Annotated[
         Path | None, Option("--recommend", help="Write a flight.yaml with the recommended model.")
@@ -57,7 +58,7 @@ def report(
     strict: Annotated[bool, Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
         Literal["none", "svg", "png", "pdf", "all"],
-        Option(help="Figures as files beside the page: none, or all in one format or in every format."),
+        Option(help="Figures as separate files: none, or all in one format or in every format."),
     ] = "none",
     style: Annotated[
         Literal["screen", "paper"], Option(help="Figure style: screen, or paper (IEEE width, fonts embedded).")
@@ -109,7 +110,7 @@ def _print_cards(verdict: Mapping[str, Any]) -> None:
 
 
 def _nothing_compared(metrics: Mapping[str, Any]) -> int:
-    """Return 1 and warn if no channel and no rank has enough samples to compare; return 0 otherwise."""
+    """Return 1 and warn if no channel and no rank has enough samples to compare, otherwise 0."""
     from ...compare.statistics import FEWEST
 
     channels = [m for channels in metrics["rss"].values() for m in channels.values()]
@@ -123,7 +124,7 @@ def _nothing_compared(metrics: Mapping[str, Any]) -> int:
 
 
 def _verdict(outcome: Any, strict: bool) -> int:
-    """Warn about each failed check; return 1 if a failed check makes the command fail."""
+    """Warn about each failed check, and return 1 if a failed check makes the command fail."""
     for check in outcome.failed_checks:
         say.warn(f"check failed: {check}")
     return 1 if strict and outcome.failed_checks else 0
@@ -241,7 +242,7 @@ def calibrate(
         rows.append([name.replace("_", " "), *(number(v, "{:.2f}") for v in means), str(len(scores))])
     if rows:
         heads = ["left out", "RMSE dB", "4 s means dB", *(f"{title} dB" for title in BASELINES.values()), "series"]
-        table(heads, rows, "Scores on what was left out, means")
+        table(heads, rows, "Mean scores on held-out data")
     forecasts = [
         {**forecast, "split": split.replace("_", " ")} for split, scores in m["rank"].items() for forecast in scores
     ]
@@ -250,7 +251,7 @@ def calibrate(
         "commonest": "majority_agreement:.3f", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",
         "TV": "total_variation_expected:.3f",
     }  # fmt: skip
-    records(forecasts, columns, "Rank on what was left out")
+    records(forecasts, columns, "Rank on held-out data")
     for text in [*m["words"], *m["warnings"]]:
         show(text)
     show(outcome.files[0])

@@ -45,7 +45,7 @@ def tap(
         list[str] | None,
         Argument(help="Serial port, or several  [default: the first AT port of a Quectel modem]"),
     ] = None,
-    out: Annotated[Path, output("Folder of the log segments; of several ports, a folder in it for each.")] = Path(
+    out: Annotated[Path, output("Folder of the log segments. With several ports, each has a folder inside.")] = Path(
         "tap"
     ),
     status: Annotated[bool, Option("--status/--no-status", help="A status line on standard error.")] = True,
@@ -163,7 +163,9 @@ def modem_sim(
     from ...live.simulator import FlightModem, ModemSimulator, run_modem_sim
 
     if (flight is None) != (telemetry is None):
-        raise UsageError("--flight or --telemetry stands alone", expected="both: the flight to fly, and its new log")
+        raise UsageError(
+            "--flight needs --telemetry, and the reverse", expected="both: the flight to fly, and its new log"
+        )
     flown = None
     if flight is not None and telemetry is not None:
         from ...jobs.live_twin import FlownAgain

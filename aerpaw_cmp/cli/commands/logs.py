@@ -52,7 +52,7 @@ def ingest(
         raise UsageError("--site without --draft", expected="--draft FILE: the site is that of the draft")
     options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
     if columns:
-        # what the user says outweighs what a mapping implies, such as the number of rank 1
+        # options outweigh a mapping, such as one with the number of rank 1
         options = run.mapping(columns) | {key: value for key, value in options.items() if value is not None}
         reader = reader or "generic_csv"
     try:
@@ -70,7 +70,7 @@ def ingest(
         show(f"wrote {out}{several}")
     if draft is not None:
         for remark in summary["draft"]:
-            # a line to check and a log left out are warnings, which --quiet shows
+            # a line to check and a skipped log are warnings, which --quiet shows
             (say if remark.endswith("can be compared") else say.warn)(remark)
         for place in summary["drafts"]:
             show(f"wrote {place}")

@@ -38,12 +38,12 @@ def predict(
     out: Annotated[Path | None, output("Output folder  [default: reports/prediction-<WHERE>]")] = None,
     height: Annotated[
         list[float] | None,
-        Option(help="Height of a grid [m], repeatable; of route points without one  [default: 40]"),
+        Option(help="Height of a grid [m], repeatable, and of route points without a height  [default: 40]"),
     ] = None,
     spacing: Annotated[float | None, Option(min=1.0, help="Spacing of a grid [m]  [default: 30]")] = None,
     heading: Annotated[
         float | None,
-        Option(help="Heading at all points [deg]  [default: that of the route; where it says none, all count alike]"),
+        Option(help="Heading at all points [deg]  [default: that of the route; all headings equally if it has none]"),
     ] = None,
     carrier_ghz: Annotated[
         float | None, Option(min=0.1, max=100.0, help="Carrier of a prediction before any flight [GHz].")
@@ -53,7 +53,7 @@ def predict(
     dry_run: DryRun = False,
     force: Force = False,
 ) -> None:
-    """Predict level and rank with error bars where nobody has flown yet."""
+    """Predict level and rank with error bars for positions without flights."""
     from ...jobs.predict import run_predict
     from ...jobs.sources import TargetOptions
 

@@ -1,4 +1,4 @@
-"""Reports, in detail and beside each other: ``explain``, ``diff``, ``campaign``."""
+"""Reports, in detail and compared: ``explain``, ``diff``, ``campaign``."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def campaign(
     strict: Annotated[bool, Option("--strict", help="Exit code 1 also when a stated check failed.")] = False,
     force: Force = False,
 ) -> int:
-    """Many flights and settings, with what can be said only of several flights."""
+    """Many flights and settings, with results that need several flights."""
     from ...jobs import run
 
     options = RunOptions(
@@ -178,7 +178,7 @@ def campaign(
     for check in outcome.failed_checks:
         say.warn(f"failed: {check}")
     if not (outcome.metrics["rss"] or outcome.metrics["rank"] or outcome.metrics["season"]["nodes"]):
-        # no flight could be compared: their inputs are at fault, whatever the settings
+        # no flight could be compared with any settings, so the inputs are wrong
         return 3
     return 1 if outcome.metrics["failures"] or (strict and outcome.failed_checks) else 0
 

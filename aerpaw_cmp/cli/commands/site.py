@@ -206,7 +206,7 @@ def map_(
     ] = None,
     figures: Annotated[
         Literal["none", "png", "svg", "pdf", "all"],
-        Option(help="Figures as files beside the page: none, or all in one format or in every format."),
+        Option(help="Figures as separate files: none, or all in one format or in every format."),
     ] = "none",
     workers: Workers = 1,
     scheduler: Scheduler = None,

@@ -142,7 +142,7 @@ class RssFurther:
     simulated_sd_db: float | None = None
     """Mean of what learned antennas state for one sample: gain, the flight's own nuisance, noise, fading."""
     error_bars: Mapping[str, float] | None = None
-    """Its parts [dB], and the share of samples that the stated 50, 90 and 95 % intervals hold here."""
+    """Its parts [dB], and the share of samples that the stated 50, 90 and 95 % intervals contain here."""
     elsewhere: Mapping[str, float] | None = None
     """Of learned antennas: RMSE [dB] on flights left out, of the same with free space, and of means over 4 s."""
     trained_on: tuple[str, ...] | None = None

@@ -377,7 +377,7 @@ def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore 
 
 
 def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[str, float]:
-    """Parts of the stated standard deviation [dB], and the shares of samples that its intervals hold, where scored."""
+    """Return the parts of the stated standard deviation [dB], and the shares of scored samples in its intervals."""
     parts = {"gain_sd_db": float(np.nanmean(stated.gain_sd_db)), **dataclasses.asdict(stated.spread)}
     if residual_db is None:
         return parts

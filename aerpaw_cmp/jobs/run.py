@@ -347,7 +347,7 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
         if m["n"] == 0:
             failed.append(f"{link}: no sample could be compared")
         elif m["at_search_edge"]:
-            failed.append(f"{link}: the best offset lies at the edge of the searched span")
+            failed.append(f"{link}: the best offset is at the end of its search range")
     audit = (metrics.get("rt") or {}).get("audit") or {}
     if why := (metrics.get("rt") or {}).get("not_audited"):
         failed.append(f"audit: {why}")

@@ -1,4 +1,4 @@
-"""The residual field: closed forms, a second way in plain loops, planted fields whose intervals hold."""
+"""The residual field: closed forms, a second way in plain loops, planted fields whose intervals contain."""
 
 import dataclasses
 import itertools

@@ -112,7 +112,7 @@ def diff(_: Fixture) -> str:
 
 
 def prediction(fixture: Fixture) -> str:
-    """A route of 400 points under one tower, a third of them outside the flown places."""
+    """A route of 400 points under one tower, a third of them outside the flown area."""
     from tests.report.test_prediction_words import FREE, LEARNED, WITH_FIELD, correction
 
     chosen = correction(LEARNED, {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.1}, 3.0)

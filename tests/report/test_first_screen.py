@@ -97,7 +97,7 @@ def test_the_first_sentence_follows_from_the_interval_over_all_channels(report_d
         f"Ray tracing (RMSE 8.4 dB) and {best} differ by less than 0.01 dB over {n} channels (95 %)."
     )
     few = paragraph(judged_as(report_data, 0.5, np.nan, np.nan))
-    assert f"{best}: 7.9 dB. The flight is too short to tell the two apart." in few
+    assert f"{best}: 7.9 dB. The flight is too short to distinguish them." in few
     none = paragraph(dataclasses.replace(lost, verdict=None))
     assert none.startswith("Ray tracing: RMSE 8.4 dB. No baseline could be scored.")
 
@@ -224,7 +224,7 @@ def test_a_training_flight_explains_its_dashes(report_data):
 
 @pytest.mark.parametrize(("offset_db", "unit", "said"), [
     (-57.2, "dB re full scale", "Offset −57.2 dB: the log is relative to full scale"),
-    (3.1, "dB re full scale", None), (-88.0, "dB", "Offset −88.0 dB: the log is a ratio to the noise"),
+    (3.1, "dB re full scale", None), (-88.0, "dB", "Offset −88.0 dB: the log is a signal-to-noise ratio"),
     (31.0, "dBm", "Offset +31.0 dB: the transmit power"), (np.nan, "dBm", None),
 ])  # fmt: skip
 def test_a_negative_or_large_offset_is_explained(report_data, offset_db, unit, said):
@@ -275,10 +275,10 @@ def test_an_offset_beyond_the_span_is_no_error_and_its_dead_neighbour_has_no_off
     step = "`rss: {span_db: [-120, 50]}`"
     panels = tuple(with_numbers(panel, at_edge=True, offset_db=-50.0) for panel in report_data.rss)
     data = dataclasses.replace(report_data, rss=panels, rank=(), next_step=step)
-    assert paragraph(data) == f"No error can be given: the best offset lies beyond the searched span. Next: {step}."
+    assert paragraph(data) == f"There is no error to report: the best offset is outside its search range. Next: {step}."
     assert offset_sentences(panels) == []
     text = paragraph(with_cause(dataclasses.replace(report_data, rss=(panels[0], *report_data.rss[1:]))))
-    assert f" The best offset of {panels[0].name} lies beyond the searched span. Next: " in text
+    assert f" The best offset of {panels[0].name} is outside its search range. Next: " in text
     assert CAUSE.sentence not in text
 
 
@@ -340,7 +340,7 @@ def test_a_rank_forecast_is_the_headline_where_there_is_one(report_data):
     first = paragraph(data)
     assert first.startswith(f"Rank at {panel.tower} by the receiver learned on other flights: kappa 0.37")
     assert "log score 19 % below the constant forecast" in first
-    assert "agrees in 71 % of samples; always guessing the commonest agrees in 66 %" in first
+    assert "agrees in 71 % of samples; always guessing the most frequent rank agrees in 66 %" in first
     assert len(first.split()) <= MOST_WORDS
     (card,) = [line for line in headlines(data) if line.label.startswith("Rank")]
     assert (card.value, card.interval) == ("kappa 0.37", "95 %: 0.17 to 0.61")
@@ -391,7 +391,7 @@ def test_a_difference_of_reports_says_what_its_interval_does(word):
 def test_two_channels_of_the_same_levels_are_told(report_data):
     panel = report_data.rss[0]
     twice = dataclasses.replace(report_data, rss=(panel, dataclasses.replace(panel, channel="copy")))
-    said = f"{panel.name} and {panel.tower} copy hold the same levels: they are one measurement."
+    said = f"{panel.name} and {panel.tower} copy have the same levels, so they count as one measurement."
     assert said in cautions(twice)
     assert not any("same levels" in text for text in cautions(report_data))
     pooled = flight_verdict(twice.rss)
@@ -407,7 +407,7 @@ def test_a_dead_channel_takes_no_part_in_the_verdict_of_one_that_lives(report_da
     dead = dataclasses.replace(panel, channel="dead", measured_db=np.where(panel.posed, silent, np.nan))
     both = dataclasses.replace(report_data, rss=(panel, dead))
     assert flight_verdict(both.rss) == flight_verdict([panel])
-    said = f"{dead.name} stays within 1 dB, whatever is predicted: it does not count in the first sentence."
+    said = f"{dead.name} varies by less than 1 dB, so the summary does not include it."
     assert said in cautions(both)
     alone = dataclasses.replace(report_data, rss=(dead,))  # of a flight without any other it is the error
     assert flight_verdict(alone.rss) is not None
@@ -454,6 +454,7 @@ def test_a_receiver_that_lost_its_lock_has_one_error_that_with_the_floor(report_
     assert "Brier" not in text
     assert cards[0].value == f"{expected[0]:.1f} dB"
     assert any(f"{panel.name} lost its lock in 30 % of the samples" in said for said in cautions(data))
-    assert "Brier score is 0.14 by the predicted level (learned on other flights), 0.20 by that share" in rss_verdict(
-        panel
+    assert (
+        "Brier score of the predicted level is 0.14 (learned on other flights), and 0.20 for that share"
+        in rss_verdict(panel)
     )

@@ -104,7 +104,7 @@ def test_first_screen_says_what_and_how_well(report_data):
     head = text[: text.index("Received signal strength")]
     panel = report_data.rss[0]
     errors = (panel.score.rmse_db, *(panel.baselines[name].rmse_db for name in ("free_space", "two_ray")))
-    for piece in (f"{panel.score.offset_db:.1f}", *(f"{error:.2f}" for error in errors), "synthetic"):
+    for piece in (f"{panel.score.offset_db:.1f}", *(f"{error:.1f}" for error in errors), "synthetic"):
         assert piece in head
 
 
@@ -195,7 +195,7 @@ class TestWords:
 
     def test_edge_of_the_search(self, report_data):
         at_edge = with_numbers(report_data.rss[0], at_edge=True)
-        assert any("edge of the searched span" in w for w in build.rss_warnings(at_edge))
+        assert any("end of its search range" in w for w in build.rss_warnings(at_edge))
         assert build.rss_warnings(report_data.rss[0]) == ()
 
     def test_nothing_to_score(self, report_data):
@@ -209,13 +209,13 @@ class TestWords:
             repeat={"any_heading": RankRepeat(n=90, kappa=0.42, kappa_ci95=(0.3, 0.5), agreement=0.7)},
         )
         text = words.rank_verdict(panel)
-        assert "always saying 2 would agree in 71 %" in text
-        assert "repeats itself at the same places to kappa 0.42" in text
+        assert "always guessing 2 agrees in 71 %" in text
+        assert "repeated visits of the modem at the same positions have kappa 0.42" in text
 
     def test_best_k_is_the_nearest_distribution(self, report_data):
         panel = report_data.rank[0]
         best = min(panel.score.simulated, key=lambda k: panel.score.simulated[k].total_variation)
-        assert f"K = {best:g} comes nearest" in words.rank_verdict(panel)
+        assert f"K = {best:g} is closest" in words.rank_verdict(panel)
 
 
 def test_a_note_of_site_and_flight_is_said_once(report_data):

@@ -12,12 +12,16 @@ from aerpaw_cmp.report.maps import MapsData, RssMap, first_words, warnings
 @pytest.mark.parametrize(
     ("covered", "change", "said"),
     [
-        ({"opaque": 0.99}, {}, "Nothing here was measured. Least coverage: 99.0 % of the positions at 30 m. Next: "),
+        (
+            {"opaque": 0.99},
+            {},
+            "The map contains no measurement. Least coverage: 99.0 % of the positions at 30 m. Next: ",
+        ),
         ({"opaque": 0.6, "none": 0.95}, {}, "trees take most of the rest. Next: fly higher, or map with `--foliage"),
         ({"opaque": 0.6, "attenuating": 0.9, "none": 0.95}, {}, "Next: fly higher, or compare the rows of attenuating"),
         ({"opaque": 0.6, "none": 0.62}, {}, "buildings and terrain take most of the rest"),
-        ({"none": 0.0}, {}, "No path arrives at any position at 30 m. Next: check the towers"),
-        ({"none": 0.99}, {"outside_flown": 0.7}, "70 % of the positions lie outside the flown places"),
+        ({"none": 0.0}, {}, "There is no path to any position at 30 m. Next: check the towers"),
+        ({"none": 0.99}, {"outside_flown": 0.7}, "70 % of the positions are outside the flown area"),
     ],
 )
 def test_the_cause_that_was_put_in_is_said(

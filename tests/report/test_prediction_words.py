@@ -36,16 +36,16 @@ def test_a_model_that_beats_free_space_is_called_better_with_its_interval() -> N
     words, listed = first_words(chosen, 0.1, 4.2, 7.5), " ".join(cautions(chosen, 0.1))
     said = re.fullmatch(
         r"Expect an RMSE of 4\.2 dB over 4 s means at these points on a new flight \(heading open\); 90 % of the samples lie "
-        r"within ±7\.5 dB\. On flights left out it is (\d\.\d) dB better than free space \[(\d\.\d), (\d\.\d)\] \(95 %\)\.",
+        r"within ±7\.5 dB\. On held-out flights it is (\d\.\d) dB better than free space \[(\d\.\d), (\d\.\d)\] \(95 %\)\.",
         words,
     )  # its offset and places count
     assert said is not None
     assert float(said[2]) < float(said[1]) < float(said[3])
-    assert "90 % intervals hold " in listed
+    assert "90 % intervals contain " in listed
     assert "too narrow" not in listed
     assert "too wide" not in listed
-    assert "The residual field is off" in listed
-    assert "outside the flown places" not in listed
+    assert "The residual field (a spatial correction) is off" in listed
+    assert "outside the flown area" not in listed
 
 
 def test_equal_models_are_called_neither_better_nor_worse() -> None:
@@ -62,7 +62,7 @@ def test_two_flights_give_no_interval_as_in_a_calibration() -> None:
     assert re.search(r"differs from free space by −?-?[23]\.\d dB; two flights give no interval", words)
     assert "95 %" not in words
     single = first_words(correction(LEARNED, errors, 3.0, ("a",)), 0.0, 4.2, 7.5)
-    assert "On 300 m blocks left out it is" in single
+    assert "On held-out 300 m blocks it is" in single
     assert "(95 %)" in single
 
 
@@ -76,9 +76,11 @@ def test_intervals_that_do_not_hold_are_named_with_the_ratio(sd: float, said: st
 def test_a_field_that_helps_is_on_for_a_stated_gain() -> None:
     chosen = correction(WITH_FIELD, {FREE: 6.0, LEARNED: 4.0, WITH_FIELD: 2.0}, 3.0)
     listed = cautions(chosen, 0.5)
-    assert listed[0] == "50 % of the points lie outside the flown places."
-    assert "The residual field is on: it lowers the CRPS by " in " ".join(listed)
-    assert first_words(chosen, 0.5, 4.2, 7.5).endswith("Next: `aerpaw-cmp plan` names the flight that helps most.")
+    assert listed[0] == "50 % of the points are outside the flown area."
+    assert "The residual field (a spatial correction) is on: it lowers the CRPS by " in " ".join(listed)
+    assert first_words(chosen, 0.5, 4.2, 7.5).endswith(
+        "Next: `aerpaw-cmp plan` finds the flight that reduces the standard deviation most."
+    )
     assert set(FIELD) == {"better", "worse", "off"}
 
 
@@ -106,6 +108,6 @@ def test_the_flight_that_followed_is_said_by_the_gravest_cause(cause: str) -> No
     scores = {"rmse_db": 4.0, "rmse_4s_db": 3.0, "own_offset_rmse_db": 3.5, "coverage_90": 0.7}
     stated = [Verdict(), Verdict(cause=cause, effect=2.0, interval=(1.5, 2.5), where="LW1 USRP1")]
     words = after_flight({"LW1 USRP1": scores}, stated)
-    assert "the 90 % band holds 70 % of the samples" in words
+    assert "the 90 % band contains 70 % of the samples" in words
     assert FLOWN[cause][0].split("{")[0] in words
     assert ("LW1 USRP1" in words) == (cause in ("narrow", "wide", "biased"))

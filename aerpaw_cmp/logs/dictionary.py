@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -235,7 +235,7 @@ def _forms() -> tuple[tuple[re.Pattern[str], Quantity], ...]:
 
 _NEIGHBOUR = re.compile(
     r"\b(detected|neigh(bou?rs?)?\d{0,2}|ngh?br?s?\d{0,2}|nbr?\d{0,2}|nc(ell)? ?\d{0,2}|n ?\d{1,2}|nrx|nlte\w*"
-    r"|adj(acent)?\d{0,2})\b|\btop \d{1,2}\b|^nrx"
+    r"|adj(acent)?\d{0,2}|top ?\d{1,2})\b|^nrx"
 )
 # A neighbour whose name is one word with its quantity: 'NRSRP1', 'nei1Pci', 'NCellRSRP2'.
 _JOINED = re.compile(
@@ -354,6 +354,40 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
         place = (other[1] or other[2] or f"cell{other[3]}").replace(" ", "")
     part = "mean" if _MEAN.search(text) else "port" if _PORT.search(text) else ""
     return Meaning(row, unit, rat, place, indirect=_INDIRECT.search(text) is not None, part=part)
+
+
+# Words that pairs of an identity and a level do not share, or that only name the radio access or the serving cell.
+_UNPAIRED = re.compile(rf"{_MEAN.pattern}|\b(nr|ss|lte|4g|5g|cell|serving|primary|pcell|pscell|spcell|dbm?)\b")
+
+
+def of_pairs(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | None]:
+    """Return the meanings of columns, with a place for each level and identity that share their further words.
+
+    A place with several identities, such as "PCI A" and "PCI B", has several cells: "RSRP A" is the level of the first.
+
+    Examples
+    --------
+    >>> names = ["PCI A", "RSRP A", "PCI B", "RSRP B"]
+    >>> [what.place for what in of_pairs([(name, meaning(name)) for name in names])]
+    ['cell a', 'cell a', 'cell b', 'cell b']
+    """
+    forms, known = {row.name: form for form, row in _forms()}, [*columns]
+    cells: dict[tuple[str, str], dict[str, set[str]]] = {}
+    words = [
+        " ".join(_UNPAIRED.sub(" ", forms[what.quantity.name].sub(" ", without_unit(name)[0])).split()) if what else ""
+        for name, what in known
+    ]
+    for rest, (_, what) in zip(words, known, strict=True):
+        if what is not None and what.quantity.name in ("PCI", "RSRP", "RSSI", "RSCP"):
+            role = "PCI" if what.quantity.name == "PCI" else "level"
+            cells.setdefault((role, what.place), {}).setdefault(rest, set()).add(what.rat)
+    placed = []
+    for rest, (_, what) in zip(words, known, strict=True):
+        shared = {} if what is None else cells.get(("PCI", what.place), {})
+        pairs = what is not None and rest in shared and rest in cells.get(("level", what.place), {})
+        several = any({*shared.get(rest, ())} & rats for other, rats in shared.items() if other != rest)
+        placed.append(replace(what, place=f"cell {rest}") if what and pairs and several and rest else what)
+    return placed
 
 
 def without_unit(name: str) -> tuple[str, str]:

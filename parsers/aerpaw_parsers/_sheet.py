@@ -203,7 +203,8 @@ class Sheet:
     def meanings(self) -> list[dictionary.Meaning | None]:
         """Meaning of each column."""
         said = {i: dictionary.Meaning(row, dictionary.without_unit(self.names[i])[1]) for i, row in self.said.items()}
-        return [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
+        known = [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
+        return dictionary.of_pairs(zip(self.plain, known, strict=True))
 
     def find(self, *quantities: str) -> int | None:
         """The column that surest holds one of the quantities; an empty one only where no other does."""

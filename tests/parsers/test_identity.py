@@ -120,3 +120,22 @@ def test_a_column_of_an_unknown_name_whose_values_alternate_without_turns_is_ask
         == [text for text in warnings if text.startswith("column 'box'")]
         != []
     )
+
+
+@pytest.mark.parametrize(
+    "form", ["Top{} {q}", "{q} Top{}", "Cell {} {q}", "{q}({})", "cell{}_{q}", "Scan #{} {q} [dBm]", "{} best {q}"]
+)
+@pytest.mark.parametrize("words", [("1", "2"), ("A", "B"), ("First", "Last")])
+def test_an_identity_is_that_of_the_level_whose_other_words_it_shares(
+    form: str, words: tuple[str, str], tmp_path: Path
+) -> None:
+    """A scan sorts its cells by level, so that the columns of each cell change from row to row."""
+    names = [form.format(word, q=quantity) for word in words for quantity in ("PCI", "RSRP")]
+    names = [name.replace("PCI [dBm]", "PCI") for name in names]
+    rows = [(f"{1749564000 + i}", *(("11,-70", "12,-95") if i % 3 else ("12,-68", "11,-71"))) for i in range(30)]
+    text = f"timestamp,{','.join(names)}\n" + "\n".join(",".join(row) for row in rows) + "\n"
+    levels = {
+        stream.attributes["pci"]: len(stream.frame["rss_db"].dropna())
+        for stream in read(tmp_path / "x.csv", text).streams if stream.kind == "rss"
+    }  # fmt: skip
+    assert levels == {11: 30, 12: 30}

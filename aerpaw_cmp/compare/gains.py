@@ -1,26 +1,26 @@
-"""Gains over direction and their spread, and the mount of an antenna.
+"""Gains over direction that are learned from flights: model, fit, error model, mounts, and evidence for a flight.
 
-Gain over direction at both ends of a link, learned from the residuals of several flights.
+The gain over direction at both ends of a link is learned from the residuals of several flights:
 
 ``residual = offset + g_uav(body) + g_tower(mast) + g_pair(body, mast) + own + noise``
 
-``offset`` is free per flight, tower and channel. ``own`` is a nuisance of each flight and channel, correlated over
-place, so that the shadowing of one flight is not learned as antenna. The gains are Gaussian processes over directions:
-of the tower in the body, of the UAV at the mast, and of both together per channel (what the gain at one end does not
-explain without the other).
+``offset`` is free per flight, tower and channel. ``own`` is a nuisance of each flight and channel that is correlated
+over place, so that the shadowing of one flight is not learned as antenna. The gains are Gaussian processes over
+directions: of the tower in the body frame, of the UAV at the mast, and of both together per channel (the part that the
+gains at the two ends do not explain).
 
-Mounts of antennas of known pattern: azimuths of all ends of several flights at once.
+Mounts of antennas with a known pattern are azimuths of all ends, fitted on several flights at once.
 
-Pitch and roll are 0: on dataset 12 tilts fitted on one flight (up to 20 degrees) raised the error of the other from
-3.53 to 4.00 dB.
+Pitch and roll are 0, because tilts fitted on one flight of dataset 12 (up to 20 degrees) raised the error of the other
+flight from 3.53 to 4.00 dB.
 
-Spread of a level about its prediction by learned antennas: gain, the flight's own nuisance, noise, fading.
+The error model of a level with learned antennas has parts for gain, nuisance of the flight, noise and fading.
 
-Evidence, from the levels of a flight, that antennas learned on other flights are its own.
+Evidence from the levels of a flight shows whether antennas learned on other flights apply to it.
 
-The log likelihood of the levels with the learned gain is compared with that of a gain of the flight's own under the
-prior of a calibration, and with that of the learned gain of the UAV rotated by 90, 180 and 270 deg. Offset, nuisance,
-noise and all gains that are not compared are the same in each. No name takes part: neither reader, file nor channel.
+The log likelihood of the levels with the learned gain is compared with that of an unknown gain under the prior of a
+calibration, and with that of the learned gain of the UAV rotated by 90, 180 and 270 deg. Offset, nuisance, noise and
+all gains that are not compared are equal in each. Names of readers, files and channels have no effect.
 """
 
 from __future__ import annotations
@@ -43,27 +43,27 @@ from .level import crps_normal
 Frame = Literal["body", "mast", "pair"]
 _Sharing = Literal["all", "antenna"]
 
-# Prior of each offset in standard deviations of the noise: free in effect, and still a proper covariance.
+# Prior of each offset in standard deviations of the noise, so large that the offset is practically free.
 _OFFSET_SD = 100.0
 
-# Means that a fit rests on (a matrix of 72 MB); of more flights they are over longer times.
+# Largest number of means in a fit (a matrix of 72 MB). With more flights, means are over longer times.
 MOST_ROWS = 3000
 
-# Of the tower's gains against the UAV's: the likelier one is taken. Nothing else is chosen on flights: a length of the
-# nuisance by likelihood and its strength by flights left out, of 0.5 to 4, left 0.06 dB more on dataset 12.
+# Candidate strengths of the gains of the tower relative to those of the UAV, selected by likelihood. No other parameter
+# is selected on flights: with length and strength of the nuisance selected, the error on dataset 12 rose by 0.06 dB.
 _TOWER_FACTORS = (1.0, 0.5)
 
 
 def link_directions(tower_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit vectors (n, 3) of both ends towards each other: at the UAV in its body frame, at the tower in the mast's.
+    """Return unit vectors (n, 3) of both ends towards each other, in the body frame of the UAV and in that of the mast.
 
     Parameters
     ----------
     tower_m : (3,) or (n, 3)
-        Place of the tower's array [m].
+        Position of the array of the tower [m].
     position_m : (n, 3)
     rotation : (n, 3, 3)
-        From the body frame to the site's.
+        Rotation from the body frame to the site frame.
     """
     ray = position_m - tower_m
     at_tower = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
@@ -71,35 +71,35 @@ def link_directions(tower_m: FloatArray, position_m: FloatArray, rotation: Float
 
 
 def rotated(direction: FloatArray, turn_deg: float) -> FloatArray:
-    """Return directions (n, 3) in the body frame, rotated anticlockwise about its vertical axis."""
+    """Return directions (n, 3) in the body frame, rotated counter-clockwise about its vertical axis."""
     c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
     return np.asarray(direction @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
 
 
 @dataclass(frozen=True, slots=True)
 class LinkSamples:
-    """Measurements of one flight on one channel of one tower, against a model without the gain to be learned.
+    """The measurements of one flight on one channel of one tower, minus a model without the gain to be learned.
 
     Parameters
     ----------
     flight, tower, channel : str
-        Names; tower and channel together are an antenna.
+        Names. Tower and channel together identify an antenna.
     time_s : (n,)
-        Increasing [s].
+        Increasing times [s].
     position_m : (n, 3)
-        Of the UAV, east, north, up [m].
+        Position of the UAV: east, north, up [m].
     at_uav : (n, 3)
         Unit vector towards the tower in the body frame (forward, left, up).
     at_tower : (n, 3)
         Unit vector towards the UAV in the frame of the mast (east, north, up).
     residual_db : (n,)
-        Measured minus model [dB]; NaN does not count.
+        Measured minus model [dB]; NaN is ignored.
     floor_db : (n,), optional
-        The residual of a level at the receiver's floor [dB]: a smaller one says "no higher than that".
+        Residual of a level at the floor of the receiver [dB]. A smaller residual only means "at most this".
     campaign : str
-        Measurement campaign; its levels have one nuisance and noise.
+        Measurement campaign, whose levels have common parameters of nuisance and noise.
     airframe : str
-        Airframe and band: gains of different ones share nothing.
+        Airframe and band. Different airframes share no gain.
     """
 
     flight: str
@@ -121,29 +121,29 @@ class LinkSamples:
 
     @property
     def group(self) -> tuple[str, str, str]:
-        """Antenna, campaign and airframe: samples with equal ones share all gains."""
+        """Antenna, campaign and airframe. Samples with equal groups share all gains."""
         return self.antenna, self.campaign, self.airframe
 
     def __len__(self) -> int:
         return len(self.time_s)
 
     def part(self, keep: BoolArray | IntArray) -> LinkSamples:
-        """Some of the samples."""
+        """Return some of the samples."""
         arrays: dict[str, Any] = {name: getattr(self, name)[keep] for name in _ARRAYS}
         floor_db = None if self.floor_db is None else self.floor_db[keep]
         return dataclasses.replace(self, floor_db=floor_db, **arrays)
 
     def binned(self, width_s: float) -> LinkSamples:
-        """Means over bins of time; directions are normalised again.
+        """Return means over bins of time, with normalised directions.
 
-        A bin mixes directions only as far as the UAV turns within it; a few seconds are less than the lengths of the
+        A bin mixes only the directions that the UAV passes within it, which a few seconds keep below the lengths of the
         kernels.
         """
         finite = np.isfinite(self.residual_db) & np.isfinite(self.at_uav).all(axis=1)
         if not finite.any():
             return self.part(finite)
         part = self.part(finite)
-        # from the first sample: the bins of a log do not depend on where it was cut
+        # count from the first sample, so that bins do not depend on where a log was cut
         _, member = np.unique(np.floor((part.time_s - part.time_s[0]) / width_s).astype(np.int64), return_inverse=True)
         means: dict[str, Any] = {name: _bin_means(getattr(part, name), member) for name in _ARRAYS}
         for name in ("at_uav", "at_tower"):
@@ -163,21 +163,21 @@ def _bin_means(values: FloatArray, member: IntArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One Gaussian process: its covariance falls exponentially, or, of the pair, as a Gaussian.
+    """One Gaussian process, whose covariance is exponential, or Gaussian for the pair of ends.
 
     Parameters
     ----------
     frame : {"body", "mast", "pair"}
-        Its argument: direction of the tower in the body, of the UAV at the mast, or both of these.
+        Argument: direction of the tower in the body frame, of the UAV at the mast, or both.
     per : {"all", "antenna"}
         One function for all, or one per tower and channel.
     length : float
-        Chord on the unit sphere.
+        Length of the kernel, as a chord on the unit sphere.
     sd_db : float
         Standard deviation [dB].
     tied : float
         Share of the variance that campaigns with one airframe have in common. The evidence of dataset 12, LTE and AADM
-        is flat from 0.7 to 0.95.
+        is almost constant from 0.7 to 0.95.
     """
 
     frame: Frame
@@ -187,8 +187,8 @@ class Term:
     tied: float = 0.9
 
     def shared(self, first: LinkSamples, second: LinkSamples) -> float:
-        """Return the share of the covariance that samples of two series have."""
-        if self.per == "antenna" and first.antenna != second.antenna:  # gains of two antennas share nothing
+        """Return the share of the covariance that samples of two series have in common."""
+        if self.per == "antenna" and first.antenna != second.antenna:  # gains of two antennas have nothing in common
             return 0.0
         if self.frame == "body" and first.airframe != second.airframe:
             return 0.0
@@ -200,18 +200,18 @@ ANTENNA_TERMS = (Term("body", "all", 1.0, 3.2), Term("mast", "antenna", 0.5, 3.4
 
 @dataclass(frozen=True, slots=True)
 class GainModel:
-    """All that is not learned from directions: which terms, how strong, how long.
+    """The parameters that are not learned from directions: terms, strengths and lengths.
 
     Parameters
     ----------
     terms : tuple of Term
-        At least one.
+        One or more terms.
     own_sd_db, own_length_m : float
         Nuisance of a flight and channel: ``sd^2 exp(-distance / length)``.
     noise_sd_db : float
-        Of a bin.
+        Standard deviation of the noise of a bin [dB].
     bin_s : float
-        Samples are averaged over this time [s].
+        Duration over which samples are averaged [s].
     """
 
     terms: tuple[Term, ...] = ANTENNA_TERMS
@@ -220,7 +220,7 @@ class GainModel:
     noise_sd_db: float = 1.5
     bin_s: float = 4.0
     campaigns: tuple[tuple[str, float, float], ...] = ()
-    """Name, ``own_sd_db`` and ``noise_sd_db`` of campaigns that have other ones."""
+    """Name, ``own_sd_db`` and ``noise_sd_db`` of campaigns with other values."""
 
     def scales_db(self, campaign: str) -> tuple[float, float]:
         """Return the standard deviations of nuisance and noise of a campaign [dB]."""
@@ -230,7 +230,7 @@ class GainModel:
         )
 
     def scaled(self, factor: float) -> GainModel:
-        """All standard deviations times a factor."""
+        """Return the model with all standard deviations multiplied by a factor."""
         return dataclasses.replace(
             self,
             terms=tuple(dataclasses.replace(t, sd_db=t.sd_db * factor) for t in self.terms),
@@ -241,22 +241,22 @@ class GainModel:
 
 
 def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
-    """Argument of a term of this frame: (n, 3), or (n, 6) of both directions."""
+    """Return the argument of a term of this frame: (n, 3), or (n, 6) for both directions."""
     if frame == "pair":
         return np.concatenate([samples.at_uav, samples.at_tower], axis=1)
     return samples.at_uav if frame == "body" else samples.at_tower
 
 
 def term_kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
-    """Covariance (n, m) of a term between arguments [dB^2].
+    """Return the covariance of a term between arguments, shape (n, m) [dB^2].
 
-    Gains of airframes have details of every size: an exponential leaves 0.1 dB less than sums of Gaussians.
+    Gains of airframes have details of every size: an exponential kernel has an error 0.1 dB below sums of Gaussians.
     """
     from scipy.spatial.distance import cdist
 
     if term.frame == "pair":
         kernel = gaussian_kernel(at, to, term.length)
-    else:  # in place: these matrices are most of the time of a calibration
+    else:  # in place, because these matrices take most of the time of a calibration
         kernel = np.asarray(cdist(at, to))
         kernel /= -term.length
         np.exp(kernel, out=kernel)
@@ -266,13 +266,13 @@ def term_kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=len(ANTENNA_TERMS))
 def _last_kernel(term: Term, at: bytes, to: bytes) -> FloatArray:
-    """Return :func:`term_kernel` of float64 arguments, kept: channels of one log have the same directions."""
+    """Return :func:`term_kernel` of float64 arguments, cached because channels of one log have the same directions."""
     width = 6 if term.frame == "pair" else 3
     return term_kernel(term, np.frombuffer(at).reshape(-1, width), np.frombuffer(to).reshape(-1, width))
 
 
 def gain_covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Sequence[LinkSamples]) -> FloatArray:
-    """Covariance (n, m) of the gains between samples of some series and of others [dB^2]."""
+    """Return the covariance of the gains between samples of some series and of others, shape (n, m) [dB^2]."""
     rows, columns = _groups(first), _groups(second)
     out = np.zeros((sum(map(len, first)), sum(map(len, second))))
     for term in terms:
@@ -289,7 +289,7 @@ def gain_covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second:
 
 
 def _groups(series: Sequence[LinkSamples]) -> list[tuple[LinkSamples, slice]]:
-    """Return the first of each run of series that share all gains, and where the samples of the run begin and end."""
+    """Return the first of each run of series that share all gains, and the range of the samples of the run."""
     out, start = [], 0
     for _, some in groupby(series, lambda s: s.group):
         run = list(some)
@@ -302,7 +302,7 @@ def _groups(series: Sequence[LinkSamples]) -> list[tuple[LinkSamples, slice]]:
 def _expected(
     terms: Sequence[Term], samples: LinkSamples, rows: Sequence[LinkSamples], weights: FloatArray
 ) -> FloatArray:
-    """Gains (n,) along samples by the weights of the rows [dB]."""
+    """Return the gains along samples from the weights of the rows, shape (n,) [dB]."""
     gain, counts = np.zeros(len(samples)), [len(s) for s in rows]
     for term in terms:
         share = np.repeat([term.shared(samples, s) for s in rows], counts)
@@ -317,7 +317,7 @@ def _expected(
 
 
 def own_covariance(model: GainModel, samples: LinkSamples) -> FloatArray:
-    """Covariance (n, n) of a series' offset, nuisance and noise [dB^2]."""
+    """Return the covariance of offset, nuisance and noise of a series, shape (n, n) [dB^2]."""
     from scipy.spatial.distance import cdist
 
     distance = cdist(samples.position_m, samples.position_m)
@@ -328,7 +328,7 @@ def own_covariance(model: GainModel, samples: LinkSamples) -> FloatArray:
 
 
 def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> FloatArray:
-    """Covariance (n, n) of the levels of all rows: gains, and what each series has of its own [dB^2]."""
+    """Return the covariance of the levels of all rows, with gains, offsets, nuisances and noise, (n, n) [dB^2]."""
     out, start = gain_covariance(model.terms, rows, rows), 0
     for samples in rows:
         block = slice(start, start + len(samples))
@@ -339,18 +339,18 @@ def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> Floa
 
 @dataclass(frozen=True, slots=True)
 class GainFit:
-    """Gain over direction with its uncertainty.
+    """A learned gain over direction with its uncertainty.
 
     Parameters
     ----------
     model : GainModel
-        With the standard deviations and the bins that were used.
+        Model with the standard deviations and the bins that were used.
     rows : tuple of LinkSamples
-        Means over bins that were learned from.
+        Means over bins, the training data.
     log_evidence : float
-        Log marginal likelihood, but for a constant of the data.
+        Log marginal likelihood, without a constant of the data.
     common_scale : float
-        Factor on all standard deviations that makes them fit the data: ``s^2 = y' C^-1 y / rows``.
+        Factor on all standard deviations with which they fit the data: ``s^2 = y' C^-1 y / rows``.
     """
 
     model: GainModel
@@ -364,12 +364,12 @@ class GainFit:
 
     @property
     def antennas(self) -> tuple[str, ...]:
-        """``tower.channel`` of those that were fitted."""
+        """``tower.channel`` of the fitted antennas."""
         return tuple(dict.fromkeys(s.antenna for s in self.rows))
 
     def scaled(self) -> GainFit:
-        """The fit with all standard deviations times :attr:`common_scale`: the same gains, other uncertainties."""
-        # a scale moves no mean: the factor and the evidence follow in closed form
+        """The fit with all standard deviations multiplied by :attr:`common_scale`, and unchanged gains."""
+        # a scale changes no mean, and the factor and the evidence follow in closed form
         s, count = self.common_scale, len(self._weights)
         misfit = s**2 * max(count - len(self.rows), 1)
         return dataclasses.replace(
@@ -382,24 +382,24 @@ class GainFit:
         )
 
     def predict(self, samples: LinkSamples, frames: Sequence[Frame] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Gain of all terms together along samples, about its mean over the samples it was learned from.
+        """Return the gain of all terms along samples, relative to its mean over the training samples.
 
         Parameters
         ----------
         samples : LinkSamples
-            Of a fitted antenna; their residual is not used.
+            Samples of a fitted antenna, whose residuals are not used.
         frames : sequence of Frame, optional
-            Terms that count; all by default.
+            Frames of the terms that are included; all by default.
 
         Returns
         -------
         gain_db, sd_db : (n,)
-            Posterior mean and standard deviation [dB]; NaN where a direction is NaN.
+            Posterior mean and standard deviation [dB]; NaN if a direction is NaN.
 
         Raises
         ------
         UsageError
-            If no flight of the fit had this tower and channel.
+            If no flight of the fit has this tower and channel.
         """
         samples = self._like_fitted(samples)
         gain, sd = np.full(len(samples), np.nan), np.full(len(samples), np.nan)
@@ -411,7 +411,7 @@ class GainFit:
         return gain, sd
 
     def mean(self, samples: LinkSamples) -> FloatArray:
-        """The gain of :meth:`predict` alone (n,) [dB]."""
+        """Return the gain of :meth:`predict` without its standard deviation, shape (n,) [dB]."""
         samples = self._like_fitted(samples)
         gain, known = np.full(len(samples), np.nan), self._known_rows(samples)
         for start in range(0, len(known), AT_ONCE):
@@ -420,20 +420,23 @@ class GainFit:
         return gain - self._zero[samples.antenna]
 
     def gain(self, frame: Frame, antenna: str, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gain at one end over directions (n, 3), or of the pair of ends (n, 6): posterior mean and SD (n,) [dB].
+        """Return posterior mean and SD of the gain at one end over directions (n, 3), or of the pair (n, 6) [dB].
 
-        Zero is the mean over the bins of the flights: the level itself is in the offsets.
+        Zero is the mean over the bins of the flights, because offsets contain the level.
         """
         return self.predict(directed(antenna, np.asarray(direction, dtype=np.float64)), (frame,))
 
     def seen(self, frame: Frame, antenna: str) -> FloatArray:
-        """Directions (m, 3) of the bins of the fit at one end, the UAV's of all antennas together; (m, 6) of pairs."""
+        """Return the directions of the bins of the fit at one end, (m, 3), or of pairs, (m, 6).
+
+        At the UAV they are the directions of all antennas.
+        """
         return np.concatenate(
             [argument_of(s, frame) for s in (self.rows if frame == "body" else self._rows_of(antenna))]
         )
 
     def sd_about_mean(self, samples: LinkSamples) -> FloatArray:
-        """Standard deviation (n,) of the gain along samples about its mean over them, as an own offset leaves it [dB].
+        """Return the standard deviation of the gain along samples relative to its mean over them, shape (n,) [dB].
 
         Every sample must have both directions.
         """
@@ -441,7 +444,7 @@ class GainFit:
         return self._moments(self.model.terms, samples, [samples])[1]
 
     def airframe_mean(self, samples: LinkSamples) -> FloatArray:
-        """Return the gain of the UAV alone (n,) [dB], for any tower and campaign with an airframe of the fit."""
+        """Return the gain of the UAV alone, for any tower and campaign with an airframe of the fit, shape (n,) [dB]."""
         gain, known = np.full(len(samples), np.nan), self._known_rows(samples)
         terms = [t for t in self.model.terms if t.frame == "body"]
         for start in range(0, len(known), AT_ONCE):
@@ -455,7 +458,7 @@ class GainFit:
         return dataclasses.replace(samples, campaign=first.campaign, airframe=first.airframe)
 
     def _rows_of(self, antenna: str) -> list[LinkSamples]:
-        """Rows of an antenna."""
+        """Return the rows of an antenna."""
         rows = [s for s in self.rows if s.antenna == antenna]
         if not rows:
             raise UsageError(
@@ -469,7 +472,7 @@ class GainFit:
         return np.flatnonzero(finite.all(axis=1))
 
     def covariance(self, frame: Frame, antenna: str, direction: FloatArray) -> FloatArray:
-        """Return the covariance (n, n) of :meth:`gain` towards directions (n, 3) [dB^2]."""
+        """Return the covariance of :meth:`gain` towards directions (n, 3), shape (n, n) [dB^2]."""
         terms = [t for t in self.model.terms if t.frame == frame]
         at = self._like_fitted(directed(antenna, np.asarray(direction, dtype=np.float64)))
         about = self._rows_of(antenna)
@@ -484,21 +487,21 @@ class GainFit:
     def _moments(
         self, terms: Sequence[Term], at: LinkSamples, about: Sequence[LinkSamples]
     ) -> tuple[FloatArray, FloatArray]:
-        """Sum of some terms along samples about its mean over others: mean and standard deviation (n,)."""
+        """Return mean and standard deviation (n,) of a sum of terms along samples, relative to its mean over others."""
         centre = gain_covariance(terms, about, [at, *self.rows]).mean(axis=0)
         across = gain_covariance(terms, [at], self.rows) - centre[len(at) :]
-        # between samples of one antenna every term counts
+        # all terms count between samples of one antenna
         prior = sum(t.sd_db**2 for t in terms) - 2.0 * centre[: len(at)] + gain_covariance(terms, about, about).mean()
         spread = self._factor.whiten(across.T)
         return across @ self._weights, np.sqrt(np.maximum(prior - (spread**2).sum(axis=0), 0.0))
 
 
-# Samples that are predicted at a time; bounds the memory.
+# Samples that are predicted at a time, which limits the memory.
 AT_ONCE = 2000
 
 
 def directed(antenna: str, direction: FloatArray) -> LinkSamples:
-    """Samples (n,) of an antenna towards directions (n, 3), the same at both ends, or pairs of them (n, 6)."""
+    """Return samples of an antenna towards directions (n, 3), equal at both ends, or towards pairs of them (n, 6)."""
     count = len(direction)
     tower, _, channel = antenna.partition(".")
     return LinkSamples(
@@ -519,9 +522,9 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     Parameters
     ----------
     series : sequence of LinkSamples
-        Of all flights.
+        Samples of all flights.
     model : GainModel, optional
-        Terms and their strength; see :func:`chosen_fit`.
+        Terms and their strengths; see :func:`chosen_fit`.
 
     Returns
     -------
@@ -530,26 +533,26 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     Raises
     ------
     InputError
-        If no sample counts, or the equations cannot be solved.
+        If there are no valid samples, or the equations cannot be solved.
 
     Notes
     -----
-    ``y = offset + gains + own + noise``, all normal: with the covariance ``C`` of the rows the gain at directions of
+    ``y = offset + gains + own + noise``, all normal: with the covariance ``C`` of the rows, the gain at directions of
     covariance ``k`` with them is ``k' C^-1 y`` (:class:`~aerpaw_cmp.common.gaussian.Factor`). The solution is exact
-    but for the average over ``bin_s``.
+    except for the average over ``bin_s``.
     """
     model, rows = _binned_series(series, model or GainModel())
     return _solved(model, rows, _covariance_of_levels(model, rows))
 
 
 def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArray) -> GainFit:
-    """The fit of rows with the covariance of their levels, in the place of which it is factored."""
-    # in its place: at 3 000 rows a copy is 72 MB
+    """Return the fit of rows with the covariance of their levels, which is overwritten by its factor."""
+    # in place, because a copy has 72 MB with 3 000 rows
     factor = Factor.of(covariance)
     target = np.concatenate([s.residual_db - s.residual_db.mean() for s in rows])
     weights = factor.solve(target)
     misfit = float(target @ weights)
-    # what the equations leave to the gains
+    # the part of the levels that the gains explain
     parts = np.split(weights, np.cumsum([len(s) for s in rows])[:-1])
     gain = target - np.concatenate([own_covariance(model, s) @ w for s, w in zip(rows, parts, strict=True)])
     return GainFit(
@@ -565,9 +568,9 @@ def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArra
 
 
 def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) -> GainFit:
-    """:func:`fit_gain` with the likelier strength of the tower's gains and the common scale of all.
+    """Return :func:`fit_gain` with the more likely strength of the gains of the tower, and the common scale of all.
 
-    The scale, which changes no mean, makes the standard deviations fit the data: ``s^2 = y' C^-1 y / rows``.
+    The scale changes no mean. It makes the standard deviations fit the data: ``s^2 = y' C^-1 y / rows``.
     """
     model, rows = _binned_series(series, model or GainModel())
     model = _with_scales(model, rows)
@@ -585,20 +588,20 @@ def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) ->
     return max(fits, key=lambda fit: fit.log_evidence)
 
 
-# Standard deviations of nuisance and noise that are tried for each of several campaigns [dB]. One pair for all of them
-# is 18 to 99 nat less likely: 1.2 and 1.0 (dataset 12), 2.0 and 2.2 (LTE), 2.0 and 3.0 (AADM).
+# Candidate standard deviations of nuisance and noise for each of several campaigns [dB]. One pair for all of them is 18
+# to 99 nat less likely: 1.2 and 1.0 (dataset 12), 2.0 and 2.2 (LTE), 2.0 and 3.0 (AADM).
 _CAMPAIGN_SCALES_DB = tuple(product((0.8, 1.2, 2.0, 3.0), (1.0, 1.5, 2.2, 3.2)))
 
 
 def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
-    """Return the model with the likeliest nuisance and noise of each campaign, where there are several."""
+    """Return the model with the most likely nuisance and noise of each of several campaigns."""
     names = list(dict.fromkeys(s.campaign for s in rows))
     if len(names) == 1 or model.campaigns:
         return model
     chosen = []
     for name in names:
         mine = [s for s in rows if s.campaign == name]
-        # every second mean: the scales are those of a mean, and a factor costs an eighth
+        # every second mean, because the scales are those of a mean, and a factor then costs an eighth
         mine = [s.part(np.arange(0, len(s), 2)) for s in mine]
         gains = gain_covariance(model.terms, mine, mine)
         levels = np.concatenate([s.residual_db - s.residual_db.mean() for s in mine])
@@ -622,7 +625,7 @@ def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
 
 
 def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[GainModel, list[LinkSamples]]:
-    """Means over bins of each series that has any, and the model with the bins used; InputError if none has."""
+    """Return the model with its bins, and means over bins of each series; raise InputError if there are none."""
     binned = [s.binned(model.bin_s) for s in series]
     longer = math.ceil(sum(map(len, binned)) / MOST_ROWS)
     if longer > 1:
@@ -632,7 +635,7 @@ def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[Gai
     if not binned:
         raise InputError("no sample has a level and a direction", expected="RSS with positions and attitude")
     groups = [s.group for s in binned]
-    # antenna after antenna: what they do not share is zeros in blocks
+    # sort by antenna, so that covariances between antennas without common gains are blocks of zeros
     return model, sorted(binned, key=lambda s: groups.index(s.group))
 
 
@@ -641,20 +644,20 @@ def column_forms(
     model: GainModel,
     columns: Callable[[LinkSamples, float], FloatArray],
 ) -> FloatArray:
-    """``X' Sigma^-1 X`` (width, width), Sigma the covariance of a model with the gains integrated out.
+    """Return ``X' Sigma^-1 X`` (width, width), with the gains integrated out of the covariance Sigma of a model.
 
     Parameters
     ----------
     series : sequence of LinkSamples
     model : GainModel
-        Its priors and noise make Sigma.
+        Model whose priors and noise define Sigma.
     columns : callable
-        ``columns(series, bin_s)`` gives the columns X of one series (bins, width), of :meth:`LinkSamples.binned`.
+        ``columns(series, bin_s)`` returns the columns X of one series (bins, width) of :meth:`LinkSamples.binned`.
 
     Returns
     -------
     (width, width)
-        Symmetric, positive semidefinite [squared unit of the columns per dB^2].
+        A symmetric, positive semidefinite matrix [squared unit of the columns per dB^2].
     """
     model, rows = _binned_series(series, model)
     names = [s.group for s in rows]
@@ -664,34 +667,34 @@ def column_forms(
     return np.asarray(inside.T @ inside)
 
 
-# Between the azimuths that are tried.
+# Step between candidate azimuths.
 STEP_DEG = 10.0
 
-# Standard deviation of a bin about the patterns: 4 dB of residual that stays alike over some six bins.
+# Standard deviation of a bin about the patterns: 4 dB of residual that is correlated over about six bins.
 #
-# Least squares: a covariance with learned gains, or with shadowing correlated over place, takes for itself the broad
-# shape over azimuth that tells a mount. On dataset 12 the azimuth at the UAV then jumps between flights (320 and 120
-# deg, in place of 270 and 270).
+# Least squares are used, because a covariance with learned gains or with shadowing over place would absorb the broad
+# shape over azimuth that determines a mount. On dataset 12 the azimuth at the UAV then jumps between flights (320 and
+# 120 deg instead of 270 and 270).
 _MOUNT_NOISE_DB = 10.0
 
-# Samples are averaged over this time [s].
+# Duration over which samples are averaged [s].
 BIN_S = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class MountFit:
-    """Fitted mount of an antenna of known pattern.
+    """The fitted mount of an antenna with a known pattern.
 
     Parameters
     ----------
     azimuth_deg : float
-        Of the most probable mount, as ``yaw_deg`` of flight.yaml.
+        Azimuth of the most probable mount, as ``yaw_deg`` of flight.yaml.
     azimuth_sd_deg : float
         Circular standard deviation.
     probability : (azimuths,)
         Posterior over ``grid_deg``.
     identified : bool
-        False where the data leave an azimuth further than 45 degrees away with more than 5 % of the probability.
+        False if azimuths more than 45 degrees away have more than 5 % of the probability.
     """
 
     azimuth_deg: float
@@ -706,20 +709,20 @@ GainOf = Callable[[FloatArray], FloatArray]
 
 
 def turned(azimuth_deg: float) -> FloatArray:
-    """Mount (3, 3) of an antenna whose front looks that way, counter-clockwise from above."""
+    """Return the mount of an antenna with this azimuth of its front, counter-clockwise from above, shape (3, 3)."""
     c, s = np.cos(np.radians(azimuth_deg)), np.sin(np.radians(azimuth_deg))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def fit_mounts(series: Sequence[LinkSamples], patterns: Mapping[str, GainOf]) -> dict[str, MountFit]:
-    """Mounts of antennas with a pattern, all at once.
+    """Fit the mounts of all antennas with a pattern together.
 
     Parameters
     ----------
     series : sequence of LinkSamples
-        Residuals against free space.
+        Residuals relative to free space.
     patterns : mapping of str to callable
-        Key ``uav`` and the antennas at towers that have a pattern; others count as isotropic.
+        Patterns by the key ``uav`` and by antennas of towers. Other antennas are isotropic.
 
     Returns
     -------
@@ -727,8 +730,8 @@ def fit_mounts(series: Sequence[LinkSamples], patterns: Mapping[str, GainOf]) ->
 
     Notes
     -----
-    ``log p = -|y - u - t|^2 / (2 s^2)`` is a quadratic form of columns computed once. Azimuths of
-    tower antennas are optimised for each azimuth of the UAV.
+    ``log p = -|y - u - t|^2 / (2 s^2)`` is a quadratic form of columns that are computed once. Azimuths of
+    antennas of towers are optimised for each azimuth of the UAV.
     """
     grid = np.arange(0.0, 360.0, STEP_DEG)
     chosen, probability = _best_together(_quadratic_forms(series, patterns, grid))
@@ -737,12 +740,12 @@ def fit_mounts(series: Sequence[LinkSamples], patterns: Mapping[str, GainOf]) ->
 
 def _mount(grid: FloatArray, probability: FloatArray, best_deg: float) -> MountFit:
     phasor = complex((probability * np.exp(1j * np.radians(grid))).sum())
-    # circular standard deviation, as of a wrapped normal distribution
+    # circular standard deviation, as for a wrapped normal distribution
     spread = np.degrees(np.sqrt(-2.0 * np.log(min(max(abs(phasor), 1e-9), 1.0))))
     apart = np.abs(wrap_degrees(grid - best_deg))
     return MountFit(
         azimuth_deg=best_deg,
-        # no finer than the grid: the standard deviation of a uniform step
+        # at least the standard deviation of a uniform step of the grid
         azimuth_sd_deg=float(max(spread, (grid[1] - grid[0]) / np.sqrt(12.0))),
         grid_deg=grid,
         probability=probability,
@@ -752,7 +755,7 @@ def _mount(grid: FloatArray, probability: FloatArray, best_deg: float) -> MountF
 
 @dataclass(frozen=True, slots=True)
 class _Forms:
-    """Quadratic form (q, q) of all columns: the target first, then the candidates of each name."""
+    """A quadratic form (q, q) of all columns: the target first, then the candidates of each name."""
 
     form: FloatArray
     columns: Mapping[str, slice]
@@ -763,7 +766,7 @@ def _quadratic_forms(series: Sequence[LinkSamples], patterns: Mapping[str, GainO
     mounts = [turned(azimuth) for azimuth in grid]
 
     def candidates(samples: LinkSamples) -> FloatArray:
-        """Target and candidates (bins, q) of a series."""
+        """Return target and candidates of a series (bins, q)."""
         good = samples.part(np.isfinite(samples.residual_db) & np.isfinite(samples.at_uav).all(axis=1))
         bins = good.binned(BIN_S)
         out = np.zeros((len(bins), 1 + len(patterns) * len(grid)))
@@ -781,7 +784,7 @@ def _quadratic_forms(series: Sequence[LinkSamples], patterns: Mapping[str, GainO
 
 
 def _best_together(forms: _Forms) -> tuple[dict[str, int], dict[str, FloatArray]]:
-    """Most probable candidate of each name, and its marginal probabilities."""
+    """Return the most probable candidate of each name, and its marginal probabilities."""
     names = list(forms.columns)
     first, further = names[0], names[1:]
     size = forms.columns[first].stop - forms.columns[first].start
@@ -809,7 +812,7 @@ def _best_together(forms: _Forms) -> tuple[dict[str, int], dict[str, FloatArray]
 
 
 def _given_others(forms: _Forms, chosen: Mapping[str, int], name: str) -> FloatArray:
-    """Log likelihood of all candidates of one name, those of the others given."""
+    """Return the log likelihood of all candidates of one name for given candidates of the others."""
     form, candidates = forms.form, forms.columns[name]
     chosen_columns = [forms.columns[end].start + at for end, at in chosen.items() if end != name]
     sign = np.zeros(len(form))
@@ -822,45 +825,46 @@ def _given_others(forms: _Forms, chosen: Mapping[str, int], name: str) -> FloatA
 # Nominal shares of samples within an interval.
 SHARES = (0.5, 0.9, 0.95)
 
-# Of the band that a report draws.
+# Share of the band in a report.
 BAND = 0.9
 
 
 def student_factor(flights: int) -> float:
-    """Standard deviation of the normal distribution with the :data:`BAND` of Student's t with n + 1 degrees of freedom.
+    """Return the SD of the normal distribution with the :data:`BAND` of Student's t with n + 1 degrees of freedom.
 
     Notes
     -----
-    So a new flight's offset lies about the mean of n: the spread between flights is itself known from n - 1 differences
-    and a guess that counts as two (Gelman et al., Bayesian Data Analysis, 3.3); two degrees have no variance.
+    The offset of a new flight has this distribution about the mean of n flights, because the variance between flights
+    is estimated from n - 1 differences and a prior that counts as two (Gelman et al., Bayesian Data Analysis, 3.3).
+    Student's t with two degrees of freedom has no variance.
     """
     from scipy.special import ndtri, stdtrit
 
     return float(stdtrit(flights + 1.0, 0.5 + 0.5 * BAND) / ndtri(0.5 + 0.5 * BAND))
 
 
-# Beyond it the expansion of :meth:`Spread.half_width_db` is no longer one of a bell.
+# The expansion of :meth:`Spread.half_width_db` is not valid above this.
 _MOST_KURTOSIS = 2.0
 
 
-# Squared skewness of fading in dB for each unit of excess kurtosis: 1.30 / 2.40 of Rayleigh's.
+# Squared skewness of fading in dB per unit of excess kurtosis: 1.30 / 2.40 for Rayleigh fading.
 _FADE_SKEWNESS2 = 0.54
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """Spread of a predicted level besides the gain's own standard deviation.
+    """The error model of a predicted level without the standard deviation of the gain.
 
     Parameters
     ----------
     own_sd_db : float
-        Of the nuisance of a flight and channel (shadowing that no antenna explains).
+        Standard deviation of the nuisance of a flight and channel (shadowing that no antenna explains) [dB].
     noise_sd_db : float
-        Of means over ``bin_s``.
+        Standard deviation of the noise of means over ``bin_s`` [dB].
     fading_sd_db, fading_kurtosis : float
         Standard deviation and excess kurtosis of samples about their mean over ``bin_s``.
     bin_s : float
-        Time over which the antennas were learned from means [s].
+        Duration of the means from which the antennas were learned [s].
     """
 
     own_sd_db: float
@@ -870,18 +874,19 @@ class Spread:
     bin_s: float
 
     def total_db(self, gain_sd_db: FloatArray) -> FloatArray:
-        """Standard deviation (n,) of a sample about its prediction, from that of the gain (n,) [dB]."""
+        """Return the standard deviation of a sample about its prediction, from that of the gain, shape (n,) [dB]."""
         variance = self.own_sd_db**2 + self.noise_sd_db**2 + self.fading_sd_db**2
         return np.asarray(np.sqrt(gain_sd_db**2 + variance))
 
     def half_width_db(self, gain_sd_db: FloatArray, share: float) -> FloatArray:
-        """Half of the interval (n,) that holds a share of the samples [dB].
+        """Return half of the interval that contains a share of the samples, shape (n,) [dB].
 
         Notes
         -----
-        The quantile of ``|x|`` for a sum of a normal part and of fading, by the even terms of Edgeworth's series in the
-        excess kurtosis k and the skewness s of the sum: q = z + He3(z) k / 24 + He5(z) s^2 / 72 (Cornish and Fisher,
-        Rev. Inst. Int. Stat. 5, 1938). Without the second term half of the samples are said to lie where 40 % do.
+        The quantile of ``|x|`` for a sum of a normal part and of fading follows from the even terms of the Edgeworth
+        series in the excess kurtosis k and the skewness s of the sum: q = z + He3(z) k / 24 + He5(z) s^2 / 72 (Cornish
+        and Fisher, Rev. Inst. Int. Stat. 5, 1938). Without the second term, the 50 % interval contains 40 % of the
+        samples.
         """
         from scipy.special import ndtri
 
@@ -894,22 +899,22 @@ class Spread:
         return np.asarray(total * (z + third * k / 24.0 + fifth * skew2 / 72.0))
 
 
-# Of learned files that state the standard deviation of the gain alone.
+# Error model of learned files that contain only the standard deviation of the gain.
 NO_SPREAD = Spread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=0.0, fading_kurtosis=0.0, bin_s=4.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LostLock:
-    """Error of a prediction whose receiver may have lost its lock: normal in lock, and about another level without.
+    """The error of a prediction for a receiver that may lose its lock, normal about one level in lock and another without.
 
     Parameters
     ----------
     probability : (n,)
-        Of lock.
+        Probability of lock.
     locked_db : (n,)
         Mean error in lock.
     lost_db : (n,)
-        Mean error without.
+        Mean error without lock.
     locked_sd_db, lost_sd_db : float
     """
 
@@ -921,40 +926,40 @@ class LostLock:
 
     @property
     def parts(self) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-        """Share, mean error and standard deviation (each (n,)) in lock, then without."""
+        """Share, mean error and standard deviation in lock and without lock, each (n,)."""
         one, share = np.ones(len(self.probability)), self.probability
         lost = 1.0 - share, self.lost_db, self.lost_sd_db * one
         return [(share, self.locked_db, self.locked_sd_db * one), lost]
 
     def sd_db(self, about_db: FloatArray) -> FloatArray:
-        """Root mean square (n,) of the error about a prediction that is this much higher (n,) [dB]."""
+        """Return the root mean square error about a prediction that is ``about_db`` higher, shape (n,) [dB]."""
         return np.asarray(np.sqrt(sum(share * ((mean - about_db) ** 2 + sd**2) for share, mean, sd in self.parts)))
 
     def quantile_db(self, share: float) -> FloatArray:
-        """Error (n,) below which a share of the samples lies, to a hundredth of a dB."""
+        """Return the error below which a share of the samples lies, to 0.01 dB, shape (n,)."""
         from scipy.special import ndtr
 
         reach = 6.0 * max(self.locked_sd_db, self.lost_sd_db)
         low = np.minimum(self.locked_db, self.lost_db) - reach
         high = np.maximum(self.locked_db, self.lost_db) + reach
-        # from some hundred decibels to two thousandths
-        for _ in range(16):  # no closed form: each step halves what is left of some 130 dB
+        # from some hundred decibels to 0.002 dB
+        for _ in range(16):  # there is no closed form, and each step halves an interval of about 130 dB
             middle = 0.5 * (low + high)
             below = sum(p * ndtr((middle - mean) / sd) for p, mean, sd in self.parts)
             low, high = np.where(below < share, middle, low), np.where(below < share, high, middle)
         return np.asarray(0.5 * (low + high))
 
     def log_score(self, error_db: FloatArray) -> float:
-        """Mean of minus the logarithm of the density at errors (n,) [nat]."""
+        """Return the mean of minus the logarithm of the density at errors (n,) [nat]."""
         density = sum(p / sd * np.exp(-0.5 * ((error_db - mean) / sd) ** 2) for p, mean, sd in self.parts)
         return float(-np.log(density / np.sqrt(2.0 * np.pi)).mean())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatedSpread:
-    """Error bars of one series: standard deviation of the gain (n,) [dB], NaN without a pose, and what is beside it.
+    """The stated error of one series: standard deviation of the gain (n,) [dB], NaN without a pose, and further parts.
 
-    ``lock``: in place of the spread, of a receiver that loses its lock.
+    ``lock`` replaces the error model for a receiver that loses its lock.
     """
 
     gain_sd_db: FloatArray
@@ -963,22 +968,22 @@ class StatedSpread:
 
     @property
     def total_db(self) -> FloatArray:
-        """Standard deviation (n,) of a sample about its prediction [dB]."""
+        """Return the standard deviation of a sample about its prediction, shape (n,) [dB]."""
         return self.spread.total_db(self.gain_sd_db)
 
     def band_db(self, share: float) -> tuple[FloatArray, FloatArray]:
-        """Ends (n,) of the interval about the prediction that holds a share of the samples [dB]."""
+        """Return the ends of the interval about the prediction that contains a share of the samples, each (n,) [dB]."""
         if self.lock is None:
             half = self.spread.half_width_db(self.gain_sd_db, share)
             return -half, half
         return self.lock.quantile_db(0.5 - 0.5 * share), self.lock.quantile_db(0.5 + 0.5 * share)
 
     def crps_db(self, error_db: FloatArray) -> float:
-        """Mean continuous ranked probability score of errors (n,) [dB]; NaN does not count.
+        """Return the mean continuous ranked probability score of errors (n,) [dB]; NaN is ignored.
 
         Notes
         -----
-        Of a mixture of normal distributions in closed form (Grimit, Gneiting, Berrocal and Johnson 2006,
+        The score of a mixture of normal distributions in closed form (Grimit, Gneiting, Berrocal and Johnson 2006,
         doi:10.1256/qj.05.235).
         """
         one = np.ones(len(error_db))
@@ -997,7 +1002,7 @@ class StatedSpread:
         return float(np.nanmean(score)) if np.isfinite(score).any() else math.nan
 
     def columns(self, level_dbm: FloatArray) -> dict[str, FloatArray]:
-        """Parts and 90 % interval about a level (n,), by the names of rss.csv."""
+        """Return parts and 90 % interval about a level (n,), by the names of rss.csv."""
         known = np.where(np.isfinite(self.gain_sd_db), 1.0, np.nan)
         low, high = self.band_db(BAND)
         return {
@@ -1012,7 +1017,10 @@ class StatedSpread:
 
 
 def inside_shares(error_db: FloatArray, stated: StatedSpread) -> dict[str, float]:
-    """Share of errors (n,) inside the interval of each nominal share: ``inside_50`` and so on; NaN does not count."""
+    """Return the share of errors inside the interval of each nominal share: ``inside_50`` and so on.
+
+    Errors (n,) that are NaN are ignored.
+    """
     good = np.isfinite(error_db) & np.isfinite(stated.gain_sd_db)
     out = {}
     for share in SHARES:
@@ -1023,7 +1031,9 @@ def inside_shares(error_db: FloatArray, stated: StatedSpread) -> dict[str, float
 
 
 def fading_of(series: Sequence[LinkSamples], bin_s: float) -> tuple[float, float]:
-    """Standard deviation [dB] and excess kurtosis of samples about their means over bins; zeros where no bin has two.
+    """Return standard deviation [dB] and excess kurtosis of samples about their means over bins.
+
+    Both are 0 if no bin has two samples.
 
     Examples
     --------
@@ -1052,22 +1062,22 @@ def fading_of(series: Sequence[LinkSamples], bin_s: float) -> tuple[float, float
 
 BODY, MAST, PAIR = ANTENNA_TERMS
 
-# Log odds that a learned gain must have over an own gain, and an airframe alone over each rotated copy of it. Field
-# flights: 3 accepts the airframe of dataset 12 on LTE and AADM (6.8 to 8.3) and refuses NR everywhere (-11.5 to -1.2).
+# Log odds required of a learned gain against an own gain, and of an airframe against each rotated copy. On field
+# flights 3 accepts the airframe of dataset 12 on LTE and AADM (6.8 to 8.3) and refuses NR everywhere (-11.5 to -1.2).
 LEAST_ODDS = 3.0
 
 _TURNS_DEG = (90.0, 180.0, 270.0)
 
-# Log odds against an own gain that no knowledge of names outweighs.
+# Log odds against an own gain that no evidence of names outweighs.
 _HOPELESS = 8.0
 
-# Means that a flight is judged by: of more, over longer times.
+# Largest number of means by which a flight is tested. With more, means are over longer times.
 _MOST_ROWS, _BIN_S = 700, 4.0
 
-# Standard deviations of nuisance and noise that are tried [dB]; the likeliest of each series is taken.
+# Candidate standard deviations of nuisance and noise [dB], selected by likelihood for each series.
 _SCALES_DB = (0.7, 1.2, 2.0, 3.5, 6.0)
 
-# Part of the variance of the gain towards both ends at once that its table leaves.
+# Share of the variance of the gain towards both ends that its table does not explain.
 _PAIR_LEFT = 0.5
 
 # Mean (n,) [dB] and covariance (n, n) [dB^2] of a learned gain along samples.
@@ -1076,18 +1086,18 @@ Moments = Callable[[LinkSamples], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """Log odds [nat] of a learned gain against an own gain of the flight, and against its likeliest rotated copy."""
+    """Log odds of a learned gain against an unknown gain, and against its most likely rotated copy [nat]."""
 
     over_own: float
     over_turned: float
 
     @property
     def fits(self) -> bool:
-        """True if both log odds suffice for an airframe without its tower's antenna."""
+        """True if both log odds are sufficient for an airframe without the antenna of its tower."""
         return min(self.over_own, self.over_turned) >= LEAST_ODDS
 
     def with_prior(self, odds: float) -> Evidence:
-        """Return the evidence with log odds [nat] against an own gain that were there before the levels."""
+        """Return the evidence with prior log odds against an unknown gain [nat]."""
         return Evidence(over_own=self.over_own + odds, over_turned=self.over_turned)
 
 
@@ -1098,11 +1108,11 @@ class KnownProcess:
     Parameters
     ----------
     gain_db, sd_db : callable
-        Mean and standard deviation (n,) [dB] towards unit vectors (n, 3).
+        Mean and standard deviation towards unit vectors (n, 3), each (n,) [dB].
     directions : (m, 3)
     covariance_db2 : (m, m)
     term : Term
-        Prior of the gain: that of the UAV, or of a tower's antenna.
+        Prior of the gain of the UAV, or of the antenna of a tower.
     """
 
     gain_db: Callable[[FloatArray], FloatArray]
@@ -1114,7 +1124,7 @@ class KnownProcess:
     @cached_property
     def _factor(self) -> Factor:
         prior = term_kernel(self.term, self.directions, self.directions)
-        # the directions have a tenth of a degree: two may be the same
+        # directions are rounded to a tenth of a degree, so two may be equal
         prior[np.diag_indices(len(prior))] += 1e-3 * self.term.sd_db**2
         return Factor.of(prior)
 
@@ -1137,12 +1147,12 @@ class KnownProcess:
 
 
 class FlightEvidence:
-    """Levels of one flight, by which learned gains are judged.
+    """The levels of one flight, by which learned gains are tested.
 
     Parameters
     ----------
     series : sequence of LinkSamples
-        Of all channels.
+        Series of all channels.
     """
 
     def __init__(self, series: Sequence[LinkSamples]) -> None:
@@ -1156,8 +1166,8 @@ class FlightEvidence:
     def of_link(self, number: int, known: Moments, airframe: KnownProcess | None = None) -> Evidence:
         """Return the evidence for the learned antennas of both ends of one series, by its number.
 
-        ``known`` returns the moments of the gain of both ends without what its table of pairs leaves. With ``airframe``
-        they must also win against that airframe at a tower with a gain of its own.
+        ``known`` returns the moments of the gain of both ends, without the part that its table of pairs does not
+        explain. With ``airframe`` they must also be more likely than that airframe at a tower with an unknown gain.
         """
         rows, noise = self.rows[number], self._noise[number]
         if not len(rows):
@@ -1176,7 +1186,7 @@ class FlightEvidence:
         return _judged(own, of)
 
     def of_airframe(self, known: KnownProcess) -> Evidence:
-        """Return the evidence for a learned airframe in all series together, each tower with a gain of its own."""
+        """Return the evidence for a learned airframe in all series together, with an unknown gain of each tower."""
         rows = [some for some in self.rows if len(some)]
         if not rows:
             return Evidence(over_own=-math.inf, over_turned=-math.inf)
@@ -1192,7 +1202,7 @@ class FlightEvidence:
 
     @cached_property
     def _without_airframe(self) -> FloatArray:
-        """Covariance of all but the gain of the UAV."""
+        """Return the covariance of all parts except the gain of the UAV."""
         rows = [some for some in self.rows if len(some)]
         covariance, start = gain_covariance([MAST, PAIR], rows, rows), 0
         for some, noise in zip(self.rows, self._noise, strict=True):
@@ -1204,16 +1214,16 @@ class FlightEvidence:
 
 def _judged(own: float, of: Callable[[float], float]) -> Evidence:
     learned = of(0.0)
-    # copies cost three times as much: a gain that loses clearly is not compared with them
+    # copies cost three times as much, so a gain that is clearly worse is not compared with them
     turned = max(map(of, _TURNS_DEG)) if learned > own - _HOPELESS else math.inf
     return Evidence(over_own=learned - own, over_turned=learned - turned)
 
 
 def _noise_covariance(rows: LinkSamples) -> FloatArray:
-    """Return the covariance (n, n) of offset, nuisance and noise of one series, by the likeliest scales."""
+    """Return the covariance of offset, nuisance and noise of one series with the most likely scales, shape (n, n)."""
     if not len(rows):
         return np.zeros((0, 0))
-    # some hundred rows decide as well as all
+    # some hundred rows are sufficient to decide
     some = rows.part(np.arange(0, len(rows), max(1, len(rows) // 200)))
     gains, levels = gain_covariance(ANTENNA_TERMS, [some], [some]), _centred(some)
 
@@ -1235,5 +1245,5 @@ def _log_likelihood(covariance: FloatArray, values: FloatArray) -> float:
 
 
 def _rotated(rows: LinkSamples, turn_deg: float) -> LinkSamples:
-    """Return samples whose directions at the UAV are rotated anticlockwise."""
+    """Return samples whose directions at the UAV are rotated counter-clockwise."""
     return dataclasses.replace(rows, at_uav=rotated(rows.at_uav, turn_deg)) if turn_deg else rows

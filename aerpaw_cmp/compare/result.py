@@ -1,10 +1,10 @@
-"""The numbers of one comparison: what the comparison stage gives, and report, campaign and JSON take from.
+"""The numbers of one comparison, which reports, campaigns and JSON use.
 
-Nothing here is computed, drawn or formatted. Times are naive ``datetime64[ns]`` in UTC, a missing number is NaN, a
+This file computes, draws and formats nothing. Times are naive ``datetime64[ns]`` in UTC. A missing number is NaN, and a
 number that a flight cannot have is None.
 
-A new number of a tower and channel takes one field of :class:`RssFurther` (of the rank: :class:`RankFurther`) and one
-function beside those that fill its neighbours: metrics.json and the tables of the report list its fields by name.
+A new number of a tower and channel needs one field of :class:`RssFurther` (for the rank: :class:`RankFurther`) and one
+function that computes it. metrics.json and the tables of the report list the fields by name.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .rank import CommonestRank, RankComparison, RankRepeat
 from .receiver import ForecastScore
 from .statistics import Interval, PairedDifference
 
-# Models that a replay is held against, with their names in words; the last two know no physics.
+# Models that a replay is compared with, and their titles. The last two contain no physics.
 BASELINE_TITLE = {
     "free_space": "free space",
     "two_ray": "two-ray ground",
@@ -39,7 +39,7 @@ BASELINE_TITLE = {
     "constant": "constant level",
 }
 
-# What was done with a clock: corrected by the estimate, asked to be and not, not asked to be; corrected as stated.
+# States of a clock: corrected by the estimate, correction refused, not requested, or corrected by a stated value.
 APPLIED, NOT_APPLIED, ESTIMATED, GIVEN = (
     "estimated and applied", "asked for, not applied", "estimated, not applied", "given in flight.yaml"
 )  # fmt: skip
@@ -47,10 +47,10 @@ APPLIED, NOT_APPLIED, ESTIMATED, GIVEN = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockResult:
-    """Radio clock of a receiver (a tower) against the telemetry clock, as far as it is a number.
+    """The radio clock of a receiver (a tower) compared with the telemetry clock.
 
-    ``radio_minus_telemetry_s`` is positive where the radio's clock shows later times; subtracting it corrects them.
-    ``applied`` is one of the words above, ``checks`` what the verdict rests on, by name.
+    ``radio_minus_telemetry_s`` is positive if the radio clock shows later times; subtracting it corrects them.
+    ``applied`` is one of the states above, and ``checks`` contains the tests behind the verdict, by name.
     """
 
     receiver: str
@@ -63,12 +63,12 @@ class ClockResult:
 
     @property
     def shifted(self) -> bool:
-        """True of a clock that is wrong and was not corrected."""
+        """True if the clock is wrong and was not corrected."""
         return self.verdict == "shifted" and self.applied != APPLIED
 
     @property
     def in_words(self) -> str:
-        """Its lag with the interval, as every sentence has them."""
+        """The lag with its interval as text."""
         ends = "[{:+.2f}, {:+.2f}]".format(*map(Printed, self.ci95_s))
         side = "ahead of" if self.radio_minus_telemetry_s > 0 else "behind"
         return f"{abs(self.radio_minus_telemetry_s):.2f} s {side} the telemetry clock {ends}"
@@ -76,7 +76,7 @@ class ClockResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """An offset and what it leaves [dB]."""
+    """An offset and the RMSE with it [dB]."""
 
     offset_db: float
     rmse_db: float
@@ -94,10 +94,10 @@ class ModelLevel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SnrScore:
-    """A ratio to the noise against the replay's level over thermal noise, nothing fitted, over ``n`` samples.
+    """The error of a signal-to-noise ratio of the replay over thermal noise, without fitted values, over ``n`` samples.
 
-    ``noise_dbm`` is k T B with the noise figure; ``mean_error_db`` is measured minus predicted, and what is left of the
-    error without that mean is the comparison's RMSE.
+    ``noise_dbm`` is k T B with the noise figure. ``mean_error_db`` is measured minus predicted. The RMSE of the
+    comparison is the error without this mean.
     """
 
     noise_dbm: float
@@ -108,13 +108,13 @@ class SnrScore:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RssFurther:
-    """Numbers of a tower and channel beside offset, RMSE and correlation, as metrics.json names them.
+    """Numbers of a tower and channel other than offset, RMSE and correlation, with their names in metrics.json.
 
-    A field without a default is always written; one whose default is None only where the flight has it.
-    ``n_flagged`` is by reason; ``compared_with`` says by the name of each baseline and of each other assumption whether
-    the replay is better or worse on the same samples; ``averaged`` is by simulation and window.
-    ``n_outliers`` samples lie far outside the distribution of the channel's own levels: they count in all numbers but
-    ``rmse_without_outliers_db``. ``identifiable_db``, ``block_length`` and the other counts are those of
+    A field without a default is always written, and one whose default is None only if the flight has it. ``n_flagged``
+    is by reason. ``compared_with`` contains, by the name of each baseline and other assumption, whether the replay is
+    better or worse on the same samples. ``averaged`` is by simulation and window. ``n_outliers`` samples are far
+    outside the distribution of the levels of the channel; only ``rmse_without_outliers_db`` excludes them.
+    ``identifiable_db``, ``block_length`` and the other counts are those of
     :class:`~aerpaw_cmp.compare.level.RssComparison`.
     """
 
@@ -132,40 +132,40 @@ class RssFurther:
     compared_with: Mapping[str, PairedDifference]
     averaged: Mapping[str, Mapping[str, Fit]]
     detection: DetectionScore | None = None
-    """Of a receiver that loses its lock or ends at a floor."""
+    """Scores of the detection, for a receiver that loses its lock or ends at a floor."""
     snr: SnrScore | None = None
-    """Of a ratio to the noise whose receiver's bandwidth is given."""
+    """Error of a signal-to-noise ratio, for a receiver whose bandwidth is known."""
     rmse_bound: str | None = None
-    """Reason why the interval of the RMSE is a lower bound alone, where it is."""
+    """Reason why the interval of the RMSE is only a lower bound; None for a complete interval."""
     interval_notes: tuple[str, ...] | None = None
-    """Sentences on what limits the intervals: no correlation over place, an error that is not stationary."""
+    """Sentences about limits of the intervals: no correlation over place, an error that is not stationary."""
     simulated_sd_db: float | None = None
-    """Mean of what learned antennas state for one sample: gain, the flight's own nuisance, noise, fading."""
+    """Mean stated SD of one sample with learned antennas: gain, nuisance of the flight, noise, fading [dB]."""
     error_bars: Mapping[str, float] | None = None
-    """Its parts [dB], and the share of samples that the stated 50, 90 and 95 % intervals contain here."""
+    """Parts of that standard deviation [dB], and the shares of samples inside the stated 50, 90 and 95 % intervals."""
     elsewhere: Mapping[str, float] | None = None
-    """Of learned antennas: RMSE [dB] on flights left out, of the same with free space, and of means over 4 s."""
+    """Errors of learned antennas on held-out flights: RMSE [dB], RMSE of free space, and RMSE of means over 4 s."""
     trained_on: tuple[str, ...] | None = None
-    """SHA-256 of the logs of this series that its antennas or settings were learned from: then no error is given."""
+    """SHA-256 of the logs of this series from which its antennas or settings were learned. It then has no error."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RssResult:
-    """RSS of one tower and channel, measured against simulated.
+    """The RSS of one tower and channel, measured and simulated.
 
     Parameters
     ----------
     tower, channel, unit : str
-        ``unit`` of the measurement before the offset: ``"dBm"`` or ``"dB re full scale"``.
+        ``unit`` is that of the measurement before the offset: ``"dBm"`` or ``"dB re full scale"``.
     time : (n,) datetime64[ns]
     measured_db, simulated_dbm : (n,)
-        Before the offset; NaN without a signal, without a path, or where the pose is unknown or too low.
+        Levels before the offset; NaN without a signal or a path, or if the pose is unknown or too low.
     posed : (n,) bool
-        Samples with a known pose above the lowest height: the others belong to no comparison.
+        True for samples with a known pose above the lowest height, which are compared.
     position_m : (n, 3)
-        In the site frame; NaN where no pose is known.
+        Position in the site frame; NaN if the pose is unknown.
     line_of_sight : (n,)
-        1, 0, NaN without a pose.
+        1 with a line of sight, 0 without, NaN without a pose.
     geometry : mapping of str to (n,)
         Distance [m] and angles [deg] of the link, by name with unit.
     score : RssComparison
@@ -173,7 +173,7 @@ class RssResult:
     baselines : mapping of str to ModelLevel
         Free space, two-ray and lines.
     spans : tuple of ErrorSpan
-        Stretches with the largest errors.
+        Segments with the largest errors.
     further : RssFurther
     """
 
@@ -192,9 +192,9 @@ class RssResult:
     spans: tuple[ErrorSpan, ...]
     further: RssFurther
     stated: StatedSpread | None = None
-    """Error bars of the simulated level that learned antennas state."""
+    """Stated standard deviations of the simulated level with learned antennas."""
     tower_m: FloatArray | None = None
-    """Place (n, 3) of a tower that moves, NaN where it is not known [m]; None of one that stands."""
+    """Position of a tower that moves, shape (n, 3) [m], NaN if unknown; None for a fixed tower."""
 
     @property
     def name(self) -> str:
@@ -203,12 +203,12 @@ class RssResult:
 
     @property
     def training(self) -> bool:
-        """True if the antennas were learned from the very logs of this series: no error is given then."""
+        """True if the antennas were learned from the logs of this series, which then has no error."""
         return bool(self.further.trained_on)
 
     @property
     def clock_verdict(self) -> str:
-        """Verdict on the radio clock; empty where none was estimated."""
+        """Verdict about the radio clock; empty if none was estimated."""
         return "" if self.further.clock is None else self.further.clock.verdict
 
     @property
@@ -218,7 +218,7 @@ class RssResult:
 
     @property
     def simulated_out_of_coverage(self) -> BoolArray:
-        """Posed samples (n,) without a path: ``Z`` in the plots."""
+        """Posed samples (n,) without a path."""
         return self.posed & ~np.isfinite(self.simulated_dbm)
 
     @property
@@ -228,16 +228,16 @@ class RssResult:
 
     @property
     def residual_db(self) -> FloatArray:
-        """Calibrated measurement minus simulation (n,); NaN where a side is missing, or was learned on this flight."""
+        """Measurement plus offset minus simulation (n,); NaN if a side is missing or was learned on this flight."""
         if LEARNED_HERE in self.score.fitted_on_scored:
-            # nothing that was learned here is scored here
+            # a series is not scored on its own training data
             return np.full(len(self.time), np.nan)
         return self.calibrated_db - self.simulated_dbm
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairResult:
-    """Two channels of one tower at their common instants ``time`` (n,)."""
+    """Two channels of one tower at their common times ``time`` (n,)."""
 
     tower: str
     first: str
@@ -248,10 +248,10 @@ class PairResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankFurther:
-    """Numbers of a tower's rank beside those of :class:`~aerpaw_cmp.compare.rank.RankComparison`.
+    """Numbers of the rank of a tower other than those of :class:`~aerpaw_cmp.compare.rank.RankComparison`.
 
-    ``n_flagged`` is by reason, ``foliage`` by run and K. ``commonest`` is the forecast that needs no model; ``repeat``
-    is how well the modem agrees with itself where the second half of the flight passes places of the first.
+    ``n_flagged`` is by reason, ``foliage`` by run and K. ``commonest`` is the constant forecast. ``repeat`` is the
+    agreement of the modem with itself where the second half of the flight repeats positions of the first half.
     """
 
     n_flagged: Mapping[str, int]
@@ -260,33 +260,33 @@ class RankFurther:
     repeat: Mapping[str, RankRepeat]
     receiver: ForecastScore | None = None
     trained_on: tuple[str, ...] | None = None
-    """SHA-256 of the logs of these reports that the receiver was fitted on: then it has no score."""
+    """SHA-256 of the logs on which the receiver was fitted. It then has no score."""
     agreement_sd_by_ground: Mapping[str, float] | None = None
-    """Standard deviation of the agreement, by K, over grounds within the errors of the known heights."""
+    """Standard deviation of the agreement by K, over grounds within the errors of the known heights."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankResult:
-    """Rank of one tower: what the modem reported against what each K says, over the samples that are compared.
+    """The rank of one tower: reported by the modem, and simulated for each K, over the compared samples.
 
     Parameters
     ----------
     tower : str
     n_samples : int
-        Of the log; those too low or without a pose are left out of what follows.
+        Samples of the log. Samples that are too low or have no pose are not part of the following arrays.
     time : (n,) datetime64[ns]
     position_m : (n, 3)
     measured : (n,)
-        NaN: no CSI.
+        Reported rank; NaN without CSI.
     sinr_db : (n,), optional
     sigma : (n, min(n_rx, n_tx))
-        Singular values of the simulated channels, falling, relative to a scale of each channel.
+        Singular values of the simulated channels in falling order, relative to a scale of each channel.
     level_dbm : (n,)
-        Simulated level, NaN without a path.
+        Simulated level; NaN without a path.
     probability : (n, 4), optional
-        Of rank 1 to 4, by the fitted receiver that ``rank.receiver`` names.
+        Probability of rank 1 to 4 by the fitted receiver of ``rank.receiver``.
     rank : mapping of float to (n,) int
-        Simulated, per K; 0: no path.
+        Simulated rank per K; 0 without a path.
     score : RankComparison
     further : RankFurther
     """
@@ -304,18 +304,18 @@ class RankResult:
     further: RankFurther
     probability: FloatArray | None = None
     tower_m: FloatArray | None = None
-    """Place (n, 3) of a tower that moves [m]; None of one that stands."""
+    """Position of a tower that moves, shape (n, 3) [m]; None for a fixed tower."""
 
     @property
     def singular_ratio_db(self) -> FloatArray:
-        """Second to last singular value over the first (n, m - 1) [dB]: why a rank is what it is."""
-        with np.errstate(invalid="ignore"):  # no channel: 0 / 0
+        """Second to last singular value divided by the first, shape (n, m - 1) [dB], which explains a rank."""
+        with np.errstate(invalid="ignore"):  # 0 / 0 without a channel
             return db_from_amplitude(self.sigma[:, 1:] / self.sigma[:, :1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditResult:
-    """The engine checked against another one on a spread of links of all series."""
+    """The check of the engine against another one on a spread of links of all series."""
 
     reference: str
     links: int
@@ -327,16 +327,16 @@ class AuditResult:
     reference_seconds: float = float("nan")
     note: str = ""
     fields: FieldAudit | None = None
-    """Fields, paths and attitude against Sionna's own coefficients and a second implementation."""
+    """Check of fields, paths and attitude against the coefficients of Sionna RT and a second implementation."""
     read_from_cache_of: str = ""
-    """Day on which this machine made it, where its inputs are those of that day."""
+    """Day on which this machine computed the audit, if it comes from the cache."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineResult:
-    """Engine that replayed the flight, its price, the things that it left out, and its audit.
+    """The engine that replayed the flight, its time, its omissions, and its audit.
 
-    ``not_audited`` is the reason why Sionna RT could not audit it, empty where it did or was not asked to.
+    ``not_audited`` is the reason why Sionna RT could not audit it, and empty otherwise.
     """
 
     engine: str
@@ -351,10 +351,10 @@ class EngineResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightVerdict:
-    """Ray tracing against the best baseline ``against``, over all channels of a flight at once.
+    """The comparison of ray tracing with the best baseline ``against``, over all channels of a flight.
 
-    ``difference_db`` is its RMSE minus that of the baseline, each channel after its own offset: negative where ray
-    tracing is better. Levels of a receiver that lost its lock count with its floor.
+    ``difference_db`` is the RMSE of ray tracing minus that of the baseline, each channel after its own offset, so it is
+    negative if ray tracing is better. Levels of a receiver that lost its lock count as its floor.
     """
 
     against: str

@@ -905,7 +905,9 @@ NO_SPREAD = Spread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=0.0, fading_kurt
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LostLock:
-    """The error of a prediction for a receiver that may lose its lock, normal about one level in lock and another without.
+    """The error of a prediction for a receiver that may lose its lock.
+
+    It is normal about one level in lock, and about another level without lock.
 
     Parameters
     ----------

@@ -81,7 +81,7 @@ REACHING = {
     "socket", "ssl", "http", "urllib.request", "requests", "httpx", "aiohttp", "ftplib", "smtplib", "poplib", "imaplib",
     "telnetlib", "xmlrpc", "asyncio", "socketserver", "webbrowser", "distributed", "dask", "paramiko",
 }  # fmt: skip
-MAY = {"live/web.py": {"socket", "http"}, "jobs/tasks.py": {"distributed"}}
+MAY = {"live/web.py": {"socket", "http"}, "jobs/workers.py": {"distributed"}}
 
 
 def test_nothing_opens_a_socket_to_another_machine_but_dask() -> None:

@@ -61,7 +61,8 @@ from ..report.campaign import (
 )
 from .flight_run import run_flight
 from .options import DEFAULT, RunOptions
-from .tasks import Lost, OutcomeStore, Workers, open_workers, stamp, task_inputs, task_key
+from .tasks import OutcomeStore, stamp, task_inputs, task_key
+from .workers import Lost, Workers, open_workers
 
 
 @dataclass(frozen=True, slots=True)

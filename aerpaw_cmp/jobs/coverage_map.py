@@ -64,7 +64,8 @@ from ..report.prediction import outside_share
 from ..site.site import Site
 from ..site.siteyaml import inputs_of_site, load_site, site_model
 from .predict import CorrectedMaps
-from .tasks import InProcess, Lost, Workers, code_digest
+from .tasks import code_digest
+from .workers import InProcess, Lost, Workers
 
 # Modes of the trees, from no loss to total loss; the paper's is the last.
 FOLIAGE = ("none", "attenuating", "opaque")

@@ -459,7 +459,7 @@ def run_map(
     from . import coverage_map as mapping
     from .paper_table import paper_markdown, paper_rows
     from .sources import files_of, named_flights
-    from .tasks import open_workers
+    from .workers import open_workers
 
     # before the site: a misspelt flight is told without reading a map
     known = named_flights(flights)

@@ -9,18 +9,16 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import dask
 import distributed
 from distributed.security import Security
-from worker_tasks import collected, dies  # beside this script
+from worker_tasks import message, scenarios  # in the same folder
 
-from aerpaw_cmp.common.errors import AerpawCmpError
-from aerpaw_cmp.jobs import tasks
-from aerpaw_cmp.jobs.tasks import check_workers, open_workers
+from aerpaw_cmp.jobs import workers
+from aerpaw_cmp.jobs.workers import check_workers, open_workers
 
 SECURITY = Security.temporary()
 # as a user's configuration names them, there by files
@@ -37,21 +35,9 @@ dask.config.set(
 )
 
 
-def square(number: int) -> int:
-    return number * number
-
-
 def slow(number: int) -> int:
     time.sleep(0.05)
     return number * number
-
-
-def message(action: Callable[[], Any]) -> str:
-    try:
-        action()
-    except AerpawCmpError as error:
-        return f"{type(error).__name__}: {error}"
-    return "no error"
 
 
 def on_a_cluster(folder: Path) -> dict[str, Any]:
@@ -62,17 +48,15 @@ def on_a_cluster(folder: Path) -> dict[str, Any]:
     plain = f"tcp://127.0.0.1:{_port()}"
     with cluster, open_workers(1, cluster.scheduler_address, progress=lambda text, *_: messages.append(text)) as crew:
         out = {
-            "count": crew.count,
-            "squares": collected(crew, square, list(range(25))),
             "told": messages,
             "good": message(lambda: check_workers(crew._client, [folder])),
             "unseen": message(lambda: check_workers(crew._client, [folder / "nowhere"])),
             "plain": message(lambda: open_workers(1, plain).__enter__()),
         }
-        real, tasks.code_digest = tasks.code_digest, lambda: "another"
+        real, workers.code_digest = workers.code_digest, lambda: "another"
         out["other"] = message(lambda: check_workers(crew._client, []))
-        tasks.code_digest = real
-        out["killed"] = collected(crew, dies, [(i, str(folder)) for i in range(8)])
+        workers.code_digest = real
+        out |= scenarios(crew, folder)
         # Dask cannot close a cluster while it starts a worker anew ("can only join a started process")
         crew._client.wait_for_workers(2, timeout=60)
     return out
@@ -111,7 +95,7 @@ def gone() -> str:
 
 
 def none_there() -> str:
-    tasks.CONNECT_S = 0.5
+    workers.CONNECT_S = 0.5
 
     def open_one() -> None:
         with open_workers(1, f"tls://127.0.0.1:{_port()}"):

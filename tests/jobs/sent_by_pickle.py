@@ -3,7 +3,7 @@
 import pickle
 from typing import Any
 
-from aerpaw_cmp.jobs.tasks import InProcess
+from aerpaw_cmp.jobs.workers import InProcess
 
 
 class SentByPickle(InProcess):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.flight.gains import path_loss, roughness_loss
+from aerpaw_cmp.flight.gains import path_loss, path_losses
 from aerpaw_cmp.flight.replay import replay_poses
 from aerpaw_cmp.flight.settings import RtSettings, load_flight
 from aerpaw_cmp.jobs.calibrate import GroundFit
@@ -44,7 +44,7 @@ def test_roofs_and_walls_stay_smooth_and_the_second_implementation_agrees():
     settings = rt(ground_roughness_m=0.05, max_depth=2)
     few = Poses(POSES.position_m[::2], POSES.rotation[::2])  # buildings beside LW1 hide many ground reflections
     replayed = replay_poses(SITE, settings, LINK, few)
-    rough = roughness_loss(SITE, settings, LINK.carrier_hz)
+    rough = path_losses(SITE, settings, LINK.carrier_hz)["rough ground"]
     assert rough is not None
     loss = rough(replayed.paths, LW1[None], few.position_m)
     ground = (replayed.faces.solid[replayed.paths.faces] < 0) & (replayed.paths.faces >= 0)

@@ -16,7 +16,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.jobs import coverage_map
-from aerpaw_cmp.jobs.tasks import InProcess, Lost
+from aerpaw_cmp.jobs.workers import InProcess, Lost
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.store import PLANES
 from aerpaw_cmp.site.siteyaml import load_site

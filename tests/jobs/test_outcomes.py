@@ -19,7 +19,8 @@ from aerpaw_cmp.common.stages import logged
 from aerpaw_cmp.flight.settings import FlightFile, load_flight, overridden
 from aerpaw_cmp.jobs import campaign, sample
 from aerpaw_cmp.jobs.campaign import Order, Outcome, Task, carry_out, compute, digest_of, kept_outcomes, planned_tasks
-from aerpaw_cmp.jobs.tasks import InProcess, Lost, OutcomeStore, Workers, task_inputs, task_key
+from aerpaw_cmp.jobs.tasks import OutcomeStore, task_inputs, task_key
+from aerpaw_cmp.jobs.workers import InProcess, Lost, Workers
 from aerpaw_cmp.report.campaign import Failure
 from tests.jobs.campaign_rows import rss_row
 
@@ -246,7 +247,7 @@ import os, signal, sys
 from pathlib import Path
 from aerpaw_cmp.jobs import campaign as campaign_tasks
 from aerpaw_cmp.jobs.campaign import compute, kept_outcomes
-from aerpaw_cmp.jobs.tasks import InProcess
+from aerpaw_cmp.jobs.workers import InProcess
 from tests.jobs.campaign_rows import rss_row
 
 def compute_but_f2(task):

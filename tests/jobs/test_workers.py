@@ -1,4 +1,4 @@
-"""Workers of every kind give one result; what they lose, see or run differently is told."""
+"""One suite for every kind of workers, and what is particular to processes and to Dask."""
 
 import json
 import multiprocessing
@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.jobs import tasks
-from aerpaw_cmp.jobs.tasks import open_workers
-from tests.jobs.worker_tasks import collected, dies, listening
+from aerpaw_cmp.jobs import workers
+from aerpaw_cmp.jobs.workers import open_workers
+from tests.jobs.worker_tasks import listening, scenarios
 
 
 @pytest.fixture(scope="module")
@@ -33,19 +33,34 @@ def seen() -> dict[str, Any]:
     return scenarios
 
 
-def test_workers_of_a_cluster_give_what_one_process_gives(seen: dict[str, Any]) -> None:
-    cluster = seen["cluster"]
-    assert cluster["count"] == 2
-    assert cluster["squares"] == [i * i for i in range(25)]
+@pytest.fixture(scope="module", params=["in process", "processes", "Dask"])
+def kind(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Outcomes of the suite for one kind of workers."""
+    if request.param == "Dask":
+        cluster: dict[str, Any] = request.getfixturevalue("seen")["cluster"]
+        return cluster
+    with open_workers(1 if request.param == "in process" else 2) as crew:
+        return scenarios(crew, tmp_path_factory.mktemp("killed"))
 
 
-def test_a_killed_worker_costs_its_task_one_more_try(seen: dict[str, Any], tmp_path: Path) -> None:
-    """The task that kills every time is lost alone; its neighbours, and the one that killed once, are there."""
-    crew = tasks.Processes(2)
-    here = collected(crew, dies, [(i, str(tmp_path)) for i in range(8)])
-    for killed in (seen["cluster"]["killed"], here):
-        assert "worker process ended" in killed[5]
-        assert killed[:5] + killed[6:] == [i * i for i in range(8) if i != 5]
+def test_every_item_has_its_result_once(kind: dict[str, Any]) -> None:
+    assert kind["count"] == (2 if "killed" in kind else 1)
+    assert kind["squares"] == [i * i for i in range(25)]
+    assert kind["no items"] == []
+
+
+def test_the_message_of_a_task_reaches_the_caller_and_the_workers_go_on(kind: dict[str, Any]) -> None:
+    assert kind["message"] == "InputError: numbers.txt, line 3: found 3; expected another number"
+    assert kind["after a message"] == [4, 9]
+
+
+def test_a_killed_worker_costs_its_task_one_more_try(kind: dict[str, Any]) -> None:
+    """Only the task that ends its worker every time is lost. A result that cannot be sent back is lost, too."""
+    if "killed" not in kind:
+        pytest.skip("a task cannot end the process of the caller")
+    assert "worker process ended" in kind["killed"][5]
+    assert kind["killed"][:5] + kind["killed"][6:] == [i * i for i in range(8) if i != 5]
+    assert "pickle" in kind["not picklable"][0]
 
 
 def test_an_interrupt_ends_no_process_of_the_caller() -> None:
@@ -53,7 +68,7 @@ def test_an_interrupt_ends_no_process_of_the_caller() -> None:
     own.start()
     try:
         with pytest.raises(KeyboardInterrupt):
-            tasks.Processes(2).run(time.sleep, [0.0, 60.0], interrupted)
+            workers.Processes(2).run(time.sleep, [0.0, 60.0], interrupted)
         assert own.is_alive()
         assert multiprocessing.active_children() == [own]
     finally:
@@ -71,7 +86,7 @@ def test_workers_run_no_module_that_lies_in_the_working_folder(tmp_path: Path) -
     for name in ("multiprocessing", "pickle", "numpy", "signal"):
         (logs / f"{name}.py").write_text(f"open('ran_{name}', 'w').close()")
     script.write_text(
-        "import os\nfrom aerpaw_cmp.jobs.tasks import Processes\n"
+        "import os\nfrom aerpaw_cmp.jobs.workers import Processes\n"
         "if __name__ == '__main__':\n"
         "    Processes(2).run(os.path.abspath, ['a', 'b'], lambda number, place: print(number, place))\n"
     )
@@ -112,7 +127,7 @@ def test_workers_end_with_their_parent_and_leave_nothing(tmp_path: Path) -> None
     """SIGKILL in the middle of a task: no process and no temporary folder stays."""
     script = (
         "import sys, time; sys.path[:0] = sys.argv[2:]\n"
-        "from aerpaw_cmp.jobs.tasks import open_workers\n"
+        "from aerpaw_cmp.jobs.workers import open_workers\n"
         "from tests.jobs.worker_tasks import sleeps\n"
         "if __name__ == '__main__':\n"
         "    with open_workers(2) as crew: crew.run(sleeps, [sys.argv[1]] * 2, print)\n"
@@ -173,10 +188,10 @@ class Later:
 
 def test_a_scheduler_without_workers_is_spoken_of(monkeypatch: pytest.MonkeyPatch) -> None:
     """A season waited for half an hour without a word for workers that had given up while the machine was busy."""
-    monkeypatch.setattr(tasks, "NO_WORKER_S", 0.1)
-    monkeypatch.setattr(tasks, "COUNT_EVERY_S", 0.05)
+    monkeypatch.setattr(workers, "NO_WORKER_S", 0.1)
+    monkeypatch.setattr(workers, "COUNT_EVERY_S", 0.05)
     messages: list[str] = []
-    crew = tasks.Cluster(NoWorkers(messages), lambda text, _share=None: messages.append(text))
+    crew = workers.Cluster(NoWorkers(messages), lambda text, _share=None: messages.append(text))
     results: dict[int, Any] = {}
     crew.run(abs, [-2, 3], results.__setitem__)
     assert results == {0: 2, 1: 3}
@@ -194,4 +209,4 @@ def test_a_scheduler_that_goes_away_as_it_is_asked_is_one_message() -> None:
             raise OSError("Stream is closed")
 
     with pytest.raises(InputError, match="went away"):
-        _ = tasks.Cluster(Gone()).count
+        _ = workers.Cluster(Gone()).count

@@ -1,13 +1,54 @@
-"""Tasks for workers of every kind, and what a crew makes of them."""
+"""Tasks for workers of every kind, and one suite of scenarios that each kind runs."""
 
 import contextlib
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from aerpaw_cmp.jobs.tasks import Lost
+from aerpaw_cmp.common.errors import AerpawCmpError, InputError
+from aerpaw_cmp.jobs.workers import InProcess, Lost
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def refuses(number: int) -> int:
+    """Task that ends with a message of the package for item 3."""
+    if number == 3:
+        raise InputError("found 3", expected="another number", path="numbers.txt", line=3)
+    return number
+
+
+def generator(number: int) -> Any:
+    """Task whose result cannot be sent back."""
+    return (i for i in range(number))
+
+
+def message(action: Callable[[], Any]) -> str:
+    try:
+        action()
+    except AerpawCmpError as error:
+        return f"{type(error).__name__}: {error}"
+    return "no error"
+
+
+def scenarios(crew: Any, folder: Path) -> dict[str, Any]:
+    """The suite: what any kind of workers returns for the same tasks. The caller's process cannot be killed."""
+    outcomes = {
+        "count": crew.count,
+        "squares": collected(crew, square, list(range(25))),
+        "no items": collected(crew, square, []),
+        "message": message(lambda: collected(crew, refuses, list(range(6)))),
+        "after a message": collected(crew, square, [2, 3]),
+    }
+    if not isinstance(crew, InProcess):
+        outcomes["killed"] = collected(crew, dies, [(i, str(folder)) for i in range(8)])
+        outcomes["not picklable"] = collected(crew, generator, [1])
+    return outcomes
 
 
 def dies(item: tuple[int, str]) -> int:

@@ -2,6 +2,7 @@
 
 import ast
 import email
+import importlib
 import itertools
 import re
 import runpy
@@ -9,6 +10,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import types
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +18,7 @@ import pytest
 import yaml
 
 import aerpaw_cmp
+from aerpaw_cmp import propagation
 from aerpaw_cmp.common.text import COMMANDS
 from tests.test_words import FILES, faults, parsed, texts_of
 
@@ -322,3 +325,16 @@ def test_the_tree_of_the_architecture_page_is_the_one_on_disk() -> None:
     assert {file.stem for file in files} - {"__init__"} <= shown
     folders = {file.parent.name for file in files}
     assert shown <= {file.stem for file in files} | folders | {"parsers"}
+
+
+def test_the_table_of_formulas_names_code_that_exists() -> None:
+    named = re.findall(r"``([\w.]+)``", (propagation.__doc__ or "").partition("=====")[2].rpartition("=====")[0])
+    assert len(named) > 12
+    for name in named:
+        place: object = propagation
+        # half_space and slab are in the module of the name before them
+        for part in (f"field.fresnel.{name}" if name in ("half_space", "slab") else name).split("."):
+            if isinstance(place, types.ModuleType) and hasattr(place, "__path__"):
+                importlib.import_module(f"{place.__name__}.{part}")
+            assert hasattr(place, part), name
+            place = getattr(place, part)

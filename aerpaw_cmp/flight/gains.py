@@ -14,7 +14,7 @@ Notes that must be given on foliage models: how far they are stretched or assume
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -142,78 +142,61 @@ def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | floa
     return 0.0 if gain is None else gain.pair_db
 
 
-def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
-    """Loss per path besides the field's own: foliage and reflections, a function of paths and their ends.
+# --- losses of a path ------------------------------------------------------------------------------------------------
 
-    Parameters
-    ----------
-    site : Site
-        Its trees and stands, and how high its ground lies.
-    rt : RtSettings
-        ``foliage``, ``foliage_model``, ``gamma_db_per_m``, ``maximum_loss_db``, ``leaves``, ``reflection_loss_db``,
-        ``ground_roughness_m``.
-    carrier_hz : float
 
-    Returns
-    -------
-    callable or None
-        ``loss(paths, sources_m (towers, 3), targets_m (poses, 3)) -> (paths,)`` [dB], infinite where nothing gets
-        through; None where no path loses anything.
-
-    Raises
-    ------
-    UsageError
-        ``rt.ground_roughness_m`` with a scene of triangles.
-    """
-    through = _foliage_loss(site, rt, carrier_hz)
-    per_reflection, rough = rt.reflection_loss_db, roughness_loss(site, rt, carrier_hz)
-    if per_reflection == 0.0 and rough is None:
-        return through
+def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
+    """Return the loss in crowns and in woods as media. None if the site has no trees or ``rt.foliage`` is none."""
+    if not site.wooded or rt.foliage == "none":
+        return None
+    site = site.under(rt.foliage)
+    model, evergreen = (
+        foliage_model(
+            rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
+            carrier_hz,
+            in_leaf=in_leaf,
+            gamma_db_per_m=rt.advanced.gamma_db_per_m,
+            maximum_db=rt.advanced.maximum_loss_db,
+        )
+        for in_leaf in (rt.leaves == "in", True)
+    )
+    index, wavelength = crown_index(site.trees), wavelength_m(carrier_hz)
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
-        trees_db = 0.0 if through is None else through(paths, sources_m, targets_m)
-        ground_db = 0.0 if rough is None else rough(paths, sources_m, targets_m)
-        return np.asarray(trees_db + ground_db + per_reflection * paths.depth, dtype=np.float64)
+        source, target = sources_m[paths.tower], targets_m[paths.pose]
+        # a path passes single trees and woods one after the other, so their losses add
+        trees_db = foliage_loss_db(source, paths.vertices_m, target, index, model)
+        return trees_db + stand_loss_db(site, source, paths.vertices_m, target, model, wavelength, evergreen)
 
     return loss
 
 
-# Lines of sight are the same at any carrier.
-_ANY_HZ = 3.4e9
+def _reflection_loss(_site: Site, rt: RtSettings, _carrier_hz: float) -> Loss | None:
+    """Return ``rt.reflection_loss_db`` per reflection. None if it is 0."""
+    if rt.reflection_loss_db == 0.0:
+        return None
+    return lambda paths, _sources_m, _targets_m: np.asarray(rt.reflection_loss_db * paths.depth, dtype=np.float64)
 
-# A reflection this near to a ground plane of the site is one off the ground.
+
+# A reflection this close to a ground plane of the site is a ground reflection.
 _ON_GROUND_M = 1e-6
 
 
-# The same over an elevation model, whose specular points are found by iteration.
+# The same for an elevation model, whose specular points are found by iteration.
 _NEAR_TERRAIN_M = 0.01
 
 
-def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
-    """Loss [dB] of ground reflections by ``rt.ground_roughness_m``; None where the ground is smooth.
+def _roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
+    """Return the loss of ground reflections by ``rt.ground_roughness_m``. None for smooth ground.
 
-    Parameters
-    ----------
-    site : Site
-        Its ground: planes of the origin and of its towers, and its elevation model.
-    rt : RtSettings
-    carrier_hz : float
-
-    Returns
-    -------
-    callable or None
-        As :func:`path_loss` gives it.
+    Each ground reflection is multiplied by ``exp(-2 (k sigma sin(grazing))^2)``, with the grazing angle of the array
+    centres. It is :func:`aerpaw_cmp.propagation.field.baselines.specular_factor` as a loss, which does not underflow.
+    Scattered power is not followed.
 
     Raises
     ------
     UsageError
-        A site that is a scene of triangles.
-
-    Notes
-    -----
-    Each reflection off the ground falls by ``exp(-2 (k sigma sin(grazing))^2)``, the grazing angle that of the array
-    centres (:func:`aerpaw_cmp.propagation.field.baselines.specular_factor`, here as a loss, which does not underflow);
-    what leaves the specular direction is not followed.
+        If the site is a scene of triangles.
     """
     sigma = rt.ground_roughness_m
     if sigma == 0.0:
@@ -224,7 +207,7 @@ def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None
             expected="a site with a ground plane, or reflection_loss_db",
             cause="no face of the scene is known to be its ground",
         )
-    # the planes of tower_ground: offsets stand beside the origin's
+    # tower_ground: offsets adds planes to that of the origin
     heights = np.array(sorted({0.0, *(tower.ground_m for tower in site.towers.values())}))
     wavelength = wavelength_m(carrier_hz)
 
@@ -244,29 +227,100 @@ def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None
     return loss
 
 
-def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
-    if not site.wooded or rt.foliage == "none":
-        return None
-    site = site.under(rt.foliage)
-    model, evergreen = (
-        foliage_model(
-            rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
-            carrier_hz,
-            in_leaf=in_leaf,
-            gamma_db_per_m=rt.advanced.gamma_db_per_m,
-            maximum_db=rt.advanced.maximum_loss_db,
-        )
-        for in_leaf in (rt.leaves == "in", True)
-    )
-    index, wavelength = crown_index(site.trees), wavelength_m(carrier_hz)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathLoss:
+    """A loss of a path besides its own field, declared once for replay, explain, model comparison and audit.
+
+    Parameters
+    ----------
+    name : str
+        Name of its term in ``explain``.
+    off : mapping
+        Keys of ``rt`` that switch the loss off. A model of the comparison includes a loss only if it sets these keys.
+    of : callable
+        ``of(site, rt, carrier_hz)`` returns the loss as a function, or None if no path has this loss.
+    expected : callable
+        ``expected(rt)`` returns the values from which the audit computes the loss a second time: fields of
+        :class:`~aerpaw_cmp.propagation.check.reference.ExpectedLoss`.
+    """
+
+    name: str
+    off: Mapping[str, Any]
+    of: Callable[[Site, RtSettings, float], Loss | None]
+    expected: Callable[[RtSettings], dict[str, Any]]
+
+
+LOSSES: tuple[PathLoss, ...] = (
+    PathLoss(
+        name="foliage",
+        off={"foliage": "none"},
+        of=_foliage_loss,
+        expected=lambda rt: {
+            "model": rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
+            "gamma_db_per_m": rt.advanced.gamma_db_per_m,
+            "maximum_db": rt.advanced.maximum_loss_db,
+            "in_leaf": rt.leaves == "in",
+        },
+    ),
+    PathLoss(
+        name="rough surfaces",
+        off={"reflection_loss_db": 0.0},
+        of=_reflection_loss,
+        expected=lambda rt: {"reflection_db": rt.reflection_loss_db},
+    ),
+    PathLoss(
+        name="rough ground",
+        off={"ground_roughness_m": 0.0},
+        of=_roughness_loss,
+        expected=lambda rt: {"ground_roughness_m": rt.ground_roughness_m},
+    ),
+)
+
+
+def without_losses() -> dict[str, Any]:
+    """Return the keys of ``rt`` that switch all losses off."""
+    return {key: value for loss in LOSSES for key, value in loss.off.items()}
+
+
+def path_losses(site: Site, rt: RtSettings, carrier_hz: float) -> dict[str, Loss]:
+    """Return the losses of the paths of a flight by name: functions as those of :func:`path_loss`."""
+    every = ((declared.name, declared.of(site, rt, carrier_hz)) for declared in LOSSES)
+    return {name: loss for name, loss in every if loss is not None}
+
+
+def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
+    """Return the sum of all losses of a path besides its own field.
+
+    Parameters
+    ----------
+    site : Site
+        Its trees and forest stands, and its ground.
+    rt : RtSettings
+    carrier_hz : float
+
+    Returns
+    -------
+    callable or None
+        ``loss(paths, sources_m (towers, 3), targets_m (poses, 3)) -> (paths,)`` [dB], infinite if a path is blocked.
+        None if no path has a loss.
+
+    Raises
+    ------
+    UsageError
+        ``rt.ground_roughness_m`` with a scene of triangles.
+    """
+    losses = list(path_losses(site, rt, carrier_hz).values())
+    if len(losses) < 2:
+        return losses[0] if losses else None
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
-        source, target = sources_m[paths.tower], targets_m[paths.pose]
-        # single trees and woods as media shade one behind the other: their losses add
-        trees_db = foliage_loss_db(source, paths.vertices_m, target, index, model)
-        return trees_db + stand_loss_db(site, source, paths.vertices_m, target, model, wavelength, evergreen)
+        return np.asarray(sum(each(paths, sources_m, targets_m) for each in losses), dtype=np.float64)
 
     return loss
+
+
+# Lines of sight are the same at any carrier.
+_ANY_HZ = 3.4e9
 
 
 def sight_shares(site: Site, tower: str, poses_m: FloatArray) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from ..common.versions import library_versions, utc_now
 from ..compare.level import FieldAudit
 from ..compare.result import AuditResult, EngineResult
 from ..flight.data import FlightData
-from ..flight.gains import path_loss
+from ..flight.gains import LOSSES, path_loss
 from ..flight.replay import Replayed, attitude_rotation, part_of
 from ..flight.settings import ArraySettings, LinkSettings, RtSettings, load_pattern
 from ..logs.ingest import IngestedFile
@@ -206,14 +206,7 @@ def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected
     """For each replay what the settings say of its link and losses."""
     settings = [*(s.link for s in data.rss), *[data.settings.link.rank] * len(data.rank)]
     rt = data.settings.rt
-    loss = reference.ExpectedLoss(
-        model=rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
-        gamma_db_per_m=rt.advanced.gamma_db_per_m,
-        maximum_db=rt.advanced.maximum_loss_db,
-        in_leaf=rt.leaves == "in",
-        reflection_db=rt.reflection_loss_db,
-        ground_roughness_m=rt.ground_roughness_m,
-    )
+    loss = reference.ExpectedLoss(**{key: value for each in LOSSES for key, value in each.expected(rt).items()})
     if len(settings) != len(replays):  # part of the flight: from the links themselves
         return [Expected.of(r.link, loss) for r in replays]
     return [

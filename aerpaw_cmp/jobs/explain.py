@@ -17,7 +17,7 @@ from ..common.jsonable import fields_of, json_object
 from ..common.stages import Progress, logged
 from ..common.units import FloatArray
 from ..flight.data import FlightData, RankSeries, RssSeries, Times, load_data
-from ..flight.gains import load_with_learned, path_loss, roughness_loss
+from ..flight.gains import load_with_learned, path_losses
 from ..flight.replay import estimate_clocks, rank_poses, replay_poses, telemetry_time, valid_poses
 from ..flight.settings import RtSettings
 from ..propagation.check.explain import (
@@ -234,22 +234,12 @@ def _check_pose(valid: Any, series: RssSeries | RankSeries, at: int) -> None:
         )
 
 
-SMOOTH = {"reflection_loss_db": 0.0, "ground_roughness_m": 0.0}
-
-
 def _paths(
     site: Site, rt: RtSettings, replayed: Replay, link: Link, pose: Poses, source: FloatArray
 ) -> tuple[ExplainedPath, ...]:
-    """The paths with their terms, foliage and roughness apart."""
-    through = path_loss(site, rt.model_copy(update=SMOOTH), link.carrier_hz)
-    further = {}
-    if through is not None:
-        further["foliage"] = through(replayed.paths, source[None], pose.position_m)
-    if rt.reflection_loss_db:
-        further["rough surfaces"] = rt.reflection_loss_db * replayed.paths.depth.astype(np.float64)
-    rough = roughness_loss(site, rt, link.carrier_hz)
-    if rough is not None:
-        further["rough ground"] = rough(replayed.paths, source[None], pose.position_m)
+    """Return the paths with their terms, one term per loss."""
+    losses = path_losses(site, rt, link.carrier_hz)
+    further = {name: loss(replayed.paths, source[None], pose.position_m) for name, loss in losses.items()}
     if replayed.paths.terrain_db.any():
         further["terrain"] = replayed.paths.terrain_db
     return explain_paths(replayed.paths, replayed.faces, source, pose, link, further)

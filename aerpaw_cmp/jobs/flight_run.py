@@ -36,7 +36,7 @@ from ..compare.statistics import pooled_difference
 from ..compare.verdict import is_one_place
 from ..flight.data import FlightData, RssSeries, choose_site
 from ..flight.drafting.proposals import errors_elsewhere, offered
-from ..flight.gains import pair_db, path_loss
+from ..flight.gains import pair_db, path_loss, without_losses
 from ..flight.replay import FlightReplay, Replayed, attitude_rotation, replay_flight, try_replay
 from ..flight.settings import FlightFile, RssSettings
 from ..flight.training import learned_here
@@ -433,7 +433,7 @@ class _Climber:
             begin = time.perf_counter()
             rt, site = self._data.settings.rt, self._site(model.relief)
             paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
-            changed = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
+            changed = rt.model_copy(update=without_losses() | model.settings(rt.max_depth)["rt"])
             field, ends = Field(path_loss(site, changed, self._links[index].carrier_hz)), traced.ends
             lines = [paths, *(some.lines() for some in traced.further)]
             losses = [field.loss_db(some, ends.sources_m, ends.poses.position_m) for some in lines]

@@ -7,14 +7,15 @@ Each formula has one implementation:
 
 ======================================  ==============================================================
 Fresnel coefficients of a face          ``field.fresnel.coefficients`` (``half_space``, ``slab``)
-slant of an element                     ``field.dyads.slant_rotation``; its parts ``arrays.Array.slant_parts``
-field of an element, dyad of a bounce   ``field.dyads.field_vector``, ``field.dyads.reflected``
-diffraction at a wedge                  ``field.wedge.wedge``; paths over edges, one file: ``edges``
+slant of an element                     ``field.dyads.slant_rotation``, ``geometry.Array.slant_parts``
+field of an element, reflection         ``field.dyads.field_vector``, ``field.dyads.reflected``
+diffraction at a wedge                  ``edges.wedge``, and all paths over edges: ``edges``
 sum over paths                          ``field.sum.channel_matrices``
-mirror images                           ``search.mirror``; among thousands of faces ``search.beams``
-visibility                              ``search.occlusion.Occlusion``; of triangles ``search.beams.segment_cut``
-legs of a path                          ``paths.legs``
+mirror images                           ``search.mirror``, and among thousands of faces ``search.beams``
+visibility                              ``search.mirror.Occlusion``, for triangles ``search.beams.segment_cut``
+legs of a path                          ``geometry.legs``
 ======================================  ==============================================================
 
-``check`` holds the second ways that judge them; ``check.reference`` shares nothing with ``search`` and ``field``.
+``check`` computes the same values a second time to audit them. ``check.reference`` shares no code with ``search`` and
+``field``.
 """

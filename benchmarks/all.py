@@ -72,6 +72,7 @@ SMALLEST: dict[str, list[str]] = {
     "planted_fields": ["--sets", "1", "--targets", "200"],
     "published": ["tasks", "--data", "sample_logs"],
     "real_ground": ["--only", "aadm", "--no-fit"],
+    "predicted_triples": ["--triples", "1"],
     "predict_scale": ["--points", "500", "--flights", "2"],
     "replay": ["--quick"],
     "report": ["--quick"],

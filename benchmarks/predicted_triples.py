@@ -1,8 +1,8 @@
 """How often the 90 % band of ``predict`` covers a third flight, learned from two, on simulated and on real flights.
 
-Each triple is made by ``aerpaw-cmp simulate``: three flights on different routes at Lake Wheeler, with a common level,
-an offset between flights (standard deviation 0, 1 or 2 dB), fading, and antennas that are isotropic or tilted dipoles,
-which the flight files do not state.
+Each triple is made by ``aerpaw-cmp simulate``: three flights on different routes at Lake Wheeler, with the same offset
+(even seeds) or one that varies by 1.5 dB between flights and towers (odd seeds), fading, and antennas that are
+isotropic or tilted dipoles, which the flight files do not state.
 Two of the flights teach, the third is predicted along its plan and scored as ``report --against`` scores it. Printed
 per triple and as means: share of samples inside the 90 % band, RMSE, the standard deviation that was stated, and the
 CRPS of the levels. The goal is a mean share of 88 to 93 %. Seeds below 100 were used to choose the constants of
@@ -16,6 +16,7 @@ import argparse
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -36,6 +37,7 @@ CAMPAIGNS = {
     "AFAR": [f"calibrations/afar{name}" for name in
              ("300_loc_1", "300_loc_2", "309_loc_2", "328_loc_1", "328_loc_3", "288_loc_1")],
 }  # fmt: skip
+TOWERS = ("LW1", "LW2")
 NAMES = ("share", "RMSE", "own offset", "stated SD", "CRPS")
 
 
@@ -59,13 +61,13 @@ def route(rng: np.random.Generator, kind: str) -> list[dict[str, float]]:
 def simulated(seed: int, folder: Path) -> list[Path]:
     """Write three flights of a triple; return their flight files."""
     rng = np.random.default_rng(seed)
-    between_db, fading_db = float(rng.choice([0.0, 1.0, 2.0])), float(rng.choice([1.5, 2.5, 4.0]))
+    between_db, fading_db = 1.5 * (seed % 2), float(rng.choice([1.5, 2.5, 4.0]))
     fading_s, level_db = float(rng.choice([1.5, 5.0, 15.0])), float(rng.uniform(0.0, 15.0))
-    link = {"carrier_hz": 3.3e9, "transmit_power_dbm": 40, "uav_transmits": True}
+    link: dict[str, Any] = {"carrier_hz": 3.3e9, "transmit_power_dbm": 40, "uav_transmits": True}
     if rng.random() < 0.5:
         dipole = {"antenna": {"model": "dipole"}}
         link |= {"uav": dipole | {"roll_deg": float(rng.uniform(-20, 20))}, "tower": dict(dipole)}
-    field, tower, files = str(rng.choice(["coherent", "power"])), str(rng.choice(["LW1", "LW2"])), []
+    field, files = str(rng.choice(["coherent", "power"])), list[Path]()
     for number in range(3):
         name = f"triple{seed}_{number}"
         content = {
@@ -74,13 +76,15 @@ def simulated(seed: int, folder: Path) -> list[Path]:
                 "plan": {
                     "start": f"2025-06-0{number + 1} 10:00:00", "seed": int(seed), "speed_mps": 8.0,
                     "rss_interval_s": 0.5, "fading_db": fading_db, "fading_correlation_s": fading_s,
-                    "offsets_db": {tower: {"USRP1": level_db + between_db * float(rng.normal())}},
+                    "offsets_db": {tower: {"USRP1": level_db + between_db * float(rng.normal())} for tower in TOWERS},
                     "waypoints": route(rng, str(rng.choice(["lawnmower", "orbit", "waypoints"]))),
                 },
             },
             "site": "lake_wheeler", "timezone": "America/New_York",
-            "logs": [{"path": "UAV_vehicleOut.txt", "reader": "vehicle_out"},
-                     {"path": "power.txt", "reader": "sounder_log", "node": tower, "channel": "USRP1"}],
+            "logs": [{"path": "UAV_vehicleOut.txt", "reader": "vehicle_out"}] + [
+                {"path": f"{tower}_power.txt", "reader": "sounder_log", "node": tower, "channel": "USRP1"}
+                for tower in TOWERS
+            ],
             "link": {"rss": link}, "rt": {"engine": "image", "max_depth": 2, "foliage": "attenuating"},
             "rss": {"field": field},
         }  # fmt: skip

@@ -42,7 +42,7 @@ from .gains import (
 from .ladder import log_distance_level_db
 from .level import crps_normal, floored_fit, local_mean_db
 from .result import BASELINE_TITLE
-from .statistics import mean_interval
+from .statistics import Interval, mean_interval
 
 SECTORS = 6
 # Directions this near a left-out sector are not learned from either.
@@ -739,6 +739,8 @@ class Correction:
     rmse_db : mapping of (base, title) to float
     held_out : mapping of (base, title) to ((n,), (n,))
         Errors on what was left out, in one order for all, and the standard deviations stated for them; NaN: no error.
+    held_out_place_m : (n, 3), optional
+        Positions of the samples of ``held_out`` [m].
     held_out_parts : tuple of (str, int)
         Flight and number of samples of each tower and channel in ``held_out``, in its order.
     sd_factor : float
@@ -755,6 +757,7 @@ class Correction:
     crps_db: Mapping[tuple[str, str], float]
     rmse_db: Mapping[tuple[str, str], float]
     held_out: Mapping[tuple[str, str], _HeldOut] = field(default_factory=dict)
+    held_out_place_m: FloatArray | None = None
     held_out_parts: tuple[tuple[str, int], ...] = ()
     sd_factor: float = 1.0
     fits: dict[str, FieldFit] = field(default_factory=dict, repr=False, compare=False)
@@ -964,12 +967,13 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
                 many = len({s.flight for s in series}) > MOST_GROUPS
                 _score_fold(fold, base, models, {t: tallies[name, t] for t in titles}, keep=many)
     joined = {key: _joined(parts) for key, parts in tallies.items() if parts}
-    left_out = [s.flight for fold in folds if fold.known for s in fold.left_out if np.isfinite(s.residual_db).any()]
+    left_out = [s for fold in folds if fold.known for s in fold.left_out if np.isfinite(s.residual_db).any()]
+    place = np.concatenate([np.zeros((0, 3)), *(s.binned(BIN_S).position_m for s in left_out)])
     # scaled before they are scored: CRPS then compares errors, not how badly spreads are stated
     factors = {key: _sd_factor(*errors) for key, errors in joined.items()}
     held_out = {key: (error, factors[key] * sd) for key, (error, sd) in joined.items()}
     crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*errors)) for key, errors in held_out.items()}
-    sure = [key for key in held_out if key[1] == OFF or mean_interval(crps_difference(held_out, key))[1] < 0.0]
+    sure = [key for key in held_out if key[1] == OFF or crps_difference(held_out, key, place)[1][1] < 0.0]
     # to a thousandth of a decibel, then in the order in which they are preferred
     best = min(sure or crps, key=lambda key: (round(crps[key], 3), list(tallies).index(key)))
     flights = tuple(dict.fromkeys(s.flight for s in series))
@@ -986,15 +990,29 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
         rmse_db=dict.fromkeys(tallies, math.nan)
         | {key: math.sqrt(_mean(np.square(error))) for key, (error, _) in held_out.items()},
         held_out=held_out,
-        held_out_parts=tuple((name, len(part[0])) for name, part in zip(left_out, tallies[best], strict=True)),
+        held_out_place_m=place,
+        held_out_parts=tuple((s.flight, len(part[0])) for s, part in zip(left_out, tallies[best], strict=True)),
         sd_factor=factors.get(best, 1.0),
     )
 
 
-def crps_difference(held_out: Mapping[tuple[str, str], _HeldOut], key: tuple[str, str]) -> FloatArray:
-    """CRPS of a base with a residual field minus that of the base alone, where both have an error [dB]."""
+def crps_difference(
+    held_out: Mapping[tuple[str, str], _HeldOut], key: tuple[str, str], place_m: FloatArray | None
+) -> tuple[float, Interval]:
+    """Return the mean CRPS of a base with a residual field minus that of the base alone, and its 95 % interval [dB].
+
+    Parameters
+    ----------
+    held_out : mapping of (base, title) to ((n,), (n,))
+        Errors and their standard deviations, as :class:`Correction` has them.
+    key : (base, title)
+    place_m : (n, 3) or None
+        Positions [m]: the interval considers correlation over place, too.
+    """
     difference = crps_normal(*held_out[key]) - crps_normal(*held_out[key[0], OFF])
-    return np.asarray(difference[np.isfinite(difference)])
+    good = np.isfinite(difference)
+    place = None if place_m is None else place_m[good]
+    return float(difference[good].mean()), mean_interval(difference[good], place)
 
 
 def _sd_factor(error: FloatArray, sd: FloatArray) -> float:

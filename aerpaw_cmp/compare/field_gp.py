@@ -1,22 +1,19 @@
-"""Residual of a prediction, as a Gaussian process over place, height, direction and time of flight.
+"""The residual of a prediction as a Gaussian process over position, height, direction and time of flight.
 
-One covariance for every use (a map, a route, blocks left out, the rest of a flight)::
+One covariance serves a map, a route, held-out blocks and the rest of a flight::
 
     residual = mean + place(east, north, up, direction) + offset(flight) + drift(flight, time) + noise
 
-``mean`` is unknown. ``place`` is shared by all flights: ``sd^2 exp(-d / length) exp(-dz / height) exp(-chord^2 / 2
-turn^2)``. ``offset`` and ``drift`` (``sd^2 exp(-dt / drift_s)``) are each flight's own. The lengths are bounded by what
-the physics knows (:data:`BOUNDS`): unbounded, fading is fitted as place. Channels of a tower are kept apart.
+``mean`` is unknown. All flights share ``place``: ``sd^2 exp(-d / length) exp(-dz / height) exp(-chord^2 / 2 turn^2)``.
+Each flight has its own ``offset`` and ``drift`` (``sd^2 exp(-dt / drift_s)``). The lengths have physical bounds
+(:data:`BOUNDS`), because an unbounded fit takes fading for a field over positions. Channels are fitted separately.
 
-The standard deviation that a further flight would leave, before anyone has flown it.
+:class:`Known` computes the standard deviation after a planned flight. A Gaussian process needs no levels for that: the
+directions and positions of the route are enough. Antennas are those of :mod:`.gains`, with a field for their residual.
 
-A Gaussian process does not ask for levels to say how well it will know a place: directions and positions of a planned
-route are enough. Antennas are those of :mod:`.gains`, what they leave is the field of :mod:`.field_gp`.
-
-The rest of a flight, predicted anew as its levels come in: a trend and a Gaussian process on what it leaves.
-
-The trend is chosen by the CRPS of predictions some way ahead, and may be none at all. Means over :data:`BIN_S` are
-kept, the latest :data:`KEEP` of them, so that an update costs the same at any time of the flight.
+:class:`RouteAhead` predicts the rest of a flight each time levels arrive, by a trend and a Gaussian process of its
+residual. The trend with the lowest CRPS of earlier predictions is used, and can be zero. Only the latest :data:`KEEP`
+means over :data:`BIN_S` are used, so that an update takes the same time throughout the flight.
 """
 
 from __future__ import annotations
@@ -39,16 +36,16 @@ from .level import crps_normal
 Part = Literal["mean", "place", "offset", "drift"]
 PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
 
-# Of the unknown mean: free in effect, and still a proper covariance.
+# Standard deviation of the unknown mean: large enough not to restrict it, and still a proper covariance.
 MEAN_SD_DB = 100.0
 
-# Rows of the exact solution: one matrix of 72 MB.
+# Largest number of rows of the exact solution, whose matrix then takes 72 MB.
 _EXACT_ROWS = 3000
 
-# Rows squared times targets: beyond it (some ten seconds) only the nearest rows of a target are used.
+# Rows squared times targets above which (about ten seconds) a target is predicted from its nearest rows.
 _EXACT_WORK = 2.0e11
 
-# Rows of the approximation for a single target, and at most for targets that share them.
+# Nearest rows of a single target, and the largest number of rows that several targets share.
 _NEAREST, _MOST_NEAREST = 40, 160
 
 # Side of the cells in scaled space whose targets share their rows.
@@ -57,10 +54,10 @@ _TOGETHER = 0.25
 # Rows of one channel from which scales are learned.
 FIT_ROWS = 700
 
-# Targets at a time; bounds the memory.
+# Targets per block, which limits memory.
 AT_ONCE = 1024
 
-# Code of a flight that no row has.
+# Code of a new flight, without rows.
 NEW_FLIGHT = -1
 
 
@@ -71,13 +68,14 @@ class FieldModel:
     Parameters
     ----------
     place_sd_db, length_m, height_m, turn : float
-        Field over places: horizontal and vertical scale [m], and chord of the direction; infinite: independent of it.
+        The field over positions: its standard deviation, horizontal and vertical length [m], and chord of the
+        direction. With an infinite ``turn`` the field does not depend on direction.
     offset_sd_db : float
-        Between flights.
+        Standard deviation between flights.
     drift_sd_db, drift_s : float
-        Within a flight, over time [s].
+        Standard deviation and correlation time [s] of the drift within a flight.
     noise_sd_db : float
-        Of a row.
+        Standard deviation of the noise of a row.
     """
 
     place_sd_db: float = 2.0
@@ -90,7 +88,7 @@ class FieldModel:
     noise_sd_db: float = 1.5
 
 
-# What may be learned, and between which values.
+# Bounds of the parameters that can be fitted.
 BOUNDS: dict[str, tuple[float, float]] = {
     "place_sd_db": (0.05, 12.0),
     "length_m": (10.0, 300.0),
@@ -104,18 +102,18 @@ BOUNDS: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rows:
-    """Places and times: samples of one channel, or targets.
+    """The positions and times of the samples of one channel, or of targets.
 
     Parameters
     ----------
     position_m : (n, 3)
         East, north, up [m].
     direction : (n, 3) or (n, headings, 3)
-        Unit vector towards the tower in the body frame; of targets, at each of several headings that count alike.
+        Unit vector towards the tower in the body frame. Targets can have several headings with equal weights.
     time_s : (n,)
-        Since the start of the row's flight [s].
+        Time since the start of the row's flight [s].
     flight : (n,) int
-        Code of the flight; :data:`NEW_FLIGHT` of one that is not flown yet.
+        Code of the flight: :data:`NEW_FLIGHT` for a flight without rows.
     """
 
     position_m: FloatArray
@@ -128,23 +126,26 @@ class Rows:
 
     @classmethod
     def of(cls, samples: LinkSamples, flight: int) -> Rows:
-        """Places of the samples of one flight, as the UAV sees the tower; ``flight`` is its code."""
+        """Return the rows of the samples of one flight, whose code is ``flight``."""
         codes = np.full(len(samples), flight)
         return cls(position_m=samples.position_m, direction=samples.at_uav, time_s=samples.time_s, flight=codes)
 
     def part(self, keep: Any) -> Rows:
-        """Some of the rows; an index of two dimensions gives rows of rows."""
+        """Return some of the rows. An index with two dimensions adds a dimension to every array."""
         return Rows(**{f.name: getattr(self, f.name)[keep] for f in dataclasses.fields(self)})
 
     @classmethod
     def joined(cls, parts: Sequence[Rows]) -> Rows:
-        """All rows of several."""
+        """Return the rows of all parts, joined in order."""
         return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(cls)})
 
 
 @dataclass(frozen=True, slots=True)
 class _Apart:
-    """Distances between rows (..., n, m): horizontal, in height, in direction (squared), in time; same flight."""
+    """The distances between rows (..., n, m): horizontal, vertical, squared chord of the direction, and time.
+
+    ``same`` is 1 for rows of the same flight.
+    """
 
     across_m: FloatArray
     height_m: FloatArray
@@ -154,7 +155,7 @@ class _Apart:
 
     @classmethod
     def of(cls, rows: Rows, columns: Rows) -> _Apart:
-        """Of rows (..., n) from others (..., m)."""
+        """Return the distances of ``rows`` (..., n) from ``columns`` (..., m)."""
         a, b = (np.moveaxis(r.position_m, -1, 0) for r in (rows, columns))
         up = np.abs(a[2][..., :, None] - b[2][..., None, :])
         across = np.hypot(a[0][..., :, None] - b[0][..., None, :], a[1][..., :, None] - b[1][..., None, :])
@@ -165,7 +166,7 @@ class _Apart:
         return cls(
             across,
             up,
-            # the product of equal unit vectors may round above 1
+            # the product of equal unit vectors can round above 1
             np.maximum(2.0 - 2.0 * inner, 0.0),
             np.abs(rows.time_s[..., :, None] - columns.time_s[..., None, :]),
             (rows.flight[..., :, None] == columns.flight[..., None, :]).astype(np.float64),
@@ -173,7 +174,10 @@ class _Apart:
 
 
 def _place(model: FieldModel, apart: _Apart) -> FloatArray:
-    """Covariance (..., n, m); over several headings its mean, that of a level whose heading is not known."""
+    """Return the covariance (..., n, m) of the field over positions.
+
+    Several headings count equally: their mean is the covariance of a level whose heading is not known.
+    """
     near = np.exp(-apart.across_m / model.length_m - apart.height_m / model.height_m)
     if math.isfinite(model.turn):
         alike = np.exp(-apart.chord2 / (2.0 * model.turn**2))
@@ -186,15 +190,15 @@ def _drift(model: FieldModel, apart: _Apart) -> FloatArray:
 
 
 def covariance(model: FieldModel, rows: Rows, columns: Rows, parts: Collection[Part] = PARTS) -> FloatArray:
-    """Covariance of some parts of the residual between rows (..., n, m), without noise [dB^2].
+    """Return the covariance of some parts of the residual between rows (..., n, m), without noise [dB^2].
 
     Parameters
     ----------
     model : FieldModel
     rows, columns : Rows
-        (..., n) and (..., m).
+        Rows (..., n) and (..., m).
     parts : collection of str
-        Of :data:`PARTS`.
+        Names from :data:`PARTS`.
 
     Returns
     -------
@@ -215,7 +219,7 @@ def _covariance(model: FieldModel, apart: _Apart, parts: Collection[Part]) -> Fl
 
 
 def prior_sd_db(model: FieldModel, parts: Collection[Part]) -> float:
-    """Standard deviation of some parts where nothing is known [dB]."""
+    """Return the standard deviation of some parts before any sample is known [dB]."""
     each = {
         "mean": MEAN_SD_DB,
         "place": model.place_sd_db,
@@ -230,7 +234,7 @@ def prior_sd_db(model: FieldModel, parts: Collection[Part]) -> float:
 
 @dataclass(frozen=True)
 class FieldFit:
-    """The process conditioned on rows; ``value_db`` (n,) may be absent, where only standard deviations are wanted."""
+    """The process conditioned on rows. Standard deviations do not need ``value_db`` (n,)."""
 
     model: FieldModel
     rows: Rows
@@ -243,15 +247,16 @@ class FieldFit:
     def predict(
         self, targets: Rows, parts: Collection[Part] = PARTS, *, exact: bool | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Mean and standard deviation (m,) of some parts at targets [dB]; NaN where a target has NaN.
+        """Return the mean and standard deviation (m,) of some parts at targets [dB], NaN where a target has NaN.
 
         Parameters
         ----------
         targets : Rows
         parts : collection of str
-            Which parts of the residual: those of ``("place", "drift")`` are a flight about its own mean.
+            Parts of the residual. ``("place", "drift")`` is a flight about its own mean.
         exact : bool, optional
-            By default where the matrices fit (:data:`_EXACT_ROWS`, :data:`_EXACT_WORK`); else the nearest rows alone.
+            True uses all rows, False the nearest rows of each target. The default is the exact solution if its
+            matrices fit (:data:`_EXACT_ROWS`, :data:`_EXACT_WORK`).
 
         Returns
         -------
@@ -259,10 +264,10 @@ class FieldFit:
 
         Notes
         -----
-        Beyond the exact solution the common mean and each flight's offset come from evenly thinned rows, and each
-        target from its :data:`_NEAREST` rows in the scaled space (Vecchia's conditioning; Datta et al. 2016,
-        doi 10.1080/01621459.2015.1044091). Targets of one cell share the rows nearest to their middle, the more of
-        them the more targets there are (Guinness 2018, doi 10.1080/00401706.2018.1437476).
+        In the approximation, evenly thinned rows determine the common mean and the offset of each flight. A target is
+        predicted from its :data:`_NEAREST` rows in the scaled space (Vecchia's conditioning: Datta et al. 2016, doi
+        10.1080/01621459.2015.1044091). Targets of one cell share the rows nearest to their centre. More targets share
+        more rows (Guinness 2018, doi 10.1080/00401706.2018.1437476).
         """
         mean, sd = np.full((2, len(targets)), np.nan)
         ends = targets.direction.reshape(len(targets), -1)
@@ -275,12 +280,12 @@ class FieldFit:
         return mean, sd
 
     def fits(self, targets: int) -> bool:
-        """Check whether so many targets have the exact solution."""
+        """Check whether the exact solution is used for this number of targets."""
         return len(self.rows) <= _EXACT_ROWS and len(self.rows) ** 2 * float(targets) <= _EXACT_WORK
 
     @cached_property
     def _whitened(self) -> tuple[Factor, FloatArray]:
-        """Factor of the covariance of the rows, and their values by it."""
+        """The factor of the covariance of the rows, and the values whitened by it."""
         factor = Factor.of(_noisy(self.model, covariance(self.model, self.rows, self.rows)))
         return factor, factor.whiten(np.zeros(len(self.rows)) if self.value_db is None else self.value_db)
 
@@ -304,10 +309,10 @@ class FieldFit:
         value = np.zeros(len(self.rows)) if self.value_db is None else self.value_db - row_levels
         near: list[Part] = ["place", "drift"]
         near_parts = [part for part in near if part in parts]
-        # levels alone come from all rows; the level of another flight than the targets' own tells them nothing
+        # The mean and the offsets use all rows. The error of the level of another flight does not affect the targets.
         row_sd = row_sd * (np.isin(self.rows.flight, targets.flight) & bool(near_parts))
         prior = prior_sd_db(self.model, near_parts) ** 2 if near_parts else 0.0
-        # of several headings there is no one direction to be near to
+        # several headings have no single direction to which a row is near
         turned = math.isfinite(self.model.turn) and targets.direction.ndim == 2
         tree, places = cKDTree(self._scaled(self.rows, turned)), self._scaled(targets, turned)
         for part, shared in _cells(places, step):
@@ -315,7 +320,7 @@ class FieldFit:
             count = np.arange(1, min(round(most), len(self.rows)) + 1)
             index = tree.query(places[part].mean(axis=0) if shared else places[part], k=count)[1]
             rows, some, sd = self.rows.part(index), targets.part(part), row_sd[index]
-            # a flight's level is known to its sd only: that error is common to what its rows have left
+            # the error of a flight's level is common to the residuals of its rows
             common = sd[..., :, None] * sd[..., None, :] * (rows.flight[..., :, None] == rows.flight[..., None, :])
             matrix = _noisy(self.model, covariance(self.model, rows, rows, near) + common)
             own = level_sd[part][:, None] * sd * (some.flight[:, None] == rows.flight)
@@ -330,13 +335,13 @@ class FieldFit:
             yield part, mean, np.sqrt(np.maximum(variance, 0.0))
 
     def _scaled(self, rows: Rows, turned: bool) -> FloatArray:
-        """Coordinates in which the place part falls off evenly, with or without the direction."""
+        """Return coordinates in which the field has a length of 1, with or without the direction."""
         m = self.model
         place = rows.position_m / (m.length_m, m.length_m, m.height_m)
         return np.column_stack([place, rows.direction / m.turn]) if turned else place
 
     def _levels(self, targets: Rows, parts: Collection[Part]) -> tuple[FloatArray, FloatArray]:
-        """Mean and offsets (m,) at targets from thinned rows, with their standard deviation."""
+        """Return mean plus offset (m,) at targets from thinned rows, and its standard deviation (m,)."""
         level_parts: list[Part] = [part for part in ("mean", "offset") if part in parts]  # type: ignore[misc]
         out, sd = np.zeros((2, len(targets)))
         if not level_parts:
@@ -348,12 +353,15 @@ class FieldFit:
         return mean_of[member], sd_of[member]
 
 
-# Targets of smaller cells have their own rows: many at a time are as cheap.
+# Number of targets per cell from which they share rows. Smaller cells would not save time.
 FEWEST_TOGETHER = 8
 
 
 def _cells(places: FloatArray, step: int) -> Iterator[tuple[IntArray, bool]]:
-    """At most ``step`` targets (n, k) at a time: those of one cell, and then all others; True for those of one cell."""
+    """Yield the indices of at most ``step`` targets (n, k), and whether they share their rows.
+
+    Targets of cells with many targets come first, one cell at a time.
+    """
     cell = np.floor(places / _TOGETHER).astype(np.int64)
     _, member, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     member = member.ravel()
@@ -368,7 +376,7 @@ def _cells(places: FloatArray, step: int) -> Iterator[tuple[IntArray, bool]]:
 
 
 def _noisy(model: FieldModel, matrix: FloatArray) -> FloatArray:
-    """A covariance (..., n, n) with the noise on its diagonal, in place."""
+    """Add the noise to the diagonal of a covariance (..., n, n), in place, and return it."""
     count = matrix.shape[-1]
     matrix[..., np.arange(count), np.arange(count)] += model.noise_sd_db**2
     return matrix
@@ -380,16 +388,17 @@ def _noisy(model: FieldModel, matrix: FloatArray) -> FloatArray:
 def fit_field(
     channels: Sequence[tuple[Rows, FloatArray]], start: FieldModel | None = None, learn: Collection[str] = tuple(BOUNDS)
 ) -> FieldModel:
-    """Strengths and scales by the marginal likelihood of the residuals of one or more channels.
+    """Fit strengths and scales to the residuals of one or more channels by marginal likelihood.
 
     Parameters
     ----------
     channels : sequence of (Rows, (n,))
-        Rows and residuals [dB] of each channel; they share the model, not the field.
+        Rows and residuals [dB] of each channel. They share the model, not the field.
     start : FieldModel, optional
-        Where the search starts, and what is not learned: the offset between flights is :func:`_offset_sd_of` them.
+        Start of the search, and the values that are not fitted. The offset between flights is estimated by
+        :func:`_offset_sd_of`.
     learn : collection of str
-        Names of :data:`BOUNDS`.
+        Names from :data:`BOUNDS` that are fitted.
 
     Returns
     -------
@@ -398,7 +407,7 @@ def fit_field(
     Raises
     ------
     InputError
-        No channel has three rows.
+        If no channel has three rows.
     """
     from scipy.optimize import minimize
 
@@ -418,7 +427,7 @@ def fit_field(
             total, slope = total - value_nat, slope - gradient
         return total, slope
 
-    # by their logarithms: strengths and lengths are positive, and count by their ratios
+    # search over logarithms: strengths and lengths are positive, and their ratios matter
     limits = [(math.log(BOUNDS[name][0]), math.log(BOUNDS[name][1])) for name in names]
     first = np.clip([math.log(getattr(start, name)) for name in names], *np.array(limits).T)
     best = minimize(misfit, first, jac=True, bounds=limits, method="L-BFGS-B", options={"maxiter": 40})
@@ -431,10 +440,10 @@ def _with(model: FieldModel, names: Sequence[str], logs: FloatArray) -> FieldMod
 
 
 def _evenly(rows: Rows, value: FloatArray) -> tuple[Rows, FloatArray]:
-    """Whole stretches of at most :data:`FIT_ROWS` rows: thinning would hide short scales."""
+    """Return uninterrupted segments with at most :data:`FIT_ROWS` rows: thinning would hide short scales."""
     if len(rows) <= FIT_ROWS:
         return rows, value
-    # seven stretches over the flight: near and far, climbing and landing
+    # seven segments over the flight cover near and far, climb and landing
     stretch = FIT_ROWS // 7
     starts = np.linspace(0, len(rows) - stretch, 7).astype(int)
     keep = np.unique(np.concatenate([np.arange(s, s + stretch) for s in starts]))
@@ -442,11 +451,11 @@ def _evenly(rows: Rows, value: FloatArray) -> tuple[Rows, FloatArray]:
 
 
 def _offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], otherwise_db: float) -> float:
-    """Standard deviation of the means of flights of one channel [dB], shrunk towards a prior guess.
+    """Return the standard deviation between the means of flights [dB], shrunk towards a prior guess.
 
-    Two flights say little: the guess counts as two more (the mean of an inverse-gamma posterior).
+    The guess counts as two observations, because two flights hardly determine a standard deviation (the mean of an
+    inverse-gamma posterior).
     """
-    # the guess as two observations
     squares, count = 2.0 * otherwise_db**2, 2.0
     for rows, value in channels:
         means = np.array([value[rows.flight == code].mean() for code in np.unique(rows.flight)])
@@ -455,7 +464,7 @@ def _offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], otherwise_db: flo
 
 
 def _likelihood(model: FieldModel, apart: _Apart, value: FloatArray, names: Sequence[str]) -> tuple[float, FloatArray]:
-    """Log marginal likelihood but for a constant, and its slope along the logarithm of each named parameter."""
+    """Return the log marginal likelihood up to a constant, and its slope by the logarithm of each named parameter."""
     place, drift = _place(model, apart), _drift(model, apart)
     factor = Factor.of(_noisy(model, MEAN_SD_DB**2 + place + model.offset_sd_db**2 * apart.same + drift))
     inverse = factor.inverse()
@@ -478,22 +487,22 @@ def _likelihood(model: FieldModel, apart: _Apart, value: FloatArray, names: Sequ
     return factor.log_likelihood(value), np.array(slope)
 
 
-# Name of the flight to come.
+# Name of the planned flight.
 _PLANNED = "planned"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Known:
-    """All that decides how well targets are known.
+    """The flights and models that determine how well targets are known.
 
     Parameters
     ----------
     series : sequence of LinkSamples
-        Of the flights that were flown; none: antennas are as the prior has them.
+        Samples of the flown flights. If there are none, the antennas have their prior.
     model : GainModel
-        Terms and strengths of the antennas, own nuisance, noise.
+        Terms and strengths of the antennas, error of a flight and channel, noise.
     field : FieldModel, optional
-        Of what the antennas leave; None: nothing is added.
+        Model of the residual of the antennas. None adds no field.
     """
 
     series: Sequence[LinkSamples]
@@ -501,21 +510,22 @@ class Known:
     field: FieldModel | None = None
 
     def sd_db(self, route: Sequence[LinkSamples], targets: Mapping[str, LinkSamples]) -> dict[str, FloatArray]:
-        """Standard deviation (targets,) of the level per antenna, about its mean over the targets [dB].
+        """Return the standard deviation (targets,) of the level at each antenna, about its mean over the targets [dB].
 
         Parameters
         ----------
         route : sequence of LinkSamples
-            The planned flight at each antenna; levels are not used. None: as it stands.
+            Samples of the planned flight at each antenna. Their levels are not used. An empty sequence plans no flight.
         targets : mapping of str to LinkSamples
-            By antenna.
+            Targets by antenna.
 
         Returns
         -------
         dict of str to (targets,)
-            Of antennas and field, without nuisance and noise of a later flight, which no route lowers.
+            Standard deviation of antennas and field. The error and noise of a later flight are not included, because
+            no route reduces them.
         """
-        # any levels: how well places will be known does not depend on them
+        # any levels serve: the standard deviation does not depend on them
         planned = [dataclasses.replace(s, flight=_PLANNED, residual_db=np.zeros(len(s))) for s in route]
         rows = [*self.series, *planned]
         fit = fit_gain(rows, self.model) if rows else None
@@ -540,17 +550,17 @@ class Known:
 
 
 def rms_db(sd_db: Mapping[str, FloatArray]) -> float:
-    """Root mean square over all targets and antennas [dB]: the error to expect of the mean of a flight there."""
+    """Return the root mean square over all targets and antennas [dB]: the error to expect of a flight's mean there."""
     return math.sqrt(float(np.mean(np.concatenate([sd**2 for sd in sd_db.values()]))))
 
 
 BIN_S = 2.0
 KEEP = 150
 LEAST = 8
-# A trend is judged by what it says of levels so much later [s].
+# A trend is scored by its predictions of levels this much later [s].
 AHEAD_S = 20.0
 
-# Weight of an older error against that of the next bin.
+# Weight of an error relative to that of the next bin.
 _FORGET = 0.98
 
 LENGTHS_M = (30.0, 120.0)
@@ -574,7 +584,7 @@ _MODELS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ahead:
-    """Levels of the rest of the route: index of its points (m,), median, standard deviation of a sample, trend."""
+    """The predicted rest of the route: index of its points (m,), median, standard deviation of a sample, and trend."""
 
     index: IntArray
     level_db: FloatArray
@@ -583,14 +593,14 @@ class Ahead:
 
     @property
     def interval_db(self) -> tuple[FloatArray, FloatArray]:
-        """90 % interval of one sample (m,) each."""
+        """The 90 % interval of one sample at each point: lower and upper ends (m,)."""
         # 1.645: the 95 % point of the normal distribution
         return self.level_db - 1.645 * self.sd_db, self.level_db + 1.645 * self.sd_db
 
 
 @dataclass(slots=True)
 class _Bins:
-    """Closed bins, oldest first: place (n, 3), time (n,), level (n,), each trend (n,)."""
+    """The closed bins, oldest first: position (n, 3), time (n,), level (n,) and each trend (n,)."""
 
     place: list[FloatArray] = field(default_factory=list)
     time_s: list[float] = field(default_factory=list)
@@ -603,14 +613,14 @@ class _Bins:
 
 
 class RouteAhead:
-    """Prediction of a route's rest that learns from every record.
+    """A prediction of the rest of a route that learns from every record.
 
     Parameters
     ----------
     route_m : (m, 3)
         Points of the route in the order of flight [m].
     trends : mapping of str to (m,)
-        Models of the level at these points [dB], up to a constant; "none" is added.
+        Models of the level at these points [dB], up to a constant. A trend of zero, "none", is added.
     """
 
     def __init__(self, route_m: FloatArray, trends: Mapping[str, FloatArray]) -> None:
@@ -623,17 +633,18 @@ class RouteAhead:
         self.squares, self.samples = 0.0, 0
 
     def add(self, time_s: float, place_m: FloatArray, level_db: float, trends: Mapping[str, float]) -> Ahead | None:
-        """Take a record in; the rest of the route anew where a bin closed, else None.
+        """Add a record. Return the prediction of the rest of the route if a bin closed, else None.
 
         Parameters
         ----------
         time_s : float
-            Not before that of the record before.
+            Time [s], not before that of the previous record.
         place_m : (3,)
+            Position [m].
         level_db : float
-            Measured.
+            Measured level.
         trends : mapping of str to float
-            Of every model, here.
+            Level of each model at this position.
 
         Returns
         -------
@@ -667,8 +678,8 @@ class RouteAhead:
         self._open.clear()
 
     def _judge(self, time: float, place: FloatArray, level: float, trends: Mapping[str, float]) -> None:
-        """Score every trend on a bin by what it said :data:`AHEAD_S` before."""
-        # only what was known so long before: else a trend is judged by levels beside it
+        """Score the prediction of every trend for a bin, made :data:`AHEAD_S` earlier."""
+        # use only earlier bins: neighbouring levels would predict any bin well
         known = int(np.searchsorted(self._bins.time_s, time - AHEAD_S))
         if known < LEAST:
             return
@@ -682,9 +693,9 @@ class RouteAhead:
     def _moments(
         self, model: FieldModel, known: int, place: FloatArray, time_s: FloatArray, names: Sequence[str]
     ) -> list[tuple[FloatArray, FloatArray]]:
-        """Mean of each trend's residual and standard deviation of a bin (m,), from the first ``known`` bins.
+        """Return the mean of each trend's residual and the standard deviation of a bin (m,), from ``known`` bins.
 
-        One factor serves all trends. The strengths are scaled to the data: ``s^2 = y' inv(K) y / n``.
+        All trends share one factor. The strengths are scaled to the data: ``s^2 = y' inv(K) y / n``.
         """
         rows = _rows(np.array(self._bins.place[:known]), np.array(self._bins.time_s[:known]))
         level = np.array(self._bins.level[:known])
@@ -694,7 +705,7 @@ class RouteAhead:
         factor = Factor.of(matrix)
         middle = value.mean(axis=0)
         white = factor.whiten(value - middle)
-        # a level that has not changed yet would make every interval a point
+        # a level that has been constant so far would make every interval a point
         scale = np.maximum((white**2).sum(axis=0) / known, 1e-2)
         targets = _rows(place, time_s)
         mean, explained = factor.condition(covariance(model, targets, rows), white)
@@ -703,15 +714,15 @@ class RouteAhead:
         return [(middle[k] + mean[:, k], np.sqrt(scale[k] * variance)) for k in range(len(names))]
 
     def _predict(self, place: FloatArray) -> Ahead | None:
-        """The rest of the route from where the UAV is."""
+        """Return the prediction of the rest of the route from the position of the UAV."""
         if len(self._bins.level) < LEAST:
             return None
-        # onwards and not far: where a route crosses itself, the nearest point may be of its other leg
+        # search only a little ahead: where a route crosses itself, the nearest point can be on another leg
         window = slice(self._reached, self._reached + max(50, len(self.route_m) // 10))
         self._reached += int(np.linalg.norm(self.route_m[window] - place, axis=1).argmin())
         index = np.arange(self._reached, len(self.route_m))
         known = {key: total / weight for key, (total, weight) in self._scores.items()}
-        # before anything was judged: no trend, and the longer memory
+        # before the first score: no trend, and the longer length
         trend, length = min(known, key=lambda key: known[key], default=(NONE, LENGTHS_M[-1]))
         now = self._bins.time_s[-1]
         steps = np.linalg.norm(np.diff(self.route_m[index], axis=0, prepend=place[None]), axis=1)

@@ -1,8 +1,8 @@
-"""The one constant between a measurement and a simulation, and what is known about it.
+"""The constant offset between a measurement and a simulation, and its uncertainty.
 
-The offset is **added to the measurement**. Its grid is integers over ``1 / step`` (never accumulated floats),
-a tie goes to the offset nearer zero, and an optimum at the edge of the span is flagged: it is an error to look
-at, not a result.
+The offset is **added to the measurement**. Its grid consists of integers divided by ``1 / step``, not of accumulated
+floats. A tie goes to the offset nearer zero. An optimum at the edge of the search range is flagged: it is an error to
+investigate, not a result.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from numpy.typing import ArrayLike
 
 from ..common.units import FloatArray, unmasked
 
-# Search span of arXiv 2502.10324, section V [dB].
+# Search range of arXiv 2502.10324, section V [dB].
 SPAN_DB = (-50.0, 50.0)
 
 # Search step of arXiv 2502.10324, section V [dB].
 STEP_DB = 0.1
 
-# A longer grid is a mistake in the step or the span, and would not fit in memory.
+# A longer grid results from a wrong step or range, and would not fit in memory.
 MAXIMUM_OFFSETS = 10_000_000
 
 # Distances that differ by less than this share of a step are ties (0.15 lies between 0.1 and 0.2).
@@ -31,18 +31,18 @@ _TIE = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class OffsetFit:
-    """Best constant offset.
+    """The best constant offset.
 
     Parameters
     ----------
     offset_db : float
-        To be added to the measurement [dB]; NaN without a pair.
+        Offset to add to the measurement [dB]. NaN if there are no pairs.
     rmse_db : float
-        Root mean square of ``measured + offset - simulated`` [dB]; NaN without a pair.
+        Root mean square of ``measured + offset - simulated`` [dB]. NaN if there are no pairs.
     n : int
-        Pairs that count (both sides finite).
+        Number of pairs with both sides finite.
     at_edge : bool
-        The optimum is the first or last offset of the span: the true one may lie outside.
+        True if the optimum is the first or last offset of the range: the true offset can be outside.
     """
 
     offset_db: float
@@ -55,7 +55,7 @@ _NO_FIT = OffsetFit(float("nan"), float("nan"), 0, False)
 
 
 def offset_grid(step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB) -> FloatArray:
-    """Offsets to try [dB]: the multiples of ``step_db`` inside ``span_db``, each correctly rounded.
+    """Return the offsets to try [dB]: the multiples of ``step_db`` inside ``span_db``, each correctly rounded.
 
     Raises
     ------
@@ -84,15 +84,15 @@ def offset_grid(step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB
 
 
 def nearest_offset(grid_db: FloatArray, target_db: float, step_db: float = STEP_DB) -> int:
-    """Index of the offset nearest to ``target_db``; a tie goes to the one nearer zero."""
-    # a target far beyond the grid is at its edge: 1e30 lies equally far from all offsets in float64
+    """Return the index of the offset nearest to ``target_db``. A tie goes to the offset nearer zero."""
+    # clip the target to the grid: in float64, 1e30 is equally far from all offsets
     distance = np.abs(grid_db - np.clip(target_db, grid_db[0], grid_db[-1]))
     near = np.flatnonzero(distance <= distance.min() + _TIE * step_db)
     return int(near[np.argmin(np.abs(grid_db[near]))])
 
 
 def _difference(measured_db: ArrayLike, simulated_db: ArrayLike) -> FloatArray:
-    """Simulated minus measured over the pairs that count [dB], flat."""
+    """Return simulated minus measured over the pairs with both sides finite [dB], flattened."""
     measured = unmasked(measured_db)
     simulated = unmasked(simulated_db)
     if measured.shape != simulated.shape:
@@ -118,7 +118,7 @@ def grid_offset(
     step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> OffsetFit:
-    """Offset of least RMSE by grid search.
+    """Find the offset with the lowest RMSE by grid search.
 
     Parameters
     ----------
@@ -167,19 +167,19 @@ def offset_curve(
     step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> tuple[FloatArray, FloatArray]:
-    """RMSE [dB] at every offset [dB] of the grid: how sharply the data fix the offset.
+    """Return the RMSE [dB] at every offset [dB] of the grid: how sharply the data determine the offset.
 
     Parameters
     ----------
     measured_db, simulated_db : array_like, (n,)
         Levels [dB]; pairs with a NaN do not count.
     step_db, span_db : float, (float, float)
-        Of the candidate offsets, as in :func:`offset_grid` [dB].
+        Step and range of the candidate offsets, as in :func:`offset_grid` [dB].
 
     Returns
     -------
     (offsets_db, rmse_db), each (offsets,)
-        RMSE is NaN everywhere without a pair.
+        The RMSE is NaN everywhere if there are no pairs.
     """
     grid = offset_grid(step_db, span_db)
     difference = _difference(measured_db, simulated_db)
@@ -190,7 +190,7 @@ def offset_curve(
 
 
 def identifiable_range(offsets_db: FloatArray, rmse_db: FloatArray, *, excess_db: float = 0.1) -> tuple[float, float]:
-    """Offsets whose RMSE stays within ``excess_db`` of the best one: (lowest, highest) [dB]."""
+    """Return the lowest and highest offset whose RMSE is within ``excess_db`` of the best one [dB]."""
     if not np.isfinite(rmse_db).any():
         return float("nan"), float("nan")
     near = offsets_db[rmse_db <= np.nanmin(rmse_db) + excess_db]
@@ -204,7 +204,7 @@ _GROUP: dict[str, tuple[int, ...]] = {"link": (0, 1, 2), "tower": (1,), "channel
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moments:
-    """Moments of a sequence that an offset needs: pairs, mean and variance of simulated minus measured [dB, dB^2]."""
+    """The number of pairs of a sequence, and mean [dB] and variance [dB^2] of simulated minus measured."""
 
     n: int
     mean_db: float
@@ -212,7 +212,7 @@ class Moments:
 
 
 def difference_moments(measured_db: ArrayLike, simulated_db: ArrayLike) -> Moments:
-    """The moments of the pairs that count; NaN without one.
+    """Return the moments of the pairs with both sides finite, NaN if there are no pairs.
 
     Examples
     --------
@@ -232,16 +232,16 @@ def pooled_moments(
     *,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> dict[tuple[str, str, str], OffsetFit]:
-    """One offset per tower, channel, flight, link or for everything.
+    """Fit one offset per link, tower, channel or flight, or a single one.
 
     Parameters
     ----------
     moments : mapping of (flight, tower, channel) to Moments
-        Of all sequences.
+        Moments of all sequences.
     per : {"link", "tower", "channel", "flight", "all"}
         Which sequences share an offset.
     span_db : (float, float)
-        Span of the search [dB].
+        Search range [dB].
 
     Returns
     -------
@@ -264,7 +264,7 @@ def pooled_moments(
             fits |= dict.fromkeys(members, _NO_FIT)
             continue
         total = sum(item.n for item in filled)
-        # about the first mean: sums of levels near -90 dB would lose the digits that decide a tie
+        # sum about the first mean: sums of levels near -90 dB would lose the digits that decide a tie
         mean = filled[0].mean_db + sum((item.mean_db - filled[0].mean_db) * (item.n / total) for item in filled)
         best = nearest_offset(grid, mean)
         offset, at_edge = float(grid[best]), best in (0, len(grid) - 1)

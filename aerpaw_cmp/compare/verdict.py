@@ -481,7 +481,12 @@ _TWO_TRIED = 1.3
 _LEAST_RATIO = 1.15
 
 
-def stated_errors(error_db: FloatArray, sd_db: FloatArray, common_db: FloatArray | float = 0.0) -> Verdict:
+def stated_errors(
+    error_db: FloatArray,
+    sd_db: FloatArray,
+    common_db: FloatArray | float = 0.0,
+    place_m: FloatArray | None = None,
+) -> Verdict:
     """Check whether errors are as large as was stated for them.
 
     Parameters
@@ -490,6 +495,8 @@ def stated_errors(error_db: FloatArray, sd_db: FloatArray, common_db: FloatArray
         Measured minus predicted, and the standard deviation stated for it, in time order [dB].
     common_db : float or (n,)
         Part of that standard deviation that a whole flight may share (an offset) [dB].
+    place_m : (n, 3), optional
+        As for :func:`~aerpaw_cmp.compare.statistics.mean_draws`.
 
     Returns
     -------
@@ -498,15 +505,15 @@ def stated_errors(error_db: FloatArray, sd_db: FloatArray, common_db: FloatArray
         ``none`` with the ratio and its interval; ``no interval`` of fewer than 20 samples.
     """
     good = np.isfinite(error_db) & np.isfinite(sd_db) & (sd_db > 0.0)
-    error, sd = error_db[good], sd_db[good]
+    error, sd, place = error_db[good], sd_db[good], None if place_m is None else place_m[good]
     if len(error) < FEWEST:
         return Verdict(cause="no interval")
     share = float(np.mean(np.square(np.broadcast_to(common_db, good.shape)[good])))
-    mean, ends = float(error.mean()), mean_interval(error)
+    mean, ends = float(error.mean()), mean_interval(error, place)
     reach = math.hypot(0.5 * (ends[1] - ends[0]), 1.96 * math.sqrt(share))
     bias = Verdict(cause="biased", effect=mean, interval=(mean - reach, mean + reach))
     ratio = error / sd
-    low, high = spread_interval(ratio)
+    low, high = spread_interval(ratio, place)
     # what a flight shares is no spread inside of it: it can hide a narrow interval, not make a wide one
     allowed = share / float(np.mean(sd**2))
     effect, within = float(np.sqrt(np.mean(ratio**2))), float(ratio.std())

@@ -750,6 +750,7 @@ def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
     return AgainstSeries(
         name=f"{s.tower} {s.channel}",
         time_s=s.time_s,
+        position_m=s.position_m,
         measured_db=s.residual_db + finite.free_space_db[near],
         level_db=level_db,
         lock=lock,

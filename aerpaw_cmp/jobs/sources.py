@@ -509,8 +509,9 @@ class Flown:
         flights, fitted = len({s.flight for s in self.sources[antenna].samples}), self.correction
         wider = math.sqrt((1.0 + 1.0 / flights) * (student_factor(flights) ** 2 - 1.0))
         slow = np.hypot(slow, fitted.sd_factor * wider * fitted.model.offset_sd_db)
-        beyond = between_blocks_db(self.correction.channels[antenna])
-        return level, np.where(guess, np.hypot(slow, beyond), slow), guess
+        if flights == 1:  # of several flights the errors on held-out ones contain what changes from place to place
+            slow = np.where(guess, np.hypot(slow, between_blocks_db(self.correction.channels[antenna])), slow)
+        return level, slow, guess
 
     def fading(self, antenna: str) -> Spread:
         """Spread of samples about their means over 4 s."""

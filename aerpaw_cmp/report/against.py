@@ -20,6 +20,9 @@ class AgainstSeries(LevelSeries):
     """The predicted samples of one tower and channel, shape (n,); levels are in the unit of the log [dB]."""
 
     sd_db: FloatArray
+    position_m: FloatArray | None = None
+    """East, north and up of each sample [m], shape (n, 3)."""
+
     own_offset: bool = False
     low_db: FloatArray
     high_db: FloatArray
@@ -35,7 +38,8 @@ class AgainstSeries(LevelSeries):
     @property
     def stated(self) -> Verdict:
         """Whether the errors are as large as the stated standard deviations."""
-        return replace(stated_errors(self.error_db, self.sd_db, self.common_db), where=self.name)
+        verdict = stated_errors(self.error_db, self.sd_db, self.common_db, self.position_m)
+        return replace(verdict, where=self.name)
 
     @property
     def scores(self) -> dict[str, float]:

@@ -19,7 +19,7 @@ from ..common.text import guarded
 from ..common.units import FloatArray
 from ..compare.calibration import OFF, Correction, crps_difference
 from ..compare.receiver import ForecastScore
-from ..compare.statistics import mean_interval, paired_difference
+from ..compare.statistics import paired_difference
 from ..compare.verdict import Verdict, by_flight, stated_errors
 from ..site.learned import Entry, LearnedSeries
 from ..site.site import Site
@@ -245,7 +245,8 @@ def prior_caution(offset_db: float, antennas_db: float, shadowing_db: float, fad
 def _stated(correction: Correction) -> str:
     """Return the sentence and next step about the stated standard deviations on held-out data."""
     error, sd = correction.held_out[correction.base, correction.title]
-    return said_of(stated_errors(error, sd), STATED, inside=100.0 * _inside_share(error, sd))
+    verdict = stated_errors(error, sd, place_m=correction.held_out_place_m)
+    return said_of(verdict, STATED, inside=100.0 * _inside_share(error, sd))
 
 
 def _inside_share(error: FloatArray, sd: FloatArray) -> float:
@@ -264,7 +265,7 @@ def _against_free_space(correction: Correction) -> Verdict:
         parts = correction.held_out_parts
         verdict = by_flight(_by_part(error, parts), _by_part(free_space, parts))
         return replace(verdict, cause="two flights") if verdict.cause == "no interval" else verdict
-    pair = paired_difference(error, free_space, free_offset=False)
+    pair = paired_difference(error, free_space, free_offset=False, place_m=correction.held_out_place_m)
     return Verdict(cause=pair.verdict, effect=pair.difference_db, interval=pair.difference_ci95_db)
 
 
@@ -280,10 +281,9 @@ def field(correction: Correction) -> Verdict:
     """Return the difference in CRPS between the best residual field and no residual field."""
     base = correction.base
     title = min((t for b, t in correction.crps_db if b == base and t != OFF), key=lambda t: correction.crps_db[base, t])
-    difference = crps_difference(correction.held_out, (base, title))
-    ends = mean_interval(difference)
+    difference, ends = crps_difference(correction.held_out, (base, title), correction.held_out_place_m)
     cause = "better" if correction.on else "worse" if ends[0] > 0.0 else "off"
-    return Verdict(cause=cause, effect=float(difference.mean()), interval=ends, where=title)
+    return Verdict(cause=cause, effect=difference, interval=ends, where=title)
 
 
 def against_words(series: Sequence[AgainstSeries], ranks: Mapping[str, ForecastScore]) -> str:

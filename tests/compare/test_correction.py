@@ -138,7 +138,7 @@ def test_a_field_is_added_where_one_was_planted_and_the_nearer_base_wins() -> No
 def test_a_field_that_helps_by_chance_stays_off() -> None:
     """Weak waves: the difference by block means of 16 samples, whose interval is that of Student."""
     nothing, lower = fixed_base(lambda series: np.zeros(len(series))), []
-    for seed in (0, 3, 9):
+    for seed in (0, 1, 3):
         choice = choose([flight(name, seed + k, field_db=1.5) for k, name in enumerate("abc")], {"made": nothing})
         field, bare = (crps_normal(*choice.held_out["made", title]) for title in ("field", OFF))
         means = (field - bare).reshape(-1, 16).mean(axis=1)

@@ -10,6 +10,7 @@ from scipy.stats import multivariate_normal
 
 from aerpaw_cmp.compare import statistics
 from aerpaw_cmp.compare.statistics import RATES, TERMS, WHITE_SHARES, cosine_terms, likelihoods, mean_draws, memories
+from aerpaw_cmp.compare.verdict import stated_errors
 
 POINTS = 2000
 
@@ -197,6 +198,16 @@ def test_a_memory_over_place_is_the_covariance_of_its_terms_along_the_track() ->
             mixed = (1.0 - white) * inner + white * np.eye(terms) / terms
             np.testing.assert_allclose(whiten @ mixed @ whiten.T, np.eye(terms), atol=1e-6)
     assert len(known.power) == len(statistics.LENGTHS) * (len(statistics.PLACE_WHITE) + len(statistics.PLACE_FADING))
+
+
+def test_errors_as_large_as_stated_get_no_verdict_on_a_lawnmower_over_shadowing() -> None:
+    place, sd = lawnmower(400), np.full(400, np.sqrt(1.16))
+    knowing, alone = (
+        np.mean([stated_errors(e, sd, place_m=known).cause == "biased" for e in shadowed(place, 150.0, 60, seed=4)])
+        for known in (place, None)
+    )
+    assert knowing <= 0.06
+    assert alone >= 0.12, "by time alone the offset of a flight looks like a bias"
 
 
 def test_intervals_of_a_lawnmower_over_shadowing_cover_the_truth() -> None:

@@ -120,6 +120,24 @@ def test_the_offset_of_a_new_flight_is_students_as_in_the_memory(flights, monkey
     assert slow[0] * norm.ppf(0.95) == pytest.approx(student.ppf(0.95, flights + 1) * normal_db)
 
 
+@pytest.mark.parametrize(("flights", "wider_db"), [(1, 3.0), (2, 0.0)])
+def test_errors_between_blocks_count_outside_the_flown_places_of_a_single_flight(flights, wider_db, monkeypatch):
+    """Errors on held-out flights, which scale the standard deviation of several flights, have them already."""
+    here, away = np.zeros((1, 3)), np.array([[500.0, 0.0, 0.0]])
+    samples = [SimpleNamespace(flight=str(k), antenna="LW1.rss", position_m=here) for k in range(flights)]
+    field = SimpleNamespace(
+        over_headings=lambda *_, **__: (np.zeros(1), np.full(1, 2.0)), channels={"LW1.rss": None},
+        sd_factor=1.0, model=SimpleNamespace(offset_sd_db=0.0),
+    )  # fmt: skip
+    monkeypatch.setattr(sources, "between_blocks_db", lambda _: 3.0)
+    flown = sources.Flown(field, {"LW1.rss": SimpleNamespace(samples=samples)})
+    near, far = (
+        flown.levels([SimpleNamespace(antenna="LW1.rss", position_m=place)], 1)[1][0] for place in (here, away)
+    )
+    assert near == 2.0
+    assert far == pytest.approx(np.hypot(2.0, wider_db))
+
+
 def test_a_notebook_shows_first_words_and_points(prediction):
     shown = prediction._repr_html_()
     assert "Expect an RMSE of " in shown

@@ -970,7 +970,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
     left_out = [s for fold in folds if fold.known for s in fold.left_out if np.isfinite(s.residual_db).any()]
     place = np.concatenate([np.zeros((0, 3)), *(s.binned(BIN_S).position_m for s in left_out)])
     # scaled before they are scored: CRPS then compares errors, not how badly spreads are stated
-    factors = {key: _sd_factor(*errors) for key, errors in joined.items()}
+    factors = {key: _sd_factor(tallies[key]) for key in joined}
     held_out = {key: (error, factors[key] * sd) for key, (error, sd) in joined.items()}
     crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*errors)) for key, errors in held_out.items()}
     sure = [key for key in held_out if key[1] == OFF or crps_difference(held_out, key, place)[1][1] < 0.0]
@@ -1015,10 +1015,15 @@ def crps_difference(
     return float(difference[good].mean()), mean_interval(difference[good], place)
 
 
-def _sd_factor(error: FloatArray, sd: FloatArray) -> float:
-    """Ratio of seen to stated errors, between 0.8 and 1.6; 1 without an error."""
-    ratio = _mean(np.square(error / sd))
-    return min(max(math.sqrt(ratio), 0.8), 1.6) if math.isfinite(ratio) else 1.0
+def _sd_factor(parts: Sequence[_HeldOut]) -> float:
+    """Return the ratio of seen to stated errors of held-out parts, between 0.8 and 1.6. 1 if there is no error.
+
+    It is a geometric mean over the parts: a model of quiet flights states too little for a restless one, and the
+    reverse. An arithmetic mean would count the first case more, although the final model knows both kinds.
+    """
+    squares = [_mean(np.square(error / sd)) for error, sd in parts]
+    logs = [math.log(max(square, 1e-12)) for square in squares if math.isfinite(square)]
+    return min(max(math.exp(0.5 * sum(logs) / len(logs)), 0.8), 1.6) if logs else 1.0
 
 
 def _joined(parts: Sequence[_HeldOut]) -> _HeldOut:

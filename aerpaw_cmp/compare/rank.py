@@ -1,7 +1,7 @@
-"""Rank of a channel, and how two sequences of ranks compare.
+"""The rank of a channel, and the comparison of two sequences of ranks.
 
-``rank`` counts singular values above ``sigma_1 / K`` (strictly); 0 means that there is no channel. Measured RI is
-a float with NaN where the modem gave no CSI; it is never 0.
+``rank`` counts the singular values above ``sigma_1 / K`` (strictly). Rank 0 means that there is no channel. Measured RI
+is a float, NaN where the modem reported no CSI, and never 0.
 """
 
 from __future__ import annotations
@@ -42,21 +42,20 @@ _CHUNK = 1 << 20
 
 
 def singular_values(h: ArrayLike) -> FloatArray:
-    """Singular values of every channel matrix, divided by the largest magnitude of an entry.
+    """Return the singular values of every channel matrix, divided by the largest magnitude of an entry.
 
     Source: arXiv 2502.10324 eq. 2.
 
     Parameters
     ----------
     h : array_like, complex, (..., n_rx, n_tx)
-        Channel matrices. Only ratios of singular values matter to a rank, so each matrix is scaled by a power of
-        two before its decomposition: entries of 1e-150 or 1e150 neither vanish nor overflow.
+        Channel matrices. Each is scaled by a power of two before its decomposition, so that entries of 1e-150 or 1e150
+        neither vanish nor overflow. The rank depends on ratios alone.
 
     Returns
     -------
     ndarray, (..., min(n_rx, n_tx))
-        Descending, relative to the scale of each matrix; zeros for an all-zero matrix, NaN where an entry is not
-        finite.
+        Descending, relative to the scale of each matrix. Zeros for an all-zero matrix, NaN if an entry is not finite.
 
     Examples
     --------
@@ -79,7 +78,7 @@ def singular_values(h: ArrayLike) -> FloatArray:
 
 
 def _scaled(matrix: ComplexArray) -> ComplexArray:
-    """Each matrix times the power of two that brings its largest part into [0.5, 1): exact."""
+    """Multiply each matrix by the power of two that brings its largest part into [0.5, 1), which is exact."""
     if not matrix.size:
         return matrix
     largest = np.maximum(np.abs(matrix.real), np.abs(matrix.imag)).max(axis=(1, 2))
@@ -89,10 +88,10 @@ def _scaled(matrix: ComplexArray) -> ComplexArray:
 
 
 def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
-    """Ranks of singular-value profiles (..., m), as in :func:`channel_rank`; NaN profiles give 0.
+    """Return the ranks of singular-value profiles (..., m), as in :func:`channel_rank`. A NaN profile has rank 0.
 
     Singular values that tie with ``sigma_1 / k`` do not count (strict). SVD noise is a few ulp of ``sigma_1``, so a
-    tie is decided with a margin of ``8 eps sigma_1``: 1 and 0.1 at K = 10 is rank 1, whatever the rounding.
+    tie is decided with a margin of ``8 eps sigma_1``: 1 and 0.1 at K = 10 is rank 1 for any rounding.
 
     Source: arXiv 2502.10324 eq. 3.
     """
@@ -114,7 +113,7 @@ def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
 
 
 def channel_rank(h: ArrayLike, k: float) -> IntArray:
-    """Number of singular values above ``sigma_1 / k`` (strict) of every channel matrix.
+    """Count the singular values above ``sigma_1 / k`` (strict) of every channel matrix.
 
     Source: arXiv 2502.10324 eq. 3.
 
@@ -168,17 +167,17 @@ def _ranks(rank: ArrayLike) -> FloatArray:
 
 
 def histogram(rank: ArrayLike) -> FloatArray:
-    """Shares of rank 1 .. :data:`MAX_RANK`; 0 (no channel) and NaN (no CSI) do not take part.
+    """Return the shares of rank 1 to :data:`MAX_RANK`, without 0 (no channel) and NaN (no CSI).
 
     Parameters
     ----------
     rank : array_like
-        Ranks, any shape; higher ones are an error.
+        Ranks, any shape. Higher ranks are an error.
 
     Returns
     -------
     ndarray, (ranks,)
-        Sums to one; all NaN when nothing counts.
+        Shares that sum to one, or NaN if no sample has a rank.
 
     Examples
     --------
@@ -194,12 +193,12 @@ def histogram(rank: ArrayLike) -> FloatArray:
 
 
 def one_hot(rank: IntArray | FloatArray, ranks: int = MAX_RANK) -> FloatArray:
-    """1 in the column of each rank (n, ranks)."""
+    """Return an array (n, ranks) with 1 in the column of each rank."""
     return np.asarray(np.asarray(rank)[:, None] == np.arange(1, ranks + 1), dtype=np.float64)
 
 
 def agreement(measured: ArrayLike, simulated: ArrayLike) -> float:
-    """Share of poses at which both ranks exist (not NaN, not 0) and are equal; NaN when none does.
+    """Return the share of equal ranks over poses at which both exist (not NaN, not 0), NaN if there are none.
 
     Examples
     --------
@@ -211,7 +210,7 @@ def agreement(measured: ArrayLike, simulated: ArrayLike) -> float:
 
 
 def total_variation(first: ArrayLike, second: ArrayLike) -> float:
-    """Total variation distance of two histograms of shares: half the sum of absolute differences, 0 to 1.
+    """Return the total variation distance of two histograms: half the sum of absolute differences, 0 to 1.
 
     Examples
     --------
@@ -222,7 +221,7 @@ def total_variation(first: ArrayLike, second: ArrayLike) -> float:
 
 
 def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
-    """Wasserstein-1 distance of two rank histograms [ranks]: how far shares must move, in ranks.
+    """Return the Wasserstein-1 distance of two rank histograms [ranks]: how far shares must move, in ranks.
 
     Examples
     --------
@@ -230,12 +229,12 @@ def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
     3.0
     """
     step = np.cumsum(unmasked(first) - unmasked(second))
-    # the last step is the sum of all shares: 0 but for rounding
+    # the last step is the sum of all shares, which is 0 except for rounding
     return float(np.abs(step[:-1]).sum())
 
 
 def _both(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray]:
-    """Both ranks as integers, 0 where there is none."""
+    """Return both ranks as integers, 0 if missing."""
     ranks = _ranks(measured), _ranks(simulated)
     # no report (NaN) compares as False, and becomes 0
     first, second = (np.where(rank >= 1, rank, 0).astype(np.int64) for rank in ranks)
@@ -243,19 +242,19 @@ def _both(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray
 
 
 def _pairs(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray]:
-    """Both ranks as integers, where both exist (not NaN, not 0)."""
+    """Return both ranks as integers, for poses at which both exist (not NaN, not 0)."""
     first, second = _both(measured, simulated)
     existing = (first > 0) & (second > 0)
     return first[existing], second[existing]
 
 
 def confusion_matrix(measured: ArrayLike, simulated: ArrayLike) -> IntArray:
-    """Counts of (measured rank, simulated rank), each 0 .. :data:`MAX_RANK`; 0 collects what does not exist.
+    """Count the pairs of measured and simulated rank, each 0 to :data:`MAX_RANK`, with 0 for a missing rank.
 
     Returns
     -------
     ndarray of int, (max_rank + 1, max_rank + 1)
-        Row: measured (0: NaN, no CSI). Column: simulated (0: no channel). All samples are in it.
+        Row: measured (0: NaN, no CSI). Column: simulated (0: no channel). All samples are counted.
     """
     row, column = _both(measured, simulated)
     size = MAX_RANK + 1
@@ -265,10 +264,10 @@ def confusion_matrix(measured: ArrayLike, simulated: ArrayLike) -> IntArray:
 
 
 def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
-    """Cohen's kappa: agreement beyond what the two histograms alone would give.
+    """Return Cohen's kappa: agreement beyond that of the two histograms by chance.
 
-    1: always equal; 0: no better than chance; NaN without a pair or when both are the same constant (RI only ever
-    2 against rank only ever 2 agrees fully, but says nothing). Cohen (1960), doi:10.1177/001316446002000104.
+    Kappa is 1 if the ranks are always equal, and 0 if they agree as often as by chance. It is NaN without a pair, and
+    for two equal constants, which show nothing. Cohen (1960), doi:10.1177/001316446002000104.
 
     Examples
     --------
@@ -286,33 +285,33 @@ def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
 
 
 def histogram_test(measured: ArrayLike, simulated: ArrayLike, *, replicates: int = REPLICATES) -> float:
-    """p-value of the total variation between both histograms, when blocks of the pair are swapped at random.
+    """Return the p-value of the total variation between both histograms, by swapping blocks of the pair at random.
 
-    If measured and simulated ranks came from one distribution, exchanging them over whole blocks (as long as the
-    sequences remember) would change nothing. NaN without a pair.
+    If measured and simulated ranks came from one distribution, swapping them over blocks as long as their correlation
+    would change nothing. NaN without a pair.
 
     Parameters
     ----------
     measured, simulated : array_like, (n,)
-        Ranks of the same samples; NaN and 0 take no part.
+        Ranks of the same samples. NaN and 0 are ignored.
     replicates : int
-        Random exchanges.
+        Number of random swaps.
 
     Returns
     -------
     float
-        Share of exchanges with a total variation at least as large, the observed one counted among them.
+        Share of swaps with a total variation at least as large, including the observed one.
     """
     measured_rank, simulated_rank = _pairs(measured, simulated)
     if not len(measured_rank):
         return float("nan")
-    # an exchange of a block turns the sign of its difference
+    # swapping a block changes the sign of its difference
     difference = one_hot(measured_rank) - one_hot(simulated_rank)
     length = max(autocorrelation(measured_rank).block_length, autocorrelation(simulated_rank).block_length, 1)
     sums = np.add.reduceat(difference, np.arange(0, len(measured_rank), length), axis=0)
     signs = np.random.default_rng(SEED).integers(0, 2, (replicates, len(sums))) * 2.0 - 1.0
     swapped = np.abs(signs @ sums).sum(axis=1)
-    # less a little: equal exchanges sum in another order
+    # the tolerance allows for rounding: swaps with an equal result sum in another order
     return float((1 + np.sum(swapped >= np.abs(sums.sum(axis=0)).sum() - 1e-9)) / (1 + replicates))
 
 
@@ -320,7 +319,7 @@ def histogram_test(measured: ArrayLike, simulated: ArrayLike, *, replicates: int
 
 
 def k_grid(low: float = 1.25, high: float = 1e5, per_decade: int = 24) -> FloatArray:
-    """Logarithmic grid of K from ``low`` to ``high``, containing 10, 100, 1000 exactly where in range."""
+    """Return a logarithmic grid of K from ``low`` to ``high`` that contains 10, 100 and 1000 exactly if in range."""
     first, last = np.ceil(np.log10(low) * per_decade), np.floor(np.log10(high) * per_decade)
     k = 10.0 ** (np.arange(first, last + 1) / per_decade)
     decade = np.round(np.log10(k))
@@ -329,20 +328,20 @@ def k_grid(low: float = 1.25, high: float = 1e5, per_decade: int = 24) -> FloatA
 
 @dataclass(frozen=True, slots=True)
 class KCurve:
-    """Agreement and total variation as functions of continuous K.
+    """The agreement and total variation as functions of continuous K.
 
     Parameters
     ----------
     k : (m,)
         Values of K.
     agreement, total_variation : (m,)
-        Against the measurement.
+        Agreement and distance between simulated and measured ranks.
     best_k_agreement, best_k_total_variation : float
-        Where the best value is reached (the middle, on the log scale, of the best run of K); NaN without a pair.
+        K with the best value: the middle, on the log scale, of the first run of best K. NaN without a pair.
     best_k_interval, best_k_total_variation_interval : (low, high)
         Central 95 % of the best K over the bootstrap replicates, one grid step wider on either side.
     at_edge : bool
-        The best agreement is reached at an end of the grid.
+        True if the best agreement is at an end of the grid.
     """
 
     k: FloatArray
@@ -355,7 +354,7 @@ class KCurve:
     at_edge: bool = False
 
 
-# Samples times K that are resampled at once: bounds memory on flights of hours, and changes no digit.
+# Samples times K per resampling, which limits memory on flights of hours and does not change the result.
 _CELLS_AT_ONCE = 2_000_000
 
 
@@ -366,23 +365,23 @@ def k_curve(
     k: ArrayLike | None = None,
     replicates: int = REPLICATES,
 ) -> KCurve:
-    """Agreement for every K, and the K that explains the measured ranks best.
+    """Compute the agreement for every K, and the K that explains the measured ranks best.
 
     Parameters
     ----------
     measured : array_like, (n,)
-        RI in time order, NaN where none.
+        RI in time order, NaN if missing.
     sigma : array_like, (n, m)
         Singular values of the simulated channel at the same poses (any scale; see :func:`singular_values`).
     k : array_like, optional
         Grid of K, by default :func:`k_grid`.
     replicates : int
-        Block bootstrap for the intervals of the best K.
+        Number of resamples of the block bootstrap for the intervals of the best K.
 
     Returns
     -------
     KCurve
-        Agreement and total variation by K; NaN where no pose has both ranks.
+        Agreement and total variation by K, NaN if no pose has both ranks.
     """
     grid = k_grid() if k is None else unmasked(k)
     ri = _ranks(measured)
@@ -393,7 +392,7 @@ def k_curve(
     if not len(ri):
         nothing = np.full(len(grid), np.nan)
         return KCurve(k=grid, agreement=nothing, total_variation=nothing)
-    # a byte each: there are 118 K for each sample of a long flight
+    # one byte per rank: there are 118 K for each sample of a long flight
     ranks = np.stack([rank_from_singular_values(profile, value).astype(np.int8) for value in grid], axis=1)
     equal = ranks == ri[:, None]
     known = autocorrelation(equal.mean(axis=1))
@@ -426,7 +425,7 @@ def k_curve(
 
 
 def _middle_of_best(curves: FloatArray, k: FloatArray) -> FloatArray:
-    """Per row: the middle of the first run of K at which the row is at its maximum."""
+    """Return the middle of the first run of K at which each row is at its maximum."""
     top = curves >= curves.max(axis=1, keepdims=True) - 1e-12
     first = np.argmax(top, axis=1)
     later = np.arange(curves.shape[1]) >= first[:, None]
@@ -437,7 +436,7 @@ def _middle_of_best(curves: FloatArray, k: FloatArray) -> FloatArray:
 
 
 def _central(values: FloatArray, k: FloatArray) -> Interval:
-    """Central 95 % of best values, one grid step wider on either side: nothing finer was tried."""
+    """Return the central 95 % of best values, one grid step wider on either side because K is tried in such steps."""
     low, high = np.quantile(values, [0.025, 0.975])
     first = max(0, int(np.searchsorted(k, low * (1 + 1e-9))) - 2)
     last = min(len(k) - 1, int(np.searchsorted(k, high * (1 - 1e-9))) + 1)
@@ -446,16 +445,16 @@ def _central(values: FloatArray, k: FloatArray) -> Interval:
 
 @dataclass(frozen=True, slots=True)
 class Staleness:
-    """Time that the modem's report was held.
+    """The time for which the modem held each report.
 
     Parameters
     ----------
     fresh : (n,) bool
-        First row of each report: the others repeat it.
+        True for the first row of each report. Later rows repeat it.
     n_reports : int
-        Reports among the rows with a rank.
+        Number of reports among the rows with a rank.
     hold_s : float
-        Median time that one report was held [s]; NaN below two reports.
+        Median time for which a report was held [s]. NaN for fewer than two reports.
     verdict : str
         ``"fresh"`` (at most every tenth row repeats), ``"held"``, ``"constant"`` (one value throughout: staleness
         cannot be seen) or ``"no rank"``.
@@ -468,18 +467,18 @@ class Staleness:
 
 
 def stale_reports(time_s: ArrayLike, rank: ArrayLike, further: Mapping[str, ArrayLike] | None = None) -> Staleness:
-    """Recognise an RI that is held between reports.
+    """Detect an RI that is held between reports.
 
     Parameters
     ----------
     time_s : array_like, (n,)
-        Instants [s], increasing.
+        Times [s], increasing.
     rank : array_like, (n,)
-        RI, NaN where none.
+        RI, NaN if missing.
     further : mapping of str to array_like (n,), optional
-        Further numbers of the same report (RSRP, SINR, CQI). A row that repeats **all** of them is a repetition;
-        RSRP and SINR hardly ever repeat by chance. Without them the hold is read off the changes of RI alone: if
-        all changes keep to multiples of a period of several rows, the report comes once per period.
+        Further numbers of the same report (RSRP, SINR, CQI). A row that repeats **all** of them is a repetition,
+        because RSRP and SINR hardly ever repeat by chance. Without these numbers the changes of RI decide: if they
+        occur at multiples of a period of several rows, there is one report per period.
     """
     time, ri = unmasked(time_s), _ranks(rank)
     known = np.isfinite(ri)
@@ -487,9 +486,8 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, further: Mapping[str, Arra
         return Staleness(np.zeros(len(ri), dtype=bool), 0, float("nan"), "no rank")
     columns = [ri, *(np.asarray(v, dtype=np.float64) for v in (further or {}).values())]
     if len(columns) > 1:
-        has_values = np.any(
-            [np.isfinite(c) for c in columns[1:]], axis=0
-        )  # a row without further numbers proves nothing
+        # a row without further numbers cannot show a repetition
+        has_values = np.any([np.isfinite(c) for c in columns[1:]], axis=0)
         fresh = known & (_changes(columns) | ~has_values)
     else:
         fresh = known & _period_starts(ri)
@@ -501,7 +499,7 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, further: Mapping[str, Arra
 
 
 def _changes(columns: Sequence[FloatArray]) -> BoolArray:
-    """Rows that differ from the row before in any column (NaN equals NaN); the first row does."""
+    """Find the rows that differ from the previous row in any column (NaN equals NaN). The first row counts."""
     changed = np.zeros(len(columns[0]), dtype=bool)
     changed[:1] = True
     for c in columns:
@@ -510,9 +508,9 @@ def _changes(columns: Sequence[FloatArray]) -> BoolArray:
 
 
 def _period_starts(ri: FloatArray) -> BoolArray:
-    """Rows at which a report may have come, if RI changes only at multiples of a period; else all rows."""
+    """Return the possible first rows of reports: one per period if RI changes at multiples of it, else all rows."""
     change = np.flatnonzero(_changes([ri]))[1:]
-    if len(change) < 8:  # too few changes to tell a period from chance
+    if len(change) < 8:  # too few changes to distinguish a period from chance
         return np.ones(len(ri), dtype=bool)
     periods = np.arange(2, max(3, len(ri) // 8))
     # the largest period for which at least 95 % of the changes fall on one phase
@@ -528,20 +526,20 @@ def _period_starts(ri: FloatArray) -> BoolArray:
 
 @dataclass(frozen=True, slots=True)
 class RankFit:
-    """Simulated ranks at one K against the measured ones.
+    """A comparison of simulated ranks at one K with measured ranks.
 
     Parameters
     ----------
     histogram : (4,)
-        Shares of rank 1 to 4 among poses with a channel; ``histogram_ci95`` their intervals.
+        Shares of rank 1 to 4 among poses with a channel, with intervals in ``histogram_ci95``.
     out_of_coverage : int
-        Poses without a channel.
+        Number of poses without a channel.
     agreement, kappa, total_variation, wasserstein : float
-        Against the measurement, each with a 95 % interval.
+        Agreement with and distance from the measured ranks, each with a 95 % interval.
     confusion : (5, 5) int
-        Rows measured, columns simulated, 0 first (does not exist).
+        Rows measured, columns simulated, rank 0 (missing) first.
     p_histogram : float
-        Of :func:`histogram_test`.
+        The p-value of :func:`histogram_test`.
     """
 
     histogram: FloatArray
@@ -561,22 +559,22 @@ class RankFit:
 
 @dataclass(frozen=True, slots=True)
 class RankComparison:
-    """Measured RI of one tower against simulated ranks.
+    """A comparison of the measured RI of one tower with simulated ranks.
 
     Parameters
     ----------
     n, n_effective : int, float
-        Measured ranks, and how many independent ones they are worth.
+        Number of measured ranks, and the number of independent ranks that fix the mean equally well.
     n_no_csi : int
-        Rows where the modem gave no RI.
+        Number of rows without RI.
     histogram : (4,)
         Measured shares of rank 1 to 4, with intervals in ``histogram_ci95``.
     simulated : mapping of float to RankFit
-        Per K.
+        Comparison for each K.
     curve : KCurve
-        Continuous K.
+        Comparison for continuous K.
     staleness : Staleness
-        Of the measured RI.
+        Hold time of the measured RI.
     """
 
     n: int
@@ -590,7 +588,7 @@ class RankComparison:
 
     @property
     def best_k(self) -> float:
-        """The K of best agreement by pose."""
+        """The K with the best agreement by pose."""
         return self.curve.best_k_agreement
 
 
@@ -604,34 +602,34 @@ def compare_rank(
     place_m: FloatArray | None = None,
     replicates: int = REPLICATES,
 ) -> RankComparison:
-    """Compare measured RI with the ranks of simulated channels.
+    """Compare the measured RI with the ranks of simulated channels.
 
     Parameters
     ----------
     measured : array_like, (n,)
-        RI, 1-based, in time order; NaN where the modem gave none. 0 is refused: it means "no CSI" in every source.
+        RI from 1, in time order, NaN if missing. 0 is refused: it means "no CSI" in every source.
     h : array_like, complex, (n, n_rx, n_tx)
-        Simulated channels at the same poses; all zero where there is no path.
+        Simulated channels at the same poses, all zero without a path.
     ks : sequence of float
         Thresholds.
     time_s : array_like, (n,), optional
-        Instants [s], for the hold time of stale RI; by default the row number.
+        Times [s], for the hold time of stale RI. The default is the row number.
     sinr_db : array_like, (n,), optional
-        Reported SINR [dB]: a rank that is held repeats it, too.
+        Reported SINR [dB], which a held report repeats.
     place_m : (n, 3), optional
         East, north and up, NaN if unknown [m]: intervals then consider correlation over place, too.
     replicates : int
-        Bootstrap.
+        Number of resamples of the bootstrap of K and of the permutation test.
 
     Returns
     -------
     RankComparison
-        Histograms, agreement and distances per K, the curve over K, and what was stale.
+        Histograms, agreement and distances per K, the curve over K, and stale reports.
 
     Raises
     ------
     ValueError
-        A measured rank of 0; an H of another shape or length.
+        If a measured rank is 0, or ``h`` has another shape or length.
     """
     ri = _ranks(measured)
     if np.any(ri == 0):
@@ -664,10 +662,9 @@ def _histogram_intervals(rank: FloatArray, place_m: FloatArray | None = None) ->
 def compare_ranks(
     measured: ArrayLike, simulated: ArrayLike, place_m: FloatArray | None = None, *, replicates: int = REPLICATES
 ) -> RankFit:
-    """Compare two sequences of ranks by pose and by histogram; arguments as in :func:`agreement`.
+    """Compare two sequences of ranks by pose and by histogram.
 
-    The histogram distances compare all measured with all simulated ranks; their intervals come from poses at which
-    both exist.
+    The histogram distances compare all measured with all simulated ranks. Their intervals come from poses with both.
 
     Parameters
     ----------
@@ -676,7 +673,7 @@ def compare_ranks(
     place_m : (n, 3), optional
         As for :func:`compare_rank`.
     replicates : int
-        Of the bootstrap and the permutation test.
+        Number of swaps of the permutation test.
 
     Returns
     -------
@@ -710,9 +707,9 @@ def compare_ranks(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommonestRank:
-    """The forecast that needs no model: always the rank that was reported most often.
+    """The forecast without a model: always the rank that was reported most often.
 
-    Its agreement is what a model has to beat; its kappa is 0 by definition. ``rank`` is 0 without a report.
+    A model is useful if its agreement is larger. The kappa of this forecast is 0. ``rank`` is 0 without a report.
     """
 
     rank: int
@@ -721,7 +718,7 @@ class CommonestRank:
 
 
 def commonest_rank(measured: ArrayLike, place_m: FloatArray | None = None) -> CommonestRank:
-    """The commonest of the measured ranks (n,), NaN where none, and how often it is right.
+    """Return the most frequent of the measured ranks (n,), NaN if missing, and its share.
 
     Positions ``place_m`` (n, 3) [m] are used as by :func:`compare_rank`.
 
@@ -743,15 +740,16 @@ def commonest_rank(measured: ArrayLike, place_m: FloatArray | None = None) -> Co
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankRepeat:
-    """Agreement of two passes of the same places: no model can be expected to do better.
+    """The agreement of two passes over the same positions, which no model can be expected to exceed.
 
     Parameters
     ----------
     kappa, agreement : float
-        Of the reported ranks of both passes; NaN without a pair.
+        Kappa and agreement of the reported ranks of both passes, NaN without a pair.
     kappa_ci95 : (low, high)
+        95 % interval of kappa.
     n : int
-        Pairs.
+        Number of pairs.
     """
 
     kappa: float
@@ -766,7 +764,7 @@ def repeat_rank(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> 
     Parameters
     ----------
     first, second : Visit
-        Their values are ranks; 0 and NaN are ignored.
+        Visits whose values are ranks. 0 and NaN are ignored.
     radius_m : float
         A sample pairs with the nearest one of the other pass within this distance.
 

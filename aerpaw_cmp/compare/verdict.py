@@ -1,20 +1,15 @@
-"""The verdict on a flight or a campaign, and the statistics that it rests on.
+"""The verdicts on a flight, a campaign, a calibration, a prediction and a map.
 
-Decisions that the first sentences of a page are chosen from: effect, 95 % interval and likely cause.
+A verdict is an effect with a 95 % interval and a cause. The first sentences of a page are chosen from it. Causes of the
+error of a flight are in :mod:`.causes`. A cause is named only if its interval excludes "no effect". If several are
+tried, chance names any of them in at most :data:`_FALSE_ALARMS` of the cases.
 
-The report's own causes are those of :mod:`.causes`. A cause is named only where its interval excludes "no effect";
-where several could be named, chance names any of them in at most :data:`_FALSE_ALARMS` of the cases.
+The file also compares ray tracing with the best baseline over all channels of a flight. It computes offsets from the
+other flights of a campaign, and finds the nights at which offsets of nodes step.
 
-Ray tracing against the best baseline over all channels of a flight at once.
-
-Results of a season of flights: offsets from other flights, differences between settings.
-
-Offsets of nodes night by night, and the nights at which they step.
-
-Two reports of one flight on the samples that both have: what moved, and how well a change of error is known.
-
-Everywhere the first report is subtracted from the second: a negative difference of an error says that the second is
-better. Errors of both share the measurement and most of the model, so they are compared in pairs.
+Two reports of one flight are compared on their common samples, sample by sample, because their errors share the
+measurement and most of the model. The first report is subtracted from the second: a negative difference of an error
+means that the second is better.
 """
 
 from __future__ import annotations
@@ -50,7 +45,7 @@ from .statistics import (
 
 
 def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
-    """Channels whose verdicts against each baseline are corrected for the number of channels."""
+    """Correct the verdicts of the channels against each baseline for the number of channels."""
     rows = [dict(panel.further.compared_with) for panel in panels]
     for name in dict.fromkeys(name for row in rows for name in row):
         members = [i for i, row in enumerate(rows) if name in row]
@@ -65,23 +60,23 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 
 
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Channels with an offset and enough samples for a sentence, without copies and, where one lives, the dead."""
+    """Return the channels with an offset and enough samples, without copies, and without dead ones if any is alive."""
     some = [p for p in without_copies(panels) if not p.score.at_edge]
     enough = [p for p in some if p.score.n >= FEWEST and math.isfinite(p.score.rmse_db)]
     return [panel for panel in enough if not is_dead(panel)] or enough
 
 
 def without_copies(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Channels, and of some with the same levels the first."""
+    """Return the channels, of those with the same levels the first alone."""
     return list({panel.measured_db.tobytes(): panel for panel in reversed(list(panels))}.values())[::-1]
 
 
-# Fading alone makes a received level vary by more [dB], also where no model does.
+# Fading alone makes a received level vary by more [dB], even at one position.
 _DEAD_DB = 1.0
 
 
 def is_dead(panel: RssResult) -> bool:
-    """True of a level whose middle 80 % span less than a decibel, and little of what is predicted: a dead input."""
+    """Check whether a channel has no signal: the middle 80 % of its level span less than 1 dB, and predictions more."""
     known = panel.posed & np.isfinite(panel.measured_db) & np.isfinite(panel.simulated_dbm)
     if not known.any():
         return False
@@ -90,14 +85,14 @@ def is_dead(panel: RssResult) -> bool:
 
 
 def is_one_place(panels: Iterable[RssResult]) -> bool:
-    """True of levels that no model lets vary by a decibel, as where a UAV hovers: each fits as a constant does."""
+    """Check whether no model predicts a change of 1 dB, as during a hover: then all models fit like a constant."""
     every = [[panel.simulated_dbm, *(b.level_dbm for b in panel.baselines.values())] for panel in scored(panels)]
     levels = [level[np.isfinite(level)] for models in every for level in models if np.isfinite(level).any()]
     return bool(levels) and max(map(middle_span, levels)) < _DEAD_DB
 
 
 def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
-    """Pooled RMSE [dB] of each baseline that all of these channels have."""
+    """Return the pooled RMSE [dB] of each baseline that all of these channels have."""
     errors = {}
     for name in panels[0].baselines if panels else ():
         known = [panel.baselines[name].rmse_db for panel in panels if name in panel.baselines]
@@ -107,21 +102,21 @@ def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
 
 
 def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
-    """Root of the mean square error over all samples of several series, each after its own offset [dB]."""
+    """Return the RMSE over all samples of several series, each after its own offset [dB]."""
     weight = np.asarray(n, dtype=np.float64)
     return float(np.sqrt((weight * np.asarray(rmse_db) ** 2).sum() / weight.sum()))
 
 
 def lock_lost(panel: RssResult) -> DetectionScore | None:
-    """The score of a receiver whose log says when it was in lock; None of others, and of one that never lost it."""
+    """Return the score of a receiver that lost its lock by its log, None for other receivers."""
     score = panel.further.detection
     return score if score is not None and score.locks else None
 
 
 def flight_verdict(panels: Sequence[RssResult]) -> FlightVerdict | None:
-    """Ray tracing against the baseline with the smallest error, over all scored channels at once.
+    """Compare ray tracing with the baseline of the smallest error, over all scored channels at once.
 
-    A receiver that lost its lock is judged on all its samples, lower levels counted as its floor.
+    All samples of a receiver that lost its lock count, with lower levels raised to its floor.
     """
     panels = scored(panels)
     residuals = [_residuals(panel) for panel in panels]
@@ -142,7 +137,7 @@ _RAY = "ray tracing"
 
 
 def _residuals(panel: RssResult) -> dict[str, FloatArray]:
-    """Residuals (n,) of ray tracing and of each baseline after its own offset, where a path is simulated [dB]."""
+    """Return the residuals (n,) of ray tracing and each baseline after its own offset, NaN without a path [dB]."""
     models = {_RAY: (panel.simulated_dbm, panel.score.offset_db)}
     models |= {name: (model.level_dbm, model.offset_db) for name, model in panel.baselines.items()}
     known, score = panel.posed & np.isfinite(panel.simulated_dbm), lock_lost(panel)
@@ -162,36 +157,36 @@ def _rms(values: Sequence[FloatArray]) -> float:
     return float(np.sqrt(np.nanmean(np.concatenate(values) ** 2)))
 
 
-# Fewer flights than this give no interval of a mean over flights.
+# Flights below which a mean over flights has no interval.
 FEWEST_FLIGHTS = 3
 
-# From so many flights on, how alike neighbouring flights are is estimated and counted.
+# Number of flights from which the correlation of consecutive flights is estimated.
 _MANY_FLIGHTS = 20
 
 RankingVerdict = Literal["first", "worse", "not significant", "no interval"]
 
 
 def left_out_offsets(n: ArrayLike, mean_db: ArrayLike, *, span_db: tuple[float, float] = SPAN_DB) -> FloatArray:
-    """Offset [dB] of each flight from the samples of all others.
+    """Compute the offset [dB] of each flight from the samples of all others.
 
     Parameters
     ----------
     n : (f,)
-        Samples of each flight.
+        Number of samples of each flight.
     mean_db : (f,)
-        Mean of simulated minus measured [dB]; NaN where n = 0.
+        Mean of simulated minus measured [dB], NaN if n = 0.
     span_db : (low, high)
-        Of the offsets.
+        Search range of the offsets.
 
     Returns
     -------
     (f,)
-        NaN where no other flight has samples.
+        NaN if no other flight has samples.
 
     Notes
     -----
-    The offset of least RMSE over the other flights' samples is the mean of their differences,
-    sum_{j != i} n_j m_j / sum_{j != i} n_j, taken to the grid (arXiv 2502.10324, section V).
+    The offset with the lowest RMSE on the other flights is ``sum_{j != i} n_j m_j / sum_{j != i} n_j``, rounded to the
+    grid (arXiv 2502.10324, section V).
 
     Examples
     --------
@@ -204,7 +199,7 @@ def left_out_offsets(n: ArrayLike, mean_db: ArrayLike, *, span_db: tuple[float, 
     grid = offset_grid(span_db=span_db)
     result = np.full(len(count), np.nan)
     for i in np.flatnonzero(other_samples > 0):
-        # summed anew: the difference of two large sums would lose what one short flight says
+        # sum the others: the difference of two large sums would lose the digits of a short flight
         mean_of_others = np.delete(total, i).sum() / other_samples[i]
         result[i] = grid[nearest_offset(grid, float(mean_of_others))]
     return result
@@ -213,21 +208,21 @@ def left_out_offsets(n: ArrayLike, mean_db: ArrayLike, *, span_db: tuple[float, 
 def error_at_offset(
     offset_db: ArrayLike, rmse_db: ArrayLike, own_offset_db: ArrayLike, mean_db: ArrayLike
 ) -> FloatArray:
-    """RMSE [dB] at another offset than the own one.
+    """Compute the RMSE [dB] at another offset than that of the fit.
 
     Parameters
     ----------
     offset_db : array_like
-        The offset asked for.
+        The other offset.
     rmse_db, own_offset_db : array_like
-        RMSE at the own offset, and that offset.
+        RMSE and offset of the fit.
     mean_db : array_like
         Mean of simulated minus measured.
 
     Returns
     -------
     ndarray
-        RMSE [dB], of the broadcast shape.
+        RMSE [dB], in the broadcast shape.
 
     Notes
     -----
@@ -245,7 +240,7 @@ def error_at_offset(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeanOfFlights:
-    """Mean over ``n`` flights with a 95 % interval, NaN where there are too few."""
+    """A mean over ``n`` flights with a 95 % interval, NaN if there are too few flights."""
 
     n: int
     mean: float
@@ -254,13 +249,12 @@ class MeanOfFlights:
 
 
 def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
-    """Mean and 95 % interval over flights, one value each, in the order of the dates; NaN does not count.
+    """Return mean and 95 % interval over flights, one value per flight in the order of the dates, NaN ignored.
 
     Notes
     -----
-    Student's t over n flights; from :data:`_MANY_FLIGHTS` on over the effective number of
-    :func:`~aerpaw_cmp.compare.statistics.autocorrelation`, so that a season that drifts has no narrower
-    interval than its flights bear.
+    Student's t for n flights. From :data:`_MANY_FLIGHTS` flights on, n is their effective number
+    (:func:`~aerpaw_cmp.compare.statistics.autocorrelation`), because consecutive flights of a campaign can correlate.
     """
     from scipy.special import stdtrit  # scipy.stats would load for 0.2 s what one quantile needs
 
@@ -275,7 +269,7 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
     independent = float(n)
     if n >= _MANY_FLIGHTS and np.ptp(array) > 0:
         known = autocorrelation(array).n_effective
-        # no fewer than an interval asks for: with one, Student's t has no degree of freedom
+        # at least the flights that an interval requires: with one, Student's t has no degree of freedom
         independent = float(np.clip(known, FEWEST_FLIGHTS, n)) if np.isfinite(known) else independent
     reach = float(stdtrit(independent - 1.0, 0.975)) * float(array.std(ddof=1)) / independent**0.5
     return MeanOfFlights(n=n, mean=mean, low=mean - reach, high=mean + reach)
@@ -288,13 +282,13 @@ def verdict_of(difference: MeanOfFlights) -> RankingVerdict:
     return "worse" if difference.low > 0 else "not significant"
 
 
-# Share of sound campaigns in which a cause is named, over all that are tried together.
+# Share of campaigns without a fault in which any cause is named.
 _FALSE_ALARMS = 0.02
 
-# Flights below which none of a campaign is called unlike the others.
+# Flights of a campaign below which none is reported as different from the others.
 _FEWEST_TO_COMPARE = 5
 
-# An offset that differs by less [dB] costs no decision, whatever its interval.
+# An offset that differs by less [dB] changes no decision, even if it is significant.
 LEAST_DB = 2.0
 
 NONE = "none"
@@ -307,13 +301,13 @@ class Verdict:
     Parameters
     ----------
     cause : str
-        What sentence and action are chosen by; ``none`` where nothing is shown.
+        Key of the sentence and action, ``none`` if no cause is significant.
     effect : float
-        In the unit that the cause implies (dB, a ratio, a share); NaN where there is none.
+        Effect in the unit of the cause (dB, a ratio, a share), NaN if there is none.
     interval : (low, high)
-        95 % interval of the effect; NaN where none can be given.
+        95 % interval of the effect, NaN if there is none.
     where : str
-        Flight, link, baseline or instant that the sentence names.
+        Flight, link, baseline or time that the sentence names.
     """
 
     cause: str = NONE
@@ -325,21 +319,21 @@ class Verdict:
 # --- campaign -------------------------------------------------------------------------------------------------------
 
 
-# The chance of a shift that is no larger by accident, and what is said of it.
+# The chance of a shift at least as large by accident, and its verdict.
 _Shift = tuple[float, Verdict]
 
 
 def campaign_verdict(
     errors_db: Mapping[str, float], offsets_db: Mapping[str, Mapping[str, float]], order: Sequence[str]
 ) -> Verdict:
-    """The one trouble of a season that stands out: a flight's error or offset, or a step in a link's offset.
+    """Find the most significant irregularity of a campaign: a flight's error or offset, or a step in a link's offset.
 
     Parameters
     ----------
     errors_db : mapping of str to float
         Mean error of each flight [dB].
     offsets_db : mapping of str to mapping of str to float
-        Simulated minus measured, mean of each flight, by link [dB].
+        Mean of simulated minus measured of each flight, by link [dB].
     order : sequence of str
         Flights by date.
 
@@ -351,8 +345,9 @@ def campaign_verdict(
 
     Notes
     -----
-    Each candidate splits the flights in two; its two-sample t test with pooled variance is that of the externally
-    Studentised residual for one flight. The smallest chance counts times the number of candidates (Bonferroni).
+    Each candidate splits the flights in two, and is tested by a two-sample t test with pooled variance. For one flight
+    this is the test of the externally Studentised residual. The smallest chance is multiplied by the number of
+    candidates (Bonferroni).
     """
     shifts = [shift for shift in _shifts(errors_db, offsets_db, order) if math.isfinite(shift[0])]
     chance, best = min(shifts, key=lambda shift: shift[0], default=(1.0, Verdict()))
@@ -367,7 +362,7 @@ def _shifts(
     for i, chance, effect, ends in _each_alone(np.log([errors_db[name] for name in names])):
         low, high = np.exp(ends)
         ratio = Verdict(cause="outlying error", effect=math.exp(effect), interval=(low, high), where=names[i])
-        # a flight that errs less than the others is no trouble
+        # a flight with a smaller error than the others is not a problem
         yield (chance if effect > 0.0 else math.nan), ratio
     about: dict[str, list[float]] = {}
     for link, of in offsets_db.items():
@@ -375,7 +370,7 @@ def _shifts(
         values = np.array([of[name] for name in flown_here])
         for name, value in zip(flown_here, values - values.mean() if len(flown_here) else values, strict=True):
             about.setdefault(name, []).append(float(value))
-        # two flights on either side at least: one alone is an outlying flight, not a step
+        # at least two flights on either side: a single one is an outlying flight, not a step
         for k in range(2, len(flown_here) - 1):
             chance, effect, ends = _split(values, np.arange(len(flown_here)) >= k)
             where = f"{link} from {flown_here[k]}"
@@ -386,13 +381,13 @@ def _shifts(
 
 
 def _each_alone(values: FloatArray) -> Iterator[tuple[int, float, float, Interval]]:
-    """Each value against all others."""
+    """Compare each value with all others."""
     for i in range(len(values)):
         yield i, *_split(values, np.arange(len(values)) == i)
 
 
 def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interval]:
-    """Chance, difference of means (inside minus outside) and its 95 % interval, variance pooled."""
+    """Return chance, difference of means (inside minus outside) and its 95 % interval, with pooled variance."""
     from scipy.special import stdtr, stdtrit  # scipy.stats would load for 0.2 s what two functions need
 
     freedom, n = len(values) - 2, int(inside.sum())
@@ -401,7 +396,7 @@ def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interva
     within, without = values[inside], values[~inside]
     effect = float(within.mean() - without.mean())
     square = float(((within - within.mean()) ** 2).sum() + ((without - without.mean()) ** 2).sum()) / freedom
-    # flights may be equal to the last digit, as copies are
+    # the flights can be equal to the last digit, for example copies
     error = math.sqrt(max(square, 1e-12) * (1.0 / n + 1.0 / (len(values) - n)))
     reach = float(stdtrit(freedom, 0.975)) * error
     return 2.0 * float(stdtr(freedom, -abs(effect) / error)), effect, (effect - reach, effect + reach)
@@ -413,21 +408,20 @@ def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interva
 def by_flight(
     errors_db: Iterable[tuple[str, float]], other_db: Iterable[tuple[str, float]], where: str = ""
 ) -> Verdict:
-    """Two models on the same flights, one value per flight.
+    """Compare two models on the same flights, one value per flight.
 
     Parameters
     ----------
     errors_db, other_db : iterable of (flight, error)
-        Several errors of a flight (channels) count as their mean [dB].
+        Errors [dB]. Several errors of a flight (channels) count as their mean.
     where : str
         Name of the other model.
 
     Returns
     -------
     Verdict
-        ``better``, ``worse``, ``not significant`` or ``no interval``, of the first model. Effect: mean over flights of
-        the first minus the second [dB]. Interval from
-        :data:`.season.FEWEST_FLIGHTS` flights on.
+        ``better``, ``worse``, ``not significant`` or ``no interval`` for the first model. Effect: mean over flights of
+        the first minus the second [dB], with an interval from :data:`FEWEST_FLIGHTS` flights on.
     """
     first, second = _means(errors_db), _means(other_db)
     mean = mean_of_flights([first[name] - second[name] for name in first if name in second])
@@ -445,18 +439,18 @@ def _means(errors_db: Iterable[tuple[str, float]]) -> dict[str, float]:
 
 
 def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
-    """Check whether what was learned turns with the aircraft: body frame versus frames that do not (:func:`by_flight`).
+    """Check whether the learned gain rotates with the aircraft, by comparison with wrong frames (:func:`by_flight`).
 
     Parameters
     ----------
     against : sequence of Verdict
-        One per wrong frame.
+        Verdict of the body frame against each wrong frame.
 
     Returns
     -------
     Verdict
-        ``antenna`` where each wrong frame is significantly worse, ``place`` where one is significantly better, ``no
-        interval`` of too few flights, else ``not separable``; effect and interval of the nearer frame.
+        ``antenna`` if each wrong frame is significantly worse, ``place`` if one is significantly better, ``no
+        interval`` for too few flights, else ``not separable``. Effect and interval are those of the nearest frame.
     """
     known = [item for item in against if math.isfinite(item.effect)]
     if not known:
@@ -474,10 +468,10 @@ def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
 
 # --- prediction -----------------------------------------------------------------------------------------------------
 
-# 99 % over 95 % of a normal distribution: a bias is named beyond it, since a spread is tried beside it.
+# Ratio of the 99 % to the 95 % interval of a normal distribution: bias and spread are two tests, so each needs more.
 _TWO_TRIED = 1.3
 
-# Errors that are less than this times larger or smaller than stated are as stated.
+# Ratio of errors to their stated standard deviation up to which they count as stated, and its inverse.
 _LEAST_RATIO = 1.15
 
 
@@ -494,15 +488,15 @@ def stated_errors(
     error_db, sd_db : (n,)
         Measured minus predicted, and the standard deviation stated for it, in time order [dB].
     common_db : float or (n,)
-        Part of that standard deviation that a whole flight may share (an offset) [dB].
+        Part of that standard deviation that a whole flight can share (an offset) [dB].
     place_m : (n, 3), optional
         As for :func:`~aerpaw_cmp.compare.statistics.mean_draws`.
 
     Returns
     -------
     Verdict
-        ``narrow`` or ``wide`` (effect: errors over stated, as a ratio), ``biased`` (effect: mean error [dB]), else
-        ``none`` with the ratio and its interval; ``no interval`` of fewer than 20 samples.
+        ``narrow`` or ``wide`` (effect: ratio of errors to stated), ``biased`` (effect: mean error [dB]), else ``none``
+        with the ratio and its interval. ``no interval`` for fewer than 20 samples.
     """
     good = np.isfinite(error_db) & np.isfinite(sd_db) & (sd_db > 0.0)
     error, sd, place = error_db[good], sd_db[good], None if place_m is None else place_m[good]
@@ -514,7 +508,7 @@ def stated_errors(
     bias = Verdict(cause="biased", effect=mean, interval=(mean - reach, mean + reach))
     ratio = error / sd
     low, high = spread_interval(ratio, place)
-    # what a flight shares is no spread inside of it: it can hide a narrow interval, not make a wide one
+    # an error that the flight shares is not a spread within it: it can hide a narrow interval, not cause a wide one
     allowed = share / float(np.mean(sd**2))
     effect, within = float(np.sqrt(np.mean(ratio**2))), float(ratio.std())
     spread = Verdict(effect=effect, interval=(low, max(effect, math.sqrt(high**2 + allowed))))
@@ -529,16 +523,16 @@ def stated_errors(
 
 # --- map ------------------------------------------------------------------------------------------------------------
 
-# A map with less than this share of its positions in coverage has gaps that a sentence explains.
+# Share of positions in coverage below which a sentence explains the gaps of a map.
 _COVERED = 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Coverage:
-    """One height of a map: shares of its positions.
+    """The coverage of a map at one height, as shares of its positions.
 
-    ``covered`` with the trees as mapped, ``clear`` without trees (NaN where not mapped); ``outside`` lie further from
-    every flight than a correction reaches.
+    ``covered`` is the share with the trees as mapped, ``clear`` without trees (NaN if not mapped). ``outside`` is the
+    share that is farther from every flight than a correction reaches.
     """
 
     height_m: float
@@ -548,7 +542,7 @@ class Coverage:
 
 
 def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
-    """Share of the worst height that is covered, and the cause that takes the rest.
+    """Return the covered share at the worst height, and the cause of the gaps.
 
     Parameters
     ----------
@@ -557,9 +551,9 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
     Returns
     -------
     Verdict
-        Effect: share covered at the height with the least. Causes: ``extrapolated`` (most positions lie beyond the
-        flights), ``no path`` (nothing is covered), ``trees``, ``blocked`` (what takes most of the gaps), ``none`` (at
-        least :data:`_COVERED`). A computed share has no interval.
+        Effect: the smallest covered share of all heights. Causes: ``extrapolated`` (most positions are outside the
+        flights), ``no path`` (no coverage), ``trees`` or ``blocked`` (the cause of most gaps), ``none`` (at least
+        :data:`_COVERED`). A computed share has no interval.
     """
     if not heights:
         return Verdict()
@@ -576,25 +570,24 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
     return Verdict(cause=cause, effect=worst.covered, where=f"{worst.height_m:g} m")
 
 
-# Nights over which a step is looked for, and its chance on a night without one, at all nodes of a season together: the
-# last night, and the last seven, whose mean shows what one night cannot. Nominal: the tails of a robust fit with links
-# missing are longer than Student's, and the interval of a mean knows roughly how alike nights in a row are
-# (``python -m tests.compare.test_steps 500``: one false step in a hundred nights; as many where nights in a row
-# correlate by .7, half at .5).
+# Number of latest nights that are tested for a step, and the nominal chance of a false step per night over all nodes.
+# Seven nights show smaller steps than one. The true chance is one false step in a hundred nights, also if consecutive
+# nights correlate by 0.7, and half of that at 0.5 (``python -m tests.compare.test_steps 500``). It exceeds the nominal
+# one, because a robust fit with missing links has longer tails than Student's t.
 _CHANCES = {1: 0.0025, 7: 0.0005}
 
-# Fewer nights than this tell no standard deviation that a step could be judged by.
+# Nights below which the standard deviation is not known well enough to test for a step.
 _FEWEST_NIGHTS = 10
 
-# Residuals beyond so many robust standard deviations count less (Huber): a link with a car in front of it.
+# Robust standard deviations above which a residual counts less (Huber), for example a link with a car in front of it.
 _HUBER = 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """A change of an offset: first night with it, night at whose end it showed, size with 95 % interval.
+    """A change of an offset: its first night, the night at whose end it was found, and its size with 95 % interval.
 
-    ``back`` is the night with the old level again, of a step of a night or two; else empty.
+    ``back`` is the night at which the old level returned after one or two nights, else empty.
     """
 
     night: str
@@ -606,10 +599,10 @@ class Step:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeOffset:
-    """Offset of one end of links over the nights of a season [dB], against its own median.
+    """The offset of one end of links over the nights of a campaign [dB], relative to its median.
 
-    ``sd_db`` is its standard deviation between steps, ``smallest_db`` the step that shows the same night with a chance
-    of 90 %; NaN where there are too few nights.
+    ``sd_db`` is its standard deviation between steps, and ``smallest_db`` the step that is found the same night with a
+    probability of 90 %. Both are NaN if there are too few nights.
     """
 
     node: str
@@ -622,7 +615,7 @@ class NodeOffset:
 
 @dataclass(frozen=True, slots=True)
 class NightOffsets:
-    """Offsets (nights,) of one end of links [dB], NaN if unknown, and the number of links (nights,) of each night.
+    """The offsets (nights,) of one end of links [dB], NaN if unknown, and the number of links (nights,) per night.
 
     The variance of an offset is inversely proportional to its number of links.
     """
@@ -632,25 +625,25 @@ class NightOffsets:
 
 
 def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict[str, NightOffsets]:
-    """Offset of every transmitter and receiver, from those of the links between them.
+    """Compute the offset of every transmitter and receiver from those of the links between them.
 
     Parameters
     ----------
     offset_db : (nights, links)
-        NaN where a link was not measured.
+        Offset of each link, NaN if not measured [dB].
     links : sequence of (transmitter, receiver)
 
     Returns
     -------
     dict of str to NightOffsets
-        NaN where no link of a node was measured. Of one transmitter only the receivers have an offset.
+        NaN if no link of a node was measured. If there is a single transmitter, only the receivers have an offset.
 
     Notes
     -----
     ``offset(night, link) = link + transmitter(night) + receiver(night)`` by least squares with Huber's weights. The
-    part of a link is the median of its residuals, fitted in turns: its plain median would depend on the nights that
-    the link misses on either side of a step. What transmitters or receivers share (weather) is the median of the
-    others, and is subtracted if there are four or more.
+    constant of a link is the median of its residuals, fitted iteratively. The plain median of its offsets would depend
+    on missing nights before or after a step. The common part of transmitters or receivers (weather) is the median of
+    the other nodes, and is subtracted if there are four or more.
 
     Examples
     --------
@@ -681,7 +674,7 @@ def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict
     alone = fitted.copy()
     for i, (end, _) in enumerate(columns):
         others = [j for j, of in enumerate(columns) if of[0] == end and j != i]
-        if len(others) > 2:  # of fewer one that steps would be seen in the others
+        if len(others) > 2:  # with fewer, the step of one node would appear in the others
             fitted[:, i] -= _median(alone[:, others], 1)[:, 0]
     return {
         f"{name} {('transmits', 'receives')[end]}": NightOffsets(fitted[:, i], number[:, i])
@@ -690,17 +683,17 @@ def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict
 
 
 def _median(values: FloatArray, axis: int) -> FloatArray:
-    """Median of what is known along an axis, which stays; NaN where nothing is."""
+    """Return the median of the known values along an axis, which is kept. NaN if there are none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a link without a night, a night without a link
         return np.asarray(np.nanmedian(values, axis=axis, keepdims=True))
 
 
 @dataclass(slots=True)
-class _Stretch:
-    """Nights in a row without a step; ``square`` and ``freedom`` are of the stretches before it.
+class _Segment:
+    """The consecutive nights without a step, and sum of squares and degrees of freedom of the segments before them.
 
-    ``values`` has a row per night: offset [dB] and weight, the number of links.
+    ``values`` has a row per night: offset [dB] and weight, which is the number of links.
     """
 
     values: list[tuple[float, float]]
@@ -712,15 +705,15 @@ class _Stretch:
         return _mean(self.values)
 
     def pooled(self) -> tuple[float, int]:
-        """Return the weighted sum of squares about the levels of all stretches, and its degrees of freedom."""
+        """Return the weighted sum of squares about the levels of all segments, and its degrees of freedom."""
         mean, _ = self.level()
         own = sum(weight * (value - mean) ** 2 for value, weight in self.values)
         return self.square + own, self.freedom + len(self.values) - 1
 
-    def alike(self) -> float:
-        """Return the variance of a mean of nights in a row over that of independent nights.
+    def inflation(self) -> float:
+        """Return the variance of a mean of consecutive nights divided by that of independent nights.
 
-        The correlation is one standard error higher: independent nights must not look better than they are.
+        The correlation is raised by its standard error, because chance can make it too small.
         """
         mean, _ = self.level()
         about = np.array([(value - mean) * weight**0.5 for value, weight in self.values])
@@ -735,35 +728,35 @@ class _Stretch:
         square, freedom = self.pooled()
         if freedom < _FEWEST_NIGHTS - 1:
             return 0.0, np.inf, 1.0
-        alike = self.alike()
+        inflation = self.inflation()
         (before, weight), (after, weight_after) = self.level(), _mean(nights)
-        # the level before is a mean of nights in a row, too; one or two do not show a correlation, and rain must be
-        # able to end
-        level = (alike if len(self.values) > 2 else 1.0) / weight
-        share = (alike if len(nights) > 1 else 1.0) / weight_after + level
+        # The level before is a mean of consecutive nights, too. One or two nights show no correlation, and count as
+        # independent, so that the end of rain can be found.
+        level = (inflation if len(self.values) > 2 else 1.0) / weight
+        share = (inflation if len(nights) > 1 else 1.0) / weight_after + level
         error = float(np.sqrt(max(square, 1e-12) / freedom * share))
         step = after - before
         return step, float(stdtrit(freedom, 0.975)) * error, 2.0 * float(stdtr(freedom, -abs(step) / error))
 
     def smallest_db(self, chance: float, weight: float) -> float:
-        """Return the step of one night of a weight that is shown with a chance of 90 %."""
+        """Return the step that is found with a probability of 90 % in one night of the given weight."""
         from scipy.special import stdtrit
 
         square, freedom = self.pooled()
         if freedom < _FEWEST_NIGHTS - 1:
             return float("nan")
         reach = -float(stdtrit(freedom, chance / 2.0)) - float(stdtrit(freedom, 0.1))
-        return reach * float(np.sqrt(square / freedom * (1.0 / weight + self.alike() / self.level()[1])))
+        return reach * float(np.sqrt(square / freedom * (1.0 / weight + self.inflation() / self.level()[1])))
 
 
-def _split_nights(stretch: _Stretch, window: int) -> tuple[_Stretch, list[tuple[float, float]]]:
-    """Return the nights before the last ``window`` ones as a stretch, and those."""
-    return replace(stretch, values=stretch.values[:-window]), stretch.values[-window:]
+def _split_nights(segment: _Segment, window: int) -> tuple[_Segment, list[tuple[float, float]]]:
+    """Return the segment without its last ``window`` nights, and these nights."""
+    return replace(segment, values=segment.values[:-window]), segment.values[-window:]
 
 
-def _between(stretch: _Stretch, window: int) -> float:
+def _between(segment: _Segment, window: int) -> float:
     """Return the sum of squares that a step before the last ``window`` nights explains."""
-    earlier, nights = _split_nights(stretch, window)
+    earlier, nights = _split_nights(segment, window)
     (before, weight), (after, weight_after) = earlier.level(), _mean(nights)
     return (after - before) ** 2 * weight * weight_after / (weight + weight_after)
 
@@ -774,7 +767,7 @@ def _mean(nights: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) -> NodeOffset:
-    """Steps of one node's offset, night after night, each judged by the nights before it alone.
+    """Find the steps of one node's offset, night by night, each from the nights before it alone.
 
     Parameters
     ----------
@@ -782,7 +775,7 @@ def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) 
     night : sequence of str
     offsets : NightOffsets
     nodes : int
-        How many are looked at together: their false steps are one in a hundred nights.
+        Number of nodes that are tested together. All of them have one false step in a hundred nights.
 
     Returns
     -------
@@ -791,7 +784,7 @@ def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) 
     known = np.flatnonzero(np.isfinite(offsets.offset_db)).tolist()
     values = list(zip(offsets.offset_db[known].tolist(), offsets.links[known].tolist(), strict=True))
     steps: list[Step] = []
-    here, before = _Stretch([]), None
+    here, before = _Segment([]), None
     for last, value in enumerate(values):
         here.values.append(value)
         for window, chance in _CHANCES.items():
@@ -799,21 +792,21 @@ def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) 
                 continue
             if _split_nights(here, window)[0].step_to(here.values[-window:])[2] >= chance / nodes:
                 continue
-            # the window shows that there is a step, least squares when: old nights in its mean would make it too small
+            # Find the night of the step by least squares: nights before it in the window would make it too small.
             window = max(range(1, min(max(_CHANCES), len(here.values) - 1) + 1), key=lambda n: _between(here, n))
             earlier, nights = _split_nights(here, window)
             step, reach, _ = earlier.step_to(nights)
-            # back at the old level after a night or two: one event, not two steps
+            # a return to the old level after one or two nights is one event, not two steps
             if before is not None and len(earlier.values) < 3 and before.step_to([value])[2] >= chance / nodes:
                 steps[-1] = replace(steps[-1], back=night[known[last]])
                 here, before = replace(before, values=[*before.values, value]), None
             else:
                 at = (night[known[last + 1 - window]], night[known[last]])
                 steps.append(Step(night=at[0], shown=at[1], step_db=step, step_ci95_db=(step - reach, step + reach)))
-                here, before = _Stretch(nights, *earlier.pooled()), earlier
+                here, before = _Segment(nights, *earlier.pooled()), earlier
             break
     square, freedom = here.pooled() if values else (0.0, 0)
-    # of a night with the usual number of links
+    # weight of a night with the usual number of links
     usual = float(np.median([weight for _, weight in values])) if values else 1.0
     return NodeOffset(
         node=node, night=tuple(night[i] for i in known), offset_db=tuple(value for value, _ in values),
@@ -824,7 +817,7 @@ def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Changed:
-    """A number before and after: ``difference`` is second minus first; its 95 % interval is NaN where none is given."""
+    """A number in both reports: ``difference`` is second minus first, with a 95 % interval or NaN."""
 
     first: float
     second: float
@@ -834,7 +827,7 @@ class Changed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overlap:
-    """Samples of the first report, of the second, in both, and in one only."""
+    """The number of samples of the first report, of the second, and of both."""
 
     first: int
     second: int
@@ -845,32 +838,33 @@ class Overlap:
 
     @property
     def only_first(self) -> int:
-        """Samples that the second report has not."""
+        """The number of samples of the first report alone."""
         return self.first - self.common
 
     @property
     def only_second(self) -> int:
-        """Samples that the first report has not."""
+        """The number of samples of the second report alone."""
         return self.second - self.common
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LevelDifference:
-    """RSS of one tower and channel.
+    """The difference in the RSS of one tower and channel.
 
     Parameters
     ----------
     tower, channel : str
     samples : Overlap
+        All samples.
     scored : Overlap
-        Of them those with a residual.
+        Samples with a residual.
     measured_max_db, simulated_max_db, simulated_rms_db : float
-        Largest and root mean square difference of the levels on common samples [dB]; NaN without one.
+        Largest and root mean square difference of the levels on common samples [dB]. NaN if there are none.
     offset_db : Changed
         Fitted offset as reported.
     rmse : PairedDifference
-        On common scored samples, each report with its own best offset on them; first minus second of that record is
-        second minus first report.
+        Difference on common scored samples, each report with its own best offset there. The first model of the record
+        is the second report.
     """
 
     tower: str
@@ -886,7 +880,10 @@ class LevelDifference:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankDifference:
-    """Rank of one tower and K: ``n_changed`` simulated and ``n_reported_changed`` reported ranks on common samples."""
+    """The difference in the rank of one tower at one K.
+
+    On common samples, ``n_changed`` simulated and ``n_reported_changed`` reported ranks differ.
+    """
 
     tower: str
     k: str
@@ -908,7 +905,7 @@ def level_difference(
     offsets_db: tuple[float, float],
     place_m: FloatArray | None = None,
 ) -> LevelDifference:
-    """Compare one link.
+    """Compare the levels of one link in two reports.
 
     Parameters
     ----------
@@ -926,7 +923,7 @@ def level_difference(
     Returns
     -------
     LevelDifference
-        How far levels, offset and RMSE moved, with an interval.
+        Change of levels, offset and RMSE, with an interval.
     """
     moved = _apart(first[1], second[1])
     scored_in_both = np.isfinite(first[2]) & np.isfinite(second[2])
@@ -947,7 +944,7 @@ def level_difference(
 
 
 def _apart(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Differences where both sides have a value."""
+    """Return the differences of samples with both values."""
     finite = np.isfinite(first) & np.isfinite(second)
     return np.asarray(second[finite] - first[finite], dtype=np.float64)
 
@@ -968,23 +965,23 @@ def rank_difference(
     second: tuple[FloatArray, FloatArray],
     place_m: FloatArray | None = None,
 ) -> RankDifference:
-    """Compare the rank of one tower at one K.
+    """Compare the rank of one tower at one K in two reports.
 
     Parameters
     ----------
     tower, k : str
     samples : Overlap
     first, second : tuple of two (n,)
-        Reported and simulated rank of each report on the common samples in time order; NaN: none, 0: no path.
+        Reported and simulated rank of each report on the common samples in time order. NaN if missing, 0 if no path.
     place_m : (n, 3), optional
         As for :func:`level_difference`.
 
     Returns
     -------
     RankDifference
-        Samples whose rank changed, and the change of agreement and kappa with intervals.
+        Number of samples whose rank changed, and the change of agreement and kappa with intervals.
     """
-    # no report and no path are both 0 here, and a change to or from it counts
+    # a missing report and a missing path are both 0 here, and a change to or from 0 counts
     pairs = [np.nan_to_num(np.column_stack(pair)) for pair in (first, second)]
     usable = np.column_stack([*pairs])
     ranked = (usable >= 1).all(axis=1) & (usable <= MAX_RANK).all(axis=1)
@@ -1002,8 +999,8 @@ def rank_difference(
 
 
 def _agreement_change(first: IntArray, second: IntArray, place_m: FloatArray | None) -> tuple[Changed, Changed]:
-    """Agreement and kappa of two reports on the same poses, each (n, 2): measured and simulated rank."""
-    # one sequence for both reports: what they share cancels in the difference
+    """Compare agreement and kappa of two reports on the same poses, each (n, 2): measured and simulated rank."""
+    # use the sequence of differences: the common part of both reports cancels
     equal = [(pairs[:, 0] == pairs[:, 1]).astype(np.float64) for pairs in (first, second)]
     kappas = [kappa_influence(*pairs.T) for pairs in (first, second)] if len(first) else equal
     out = []

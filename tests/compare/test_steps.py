@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from aerpaw_cmp.compare.verdict import NightOffsets, NodeOffset, _Stretch, node_offsets, stepped
+from aerpaw_cmp.compare.verdict import NightOffsets, NodeOffset, _Segment, node_offsets, stepped
 
 NIGHTS, FIRST = 100, 30
 RADIOS = [f"LW{tower}:{channel}" for tower in range(1, 6) for channel in (0, 1)]
@@ -76,14 +76,14 @@ def test_the_smallest_step_that_is_stated_shows_nine_times_in_ten() -> None:
 
 def test_the_interval_of_a_step_has_the_error_of_both_levels_and_students_distribution() -> None:
     """Two nights at 0 and 2 dB with 4 and 2 links, 18 degrees of freedom before them, then two nights with one link."""
-    before = _Stretch([(0.0, 4.0), (3.0, 2.0)], square=8.0, freedom=18)
+    before = _Segment([(0.0, 4.0), (3.0, 2.0)], square=8.0, freedom=18)
     step, reach, chance = before.step_to([(7.0, 1.0)])
     # level (0 * 4 + 3 * 2) / 6 = 1, squares 8 + 4 + 2 * 4, freedom 18 + 1; a night of one link, a level of six
     error = np.sqrt((8.0 + 4.0 + 8.0) / 19.0 * (1.0 + 1.0 / 6.0))
     assert step == pytest.approx(6.0)
     assert reach == pytest.approx(stats.t.ppf(0.975, 19) * error)
     assert chance == pytest.approx(2.0 * stats.t.sf(6.0 / error, 19))
-    assert _Stretch([(0.0, 1.0), (3.0, 1.0)], freedom=7).step_to([(7.0, 1.0)])[1:] == (np.inf, 1.0)
+    assert _Segment([(0.0, 1.0), (3.0, 1.0)], freedom=7).step_to([(7.0, 1.0)])[1:] == (np.inf, 1.0)
 
 
 def test_intervals_of_a_step_cover_it_if_a_third_of_the_links_is_missing() -> None:

@@ -1,12 +1,11 @@
-"""Antenna gain learned from flights, and its generalization to flights, heights and directions left out.
+"""The antenna gain learned from flights, its scores on held-out data, and the choice of a prediction.
 
-Error on flights left out against the number of flights that were learned from, and for one more.
+Learned antennas are scored on held-out flights, heights, sectors and headings, and against the number of flights that
+they were learned from.
 
-Choice of a prediction and its correction, by flights (or blocks) left out inside those that are known.
-
-A *base* predicts levels above free space: nothing at all (a constant level), free space, a replay, learned antennas. A
-*correction* is the residual field (:mod:`.field_gp`) of a base. Both are chosen by the CRPS of what is left out, and
-the correction stays off unless a 95 % interval shows that it lowers the CRPS.
+A prediction has a *base*, which predicts levels above free space: a constant level, free space, a replay or learned
+antennas. Its *correction* is the residual field (:mod:`.field_gp`) of the base. Both are chosen by the CRPS on held-out
+flights, or on blocks of a single flight. There is no correction unless a 95 % interval shows that it lowers the CRPS.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ from .result import BASELINE_TITLE
 from .statistics import Interval, mean_interval
 
 SECTORS = 6
-# Directions this near a left-out sector are not learned from either.
+# Guard around a held-out sector [deg]: directions within it are not used for learning either.
 _GUARD_DEG = 10.0
 
 STRETCHES = 8
@@ -53,7 +52,7 @@ GUARD_S = 20.0
 _CRUISE_M = 5.0
 _LEAST_SAMPLES = 50
 
-# Fields of :class:`Score` that a learned model is held against, with their titles.
+# Fields of :class:`Score` with the errors of baselines, and their titles.
 BASELINES = {f"{name}_rmse_db": BASELINE_TITLE[name] for name in ("free_space", "log_distance", "constant")}
 
 SPLITS = (
@@ -64,11 +63,11 @@ SPLITS = (
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """Samples with what a score needs besides: level of free space (n,) [dB], heading of the nose (n,) [deg].
+    """The samples of a series with the further data of a score.
 
-    ``tower_m`` (n, 3): places of a tower that moves [m]. ``start``: the instant of ``time_s`` 0 (UTC), where known.
-    ``locked`` (n,): 1 where the receiver was in lock, 0 where it had lost it, NaN unknown. ``sent_dbm``: transmit power
-    of ``free_space_db``.
+    ``free_space_db`` (n,): level of free space for the transmit power ``sent_dbm`` [dB]. ``heading_deg`` (n,): heading
+    of the nose [deg]. ``tower_m`` (n, 3): positions of a moving tower [m]. ``start``: time of ``time_s`` 0 (UTC) or
+    None. ``locked`` (n,): receiver lock, 1 locked, 0 not locked, NaN unknown.
     """
 
     samples: LinkSamples
@@ -80,7 +79,7 @@ class Observed:
     sent_dbm: float = 0.0
 
     def part(self, keep: BoolArray | IntArray) -> Observed:
-        """Some of the samples."""
+        """Return some of the samples."""
         return dataclasses.replace(
             self,
             samples=self.samples.part(keep),
@@ -93,14 +92,14 @@ class Observed:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """Definition of the quantities to be learned.
+    """A definition of the quantities to learn.
 
     Parameters
     ----------
     model : GainModel
-        Terms and where their strengths start.
+        Terms and the initial values of their strengths.
     patterns : mapping of str to callable
-        Gain of measured patterns in the device frame: ``uav`` and antennas (``tower.channel``); may be empty.
+        Gain of measured patterns in the device frame, for ``uav`` and antennas (``tower.channel``). It can be empty.
     """
 
     model: GainModel
@@ -109,13 +108,16 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True)
 class Mounted:
-    """Measured patterns by name, and the mounts that were fitted of those that a flight used."""
+    """The measured patterns by name, and the fitted mounts of those that a flight used."""
 
     patterns: Mapping[str, GainOf]
     mounts: Mapping[str, MountFit]
 
     def pattern_db(self, name: str, direction: FloatArray) -> FloatArray:
-        """Gain (n,) of a measured pattern as mounted, towards directions (n, 3) of body or mast; 0 without one."""
+        """Return the gain (n,) of a measured pattern as mounted, towards directions (n, 3) of body or mast.
+
+        The gain is 0 if there is no pattern.
+        """
         pattern = self.patterns.get(name)
         if pattern is None:
             return np.zeros(len(direction))
@@ -123,25 +125,25 @@ class Mounted:
         return pattern(direction if mount is None else direction @ turned(mount.azimuth_deg))
 
     def patterns_db(self, samples: LinkSamples) -> FloatArray:
-        """Gain (n,) of the measured patterns of both ends."""
+        """Return the gain (n,) of the measured patterns of both ends."""
         return self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
 
 
 @dataclass(frozen=True, slots=True)
 class Learned(Mounted):
-    """The outcome of :func:`learn`."""
+    """The result of :func:`learn`."""
 
     fit: GainFit
     fading: Mapping[str, tuple[float, float]]
-    """Of each antenna: :func:`~aerpaw_cmp.compare.gains.fading_of` the flights that were learned from."""
+    """The :func:`~aerpaw_cmp.compare.gains.fading_of` the training flights, by antenna."""
 
     @property
     def model(self) -> GainModel:
-        """Terms and strengths of the fit."""
+        """The terms and strengths of the fit."""
         return self.fit.model
 
     def spread(self, antenna: str) -> Spread:
-        """Spread of a level at an antenna besides the standard deviation of the gain."""
+        """Return the error model of a level at an antenna, except for the standard deviation of the gain."""
         model = self.model
         sd_db, kurtosis = self.fading.get(antenna, (0.0, 0.0))
         campaign = next((s.campaign for s in self.fit.rows if s.antenna == antenna), "")
@@ -155,51 +157,51 @@ class Learned(Mounted):
         )
 
     def predict(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
-        """Gain of both ends and its standard deviation (n,) [dB], about a mean that the offset takes."""
+        """Return the gain of both ends and its standard deviation (n,) [dB], up to a constant in the offset."""
         gain, sd = self.fit.predict(samples)
         return self.patterns_db(samples) + gain, sd
 
     def mean_error(self, samples: LinkSamples) -> float:
-        """Mean of measured minus :meth:`mean` [dB]; NaN without a sample that has both."""
+        """Return the mean of measured minus :meth:`mean` [dB], NaN if no sample has both."""
         error = samples.residual_db - self.mean(samples)
         return float(np.nanmean(error)) if np.isfinite(error).any() else math.nan
 
     def mean(self, samples: LinkSamples) -> FloatArray:
-        """The gain of :meth:`predict` alone, along a flight in the order of time."""
+        """Return the gain of :meth:`predict` without its standard deviation, along a flight in time order."""
         return self.patterns_db(samples) + _mean_along(self.fit, samples)
 
 
-# A UAV hardly turns within this time [s].
+# Time within which a UAV hardly turns [s].
 _FINE_S = 0.5
 
 
 def _mean_along(fit: GainFit, samples: LinkSamples) -> FloatArray:
-    """Gain (n,) along a flight [dB]: at means over :data:`_FINE_S`, and linear between them."""
+    """Return the gain (n,) along a flight [dB], computed for means over :data:`_FINE_S` and linear between them."""
     at = dataclasses.replace(samples, residual_db=np.zeros(len(samples))).binned(_FINE_S)
     if not len(at):
         return np.full(len(samples), np.nan)
-    # linear between half seconds: each mean costs a row of kernels
+    # interpolate between half seconds: each mean requires a row of kernels
     gain = np.interp(samples.time_s, at.time_s, fit.mean(at))
     return np.where(np.isfinite(samples.at_uav).all(axis=1), gain, np.nan)
 
 
 def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None = None) -> Learned:
-    """Mounts, then the gain over direction on top of the patterns.
+    """Fit the mounts of the patterns, then the gain over direction that remains.
 
     Parameters
     ----------
     series : sequence of LinkSamples
-        Residuals against free space of the flights to learn from, and no other.
+        Residuals against free space of the training flights alone.
     recipe : Recipe
     model : GainModel, optional
-        Strengths that were chosen on the same flights; chosen anew without.
+        Strengths that were fitted to the same flights. The default fits them.
     """
     names = ["uav", *dict.fromkeys(s.antenna for s in series)]
     patterns = {name: recipe.patterns[name] for name in names if name in recipe.patterns}
     mounted = Mounted(recipe.patterns, fit_mounts(series, patterns) if patterns else {})
     residuals = [dataclasses.replace(s, residual_db=s.residual_db - mounted.patterns_db(s)) for s in series]
     fit = chosen_fit(residuals, recipe.model) if model is None else fit_gain(residuals, model)
-    if any(s.floor_db is not None for s in series):  # once more; another time changes nothing on flights left out
+    if any(s.floor_db is not None for s in series):  # a second fit; a third does not change held-out flights
         fit = fit_gain([_at_floor(s, mounted.patterns_db(s), fit) for s in series], fit.model)
     antennas = dict.fromkeys(s.antenna for s in series)
     fading = {name: fading_of([s for s in series if s.antenna == name], fit.model.bin_s) for name in antennas}
@@ -207,7 +209,10 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None
 
 
 def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkSamples:
-    """Residual minus ``known_db``; below the floor, the value that the fit expects, no higher than the floor."""
+    """Subtract ``known_db`` from the residual, and replace samples below the floor.
+
+    They get the value that the fit predicts, limited to the floor.
+    """
     residual = samples.residual_db - known_db
     if samples.floor_db is None:
         return dataclasses.replace(samples, residual_db=residual)
@@ -219,14 +224,14 @@ def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkS
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Error of one flight and channel that had no part in the fit, after one offset [dB].
+    """The error of one held-out flight and channel after one offset [dB].
 
-    ``rmse_4s_db``: both sides averaged in power over 4 s. ``inside_50``, ``inside_90``, ``inside_95``: share of
-    samples (some hundred of them) inside the interval that is to hold so many per cent. ``offset_db``: measured
-    minus predicted, mean. ``rmse_shared_offset_db``: with the mean offset of the flights that were learned from in
-    place of the flight's own. ``constant_rmse_db``, ``log_distance_rmse_db``: of a constant, and of a line over log
-    distance whose slope at each of eight places comes from the other places of the flight. Where a part of a flight is
-    scored, the offset of every model (and the slope of the line) comes from outside that part.
+    ``rmse_4s_db``: both sides averaged in power over 4 s. ``inside_50``, ``inside_90``, ``inside_95``: share of some
+    hundred samples inside the 50, 90 and 95 % interval. ``offset_db``: mean of measured minus predicted.
+    ``rmse_shared_offset_db``: RMSE with the mean offset of the training flights. ``constant_rmse_db``,
+    ``log_distance_rmse_db``: RMSE of a constant, and of a line over log distance. The slope of the line in each of
+    eight areas comes from the other areas of the flight. If parts of a flight are scored, the offset of every model and
+    the slope of the line come from outside the part.
     """
 
     flight: str
@@ -246,20 +251,21 @@ class Score:
 
 
 def score(observed: Observed, gain_db: FloatArray, simple: Simple | None = None) -> Score | None:
-    """Score of a prediction; None with fewer than 50 samples to score.
+    """Score a prediction.
 
     Parameters
     ----------
     observed : Observed
     gain_db : (n,)
-        Predicted level above free space [dB]; NaN is not scored.
+        Predicted level above free space [dB]. NaN is not scored.
     simple : Simple, optional
-        Baselines whose offset in each scored part, like that of ``gain_db``, comes from samples outside the part, so
-        that they are compared like for like. Without, they have one offset for the whole flight.
+        Baselines whose offset in each scored part comes from samples outside the part, like that of ``gain_db``. By
+        default they have one offset for the whole flight.
 
     Returns
     -------
     Score or None
+        None for fewer than 50 samples.
     """
     s = observed.samples
     free = np.zeros(len(s)) if simple is None else simple.free_db
@@ -288,26 +294,26 @@ def score(observed: Observed, gain_db: FloatArray, simple: Simple | None = None)
     )
 
 
-# Of a line over log distance: times free space.
+# Largest slope of a line over log distance, as a multiple of free space.
 STEEPEST = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Simple:
-    """Models without antennas, each (n,): free space above its level, a constant and a line over log distance [dB]."""
+    """The models without antennas, each (n,) [dB]: offset of free space, a constant and a line over log distance."""
 
     free_db: FloatArray
     constant_db: FloatArray
     line_db: FloatArray
 
     def predict(self, o: Observed, inside: BoolArray, outside: BoolArray) -> None:
-        """Fill in the samples of a part, every number of it from samples outside."""
+        """Fill in the samples of a part from samples outside it."""
         measured = o.samples.residual_db + o.free_space_db
         known = outside & np.isfinite(measured)
         free, level = o.free_space_db[known], measured[known]
         spread = float(((free - free.mean()) ** 2).sum())
         slope = float(((free - free.mean()) * (level - level.mean())).sum()) / spread if spread else 0.0
-        # 0 to 60 dB per decade: seen from one height only, a line may point anywhere else
+        # limit it to 0 to 60 dB per decade: samples of one height do not determine the slope
         slope = min(max(slope, 0.0), STEEPEST)
         self.free_db[inside] = o.samples.residual_db[known].mean()
         self.constant_db[inside] = level.mean()
@@ -315,30 +321,33 @@ class Simple:
 
 
 def mean_rmse(scores: Sequence[Score], name: str = "rmse_db") -> float:
-    """Mean over flights and channels [dB]; NaN without any."""
+    """Return the mean over flights and channels [dB], NaN if there are none."""
     return float(np.mean([getattr(s, name) for s in scores])) if scores else math.nan
 
 
 def flights_of(observed: Sequence[Observed]) -> list[str]:
-    """Names in order."""
+    """Return the names of the flights in order."""
     return list(dict.fromkeys(o.samples.flight for o in observed))
 
 
-# Flights are left out one by one, or, where they are more, in this many groups: none is predicted by itself.
+# Largest number of groups of held-out flights. Up to this number, each flight is held out alone.
 MOST_GROUPS = 6
 
 
 def groups_of(flights: Sequence[str]) -> list[list[str]]:
-    """Flights that are left out together: each alone, or spread over :data:`MOST_GROUPS` groups."""
+    """Return the flights that are held out together: each alone, or spread over :data:`MOST_GROUPS` groups."""
     count = min(len(flights), MOST_GROUPS)
-    # every so many: flights of one day are learned from and predicted
+    # a stride spreads the flights of one day over the groups
     return [list(flights[i::count]) for i in range(count)]
 
 
 def flight_left_out(
     observed: Sequence[Observed], recipe: Recipe, without: dict[str, Learned] | None = None
 ) -> tuple[Score, ...]:
-    """Each flight predicted from others (:func:`groups_of`); ``kept`` receives what was learned without each flight."""
+    """Score each flight as predicted from others (:func:`groups_of`).
+
+    ``without`` receives what was learned without each flight.
+    """
     scores: list[Score | None] = []
     for group in groups_of(flights_of(observed)):
         train = [o.samples for o in observed if o.samples.flight not in group]
@@ -355,14 +364,14 @@ def flight_left_out(
 
 
 def campaign_left_out(observed: Sequence[Observed], recipe: Recipe, turn_deg: float = 0.0) -> tuple[Score, ...]:
-    """Return the scores of each campaign, predicted by the airframe of the others alone; empty for one campaign.
+    """Score each campaign as predicted by the airframe of the others alone. Empty for a single campaign.
 
     Parameters
     ----------
     observed : sequence of Observed
     recipe : Recipe
     turn_deg : float
-        Control: directions at the UAV rotated anticlockwise.
+        Angle by which directions at the UAV are rotated anticlockwise, as a control.
     """
     scores: list[Score | None] = []
     for name in dict.fromkeys(o.samples.campaign for o in observed):
@@ -377,24 +386,24 @@ def campaign_left_out(observed: Sequence[Observed], recipe: Recipe, turn_deg: fl
 
 
 def score_with(learned: Learned, unseen: Sequence[Observed], train: Sequence[Observed]) -> tuple[Score, ...]:
-    """Scores of flights that were not learned from, at antennas that were."""
+    """Score held-out flights at antennas of the training flights."""
     return tuple(_scored_with(unseen, learned, _offsets([o.samples for o in train], learned)))
 
 
 def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]:
-    """Mean over flights of measured minus predicted, per antenna [dB]."""
+    """Return the mean over flights of measured minus predicted, by antenna [dB]."""
     each: dict[str, list[float]] = {}
     for samples in train:
         each.setdefault(samples.antenna, []).append(learned.mean_error(samples))
     return {antenna: float(np.nanmean(values)) for antenna, values in each.items() if np.isfinite(values).any()}
 
 
-# Samples of a series at which standard deviations are checked: each costs a thousand times what its mean does.
+# Samples of a series whose standard deviations are checked: one takes a thousand times longer than a mean.
 _SPREAD_SAMPLES = 400
 
 
 def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[str, float]) -> Iterator[Score]:
-    """Scores at antennas that have an offset, with their own and with that of the other flights."""
+    """Yield the scores at antennas that have an offset, with their own and with that of the other flights."""
     for o in unseen:
         if o.samples.antenna not in offsets:
             continue
@@ -402,29 +411,29 @@ def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[
         fitted = score(o, gain)
         if fitted is None:
             continue
-        # evenly over the flight: neighbours have the same standard deviation
+        # spread over the flight, because neighbours have the same standard deviation
         some = spread_out(len(gain), _SPREAD_SAMPLES)
         stated = StatedSpread(
             gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
         )
         error = o.samples.residual_db - gain - fitted.offset_db
         fitted = dataclasses.replace(fitted, **inside_shares(error[some], stated))  # type: ignore[arg-type]
-        # the mean square about another offset is the variance and the square of their difference
+        # the mean square about another offset is the variance plus the square of the difference of the offsets
         shared = math.hypot(fitted.rmse_db, fitted.offset_db - offsets[o.samples.antenna])
         yield dataclasses.replace(fitted, rmse_shared_offset_db=shared)
 
 
-# Of more flights, this many are scored part by part, evenly over their order.
+# Largest number of flights that are scored part by part. If there are more, some are taken at even steps.
 _MOST_SCORED = 6
 
 
 def spread_flights(flights: Sequence[str]) -> list[str]:
-    """The flights, or :data:`_MOST_SCORED` of them, the first and the last among them."""
+    """Return all flights, or :data:`_MOST_SCORED` of them including the first and the last."""
     return [flights[i] for i in spread_out(len(flights), _MOST_SCORED)]
 
 
-# ``parts(scored, other)``: per part the samples (n,) of the scored series in it, and those (m,) of another series that
-# may be learned from.
+# ``parts(scored, other)`` returns for each part the samples (n,) of the scored series in it, and the samples (m,) of
+# another series that can be used for learning.
 Parts = Callable[[Observed, Observed], list[tuple[BoolArray, BoolArray]]]
 
 
@@ -436,33 +445,32 @@ def parts_left_out(
     *,
     own_rest: bool,
 ) -> tuple[Score, ...]:
-    """Each flight predicted part by part, from other flights without what is like the part.
+    """Score each flight as predicted part by part, from other flights without samples that are like the part.
 
-    ``own_rest``: the rest of the flight is learned from, too. The offset of a part comes from the flight's samples
-    outside it, so that nothing of the part is fitted.
+    The offset of a part comes from the flight's samples outside it, so that no number is fitted to the part.
 
     Parameters
     ----------
     observed : sequence of Observed
-        Of all flights.
+        Samples of all flights.
     recipe : Recipe
     without : mapping of str to Learned
-        What was learned without each flight: its strengths are used again.
+        What was learned without each flight. Its strengths are used again.
     parts : callable
         :func:`altitude_parts`, :func:`heading_parts`, :func:`sector_parts` or :func:`route_parts`.
     own_rest : bool
-        Learn from the rest of the flight, too.
+        True to learn from the rest of the flight, too.
 
     Returns
     -------
     tuple of Score
-        One per series, over all its parts; series of which no part could be predicted are left out.
+        One score per series, over all its parts. Series without a predicted part are omitted.
     """
     flights = spread_flights(flights_of(observed))
     of = {flight: [o for o in observed if o.samples.flight == flight] for flight in flights}
     stitched = {flight: [np.full(len(o.samples), np.nan) for o in of[flight]] for flight in flights}
     simple = {flight: [Simple(*np.full((3, len(o.samples)), np.nan)) for o in of[flight]] for flight in flights}
-    # one part after the other: what the flights learn from is much the same, and kept
+    # loop over parts first: the training data of the flights are nearly the same, and their kernels are cached
     for k in range(max(len(parts(mine[0], mine[0])) for mine in of.values())):
         for flight, mine in of.items():
             sources = list(observed) if own_rest else [o for o in observed if o.samples.flight != flight]
@@ -493,20 +501,20 @@ def parts_left_out(
 
 
 def altitude_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
-    """The commonest height of the scored flight, and all other heights."""
+    """Return the most frequent height of the scored flight as one part, with all other heights for learning."""
     height, cruise = scored.samples.position_m[:, 2], cruise_height_m(scored)
     mine = np.abs(height - cruise) < _CRUISE_M
     return [(mine, np.abs(source.samples.position_m[:, 2] - cruise) >= _CRUISE_M)]
 
 
 def cruise_height_m(observed: Observed) -> float:
-    """Return the commonest height of a flight, to a metre [m]."""
+    """Return the most frequent height of a flight, to a metre [m]."""
     heights, count = np.unique(np.round(observed.samples.position_m[:, 2]), return_counts=True)
     return float(heights[count.argmax()])
 
 
 def sector_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
-    """Sectors of azimuth at the tower, with a guard."""
+    """Return sectors of azimuth at the tower, with a guard."""
 
     def azimuth(o: Observed) -> FloatArray:
         return np.degrees(azimuth_rad(o.samples.at_tower))
@@ -515,7 +523,7 @@ def sector_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, Bo
 
 
 def heading_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
-    """Eighths of the compass for the nose, with a guard."""
+    """Return eighths of the compass for the heading, with a guard."""
     return _angular(scored.heading_deg, source.heading_deg, 8, _GUARD_DEG)
 
 
@@ -531,9 +539,9 @@ def _angular(mine: FloatArray, sources: FloatArray, count: int, guard_deg: float
 
 
 def route_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
-    """Stretches of the scored flight in time, with a guard; other flights count whole."""
+    """Return segments of the scored flight in time, with a guard. All samples of other flights are used."""
     time = scored.samples.time_s
-    # a little longer: the last sample lies in the last stretch
+    # extend the last segment to include the last sample
     edges = np.linspace(time.min(), time.max() + 1e-6, STRETCHES + 1)
     out = []
     for low, high in itertools.pairwise(edges):
@@ -548,12 +556,12 @@ def route_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, Boo
 
 
 def world_frame(observed: Sequence[Observed]) -> list[Observed]:
-    """Control: the UAV's term in the world's axes, where no antenna of it is fixed."""
+    """Return the samples with the UAV's directions in world axes, as a control: no antenna is fixed there."""
     return [_with_uav(o, -o.samples.at_tower) for o in observed]
 
 
 def wrong_way(observed: Sequence[Observed]) -> list[Observed]:
-    """Control: headings taken with the wrong sign."""
+    """Return the samples with headings of the wrong sign, as a control."""
     out = []
     for o in observed:
         body = o.samples.at_uav
@@ -568,27 +576,27 @@ def _with_uav(o: Observed, at_uav: FloatArray) -> Observed:
     return dataclasses.replace(o, samples=dataclasses.replace(o.samples, at_uav=at_uav))
 
 
-# Of each number of flights; where there are more subsets, those of neighbouring flights are taken.
+# Largest number of subsets per number of flights. If there are more, subsets of consecutive flights are used.
 _MOST_FITS = 6
 
-# Numbers of flights that are tried.
+# Largest number of points of a learning curve.
 _MOST_SIZES = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CurvePoint:
-    """Mean error over the same series [dB], each predicted by every subset of other flights of one size.
+    """The mean error for one number of training flights [dB], over all subsets and the same series.
 
     Parameters
     ----------
     flights : int
-        That were learned from.
+        Number of training flights.
     rmse_db, rmse_4s_db : float
-        As logged and over 4 s, after one offset.
+        RMSE as logged and over 4 s, after one offset.
     fits : int
-        Subsets.
+        Number of subsets.
     series : int
-        Flights and channels that the mean is over.
+        Number of flights and channels.
     """
 
     flights: int
@@ -599,19 +607,19 @@ class CurvePoint:
 
 
 def learning_curve(observed: Sequence[Observed], recipe: Recipe) -> tuple[CurvePoint, ...]:
-    """Error against number of flights, by subsets of the named ones; nothing with fewer than three flights.
+    """Compute the error against the number of training flights, by subsets of the flights.
 
     Parameters
     ----------
     observed : sequence of Observed
-        Of all flights.
+        Samples of all flights.
     recipe : Recipe
-        Its strengths are chosen within each subset.
+        Terms whose strengths are fitted within each subset.
 
     Returns
     -------
     tuple of CurvePoint
-        By number of flights, the largest being all but the one that is predicted.
+        One point per number of flights, up to all but the predicted flight. Empty for fewer than three flights.
     """
     flights = flights_of(observed)
     if len(flights) < 3:
@@ -629,7 +637,7 @@ def learning_curve(observed: Sequence[Observed], recipe: Recipe) -> tuple[CurveP
             for scored in filter(None, (score(o, learned.mean(o.samples)) for o in targets)):
                 key = scored.flight, f"{scored.tower}.{scored.channel}"
                 errors[size].setdefault(key, []).append((scored.rmse_db, scored.rmse_4s_db))
-    # the same series at every number: else a curve may fall because a hard flight left it
+    # use the same series at every number of flights: otherwise a curve could fall because a difficult flight is missing
     common = set.intersection(*(set(each) for each in errors.values()))
     if not common:
         return ()
@@ -645,7 +653,7 @@ def learning_curve(observed: Sequence[Observed], recipe: Recipe) -> tuple[CurveP
 
 
 def _subsets(flights: Sequence[str], size: int) -> list[set[str]]:
-    """All subsets of a size, or runs of neighbours round the list, evenly begun."""
+    """Return all subsets of a size, or runs of consecutive flights (cyclic) with evenly spread starts."""
     if math.comb(len(flights), size) <= _MOST_FITS:
         return [set(subset) for subset in itertools.combinations(flights, size)]
     twice = [*flights, *flights]
@@ -654,12 +662,12 @@ def _subsets(flights: Sequence[str], size: int) -> list[set[str]]:
 
 
 def with_one_more(points: Sequence[CurvePoint], name: str = "rmse_db") -> float:
-    """Error to expect with one flight more than the largest subset and the one predicted [dB]; NaN with one point.
+    """Return the error to expect with one more flight than the last point [dB], NaN for a single point.
 
     Notes
     -----
-    The square of the error is fitted as ``a + b / flights`` with b >= 0; ``b / flights`` is what averages out. The last
-    three sizes count: with the first flights an error may fall slowly, until they share directions.
+    The square of the error is fitted as ``a + b / flights`` with b >= 0, where ``b / flights`` averages out. The last
+    three points are used, because the first flights share few directions and the error falls slowly.
 
     Examples
     --------
@@ -676,30 +684,30 @@ def with_one_more(points: Sequence[CurvePoint], name: str = "rmse_db") -> float:
     return math.sqrt(max(float(square[-1]) - slope * (1.0 / last - 1.0 / (last + 1)), 0.0))
 
 
-# Level above free space (n,) and its standard deviation (n,) [dB] of samples whose residual is not used.
+# Function that predicts level above free space (n,) and its standard deviation (n,) [dB]. It does not use residuals.
 Predictor = Callable[[LinkSamples], tuple[FloatArray, FloatArray]]
 
-# Learns from samples whose residual is measured minus free space.
+# Function that learns from samples whose residual is measured minus free space.
 Base = Callable[[Sequence[LinkSamples]], Predictor]
 
 _HeldOut = tuple[FloatArray, FloatArray]
 
-# Residuals are means over this time [s].
+# Averaging time of the residuals [s].
 BIN_S = 4.0
 
-# Side of the blocks of a single flight that are left out.
+# Side of the held-out blocks of a single flight [m].
 BLOCK_M = 300.0
 
-# Of more flights than :data:`~.calibration.MOST_GROUPS`, so many groups are left out in turn, and the strengths of a
-# residual field that are learned without the first serve for all: one flight among many hardly moves them.
+# Number of groups that are held out in turn if there are more flights than :data:`MOST_GROUPS`. A residual field is
+# then fitted once, without the first group: one flight among many hardly changes it.
 _SCORED_GROUPS = 3
 
 OFF = "no correction"
 
 _NUISANCE = ("drift_sd_db", "drift_s", "noise_sd_db")
 
-# Scales of the place part that are tried; drift and noise always come from the likelihood. Between few flights the
-# likelihood alone confuses place with direction and height: measured, free lengths lost 0.3 dB on flights left out.
+# Scales of the field over positions. Drift and noise are always fitted. With few flights the likelihood confuses
+# position with direction and height: free lengths increased the error on held-out flights by 0.3 dB.
 _STARTS: dict[str, FieldModel | None] = {
     OFF: FieldModel(place_sd_db=1e-3, turn=math.inf, drift_s=8.0),
     "field of 2 dB, 30 m": FieldModel(place_sd_db=2.0, length_m=30.0, height_m=20.0, turn=0.35, drift_s=8.0),
@@ -711,7 +719,7 @@ _STARTS: dict[str, FieldModel | None] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Channel:
-    """Binned rows of one tower and channel over all flights, and what a base leaves there (n,) [dB]."""
+    """The binned rows of one tower and channel over all flights, and the residuals (n,) of a base there [dB]."""
 
     rows: Rows
     left_db: FloatArray
@@ -720,31 +728,30 @@ class Channel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Correction:
-    """Chosen base and residual field, conditioned on all that is known.
+    """The chosen base and residual field, conditioned on all known flights.
 
     Parameters
     ----------
     base : str
     predictor : callable
-        Of the base, learned from all flights.
+        Prediction of the base, learned from all flights.
     title : str
-        Of the residual field, or :data:`OFF`.
+        Title of the residual field, or :data:`OFF`.
     model : FieldModel
     channels : mapping of str to Channel
-        By antenna (``tower.channel``).
+        Channels by antenna (``tower.channel``).
     flights : tuple of str
-        Their places are the codes of :class:`Rows`.
-    crps_db : mapping of (base, title) to float
-        Of what was left out.
-    rmse_db : mapping of (base, title) to float
+        Names, whose indices are the codes of :class:`Rows`.
+    crps_db, rmse_db : mapping of (base, title) to float
+        CRPS and RMSE of held-out errors.
     held_out : mapping of (base, title) to ((n,), (n,))
-        Errors on what was left out, in one order for all, and the standard deviations stated for them; NaN: no error.
+        Held-out errors, in one order for all, and their standard deviations. NaN if there is no prediction.
     held_out_place_m : (n, 3), optional
         Positions of the samples of ``held_out`` [m].
     held_out_parts : tuple of (str, int)
         Flight and number of samples of each tower and channel in ``held_out``, in its order.
     sd_factor : float
-        On all standard deviations: makes the errors of what was left out as large as stated. Each candidate of
+        Factor of all standard deviations, which makes the held-out errors as large as stated. Each candidate of
         ``held_out`` has its own.
     """
 
@@ -761,7 +768,7 @@ class Correction:
     held_out_parts: tuple[tuple[str, int], ...] = ()
     sd_factor: float = 1.0
     fits: dict[str, FieldFit] = field(default_factory=dict, repr=False, compare=False)
-    """Solved fields by antenna."""
+    """The solved fields by antenna."""
 
     @property
     def on(self) -> bool:
@@ -771,31 +778,31 @@ class Correction:
     def predict(
         self, samples: LinkSamples, flight: str | None = None, *, own_mean: bool = False
     ) -> tuple[FloatArray, FloatArray]:
-        """Level above free space (n,) and its standard deviation (n,) as a mean over :data:`BIN_S` [dB].
+        """Return level above free space (n,) and its standard deviation (n,) for means over :data:`BIN_S` [dB].
 
-        The standard deviation holds base, field, drift and noise, and the offset between flights unless the samples
-        count about their ``own_mean``.
+        The standard deviation contains base, field, drift and noise. It contains the offset between flights unless
+        errors count about the ``own_mean`` of the samples.
         """
         return self.over_headings([samples], flight, own_mean=own_mean)
 
     def over_headings(
         self, each: Sequence[LinkSamples], flight: str | None = None, *, own_mean: bool = False, all_targets: int = 0
     ) -> tuple[FloatArray, FloatArray]:
-        """As :meth:`predict`, of an aircraft whose heading is not known: each of some counts alike.
+        """Predict as :meth:`predict` for an aircraft with unknown heading, giving equal weight to several headings.
 
         Parameters
         ----------
         each : sequence of LinkSamples
-            The same samples, as seen with each heading.
+            The same samples with each heading.
         flight : str, optional
         own_mean : bool
         all_targets : int
-            Targets of the whole run, where these are a part: all parts are then solved alike.
+            Number of targets of the run, if these are a part of it. All parts are then solved in the same way.
 
         Returns
         -------
         level_db, sd_db : (n,)
-            What a field of directions says of the heading counts as not known.
+            Mean over the headings, and a standard deviation that includes the spread between them.
         """
         samples = each[0]
         channel = self.channels.get(samples.antenna)
@@ -806,30 +813,30 @@ class Correction:
         if len(each) > 1:
             targets = dataclasses.replace(targets, direction=np.stack([s.at_uav for s in each], axis=1))
         if not self.on and flight not in self.flights and len(targets):
-            # without a field one target with a position stands for all
+            # without a field, one target with a position has the solution of all
             targets = targets.part(np.array([np.isfinite(targets.position_m).all(axis=1).argmax()]))
-        # solved once for each antenna: maps ask tile by tile
+        # solve once for each antenna, because maps are predicted tile by tile
         fit = self.fits.setdefault(samples.antenna, FieldFit(self.model, channel.rows, channel.left_db))
         exact = fit.fits(max(len(targets), all_targets))
         mean, sd = fit.predict(targets, exact=exact)
         if own_mean:
-            # about its own mean a flight's offset is no error
+            # the offset of a flight does not change errors about its own mean
             _, sd = fit.predict(targets, ("place", "drift"), exact=exact)
         variance = sd**2 + (gain_sds**2).mean(axis=0) + gains.var(axis=0) + self.model.noise_sd_db**2
         return gains.mean(axis=0) + mean, self.sd_factor * np.sqrt(variance)
 
 
 def between_blocks_db(channel: Channel) -> float:
-    """Standard deviation of what a base leaves, between blocks of :data:`BLOCK_M` [dB]; 0 for a single block."""
+    """Return the standard deviation of a base's residual between blocks of :data:`BLOCK_M` [dB], 0 for one block."""
     cell = np.floor(channel.rows.position_m[:, :2] / BLOCK_M).astype(np.int64)
     member = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
-    # equal blocks: a hover counts no more than a pass
+    # blocks have equal weights, so that a hover counts no more than a pass
     means = np.bincount(member, weights=channel.left_db) / np.bincount(member)
     return float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
 
 
 def _channels(series: Sequence[LinkSamples], predictor: Predictor, flights: Sequence[str]) -> dict[str, Channel]:
-    """Residuals of a base, by antenna."""
+    """Return the residuals of a base by antenna."""
     parts: dict[str, list[Channel]] = {}
     for samples in series:
         binned = samples.binned(BIN_S)
@@ -860,14 +867,14 @@ def _model(title: str, channels: Mapping[str, Channel]) -> FieldModel:
 
 @dataclass(frozen=True, slots=True)
 class _Fold:
-    """Samples of one part that is left out, and those that it is predicted from."""
+    """The samples of a held-out part, and the known samples that it is predicted from."""
 
     known: list[LinkSamples]
     left_out: list[LinkSamples]
 
 
 def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
-    """Each flight left out (or three of six groups); of a single flight, blocks of :data:`BLOCK_M`."""
+    """Return the folds: each flight held out, or three of six groups, or blocks of a single flight."""
     names = list(dict.fromkeys(s.flight for s in series))
     if len(names) > 1:
         return [
@@ -888,22 +895,18 @@ def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
 def _score_fold(
     fold: _Fold, base: Base, models: dict[str, FieldModel | None], tallies: Mapping[str, list[_HeldOut]], *, keep: bool
 ) -> None:
-    """Add the errors of every residual field of a base; new flights count about their own mean.
+    """Add the errors of every residual field of a base in one fold. Errors of new flights count about their own mean.
 
     Parameters
     ----------
     fold : _Fold
     base : callable
     models : dict of str to FieldModel or None
-        By title; None: its strengths are learned here.
+        Models by title. The value None requests a model whose strengths are fitted here.
     tallies : mapping of str to list
-        Receives the errors.
+        Lists to which the errors are appended.
     keep : bool
-        Put what is learned into ``models``.
-
-    Returns
-    -------
-    None
+        True to store the fitted models in ``models``.
     """
     flights = list(dict.fromkeys(s.flight for s in fold.known))
     predictor = base(fold.known)
@@ -930,21 +933,21 @@ def _score_fold(
             tallies[title].append((error, np.sqrt(sd**2 + gain_sd**2 + model.noise_sd_db**2)))
 
 
-# Titles of residual fields without free lengths, which remember places.
+# Titles of the residual fields with stated lengths. Fitted lengths are not valid far from the flown positions.
 STATED_FIELDS = tuple(title for title, start in _STARTS.items() if start is not None)
 
 
 def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Sequence[str] = ()) -> Correction:
-    """The base and the residual field with the lowest CRPS on what is left out, learned from all that is known.
+    """Choose the base and residual field with the lowest held-out CRPS, and learn them from all known flights.
 
     Parameters
     ----------
     series : sequence of LinkSamples
-        Measured minus free space of every flight, tower and channel that is known.
+        Measured minus free space of every known flight, tower and channel.
     bases : mapping of str to callable
-        In order of preference where scores are equal.
+        Bases in order of preference for equal scores.
     titles : sequence of str
-        Of the residual fields that are tried, :data:`OFF` among them; all by default.
+        Titles of the residual fields that are tried, including :data:`OFF`. The default is all.
 
     Returns
     -------
@@ -953,7 +956,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
     Raises
     ------
     InputError
-        No sample has a level and a pose.
+        If no sample has a level and a pose.
     """
     series = [s for s in series if np.isfinite(s.residual_db).any()]
     if not series:
@@ -969,12 +972,12 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
     joined = {key: _joined(parts) for key, parts in tallies.items() if parts}
     left_out = [s for fold in folds if fold.known for s in fold.left_out if np.isfinite(s.residual_db).any()]
     place = np.concatenate([np.zeros((0, 3)), *(s.binned(BIN_S).position_m for s in left_out)])
-    # scaled before they are scored: CRPS then compares errors, not how badly spreads are stated
-    factors = {key: _sd_factor(tallies[key]) for key in joined}
+    # scale standard deviations before scoring, so that the CRPS compares errors
+    factors = {key: _sd_factor([s.flight for s in left_out], tallies[key]) for key in joined}
     held_out = {key: (error, factors[key] * sd) for key, (error, sd) in joined.items()}
     crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*errors)) for key, errors in held_out.items()}
     sure = [key for key in held_out if key[1] == OFF or crps_difference(held_out, key, place)[1][1] < 0.0]
-    # to a thousandth of a decibel, then in the order in which they are preferred
+    # compare to a thousandth of a decibel, then in the order of preference
     best = min(sure or crps, key=lambda key: (round(crps[key], 3), list(tallies).index(key)))
     flights = tuple(dict.fromkeys(s.flight for s in series))
     predictor = bases[best[0]](series)
@@ -1015,14 +1018,17 @@ def crps_difference(
     return float(difference[good].mean()), mean_interval(difference[good], place)
 
 
-def _sd_factor(parts: Sequence[_HeldOut]) -> float:
+def _sd_factor(flights: Sequence[str], parts: Sequence[_HeldOut]) -> float:
     """Return the ratio of seen to stated errors of held-out parts, between 0.8 and 1.6. 1 if there is no error.
 
-    It is a geometric mean over the parts: a model of quiet flights states too little for a restless one, and the
-    reverse. An arithmetic mean would count the first case more, although the final model knows both kinds.
+    It is a geometric mean over the flights of the parts: a model of quiet flights states too little for a restless one,
+    and the reverse. An arithmetic mean would count the first case more, although the final model knows both kinds.
     """
-    squares = [_mean(np.square(error / sd)) for error, sd in parts]
-    logs = [math.log(max(square, 1e-12)) for square in squares if math.isfinite(square)]
+    squares: dict[str, list[FloatArray]] = {}
+    for flight, (error, sd) in zip(flights, parts, strict=True):
+        squares.setdefault(flight, []).append(np.square(error / sd))
+    means = [_mean(np.concatenate(each)) for each in squares.values()]
+    logs = [math.log(max(mean, 1e-12)) for mean in means if math.isfinite(mean)]
     return min(max(math.exp(0.5 * sum(logs) / len(logs)), 0.8), 1.6) if logs else 1.0
 
 
@@ -1032,13 +1038,13 @@ def _joined(parts: Sequence[_HeldOut]) -> _HeldOut:
 
 
 def _mean(values: FloatArray) -> float:
-    """Mean of the finite values; infinite without any."""
+    """Return the mean of the finite values, infinite if there are none."""
     good = values[np.isfinite(values)]
     return float(good.mean()) if len(good) else math.inf
 
 
 def fixed_base(gain: Callable[[LinkSamples], FloatArray]) -> Base:
-    """A base that learns nothing: its level above free space is known to it."""
+    """Return a base with a known level above free space, which learns nothing."""
 
     def learn(_: Sequence[LinkSamples]) -> Predictor:
         return lambda samples: (gain(samples), np.zeros(len(samples)))
@@ -1046,14 +1052,15 @@ def fixed_base(gain: Callable[[LinkSamples], FloatArray]) -> Base:
     return learn
 
 
-# Of more samples at a time, a model of directions is evaluated once per degree of direction.
+# Number of samples above which a model of directions is evaluated once per degree.
 MOST_DIRECTIONS = 5_000
 
 
 def by_degree(predictor: Predictor) -> Predictor:
-    """A model of directions that takes many samples a degree at a time (gains have lengths of 11 degrees and more).
+    """Return a predictor that evaluates a model of directions once per degree if there are many samples.
 
-    What a degree has is kept: later parts of a run, and other headings, ask for much the same directions.
+    Gains have correlation lengths of 11 degrees and more. Results are cached, because later parts of a run and other
+    headings have nearly the same directions.
     """
     known: dict[str, tuple[IntArray, FloatArray]] = {}
 

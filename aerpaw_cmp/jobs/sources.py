@@ -505,9 +505,11 @@ class Flown:
         antenna = each[0].antenna
         level, slow = self.correction.over_headings(each, all_targets=run_targets)
         guess = outside(each[0].position_m, self.sources[antenna].samples)
-        # the field's offset of a new flight is normal; few flights tell little of its spread, as in the memory
-        flights, fitted = len({s.flight for s in self.sources[antenna].samples}), self.correction
-        wider = math.sqrt((1.0 + 1.0 / flights) * (student_factor(flights) ** 2 - 1.0))
+        # The field's offset of a new flight is normal. Its spread is estimated from the differences between flights on
+        # all channels: few differences determine it poorly.
+        count = {name: len({s.flight for s in source.samples}) for name, source in self.sources.items()}
+        flights, differences, fitted = count[antenna], sum(count.values()) - len(count), self.correction
+        wider = math.sqrt((1.0 + 1.0 / flights) * (student_factor(1 + differences) ** 2 - 1.0))
         slow = np.hypot(slow, fitted.sd_factor * wider * fitted.model.offset_sd_db)
         if flights == 1:  # of several flights the errors on held-out ones contain what changes from place to place
             slow = np.where(guess, np.hypot(slow, between_blocks_db(self.correction.channels[antenna])), slow)

@@ -105,9 +105,9 @@ def test_columns_are_those_of_the_contract(prediction):
     np.testing.assert_allclose(by_point, 1.0, atol=2e-3)
 
 
-@pytest.mark.parametrize("flights", [1, 2, 9])
-def test_the_offset_of_a_new_flight_is_students_as_in_the_memory(flights, monkeypatch):
-    """A field that knows its spread exactly and nothing else is unsure: the 90 % band is that of n + 1 degrees."""
+@pytest.mark.parametrize(("flights", "channels"), [(1, 1), (2, 1), (9, 1), (2, 3)])
+def test_the_offset_of_a_new_flight_is_students_as_in_the_memory(flights, channels, monkeypatch):
+    """The band of an offset alone: two degrees of the guess, and one per difference of flights on any channel."""
     normal_db = 1.5 * np.sqrt(1.0 + 1.0 / flights)
     samples = [SimpleNamespace(flight=str(k), antenna="LW1.rss", position_m=np.zeros((1, 3))) for k in range(flights)]
     field = SimpleNamespace(
@@ -116,8 +116,10 @@ def test_the_offset_of_a_new_flight_is_students_as_in_the_memory(flights, monkey
     )  # fmt: skip
     monkeypatch.setattr(sources, "between_blocks_db", lambda _: 0.0)
     source = SimpleNamespace(samples=[s for s in samples for _ in range(2)])
-    _, slow, _ = sources.Flown(field, {"LW1.rss": source}).levels(samples[:1], 1)
-    assert slow[0] * norm.ppf(0.95) == pytest.approx(student.ppf(0.95, flights + 1) * normal_db)
+    known = {"LW1.rss": source} | {f"LW{k}.rss": source for k in range(2, channels + 1)}
+    _, slow, _ = sources.Flown(field, known).levels(samples[:1], 1)
+    degrees = 2 + channels * (flights - 1)
+    assert slow[0] * norm.ppf(0.95) == pytest.approx(student.ppf(0.95, degrees) * normal_db)
 
 
 @pytest.mark.parametrize(("flights", "wider_db"), [(1, 3.0), (2, 0.0)])

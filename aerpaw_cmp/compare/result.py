@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -143,8 +144,8 @@ class RssFurther:
     """Mean stated SD of one sample with learned antennas: gain, nuisance of the flight, noise, fading [dB]."""
     error_bars: Mapping[str, float] | None = None
     """Parts of that standard deviation [dB], and the shares of samples inside the stated 50, 90 and 95 % intervals."""
-    elsewhere: Mapping[str, float] | None = None
-    """Errors of learned antennas on held-out flights: RMSE [dB], RMSE of free space, and RMSE of means over 4 s."""
+    elsewhere: Mapping[str, Any] | None = None
+    """Errors of learned antennas on held-out flights of a ``kind`` [dB]: RMSE, that of free space, and of 4 s means."""
     trained_on: tuple[str, ...] | None = None
     """SHA-256 of the logs of this series from which its antennas or settings were learned. It then has no error."""
 

@@ -358,17 +358,18 @@ def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score:
     return offsets.grid_offset(inliers_db, levels.simulated_db, span_db=settings.span_db).rmse_db
 
 
-def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore | None) -> dict[str, float] | None:
-    """Error to expect on another flight, where the antennas of the site say it and this flight does not refute it."""
+def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore | None) -> dict[str, Any] | None:
+    """Return the expected error on another flight of this kind, unless this flight contradicts it."""
     gain, lock = case.replayed.learned, _lock(case)
     flown = None if gain is None else (case.replayed.poses.position_m, gain.sd_db)
-    errors = errors_elsewhere(case.data.settings.antennas, case.series, case.data.folder, flown)
+    errors, kind = errors_elsewhere(case.data.settings.antennas, case.series, case.data.folder, flown)
     if errors is not None and score.rmse_ci95_db[0] > errors.rmse_db:
         return None
     if lock is not None and detection is not None and detection.rmse_ci95_db[0] > lock.floor_rmse_db:
         return None
-    out = {}
+    out: dict[str, Any] = {}
     if errors is not None:
+        out["kind"] = kind
         out["rmse_db"], out["free_space_rmse_db"] = errors.rmse_db, errors.free_space_rmse_db
         out["rmse_4s_db"] = errors.rmse_4s_db
     if lock is not None:

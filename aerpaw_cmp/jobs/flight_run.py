@@ -273,7 +273,7 @@ class _Climber:
     def _by_flights_left_out(self, climbed: FlightLadder) -> FlightLadder:
         """The learned model, as it was calibrated, where flights left out say that it beats free space."""
         antennas = (self._offer or self._data.settings).antennas
-        errors = [errors_elsewhere(antennas, series, self._data.folder) for series in self._data.rss]
+        errors = [errors_elsewhere(antennas, series, self._data.folder)[0] for series in self._data.rss]
         known = [error for error in errors if error is not None]
         if len(known) < len(errors) or not known:
             return climbed

@@ -203,12 +203,13 @@ def flight_sentence(verdict: FlightVerdict, floor_db: float | None = None) -> st
 
 
 def expected_sentence(panels: Sequence[RssResult]) -> str:
-    """Return the expected error on another flight; empty unless all scored channels have errors of held-out flights."""
+    """Return the expected error on another flight of this kind, if all channels have errors of held-out flights."""
     # for a receiver that can lose its lock, the error with its floor counts
     given = [panel.further.elsewhere or {} for panel in panels]
     known = [entry.get("floor_rmse_db", entry.get("rmse_db", math.nan)) for entry in given]
     error = math.sqrt(sum(value**2 for value in known) / len(known)) if known else math.nan
-    return f"Expect {error:.1f} dB on another flight." if math.isfinite(error) else ""
+    kind = next((entry["kind"] for entry in given if "floor_rmse_db" not in entry and "kind" in entry), "")
+    return f"Expect {error:.1f} dB {kind or 'on another flight'}." if math.isfinite(error) else ""
 
 
 NO_CAUSE = "No likely cause was identified."

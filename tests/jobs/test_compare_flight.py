@@ -477,7 +477,7 @@ def test_an_expectation_that_the_flight_refutes_is_withdrawn(
 ) -> None:
     """Flights left out had 3.5 dB, 7.7 with the floor: one whose interval begins above has another fault."""
     errors = Errors(series=2, rmse_db=3.5, rmse_4s_db=2.8, free_space_rmse_db=6.1, inside_90=0.9)
-    monkeypatch.setattr(compare_flight, "errors_elsewhere", lambda *_: errors)
+    monkeypatch.setattr(compare_flight, "errors_elsewhere", lambda *_: (errors, "at a height that was not flown"))
     data = SimpleNamespace(settings=SimpleNamespace(antennas={}), folder=Path())
     lock = SimpleNamespace(floor_rmse_db=7.7, free_space_floor_rmse_db=9.9)
     monkeypatch.setattr(compare_flight, "lock_elsewhere", lambda *_: lock)
@@ -487,6 +487,7 @@ def test_an_expectation_that_the_flight_refutes_is_withdrawn(
     case = SimpleNamespace(data=data, series=series, replayed=SimpleNamespace(learned=None))
     known = compare_flight._elsewhere(case, SimpleNamespace(rmse_ci95_db=(low_db, 9.0)), floored)
     assert (known is not None and known["rmse_db"] == 3.5) == expected
+    assert known is None or known["kind"] == "at a height that was not flown"
 
 
 def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: pytest.MonkeyPatch) -> None:

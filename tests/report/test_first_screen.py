@@ -31,6 +31,7 @@ from aerpaw_cmp.report.flight_words import (
     TWO_LEVELS,
     Judged,
     cautions,
+    expected_sentence,
     first_sentence,
     headlines,
     models_verdict,
@@ -194,6 +195,19 @@ def every_outcome(data):
         judged = dataclasses.replace(judged, rss=tuple(panels))
         judged = with_cause(judged) if cause else judged
         yield dataclasses.replace(judged, next_step=step) if learned or not cause else judged
+
+
+@pytest.mark.parametrize(
+    ("floor", "words"),
+    [
+        ({}, "Expect 3.5 dB in directions that were not flown."),
+        ({"floor_rmse_db": 7.7}, "Expect 7.7 dB on another flight."),
+    ],
+)
+def test_the_expected_error_is_that_of_flights_of_one_kind(report_data, floor, words):
+    """The error with a floor is that of all held-out flights."""
+    known = {"rmse_db": 3.5, "kind": "in directions that were not flown", **floor}
+    assert expected_sentence([with_numbers(panel, elsewhere=known) for panel in report_data.rss]) == words
 
 
 def test_no_first_paragraph_has_more_than_sixty_words_and_all_have_one_order(report_data):

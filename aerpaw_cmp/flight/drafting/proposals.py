@@ -726,8 +726,10 @@ def errors_elsewhere(
     series: RssSeries,
     folder: Path,
     flown: tuple[FloatArray, FloatArray] | None = None,
-) -> learned.Errors | None:
-    """Return the errors of learned antennas on held-out flights like that of a series. None without such antennas.
+) -> tuple[learned.Errors | None, str]:
+    """Return the errors of learned antennas on held-out flights like that of a series, and a phrase for their kind.
+
+    The errors are None without such antennas.
 
     Parameters
     ----------
@@ -743,16 +745,18 @@ def errors_elsewhere(
     Returns
     -------
     Errors or None
+    str
+        Kind of the held-out flights, such as ``"on another flight"``.
     """
     name = antennas.get(f"{series.tower}.{series.channel}")
     if "uav" not in antennas:
-        return None
+        return None, ""
     try:
         named = learned.find_named(name or antennas["uav"], folder)
     except (InputError, UsageError):
-        return None
+        return None, ""
     antenna = None if name is None else named.antenna("tower", series.link.carrier_hz)
-    return _expected(named.entry, antenna, *(flown or ()))[0]
+    return _expected(named.entry, antenna, *(flown or ()))
 
 
 # Directions are new if the standard deviation of the gain exceeds this multiple of that in learned directions.

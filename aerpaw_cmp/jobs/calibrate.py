@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any
@@ -400,8 +401,8 @@ def calibrate(
     fits: dict[str, Learned] = {}
     with stages("scores"):
         scores = _score_all(observed, recipe, stages, fits)
-        stages.progress("scores: controls")
         controls = _controls_of(observed, recipe, scores["flight_left_out"])
+        stages.progress("scores", 1.0)
         locks, health = learned_locks(observed, recipe, fits), learned_healths(observed, fits)
         taught = teaching(observed, campaigns, fits)
     with stages("curve"):
@@ -664,16 +665,24 @@ def _score_all(
     scores: dict[str, tuple[Score, ...]] = dict.fromkeys(calibration.SPLITS, ())
     if len(calibration.flights_of(observed)) < 2:
         return scores
-    scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, fits)
-    for split, parts, own_rest in (
-        ("altitude_left_out", calibration.altitude_parts, False),
-        ("heading_left_out", calibration.heading_parts, False),
-        ("sector_left_out", calibration.sector_parts, False),
-        ("route_left_out", calibration.route_parts, True),
-    ):
-        stages.progress(f"scores: {split.replace('_', ' ')}")
-        scores[split] = calibration.parts_left_out(observed, recipe, fits, parts, own_rest=own_rest)
-    scores["campaign_left_out"] = calibration.campaign_left_out(observed, recipe)
+    splits: dict[str, Callable[[], tuple[Score, ...]]] = {
+        "flight_left_out": lambda: calibration.flight_left_out(observed, recipe, fits),
+        **{
+            f"{name}_left_out": partial(calibration.parts_left_out, observed, recipe, fits, parts, own_rest=own_rest)
+            for name, parts, own_rest in (
+                ("altitude", calibration.altitude_parts, False),
+                ("heading", calibration.heading_parts, False),
+                ("sector", calibration.sector_parts, False),
+                ("route", calibration.route_parts, True),
+            )
+        },
+        "campaign_left_out": lambda: calibration.campaign_left_out(observed, recipe),
+    }
+    for done, (split, score) in enumerate(splits.items()):
+        # the controls take about as long as two splits
+        stages.progress("scores", done / (len(splits) + 2))
+        scores[split] = score()
+    stages.progress("scores", len(splits) / (len(splits) + 2))
     return scores
 
 

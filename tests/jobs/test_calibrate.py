@@ -11,6 +11,8 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.calibration import BASELINES, SPLITS, mean_rmse
 from aerpaw_cmp.jobs.calibrate import load_calibration, observe, read_flights, recipe_of
+from aerpaw_cmp.jobs.options import RunOptions
+from aerpaw_cmp.jobs.run import run_calibrate
 from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.learned import read_sphere_csv
 from tests.jobs.calibrated import YAW_DEG, calibrated, past_sector_antenna, settings
@@ -29,10 +31,26 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def metrics(folder: Path) -> dict:
+def shares() -> list[float]:
+    """Shares of the scores that the progress bar has shown."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def metrics(folder: Path, shares: list[float]) -> dict:
+    def progress(text: str, fraction: float | None = None, /) -> None:
+        if text == "scores" and fraction is not None:
+            shares.append(fraction)
+
     out = folder / "calibrated.yaml"
-    assert main(["calibrate", str(folder / "calibration.yaml"), "-o", str(out)]) == 0
+    run_calibrate(folder / "calibration.yaml", RunOptions(out=out, progress=progress))
     return json.loads((folder / "calibrated" / "metrics.json").read_text())
+
+
+def test_the_progress_of_the_scores_rises_to_one(metrics: dict, shares: list[float]) -> None:
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0.0, 1.0)
+    assert len(shares) > 5
 
 
 def test_scores_are_those_of_what_was_left_out(metrics: dict) -> None:

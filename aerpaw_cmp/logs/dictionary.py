@@ -586,8 +586,8 @@ AERPAW_MAT = _program(
 PROGRAMS: tuple[Program, ...] = (
     _program("PX4, vehicle_gps_position", "time utc usec,timestamp", datum="sea level",
              units={"timestamp": "us", "alt": "mm", "lat": "e7", "lon": "e7"}),
-    _program("PX4", "timestamp,timestamp sample", "timestamp,delta alt", datum="sea level", units={"timestamp": "us"},
-             angles="rad"),
+    _program("PX4", "timestamp,timestamp sample", "timestamp,delta alt", "timestamp,alt ellipsoid", datum="sea level",
+             units={"timestamp": "us"}, angles="rad"),
     _program("MAVLink", "time boot ms", "rollspeed", "satellites visible,eph", datum="sea level", angles="rad",
              units=_MAVLINK_UNITS, words={r"satellites visible": "satellites", r"voltage battery": "battery voltage"}),
     _program("ArduPilot", "timeus", "gcrs,spd", "lat,lng,q1,q2", "desroll,roll", datum="sea level", angles="deg",

@@ -775,6 +775,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     # the sign for micro is no letter of a plain name: 'Time [\u00b5s]' is 'time s' there
     if unit in ("\u00b5s", "\u03bcs") or (unit and count is None):
         count = "us" if unit in ("\u00b5s", "\u03bcs") else "s"
+    written = dictionary.without_unit(sheet.names[column])[1] or any(c.said.search(name) for c in _text.COUNTS.values())
     zone = _stamps.header_zone(sheet.names[column], dictionary.in_brackets(sheet.names[column])[1])
     if day is not None and not zone:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
@@ -784,7 +785,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     heads = " ".join(sheet.names[i].lower() for i in (day, column) if i is not None)
     first = _DAY_OR_MONTH.search(heads)
     return _stamps.read(
-        texts, options, unit=count, european=sheet.has_decimal_commas, zone=zone, gps=gps,
+        texts, options, unit=count, by_program=not written, european=sheet.has_decimal_commas, zone=zone, gps=gps,
         day_first=None if first is None else first[1].startswith("d"), device=_devices(sheet),
     )  # fmt: skip
 

@@ -335,8 +335,9 @@ def beside(text: str) -> str:
 
 
 def read(
-    texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, european: bool = False, zone: str = "",
-    gps: bool = False, day_first: bool | None = None, device: IntArray | None = None,
+    texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, by_program: bool = False,
+    european: bool = False, zone: str = "", gps: bool = False, day_first: bool | None = None,
+    device: IntArray | None = None,
 ) -> tuple[str, AnyArray, list[str]]:  # fmt: skip
     """A column of times in any of the known forms.
 
@@ -346,6 +347,8 @@ def read(
     options : ReadOptions
     unit : {"ns", "us", "ms", "s", "min", "h"}, optional
         Of numbers, where the head of the column says so and they count from no known origin.
+    by_program : bool
+        The unit is only what the program is known to write.
     european : bool
         Has the table decimal commas? Where they stand, the day comes before the month.
     zone : str
@@ -372,16 +375,23 @@ def read(
     ]
     shown = _padded(shown)
     filled = [text for text in shown if text]
-    if 2 * sum((match := _COMPACT.fullmatch(text)) is not None and bool(match[1] or zone) for text in filled) > len(
-        filled
-    ):
+    compact = [match for text in filled if (match := _COMPACT.fullmatch(text))]
+    # counts of seconds reach 60 to 99, times of the day never do
+    clocks = len(compact) == len(filled) and all(len({match[part] for match in compact}) > 1 for part in (6, 7))
+    if 2 * sum(clocks or bool(match[1] or zone) for match in compact) > len(filled):
         shown = [_COMPACT.sub(_with_marks, text) for text in shown]
         filled = [text for text in shown if text]
     refuse_spreadsheets(filled)
     counts = sum(_NUMBER.fullmatch(text) is not None for text in filled)
     # 20250610140000 is a number, too
     if counts * 2 > len(filled) and not any(_DIGITS.fullmatch(text) for text in filled[:3]):
-        return _numbers(shown, unit, options, gps=gps)
+        value = np.array([float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else np.nan for text in shown])
+        step = _step(value)
+        if by_program and unit and step * _text.COUNTS[unit].ns <= _LEAST_NS and "s" in _likely_units(value):
+            clock, value, warnings = _numbers(value, None, options, gps=gps, zone=zone)
+            text = f"the times go in steps of {step:g}: read as seconds, although the program usually writes {unit}"
+            return clock, value, [text, *warnings]
+        return _numbers(value, unit, options, gps=gps, zone=zone)
     if sum(_OF_DAY.fullmatch(text) is not None for text in filled) * 2 > len(filled):
         return _of_day(shown, options, zone, device)
     plain = [text for text in filled if not _COMMON.fullmatch(text)]
@@ -447,30 +457,71 @@ def refuse_spreadsheets(texts: Sequence[str]) -> None:
         )
 
 
+# Lengths of a flight [s], and of the steps between its rows [s], by the unit that numbers without a unit may have:
+# 10 s in steps of 2 ms are likelier milliseconds than 3 h in steps of 2 s.
+_FLIGHT_S, _LONGEST_STEP_S = 10_800.0, 60.0
+_LEAST_STEPS = {"s": 0.0, "ms": 10.0, "us": 2e3, "ns": 2e6}
+_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+# No program of a radio or an autopilot writes rows in such steps [ns].
+_LEAST_NS = 1e6
+
+
+def _step(value: FloatArray) -> float:
+    """Return the median step between rows of different times; NaN if all are the same."""
+    steps = np.abs(np.diff(value[np.isfinite(value)]))
+    return float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
+
+
+def _likely_units(value: FloatArray) -> list[str]:
+    """Return the units, from seconds down, in which numbers have the steps and the length of a flight."""
+    step, span = _step(value), np.diff(np.nanpercentile(value, (5, 95)))[0] if np.isfinite(value).any() else np.nan
+    return [
+        unit for unit, least in _LEAST_STEPS.items()
+        if least <= step <= _LONGEST_STEP_S * 1e9 / _text.COUNTS[unit].ns
+        and span <= _FLIGHT_S * 1e9 / _text.COUNTS[unit].ns
+    ]  # fmt: skip
+
+
 def _numbers(
-    texts: Sequence[str], unit: str | None, options: ReadOptions, *, gps: bool
+    value: FloatArray, unit: str | None, options: ReadOptions, *, gps: bool, zone: str
 ) -> tuple[str, AnyArray, list[str]]:
     """Numbers: epochs by their size, else relative times."""
-    value = np.array([float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else np.nan for text in texts])
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
+    step, likely = _step(value), _likely_units(value)
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
-        # 0.9e9 s is July 1998: a clock that shows less counts from another origin
-        if middle >= 0.9 * scale and (unit is None or scale >= _text.COUNTS[unit].least_epoch):
+        # 0.9e9 s is July 1998: a clock that shows less counts from another origin, and one with steps of odd hours
+        hours = step / scale * 1e9 / 3600
+        odd = unit is None and bool(likely) and hours > 1 and hours % 1 > 0
+        if middle >= 0.9 * scale and not odd and (unit is None or scale >= _text.COUNTS[unit].least_epoch):
             if gps and middle < 1.58 * scale:  # as an epoch of 1970 before 2020, as one of 1980 before 2030
                 value, warnings = value + (GPS_S - LEAP_S) * scale / 1e9, [_GPS_COUNT]
             else:
                 warnings = ["the times are called GPS time and count from 1970: read as UTC"] if gps else []
             return (form, value, warnings) if form else ("epoch_us", value / 1e3, warnings)
-    if unit is None and 86_400 < middle < 86_400_000 and not (value % 1 > 0).any():
-        # a log that begins within the first hour counts from its start, a later one from midnight
-        if np.nanmin(value) < 3_600_000:
-            return "relative_ms", value, [_MILLISECONDS]
-        return _on_a_date(value / 1e3, options, [_MILLISECONDS + " of the day"])
     for zero, low, high, program in _DAY_NUMBERS:
         if unit is None and len(value) > 2 and _are_days(value, low, high):
-            text = f"the times are day numbers of {program}: read as local dates and times"
-            return "wall", _wall_cells(np.datetime64(zero, "us"), value * 86_400.0), [text]
-    return f"relative_{unit or 's'}", value, []
+            text = f"the times are day numbers of {program}: read as {zone or 'local'} dates and times"
+            return "wall", _wall_cells(np.datetime64(zero, "us"), value * 86_400.0, zone, options), [text]
+    if unit is not None:
+        return f"relative_{unit}", value, []
+    whole, of_day = not (value % 1 > 0).any(), 86_400 < middle < 86_400_000
+    late = whole and middle > 86_400  # beyond a day of seconds
+    unit = next((unit for unit in likely if unit != "s" or not late), "ms" if late and of_day and not likely else "s")
+    others = dict.fromkeys(f"as {_NAMES[other]} {_lasting(value, other)}" for other in ("s", *likely) if other != unit)
+    if unit == "s" and (not whole or not others):
+        return "relative_s", value, []
+    lasting = "; ".join([f"the log lasts {_lasting(value, unit)}", *others])
+    text = f"the times are numbers without a unit: read as {_NAMES[unit]}, a guess ({lasting})"
+    advice = "to avoid it, write the unit in the column's name, such as 'time [ms]'"
+    # a log that begins within the first hour counts from its start, a later one from midnight
+    if unit == "ms" and of_day and whole and np.nanmin(value) >= 3_600_000:
+        return _on_a_date(value / 1e3, options, [f"{text}, of the day; {advice}"])
+    return f"relative_{unit}", value, [f"{text}; {advice}"]
+
+
+def _lasting(value: FloatArray, unit: str) -> str:
+    seconds = float(np.nanmax(value) - np.nanmin(value)) * _text.COUNTS[unit].ns / 1e9
+    return f"{seconds:,.4g} s" if seconds < 7200 else f"{seconds / 3600:,.0f} h"
 
 
 # GPS time counts from 6 January 1980; since 2017 it is 18 s ahead of UTC (IERS Bulletin C 52).
@@ -488,9 +539,6 @@ def _are_days(value: FloatArray, low: float, high: float) -> bool:
     if len(finite) < 3 or finite.min() < low or finite.max() >= high or np.ptp(finite) > 2.0:
         return False
     return bool(0 < np.median(np.abs(np.diff(finite))) < 1e-3)
-
-
-_MILLISECONDS = "the times are whole numbers beyond a day of seconds: read as milliseconds"
 
 
 def _of_day(
@@ -541,18 +589,19 @@ def _on_a_date(
     date = options.time_origin[:10] if options.time_origin else _date_in_name(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
         return "relative_s", seconds, [*warnings, "the times have no date and the file name has none either"]
-    # at noon, since clocks change at night
-    offset = _Zones(options, zone).offset(None, f"{date} 12:00:00").encode()
-    cells = _wall_cells(np.datetime64(date, "us"), seconds)
+    cells = _wall_cells(np.datetime64(date, "us"), seconds, zone, options)
     source = "time_origin" if options.time_origin else "the file name"
-    cells = np.where(cells == b"-", cells, np.char.add(cells, offset)) if offset else cells
     return "wall", cells, [f"the times have no date: it is that of {source}, {date}", *warnings]
 
 
-def _wall_cells(day: np.datetime64, seconds: FloatArray) -> AnyArray:
-    """Seconds after the beginning of a day as texts."""
+def _wall_cells(day: np.datetime64, seconds: FloatArray, zone: str, options: ReadOptions) -> AnyArray:
+    """Return seconds after the beginning of a day as texts, with the offset that the zone has at the first."""
     stamps = day + np.round(np.nan_to_num(seconds) * 1e6).astype("timedelta64[us]")
-    return np.where(np.isnan(seconds), b"-", np.datetime_as_string(stamps, unit="us").astype(np.bytes_))
+    cells = np.datetime_as_string(stamps, unit="us").astype(np.bytes_)
+    date = str(stamps[np.argmax(np.isfinite(seconds))])[:10]
+    # at noon, since clocks change at night
+    offset = _Zones(options, zone).offset(None, f"{date} 12:00:00").encode()
+    return np.where(np.isnan(seconds), b"-", np.char.add(cells, offset))
 
 
 def _seconds(groups: dict[str, str | None]) -> float:

@@ -1,8 +1,9 @@
 """Any CSV with a header, its columns mapped by the user: ``columns: {time: Time, rss_db: Power}``, ``kind: rss``.
 
 A CSV says nothing about its units: it is never guessed, flight.yaml names it. Times are texts (``YYYY-mm-dd
-HH:MM:SS[.f][offset]``, or as tables of other programs have them: ``15.07.2024 11:49:27,231``) or numbers: seconds since
-``time_origin`` where that is given, else since 1970 in UTC (``clock: local_as_utc`` for wall time stored so).
+HH:MM:SS[.f][offset]``, or as tables of other programs have them: ``15.07.2024 11:49:27,231``) or numbers since
+``time_origin`` where that is given, else since 1970 in UTC (``clock: local_as_utc`` for wall time stored so): seconds,
+unless the name of the column, or the steps between the rows, require another unit.
 """
 
 from __future__ import annotations

@@ -205,6 +205,44 @@ def test_microseconds_count_from_the_origin(first: int) -> None:
     assert (time.diff().iloc[1:].dt.total_seconds() == 1.0).all()
 
 
+@pytest.mark.parametrize(("first", "step", "unit_s"), [
+    (0, 1, 1.0), (100_000, 1, 1.0), (0, 30, 1.0), (0, 1000, 1e-3), (5000, 100, 1e-3), (0, 1_000_000, 1e-6),
+    (31_000_000, 1_000_000, 1e-6), (1_200_000_000, 100_000, 1e-6), (31_000_000, 20_000, 1e-6),
+    (2 * 10**12, 10**9, 1e-9),
+])  # fmt: skip
+def test_the_unit_of_bare_numbers_makes_steps_and_length_those_of_a_flight(
+    first: int, step: int, unit_s: float
+) -> None:
+    rows = "".join(f"{first + step * i},35.72,-78.69,30,-80\n" for i in range(1000 if step == 20_000 else 60))
+    result = drive_test((SIX_COLUMNS + rows).encode(), time_origin="2025-03-02T15:00:00Z")
+    time = result.streams[0].frame["time"]
+    np.testing.assert_allclose(time.diff().iloc[1:].dt.total_seconds(), step * unit_s)
+    assert any("without a unit" in text for text in result.warnings) == (step > 1)
+
+
+def test_the_unit_of_a_program_is_not_read_where_its_steps_would_be_of_no_log() -> None:
+    head = "time;cc;earfcn;pci;rsrp;pl;cfo\n"
+    for step, step_s in ((1, 1.0), (1000, 1.0), (100, 0.1)):
+        data = head + "".join(f"{step * i};0;3350;1;-80.5;90.1;12\n" for i in range(20))
+        result = drive_test(data.encode(), time_origin="2025-03-02T15:00:00Z")
+        np.testing.assert_allclose(result.streams[0].frame["time"].diff().iloc[1:].dt.total_seconds(), step_s)
+        assert any("read as seconds" in text for text in result.warnings) == (step == 1)
+
+
+def test_times_of_the_day_in_digits_are_told_from_counts() -> None:
+    stamps = [f"14{i // 60:02d}{i % 60:02d}" for i in range(100)]
+    rows = "".join(f"{stamp},35.72,-78.69,30,-80\n" for stamp in stamps)
+    time = drive_test((SIX_COLUMNS + rows).encode(), time_origin="2025-03-02").streams[0].frame["time"]
+    assert time.iloc[0].isoformat() == "2025-03-02T19:00:00"
+    assert (time.diff().iloc[1:].dt.total_seconds() == 1.0).all()
+
+
+def test_day_numbers_under_utc_are_utc() -> None:
+    rows = "".join(f"{45718 + (36_000 + i) / 86_400:.9f},35.72,-78.69,30,-80\n" for i in range(6))
+    time = drive_test((SIX_COLUMNS.replace("Time", "Time (UTC)") + rows).encode()).streams[0].frame["time"]
+    assert abs((time.iloc[0] - np.datetime64("2025-03-02T10:00:00")).total_seconds()) < 1e-3
+
+
 @pytest.mark.parametrize(("zero", "program"), [(45718, "a spreadsheet"), (739678, "MATLAB")])
 def test_day_numbers_are_local_dates(zero: int, program: str) -> None:
     """Day 45718 of a spreadsheet and datenum(2025, 3, 2) are both 2 March 2025."""

@@ -1,13 +1,13 @@
-"""Clocks of a flight: the radio clock against the telemetry clock, whole hours, and relative times.
+"""Clocks of a flight: radio clock against telemetry clock, steps of full hours, and relative times.
 
-Radio clock against telemetry clock: the likelihood of a flight's residuals over the lag.
+The lag between radio clock and telemetry clock follows from the likelihood of the residuals of a flight.
 
-One sign everywhere: ``radio_minus_telemetry_s`` is how much later the radio's clock shows than the telemetry's; radio
-times are corrected by subtracting it.
+There is one sign convention: ``radio_minus_telemetry_s`` is positive if the radio clock shows a later time. Radio times
+are corrected by subtracting it.
 
-Clocks that are off by whole hours: logs that overlap only after such a shift.
+Clocks that differ by full hours are found because their logs overlap only after such a shift.
 
-Start time of a log with relative times, from a companion log that knows the time.
+The start of a log with relative times follows from a companion log with absolute times.
 """
 
 from __future__ import annotations
@@ -33,56 +33,57 @@ from .track import interpolated, nanoseconds
 # Verdicts.
 OK, SHIFTED, CANNOT_TELL = "ok", "shifted", "cannot tell"
 
-# Lags whose log likelihood is this much below the best one are excluded [nat].
+# Lags whose log likelihood is lower than the best one by this are excluded [nat].
 EVIDENCE_NAT = 4.0
 
-# Lags up to this are no shift [s]: positions, models and time stamps of real flights are no better.
+# Smaller lags are not a shift [s], because positions, models and time stamps of real flights are not more accurate.
 _SAME_S = 0.5
 
-# Clocks agree where every lag beyond this is excluded [s].
+# Clocks agree if every lag beyond this is excluded [s].
 _AGREE_S = 1.0
 
-# A channel that refuses the lag of all together by more has a clock of its own [nat]: real ones refuse it by 1.1 at
-# most, two loggers 4 s apart by 350.
+# A channel that contradicts the common lag by more has its own clock [nat]. Real channels contradict it by at most 1.1,
+# two loggers 4 s apart by 350.
 _APART_NAT = 12.0
 
-# Autopilots and loggers stamp their rows no better [s]: the interval is wider by this on either side.
+# Accuracy of time stamps of autopilots and loggers [s], by which the interval is widened on each side.
 STAMPS_S = 0.25
 
-# First and last spacing of the lags; no finer where so many are still possible.
+# First and last spacing of the lags, and the largest number of lags that are refined.
 _STEP_S, _FINEST_S, _MOST_FINE = 0.5, 0.02, 40
-# Means of the level per channel, one a second or longer.
+# Means of the level per channel, over one second or longer.
 _BINS = 900
 _FEWEST = 60
-# Instants at which the prediction is averaged over a mean.
+# Number of times at which the prediction is averaged over a mean.
 _PER_BIN = 8
 
-# Lengths (chord of the unit sphere) over which the gain of tower and UAV changes: fine, broad, both at once.
+# Lengths (chord of the unit sphere) of the gains of tower and UAV: fine, broad, and both.
 _CHORDS = ((0.2, 0.4, 0.8), (0.2, 0.45, 0.9))
-# Most features of an end's gain, and the variance that may be left out of it.
+# Largest number of features of the gain of an end, and the variance that they may miss.
 _FEATURES, _LEFT = 64, 0.01
 
-# Standard deviation of offset and slope, in that of the residual: they are free.
+# Standard deviation of offset and slope relative to that of the residual, which leaves them free.
 _FREE = 1e3
 
 _MEMORY_S = (2.0, 5.0, 15.0, 40.0)
 _WHITE = (0.1, 0.3, 0.9)
-# Tried for :class:`_Parts`.
+# Candidate standard deviations for :class:`_Parts`.
 _GAIN = (0.05, 0.5, 1.0, 2.0)
 
-# Parts of the flight of which any two neighbours may be left out: a shift must be shown without them, too, by so much
-# [nat]. A dip, a jump of the position or a frozen track shifts no clock.
+# Parts of the flight. A shift must also be significant without any two neighbouring parts [nat], because a dip, a jump
+# of the position or a frozen track must not shift a clock.
 _LEFT_OUT, _WITHOUT_NAT = 10, 2.0
 
-# A mean so many (robust) standard deviations from the median of as many neighbours counts as one so far.
+# A mean farther than this number of robust standard deviations from the median of its neighbours is moved to that
+# limit.
 _LONE, _NEIGHBOURS = 4.0, 9
 
-# Lags whose systems are held in memory.
+# Number of lags whose systems are in memory.
 _AT_ONCE = 16
 
 
 class _Parts(NamedTuple):
-    """Memory of the residual [s], its white part and the gains, in standard deviations of the part with memory."""
+    """Correlation time of the residual [s], its white part, and the gains, relative to the SD of the correlated part."""
 
     memory_s: float
     white: float
@@ -94,12 +95,12 @@ _START = _Parts(5.0, 0.3, 1.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Along:
-    """Predictors of the level of a channel, at equally spaced instants of the telemetry; NaN where no pose is known.
+    """Predictors of the level of a channel, at equally spaced times of the telemetry; NaN without a pose.
 
     Parameters
     ----------
     start_s, step_s : float
-        First instant and spacing [s].
+        First time and spacing [s].
     predicted_db : mapping of str to (g,)
         Levels of one or more models, by name [dB].
     distance_m : (g,)
@@ -114,21 +115,21 @@ class Along:
     directions: FloatArray
 
     def features(self) -> FloatArray:
-        """Features (g, p) of offset, slope and the gains of both ends."""
+        """Return the features (g, p) of offset, slope and the gains of both ends."""
         ends = [_gain_features(self.directions[:, 3 * end : 3 * end + 3], _CHORDS[end]) for end in (0, 1)]
-        # about 100 m: offset and slope then say little of each other
+        # relative to 100 m, so that offset and slope are almost independent
         slope = np.log10(self.distance_m) - 2.0
         return np.column_stack([np.ones_like(slope), slope, *ends])
 
     @property
     def place(self) -> tuple[float, float, bytes, bytes]:
-        """Equal where the features are."""
+        """Key that is equal if the features are equal."""
         return self.start_s, self.step_s, self.distance_m.tobytes(), self.directions.tobytes()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockChannel:
-    """One channel of a receiver: levels (n,) [dB] at radio times (n,) [s], and what they depend on."""
+    """One channel of a receiver: levels (n,) [dB] at radio times (n,) [s], and their predictors."""
 
     name: str
     time_s: FloatArray
@@ -137,7 +138,7 @@ class ClockChannel:
 
     @property
     def flat(self) -> bool:
-        """True if the levels hardly vary where every model predicts that they do."""
+        """True if the levels hardly vary although every model predicts that they do."""
         at = (self.time_s - self.along.start_s) / self.along.step_s
         known = np.isfinite(self.measured_db)
         models = (np.interp(at[known], np.arange(len(p)), p) for p in self.along.predicted_db.values())
@@ -151,22 +152,22 @@ class ClockEstimate:
     Parameters
     ----------
     radio_minus_telemetry_s : float
-        Most likely lag [s]; NaN where nothing could be estimated.
+        Most likely lag [s]; NaN if no lag could be estimated.
     ci95_s : (low, high)
-        Lags that are not excluded, inside the window; the window where the data say nothing.
+        Lags inside the window that are not excluded; the complete window if the data contain no information.
     verdict : {"ok", "shifted", "cannot tell"}
     reason : str
-        Why it cannot be told.
+        Reason why the lag cannot be determined.
     window_s : float
-        Lags searched on either side.
+        Largest lag that is searched on each side.
     model : str
-        The prediction that explains the level best.
+        Prediction that explains the level best.
     channels_s : mapping of str to float
-        Estimates of the channels alone.
+        Estimates of single channels.
     n : int
-        Means of the level that count.
+        Number of means of the level.
     against_zero_nat : float
-        Log likelihood of the best lag above that of the best lag within :data:`_SAME_S`.
+        Log likelihood of the best lag minus that of the best lag within :data:`_SAME_S`.
     """
 
     radio_minus_telemetry_s: float
@@ -181,12 +182,12 @@ class ClockEstimate:
 
     @property
     def correction_s(self) -> float:
-        """To be subtracted from radio times: the estimate where it is shown to differ from zero, else 0."""
+        """Correction to subtract from radio times: the estimate if it differs significantly from zero, otherwise 0."""
         low, high = self.ci95_s
         return 0.0 if self.verdict == CANNOT_TELL or low <= 0.0 <= high else self.radio_minus_telemetry_s
 
     def result(self, receiver: str, *, apply: bool) -> ClockResult:
-        """The estimate as a number of the flight; applied where ``apply`` asks for it and it is shown."""
+        """Return the estimate as a result of the flight, which is applied if ``apply`` is set and it is significant."""
         applied = ESTIMATED
         if (apply and self.verdict != OK) or (apply and self.correction_s):
             applied = APPLIED if self.correction_s else NOT_APPLIED
@@ -202,31 +203,32 @@ class ClockEstimate:
 
 
 def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> ClockEstimate:
-    """One estimate for the channels that one computer stamped.
+    """Return one estimate for the channels with time stamps of one computer.
 
     Parameters
     ----------
     channels : sequence of ClockChannel
-        At least one; the models that all of them have count.
+        One or more channels. Only models that all of them have are used.
     window_s : float
-        Lags searched on either side [s].
+        Largest lag on each side [s].
 
     Returns
     -------
     ClockEstimate
-        Nothing is applied here.
+        The estimate, which is not applied here.
 
     Notes
     -----
     Means y over a second are normal with mean offset + slope log10(d) + p(t - lag), p the prediction of a model, and
-    three parts that vary: gains over the direction at either end (Gaussian processes), a residual with memory
-    (Ornstein-Uhlenbeck) and a white one. Offset, slope and gains are integrated out, the scale is profiled; memory,
-    white share and gain are those of largest likelihood on a small grid, per channel, at lag 0 or at the likeliest lag
-    of a model. Each lag counts with the model that explains it best: one that is no likelier than another, at another
-    lag, excludes nothing. A level that depends on no position must be less likely than that. A shift must be shown
-    without any fifth of the flight, too: one dip, jump of the position or frozen track decides nothing.
+    three random parts: gains over the direction at either end (Gaussian processes), a correlated residual
+    (Ornstein-Uhlenbeck) and a white residual. Offset, slope and gains are integrated out, and the scale is profiled.
+    The correlation time, the white share and the gains maximise the likelihood on a small grid, per channel, at lag 0
+    or at the most likely lag of a model. Each lag counts with the model that explains it best, so a model that is not
+    more likely than another at another lag excludes nothing. A level without any dependence on position must be less
+    likely. A shift must also be significant without any fifth of the flight, because one dip, jump of the position or
+    frozen track must not decide.
     """
-    alive = [channel for channel in channels if not channel.flat]  # a dead input knows no time
+    alive = [channel for channel in channels if not channel.flat]  # a constant level contains no information about time
     if not alive:
         return _nothing(_FLAT_LEVEL, window_s)
     channels = _same_models(alive)
@@ -243,9 +245,9 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
         return _nothing(_NO_OVERLAP, window_s)
     steps = int(window_s / _STEP_S + 1e-9)
     lags = np.asarray(np.arange(-steps, steps + 1) * _STEP_S, dtype=np.float64)
-    # with one guess of the memory: it finds the likely lags, at which the memory is fitted then
+    # find likely lags with one guess of the correlation time, which is then fitted at these lags
     first = np.sum([b.likelihood(lags, [[_START]] * len(names)).sum(axis=0) for names, b in bins.items()], axis=0)
-    starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # of each model, and of clocks that agree
+    starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # lags of each model, and zero
     parts = {names: b.fitted(starts) for names, b in bins.items()}
 
     def likelihood(block: FloatArray) -> FloatArray:
@@ -254,12 +256,12 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     tried, nats = _finer(lags, likelihood, window_s)
     names = [name for together in bins for name in together]
     estimate = _judged(tried, nats, names, window_s)
-    # channels of one computer have one lag: their evidence adds
-    total = nats.sum(axis=0).max(axis=1)  # of each model at its likeliest lag
+    # channels of one computer have one lag, so their log likelihoods add
+    total = nats.sum(axis=0).max(axis=1)  # each model at its most likely lag
     n = sum(b.n * len(together) for together, b in bins.items())
     estimate = replace(estimate, model=models[int(total.argmax())], n=n)
     explained = total.max() - sum(b.constant() for b in bins.values())
-    if explained < EVIDENCE_NAT + np.log(len(lags)):  # so much is had by trying as many lags
+    if explained < EVIDENCE_NAT + np.log(len(lags)):  # this is the gain of trying this number of lags by chance
         return replace(estimate, verdict=CANNOT_TELL, reason=_NO_DEPENDENCE)
     if estimate.verdict != SHIFTED or _shown_without(bins, parts, estimate.radio_minus_telemetry_s):
         return estimate
@@ -272,7 +274,7 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
 def _shown_without(
     bins: Mapping[tuple[str, ...], _Bins], parts: Mapping[tuple[str, ...], list[list[_Parts]]], lag_s: float
 ) -> bool:
-    """True if a lag is likelier than none whatever two neighbouring parts of the flight are left out."""
+    """Check whether a lag is more likely than zero without any two neighbouring parts of the flight."""
     start, end = min(b.mean_s[0] for b in bins.values()), max(b.mean_s[-1] for b in bins.values())
     lags = np.array([lag_s, 0.0, *((-_SAME_S, _SAME_S) if abs(lag_s) > _AGREE_S else ())])
     for part in range(_LEFT_OUT - 1):
@@ -293,7 +295,7 @@ _NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
 
 
 def _same_models(channels: Sequence[ClockChannel]) -> list[ClockChannel]:
-    """The channels with the models alone that all of them have."""
+    """Return the channels with only the models that all of them have."""
     common = set.intersection(*(set(channel.along.predicted_db) for channel in channels))
     alongs = {
         id(c.along): replace(c.along, predicted_db={k: v for k, v in c.along.predicted_db.items() if k in common})
@@ -303,7 +305,7 @@ def _same_models(channels: Sequence[ClockChannel]) -> list[ClockChannel]:
 
 
 def _at_one_time(channels: Sequence[ClockChannel]) -> dict[tuple[Hashable, ...], list[ClockChannel]]:
-    """Channels in groups that share all but the levels: place, instants, and which levels are missing."""
+    """Return groups of channels with equal positions, times, and missing levels."""
     groups: dict[tuple[Hashable, ...], list[ClockChannel]] = {}
     for channel in channels:
         finite = [np.isfinite(v).tobytes() for v in (channel.measured_db, *channel.along.predicted_db.values())]
@@ -314,16 +316,16 @@ def _at_one_time(channels: Sequence[ClockChannel]) -> dict[tuple[Hashable, ...],
 def _finer(
     lags: FloatArray, likelihood: Callable[[FloatArray], FloatArray], window_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Lags (m,), finer where the log likelihood (channels, models, m) of all channels is near its largest."""
+    """Return lags (m,) that are finer where the log likelihood (channels, models, m) of all channels is near its maximum."""
     nats, step = likelihood(lags), _STEP_S
     while step > _FINEST_S:
         total = nats.sum(axis=0).max(axis=0)
-        # 2 nat more: an optimum that is not excluded may lie between two lags that are
+        # 2 nat more, because an optimum that is not excluded may lie between two excluded lags
         near = lags[total > total.max() - EVIDENCE_NAT - 2.0]
         if len(near) > _MOST_FINE:
             break
         step /= 5.0
-        # rounded: a lag that two coarse ones reach is one
+        # round, because two coarse lags may refine to the same lag
         fine = np.unique(np.round((near[:, None] + step * np.arange(-4, 5)).ravel(), 6))
         fine = fine[(np.abs(fine) <= window_s) & ~np.isin(fine, np.round(lags, 6))]
         lags, nats = np.concatenate([lags, fine]), np.concatenate([nats, likelihood(fine)], axis=-1)
@@ -340,11 +342,11 @@ def _nothing(reason: str, window_s: float) -> ClockEstimate:
 
 
 def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: float) -> ClockEstimate:
-    """The verdict of log likelihoods (channels, models, lags)."""
+    """Return the verdict for log likelihoods (channels, models, lags)."""
     models = nats.sum(axis=0)
     best, total = int(models.max(axis=1).argmax()), models.max(axis=0) - models.max()
     near = np.flatnonzero(total > -EVIDENCE_NAT)
-    # the nearest that are excluded
+    # the nearest excluded lags
     first, last = lags[max(near[0] - 1, 0)], lags[min(near[-1] + 1, len(lags) - 1)]
     low, high = max(float(first) - STAMPS_S, -window_s), min(float(last) + STAMPS_S, window_s)
     against = -float(total[np.abs(lags) <= _SAME_S + 1e-9].max())
@@ -375,10 +377,10 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bins:
-    """Means (n, channels); the instants (s,) at which predictions are averaged, and the first of each mean.
+    """Means (n, channels), the times (s,) at which predictions are averaged, and the first time of each mean.
 
-    ``features`` of directions are averaged over as long a time about each instant. ``predicted`` (channels, models)
-    says which of the ``levels`` (g, k) is the prediction for a channel by a model.
+    ``features`` of directions are averaged over the same duration about each time. ``predicted`` (channels, models) is
+    the index in ``levels`` (g, k) of the prediction for a channel by a model.
     """
 
     mean_db: FloatArray
@@ -396,9 +398,9 @@ class _Bins:
 
     @classmethod
     def of(cls, channels: Sequence[ClockChannel], features: FloatArray, window_s: float) -> _Bins | None:
-        """Bins of channels that share all but the levels, and whose every shift within the window has a prediction.
+        """Return bins of channels that differ only in their levels and have a prediction at every lag of the window.
 
-        None where there are too few.
+        Returns None if there are too few bins.
         """
         along = channels[0].along
         models = {id(c.along): list(c.along.predicted_db.values()) for c in channels}
@@ -411,13 +413,13 @@ class _Bins:
             low, high = (np.floor((t + side - along.start_s) / along.step_s) for side in (-window_s, window_s))
             ok: BoolArray = np.isfinite(y).all(axis=1) & (low >= 0) & (high + 1 < len(lost))
         begin, end = (np.where(ok, side, 0).astype(np.int64) for side in (low, high))
-        # a running count of gaps: no instant of the whole window may lack a prediction
+        # a running count of gaps, because no time of the complete window may lack a prediction
         ok[ok] = missing[end[ok] + 2] == missing[begin[ok]]
         order = np.flatnonzero(ok)[np.argsort(t[ok], kind="stable")]
         t, y = t[order], y[order]
         if not len(t):
             return None
-        # one second, longer on flights beyond a quarter of an hour: the cost grows with the bins
+        # one second, and longer on flights over a quarter of an hour, because the cost grows with the bins
         width = max(1.0, (t[-1] - t[0]) / _BINS)
         _, first, count = np.unique(np.floor(t / width), return_index=True, return_counts=True)
         if len(first) < _FEWEST:
@@ -437,12 +439,12 @@ class _Bins:
         low = place.astype(np.int64)
         share = (place - low)[:, None]
         out = table.take(low, axis=0)
-        out *= 1.0 - share  # in place, and taken: brackets and new tables take twice as long
+        out *= 1.0 - share  # in place and with take, because brackets and new tables need twice the time
         out += table.take(low + 1, axis=0) * share
         return out
 
     def systems(self, lags: FloatArray) -> FloatArray:
-        """Features of offset, slope and gains, then residuals of each channel and model: (n, lags, p + residuals)."""
+        """Return features of offset, slope and gains, then residuals of each channel and model: (n, lags, p + residuals)."""
         count = np.diff(np.append(self.first, len(self.at_s)))[:, None]
         features, models = self.features.shape[1], self.predicted.shape[1]
         out = np.empty((self.n, len(lags), features + self.predicted.size))
@@ -450,14 +452,14 @@ class _Bins:
             level = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
             residual = np.repeat(self.mean_db, models, axis=1) - level[:, self.predicted.ravel()]
             out[:, row, :features] = self._between(self.mean_s - lag, self.features)
-            # the offset is free: near 0 the numbers keep their digits
+            # the offset is free, and numbers near 0 retain their digits
             out[:, row, features:] = residual - residual.mean(axis=0)
         return out
 
     def likelihood(
         self, lags: FloatArray, parts: Sequence[Sequence[_Parts]], kept: BoolArray | None = None
     ) -> FloatArray:
-        """Log likelihood (channels, models, lags), of the likeliest of each channel's parts; of the means ``kept``."""
+        """Return the log likelihood (channels, models, lags) with the most likely parts of each channel, for the means ``kept``."""
         every = list(dict.fromkeys(chain(*parts)))
         belongs = np.array([[part in mine for mine in parts] for part in every])[:, None, :, None]
         blocks = np.array_split(lags, -(-len(lags) // _AT_ONCE))
@@ -465,19 +467,19 @@ class _Bins:
         return np.moveaxis(np.concatenate(tried), 0, -1)
 
     def fitted(self, lags: FloatArray) -> list[list[_Parts]]:
-        """The parts of largest likelihood of each channel: those of each model at some lags."""
+        """Return the most likely parts of each channel, for each model at some lags."""
         parts = [_Parts(*each) for each in product(_MEMORY_S, _WHITE, _GAIN)]
         best = self._tried(lags, parts).argmax(axis=0)
         return [[parts[at] for at in set(best[:, channel].flat)] for channel in range(best.shape[1])]
 
     def _tried(self, lags: FloatArray, parts: Sequence[_Parts], kept: BoolArray | None = None) -> FloatArray:
-        """Log likelihood (parts, lags, channels, models)."""
+        """Return the log likelihood (parts, lags, channels, models)."""
         rows = np.ones(self.n, dtype=bool) if kept is None else kept
         tried = _likelihood(self.systems(lags)[rows], self.mean_s[rows], self.predicted.size, parts)
         return tried.reshape(*tried.shape[:2], *self.predicted.shape)
 
     def constant(self) -> float:
-        """Largest log likelihood of levels that depend on no position, summed over the channels."""
+        """Return the largest log likelihood of levels that do not depend on position, summed over the channels."""
         levels = self.mean_db - self.mean_db.mean(axis=0)
         columns = np.column_stack([np.ones(self.n), np.zeros(self.n), levels])
         parts = [_Parts(*memory, 0.0) for memory in product(_MEMORY_S, _WHITE)]
@@ -485,44 +487,43 @@ class _Bins:
 
 
 def _calm(mean_db: FloatArray) -> FloatArray:
-    """Means (n,) of which none lies farther from its neighbours than chance takes it: a lone dip decides nothing."""
+    """Limit the distance of means (n,) from their neighbours, so that a single dip has little weight."""
     from scipy.ndimage import median_filter
 
     middle = median_filter(mean_db, _NEIGHBOURS, mode="nearest")
-    # 1.4826: from the median of absolute deviations to the standard deviation of a normal distribution
+    # 1.4826 converts a median of absolute deviations to the standard deviation of a normal distribution
     reach = _LONE * 1.4826 * float(np.median(np.abs(mean_db - middle)))
     return np.asarray(np.clip(mean_db, middle - reach, middle + reach))
 
 
 def _averaged(table: FloatArray, width: float) -> FloatArray:
-    """Running mean of a table (g, k) over some of its rows; NaN where a row has NaN.
+    """Return the running mean of a table (g, k) over rows; NaN if a row has NaN.
 
-    Attitudes jitter within a mean of the level: taken at single instants they make the likelihood jump by 10 nat
-    between lags 0.1 s apart, and one of the jumps then looks like a sharp optimum.
+    Attitudes vary within a mean of the level. Taken at single times they would make the likelihood jump by 10 nat
+    between lags 0.1 s apart, and one of the jumps would look like a sharp optimum.
     """
     from scipy.ndimage import correlate1d
 
-    finite: BoolArray = np.asarray(np.isfinite(table).all(axis=1))
-    reach = int(width / 2 + 0.5)
-    weights = np.clip(width / 2 + 0.5 - np.abs(np.arange(-reach, reach + 1)), 0.0, 1.0)  # about the row: no lag
-    share = correlate1d(finite.astype(np.float64), weights, mode="nearest")
-    out = correlate1d(np.where(finite[:, None], table, 0.0), weights, axis=0, mode="nearest")
-    return np.asarray(np.where(finite[:, None], out / np.where(finite, share, 1.0)[:, None], np.nan))
+    finite: BoolArray = np.asarray(np.isfinite(table).all(axis=1)) reach = int(width / 2 + 0.5) weights = np.clip(width
+    / 2 + 0.5 - np.abs(np.arange(-reach, reach + 1)), 0.0, 1.0)  # centred on the row, without a lag share =
+    correlate1d(finite.astype(np.float64), weights, mode="nearest") out = correlate1d(np.where(finite[:, None], table,
+    0.0), weights, axis=0, mode="nearest") return np.asarray(np.where(finite[:, None], out / np.where(finite, share,
+    1.0)[:, None], np.nan))
 
 
 def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray:
-    """Features (g, q) whose products are the covariance of a gain of unit variance over directions (g, 3)."""
+    """Return features (g, q) whose products are the covariance of a gain of unit variance over directions (g, 3)."""
     finite = np.isfinite(direction).all(axis=1)
     unit = direction[finite] / np.linalg.norm(direction[finite], axis=1, keepdims=True)
 
     def covariance(first: FloatArray, second: FloatArray) -> FloatArray:
         return np.asarray(sum(gaussian_kernel(first, second, chord) for chord in chords) / len(chords))
 
-    # thinned: neighbours in time point to the same direction
+    # thin the directions, because neighbours in time have the same direction
     some = unit[:: max(1, len(unit) // 1500)]
     base = some[determining(some, covariance, _LEFT, _FEATURES)]
     out = np.full((len(direction), len(base)), np.nan)
-    # the points were chosen to be nearly independent: a little on the diagonal covers their rounding
+    # the points are almost independent, and the added diagonal covers rounding errors
     known = Factor.of(covariance(base, base) + 1e-9 * np.eye(len(base)))
     out[finite] = known.whiten(covariance(unit, base).T).T
     return out
@@ -531,10 +532,10 @@ def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray
 def _whitened(
     columns: FloatArray, time_s: FloatArray, memories: Sequence[tuple[float, float]]
 ) -> tuple[FloatArray, FloatArray]:
-    """Columns (n, ...) made white: (n, memories, ...), and the log determinants (memories,) of their covariances.
+    """Return whitened columns (n, memories, ...), and the log determinants (memories,) of their covariances.
 
-    A residual of some memory and white share has the covariance exp(-|dt| / memory), and white^2 more on the diagonal.
-    Each row loses what a Kalman filter expects of it after those before.
+    A residual with a correlation time and a white share has the covariance exp(-|dt| / memory), plus white^2 on the
+    diagonal. A Kalman filter subtracts from each row its expectation from earlier rows.
     """
     memory, white = np.array(memories).T
     keeps = np.exp(-np.append(np.diff(time_s), 0.0)[:, None] / memory)
@@ -544,7 +545,7 @@ def _whitened(
         gains[row] = keep * uncertainty / variances[row]
         uncertainty = keep**2 * uncertainty * white**2 / variances[row] + 1.0 - keep**2
     flat = columns.reshape(len(columns), 1, -1)
-    out = np.empty((len(columns), len(memory), flat.shape[2]))  # first what is expected of each row
+    out = np.empty((len(columns), len(memory), flat.shape[2]))  # the expectation of each row first
     out[0], buffer = 0.0, np.empty_like(out[0])
     np.multiply(flat[:-1], gains[:-1, :, None], out=out[1:])
     for last, expected, keep in zip(out[:-1], out[1:], (keeps - gains)[..., None], strict=False):
@@ -555,15 +556,15 @@ def _whitened(
 
 
 def _likelihood(columns: FloatArray, time_s: FloatArray, residuals: int, parts: Sequence[_Parts]) -> FloatArray:
-    """Log likelihood (parts, lags, residuals) of systems (n, lags, p + residuals) whose rows are at ``time_s``.
+    """Return the log likelihood (parts, lags, residuals) of systems (n, lags, p + residuals) with rows at ``time_s``.
 
-    Offset, slope and gains are integrated out, the scale is profiled.
+    Offset, slope and gains are integrated out, and the scale is profiled.
     """
-    # each memory is whitened once: the gains on top change no covariance of the residual
+    # whiten once per correlation time, because gains do not change the covariance of the residual
     memories = list(dict.fromkeys((part.memory_s, part.white) for part in parts))
     white, log_det = _whitened(columns, time_s, memories)
     lags = range(columns.shape[1])
-    # all that the likelihood needs of the rows: the gains are tried on these small matrices
+    # the likelihood needs only these small matrices of the rows, on which gains are tried
     gram = np.stack([[white[:, m, lag].T @ white[:, m, lag] for lag in lags] for m in range(len(memories))])
     n, p = len(columns), columns.shape[2] - residuals
     out = np.empty((len(parts), len(lags), residuals))
@@ -573,7 +574,7 @@ def _likelihood(columns: FloatArray, time_s: FloatArray, residuals: int, parts: 
         spread = np.concatenate([[_FREE] * 2, np.full(p - 2, part.gain), np.ones(residuals)])
         bordered = spread[:, None] * gram[which] * spread
         square = np.diagonal(bordered, axis1=1, axis2=2)[:, p:]
-        # of the factor's last rows only what stands left of the diagonal counts: the 1 keeps the matrix definite
+        # only the left part of the last rows of the factor counts; the 1 keeps the matrix positive definite
         lower = np.linalg.cholesky(bordered + np.eye(len(spread)))
         square = np.maximum(square - (lower[:, p:, :p] ** 2).sum(axis=2), np.finfo(np.float64).tiny)
         determinant = np.log(np.diagonal(lower, axis1=1, axis2=2)[:, :p]).sum(axis=1)[:, None] + 0.5 * log_det[which]
@@ -583,42 +584,42 @@ def _likelihood(columns: FloatArray, time_s: FloatArray, residuals: int, parts: 
 
 @dataclass(frozen=True, slots=True)
 class ClockTrap:
-    """Two logs of one flight that only overlap after a shift of whole (or half) hours.
+    """Two logs of one flight that overlap only after a shift of full or half hours.
 
     Parameters
     ----------
     hours : float
-        To be added to radio times.
+        Hours to add to radio times.
     explanation : str
-        What this looks like.
+        Explanation of the shift.
     """
 
     hours: float
     explanation: str
     is_utc: bool = False
-    """UTC read as local time explains it."""
+    """True if UTC that was read as local time explains the shift."""
 
     def advice(self) -> str:
-        """Cause and remedy, in words."""
+        """Return cause and remedy as text."""
         return f"{self.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' beside the log"
 
 
 def clock_trap(
     radio_span: tuple[Any, Any], telemetry_span: tuple[Any, Any], timezone: str | None = None
 ) -> ClockTrap | None:
-    """Recognise a clock that is off by whole hours, such as local time stored as if it were UTC.
+    """Recognise a clock that is wrong by full hours, such as local time that was stored as UTC.
 
     Parameters
     ----------
     radio_span, telemetry_span : (first, last)
-        datetime64 (UTC) or epoch seconds.
+        First and last time, as datetime64 (UTC) or epoch seconds.
     timezone : str, optional
-        IANA zone of the site: a shift that equals its offset from UTC on that day is named so.
+        IANA zone of the site. A shift equal to its offset from UTC on that day is explained by it.
 
     Returns
     -------
     ClockTrap or None
-        None if the logs overlap as they are, or if no shift of up to 14 h (in half hours) brings them together.
+        None if the logs overlap, or if no shift of up to 14 h (in half hours) makes them overlap.
 
     Examples
     --------
@@ -634,14 +635,14 @@ def clock_trap(
         return np.asarray(np.maximum(0.0, np.minimum(radio[1] + 3600.0 * hours, telemetry[1]) - start))
 
     # UTC-12 to UTC+14, and by halves for India and Newfoundland
-    shifts = np.asarray(np.arange(-28, 29) * 0.5, dtype=np.float64)
+    UTC-12 to UTC+14, with half hours for India and Newfoundland
     shared = overlap(shifts)
     now = float(overlap(np.zeros(1))[0])
-    # whole hours before half hours, near ones before far ones
+    # full hours before half hours, small shifts before large ones
     order = [(-round(float(shared[i])), shifts[i] % 1 != 0, abs(float(shifts[i])), i) for i in range(len(shifts))]
     best = min(order)[-1]
     shorter = min(radio[1] - radio[0], telemetry[1] - telemetry[0])
-    # the logs share most of their time as they are: their clocks agree
+    # the logs share most of their time, so their clocks agree
     if now >= 0.5 * shorter or shared[best] < max(0.5 * shorter, 1e-9):
         return None
     hours = float(shifts[best])
@@ -658,7 +659,7 @@ def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[
         moment = datetime.fromtimestamp(instant, utc.utc).astimezone(ZoneInfo(timezone))
         offset = moment.utcoffset()
         east = offset.total_seconds() / 3600.0 if offset else 0.0
-        # hours are added to the radio: local time is behind UTC where the zone is west
+        # hours are added to the radio clock, because local time is behind UTC in western zones
         if east and hours == -east:
             return f"radio times are local time ({timezone}) stored as if they were UTC", False
         if east and hours == east:
@@ -669,25 +670,25 @@ def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[
     return f"the clocks differ by {hours:+g} h: a time zone was taken into account in one log only", False
 
 
-# Two receivers on one aircraft tell places this near each other, in the median.
+# Median distance of two receivers on one aircraft.
 _AGREE_M = 12.0
-# Further apart at each second in a few points, they do not so in any tenth of one, in all.
+# If a few points are farther apart at each second, all points are farther apart at each tenth of a second.
 _NEAR_M = 4.0 * _AGREE_M
-# The second-best origin, a minute away or farther, must be so many times worse.
+# The second-best origin, a minute away or more, must have a distance larger by this factor.
 _UNIQUE = 1.8
 _POINTS = 240
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """An origin of relative times.
+    """The zero of relative times.
 
     Parameters
     ----------
     time : datetime64[ns]
-        UTC of relative time zero.
+        UTC time of the zero.
     distance_m : float
-        Median distance of the two tracks under it.
+        Median distance of the two tracks with this zero.
     """
 
     time: np.datetime64
@@ -695,17 +696,20 @@ class Origin:
 
 
 def origin_of(log: Stream, track: Stream) -> Origin | None:
-    """The origin under which the positions of a log lie on a track; None where none, or none alone, does.
+    """Return the zero of relative times with which the positions of a log are on a track.
 
-    Both logs tell where the aircraft was: the log at relative times t, the track at UTC. Searched is the shift s that
-    makes the median of |p_log(t) - p_track(t + s)| least: each second first, then tenths of a second around the best.
+    It is None if there is no such time, or more than one.
+
+    Both logs contain positions of the aircraft: the log at relative times t, the track at UTC. The search finds the
+    shift s with the smallest median of |p_log(t) - p_track(t + s)|: in steps of a second, then of 0.1 s around the
+    best.
 
     Parameters
     ----------
     log : Stream
-        With positions; its times count from 1970.
+        Log with positions, whose times count from 1970.
     track : Stream
-        Telemetry with a wall clock.
+        Telemetry with absolute times.
     """
     mine, tracked = _points(log.frame, _POINTS), _points(track.frame, None)
     if mine is None or tracked is None or has_wall_clock(mine[0][0].astype("datetime64[ns]")):
@@ -714,16 +718,16 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     time_s = mine[0].astype(np.int64) / 1e9
     track_s = tracked[0].astype(np.int64) / 1e9 - zero_s
     log_m, track_m = _metres(mine[1], tracked[1]), _metres(tracked[1], tracked[1])
-    # in the plan: heights may count from other grounds
+    # horizontally, because heights may count from different grounds
     line = shapely.linestrings(track_m[:, :2])
     shapely.prepare(line)
-    # half of the half that lies within the track's time has to be that near to it, at whatever time
+    # half of the part within the time of the track must be so close to it, at any time
     if 4 * shapely.dwithin(line, shapely.points(log_m[:, :2]), _AGREE_M).sum() < len(log_m):
         return None
     length = time_s[-1] - time_s[0]
-    # half of the log may stick out at either end of the track
+    # half of the log may be outside the track at either end
     shifts = np.arange(-time_s[0] - 0.5 * length, track_s[-1] - time_s[0] - 0.5 * length, 1.0)
-    # few points tell where no second brings the log anywhere near: most pairs of a folder of flights end here
+    # a few points show if no second brings the log near the track, which is the case for most pairs in a folder
     few = _median_distances(shifts, time_s[::8], log_m[::8], track_s, track_m)
     if not (few < _NEAR_M).any():
         return None
@@ -736,7 +740,7 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     finer = _median_distances(fine, time_s, log_m, track_s, track_m)
     distance = float(np.nanmin(finer))
     second = float(np.nanmin(misses[apart])) if np.isfinite(misses[apart]).any() else np.inf
-    # like with like: the other places were tried each second, and between two seconds an aircraft flies some metres
+    # compare with the other seconds at full seconds, because an aircraft moves some metres between seconds
     if distance > _AGREE_M or second < _UNIQUE * max(float(misses[best]), 1.0):
         return None
     origin_s = zero_s + float(fine[int(np.nanargmin(finer))])
@@ -744,36 +748,36 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
 
 
 def _points(frame: pd.DataFrame, most: int | None) -> tuple[AnyArray, FloatArray] | None:
-    """Times and (latitude, longitude, altitude) of the rows with a place, in order, thinned out to at most ``most``."""
+    """Return times and (latitude, longitude, altitude) of rows with a position, thinned to at most ``most``."""
     names = ["latitude_deg", "longitude_deg", "altitude_m"]
     if not set(names) <= set(frame.columns):
         return None
     places = np.column_stack([frame[name].to_numpy(np.float64) for name in names])
     known = np.flatnonzero(np.isfinite(places[:, :2]).all(axis=1))
     time, first = np.unique(frame["time"].to_numpy("datetime64[ns]")[known], return_index=True)
-    # fewer places lie on any track by chance
+    # fewer positions may lie on any track by chance
     if len(time) < 20:
         return None
-    # evenly, not the first: take-off is where all flights are alike
+    # evenly, because take-off is similar in all flights
     at = slice(None) if most is None or len(time) <= most else np.linspace(0, len(time) - 1, most).astype(int)
     return time[at], places[known[first]][at]
 
 
 def _metres(points: FloatArray, about: FloatArray) -> FloatArray:
-    """Places in metres from the first; heights as logged, 0 where there are none."""
+    """Return positions in metres relative to the first; heights as logged, 0 if missing."""
     return np.column_stack([rough_m(points[:, 0], points[:, 1], about[0]), np.nan_to_num(points[:, 2])])
 
 
 def _median_distances(
     shifts: FloatArray, time_s: FloatArray, log_m: FloatArray, track_s: FloatArray, track_m: FloatArray
 ) -> FloatArray:
-    """Median distance under each shift; NaN where less than half of the log lies within the track."""
+    """Return the median distance for each shift; NaN if less than half of the log is within the track."""
     parts = [np.zeros(0)]
     for some in np.array_split(shifts, -(-len(shifts) // _SHIFTS_AT_ONCE) or 1):
         time = time_s + some[:, None]
         inside = (time >= track_s[0]) & (time <= track_s[-1])
         apart = log_m - interpolated(time.ravel(), track_s, track_m).reshape(*time.shape, 3)
-        apart[..., 2] -= _medians(apart[..., 2], inside)[:, None]  # the logs count heights from grounds of their own
+        apart[..., 2] -= _medians(apart[..., 2], inside)[:, None]  # heights of the logs count from different grounds
         median = _medians(np.linalg.norm(apart, axis=2), inside)
         parts.append(np.where(2 * inside.sum(axis=1) < len(time_s), np.nan, median))
     return np.concatenate(parts)
@@ -783,7 +787,7 @@ _SHIFTS_AT_ONCE = 500
 
 
 def _medians(values: FloatArray, counts: BoolArray) -> FloatArray:
-    """Median of each row (n, m) over the values that count; NaN where none does."""
+    """Return the median of each row (n, m) over the values with ``counts``; NaN if there are none."""
     ordered = np.sort(np.where(counts, values, np.inf), axis=1)
     number, row = counts.sum(axis=1), np.arange(len(values))
     low, high = np.maximum(number - 1, 0) // 2, np.minimum(number // 2, values.shape[1] - 1)

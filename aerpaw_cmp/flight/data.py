@@ -1,6 +1,6 @@
-"""From a checked flight file to the data of one flight: site, logs, track, RSS and rank series.
+"""The data of one flight from a checked flight file: site, logs, track, RSS and rank series.
 
-Settings of a flight file that cannot act: a report warns of each, because a value that does nothing misleads.
+A report also warns of each setting that has no effect, because such a value misleads the reader.
 
 A value that equals its default is not reported. Names that no flight could have are refused
 (:func:`aerpaw_cmp.flight.data.check_names`).
@@ -66,7 +66,7 @@ def idle_log_keys(log: LogSettings, file: IngestedFile) -> list[str]:
 
 
 def _starts_near(origin: str, file: IngestedFile) -> bool:
-    # an origin that cannot be read is near nothing
+    # an origin that cannot be read is near no time
     zero = pd.to_datetime(origin, errors="coerce", utc=True).tz_localize(None)
     times = [s.frame["time"].min() for s in file.result.streams if len(s.frame) and "time" in s.frame]
     return not times or bool(np.min([abs(time - zero) for time in times]) < _NEAR_ORIGIN)
@@ -79,7 +79,7 @@ def idle_settings(settings: FlightFile, kinds: Collection[str]) -> list[str]:
     ----------
     settings : FlightFile
     kinds : collection of {"rss", "rank"}
-        What the logs measured.
+        Kinds of measurements in the logs.
     """
     texts = []
     for why, keys in _reasons(settings, kinds):
@@ -90,7 +90,7 @@ def idle_settings(settings: FlightFile, kinds: Collection[str]) -> list[str]:
 
 
 def _reasons(settings: FlightFile, kinds: Collection[str]) -> Iterator[tuple[str, str]]:
-    """Yield reasons, and the dotted keys that cannot act because of each."""
+    """Yield reasons, and the dotted keys that have no effect for each reason."""
     rt, lag = settings.rt, settings.rss.lag
     if rt.foliage != "attenuating":
         foliage = "foliage_model leaves advanced.gamma_db_per_m advanced.maximum_loss_db"
@@ -119,7 +119,10 @@ Times = NDArray[np.datetime64]
 
 @dataclass(frozen=True, slots=True)
 class RssSeries:
-    """Measured RSS of one tower and channel: ``time`` (n,) UTC, ``measured_db`` (n,), NaN = out of coverage."""
+    """The measured RSS of one tower and channel.
+
+    ``time`` (n,) is UTC, and ``measured_db`` (n,) is NaN out of coverage.
+    """
 
     tower: str
     channel: str
@@ -128,24 +131,24 @@ class RssSeries:
     measured_db: FloatArray
     link: LinkSettings
     settings_key: str
-    """Equal for series whose link settings are equal: they share a replay."""
+    """Equal for series with equal link settings, which share a replay."""
     log: IntArray
-    """Number of the log (n,) under ``logs:`` that holds each sample."""
+    """Number of the log (n,) under ``logs:`` that contains each sample."""
     line: IntArray
     """Line (n,) of that log."""
     noise_dbm: float | None = None
-    """Of a ratio to the noise: that of the receiver, where its bandwidth or floor is given; None for levels."""
+    """Noise of the receiver for a signal-to-noise ratio, if its bandwidth or floor is known [dBm]; None for levels."""
     flagged: Mapping[str, int] = field(default_factory=dict)
-    """Rows of the log that are not here, because a flag voids them: how many per flag."""
+    """Numbers of rows of the log that are excluded because of a flag, by flag."""
     serving: FloatArray | None = None
-    """Of a cell: 1 where it served the phone, 0 where another did (n,), NaN unknown; None for other levels."""
+    """Serving state of a cell: 1 if it served the phone, 0 if another did, NaN unknown (n,); None for other levels."""
     locked: FloatArray | None = None
-    """Of a sounder: 1 where it was in lock, 0 where it had lost it (n,), NaN unknown; None for other levels."""
+    """Receiver lock of a sounder: 1 in lock, 0 without lock, NaN unknown (n,); None for other levels."""
 
 
 @dataclass(frozen=True, slots=True)
 class RankSeries:
-    """Reported rank at a tower: ``rank`` (n,) with NaN for no CSI, ``position_m`` (n, 3) of the log itself or None."""
+    """The reported rank at a tower: ``rank`` (n,), NaN without CSI, and ``position_m`` (n, 3) of the log or None."""
 
     tower: str
     time: Times
@@ -154,23 +157,23 @@ class RankSeries:
     position_m: FloatArray | None
     log: IntArray
     flagged: Mapping[str, int] = field(default_factory=dict)
-    """Both as in :class:`RssSeries`."""
+    """As in :class:`RssSeries`."""
 
     @property
     def channel(self) -> str:
-        """In the place of a channel's name."""
+        """The kind of the series, used as the name of its channel."""
         return "rank"
 
 
 @dataclass(frozen=True, slots=True)
 class FlightData:
-    """Everything the comparison needs, nothing replayed yet."""
+    """The data of a flight before the replay."""
 
     settings: FlightFile
     folder: Path
-    """Where logs and antenna files resolve: ``--logs-root``, else the folder of the flight file."""
+    """Folder of logs and antenna files: ``--logs-root``, or the folder of the flight file."""
     site_place: str | Path
-    """The site's file, which lies by the flight file, or the name of a packaged site."""
+    """Site file in the folder of the flight file, or the name of a packaged site."""
     site: Site
     files: tuple[IngestedFile, ...] = ()
     track: Track | None = None
@@ -178,20 +181,20 @@ class FlightData:
     rank: tuple[RankSeries, ...] = ()
     warnings: tuple[str, ...] = ()
     nodes: Mapping[str, Track] = field(default_factory=dict)
-    """Tracks of the towers that move; ``site`` has them in the middle of their positions."""
+    """Tracks of the towers that move. ``site`` has them at the middle of their positions."""
     doubts: tuple[str, ...] = ()
-    """Clauses on clocks and heights that the first words of a report repeat."""
+    """Clauses about clocks and heights that the summary of a report repeats."""
     cautions: tuple[str, ...] = ()
-    """Sentences on settings that the user wrote and that do not fit: they come before all other cautions."""
+    """Sentences about settings of the user that do not fit, which come before all other warnings."""
     _links: dict[str, Link] = field(init=False, default_factory=dict, repr=False, compare=False)
 
     @property
     def series(self) -> list[tuple[str, RssSeries | RankSeries]]:
-        """Every series with the kind of what it measured, RSS first."""
+        """All series with the kind of their measurement, RSS first."""
         return [*(("RSS", s) for s in self.rss), *(("rank", s) for s in self.rank)]
 
     def link_of(self, series: RssSeries | RankSeries) -> Link:
-        """The link of a series to its tower; antenna files are read once."""
+        """Return the link of a series to its tower; antenna files are read once."""
         settings = series.link if isinstance(series, RssSeries) else self.settings.link.rank
         key = f"{series.tower} {series.settings_key if isinstance(series, RssSeries) else series.channel}"
         if key not in self._links:
@@ -199,14 +202,14 @@ class FlightData:
         return self._links[key]
 
     def poses_at(self, time: Times) -> TrackPoses:
-        """Poses of the UAV at instants (n,), for a flight with a track."""
+        """Return poses of the UAV at times (n,), for a flight with a track."""
         assert self.track is not None
         return self.track.pose_at(time)
 
     def tower_at(self, tower: str, time: Times) -> tuple[FloatArray, BoolArray]:
-        """Array centre of a tower at instants (n,), and where it is known (n,); NaN elsewhere.
+        """Return the array centre of a tower at times (n,), and whether it is known (n,); unknown positions are NaN.
 
-        (1, 3) of a tower that stands, (n, 3) of one that moves.
+        The shape is (1, 3) for a fixed tower, and (n, 3) for one that moves.
         """
         if tower not in self.nodes:
             return self.site.towers[tower].position_m[None, :], np.ones(len(time), dtype=np.bool_)
@@ -218,19 +221,19 @@ class FlightData:
 
 
 def site_place(site: str, folder: Path) -> str | Path:
-    """A site.yaml below the folder, or the name of a packaged site."""
+    """Return a site.yaml below the folder, or the name of a packaged site."""
     return folder / site if (folder / site).is_file() else site
 
 
 def choose_site(choice: SiteChoice, folder: Path) -> Site:
-    """The site of a flight, with the flight's own changes."""
+    """Return the site of a flight with the changes that the flight file specifies."""
     site = load_site(site_place(choice.file, folder), coordinates=choice.coordinates, tower_ground=choice.tower_ground)
     if choice.antenna_height_m is not None:
         towers = {
             key: dataclasses.replace(tower, antenna_height_m=choice.antenna_height_m)
             for key, tower in site.towers.items()
         }
-        # of every tower: a flight does not say which are its own
+        # change every tower, because a flight does not name its towers
         site = dataclasses.replace(site, towers=towers)
     if choice.without_buildings:
         note = "this flight is replayed without the buildings of the site (site.without_buildings)"
@@ -238,37 +241,37 @@ def choose_site(choice: SiteChoice, folder: Path) -> Site:
     return site
 
 
-# A ground node whose positions stay within this of their median stands still: that is the noise of its GNSS.
+# A ground node is fixed if its positions stay within this distance of their median, which is the noise of its GNSS.
 STANDS_STILL_M = 3.0
 
 
 def ground_nodes(
     site: Site, settings: FlightFile, folder: Path, warnings: list[str] | None = None
 ) -> tuple[Site, dict[str, Track]]:
-    """The site with the flight's own nodes as towers, and the tracks of those that move.
+    """Return the site with the nodes of the flight as towers, and the tracks of nodes that move.
 
     Parameters
     ----------
     site : Site
     settings : FlightFile
     folder : Path
-        Where the logs of positions resolve.
+        Folder of the logs of positions.
     warnings : list of str, optional
-        Takes what is to be said of the tracks.
+        Receives warnings about the tracks.
 
     Returns
     -------
     Site
-        A node that moves stands in the middle of its positions.
+        Site in which a node that moves is at the middle of its positions.
     dict of str to Track
-        Of the nodes that move, by name.
+        Tracks of the nodes that move, by name.
 
     Raises
     ------
     UsageError
-        A name that the site has already.
+        If the site already has the name.
     InputError
-        A track without positions, or whose times are not known.
+        If a track has no positions, or its times are unknown.
     """
     towers, nodes = dict(site.towers), dict[str, Track]()
     for name, node in settings.towers.items():
@@ -296,7 +299,7 @@ def ground_nodes(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _NodePlace:
-    """Middle of a node's positions, and its track where it moves."""
+    """The middle of the positions of a node, and its track if it moves."""
 
     latitude_deg: float
     longitude_deg: float
@@ -306,7 +309,7 @@ class _NodePlace:
 
 
 def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile, site: Site) -> _NodePlace:
-    """Position of a node, or its track where it moves."""
+    """Return the position of a node, or its track if it moves."""
     if node.track is None:
         assert node.latitude_deg is not None
         assert node.longitude_deg is not None
@@ -316,7 +319,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
     path, logged = folder / node.track.path, node.height == "logged"
     frame = _node_positions(name, node.track, path, settings.timezone)
     latitude, longitude = (frame[key].to_numpy(np.float64) for key in ("latitude_deg", "longitude_deg"))
-    # the median: one position of a receiver without a fix moves no node
+    # use the median, because a single position without a fix must not move the node
     middle = float(np.median(latitude)), float(np.median(longitude))
     east, north = site.frame.to_local(latitude, longitude)
     centre = site.frame.to_local(np.array([middle[0]]), np.array([middle[1]]))
@@ -328,7 +331,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
         raise InputError(
             "no heights in this log", expected=f"those of towers.{name}, which has height: logged", path=path
         )
-    # a height that is taken from the ground does not move
+    # a height that is taken from the ground does not change
     rises = float(np.nanmax(np.abs(up - height))) if logged else 0.0
     stands = _NodePlace(
         latitude_deg=middle[0], longitude_deg=middle[1], height_m=height if logged else node.antenna_height_m
@@ -336,7 +339,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
     if max(reach_m, rises) <= STANDS_STILL_M:
         return stands
     track = Track(
-        # on the ground: its own heights are not used, and may be missing
+        # the heights of a node on the ground are not used and may be missing
         frame if logged else frame.assign(altitude_m=0.0),
         site.frame,
         maximum_gap_s=settings.rt.advanced.maximum_gap_s,
@@ -351,13 +354,13 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
             path=path,
         )
     remarks = [f"moves {reach_m:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
-    # nobody uses how a node is turned
+    # the attitude of a node is not used
     remarks += [text for text in track.account.warnings if "attitude" not in text]
     return dataclasses.replace(stands, track=track, remarks=tuple(remarks))
 
 
 def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | None) -> pd.DataFrame:
-    """Rows with a position of the first stream that has any, with all columns of telemetry."""
+    """Return rows of the first stream with a position, with all columns of telemetry."""
     if not path.is_file():
         raise InputError("there is no such log", expected=f"the positions of towers.{name}", path=path)
     options = log.options(timezone)
@@ -374,24 +377,24 @@ def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | Non
     raise InputError("no positions in this log", expected=f"those of towers.{name}", path=path)
 
 
-# All but fix and satellites, which are no numbers of a pose.
+# All columns except fix and satellites, which are not part of a pose.
 _TELEMETRY = COLUMNS["telemetry"][:-2]
 
 
 def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> tuple[IngestedFile, ...]:
-    """Every log of the flight file, in its order.
+    """Read every log of the flight file, in its order.
 
     Raises
     ------
     InputError
-        A missing file, a log of another kind than the flight file says, a log without any record.
+        If a file is missing, a log has another kind than the flight file specifies, or a log has no record.
     """
     if not settings.logs:
         raise UsageError("the flight file lists no log", expected="one or more lines under 'logs:'")
-    # a flight file of several logs is read once
+    # a flight file with several logs is read once
     root, cache = logs_root or folder, Held()
     for log in settings.logs:
-        # a missing log is reported before minutes of reading those above it
+        # report a missing log before the logs above it are read for minutes
         named_log(root, log.path)
     return tuple(
         read_log(root, log.path, log.options(settings.timezone), reader=log.reader, held=cache) for log in settings.logs
@@ -399,36 +402,36 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 
 
 SNR = "snr"
-# Streams or channels of kind rss that are no levels, as sounder and controller name them.
+# Names of streams or channels of kind rss that are ratios, as the sounder and the controller name them.
 RATIOS = ("quality", SNR)
 
 
 def is_ratio(stream: Stream, names: Sequence[str] = RATIOS) -> bool:
-    """Check whether a stream of kind rss is a ratio to the noise, of one of the names."""
+    """Check whether a stream of kind rss is a signal-to-noise ratio with one of the names."""
     known = (stream.name, _text(stream, "channel"), _text(stream, "quantity"))
     return stream.kind == "rss" and any(name is not None and name.lower() in names for name in known)
 
 
 def is_own_radio(stream: Stream) -> bool:
-    """Check whether a level is that of the autopilot's telemetry radio, which hears no tower of the experiment."""
+    """Check whether a level is that of the telemetry radio of the autopilot, which receives no tower."""
     return stream.kind == "rss" and _text(stream, "quantity") == "telemetry radio RSSI"
 
 
 def rank_quantity(stream: Stream, reader: str) -> str:
-    """Rank that a stream holds, as its reader names it; the reader where that names none."""
+    """Return the name of the rank in a stream, or the name of its reader."""
     return _text(stream, "source") or reader
 
 
 def quantity_of(data: FlightData, series: RankSeries) -> str:
-    """Return the name of a rank in its log, as :func:`rank_quantity`."""
+    """Return the name of a rank in its log, as :func:`rank_quantity` does."""
     file = data.files[int(series.log[0])]
     return next(rank_quantity(stream, file.result.reader) for stream in file.result.streams if stream.kind == "rank")
 
 
 def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettings]:
-    """Noise [dBm] under an SNR, where the flight file gives it, and the link as such a receiver hears it.
+    """Return the noise below an SNR [dBm], if the flight file has it, and the link for such a receiver.
 
-    An estimator reports ratios below 0 dB too (it knows the signal): its own noise cuts nothing off.
+    An estimator also reports ratios below 0 dB, because it knows the signal, so its noise floor cuts nothing off.
     """
     if not is_ratio(stream, (SNR,)) or link.bandwidth_hz is None:
         return None, link
@@ -436,15 +439,15 @@ def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettin
 
 
 def unread(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> FlightData:
-    """The site and the nodes of a flight, with what is to be said of the nodes; no log of it is read.
+    """Return the site and the nodes of a flight with remarks about the nodes, without reading its logs.
 
     Parameters
     ----------
     settings : FlightFile
     folder : Path
-        Of the flight file.
+        Folder of the flight file.
     logs_root : Path, optional
-        Where logs and antenna files resolve, in place of ``folder``.
+        Folder of logs and antenna files, instead of ``folder``.
     """
     root, warnings = logs_root or folder, list[str]()
     site, nodes = ground_nodes(choose_site(settings.site, folder), settings, root, warnings)
@@ -463,23 +466,23 @@ def gather(
     ----------
     settings : FlightFile
     folder : Path
-        Of the flight file.
+        Folder of the flight file.
     files : sequence of IngestedFile
-        In the order of ``settings.logs``.
+        Read logs in the order of ``settings.logs``.
     logs_root : Path, optional
-        Where logs and antenna files resolve, in place of ``folder``.
+        Folder of logs and antenna files, instead of ``folder``.
 
     Returns
     -------
     FlightData
-        Site, track and series, with the warnings of the logs.
+        Site, track and series, with the warnings about the logs.
 
     Raises
     ------
     UsageError
-        A log without a tower, a tower that the site does not have, two records at one time.
+        If a log has no tower, the site does not have a tower, or two records have one time.
     InputError
-        No position, no row that may be compared, a flight far from every tower.
+        If there is no position or no row to compare, or the flight is far from every tower.
     """
     files = [at_height(log, file) for log, file in zip(settings.logs, files, strict=True)]
     data = unread(settings, folder, logs_root)
@@ -499,7 +502,7 @@ def gather(
         telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
         heard = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
         for stream in (s for s in heard if log.node or not is_own_radio(s)):
-            # the sounder writes power and quality to files of their own
+            # the sounder writes power and quality to separate files
             elsewhere = (candidate for source in files if source is not file for candidate in source.result.streams)
             locked, remark = lock_of(stream, [*file.result.streams, *elsewhere])
             warnings += [f"{log.path}: {remark}"] if remark else []
@@ -534,7 +537,7 @@ def gather(
     )
     if track is not None:
         rss = [(path, _moving(path, series, track, warnings)) for path, series in rss]
-    # without any position at all the message of the overlap says it better
+    # without any position, the message about the overlap is better
     if track is None and rss and any(series.position_m is not None for _, series in rank):
         levels = ", ".join(dict.fromkeys(f"{series.tower} {series.channel}" for _, series in rss))
         warnings.append(f"no telemetry log: the levels of {levels} have no positions and are left out")
@@ -555,26 +558,26 @@ def gather(
         undated = _undated(data, telemetry[0][0])
         asked += doubts(track, telemetry[0][1], _times_on_track(data), undated, site.takeoff_ground_m)
         asked += check_heights(site, *telemetry[0])
-    # after the overlap was checked: a flight that shares no time stops with its own message
+    # after the check of the overlap, so that a flight without common times has its own message
     every = (*cautions, *_idle_attitude(data), *data.warnings, *(f"{text}." for text in asked))
     return dataclasses.replace(data, doubts=asked, warnings=every, cautions=cautions)
 
 
 def check_names(settings: FlightFile, site: Site, series: Sequence[tuple[str, str]]) -> tuple[str, ...]:
-    """Check the towers and channels that settings name; return the cautions on learned antennas that do not fit.
+    """Check the towers and channels that settings name, and return cautions about learned antennas that do not fit.
 
     Parameters
     ----------
     settings : FlightFile
     site : Site
-        With the towers of the flight.
+        Site with the towers of the flight.
     series : sequence of (tower, channel)
-        Every level of the logs.
+        All levels of the logs.
 
     Raises
     ------
     UsageError
-        A tower that neither site nor flight has, a channel or a pair of both that no log has.
+        For a tower that neither site nor flight has, and a channel or tower with a channel that no log has.
     """
     channels = list(dict.fromkeys(channel for _, channel in series))
     pairs = [f"{tower}.{channel}" for tower, channel in dict.fromkeys(series)]
@@ -605,10 +608,10 @@ def _unknown(key: str, kind: str, name: str, valid: Sequence[str]) -> NoReturn:
 
 
 def _learned_cautions(settings: FlightFile, channels: Sequence[str]) -> tuple[str, ...]:
-    """Return a sentence per caution on learned antennas and receivers; it names channels if only some are concerned."""
+    """Return a sentence per caution about learned antennas, which names channels if only some are affected."""
     touched: dict[str, list[str]] = {}
     for caution in settings.cautions:
-        # None: the link of all channels without an entry
+        # None is the link of all channels without an entry
         links = settings.link.channels if caution.channel is None else {*channels} - {caution.channel}
         concerned = [channel for channel in channels if channel not in links]
         if concerned or caution.key == "rank.receiver":
@@ -628,7 +631,7 @@ def _idle_channels(settings: FlightFile, channels: Sequence[str]) -> tuple[str, 
 
 
 def _undated(data: FlightData, track: str) -> list[str]:
-    """Logs with positions of their own that only 'time_origin' dates, beside a track that has a clock."""
+    """Return logs with positions that only 'time_origin' dates, while the track has a clock."""
     dated = {log.path for log in data.settings.logs if log.time_origin is not None}
     return [
         log.path
@@ -639,27 +642,27 @@ def _undated(data: FlightData, track: str) -> list[str]:
 
 
 def _times_on_track(data: FlightData) -> list[tuple[str, Times]]:
-    """Names and times of the series whose positions are those of the telemetry."""
+    """Return names and times of the series whose positions come from the telemetry."""
     levels = [(f"RSS of {series.tower} {series.channel}", series.time) for series in data.rss]
     return levels + [(f"rank of {series.tower}", series.time) for series in data.rank if series.position_m is None]
 
 
 def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> FlightData:
-    """The data of a flight: :func:`gather` of what :func:`read_logs` reads.
+    """Return the data of a flight: :func:`gather` for the logs of :func:`read_logs`.
 
     Parameters
     ----------
     settings : FlightFile
     folder : Path
-        Of the flight file.
+        Folder of the flight file.
     logs_root : Path, optional
-        Where logs and antenna files resolve, in place of ``folder``.
+        Folder of logs and antenna files, instead of ``folder``.
     """
     return gather(settings, folder, read_logs(settings, folder, logs_root), logs_root)
 
 
 def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
-    """Remarks on streams that are compared with a level over noise, or as if they were one."""
+    """Return remarks about streams that are compared with a level over noise."""
     ratios = [s for s in streams if is_ratio(s) and s.name not in log.skip]
     blind = [s.name for s in ratios if _noise(s, links.of(_channel_of(log, s)))[0] is None]
     if not blind:
@@ -673,7 +676,7 @@ def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]
 
 
 def _of_carriers(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
-    """Remarks on levels of a frequency that is not the one at which their link is replayed."""
+    """Return remarks about levels whose frequency differs from the carrier of their link."""
     carriers = [
         (s.name, float(s.attributes["frequency_hz"]), links.of(_channel_of(log, s)).carrier_hz)
         for s in streams if s.kind == "rss" and isinstance(s.attributes.get("frequency_hz"), float)
@@ -684,7 +687,7 @@ def _of_carriers(links: LinksSettings, log: LogSettings, streams: Sequence[Strea
     ]  # fmt: skip
 
 
-# Free space differs by 0.4 dB where carriers differ by so much.
+# Relative difference of carriers at which free space differs by 0.4 dB.
 _CARRIER_SHARE = 0.05
 
 
@@ -714,22 +717,22 @@ def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximu
     return track
 
 
-# A flight further than this from every tower [m] was not flown at this site.
+# A flight farther than this from every tower belongs to another site [m].
 FAR_M = 30_000.0
 
 
 def check_place(site: Site, path: str, stream: Stream) -> None:
-    """A flight far from every tower is no flight of this site: exchanged or mirrored angles are named.
+    """Refuse a flight far from every tower, and report swapped or mirrored angles.
 
     Raises
     ------
     InputError
-        If no position comes within :data:`FAR_M` of any tower.
+        If no position is within :data:`FAR_M` of any tower.
     """
     latitude, longitude = (stream.frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
     if not (near := nearest_m(site, latitude, longitude)) > FAR_M:
         return
-    # in the order in which they happen
+    # in the order of their frequency
     turned = {
         "latitude and longitude are exchanged": (longitude, latitude),
         "the longitude lacks its sign (west is negative)": (latitude, -longitude),
@@ -746,19 +749,19 @@ def check_place(site: Site, path: str, stream: Stream) -> None:
 
 
 def nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) -> float:
-    """Least horizontal distance of positions to any tower [m]; NaN without a position."""
-    # impossible angles are refused elsewhere, and would stop the projection
+    """Return the smallest horizontal distance of positions to any tower [m]; NaN without a position."""
+    # impossible angles are refused by another check, and would stop the projection
     can = (np.abs(latitude_deg) <= 90.0) & (np.abs(longitude_deg) <= 180.0)
     if not can.any():
         return float("nan")
     east, north = site.frame.to_local(latitude_deg[can], longitude_deg[can])
-    # by each tower's nearest sample: a flight may be long
+    # use the nearest sample of each tower, because a flight may be long
     gaps = [np.hypot(east - t.position_m[0], north - t.position_m[1]).min() for t in site.towers.values()]
     return float(np.min(gaps, initial=np.inf))
 
 
 def _idle_attitude(data: FlightData) -> tuple[str, ...]:
-    """Warnings where ``rt.attitude`` cannot act, or only in part."""
+    """Return warnings if ``rt.attitude`` has no effect or only a partial one."""
     mode = data.settings.rt.attitude
     if mode == "ignored":
         return ()
@@ -799,12 +802,12 @@ def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:
 
 
 def _unnamed_cell(log: LogSettings, stream: Stream) -> bool:
-    """Check whether a stream is that of a cell that the flight file, which names others, does not name."""
+    """Check whether a stream belongs to a cell that the flight file, which names other cells, does not name."""
     return bool(log.cells) and not {"pci", "part"}.isdisjoint(stream.attributes) and _home(log, stream) is None
 
 
 def _home(log: LogSettings, stream: Stream) -> str | None:
-    """Tower that ``cells`` gives a stream, by its PCI or by its name."""
+    """Return the tower of a stream in ``cells``, by its PCI or by its name."""
     return log.cells.get(int(stream.attributes.get("pci", -1)), log.cells.get(stream.name))
 
 
@@ -833,7 +836,7 @@ def _rss_series(
 
 
 def _moving(path: str, series: RssSeries, track: Track, warnings: list[str]) -> RssSeries:
-    """Return a series without the samples at which the level is frozen in flight, counted among the flagged."""
+    """Return a series without samples whose level is frozen in flight, which are counted as flagged."""
     order = np.argsort(series.time, kind="stable")
     bad = np.zeros(len(order), dtype=np.bool_)
     bad[order] = frozen(series.time[order], series.measured_db[order], track.pose_at(series.time[order]).position_m)
@@ -854,10 +857,10 @@ def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | N
     position = None
     if {"latitude_deg", "longitude_deg", "altitude_m"} <= set(frame.columns) and frame["latitude_deg"].notna().any():
         east, north = site.frame.to_local(frame["latitude_deg"], frame["longitude_deg"])
-        takeoff_m = site.takeoff_ground_m  # as of the track: altitude_m counts from there
+        takeoff_m = site.takeoff_ground_m  # altitude_m counts from the take-off point, as in the track
         up = frame["altitude_m"].to_numpy(np.float64) + takeoff_m
         up, buried = raised(up, site.ground_under_m(east, north), takeoff_m)
-        # buried and without a height: no position, as in a track
+        # samples below the ground or without a height have no position, as in a track
         position = np.stack([east, north, np.where(buried | np.isnan(frame["altitude_m"]), np.nan, up)], axis=-1)
     sinr = frame["sinr_db"].to_numpy(np.float64) if "sinr_db" in frame else np.full(len(frame), np.nan)
     return RankSeries(
@@ -875,12 +878,12 @@ Series = TypeVar("Series", "RssSeries", "RankSeries")
 
 
 def _records(parts: Sequence[tuple[str, Series]], name: Callable[[Series], str]) -> tuple[Series, ...]:
-    """One series per name: logs that follow each other (a radio started anew) are one record.
+    """Return one series per name. Logs that follow each other, as after a restart of the radio, are one record.
 
     Raises
     ------
     UsageError
-        If two logs hold the same at the same time: only one of them could be compared.
+        If two logs contain the same series at the same time, because only one could be compared.
     """
     groups: dict[str, list[tuple[str, Series]]] = {}
     for path, series in parts:
@@ -891,7 +894,7 @@ def _records(parts: Sequence[tuple[str, Series]], name: Callable[[Series], str])
 def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
     if len(group) == 1:
         return group[0][1]
-    # in time, whatever the order of the flight file; a record without a sample has no place in it
+    # sort by time, independent of the order in the flight file; a record without samples is not included
     parts = sorted((p for p in group if len(p[1].time)), key=lambda p: p[1].time.min()) or [group[0]]
     for (path, before), (later_path, after) in itertools.pairwise(parts):
         if after.time.min() < before.time.max() or _form(before) != _form(after):
@@ -906,7 +909,7 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
                 expected="one record of each channel and of each tower's rank",
                 cause=f"{cause}; another radio: give it its own 'channel'",
             )
-    # what does not grow with the record (link, unit) is that of its first part
+    # values that do not grow with the record (link, unit) are those of its first part
     first = parts[0][1]
     series = [part for _, part in parts]
     arrays: dict[str, Any] = {
@@ -917,7 +920,7 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
 
 
 def _joined(parts: Sequence[RssSeries | RankSeries], name: str) -> AnyArray:
-    """A column of all parts, NaN where a part does not have it (a log that says no serving cell); empty if none has."""
+    """Return a column of all parts, NaN for parts without it, such as a serving cell; empty if no part has it."""
     arrays = [getattr(part, name) for part in parts]
     if not any(isinstance(value, np.ndarray) for value in arrays):
         return np.empty(0)
@@ -927,7 +930,7 @@ def _joined(parts: Sequence[RssSeries | RankSeries], name: str) -> AnyArray:
 
 
 def _form(series: RssSeries | RankSeries) -> object:
-    """Property that two parts of one record must share."""
+    """Return the property that two parts of one record must share."""
     return series.unit if isinstance(series, RssSeries) else series.position_m is None
 
 
@@ -937,7 +940,7 @@ def _text(stream: Stream, key: str) -> str | None:
 
 
 def _check_overlap(data: FlightData) -> None:
-    """Every series must share time with the track that gives its poses, and with that of a tower that moves."""
+    """Check that every series shares time with the track of its poses, and with that of a tower that moves."""
     if not data.rss and not data.rank:
         raise UsageError(
             "none of the logs holds RSS or rank",
@@ -957,12 +960,12 @@ def _check_overlap(data: FlightData) -> None:
             _check_shared(data, what, series.time, data.nodes[series.tower], node=series.tower)
 
 
-# A log that ends before counts from a zero of its own.
+# A log that ends before this year has relative times.
 _FIRST_YEAR = 2000
 
 
 def _check_shared(data: FlightData, what: str, time: Times, track: Track, node: str | None = None) -> None:
-    """Times of a series must meet those of the telemetry, or of the track of a node."""
+    """Check that times of a series overlap those of the telemetry, or of the track of a node."""
     start, end = np.datetime64(track.start_ns, "ns"), np.datetime64(track.end_ns, "ns")
     if len(time) and time.min() <= end and time.max() >= start:
         return
@@ -972,7 +975,7 @@ def _check_shared(data: FlightData, what: str, time: Times, track: Track, node: 
     expected = "logs of the same flight"
     if node is not None:
         of, expected = "the track of this tower", "positions of the node during the flight"
-        # 1970: times from a zero of their own
+        # a year of 1970 means times from another zero
         if pd.Timestamp(end).year < _FIRST_YEAR:
             cause = "relative times: they want 'time_origin' beside the log"
         cause = cause.replace("beside the log", f"beside 'path' in towers.{node}.track")
@@ -993,7 +996,7 @@ def _clock_cause(timezone: str | None, time: Times, start: np.datetime64, end: n
 
 
 def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray, BoolArray]:
-    """Positions (n, 3) [m] and which of them are known: the log's own, and the track's where it has none."""
+    """Return positions (n, 3) of the log, or of the track where the log has none [m], and which of them are known."""
     if series.position_m is None:
         assert track is not None
         pose = track.pose_at(series.time)
@@ -1002,7 +1005,7 @@ def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray,
     known = np.isfinite(position).all(axis=1)
     if track is not None and not known.all():
         pose = track.pose_at(series.time)
-        # row by row: a modem without a fix for a while has the track's position then
+        # decide row by row: a modem without a fix for some time has the position of the track then
         use = ~known & pose.valid
         position, known = np.where(use[:, None], pose.position_m, position), known | use
     return position, np.asarray(known)

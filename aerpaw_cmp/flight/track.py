@@ -1,10 +1,8 @@
-"""Position and attitude of the UAV at any instant.
+"""Position, height and attitude of the UAV at any time.
 
-Attitude is interpolated as rotation (slerp), never as angles. Telemetry gaps longer than a stated limit are not
-bridged; poses in them are invalid, with a reason. What a log does not say (attitude) is replaced by level flight
-along the course and flagged. Nothing is dropped silently: :class:`TrackAccount` counts every row left out.
-
-Heights of tracks: over the ground under them, and those of logs that write latitude and longitude alone.
+Attitude is interpolated as rotation (slerp), never as angles. Telemetry gaps longer than a limit are not bridged, and
+poses inside them are invalid, with a reason. A missing attitude is replaced by level flight along the course, and
+flagged. :class:`TrackAccount` counts every row that is not used.
 """
 
 from __future__ import annotations
@@ -33,24 +31,24 @@ if TYPE_CHECKING:
 
 
 Ground = Callable[[FloatArray, FloatArray], FloatArray]
-"""Up of the ground [m] at easts and norths (n,)."""
+"""Height of the ground [m] at east and north, each (n,)."""
 
-# Heights above take-off drift by this much in a flight [m]: real ones end at -3.9 m after landing.
+# Drift of heights above take-off during a flight [m]. Real logs end at -3.9 m after landing.
 _DRIFT_M = 5.0
 
 
 def raised(up_m: FloatArray, ground_m: FloatArray, takeoff_m: float) -> tuple[FloatArray, BoolArray]:
-    """Heights of poses over the ground under them, and which poses lie below it.
+    """Return heights of poses raised to just above the ground, and which poses are below the ground.
 
-    A little below ground that is about as high as the take-off point is the drift of the height; all else below
-    ground cannot have been flown: the ground or the heights are wrong.
+    A height slightly below ground that is about as high as the take-off point is a drift. Other heights below the
+    ground are wrong, or the ground is.
 
     Parameters
     ----------
     up_m, ground_m : (n,)
-        Of the poses and of the ground under them [m].
+        Heights of the poses and of the ground below them [m].
     takeoff_m : float
-        Up of the take-off point [m].
+        Height of the take-off point [m].
 
     Returns
     -------
@@ -78,23 +76,23 @@ def lacks_height(stream: Stream) -> bool:
 
 
 def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
-    """A log whose positions without altitude are all at the ``height_m`` that the flight file gives.
+    """Return a log whose positions without altitude are at the ``height_m`` of the flight file.
 
     Parameters
     ----------
     log : LogSettings
     file : IngestedFile
-        What was read of it.
+        The log as it was read.
 
     Returns
     -------
     IngestedFile
-        The same where no height is given.
+        The same log if the flight file has no height.
 
     Raises
     ------
     UsageError
-        If a height is given and every stream with positions has altitudes of its own.
+        If the flight file has a height, but every stream with positions has altitudes.
     """
     if log.height_m is None:
         return file
@@ -109,53 +107,53 @@ def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
             cause="the log has altitudes of its own, or no positions",
         )
     note = f"no altitude in the log: {log.height_m:g} m above take-off in all of it, as height_m says"
-    # the reader asked for what is answered here
+    # the question of the reader is answered here
     warnings = [text for text in file.result.warnings if not text.startswith("no column is known as a height")]
     return replace(file, result=replace(file.result, streams=tuple(streams), warnings=(*warnings, note)))
 
 
 def height_in_name(path: str) -> float | None:
-    """The height [m] that the name of a log's file tells, if it tells one alone.
+    """Return the height in the name of a log file [m], if the name contains exactly one.
 
     Examples
     --------
     >>> height_in_name("urban/60m.csv"), height_in_name("run2_120m_5G.csv"), height_in_name("phone.csv")
     (60.0, 120.0, None)
     """
-    # as a set: 'flight_60m_60m' tells one height, '40m_to_60m' none
+    # as a set: flight_60m_60m contains one height, 40m_to_60m contains two
     heights = {float(text) for text in _IN_NAME.findall(Path(path).stem.replace("_", " "))}
     return heights.pop() if len(heights) == 1 else None
 
 
-# Telemetry gaps longer than this are not bridged [s]; vehicleOut rows come every 1.0 s.
+# Longer gaps of the telemetry are not bridged [s]. Rows of vehicleOut have a spacing of 1.0 s.
 _MAXIMUM_GAP_S = 3.0
 
-# Telemetry as sparse as this per fix is a straight line between fixes where nine of ten lie no farther apart [m]:
-# what a search at 2 m/s covers in 14 s. Of a faster flight its steady legs are: intervals of which one end or the other
-# lies this near the line between the fixes beside it (the field's own search: 7.7 m in nine of ten), and no turn does.
+# Sparse telemetry is joined by straight lines if nine of ten fixes are no farther apart than this [m], which is the
+# distance of 14 s at 2 m/s. On a faster flight its steady legs are joined: intervals of which one end is this close to
+# the line between the neighbouring fixes (7.7 m for nine of ten in the field data). Turns are not joined.
 _SPARSE_APART_M, _SPARSE_ERROR_M = 100.0, 10.0
 
-# An interval this many times the usual one of sparse telemetry is a gap.
+# An interval of sparse telemetry longer than this multiple of the usual one is a gap.
 _SPARSE_GAP = 2.0
 
-# Below this ground speed the course says nothing about the heading [m/s].
+# Below this ground speed the course does not indicate the heading [m/s].
 _COURSE_SPEED_MPS = 1.0
 
-# Instants whose poses are computed at once: bounds memory on flights of more than half an hour.
+# Number of times whose poses are computed together, which limits the memory on flights over half an hour.
 AT_ONCE = 100_000
 
-# Positions this long before and after give a velocity that is not logged [s].
+# Time before and after for a velocity from positions [s].
 _COURSE_SPAN_S = 2.0
 
-# Why a pose is not valid; index 0 is a valid pose.
+# Reasons why a pose is not valid; index 0 is a valid pose.
 REASONS = (
     "", "before telemetry", "after telemetry", "telemetry gap", "no telemetry", "no time", "no position of the tower",
     "below the site's ground plane",
 )  # fmt: skip
 
 
-# What a log may mean by its attitude: the columns that hold roll, pitch and yaw, their signs, and degrees that
-# the yaw lacks. A yaw without a sign is the course.
+# Alternative meanings of a logged attitude: the columns of roll, pitch and yaw, their signs, and degrees to add to
+# the yaw. A yaw without a sign is the course.
 MISREAD = {
     "the logged yaw has the wrong sign": ([0, 1, 2], [1.0, 1.0, -1.0], 0.0),
     "the logged yaw counts from east, counter-clockwise": ([0, 1, 2], [1.0, 1.0, -1.0], 90.0),
@@ -172,33 +170,33 @@ MISREAD = {
 
 @dataclass(frozen=True, slots=True)
 class TrackAccount:
-    """Account of what became of the telemetry rows.
+    """Counts of the telemetry rows by their use.
 
     Parameters
     ----------
     rows : int
         Rows of the telemetry frame.
     no_time, duplicate_time, backward_time, bad_position : int
-        Rows not used for position: no time stamp; the stamp of the row before; a stamp earlier than one before it
-        (or, where fewer rows are lost that way, later than one after it); NaN, -999 or impossible coordinates.
+        Rows that are not used for positions: no time stamp; the stamp of the row before; a stamp earlier than one
+        before it (or, if that excludes fewer rows, later than one after it); NaN, -999 or impossible coordinates.
     steps_sorted : int
-        Steps back in time of a shuffled file, whose rows were sorted: the path is shorter in order of time.
+        Steps back in time of a shuffled file, whose rows were sorted because the path is then shorter.
     unknown_attitude : int
-        Used rows without attitude (NaN, or exactly 0, 0, 0: written by converters for "unknown").
+        Used rows without attitude (NaN, or exactly 0, 0, 0, which converters write for "unknown").
     heading_alone : int
-        Used rows with a heading and neither roll nor pitch.
+        Used rows with a heading and without roll and pitch.
     below_ground : int
-        Used rows below the site's ground plane.
+        Used rows below the ground plane of the site.
     sparse_s : float
-        Usual interval of sparse telemetry whose fixes are joined by straight lines [s]; 0 of other telemetry.
+        Usual interval of sparse telemetry whose fixes are joined by straight lines [s]; 0 for other telemetry.
     sparse_error_m : (median, ninth of ten)
-        Error of those lines: half the distance of each fix from the line between its neighbours [m].
+        Error of these lines: half the distance of each fix from the line between its neighbours [m].
     gaps : int
-        Intervals between used rows that are longer than the limit.
+        Intervals between used rows that exceed the limit.
     longest_gap_s : float
-        The longest interval [s].
+        Longest interval [s].
     hour_steps : int
-        Steps of whole hours between neighbouring rows of the file: a clock that changed to or from daylight saving.
+        Steps of full hours between neighbouring rows: a change to or from daylight saving time.
     """
 
     rows: int
@@ -245,20 +243,20 @@ class TrackAccount:
 
 @dataclass(frozen=True, slots=True)
 class TrackPoses:
-    """Poses at asked instants.
+    """The poses at requested times.
 
     Parameters
     ----------
     position_m : (n, 3)
-        East, north, up in the site frame [m]; NaN where not valid.
+        East, north, up in the site frame [m]; NaN if not valid.
     rotation : (n, 3, 3)
-        Aircraft body (forward-left-up) to east-north-up; NaN where not valid.
+        Rotation from the aircraft body (forward-left-up) to east-north-up; NaN if not valid.
     valid : (n,) bool
         False before, after and inside gaps of the telemetry.
     reason_code : (n,) int8
-        Which of :data:`REASONS` it is; 0 where valid.
+        Index into :data:`REASONS`; 0 if valid.
     attitude_known : (n,) bool
-        False where level flight along the course stands in for the attitude.
+        False if level flight along the course replaces the attitude.
     """
 
     position_m: FloatArray
@@ -271,13 +269,13 @@ class TrackPoses:
         return len(self.valid)
 
     def pick(self, rows: BoolArray) -> TrackPoses:
-        """The poses of some rows (n,) bool; the very same where these are all of them."""
+        """Return the poses of some rows (n,) bool, or this object if all rows are selected."""
         if rows.all():
             return self
         return TrackPoses(**{field.name: getattr(self, field.name)[rows] for field in dataclasses.fields(self)})
 
     def where(self, known: BoolArray) -> TrackPoses:
-        """The poses with those as not valid at which the tower, which moves too, is not known (n,)."""
+        """Return poses that are not valid at times without a known position of a tower that moves (n,)."""
         if known.all():
             return self
         lost = self.valid & ~known
@@ -290,7 +288,7 @@ class TrackPoses:
 
     @property
     def reason(self) -> AnyArray:
-        """Reason why a pose is not valid (n,), one of :data:`REASONS`; empty where it is."""
+        """Reasons why poses are not valid (n,), from :data:`REASONS`; empty for valid poses."""
         return np.asarray(REASONS)[self.reason_code]
 
     @property
@@ -300,8 +298,11 @@ class TrackPoses:
 
 
 def nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
-    """UTC instants as int64 ns since 1970; NaT becomes the smallest integer. Floats are epoch seconds."""
-    # to the nanosecond whatever pandas or NumPy had: their default units differ by version
+    """Return UTC times as int64 ns since 1970.
+
+    NaT becomes the smallest integer. Floats are epoch seconds.
+    """
+    # convert to ns here, because default units differ between versions of pandas and NumPy
     array = np.asarray(times)
     if array.dtype.kind == "M":
         return np.asarray(array.astype("datetime64[ns]").astype(np.int64))
@@ -316,18 +317,18 @@ def nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
     return np.asarray(np.where(good, stamp, np.iinfo(np.int64).min))
 
 
-# What an instant that is not known becomes.
+# Value of an unknown time.
 NO_TIME = np.iinfo(np.int64).min
 
-# Instants nearer than this are one: epoch seconds as floats carry 0.2 microseconds [s].
+# Times closer than this are equal, because epoch seconds as floats have 0.2 microseconds [s].
 _SAME_S = 1e-6
 
 
 def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
-    """Rows of a strictly increasing clock, and how many are duplicates and backward.
+    """Return the rows of a strictly increasing clock, and the numbers of duplicate and backward rows.
 
-    A stamp is backward when an earlier row is later. One wild stamp in the future would then condemn all rows
-    after it, so the mirrored rule (a stamp later than a later row's is wrong) is used where it loses fewer rows.
+    A stamp is backward if an earlier row is later. A single wrong stamp in the future would then exclude all rows after
+    it, so the mirrored rule (a stamp later than that of a later row is wrong) is used if it excludes fewer rows.
     """
     if not len(stamp):
         return np.zeros(0, dtype=bool), 0, 0
@@ -335,7 +336,7 @@ def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
     before = np.concatenate([[NO_TIME], np.maximum.accumulate(stamp)[:-1]])
     after = np.concatenate([np.minimum.accumulate(stamp[::-1])[::-1][1:], [np.iinfo(np.int64).max]])
     onward, mirrored = stamp >= before, stamp <= after
-    # on a tie the plain rule: what came first is right
+    # in a tie the first rule is used, because earlier rows are more likely right
     ordered = onward if onward.sum() >= mirrored.sum() else mirrored
     keep = ordered.copy()
     rows = np.flatnonzero(ordered)
@@ -345,10 +346,12 @@ def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
 
 
 def _order(stamp: AnyArray, position: FloatArray) -> tuple[IntArray, int]:
-    """Row order by time where stamps tell the truth and the file is shuffled, else as written; steps back so mended.
+    """Return the order of rows, and the number of steps back in time that sorting removes.
 
-    A clock that stepped leaves the rows in the order that was flown: sorting them would mix two parts of the flight,
-    and the path would grow. A file that was sorted by another column, or put together of parts, has the longer path.
+    Rows are sorted by time only if the file is shuffled.
+
+    A clock that stepped leaves the rows in flown order. Sorting them would mix two parts of the flight and lengthen the
+    path. A file that was sorted by another column, or joined from parts, has a longer path before sorting.
     """
     steps, written = int((np.diff(stamp) < 0).sum()), np.arange(len(stamp))
     if not steps:
@@ -358,21 +361,21 @@ def _order(stamp: AnyArray, position: FloatArray) -> tuple[IntArray, int]:
     def length_m(path: FloatArray) -> float:
         return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
-    # of a file in reverse order the path is as long, but for rounding
+    # the path of a reversed file has the same length, except for rounding
     shorter = length_m(position[order]) <= length_m(position) * (1 + 1e-9)
     return (order, steps) if shorter else (written, 0)
 
 
 def _hour_steps(stamp: AnyArray) -> int:
-    """Steps between rows that are whole hours, forward or back, give or take five seconds."""
+    """Return the number of steps between rows of full hours, forward or back, within five seconds."""
     step = np.diff(stamp) * 1e-9
     hours = np.round(step / 3600.0)
-    # clocks are turned by one hour, in Antarctica by two
+    # clocks change by one hour, and in Antarctica by two
     return int(((hours != 0) & (np.abs(hours) <= 2) & (np.abs(step - 3600.0 * hours) < 5.0)).sum())
 
 
 def good_positions(latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> BoolArray:
-    """Coordinates that can be: finite, in range, not (0, 0) and not the -999 that loggers write without a fix."""
+    """Check coordinates: finite, in range, not (0, 0) and not -999, which loggers write without a fix."""
     finite = np.isfinite(latitude) & np.isfinite(longitude) & np.isfinite(altitude)
     with np.errstate(invalid="ignore"):
         possible = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0) & (altitude > -900.0)
@@ -380,7 +383,7 @@ def good_positions(latitude: FloatArray, longitude: FloatArray, altitude: FloatA
 
 
 def positions_over_time(frame: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
-    """Times (n,) [s since 1970], ascending, and latitude and longitude (n, 2) [deg] of the rows that have both."""
+    """Return ascending times (n,) [s since 1970], and latitude and longitude (n, 2) [deg] of complete rows."""
     known = frame[["time", "latitude_deg", "longitude_deg"]].dropna().drop_duplicates("time").sort_values("time")
     return nanoseconds(known["time"]) * 1e-9, known[["latitude_deg", "longitude_deg"]].to_numpy(np.float64)
 
@@ -391,22 +394,22 @@ class Track:
     Parameters
     ----------
     telemetry : pandas.DataFrame
-        Records of kind telemetry (see :mod:`aerpaw_cmp.logs.records`), file order.
+        Records of kind telemetry (see :mod:`aerpaw_cmp.logs.records`), in the order of the file.
     frame : SiteFrame
-        The site's frame.
+        Frame of the site.
     maximum_gap_s : float
         Longer gaps are not bridged [s].
     ground_m : float
         Height of the take-off point above the site origin [m], added to ``altitude_m``.
     ground : callable, optional
-        Up [m] of the site's ground at easts and norths; by default that of the take-off point.
+        Returns the height of the ground of the site at east and north [m]; by default that of the take-off point.
 
     Attributes
     ----------
     account : TrackAccount
-        What became of the rows.
+        Counts of the rows.
     start_ns, end_ns : int
-        First and last used instant [ns since 1970, UTC]; both 0 without a row.
+        First and last used time [ns since 1970, UTC]; both 0 without a row.
     """
 
     def __init__(
@@ -431,7 +434,7 @@ class Track:
         stamp = nanoseconds(telemetry["time"])
         latitude, longitude, altitude = column("latitude_deg"), column("longitude_deg"), column("altitude_m")
         timed = stamp != NO_TIME
-        # only rows with both can be interpolated from; the others count in the account
+        # positions are interpolated between complete rows, and the account counts the others
         placed = timed & good_positions(latitude, longitude, altitude)
         rows = np.flatnonzero(placed)
         east, north = self.frame.to_local(latitude[rows], longitude[rows])
@@ -451,14 +454,14 @@ class Track:
         self._course_deg = _courses(self._velocity)
         self._attitude = np.column_stack([column("roll_deg"), column("pitch_deg"), column("yaw_deg")])[rows]
         turn, yaw = self._attitude[:, :2], self._attitude[:, 2]
-        # all zero is no heading: converters write it for "unknown"
+        # all zeros are not a heading, because converters write them for "unknown"
         heading_alone = np.isfinite(yaw) & ~np.isfinite(turn).any(axis=1) & bool(np.nan_to_num(yaw).any())
         turn[heading_alone] = 0.0
         known = np.isfinite(self._attitude).all(axis=1) & (np.any(self._attitude != 0.0, axis=1) | heading_alone)
         self._known = known
         interval = np.diff(self._time_s)
         sparse_s, self._turns, sparse_error_m = self._sparse(interval)
-        # last: what is sparse is judged by the limit that was asked for
+        # last, because the requested limit decides what is sparse
         self.maximum_gap_s = max(self.maximum_gap_s, _SPARSE_GAP * sparse_s)
         self._gap = (interval > self.maximum_gap_s) | self._turns
         self._asked = np.zeros(0, np.int64), self._pose_at(np.zeros(0, np.int64))
@@ -483,7 +486,7 @@ class Track:
         return len(self._time_s)
 
     def pose_at(self, times: ArrayLike | pd.Series) -> TrackPoses:
-        """Poses at instants.
+        """Return poses at requested times.
 
         Parameters
         ----------
@@ -496,10 +499,10 @@ class Track:
         """
         instant = nanoseconds(times).ravel()
         if len(instant) <= AT_ONCE:
-            if not np.array_equal(instant, self._asked[0]):  # channels of a log share their instants
+            if not np.array_equal(instant, self._asked[0]):  # channels of a log share their times
                 poses = self._pose_at(instant)
                 for field in dataclasses.fields(poses):
-                    getattr(poses, field.name).flags.writeable = False  # the next who asks gets the same
+                    getattr(poses, field.name).flags.writeable = False  # later callers get the same arrays
                 self._asked = instant, poses
             return self._asked[1]
         parts = [self._pose_at(part) for part in np.array_split(instant, -(-len(instant) // AT_ONCE))]
@@ -507,7 +510,7 @@ class Track:
         return TrackPoses(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
     def rotations_if(self, misread: str, times: ArrayLike | pd.Series) -> FloatArray:
-        """Rotations (n, 3, 3) at instants inside the track, were the logged angles as one of :data:`MISREAD` says."""
+        """Return rotations (n, 3, 3) at times for a meaning of the logged angles in :data:`MISREAD`."""
         order, signs, east_deg = MISREAD[misread]
         other = copy.copy(self)
         other._attitude = self._attitude[:, order] * signs + [0.0, 0.0, east_deg]
@@ -516,7 +519,7 @@ class Track:
         return other._rotations((nanoseconds(times) - self.start_ns) * 1e-9)[0]
 
     def why_not(self, pose: TrackPoses) -> str:
-        """Reason for most of the instants that have no pose."""
+        """Return the most frequent reason for times without a pose."""
         reason = REASONS[int(np.bincount(pose.reason_code[~pose.valid], minlength=len(REASONS)).argmax())]
         if reason != "telemetry gap":
             return f"most are {reason}" if reason else "there are no samples"
@@ -525,16 +528,16 @@ class Track:
         return f"it has a fix every {np.median(np.diff(self._time_s)):.0f} s; {left} are not interpolated"
 
     def _pose_at(self, instant: AnyArray) -> TrackPoses:
-        """Poses at instants (n,) [ns since 1970]."""
+        """Return poses at times (n,) [ns since 1970]."""
         timed = instant != NO_TIME
-        # from the first row: a float64 of seconds since 1970 has but 0.2 microseconds
+        # from the first row, because seconds since 1970 as float64 have only 0.2 microseconds
         t = np.where(timed, instant - self.start_ns, 0) * 1e-9
         code = self._codes(t)
         code[~timed] = REASONS.index("no time")
         valid = code == 0
         n = len(t)
         if len(self):
-            # an instant that rounding puts before the first row is at it
+            # a time that rounding moves before the first row is at the first row
             t = np.clip(t, self._time_s[0], self._time_s[-1])
         position = np.full((n, 3), np.nan)
         rotation = np.full((n, 3, 3), np.nan)
@@ -555,32 +558,32 @@ class Track:
         )
 
     def _sparse(self, interval_s: FloatArray) -> tuple[float, BoolArray, tuple[float, float]]:
-        """Usual interval of telemetry that is sparse throughout, its turns, and the error of lines between fixes."""
+        """Return the usual interval of sparse telemetry, its turns, and the error of lines between fixes."""
         usual_s = float(np.median(interval_s)) if len(interval_s) > 1 else 0.0
         turns, step_m = np.zeros(len(interval_s), dtype=bool), np.linalg.norm(np.diff(self._position, axis=0), axis=1)
         if usual_s <= self.maximum_gap_s:
             return 0.0, turns, (0.0, 0.0)
         part = (interval_s[:-1] / (interval_s[:-1] + interval_s[1:]))[:, None]
         line = (1.0 - part) * self._position[:-2] + part * self._position[2:]
-        # half: a fix is twice as far from the line between its neighbours as places between fixes are from theirs
+        # half, because a fix is twice as far from the line between its neighbours as positions between fixes
         away_m = 0.5 * np.linalg.norm(line - self._position[1:-1], axis=1)
         if np.quantile(step_m, 0.9) > _SPARSE_APART_M:
             at_ends = np.append(np.inf, away_m), np.append(away_m, np.inf)
-            # the nearer end: a leg beside a turn is straight at its other end
+            # use the nearer end, because a leg next to a turn is straight at its other end
             nearer_m = np.minimum(*at_ends)
             turns, away_m = nearer_m > _SPARSE_ERROR_M, nearer_m[nearer_m <= _SPARSE_ERROR_M]
             if not len(away_m):
                 return 0.0, ~turns, (0.0, 0.0)
-            # chosen by the nearer of two ends, they look straighter than they are: the limit, not their own 90 %
+            # return the limit, because intervals that are selected by the nearer of two ends look too straight
             return usual_s, turns, (float(np.median(away_m)), _SPARSE_ERROR_M)
         return usual_s, turns, (float(np.median(away_m)), float(np.quantile(away_m, 0.9)))
 
     def _raised(self, position: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Up of positions (n, 3), the lowest raised to just above the ground, and those that lie below it."""
+        """Return heights of positions (n, 3), raised to just above the ground, and whether they were below it."""
         return raised(position[:, 2], self._ground(position[:, 0], position[:, 1]), self.ground_m)
 
     def _codes(self, t: FloatArray) -> AnyArray:
-        """Index into :data:`REASONS` for every instant."""
+        """Return the index into :data:`REASONS` for every time."""
         code = np.zeros(len(t), dtype=np.int64)
         if not len(self):
             code[:] = REASONS.index("no telemetry")
@@ -591,11 +594,11 @@ class Track:
         return code
 
     def _rotations(self, t: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Rotation at every instant (n, 3, 3) and whether it comes from logged attitude."""
+        """Return the rotation at every time (n, 3, 3), and whether it comes from a logged attitude."""
         at = self._time_s[self._known]
         near = np.zeros(len(t), dtype=bool)
         if len(at):
-            # attitudes may end before positions do, and have gaps of their own
+            # attitudes may end before positions, and have their own gaps
             near = (t >= at[0]) & (t <= at[-1]) & ~_in_gap(t, at, np.diff(at) > self.maximum_gap_s)
         if near.all() and len(t):
             return _slerp(t, at, self._attitude[self._known]), near
@@ -605,31 +608,31 @@ class Track:
         return course, near
 
     def _course_at(self, t: FloatArray) -> FloatArray:
-        """Course over ground [deg], interpolated as a direction."""
-        # by sine and cosine: between 350 and 10 degrees lies north
+        """Return the course over ground [deg], interpolated as a direction."""
+        # by sine and cosine, because north is between 350 and 10 degrees
         angle = np.radians(self._course_deg)
         return bearing_deg(interpolated(t, self._time_s, np.column_stack([np.sin(angle), np.cos(angle)])))
 
 
 def interpolated(t: FloatArray, at: FloatArray, values: FloatArray) -> FloatArray:
-    """Columns (rows, m) known at ``at`` (rows,), ascending, at t (n,): linear between rows, (n, m)."""
+    """Interpolate columns (rows, m) at ascending ``at`` (rows,) linearly to t (n,), shape (n, m)."""
     return np.column_stack([np.interp(t, at, values[:, i]) for i in range(values.shape[1])])
 
 
 def _in_gap(t: FloatArray, at: FloatArray, gap: BoolArray) -> BoolArray:
-    """Check whether an instant lies strictly inside an interval (rows - 1,) that is a gap."""
+    """Check whether times are strictly inside an interval (rows - 1,) that is a gap."""
     later = np.clip(np.searchsorted(at, t, side="left"), 0, len(at) - 1)
     earlier = np.maximum(later - 1, 0)
-    # at a row itself the pose is known, whatever gap follows
+    # the pose at a row is known, even if a gap follows
     exact = np.minimum(np.abs(at[later] - t), np.abs(at[earlier] - t)) <= _SAME_S
     return np.asarray(np.append(gap, False)[earlier] & (later > earlier) & ~exact)
 
 
 def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArray:
-    """Rotations at t (n, 3, 3) from roll, pitch, yaw (rows, 3) at ``at``."""
+    """Return rotations at t (n, 3, 3) from roll, pitch, yaw (rows, 3) at ``at``."""
     from scipy.spatial.transform import Rotation, Slerp
 
-    # only the rows around t: a part of a long flight does not turn the whole
+    # use only rows around t, because a part of a long flight needs few rotations
     part = slice(max(int(np.searchsorted(at, t.min(), side="right")) - 1, 0), int(np.searchsorted(at, t.max())) + 1)
     at, attitude_deg = at[part], attitude_deg[part]
     matrices = rotation_from_aircraft(attitude_deg[:, 0], attitude_deg[:, 1], attitude_deg[:, 2])
@@ -639,9 +642,9 @@ def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArra
 
 
 def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> FloatArray:
-    """Logged velocities (east, north, up); where missing or never moving, differences of position over 4 s.
+    """Return logged velocities (east, north, up), or differences of positions over 4 s if they are missing or constant.
 
-    Over shorter times the differences are those of the position's noise: at 10 Hz a hover then has a speed.
+    Over shorter times, differences are mainly noise of the position: at 10 Hz a hover then has a speed.
     """
     if len(t) < 2:
         return np.where(np.isfinite(logged), logged, 0.0)
@@ -653,22 +656,22 @@ def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> Floa
 
 
 def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1.0, gap_s: float = 3.0) -> FloatArray:
-    """Velocity (n, 3) by the central difference of positions over twice ``span_s``, linear between them.
+    """Return the velocity (n, 3) by central differences of positions over twice ``span_s``, linear between them.
 
     Parameters
     ----------
     time_s : (n,)
-        Ascending.
+        Ascending times [s].
     position_m : (n, 3)
     span_s : float
-        Before and after; at the ends and beside gaps one side alone.
+        Time before and after [s]; at the ends and next to gaps only one side.
     gap_s : float
-        Longer steps are not bridged.
+        Longer steps are not bridged [s].
 
     Returns
     -------
     (n, 3)
-        NaN where an instant has no neighbour.
+        Velocity [m/s]; NaN for a time without a neighbour.
     """
     velocity = np.full(position_m.shape, np.nan)
     for part in np.split(np.arange(len(time_s)), np.flatnonzero(~(np.diff(time_s) <= gap_s)) + 1):
@@ -678,16 +681,16 @@ def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1
 
 
 def _differences_mps(t: FloatArray, position_m: FloatArray, span_s: float) -> FloatArray:
-    """Velocity (n, 3) at ascending times by positions some seconds, or else a row, before and after."""
+    """Return the velocity (n, 3) at ascending times from positions some seconds, or a row, before and after."""
     early, late = np.maximum(t - span_s, t[0]), np.minimum(t + span_s, t[-1])
-    # by at least one row on either side: sparse telemetry has none within the span
+    # at least one row on each side, because sparse telemetry has none within the span
     early, late = np.minimum(early, np.append(t[0], t[:-1])), np.maximum(late, np.append(t[1:], t[-1]))
     moved = interpolated(late, t, position_m) - interpolated(early, t, position_m)
     return np.asarray(moved / (late - early)[:, None])
 
 
 def _courses(velocity: FloatArray) -> FloatArray:
-    """Course over ground [deg clockwise from north]; at rest the last one holds (before the first: the first)."""
+    """Return the course over ground [deg clockwise from north]; at rest the last course is used, or else the first."""
     course = bearing_deg(velocity)
     moving = np.flatnonzero(np.hypot(velocity[:, 0], velocity[:, 1]) >= _COURSE_SPEED_MPS)
     if not len(moving):

@@ -83,7 +83,7 @@ _AT_ONCE = 16
 
 
 class _Parts(NamedTuple):
-    """Correlation time of the residual [s], its white part, and the gains, relative to the SD of the correlated part."""
+    """The correlation time [s], white part and gains of a residual, relative to the SD of its correlated part."""
 
     memory_s: float
     white: float
@@ -316,7 +316,7 @@ def _at_one_time(channels: Sequence[ClockChannel]) -> dict[tuple[Hashable, ...],
 def _finer(
     lags: FloatArray, likelihood: Callable[[FloatArray], FloatArray], window_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return lags (m,) that are finer where the log likelihood (channels, models, m) of all channels is near its maximum."""
+    """Return lags (m,) that are finer near the maximum of the log likelihood (channels, models, m)."""
     nats, step = likelihood(lags), _STEP_S
     while step > _FINEST_S:
         total = nats.sum(axis=0).max(axis=0)
@@ -444,7 +444,7 @@ class _Bins:
         return out
 
     def systems(self, lags: FloatArray) -> FloatArray:
-        """Return features of offset, slope and gains, then residuals of each channel and model: (n, lags, p + residuals)."""
+        """Return features of offset, slope and gains, then residuals of each channel and model: (n, lags, columns)."""
         count = np.diff(np.append(self.first, len(self.at_s)))[:, None]
         features, models = self.features.shape[1], self.predicted.shape[1]
         out = np.empty((self.n, len(lags), features + self.predicted.size))
@@ -459,7 +459,7 @@ class _Bins:
     def likelihood(
         self, lags: FloatArray, parts: Sequence[Sequence[_Parts]], kept: BoolArray | None = None
     ) -> FloatArray:
-        """Return the log likelihood (channels, models, lags) with the most likely parts of each channel, for the means ``kept``."""
+        """Return the log likelihood (channels, models, lags) of the means ``kept``, with the most likely parts."""
         every = list(dict.fromkeys(chain(*parts)))
         belongs = np.array([[part in mine for mine in parts] for part in every])[:, None, :, None]
         blocks = np.array_split(lags, -(-len(lags) // _AT_ONCE))
@@ -504,11 +504,12 @@ def _averaged(table: FloatArray, width: float) -> FloatArray:
     """
     from scipy.ndimage import correlate1d
 
-    finite: BoolArray = np.asarray(np.isfinite(table).all(axis=1)) reach = int(width / 2 + 0.5) weights = np.clip(width
-    / 2 + 0.5 - np.abs(np.arange(-reach, reach + 1)), 0.0, 1.0)  # centred on the row, without a lag share =
-    correlate1d(finite.astype(np.float64), weights, mode="nearest") out = correlate1d(np.where(finite[:, None], table,
-    0.0), weights, axis=0, mode="nearest") return np.asarray(np.where(finite[:, None], out / np.where(finite, share,
-    1.0)[:, None], np.nan))
+    finite: BoolArray = np.asarray(np.isfinite(table).all(axis=1))
+    reach = int(width / 2 + 0.5)
+    weights = np.clip(width / 2 + 0.5 - np.abs(np.arange(-reach, reach + 1)), 0.0, 1.0)  # centred, without a lag
+    share = correlate1d(finite.astype(np.float64), weights, mode="nearest")
+    out = correlate1d(np.where(finite[:, None], table, 0.0), weights, axis=0, mode="nearest")
+    return np.asarray(np.where(finite[:, None], out / np.where(finite, share, 1.0)[:, None], np.nan))
 
 
 def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray:
@@ -634,8 +635,8 @@ def clock_trap(
         start = np.maximum(radio[0] + 3600.0 * hours, telemetry[0])
         return np.asarray(np.maximum(0.0, np.minimum(radio[1] + 3600.0 * hours, telemetry[1]) - start))
 
-    # UTC-12 to UTC+14, and by halves for India and Newfoundland
-    UTC-12 to UTC+14, with half hours for India and Newfoundland
+    # UTC-12 to UTC+14, with half hours for India and Newfoundland
+    shifts = np.asarray(np.arange(-28, 29) * 0.5, dtype=np.float64)
     shared = overlap(shifts)
     now = float(overlap(np.zeros(1))[0])
     # full hours before half hours, small shifts before large ones

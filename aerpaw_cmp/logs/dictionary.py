@@ -1,8 +1,8 @@
-"""The dictionary of columns: what a name means in any log, whatever the program, and which values of it can be.
+"""The dictionary of columns: the meaning of a name in any log of any program, and its possible values.
 
-A reader says which names a file has; :func:`meaning` says what each holds: quantity, unit, words for none, possible
-range, role (serving cell, n-th neighbour, uplink) and, of a height, its datum. ``PROGRAMS`` says what the names alone
-do not: units and datums that a program is known to write. A new name is a row here; docs/formats.md shows the table.
+:func:`meaning` returns the quantity of a column by its name: unit, numbers for missing values, possible range, role
+(serving cell, n-th neighbour, uplink) and the datum of a height. ``PROGRAMS`` adds what names alone do not show: units
+and datums that a program is known to write. To add a name, add a row here. docs/formats.md shows the table.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ class Quantity:
         ``time``, ``position``, ``height``, ``angle``, ``velocity``, ``count``, ``doubt``, ``identity``, ``cell`` or a
         kind of stream: ``rss``, ``rank``, ``kpi``.
     names : tuple of str
-        Patterns that stand in a plain name (:func:`plain`), the preferred first.
+        Patterns that are searched in a plain name (:func:`plain`), the preferred pattern first.
     unit : str
-        In which it is read, and what numbers without a unit count in.
+        The unit of the values, and of numbers without a unit.
     none : tuple of float
-        Numbers that stand for no value, besides those of :data:`UNAVAILABLE`.
+        Numbers that mean a missing value, besides those of :data:`UNAVAILABLE`.
     can_be : (low, high)
-        Possible values, in its unit: what lies beyond belongs to another column.
+        Possible values in its unit: a value beyond them belongs to another column.
     datum : str
-        Of a height: ``take-off``, ``ground``, ``sea level``, ``ellipsoid`` or ``unknown``.
+        Zero of a height: ``take-off``, ``ground``, ``sea level``, ``ellipsoid`` or ``unknown``.
     open_unit : bool
         Programs write the quantity in several units: numbers without a unit are of an unknown one.
     """
@@ -60,11 +60,11 @@ class Quantity:
 
     @property
     def kind(self) -> Kind:
-        """Kind of the stream that a level, rank or KPI gives."""
+        """The kind of stream that a level, rank or KPI becomes."""
         return "rss" if self.role == "rss" else "rank" if self.role == "rank" else "kpi"
 
 
-# Where a row takes _UP[2:], a word stands in front and the mark of a word's beginning is left out.
+# A row with _UP[2:] has a word before it, so it omits the boundary at the beginning.
 _UP = r"\b(alt|altitude|height|hgt|elevation|ele|hoehe|h he)"
 _ANGLE = (-360.0, 360.0)
 _SPEED = (-400.0, 400.0)
@@ -115,7 +115,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"(^| )[hpg]dop$", r"(^| )eph$",
         r"^(gps |gnss |position |pos |location |horizontal |horiz )?((horizontal |horiz |h ?)?acc(uracy)?)( m)?$",
     )),
-    # how high: the datum that the name tells; heights of home and of the terrain are not the aircraft's
+    # how high, by the datum in the name; heights of home and of the terrain are not those of the aircraft
     Quantity("home", "other", (
         r"\b(home|take ?off|launch|terrain|ground|geoid|undulation|delta|target|max|min)\b.*" + _UP + r"(?!.*\babove)",
         _UP + r" (of )?(home|terrain|target)$", r"^geoid", r"accuracy|variance|\bvdop\b|precision",
@@ -197,7 +197,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("power", "rss", (r"^link power$", r"^(power )?lw ?[1-5]( (power|level))?( dbm?)?$"), _FULL_SCALE),
     Quantity("quality", "rss", (r"^link quality$",), "dB"),
     Quantity("SNR", "rss", (r"^link snr$",), "dB"),
-    # 'rank' alone may be that of any list: described() takes it where levels stand beside; 0 is no report
+    # 'rank' alone may be the position in any list: described() accepts it if the table has levels; 0: nothing reported
     Quantity("rank", "rank", (
         r"\b((pdsch|dl|nr|lte|[45]g|mimo|csi) rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri|dl layer num)\b",
     ), none=(0.0,), can_be=(0.0, 16.0)),
@@ -229,7 +229,7 @@ QUANTITIES: tuple[Quantity, ...] = (
 
 @cache
 def _forms() -> tuple[tuple[re.Pattern[str], Quantity], ...]:
-    """Patterns as one expression per row, for most names are none of them; a binary log asks about no name."""
+    """Return one expression per row: most names match none of its patterns."""
     return tuple((re.compile("|".join(f"(?:{pattern})" for pattern in row.names)), row) for row in QUANTITIES)
 
 
@@ -244,7 +244,7 @@ _JOINED = re.compile(
 )
 _NR = re.compile(r"\b(nr|5g|spcell|ss ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss|\bnrpci\b|\bnr ?arfcn\b|\bnci\b")
 _LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
-# A secondary carrier: it serves beside the primary one.
+# A secondary carrier, which serves together with the primary one.
 _SECONDARY = re.compile(r"\bsc(?:ell|c) ?(\d{0,2})\b")
 _NUMBER = re.compile(
     r"(?:^| )(?:n|nb|nbr|nc|ngbr|neigh|neighbou?r|ncell|adj|top|rsrp|rsrq|pci|e?arfcn)? ?(\d{1,2})(?: |$)"
@@ -255,7 +255,7 @@ _OTHER = re.compile(
     r"|\b(second|third|2nd|3rd|other|inter|intra|pscell|secondary)\b"
     r"|\b(?:cell|pci|rsrp|rsrq|rssi|sinr|e?arfcn) ?(\d{1,2})\b"
 )
-# What the base station hears, statistics, and what a model says are no level that the receiver measured.
+# Levels that the receiver did not measure: those of the base station, statistics, and predictions of a model.
 _INDIRECT = re.compile(
     r"\b(ul|uplink|pusch|pucch|srs|at (the )?(gnb|enb|bs)|(gnb|enb|bs) (rx|rssi|received)|min|minimum|max|maximum|std"
     r"|stdev|sigma|var|variance|thresh(old)?|predicted|prediction|simulated|expected|target|model(led)?|error|delta|diff"
@@ -263,7 +263,7 @@ _INDIRECT = re.compile(
 )
 
 
-# Levels beside the one that the receiver measured: averaged over time, or of one of its ports.
+# Levels in addition to the measured one: averages over time, and those of single ports.
 _MEAN = re.compile(r"\b(mean|avg|average|averaged|filtered|filt|smooth(ed)?|median|ema|rolling|moving)\d*\b")
 _PORT = re.compile(r"\b(rx|ant(enna)?|port|branch|chain|path) ?\d\b")
 
@@ -276,13 +276,13 @@ class Meaning:
     ----------
     quantity : Quantity
     unit : str
-        As its name writes it, in lower case; empty where it does not.
+        The unit in its name, in lower case; empty if there is none.
     rat : str
         ``lte``, ``nr`` or empty.
     place : str
         ``serving``, ``scell1``, ``n2`` (the second neighbour; ``n0`` where it has no number), ``cell2``, ``sim2``.
     indirect : bool
-        Of the uplink, a statistic or a model: no level that the receiver measured.
+        True for the uplink, a statistic or a model: the receiver did not measure such a level.
     part : str
         ``mean`` of a level averaged over time, ``port`` of one receive port alone; empty for the cell's own level.
     """
@@ -296,14 +296,14 @@ class Meaning:
 
 
 def plain(name: str) -> str:
-    """A name in lower case with its marks as single spaces.
+    """Return a name in lower case with its punctuation as single spaces.
 
     Examples
     --------
     >>> plain("RSRP (LTE detected) - 1")
     'rsrp lte detected 1'
     """
-    # a zero-width space stands in headers that were copied from web pages
+    # headers copied from web pages contain zero-width spaces
     return re.sub(r"[^a-z0-9]+", " ", name.lower().replace("\u200b", "")).strip()
 
 
@@ -315,14 +315,14 @@ _A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5\u
 
 @cache
 def meaning(name: str, words: str | None = None) -> Meaning | None:
-    """Meaning of a name; None if nothing that is known.
+    """Return the meaning of a name, or None if it is unknown.
 
     Parameters
     ----------
     name : str
         As written, with its unit.
     words : str, optional
-        Its plain form in common words, where a program has words of its own.
+        Its plain form in common words, if the program uses its own words.
 
     Examples
     --------
@@ -391,7 +391,7 @@ def of_pairs(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | No
 
 
 def without_unit(name: str) -> tuple[str, str]:
-    """Plain name without the unit in it, in brackets or not, and the unit in lower case or an empty text.
+    """Return the plain name without its unit, and the unit in lower case or an empty text.
 
     Examples
     --------
@@ -412,7 +412,7 @@ def without_unit(name: str) -> tuple[str, str]:
 
 
 def in_brackets(name: str) -> tuple[str, str, str]:
-    """Unit in brackets in a name, or what else is in brackets at its end, and the name without them."""
+    """Return the unit in brackets, other text in brackets at the end, and the name without brackets."""
     unit = next((inner for inner in _BRACKETS.finditer(name) if is_unit(inner[1])), None)
     if unit is not None:
         return unit[1].lower(), "", f"{name[: unit.start()]} {name[unit.end() :]}"
@@ -429,7 +429,7 @@ def in_brackets(name: str) -> tuple[str, str, str]:
 
 
 def rank_of(quantity: Quantity, words: str) -> tuple[int, int]:
-    """Place of a plain name in the order of preference: rows come so, and the patterns of a row."""
+    """Return the place of a plain name in the order of preference: first by row, then by pattern."""
     fits = [i for i, pattern in enumerate(quantity.names) if re.search(pattern, words)]
     # a height above the ellipsoid only where no other is: it is 33 m off at Lake Wheeler
     last = len(QUANTITIES) * (quantity.datum == "ellipsoid")
@@ -437,12 +437,12 @@ def rank_of(quantity: Quantity, words: str) -> tuple[int, int]:
 
 
 def is_none(quantity: Quantity, values: FloatArray) -> BoolArray:
-    """Mask of numbers that stand for no value."""
+    """Return the mask of numbers that mean a missing value."""
     return np.isin(values, (*UNAVAILABLE, *quantity.none))
 
 
 def impossible(quantity: Quantity, values: FloatArray) -> BoolArray:
-    """Mask of values that a quantity cannot have, numbers for none aside; of identities, fractions, too."""
+    """Return the mask of values that a quantity cannot have; identities cannot be fractions."""
     beyond = (values < quantity.can_be[0]) | (values > quantity.can_be[1])
     if quantity.role == "cell":
         beyond |= np.isfinite(values) & (values != np.round(values))
@@ -450,7 +450,7 @@ def impossible(quantity: Quantity, values: FloatArray) -> BoolArray:
 
 
 def angle_form(values: FloatArray, quantity: Quantity) -> str:
-    """The unit of positions that cannot be degrees: MAVLink's integers, or NMEA's degrees and minutes; else empty."""
+    """Return the unit of positions that are too large for degrees: ``1e-7 deg`` or ``ddmm.mmmm``, else empty."""
     # zeros are rows before the first fix
     known = np.abs(values[np.isfinite(values) & ~is_none(quantity, values) & (values != 0)])
     most = quantity.can_be[1]
@@ -459,7 +459,7 @@ def angle_form(values: FloatArray, quantity: Quantity) -> str:
         return ""
     if (known == np.round(known)).all() and np.median(known) > 1e5 and known.max() <= most * 1e7:
         return "1e-7 deg"
-    # minutes end at 60: of degrees and minutes run together all do
+    # minutes end at 60, and degrees have at most three digits before them
     if known.max() <= 100 * most and (known % 100 < 60).all():
         return "ddmm.mmmm"
     return ""
@@ -508,7 +508,7 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     "mw": ("dBm", _milliwatts(1.0)), "w": ("dBm", _milliwatts(1e3)), "uw": ("dBm", _milliwatts(1e-3)),
     "\u00b5w": ("dBm", _milliwatts(1e-3)), "nw": ("dBm", _milliwatts(1e-6)), "pw": ("dBm", _milliwatts(1e-9)),
 }  # fmt: skip
-# Units of numbers that MAVLink writes as integers: of a table in decimals they are another program's.
+# Units of MAVLink's integers: a converter that writes decimals has already scaled them.
 OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7", "semicircles")
 _DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
 # Units that a name may have without brackets: 'alt_ft_agl', 'rsrp_dbm'.
@@ -522,13 +522,13 @@ def is_unit(text: str) -> bool:
 
 
 def unit_of(written: str) -> str:
-    """Unit in which values of a written unit are read; the written one where none is known, empty for other words."""
+    """Return the unit into which a written unit is converted, an unknown unit as written, empty for other words."""
     known = UNITS.get(written)
     return known[0] if known else "deg" if written in _DDMM else written if _A_UNIT.fullmatch(written) else ""
 
 
 def converted(values: FloatArray, written: str) -> FloatArray:
-    """Values of a written unit in the unit in which they are read."""
+    """Return values of a written unit in the unit of the dictionary."""
     if written in _DDMM:
         degrees = np.trunc(values / 100)  # as NMEA writes angles
         return np.asarray(degrees + (values - 100 * degrees) / 60)
@@ -540,7 +540,7 @@ def converted(values: FloatArray, written: str) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A program and what it is known to write, by columns that it alone has.
+    """A program, recognised by its own columns, and what it is known to write.
 
     Parameters
     ----------
@@ -548,11 +548,11 @@ class Program:
     signs : collection of str
         Plain names: all of one of the sets.
     words : mapping of str to str
-        Patterns of its own words, whole plain names, and the common words for them.
+        Patterns of its own names, matched against complete plain names, and the common words for them.
     units : mapping of str to str
         Units of plain names that have none in brackets; ``time`` for that of the clock.
     datum : str
-        Of heights whose name does not tell it.
+        Datum of heights whose name does not contain it.
     angles : str
         Unit of angles.
     """
@@ -613,8 +613,8 @@ PROGRAMS: tuple[Program, ...] = (
         "position lat": "semicircles", "position long": "semicircles"}),
     _program("Open DroneLog", "vps height m,height m", datum="sea level", words={
         r"height m": "height above takeoff", r"velocity ([xyz]) ms": r"velocity \1"}),
-    # dB stands for dBm; 1RSS and 2RSS are heard by the aircraft, TRSS by the transmitter; FrSky's RSSI is no dBm, and
-    # Hdg is the course over ground
+    # its dB are dBm; 1RSS and 2RSS are received by the aircraft, TRSS by the transmitter; FrSky's RSSI is not in dBm,
+    # and Hdg is the course over ground
     _program("EdgeTX", "date,time,txbat v", "rqly,rsnr db", "date,time,rxbt v", words={
         r"([12])rss( dbm?)?": r"rssi \1", r"trss( dbm?)?": "rssi telemetry", r"rsnr( db)?": "sinr 1",
         r"tsnr( db)?": "sinr telemetry", r"rssi( db)?": "rssi count", r"ptch( rad)?": "pitch", r"hdg( .*)?": "course",
@@ -626,7 +626,7 @@ PROGRAMS: tuple[Program, ...] = (
 )  # fmt: skip
 
 
-# What a level of another program may be called, and what only sounds so: an altitude above sea level, a battery.
+# Names that a level of another program may have, and names that only look so: an altitude above sea level, a battery.
 _LIKE_A_LEVEL = re.compile(
     r"^value$|power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs)?\b|\brss|strength|\bampl|magnitude|rsrp"
 )
@@ -646,12 +646,12 @@ _CELL_ID = re.compile(r"\b(cell ?id|l?cid|e?ci|nci|[en]?cgi|[eg]nb ?id|sector ?i
 
 
 def names_a_cell(words: str, *, alone: bool = False) -> bool:
-    """Check whether a plain name is that of a cell, an antenna or a beam; if ``alone``, of the row's own."""
+    """Check whether a plain name names a cell, an antenna or a beam; ``alone``: only that of the row itself."""
     return _OF_A_CELL.fullmatch(words) is not None or (not alone and _CELL_ID.search(words) is not None)
 
 
 def like_levels(names: Iterable[str]) -> list[str]:
-    """Return the names that a level may have, of names that no row knows; a power beside a voltage is electric."""
+    """Return those of some unknown names that may be levels; a power next to a voltage is electric."""
     words = {name: plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)) for name in names}
     electric = any(re.search(r"volt|batt|\bcurrent", text) for text in words.values())
     return [
@@ -662,7 +662,7 @@ def like_levels(names: Iterable[str]) -> list[str]:
 
 
 def program(names: Collection[str]) -> Program | None:
-    """The program that wrote a table of such plain names, None where no sign stands in it."""
+    """Return the program that wrote a table with such plain names, or None if no program is recognised."""
     present = set(names)
     return next((item for item in PROGRAMS if any(sign <= present for sign in item.signs)), None)
 
@@ -670,14 +670,14 @@ def program(names: Collection[str]) -> Program | None:
 def described(
     names: Iterable[str], *, known: Program | None = None, of: Collection[str] = ()
 ) -> tuple[Program | None, list[tuple[Meaning | None, str, str]]]:
-    """Program of a table, and of each name the meaning, the unit as written or as the program writes it, common words.
+    """Return the program of a table and, per name, its meaning, its unit and its plain form in common words.
 
     Parameters
     ----------
     names : iterable of str
         As written.
     known : Program, optional
-        Where the names do not tell it.
+        The program, if it is known before.
     of : collection of str
         Further names that tell it.
     """
@@ -686,7 +686,7 @@ def described(
     known = known or program([*present, *map(plain, of)])
     words, columns = dict(known.words) if known else {}, []
     if "rank" in present and not words and any((m := meaning(name)) and m.quantity.role == "rss" for name in present):
-        words = {"rank": "rank indicator"}  # by itself the word may be that of any list
+        words = {"rank": "rank indicator"}  # without levels it may be the position in any list
     for name, bare in own:
         forms = (re.sub(form, word, bare) for form, word in words.items() if re.fullmatch(form, bare))
         common = next(forms, bare)
@@ -701,29 +701,29 @@ def described(
 def record_columns(
     fields: Mapping[str, FloatArray], *, integers: Collection[str] = (), of: Collection[str] = ()
 ) -> dict[str, FloatArray]:
-    """Columns of the record model, in its units, that the fields of a message or of a file hold.
+    """Return the columns of the record model, in its units, from the fields of a message or of a file.
 
     Parameters
     ----------
     fields : mapping of str to float array, shape (n,)
     integers : collection of str
-        Names of fields that are written as integers: only these have the units of integers (mm, 1e-7 deg).
+        Names of integer fields: only these have the units of integers (mm, 1e-7 deg).
     of : collection of str
         Further names that tell the program.
 
     Returns
     -------
     dict of str to float array, shape (n,)
-        Of several fields of one column the preferred; heights above take-off as ``above_home_m``.
+        If several fields have one quantity, the preferred one. Heights above take-off are ``above_home_m``.
     """
     columns: dict[str, tuple[tuple[int, int], FloatArray]] = {}
     for name, (what, unit, words) in zip(fields, described(fields, of=of)[1], strict=True):
         if what is None or what.quantity.role not in ("position", "height", "angle", "velocity", "count"):
             continue
         row = what.quantity
-        # the same names in decimals are those of a converter, which has scaled them already
+        # decimals were written by a converter, which has already scaled them
         unit = "" if unit in OF_INTEGERS and name not in integers else unit
-        # 65535 mm are a height: of these only the ends of the type are none
+        # 65535 mm may be a height: only the ends of the integer type mean a missing value
         none = np.abs(fields[name]) >= UNAVAILABLE[0] if unit in ("mm", "e7") else is_none(row, fields[name])
         values = np.where(none, np.nan, fields[name])
         if row.role == "position" and not unit:

@@ -1,23 +1,18 @@
 """Files of logs: archives, packed files, checksums, and files larger than memory in pieces.
 
-Logs packed by gzip, bzip2 or xz, unpacked piece by piece and bounded.
+Logs packed by gzip, bzip2 or xz are unpacked piece by piece, up to a limit. A file may contain several streams, as
+parallel packers write them.
 
-A file may hold several streams, as parallel packers write them. Python may have been built without bzip2 or
-xz: then the message says so.
+Zip and tar archives are read as folders of logs: members are streams with a limit and are never written to disk. A
+member is named like a file in a folder: ``dataset.zip/LW1/power_log.txt``.
 
-Zip and tar archives as folders of logs: members are read as streams, bounded, and never written to disk.
+A line of the log of ``aerpaw-cmp tap`` is a JSON object; its last key is the CRC-32 of the text before it.
 
-A member is named like a file in a folder: ``dataset.zip/LW1/power_log.txt``.
+A log larger than memory is read in pieces of complete lines. The result of ``Reader.read_pieces`` does not depend on
+the size of the pieces: a reader stores a few numbers per piece and completes the result at the end.
 
-Lines of the log of ``aerpaw-cmp tap``: a JSON object each, its last key the CRC-32 of what stands before it.
-
-Logs larger than memory: a file as pieces of whole lines.
-
-The one law of readers that take pieces (``Reader.read_pieces``): pieces of any size give what one piece gives. A reader
-keeps of each piece the few numbers that it needs and settles what only the whole log can tell at the end.
-
-Records of 2 GB fill memory all the same. Where only their number and span are asked for, ``Reader.read_sections`` gives
-them section by section (:func:`spans`), and last a result with the sums over all.
+If only the number and span of the records are needed, ``Reader.read_sections`` returns them section by section
+(:func:`spans`), because the records of a 2 GB log would fill the memory.
 """
 
 from __future__ import annotations
@@ -45,14 +40,14 @@ from .records import ReadResult, Stream
 
 _MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\x00": "xz"}
 _PIECE = 2 << 20
-# What unpacks to more than so many times its size is no log: text of the most regular of them takes a hundredth.
+# A file that unpacks to more than this multiple of its size is not a log: the most regular logs shrink to a hundredth.
 _MOST_RATIO = 1100
-# Of the xz library; its strongest setting takes 65 MiB.
+# Memory of the xz library; its strongest setting needs 65 MiB.
 _MOST_MEMORY = 1 << 28
 
 
 def packed_form(head: bytes) -> str | None:
-    """``gzip``, ``bzip2`` or ``xz``, None for any other content."""
+    """Return ``gzip``, ``bzip2`` or ``xz``, or None for other content."""
     for magic, name in _MAGIC.items():
         if head.startswith(magic) and (name != "bzip2" or head[3:10] in _BLOCKS):
             return name
@@ -105,19 +100,19 @@ def _machine(name: str, path: str | Path) -> Callable[[], Any]:
 
 
 def unpacked_pieces(content: Iterable[bytes], path: str | Path) -> Iterator[bytes]:
-    """Content of a packed file, some MiB at a time.
+    """Yield the content of a packed file, some MiB at a time.
 
     Parameters
     ----------
     content : iterable of bytes
-        Of the file; the first one shows its form.
+        Pieces of the file; the first one shows its form.
     path : str or Path
-        What messages name.
+        Path in messages.
 
     Raises
     ------
     InputError
-        If it is damaged or cut, or unpacks to more than a log can.
+        If the file is damaged or truncated, or unpacks to more than a log can.
     """
     content = iter(content)
     unread = next(content, b"")
@@ -153,7 +148,7 @@ def unpacked_pieces(content: Iterable[bytes], path: str | Path) -> Iterator[byte
 
 
 def unpacked(raw: bytes, path: str | Path, most: int) -> bytes:
-    """All of a packed file, never more than ``most`` bytes; see :func:`pieces`."""
+    """Return the content of a packed file of at most ``most`` bytes."""
     parts, size = [], 0
     for piece in unpacked_pieces([raw], path):
         parts.append(piece)
@@ -166,7 +161,7 @@ def unpacked(raw: bytes, path: str | Path, most: int) -> bytes:
 
 
 def head_of(place: Path, count: int) -> bytes:
-    """The first bytes of what a packed file holds, none where it is damaged: reading it says so."""
+    """Return the first bytes of the content of a packed file, or no bytes if the file is damaged."""
     head = b""
     try:
         for piece in unpacked_pieces(read_chunks(place, _PIECE), place):
@@ -174,12 +169,12 @@ def head_of(place: Path, count: int) -> bytes:
             if len(head) >= count:
                 break
     except InputError:
-        return b""  # damaged further on than the beginning: refused alike when it is read
+        return b""  # reading the file later reports the damage
     return head[:count]
 
 
 def read_chunks(place: Path, size: int) -> Iterator[bytes]:
-    """Content of a file, so many bytes at a time."""
+    """Yield the content of a file, ``size`` bytes at a time."""
     with place.open("rb") as file:
         while chunk := file.read(size):
             yield chunk
@@ -187,19 +182,18 @@ def read_chunks(place: Path, size: int) -> Iterator[bytes]:
 
 # A flight of half an hour with a burst every 0.1 s has 18 000.
 MOST_MEMBERS = 20_000
-# Of one member after decompression.
+# Largest size of a member, and of all members together, after decompression.
 MOST_BYTES = 2**31
-# Of all members together.
 _MOST_IN_ALL = 2**35
-# Of all members together to the archive, beyond ``_FREE_BYTES``: logs shrink to a fifth, the most even to a 50th.
+# Largest ratio of all members to the archive, beyond ``_FREE_BYTES``: logs shrink to a fifth, some to a 50th.
 MOST_RATIO = 100
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 _TAR = b"ustar"
 _MARGIN = 2**20
 _FREE_BYTES = 2**28
-# Deflate makes a file at most 1032 times smaller: what claims more lies.
+# Deflate makes a file at most 1032 times smaller: a larger ratio is false.
 _RATIO = 1200
-# What Python's libraries raise for damaged archives; a ValueError for a directory that begins before the file does.
+# Errors of Python's libraries for damaged archives, ValueError for a directory that begins before the file does.
 _DAMAGE = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, ValueError, IndexError,
     OverflowError, NotImplementedError,
@@ -213,11 +207,11 @@ class Member:
     Parameters
     ----------
     name : str
-        Relative, whatever the archive says.
+        Relative path, also if the archive has an absolute one.
     size : int
-        After decompression, as the archive says [bytes].
+        Size after decompression according to the archive [bytes].
     read : callable
-        Content, all of it or at most so many bytes.
+        Return the content, all of it or at most the given number of bytes.
     """
 
     name: str
@@ -227,24 +221,24 @@ class Member:
 
 def is_archive(head: bytes) -> bool:
     """Check whether the first bytes of a file (gunzipped or not) are those of an archive."""
-    # the mark of POSIX tar stands behind 257 bytes of the first header
+    # the mark of POSIX tar is at byte 257 of the first header
     return head.startswith(_ZIP) or head[257:262] == _TAR
 
 
 def path_in_archive(path: Path) -> tuple[Path, str] | None:
-    """The archive and the member that a path names; None where no part of it is a file."""
+    """Return the archive and the member that a path names, or None if no part of the path is a file."""
     # Path's own test raises for a name that is too long
     file = next((parent for parent in path.parents if isfile(parent)), None)  # noqa: PTH113
     return None if file is None else (file, path.relative_to(file).as_posix())
 
 
 def archive_members(data: bytes, path: str | Path) -> dict[str, Member]:
-    """Files of an archive by their names, in order.
+    """Return the files of an archive by their names, in order.
 
     Raises
     ------
     InputError
-        If the archive is damaged, or holds or unpacks to more than a data set can; also from a member's ``read``.
+        If the archive is damaged, or contains or unpacks to more than a data set can; also from a member's ``read``.
     """
     try:
         entries = list(_zip(data, path) if data.startswith(_ZIP) else _tar(data, path))
@@ -263,7 +257,7 @@ def _zip(data: bytes, path: str | Path) -> Iterator[Member]:
     for entry in book.infolist():
         if not entry.is_dir() and not _hidden(entry.filename):
             size = entry.file_size
-            # deflate cannot do it: the directory lies
+            # deflate cannot shrink a file so much: the directory is false
             lies = size > MOST_BYTES or size > _RATIO * entry.compress_size + _MARGIN
             read = (
                 partial(_refused, f"the member unpacks to {size} bytes", f"at most {MOST_BYTES}", path)
@@ -277,7 +271,7 @@ def _unzipped(book: zipfile.ZipFile, entry: zipfile.ZipInfo, path: str | Path, m
     place = f"{path}/{entry.filename}"
     try:
         with book.open(entry) as stream:
-            # one byte more than is said shows a lie
+            # read one byte more than declared, to detect a false size
             content = stream.read(entry.file_size + 1 if most is None else most)
     except (*_DAMAGE, RuntimeError) as error:
         raise InputError(f"a damaged or locked member ({error})", cause="a cut download", path=place) from error
@@ -301,7 +295,7 @@ def _untarred(book: tarfile.TarFile, entry: tarfile.TarInfo, most: int | None) -
 
 
 def _member(name: str, size: int, path: str | Path, read: Callable[[int | None], bytes]) -> Member:
-    """A member under a relative name: what a flight.yaml names by it lies in the archive and nowhere else."""
+    """Return a member under a relative name, so that a flight.yaml reaches files in the archive only."""
     if ".." in name.split("/"):
         return Member(name, 0, partial(_refused, "the member's name leads out of the archive", "a name below it", path))
     return Member(name.lstrip("/"), size, read)
@@ -312,7 +306,7 @@ def _refused(found: str, expected: str, path: str | Path, _most: int | None) -> 
 
 
 def most_bytes(size: int) -> int:
-    """Bytes that an archive or packed file of ``size`` bytes may unpack to."""
+    """Return the number of bytes that an archive or packed file of ``size`` bytes may unpack to."""
     return min(_MOST_IN_ALL, MOST_RATIO * size + _FREE_BYTES)
 
 
@@ -336,7 +330,7 @@ Record = dict[str, Any]
 
 
 def encode_record(record: Record) -> bytes:
-    r"""One line, with its checksum and line end.
+    r"""Return the line of a record, with its checksum and line end.
 
     Examples
     --------
@@ -348,12 +342,12 @@ def encode_record(record: Record) -> bytes:
 
 
 def decode_record(line: bytes) -> Record:
-    """A line's record.
+    """Return the record of a line.
 
     Raises
     ------
     ValueError
-        With the reason, if the line is torn or its checksum is wrong.
+        If the line is truncated or its checksum is wrong.
     """
     body, mark, tail = line.strip().rpartition(_CRC)
     if not mark or len(tail) != 10 or not tail.endswith(b'"}'):
@@ -373,7 +367,7 @@ PIECE_BYTES = 4 << 20
 
 
 def file_pieces(place: Path, digest: Any) -> Iterator[bytes]:
-    """Content of a log, unpacked, some MiB of whole lines at a time; ``digest`` takes that content."""
+    """Yield the unpacked content of a log, some MiB of complete lines at a time, and update ``digest`` with it."""
     chunks = read_chunks(place, PIECE_BYTES)
     first = next(chunks, b"")
     content = chain((first,), chunks)
@@ -381,7 +375,7 @@ def file_pieces(place: Path, digest: Any) -> Iterator[bytes]:
 
 
 def whole_lines(chunks: Iterable[bytes]) -> Iterator[bytes]:
-    r"""The same bytes, each piece but the last with a line end at its end, without a byte order mark in front.
+    r"""Yield the same bytes in pieces that end with a line end, except the last, and without a byte order mark.
 
     Examples
     --------
@@ -410,7 +404,7 @@ def _counted(chunks: Iterable[bytes], digest: Any) -> Iterator[bytes]:
 
 
 class Column:
-    """A column that grows in place: pieces that are kept one by one and joined take twice the memory."""
+    """A column that grows in place: joining stored pieces would need twice the memory."""
 
     def __init__(self, dtype: Any, first: Any = ()) -> None:
         self._values: AnyArray = np.array(first, dtype=dtype)
@@ -421,25 +415,25 @@ class Column:
         return self._count
 
     def extend(self, piece: AnyArray) -> None:
-        """Values behind those that are there."""
+        """Append values."""
         end = self._count + len(piece)
         if end > len(self._values):
-            # a sixteenth more: few moves, little to spare
+            # a sixteenth more, as a compromise between moves and unused memory
             self._values.resize(end + end // 16, refcheck=False)  # the system moves pages, not bytes
         self._values[self._count : end] = piece
         self._count = end
 
     def array(self) -> AnyArray:
-        """The column; it takes no more values."""
+        """Return the column, which is complete then."""
         self._values.resize(self._count, refcheck=False)
         return self._values
 
 
 class WholeLogError(Exception):
-    """Something that only all records of a log together can settle."""
+    """A question that needs all records of a log together."""
 
 
-# Streams by section, and last the result without them.
+# Streams by section, and at the end the result without streams.
 Sections = Iterator[Stream | ReadResult]
 
 # Records of a section, some 100 MB.
@@ -447,12 +441,12 @@ SECTION = 1 << 20
 
 
 def spans(sections: Sections) -> ReadResult:
-    """Result of a log whose streams hold the first and the last record in time, and how many there are.
+    """Return a result whose streams contain the first and the last record in time, and the number of records.
 
     Raises
     ------
     WholeLogError
-        If values are impossible, or days lie between records: the limits of quantities judge all of them together.
+        If values are impossible or days lie between records: such checks need all records together.
     """
     import pandas as pd
 

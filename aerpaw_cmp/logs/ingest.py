@@ -55,17 +55,17 @@ class Skipped:
     path: str
     reason: str
     error: AerpawCmpError | None = None
-    """A usage error names an option without which it cannot be read: of the folder's other files it says nothing."""
+    """A usage error names an option that this file needs; the other files of the folder may not need it."""
 
     @classmethod
     def of(cls, path: Path, names: Collection[str], error: AerpawCmpError) -> Skipped:
-        """Of a file beside files of these names; a table's reason says how to read it."""
+        """Return a skipped file of a folder with such names, with the way to read it if it is a table."""
         way_out = f"; {error.cause}" if "--map" in (error.cause or "") else ""
         return cls(str(path), _samples_of(path.name, names) or error.found + way_out, error)
 
 
 class Ingested(list[IngestedFile]):
-    """The files that were read, in order; ``skipped`` names those of folders that were not."""
+    """The files that were read, in order, and in ``skipped`` the files of folders that were not read."""
 
     def __init__(self, files: Sequence[IngestedFile] = (), skipped: Sequence[Skipped] = ()) -> None:
         super().__init__(files)
@@ -73,7 +73,7 @@ class Ingested(list[IngestedFile]):
 
 
 def read_bytes(path: str | Path) -> tuple[bytes, str]:
-    """Content of a log, unpacked where it is a gzip, bzip2 or xz file, and its SHA-256: what a log is known by.
+    """Return the content of a log, unpacked if it is a gzip, bzip2 or xz file, and the SHA-256 of that content.
 
     Raises
     ------
@@ -85,21 +85,21 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 
 
 def read_head(place: Path) -> bytes:
-    """Return the first bytes of a log on disk, as much as the sniffers look at; InputError if it cannot be read."""
+    """Return as many first bytes of a log on disk as the sniffers look at."""
     return as_utf8(_raw(place, HEAD_BYTES))
 
 
 def _unpacked(raw: bytes, path: str | Path) -> bytes:
-    """Content of a packed file, other content as it is."""
+    """Return the content of a packed file, and other content unchanged."""
     most = min(MAX_BYTES, archives.most_bytes(len(raw)))
     return raw if packed.packed_form(raw) is None else packed.unpacked(raw, path, most)
 
 
 def _raw(place: Path, limit: int | None = None) -> bytes:
-    """Bytes on disk, all or the first ``limit``."""
+    """Return the bytes on disk, all or the first ``limit``."""
     try:
         if place.is_dir():
-            raise InputError("a folder stands where a log is expected", path=place)
+            raise InputError("a folder where a log is expected", path=place)
         if not place.is_file() and place.exists():
             raise InputError("not a regular file", expected="a log", path=place)
         if limit is None:
@@ -125,7 +125,7 @@ def ingest(
         Files, folders and archives (zip, tar); folders are searched to the bottom, in sorted order. Hidden files are
         left out. A flight file that ``ingest -o`` wrote gives the files that it holds.
     options : ReadOptions or callable, optional
-        What the files cannot say themselves; a callable gives them per path.
+        Facts that are not in the files; a callable returns them per path.
     reader : str, optional
         Name of the reader, instead of sniffing.
 
@@ -137,7 +137,7 @@ def ingest(
     Raises
     ------
     InputError
-        If a named file cannot be read or is of no known kind, or a folder holds no log at all.
+        If a named file cannot be read or has an unknown format, or a folder does not contain a log.
     UsageError
         If an option is missing (``timezone:``) or the reader is unknown.
     """
@@ -151,7 +151,7 @@ def ingest(
         files += inside
         skipped += skipped_below
     if any(file.result.reader == "generic_csv" for file in files):
-        # of one table's columns the files beside it know nothing: they keep their readers
+        # the mapped columns belong to one table: the other files of the folder keep their readers
         refused = [item for item in skipped if isinstance(item.error, UsageError)]
         skipped = [item for item in skipped if item not in refused]
         for item in refused:
@@ -168,7 +168,7 @@ def ingest(
 def _check_readable(places: Sequence[Path]) -> None:
     """Raise InputError for all files that cannot be opened: reading the folder before them may take minutes."""
     errors = []
-    # a path may name a member of an archive, which is no file
+    # a path may name a member of an archive, which does not exist on disk
     for place in (place for place in places if not _is_folder(place) and _part_of(place) is None):
         try:
             _raw(place, 1)
@@ -186,12 +186,12 @@ def _check_readable(places: Sequence[Path]) -> None:
         raise errors[0]
 
 
-# Logs that were read, and files that are none.
+# Logs that were read, and files that were skipped.
 _Found = tuple[list[IngestedFile], list[Skipped]]
 
 
 def _below(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> _Found:
-    """Logs of a file, a folder, an archive or a flight file, and the files that are none."""
+    """Read a file, a folder, an archive or a flight file: return its logs and the skipped files."""
     if (is_folder := _is_folder(place)) or _is_archive(place):
         inside, skipped = (_folder if is_folder else _archive)(place, options, chosen)
     elif _head(place).startswith(_HDF5):
@@ -211,7 +211,7 @@ def _below(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> _
 
 
 def as_utf8(data: bytes) -> bytes:
-    """Text without its byte order mark, UTF-16 (what PowerShell's ``>`` writes) as UTF-8; other content as it is.
+    """Return text without its byte order mark, and UTF-16 (written by PowerShell's ``>``) as UTF-8.
 
     Examples
     --------
@@ -225,7 +225,7 @@ def as_utf8(data: bytes) -> bytes:
     return data.removeprefix(b"\xef\xbb\xbf")
 
 
-# Path's own raise for a name that is too long: read_bytes says so.
+# The methods of Path raise for a name that is too long; read_bytes reports it.
 _present, _is_folder = os.path.exists, os.path.isdir
 
 
@@ -239,20 +239,20 @@ def _part_of(path: Path) -> tuple[Path, str] | None:
 
 
 def sniffers_of(path: Path) -> list[str]:
-    """Names of the readers whose sniffers accept a log; none for a folder of pieces or a log in a flight file."""
+    """Return the names of the readers whose sniffers accept a log, none for a folder or a log in a flight file."""
     if path.is_dir():
         return []
     if (part := _part_of(path)) is None:
         return [reader.name for reader in claims(_beginning(path)) if reader.kinds]
     if _in_flight_file(path) is not None:
-        return []  # a flight file knows the reader of each log
+        return []  # a flight file contains the reader of each log
     content = archives.archive_members(read_bytes(part[0])[0], part[0])
     data = as_utf8(content[part[1]].read(DEEP_BYTES)) if part[1] in content else b""
     return [reader.name for reader in claims(data) if reader.kinds]
 
 
 def _beginning(place: Path, count: int = DEEP_BYTES) -> bytes:
-    """The first bytes of a log, unpacked and as UTF-8; none of a damaged packed file."""
+    """Return the first bytes of a log, unpacked and as UTF-8, or no bytes if a packed file is damaged."""
     head = _raw(place, count)
     return as_utf8(head if packed.packed_form(head) is None else packed.head_of(place, count))
 
@@ -262,7 +262,7 @@ Held = dict[Path, list[IngestedFile]]
 
 
 def named_log(root: Path, name: str) -> Path:
-    """Return the path of a log that a flight file names; InputError if there is no such file, folder or member."""
+    """Return the path of an existing file, folder or archive member that a flight file names."""
     path = root / name
     if not exists(path):
         cause = "a wrong path, or --logs-root"
@@ -273,7 +273,7 @@ def named_log(root: Path, name: str) -> Path:
 def read_log(
     root: Path, name: str, options: ReadOptions, *, reader: str | None = None, held: Held | None = None
 ) -> IngestedFile:
-    """One log of a flight file, which says where it lies and may say what it is.
+    """Read one log that a flight file names.
 
     Parameters
     ----------
@@ -282,11 +282,11 @@ def read_log(
     name : str
         Path of the log: a file, a folder of pieces, or a member of an archive.
     options : ReadOptions
-        What the file cannot say about itself.
+        Facts that are not in the file.
     reader : str, optional
-        In place of recognising it.
+        The reader, if it should not be recognised by content.
     held : dict, optional
-        Flight files that one caller has read already; gets those that this call reads.
+        Flight files that the caller has read before; this call adds those that it reads.
 
     Returns
     -------
@@ -296,9 +296,9 @@ def read_log(
     Raises
     ------
     InputError
-        A missing file, a log of another kind than its reader's, a log without any record.
+        If the file is missing, is not a log of this reader, or contains no record.
     UsageError
-        No such reader; options that the reader asks for.
+        If there is no such reader, or an option that it needs is missing.
     """
     path = named_log(root, name)
     if reader is not None:
@@ -311,7 +311,7 @@ def read_log(
     if len(files) != 1:
         names = ", ".join(one_line(Path(item.path).name) for item in files[:4])
         raise UsageError(
-            f"{len(files)} logs stand under one path: {names}",
+            f"{len(files)} logs under one path: {names}",
             expected=f"one of them, such as {name}/{one_line(Path(files[0].path).name)}",
             cause="a folder, an archive or a flight file of several logs",
             path=path,
@@ -328,9 +328,9 @@ def read_log(
 
 
 def _refuse_other_kind(path: Path, reader: Reader) -> None:
-    """A log whose content another reader recognises, and the named one does not, is the wrong file."""
+    """Refuse a log that another reader recognises and the named one does not: it is the wrong file."""
     if reader.name == "generic_csv":
-        return  # its columns were named: no other reader knows better
+        return  # its columns were named by the user
     claimed_by = sniffers_of(path)
     if not claimed_by or reader.name in claimed_by:
         return
@@ -343,7 +343,7 @@ def _refuse_other_kind(path: Path, reader: Reader) -> None:
 
 
 def _head(place: Path) -> bytes:
-    """First bytes of a file, none where it cannot be read: reading it says why."""
+    """Return the first bytes of a file, or no bytes if it cannot be read; reading it later reports why."""
     try:
         return _raw(place, HEAD_BYTES)
     except InputError:
@@ -354,11 +354,11 @@ def _is_archive(place: Path) -> bool:
     try:
         return archives.is_archive(_beginning(place, 1024))
     except InputError:
-        return False  # reading it says why
+        return False  # reading it later reports why
 
 
 def _archive(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> _Found:
-    """All logs of an archive; what cannot be read is reported, not fatal."""
+    """Read all logs of an archive, and report files that cannot be read."""
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
     content = archives.archive_members(read_bytes(place)[0], place)
@@ -380,8 +380,8 @@ def _member(
     options: _OptionsFor | None,
     chosen: Reader | None,
 ) -> IngestedFile:
-    """One file of an archive; what its first bytes show to be no log is not unpacked."""
-    # only the beginning: a data set holds recordings of GiB beside its logs
+    """Read one file of an archive; it is not unpacked if its first bytes are not those of a log."""
+    # only the beginning, because data sets contain recordings of GiB next to their logs
     head = member.read(DEEP_BYTES)
     if (
         chosen is None
@@ -405,7 +405,7 @@ def _member(
 
 
 def _samples_of(name: str, names: Collection[str]) -> str | None:
-    """Description of a file of samples whose meta file lies beside it; None for any other file."""
+    """Return the description of a file of samples with a meta file in the same folder, else None."""
     meta = name.removesuffix(".sigmf-data") + ".sigmf-meta"
     if name.endswith(".sigmf-data") and meta in names:
         return f"no log: the samples of {Path(meta).name}, read with it"
@@ -413,7 +413,7 @@ def _samples_of(name: str, names: Collection[str]) -> str | None:
 
 
 def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: Reader | None = None) -> IngestedFile:
-    """Read one file, or one member of an archive; see :func:`ingest`."""
+    """Read one file or one member of an archive, as :func:`ingest` does."""
     place = Path(path)
     if (part := _part_of(place)) is not None:
         archive, name = part
@@ -427,11 +427,11 @@ def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: R
     if head.startswith(_HDF5):
         raise InputError(
             "an HDF5 file, such as the flight file that 'ingest -o' writes",
-            expected="the logs themselves, or the flight file named alone: 'ingest' gives back the logs that it holds",
+            expected="the logs themselves, or the flight file named alone: 'ingest' returns the logs in it",
             path=path,
         )
     if reader is None and head:
-        reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
+        reader = identify(head, path=str(path))  # before reading the rest: folders contain large files of other kinds
     pointer = head.startswith(b"version https://git-lfs")
     if reader is not None and head.strip() and not pointer and (file := _in_pieces(place, reader, options)) is not None:
         return file
@@ -443,7 +443,7 @@ def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: R
 
 
 def _of_kind(file: IngestedFile, chosen: Reader | None, flight_file: Path) -> IngestedFile:
-    """A log of a flight file, which is read already: by the reader that was named, where one was."""
+    """Check that a log in a flight file was read by the named reader, if one is named."""
     if chosen is not None and file.result.reader != chosen.name:
         raise InputError(
             f"{one_line(file.path)} was read by {file.result.reader!r}",
@@ -455,13 +455,13 @@ def _of_kind(file: IngestedFile, chosen: Reader | None, flight_file: Path) -> In
 
 
 def _in_flight_file(path: Path) -> tuple[Path, str] | None:
-    """The flight file that a path leads into, and the name of the log in it."""
+    """Return the flight file that a path leads into, and the name of the log in it."""
     part = _part_of(path)
     return part if part is not None and _head(part[0]).startswith(_HDF5) else None
 
 
 def name_inside(path: str) -> str:
-    """The end of a log's path by which the flight file that holds it finds it.
+    """Return the end of a log's path, by which it is found in its flight file.
 
     Examples
     --------
@@ -472,7 +472,7 @@ def name_inside(path: str) -> str:
 
 
 def _source(flight_file: Path, name: str, held: Held | None = None) -> IngestedFile:
-    """One of the logs that a flight file holds, by its path or the end of it."""
+    """Return one of the logs in a flight file by its path or the end of it."""
     held = {} if held is None else held
     # once for all logs of a flight.yaml that name it
     files = held[flight_file] = held.get(flight_file) or read_flight(flight_file)
@@ -484,7 +484,7 @@ def _source(flight_file: Path, name: str, held: Held | None = None) -> IngestedF
 
 
 def _in_pieces(place: Path, reader: Reader, options: _OptionsFor | None) -> IngestedFile | None:
-    """A log of a reader that takes pieces; None for text in UTF-16, which is turned as one."""
+    """Read a log in pieces if its reader can, else return None; UTF-16 is converted at once."""
     if reader.read_pieces is None or _raw(place, 2) in _UTF_16:
         return None
     chosen, digest = _options(place, options, _neighbour_reader(place)), hashlib.sha256()
@@ -508,7 +508,7 @@ def _options(path: Path, options: _OptionsFor | None, neighbour: Callable[[str],
 
 
 def _neighbour_reader(path: Path) -> Callable[[str], bytes | None]:
-    """Reads another file of a log's folder."""
+    """Return a function that reads another file of a log's folder."""
 
     def read(name: str) -> bytes | None:
         neighbour = path.parent / Path(name).name
@@ -530,7 +530,7 @@ def _read(
 
 
 def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[], ReadResult]) -> ReadResult:
-    """Result of a reader, its impossible values flagged; messages name the file, which readers do not know."""
+    """Return the result of a reader with impossible values flagged; errors name the file, unknown to readers."""
     from . import limits, readers  # load pandas, as any reader does
 
     expected, cause = f"lines such as {reader.sample!r}", "a log of another kind, or a damaged one"
@@ -547,7 +547,7 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
     return result
 
 
-# GPS receivers count weeks modulo 1 024 (IS-GPS-200): their dates fall back by so many days.
+# GPS receivers count weeks modulo 1 024 (IS-GPS-200): after a rollover their dates are earlier by this number of days.
 ROLLOVER_DAYS = 7 * 1024
 
 
@@ -563,7 +563,7 @@ def _later(result: ReadResult, rollovers: int) -> ReadResult:
 
 
 def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) -> _Found:
-    """All logs below a folder; what cannot be read is reported, not fatal."""
+    """Read all logs below a folder, and report files that cannot be read."""
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
     try:
@@ -589,7 +589,7 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
 
 
 def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
-    """Output of ``ingest --json``: files, their account, streams and warnings; ``skipped`` where folders had such."""
+    """Return the output of ``ingest --json``: files, their account, streams and warnings, and skipped files."""
     entries = [
         {
             "path": file.path,
@@ -613,7 +613,7 @@ def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
 
 
 def _span(stream: Stream) -> dict[str, Any]:
-    """First and last time (ISO, UTC) and mean rate; None where undefined."""
+    """Return the first and last time (ISO, UTC) and the mean rate, None if undefined."""
     if not stream.rows:
         return {"start": None, "end": None, "rate_hz": None}
     time = stream.frame["time"]
@@ -630,16 +630,16 @@ MOST_NAMED = 6
 
 
 def account_rows(account: Mapping[str, Any], every_stream: bool = False) -> tuple[str, list[list[str]]]:
-    """A summary for people: the folder that all paths share, and a row of :data:`ACCOUNT` per file.
+    """Return the folder that all paths share, and a row of :data:`ACCOUNT` per file.
 
-    Of more than :data:`MOST_NAMED` streams of a kind, as in a wide table, only the number unless all are wanted.
+    If a kind has more than :data:`MOST_NAMED` streams, as in a wide table, only their number, unless ``every_stream``.
     """
     folder = _common_folder([Path(file["path"]) for file in account["files"]])
     return folder, [_account_row(file, folder, every_stream) for file in account["files"]]
 
 
 def _common_folder(paths: Sequence[Path]) -> str:
-    """The folder that all paths are named in; none where they begin at different places, or at several heights."""
+    """Return the folder that all paths share, empty if there is no such folder."""
     if len(paths) < 2 or len({path.is_absolute() for path in paths}) > 1:
         return ""
     return os.path.commonpath([path.parent for path in paths])
@@ -684,7 +684,7 @@ def _start_and_length(streams: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
 
 
 def account_notes(account: Mapping[str, Any]) -> list[str]:
-    """Notes that a table has no room for: warnings, the first rejected lines and the files left out, a line each."""
+    """Return warnings, the first rejected lines and the skipped files, one line each."""
     notes = []
     for file in account["files"]:
         path = one_line(file["path"])
@@ -702,7 +702,7 @@ def account_notes(account: Mapping[str, Any]) -> list[str]:
 
 
 def _join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
-    """Files in order, the pieces of one folder and reader joined under the name of the folder."""
+    """Join the pieces of one folder and reader under the name of the folder, and keep the order of the files."""
     kinds = {reader.name for reader in catalogue() if reader.pieces}
     groups: dict[tuple[str, str], list[IngestedFile]] = {}
     for file in files:
@@ -711,15 +711,15 @@ def _join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
     joined: dict[str, IngestedFile | None] = {}
     for (folder, _), group in groups.items():
         if len(group) > 1:
-            # the first of them stands for all, where it stood in the order
+            # put the joined log at the position of its first piece
             joined |= {file.path: None for file in group[1:]}
             joined[group[0].path] = _joined(folder, group)
     return [kept for file in files if (kept := joined.get(file.path, file)) is not None]
 
 
 def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
-    """One log of the pieces; its lines are theirs, one behind the other."""
-    pieces = sorted(file.sha256 for file in group)  # whatever the pieces are called
+    """Join pieces to one log whose lines are theirs, one after the other."""
+    pieces = sorted(file.sha256 for file in group)  # regardless of the names of the pieces
     digest = hashlib.sha256("".join(pieces).encode()).hexdigest()
     before = 0
     parts: dict[tuple[str, str], list[tuple[Stream, pd.DataFrame]]] = {}

@@ -1,8 +1,8 @@
-"""Possible range of each quantity of the record model: rows beyond it are flagged, whatever the reader.
+"""Possible range of each quantity of the record model, for all readers: rows beyond it are flagged.
 
-One table for all formats. A value beyond its range becomes NaN (of a position, an attitude or a velocity all three
-components do: they are one quantity), its row gets a flag, and a warning names how many there are and the first of
-them. Rows with a flag of :data:`UNSCORED` are kept in the records and left out of every comparison.
+A value beyond its range becomes NaN; a position, an attitude or a velocity loses all three components. Its row gets a
+flag, and a warning gives the number of such rows and the first of them. Rows with a flag of :data:`UNSCORED` stay in
+the records and are not compared.
 
 The ranges are those of physics and of small aircraft, wide on purpose: they catch what cannot be (a corrupted digit, an
 overflow, a sentinel), not what is unusual.
@@ -92,7 +92,7 @@ def jumps_of(frame: pd.DataFrame, what: str = "") -> tuple[BoolArray, str]:
 
 
 def path_of(frame: pd.DataFrame) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Rows with a time and a position, their times [s], and east, north, up [m] about the first."""
+    """Return the rows with a time and a position, their times [s], and east, north, up [m] about the first."""
     time = frame["time"].to_numpy("datetime64[ns]")
     latitude, longitude = (frame[name].to_numpy(np.float64) for name in PLACE[:2])
     known = np.isfinite(latitude) & np.isfinite(longitude) & ~np.isnat(time) & ((latitude != 0) | (longitude != 0))
@@ -107,12 +107,12 @@ def path_of(frame: pd.DataFrame) -> tuple[IntArray, FloatArray, FloatArray]:
 
 
 def _speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
-    """Median speed of the part in which the track moves, over steps long enough for stamps written in bursts."""
+    """Return the median speed of the moving part, over steps long enough for stamps written in bursts."""
     # over a fiftieth of the track: loggers write a second's rows in one burst
     apart = max(1, len(time_s) // 50)
     step_m = np.linalg.norm(place_m[apart:] - place_m[:-apart], axis=1)
     step_s = np.abs(time_s[apart:] - time_s[:-apart])
-    # a hover says nothing about the unit of times
+    # a hover does not show the unit of times
     moving = (step_s > 0) & (step_m > 1.0)
     return float(np.median(step_m[moving] / step_s[moving])) if moving.sum() >= 3 else 0.0
 
@@ -153,7 +153,7 @@ class _Reach:
 
 
 def _runs(time_s: FloatArray, place_m: FloatArray) -> tuple[IntArray, IntArray]:
-    """First rows, and the rows behind the last, of the runs that fast steps divide a track into."""
+    """Return the first rows, and the rows after the last, of the runs between fast steps of a track."""
     rows = np.arange(len(time_s))
     begins = np.concatenate([[0], np.flatnonzero(_Reach(time_s, place_m).beyond(rows[:-1], rows[1:])) + 1])
     return begins, np.append(begins[1:], len(time_s))
@@ -208,7 +208,7 @@ def _comes_back(time_s: FloatArray, place_m: FloatArray) -> bool:
 
 
 def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArray, float, int]:
-    """Rows (n,) off the track, those of them at rest at an end, the greatest speed that the first implies, its number.
+    """Return the rows (n,) off the track, those at rest at an end, the speed that the first implies, and its number.
 
     Rows between two fast steps form a run. The longest run that moves is the track. A run that the track cannot reach
     in time is off it if it is short, or if it does not move and the log begins or ends with it. Any other run is a
@@ -250,11 +250,11 @@ class Limit:
     Parameters
     ----------
     columns : tuple of str
-        Components that are void together.
+        Components that become NaN together.
     ranges : tuple of (low, high)
         One per column, both ends possible, in the unit of the column's name.
     flag : str
-        What rows beyond it get.
+        Flag of rows beyond it.
     """
 
     columns: tuple[str, ...]
@@ -295,12 +295,11 @@ UNSCORED = ("level_out_of_range", "level_lost", "time_out_of_range", "rank_above
 
 
 def check(result: ReadResult) -> ReadResult:
-    """A read result with its impossible values flagged; the same object where there are none.
+    """Return a read result with its impossible values flagged, or the same object if all values are possible.
 
     Parameters
     ----------
     result : ReadResult
-        Of any reader.
 
     Returns
     -------
@@ -321,8 +320,8 @@ SITES_DEG, NEAR_DEG = ((35.727, -78.696), (35.773, -78.677)), 0.3
 # No receiver in flight meets such levels: reports of RSRP end at -31 dBm (3GPP TS 38.133, 10.1.6), those of RSRQ and
 # SINR do not.
 _MOST_DBM = {"RSRP": -20.0}
-# A lost reading is this near 0 dB and this far above all others, and at most this share of the readings is lost: no
-# path gains 20 dB from one reading to the next and loses it again.
+# A lost reading is this near 0 dB (or a placeholder) and this far from all others; at most this share is lost. No path
+# gains 20 dB from one reading to the next and loses it again.
 _LOST_DB, _FAR_DB, _LOST_SHARE = 1.0, 20.0, 0.2
 # Ends of the scales of phones, modems and 8-bit integers, which programs write for a reading that is missing.
 _LEAST_DB = (-127.0, -128.0, -140.0, -141.0, -150.0, -156.0, -157.0)
@@ -333,14 +332,14 @@ _AT_ONCE_DB = 6.0
 
 
 class _Check:
-    """A stream, its records as they are marked, and what is said of them."""
+    """A stream, its records with their flags, and the sentences about them."""
 
     def __init__(self, stream: Stream) -> None:
         self.stream, self.frame, self._said = stream, stream.frame, list[str]()
         self._about, self._what = stream.attributes, f"{stream.kind} {stream.name!r}"
 
     def run(self) -> list[str]:
-        """Check everything; sentences."""
+        """Run all checks and return their sentences."""
         kind, limits = self.stream.kind, LIMITS
         if kind == "rss":
             if self._about.get("unit") == "dBm":
@@ -367,7 +366,7 @@ class _Check:
         return self.frame[name].to_numpy(dtype=np.float64)
 
     def _flag(self, bad: BoolArray, flag: str, first: str, why: str, void: Sequence[str] = ()) -> None:
-        """Flag rows, void some of their columns, and say how many there are, what the first is, and why."""
+        """Flag rows, set some of their columns to NaN, and add a sentence with number, first row and reason."""
         rows = counted(int(bad.sum()), "row is", "rows are")
         line = int(self.frame["line"].iloc[int(np.argmax(bad))])
         end = "not scored" if flag in UNSCORED else "read as missing"
@@ -393,19 +392,19 @@ class _Check:
         self._flag(bad, limit.flag, first, f"where {low:g} .. {high:g} can be{swap}", names)
 
     def _exchanged(self, bad: BoolArray) -> str:
-        """A hint where every impossible position would be possible with its angles exchanged."""
+        """Return a hint if every impossible position were possible with its angles swapped."""
         latitude, longitude = (np.abs(self._values(name)[bad]) for name in PLACE[:2])
         fits = (latitude > 90.0) & (latitude <= 180.0) & (longitude <= 90.0)
-        return "; are latitude and longitude exchanged?" if fits.all() else ""
+        return "; are latitude and longitude swapped?" if fits.all() else ""
 
     def _at_a_site_if_otherwise(self) -> None:
-        """Say where positions that can be would lie at a site of AERPAW, were they written otherwise."""
+        """Report possible positions that would lie at a site of AERPAW if they were written differently."""
         if not {*PLACE[:2]} <= set(self.frame.columns):
             return
-        # the median: one receiver's jump is no other way of writing
+        # the median ignores jumps of the receiver
         place = self.frame[[*PLACE[:2]]].median().to_numpy(dtype=np.float64)
         for how, other in (
-            ("latitude and longitude exchanged", place[::-1]),
+            ("latitude and longitude swapped", place[::-1]),
             ("western longitudes without their sign", place * [1, -1]),
             ("they radians", np.degrees(place)),
         ):
@@ -416,11 +415,11 @@ class _Check:
                 )
 
     def _within_ports(self) -> None:
-        """No rank is above the number of ports that the log itself tells."""
+        """Flag ranks above the number of ports in the log."""
         ports, rank = self._about.get("ports"), self._values("rank")
         if not isinstance(ports, (int, float)) or isinstance(ports, bool) or not (bad := rank > float(ports)).any():
             return
-        why = f"on at most {ports:g} ports by the log itself; a wrong base of the indicator, or another cell"
+        why = f"but the log has at most {ports:g} ports (a wrong base of the indicator, or another cell?)"
         self._flag(bad, "rank_above_ports", f"rank {rank[int(np.argmax(bad))]:g}", why, ["rank"])
 
     def _no_index(self) -> None:
@@ -449,7 +448,7 @@ class _Check:
                 level = self._values("rss_db")
 
     def _two_levels(self) -> None:
-        """Report a series whose levels take turns, or are several at one time: of several devices, SIMs or networks."""
+        """Report a series whose levels take turns or differ at one time: it has several devices, SIMs or networks."""
         # the beginning: two devices alternate all along
         level, time = self._values("rss_db")[:10_000], self.frame["time"].to_numpy("datetime64[ns]")[:10_000]
         level, time = level[np.isfinite(level)], time[np.isfinite(level)]
@@ -468,8 +467,8 @@ class _Check:
             return
         how = f"{step:.0f} dB apart from record to record" if turns else f"{apart_db.median():.0f} dB apart at one time"
         self._said.append(
-            f"{self._what}: its levels alternate, {how}: several devices, SIMs or networks in one series, which no "
-            "column known as a name tells apart"
+            f"{self._what}: its levels alternate, {how}: several devices, SIMs or networks in one series, without a "
+            "known column that names them"
         )
 
     def _near_in_time(self) -> None:
@@ -502,7 +501,7 @@ class _Check:
 
 
 def one_run(stamp: IntArray) -> bool:
-    """Check whether all stamps [ns] lie within a day, or each within a day of the next; nothing beside them is held."""
+    """Check whether all stamps [ns] lie within a day, or each within a day of the next one, in constant memory."""
     low, high = int(stamp.min()), int(stamp.max())
     if low == np.iinfo(np.int64).min:  # a record without a time
         return False

@@ -1,12 +1,11 @@
-"""From lines to records: what every text format repeats, so that a format is its pattern, its columns and its text.
+"""The way from lines to records that all text formats share.
 
-:func:`matched` takes a pattern with named groups (``time`` among them) and gives :class:`Rows`; :func:`built` does
-so for readers that find their rows another way. ``Rows.number`` and ``Rows.text`` are its columns, ``Rows.stream``
-makes a stream of them, ``Rows.result`` closes the account.
+:func:`matched` returns the :class:`Rows` of a pattern with named groups, one of them ``time``. :func:`built` does the
+same for readers that find their rows in another way. ``Rows.number`` and ``Rows.text`` are the columns,
+``Rows.stream`` makes a stream of them, and ``Rows.result`` completes the account.
 
-A text format from its parts: the regular expression of its rows, what marks it, and the streams of its columns.
-
-:func:`reader` does the rest: sniffing, the account of all lines, times, torn last lines.
+:func:`reader` makes a reader from the regular expression of its rows, its mark, and the streams of its columns. It adds
+sniffing, the account of all lines, times, and truncated last lines.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from . import text as _text
 from .readers import Reader, ReadOptions
 from .records import Attribute, Kind, ReadResult, RejectedLine, Stream
 
-_NO_DATE = "the time stamp is no date of the calendar"
+_NO_DATE = "the time stamp is not a date of the calendar"
 _UNREAD = "the time is empty or of a form that is not read"
 NO_TIME = "the time is beyond any flight"
 _SI = {b"k": 1e3, b"M": 1e6, b"G": 1e9, b"m": 1e-3, b"u": 1e-6, b"n": 1e-9}
@@ -47,22 +46,22 @@ class Rows:
     time : datetime64[ns] array, shape (n,)
     flag : object array, shape (n,)
     columns : mapping of str to bytes array, shape (n,)
-        What the groups of the pattern matched.
+        Text that the groups of the pattern matched.
     blank : int
     rejected : list of RejectedLine
     warnings : list of str
     relative : bool
-        Do the times count from an origin that nobody named?
+        True if the times count from an unknown origin.
     clock_from : str, optional
-        ``written`` where all times carry an offset or are epochs.
+        ``written`` if all times have an offset or are epochs.
     height_from : str, optional
-        Of the track, where the table says more than its format.
+        The source of the track's heights, if the table shows more than its format.
     about : dict
-        Attributes of all streams: who wrote these rows.
+        Attributes of all streams, such as the device that wrote these rows.
     at : int array, shape (n,)
-        Index of each row among those that were given to :func:`built`.
+        Index of each row among the rows passed to :func:`built`.
     data : bytes
-        The text itself, for what stands between the rows.
+        The complete text, for lines between the rows.
     """
 
     reader: str
@@ -87,7 +86,7 @@ class Rows:
         return len(self.row)
 
     def number(self, name: str, *, none: Iterable[bytes] = (b"n/a", b"-")) -> FloatArray:
-        """A column as numbers; empty text and the words for none are NaN."""
+        """Return a column as numbers, NaN for empty text and the words in ``none``."""
         cells = self.columns[name]
         if cells.dtype.kind == "f":
             return np.asarray(cells, dtype=np.float64)
@@ -96,15 +95,15 @@ class Rows:
         return np.asarray(_text.numbers(cells), dtype=np.float64)
 
     def si(self, name: str) -> FloatArray:
-        """A column of numbers with SI suffix: ``-4.3k`` is -4300."""
+        """Return a column of numbers with SI suffixes: ``-4.3k`` is -4300."""
         cells = [cell.strip() for cell in self.columns[name].tolist()]
-        scaled = [cell[-1:] in _SI and cell[-2:-1].isdigit() for cell in cells]  # 'nan' is no nano
+        scaled = [cell[-1:] in _SI and cell[-2:-1].isdigit() for cell in cells]  # 'nan' is not a nano
         scale = np.array([_SI[cell[-1:]] if mark else 1.0 for cell, mark in zip(cells, scaled, strict=True)])
         plain = _text.cells([cell[:-1] if mark else cell for cell, mark in zip(cells, scaled, strict=True)])
         return np.asarray(replace(self, columns={name: plain}).number(name) * scale, dtype=np.float64)
 
     def text(self, name: str) -> list[str]:
-        """A column as text."""
+        """Return a column as text."""
         return [cell.decode("utf-8", "replace") for cell in self.columns[name].tolist()]
 
     def mark(self, where: BoolArray, reason: str) -> None:
@@ -112,7 +111,7 @@ class Rows:
         _text.add_flag(self.flag, where, reason)
 
     def part(self, where: BoolArray) -> Rows:
-        """The rows that a mask holds; warnings and rejected lines are shared, the account stays that of all."""
+        """Return the rows of a mask, which share the warnings and the account of all rows."""
         columns = {name: cells[where] for name, cells in self.columns.items()}
         return replace(
             self, row=self.row[where], time=self.time[where], flag=self.flag[where], at=self.at[where], columns=columns
@@ -130,22 +129,23 @@ class Rows:
         about: Mapping[str, Attribute | None] | None = None,
         **attributes: Attribute | None,
     ) -> Stream | None:
-        """A stream of all rows, or of those of a mask; None where there are none.
+        """Return a stream of all rows or of those of a mask, or None if it is empty.
 
         Parameters
         ----------
         kind, name : str
         values : mapping
-            Columns of the kind, and any others, each of shape (n,).
+            Columns of the kind and further columns, each of shape (n,).
         where : bool array, shape (n,), optional
         pick : int array, shape (m,), optional
-            Index of the row of each record, for rows that hold several; ``values`` and ``flag`` are of shape (m,) then.
+            Index of the row of each record, for rows with several records; ``values`` and ``flag`` have shape (m,)
+            then.
         flag : object array, shape (n,), optional
-            In place of the flags that all streams of the rows share.
+            Flags of this stream, instead of those that all streams share.
         about : mapping, optional
             Further attributes.
         **attributes
-            Attributes; None leaves one out.
+            Attributes; those that are None are omitted.
 
         Returns
         -------
@@ -166,23 +166,23 @@ class Rows:
         return Stream(kind, name, frame, _text.attributes(self.options, **attributes))
 
     def level(self, values: FloatArray) -> tuple[FloatArray, AnyArray]:
-        """Levels with those at or below the floor as NaN, and their flags ``out_of_coverage``."""
+        """Return levels, NaN at or below the floor, and flags with ``out_of_coverage`` there."""
         flag, level = self.flag.copy(), np.array(values, dtype=np.float64)
-        silent = ~(level > self.options.floor_db)  # +inf is no silence: the limits of all readers flag it
+        silent = ~(level > self.options.floor_db)  # +inf is flagged by the limits of all readers
         _text.add_flag(flag, silent, "out_of_coverage")
         level[silent] = np.nan
         return level, flag
 
     def rank(self, ri: FloatArray, *, none: BoolArray | None = None) -> dict[str, FloatArray]:
-        """Columns ``rank`` and ``ri_raw`` of reported indicators; see :func:`ranks`."""
+        """Return the columns ``rank`` and ``ri_raw`` of reported indicators, by :func:`ranks`."""
         return {"rank": ranks(ri, self.flag, none=none), "ri_raw": ri}
 
     def result(self, streams: Iterable[Stream | None]) -> ReadResult:
-        """The streams that have rows, each with a name of its own, with the account."""
+        """Return the streams that have rows, under unique names, with the account."""
         names: dict[str, Stream] = {}
         for stream in streams:
             if stream is not None:
-                # names are unique in a file: what comes again (a console that was started anew) gets a number
+                # names are unique in a file: a console that was started again repeats them
                 alike = sum(name == stream.name or name.startswith(f"{stream.name}_again") for name in names)
                 name = f"{stream.name}_again{alike}" if alike else stream.name
                 names[name] = replace(stream, name=name) if alike else stream
@@ -209,7 +209,7 @@ def matched(
     skip: Callable[[IntArray], BoolArray] | None = None,
     clock: str = "wall",
 ) -> Rows:
-    r"""Rows of a log whose lines a pattern describes.
+    r"""Return the rows of a log whose lines match a pattern.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def matched(
         MULTILINE, from ``^`` to ``\r?$``, unable to cross a line end, every repetition bounded; named groups, one of
         them ``time``.
     reason : callable
-        Why a line that does not match is rejected, or None for a header, a comment or a console's talk.
+        Return why a line that does not match is rejected, or None for a header, a comment or other console output.
     skip : callable, optional
         Mask of the matching rows (0-based lines) that are comments.
     options : ReadOptions
@@ -257,7 +257,7 @@ def built(
     markup: IntArray | None = None,
     closed: bool = False,
 ) -> Rows:
-    """Rows from their lines and columns of text, ``time`` among them; see :func:`matched`.
+    """Return rows from their lines and their columns of text, one of them ``time``, as :func:`matched` does.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def built(
     markup : int array, optional
         0-based lines known to be comments.
     closed : bool
-        Are records known to be whole by their own end, whatever ends the line?
+        True if records have their own end mark, so that a missing line end does not matter.
 
     Returns
     -------
@@ -281,7 +281,7 @@ def built(
     """
     comment = np.zeros(len(rows), dtype=bool) if skip is None else skip(rows)
     before = list(extra)
-    # rejected before: they are accounted for, and are looked at no more
+    # lines rejected before are accounted for already
     known = np.concatenate((rows, np.array([line.number - 1 for line in before], dtype=np.int64))).astype(np.int64)
     blank, rejected = _text.remainder(lines, known, reason, blank=markup)
     rejected += before
@@ -311,7 +311,7 @@ def built(
 
 
 def _untimed(lines: _text.Lines, rows: IntArray, cells: AnyArray, valid: BoolArray, clock: str) -> list[RejectedLine]:
-    """Lines rejected for their time: it is of no known form, no date of the calendar, or beyond any flight."""
+    """Return the lines rejected for their time: an unknown form, not a date of the calendar, or beyond any flight."""
     bad = np.flatnonzero(~valid & ~np.isin(rows, rows[valid]))
     # a line of several records is rejected once
     bad = bad[np.unique(rows[bad], return_index=True)[1]] if len(bad) else bad
@@ -328,7 +328,7 @@ _FLIGHT_S = 9.0e9
 
 
 def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> tuple[bool, _text.Instants, BoolArray]:
-    """Instants of a column of times.
+    """Return the instants of a column of times.
 
     Parameters
     ----------
@@ -343,7 +343,7 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
     Returns
     -------
     relative : bool
-        Are the times without an origin?
+        True if the times have no origin.
     instants : Instants
     valid : bool array, shape (n,)
     """
@@ -368,7 +368,7 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
 
 
 def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = None) -> Stream | None:
-    """SNR stream of one tower; levels at or below the floor are out of coverage.
+    """Return the SNR stream of one tower; levels at or below the floor are flagged ``out_of_coverage``.
 
     Parameters
     ----------
@@ -377,7 +377,7 @@ def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = No
     values : (n,)
         [dB].
     where : (n,) bool, optional
-        Rows that are of this tower.
+        Rows of this tower.
 
     Returns
     -------
@@ -390,24 +390,24 @@ def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = No
 
 
 def ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = None, means: bool = False) -> FloatArray:
-    """Ranks of indicators that count from one, NaN for what is none; the reason is added to ``flag``, in place.
+    """Return the ranks of indicators that count from one, NaN for other values, and add reasons to ``flag`` in place.
 
     Parameters
     ----------
     ri : float array, shape (m,)
-        As written; NaN where nothing is.
+        As written, NaN where the log has no number.
     flag : object array, shape (m,)
     none : bool array, shape (m,), optional
-        Where the number means that nothing was reported.
+        True where the number means that nothing was reported.
     means : bool
-        Does the program print means over its period? Then a value between two ranks is none, but no fault.
+        True if the program prints means over its period: a value between two ranks is then missing, but not an error.
 
     Returns
     -------
     float array, shape (m,)
     """
     absent = np.isnan(ri) | (np.zeros(len(ri), dtype=bool) if none is None else none)
-    # 3GPP knows up to eight layers
+    # 3GPP specifies up to eight layers
     inside = (ri >= 1) & (ri <= 8) & ~absent
     integer = inside & (ri == np.round(ri))
     _text.add_flag(flag, absent, "no_csi")
@@ -419,9 +419,9 @@ def ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = None, mean
 def mean_rank(
     rows: Rows, ri: FloatArray, columns: Mapping[str, FloatArray], *, pick: IntArray | None = None
 ) -> list[Stream | None]:
-    """Rank streams ``gnb`` of a base station that prints means over its report period, 0 where nothing was reported.
+    """Return the rank streams ``gnb`` of a base station that prints means over its report period, 0 for no report.
 
-    A mean between two ranks is no rank: it stands in ``rank_mean`` and its row is flagged ``rank_is_a_mean``.
+    A mean between two ranks is not a rank: it is in ``rank_mean``, and its row is flagged ``rank_is_a_mean``.
 
     Parameters
     ----------
@@ -455,20 +455,22 @@ def of_ues(
     flag: AnyArray,
     about: Mapping[str, Attribute | None],
 ) -> list[Stream | None]:
-    """A stream per UE (RNTI, cell) where several were attached at once, else one: who attaches again gets a new RNTI.
+    """Return a stream per UE (RNTI, cell) if several were attached at once, else one stream for all RNTIs.
+
+    A UE that attaches again gets a new RNTI.
 
     Parameters
     ----------
     rows : Rows
     kind, name : str
-        Of the stream; of several each name ends in ``_rnti<hex>``, of one RNTI in several cells in ``_pci<n>``.
+        Kind and name. Names of several streams end in ``_rnti<hex>``, and in ``_pci<n>`` for one RNTI in several cells.
     values : mapping
-        Columns of shape (m,), ``rnti`` among them (NaN where the log names none).
+        Columns of shape (m,), one of them ``rnti`` (NaN if unknown).
     pick : int array, shape (m,), optional
         See :meth:`Rows.stream`.
     flag : object array, shape (m,)
     about : mapping
-        Attributes of all.
+        Attributes of all streams.
 
     Returns
     -------
@@ -496,7 +498,7 @@ def of_ues(
 
 
 def _divided(name: str, where: BoolArray, column: FloatArray, label: str) -> list[tuple[str, BoolArray, float | None]]:
-    """Rows by the values of a column where several of these are there at once, with that value; else all as one."""
+    """Divide rows by the values of a column if the times of several values overlap; else return them as one part."""
     known = np.unique(column[where & np.isfinite(column)]).tolist()
     if not _together([np.flatnonzero(where & (column == item))[[0, -1]] for item in known]):
         return [(name, where, known[0] if len(known) == 1 else None)]
@@ -507,7 +509,7 @@ def _divided(name: str, where: BoolArray, column: FloatArray, label: str) -> lis
 
 
 def _identity(numbers: FloatArray, most: int) -> FloatArray:
-    """Numbers that can be an identity, NaN for others: a fraction is none."""
+    """Return the numbers that can be an identity, and NaN for others, such as fractions."""
     return np.where((numbers >= 0) & (numbers <= most) & (numbers == np.round(numbers)), numbers, np.nan)
 
 
@@ -541,33 +543,32 @@ def reader(
     clock: str = "wall",
     skip: Callable[[bytes, IntArray], BoolArray] | None = None,
 ) -> Reader:
-    r"""A reader of lines that a pattern describes.
+    r"""Return a reader of lines that a pattern describes.
 
     Parameters
     ----------
     name, title, kinds, sample
         As of :class:`aerpaw_cmp.logs.readers.Reader`.
     row : re.Pattern or callable
-        See :func:`aerpaw_cmp.logs.rows.matched`; a callable makes it of the beginning of the file (of its
-        header, say).
+        See :func:`aerpaw_cmp.logs.rows.matched`. A callable makes it from the file, for instance from its header.
     streams : callable
-        ``streams(rows)``: the streams of the rows; its docstring is the reader's.
+        ``streams(rows)`` returns the streams of the rows.
     header : re.Pattern, optional
-        The whole line above a table: a comment wherever it stands. A file is known by its first line where there is
-        one, by ``mark`` where there is one, else by most of its first lines being rows.
+        The complete line above a table, which is a comment at any position. A file is recognised by this line or by
+        ``mark``, if there is one, else by most of its first lines being rows.
     mark : re.Pattern, optional
-        MULTILINE; a line by which a console is known.
+        MULTILINE; a line by which a console is recognised.
     torn : re.Pattern, optional
-        How a row of a console begins: such a line that is no row is rejected, all other lines are talk. Without it
-        every line that is neither row nor header is rejected.
+        The beginning of a row of a console: a line with it that is not a row is rejected, all other lines are comments.
+        Without it, every line that is neither a row nor the header is rejected.
     otherwise : str
         Reason of rejected lines.
     fields : int
-        Number of fields of a table: lines with others are rejected with their number.
+        Number of fields of a table; lines with another number are rejected.
     clock : str
         See :func:`aerpaw_cmp.logs.rows.times`.
     skip : callable, optional
-        ``skip(data, lines)``: which of the matching lines (0-based) are comments after all.
+        ``skip(data, lines)`` returns which of the matching lines (0-based) are comments.
 
     Returns
     -------

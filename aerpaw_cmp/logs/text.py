@@ -1,16 +1,10 @@
-"""Lines of a text log, their clocks, and the frames that are made of them.
+"""Lines of a text log, their clocks, and the frames of their records.
 
-Lines of a file as byte ranges, without making one Python object per line.
+Lines are byte ranges of a file, without a Python object per line. A line ends with LF, and a CR before it belongs to
+the line end. A last text without LF is a line, too; a file that ends with LF has no further, empty line.
 
-The accounting law starts here: a line ends with LF (a CR before it belongs to the line end); a last text
-without LF is a line too; a file that ends with LF has no further, empty line.
-
-Wall clocks to UTC, once and with the zone named.
-
-AERPAW nodes write naive America/New_York time almost everywhere; some authors then stored that wall clock
-as if it were UTC. Every reader comes here, so the rule exists once.
-
-Frames of the record model from plain arrays.
+Wall clocks of all readers become UTC here. AERPAW nodes write naive America/New_York time almost everywhere, and some
+authors stored that wall clock as if it were UTC.
 """
 
 from __future__ import annotations
@@ -33,7 +27,7 @@ from ..common.units import AnyArray, BoolArray, IntArray
 from .readers import ReadOptions
 from .records import COLUMNS, KEPT_REJECTED, Attribute, Kind, RejectedLine, RejectedReason, by_reason
 
-# Characters of a rejected line that are kept.
+# Characters of a rejected line that are stored.
 TEXT_LIMIT = 500
 
 # Flag of a record in a last line without line end: its last field may be cut short.
@@ -71,7 +65,7 @@ class Lines:
 
     @cached_property
     def blank(self) -> BoolArray:
-        """Mask of lines that hold white space only."""
+        """Mask of lines that contain white space only."""
         empty = self.ends <= self.starts
         # only short lines or those that begin with white space can be blank: few are looked at one by one
         first = self.buffer[np.minimum(self.starts, max(len(self.data) - 1, 0))] if len(self) else np.empty(0, np.uint8)
@@ -86,24 +80,24 @@ class Lines:
         return self.data[self.starts[i] : self.ends[i]]
 
     def number_at(self, offsets: Iterable[int]) -> IntArray:
-        """0-based lines in which bytes of the file lie."""
+        """Return the 0-based lines that contain bytes of the file, by their offsets."""
         return np.searchsorted(self.starts, np.array([*offsets], dtype=np.int64), side="right") - 1
 
     def text(self, i: int) -> str:
-        """Line ``i`` as text for people: at most ``TEXT_LIMIT`` characters, broken bytes replaced."""
+        """Return line ``i`` as text of at most ``TEXT_LIMIT`` characters, with undecodable bytes replaced."""
         piece = self.data[self.starts[i] : min(self.ends[i], self.starts[i] + 4 * TEXT_LIMIT)]
         return piece.decode("utf-8", errors="replace")[:TEXT_LIMIT]
 
     def reject(self, i: int, reason: str) -> RejectedLine:
-        """Line ``i`` as a rejected line."""
+        """Return line ``i`` as a rejected line."""
         return RejectedLine(int(i) + 1, reason, self.text(i))
 
     def reject_all(self, numbers: IntArray, reason: str) -> list[RejectedLine]:
-        """Several lines rejected for one reason."""
+        """Return several lines as rejected for one reason."""
         return [self.reject(int(i), reason) for i in numbers]
 
     def fixed(self, numbers: IntArray, width: int) -> AnyArray:
-        """Bytes of equally long lines as a ``(len(numbers), width)`` uint8 array."""
+        """Return the bytes of equally long lines as a ``(len(numbers), width)`` uint8 array."""
         if len(numbers) == 0:
             return np.empty((0, width), dtype=np.uint8)
         starts = self.starts[numbers]
@@ -115,12 +109,12 @@ class Lines:
         return np.asarray(self.buffer[starts[:, None] + np.arange(width)])
 
 
-# Bytes that a look at each byte takes at a time: they stay in the processor's cache.
+# Bytes that are searched at a time: they fit in the processor's cache.
 _SLICE = 1 << 17
 
 
 def _places(buffer: AnyArray, byte: int) -> IntArray:
-    """Places where a byte stands, shape (n,)."""
+    """Return the offsets of a byte, shape (n,)."""
     starts = range(0, len(buffer), _SLICE)
     # slice by slice: a mask of a GiB would be a GiB
     parts = [np.flatnonzero(buffer[first : first + _SLICE] == byte) + first for first in starts]
@@ -152,7 +146,7 @@ def split(data: bytes) -> Lines:
 
 
 def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tuple[bytes, ...]]]:
-    r"""Lines that the pattern describes, and its groups.
+    r"""Return the lines that the pattern describes, and its groups.
 
     Parameters
     ----------
@@ -175,7 +169,7 @@ def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tupl
 
 
 class Rejects:
-    """Rejected lines of a log that is read in pieces: the first of them verbatim, all counted by reason."""
+    """The rejected lines of a log that is read in pieces: the first ones verbatim, and the number per reason."""
 
     def __init__(self) -> None:
         self.before = 0  # lines of the pieces in front of this one
@@ -183,7 +177,7 @@ class Rejects:
         self._reasons: list[RejectedReason] = []
 
     def add(self, lines: Lines, numbers: Sequence[int] | IntArray, reason: str) -> None:
-        """Lines (0-based) of a piece, for one reason; of each reason and piece the first are kept."""
+        """Add lines (0-based) of a piece for one reason; the first ones of each piece are stored."""
         if not len(numbers):
             return
         # numbers count from the first piece of the file
@@ -195,13 +189,13 @@ class Rejects:
                 self._first_lines.append(RejectedLine(int(i) + self.before + 1, reason, lines.text(int(i))))
 
     def add_line(self, number: int, reason: str, text: str) -> None:
-        """A line by its number from 1."""
+        """Add a line by its number, counted from 1."""
         self._reasons.append(RejectedReason(reason, 1, number, number))
         if len(self._first_lines) < 8 * KEPT_REJECTED:
             self._first_lines.append(RejectedLine(number, reason, text))
 
     def result(self) -> tuple[tuple[RejectedLine, ...], tuple[RejectedReason, ...]]:
-        """The first of them in the order of the file, and the reasons."""
+        """Return the first rejected lines in the order of the file, and the reasons."""
         ordered = sorted(self._first_lines, key=lambda line: line.number)[:KEPT_REJECTED]
         return tuple(ordered), by_reason(self._reasons)
 
@@ -209,15 +203,15 @@ class Rejects:
 def remainder(
     lines: Lines, accepted: IntArray, reason: Callable[[bytes], str | None], *, blank: IntArray | None = None
 ) -> tuple[int, list[RejectedLine]]:
-    """Account for the lines that gave no record.
+    """Account for the lines without a record.
 
     Parameters
     ----------
     lines : Lines
     accepted : int array
-        0-based numbers of the lines that gave records.
+        0-based numbers of the lines with records.
     reason : callable
-        Reason why a line is rejected, or None for a header or comment.
+        Return why a line is rejected, or None for a header or comment.
     blank : int array, optional
         0-based numbers already known to be headers or comments.
 
@@ -245,25 +239,25 @@ def remainder(
 
 
 def columns(groups: list[tuple[bytes, ...]], count: int) -> list[AnyArray]:
-    """Groups by column, as fixed-width byte arrays."""
+    """Return groups by column, as fixed-width byte arrays."""
     return [cells([group[i] for group in groups]) for i in range(count)]
 
 
 def cells(texts: Sequence[bytes]) -> AnyArray:
-    """Texts as an array of bytes; NumPy makes none of an empty list."""
+    """Return texts as an array of bytes, also of an empty list."""
     return np.array(texts or [b""], dtype=np.bytes_)[: len(texts)]
 
 
 def numbers(column: AnyArray) -> AnyArray:
-    """Text of numbers to float64; empty text is NaN."""
+    """Return text of numbers as float64, NaN for empty text."""
     if column.dtype.itemsize == 0 or len(column) == 0:
         return np.full(len(column), np.nan)
-    # Python programs print None for what they do not know
+    # Python programs print None for an unknown value
     return np.asarray(np.where((column == b"") | (column == b"None"), b"nan", column).astype(np.float64))
 
 
 def flags(count: int) -> AnyArray:
-    """Empty flag column."""
+    """Return an empty flag column."""
     column = np.empty(count, dtype=object)
     column.fill("")  # one object; np.full would make one per row
     return column
@@ -280,7 +274,7 @@ def add_flag(column: AnyArray, mask: BoolArray, reason: str) -> None:
 
 
 def first_lines(head: bytes, count: int = 40) -> list[bytes]:
-    """Complete, non-blank lines at the start of a file: what sniffers judge by."""
+    """Return complete, non-blank lines at the start of a file, which sniffers look at."""
     # enough for any forty lines of a log
     pieces = head[:16_384].split(b"\n")
     if len(head) > 16_384 or (len(pieces) > 1 and not head.endswith(b"\n")):
@@ -301,8 +295,8 @@ TIME = rb"\d{4}[-/]\d\d[-/]\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,9})?"
 # Optional offset behind :data:`TIME`.
 ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
 
-# Abbreviations of winter that people also write in summer, and those of several countries: hours east of UTC, and the
-# zone whose clock is turned.
+# Abbreviations of winter time that are also written in summer, and abbreviations of several countries: hours east of
+# UTC, and a zone with summer time.
 WINTER = {
     "EST": ((-5.0, "America/New_York"),), "CST": ((-6.0, "America/Chicago"),), "MST": ((-7.0, "America/Denver"),),
     "PST": ((-8.0, "America/Los_Angeles"),), "AKST": ((-9.0, "America/Anchorage"),), "CET": ((1.0, "Europe/Berlin"),),
@@ -313,7 +307,7 @@ WINTER = {
 
 
 class Count(NamedTuple):
-    """A unit that clocks count in: nanoseconds, what a column's name says, and the least count that is an epoch."""
+    """A unit of clocks: its nanoseconds, its pattern in the name of a column, and the least count that is an epoch."""
 
     ns: float
     said: re.Pattern[str]
@@ -336,18 +330,18 @@ _MONTH_DAYS = np.array([0, 31, 29, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])
 
 @dataclass(frozen=True)
 class Instants:
-    """UTC times and what is doubtful about them.
+    """UTC times, and which of them are doubtful.
 
     Parameters
     ----------
     time : datetime64[ns] array, shape (n,)
         UTC, naive.
     ambiguous, nonexistent : bool array, shape (n,)
-        Wall clock read twice, or never, because of a change of the clock.
+        Wall clock that occurs twice, or never, because of a change between winter and summer time.
     warnings : tuple of str
-        What the user should know.
+        Sentences for the user.
     zoned : bool
-        Do all texts carry an offset?
+        True if all texts have an offset.
     """
 
     time: AnyArray
@@ -363,7 +357,7 @@ class Instants:
 
 
 def zone(name: str | None, *, needed_by: str) -> tzinfo:
-    """The named zone; ``UsageError`` naming the key ``timezone:`` where there is none."""
+    """Return the named zone, or raise ``UsageError`` with the key ``timezone:`` if there is no name."""
     if not name:
         raise UsageError(
             f"no time zone for the zone-less clock of {needed_by}",
@@ -401,25 +395,25 @@ def _offsets_s(buckets: IntArray, where: tzinfo, fold: int) -> IntArray:
 
 
 def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Instants:
-    """Wall clock of a zone to UTC.
+    """Convert the wall clock of a zone to UTC.
 
-    A wall clock that exists twice is read as the first pass (daylight time) until the log's clock steps back by
-    half an hour or more, afterwards as the second; both are flagged. One that never existed is read
-    with the offset before the change, and flagged.
+    A wall clock that occurs twice is read as daylight time until the log's clock steps back by half an hour or more,
+    and as winter time afterwards. A wall clock that never occurs is read with the offset before the change. Both are
+    flagged.
 
     Parameters
     ----------
     wall_ns : int array, shape (n,)
-        Wall clock as nanoseconds since 1970-01-01 00:00 of the same wall.
+        Wall clock as nanoseconds since 1970-01-01 00:00 of the same wall clock.
     name : str or None
         IANA zone.
     needed_by : str
-        Whose clock, for the message.
+        Owner of the clock, for the message.
 
     Raises
     ------
     UsageError
-        If the zone is missing or unknown, or a winter time asked for in summer.
+        If the zone is missing or unknown, or is a winter time and the times are in summer.
     """
     where = zone(name, needed_by=needed_by)
     starts, buckets, index = _runs(wall_ns)
@@ -440,7 +434,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     if back < len(wall_ns):
         behind = ambiguous.copy()
         behind[:back] = False
-        # the second pass is later by what the clock was turned
+        # the second pass is later by the change of the clock
         utc[behind] += np.repeat((first - second)[index], length)[behind].astype("timedelta64[s]")
     warnings = []
     if ambiguous.any():
@@ -456,14 +450,14 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
 
 
 def _minus(wall_ns: IntArray, offset_s: IntArray, length: IntArray) -> AnyArray:
-    """UTC of wall clocks [ns] in runs of so many with one offset [s]; no more memory than the result."""
+    """Return UTC of wall clocks [ns] in runs of ``length`` with one offset [s], without further memory."""
     utc = np.repeat(offset_s * 1_000_000_000, length)
     np.subtract(wall_ns, utc, out=utc)
     return utc.view("datetime64[ns]")
 
 
 def _first_step_back(wall_ns: IntArray) -> int:
-    """Index behind the first step back by half an hour or more; the number of times where there is none."""
+    """Return the index after the first step back by half an hour or more, or the number of times."""
     for first in range(0, len(wall_ns) - 1, _AT_ONCE):
         whole_s = wall_ns[first : first + _AT_ONCE + 1] // 1_000_000_000
         steps = np.flatnonzero(whole_s[1:] - whole_s[:-1] <= -1800)
@@ -476,11 +470,11 @@ _AT_ONCE = 1 << 20
 
 
 def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Starts of runs of times within a quarter of an hour, the distinct quarters, and that of each run."""
+    """Return the starts of runs within a quarter of an hour, the distinct quarters, and the quarter of each run."""
     if len(wall_ns) == 0:
         none = np.zeros(0, dtype=np.int64)
         return none, none, none
-    # one look into the zone's table for a quarter of an hour of rows
+    # look up the zone once per quarter of an hour
     bucket = wall_ns // (_BUCKET_S * 1_000_000_000)
     starts = np.flatnonzero(np.concatenate(([True], bucket[1:] != bucket[:-1])))
     unique, index = np.unique(bucket[starts], return_inverse=True)
@@ -488,7 +482,7 @@ def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def wall_to_utc(wall_ns: IntArray, options: ReadOptions, *, needed_by: str) -> Instants:
-    """Zone-less clock to UTC under the options: local unless ``clock: utc`` says otherwise."""
+    """Convert a zone-less clock to UTC by the options: local unless ``clock: utc`` is set."""
     if options.clock == "utc":
         none = np.zeros(len(wall_ns), dtype=bool)
         return Instants(wall_ns.astype("datetime64[ns]"), none, none)
@@ -496,19 +490,19 @@ def wall_to_utc(wall_ns: IntArray, options: ReadOptions, *, needed_by: str) -> I
 
 
 def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
-    """Fixed-layout ``YYYY-mm-dd HH:MM:SS[.f...]`` to wall nanoseconds.
+    """Convert ``YYYY-mm-dd HH:MM:SS[.f...]`` of a fixed layout to wall nanoseconds.
 
     Parameters
     ----------
     cells : uint8 array, shape (n, 19) or (n, 20 + fraction)
-        One time per row; ``fraction`` digits behind the dot.
+        One time per row, with ``fraction`` digits after the dot.
 
     Returns
     -------
     wall_ns : int array, shape (n,)
         Zero where invalid.
     valid : bool array, shape (n,)
-        Is it a date of the calendar and a time of the day?
+        True for a date of the calendar and a time of day.
     """
     count = len(cells)
     if count == 0:
@@ -521,7 +515,7 @@ def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
     minute, dated = _minutes(cells[starts, :16])
     valid = np.repeat(dated, length)
     second, worst = integers(cells[:, 17:19])
-    # a leap second (60) is no second of datetime64
+    # datetime64 has no leap seconds (60)
     valid &= (worst <= 9) & (second < 60) & (cells[:, 16] == 58)
     wall = np.repeat(minute, length) + second * np.int64(1_000_000_000)
     if fraction:
@@ -533,10 +527,10 @@ def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
 
 
 def integers(cells: AnyArray, base: int = 10) -> tuple[IntArray, AnyArray]:
-    """Digits, uint8 of shape (n, some), as whole numbers; second, the largest digit, above 9 where one is none."""
+    """Return digits, uint8 of shape (n, m), as integers, and the largest digit, above 9 if one is not a digit."""
     total, worst = np.zeros(len(cells), dtype=np.int64), np.zeros(len(cells), dtype=np.uint8)
     for column in cells.T:
-        # what is no digit wraps to more than 9
+        # other characters wrap to more than 9
         digit = column - np.uint8(48)
         np.maximum(worst, digit, out=worst)
         total *= base
@@ -545,7 +539,7 @@ def integers(cells: AnyArray, base: int = 10) -> tuple[IntArray, AnyArray]:
 
 
 def _minutes(cells: AnyArray) -> tuple[IntArray, BoolArray]:
-    """``YYYY-mm-dd HH:MM``, uint8 of shape (n, 16), to wall nanoseconds, and whether it is such a minute."""
+    """Convert ``YYYY-mm-dd HH:MM``, uint8 of shape (n, 16), to wall nanoseconds, and return which are valid."""
     digit = cells[:, [0, 1, 2, 3, 5, 6, 8, 9, 11, 12, 14, 15]].T.astype(np.int32) - 48
     valid = np.all((digit >= 0) & (digit <= 9), axis=0)
     for place, allowed in ((4, b"-/"), (7, b"-/"), (10, b" T"), (13, b":")):
@@ -555,7 +549,7 @@ def _minutes(cells: AnyArray) -> tuple[IntArray, BoolArray]:
     inside = np.clip(month, 1, 12)
     leap = (year % 4 == 0) & ((year % 100 != 0) | (year % 400 == 0))
     days = _MONTH_DAYS[inside] - ((inside == 2) & ~leap)
-    # datetime64[ns] spans 1678-2262; a log outside 1970-2261 is a clock that was never set
+    # datetime64[ns] spans 1678-2262; a clock outside 1970-2261 was never set
     valid &= (year >= 1970) & (year <= 2261) & (month == inside) & (day >= 1) & (day <= days)
     valid &= (hour < 24) & (minute < 60)
     months = (year.astype(np.int64) - 1970) * 12 + inside - 1
@@ -565,16 +559,16 @@ def _minutes(cells: AnyArray) -> tuple[IntArray, BoolArray]:
 
 
 def parse_texts(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolArray]:
-    """Times as byte strings of mixed length (the form of :data:`TIME` + :data:`ZONE`).
+    """Parse times as byte strings of mixed length (the form of :data:`TIME` + :data:`ZONE`).
 
     Returns
     -------
     wall_ns, valid : arrays, shape (n,)
         As :func:`parse_digits`.
     offset_s : int array, shape (n,)
-        Offset written in the text, else 0.
+        Offset in the text, else 0.
     zoned : bool array, shape (n,)
-        Does the text carry an offset?
+        True if the text has an offset.
     """
     count = len(column)
     wall, offset = np.zeros((2, count), dtype=np.int64)
@@ -611,13 +605,13 @@ def _zone_s(text: bytes) -> int | None:
 
 
 def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> tuple[Instants, BoolArray]:
-    """Times as text to UTC: an offset in the text wins, the rest is wall clock of the zone.
+    """Convert times as text to UTC, by the offset in the text, else as wall clock of the zone.
 
     Returns
     -------
     instants : Instants
     valid : bool array, shape (n,)
-        Times that are none are False, and 1970-01-01 in ``instants``.
+        Invalid times are False, and 1970-01-01 in ``instants``.
     """
     wall, valid, offset, zoned = parse_texts(column)
     naive = valid & ~zoned
@@ -630,7 +624,7 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
     zones = np.unique(offset[zoned & valid])
     alike = (wall[naive] - zones[0] * 1_000_000_000).astype("datetime64[ns]") if len(zones) == 1 else None
     if alike is not None and _beside(alike, utc[zoned & valid]):
-        # one program wrote them all: what some of its rows lack is what the others have
+        # one program wrote all rows: times without a zone have that of the others
         where = f"UTC {zones[0] / 3600:+g} h"
         text = f"{counted(int(naive.sum()), 'time')} without a zone between times at {where}: read as at {where}, too"
         utc[naive] = alike
@@ -649,14 +643,14 @@ def _beside(times: AnyArray, others: AnyArray) -> bool:
 
 
 def origin_ns(options: ReadOptions, *, needed_by: str) -> int | None:
-    """``time_origin`` as UTC nanoseconds; None where the option is absent."""
+    """Return ``time_origin`` as UTC nanoseconds, or None if the option is absent."""
     if options.time_origin is None:
         return None
     text = str(options.time_origin).strip().encode()
     instants, valid = texts_to_utc(np.array([text or b"-"]), options, needed_by=f"time_origin of {needed_by}")
     if not valid[0]:
         raise UsageError(
-            f"time_origin {options.time_origin!r} is no time",
+            f"time_origin {options.time_origin!r} is not a time",
             expected="an ISO time such as 2024-07-02T15:37:10.5Z, or local time with 'timezone:'",
         )
     return int(instants.time.astype(np.int64)[0])
@@ -668,9 +662,9 @@ _INTEGERS = ("fix", "satellites")
 def frame(
     kind: Kind, time: AnyArray, line: AnyArray, flag: AnyArray, values: Mapping[str, AnyArray], *, own: bool = False
 ) -> pd.DataFrame:
-    """Frame of a kind; columns that the log does not have are NaN (``fix`` and ``satellites``: -1).
+    """Return the frame of a kind, with NaN in columns that the log does not have (``fix``, ``satellites``: -1).
 
-    Its columns are copies, each an array of its own: streams of one log share their times.
+    Its columns are copies, because streams of one log share their times.
 
     Parameters
     ----------
@@ -678,13 +672,13 @@ def frame(
     time : (n,)
         datetime64[ns], UTC.
     line : (n,)
-        Of the file, from 1.
+        Lines of the file, from 1.
     flag : (n,)
-        Reasons, empty where there is none.
+        Reasons, empty if there is no reason.
     values : mapping of str to (n,)
         Columns of the kind that the log has.
     own : bool
-        Whether the arrays are given away: a log of 1 GB has no room for copies.
+        True if the arrays can be used without copies, as for a log of 1 GB.
 
     Returns
     -------
@@ -712,7 +706,7 @@ def frame(
 
 
 def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Attribute]:
-    """Attributes from the options, then those of the reader; what is unknown is left out."""
+    """Return the known attributes from the options and from the reader."""
     merged: dict[str, Attribute | None] = {
         "node": options.node, "channel": options.channel, "frequency_hz": options.frequency_hz,
         "timezone": options.timezone, **extra,
@@ -721,12 +715,12 @@ def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Att
 
 
 def steps_back(records: pd.DataFrame) -> int:
-    """Number of places where the clock of a log runs backwards."""
+    """Count the places where the clock of a log runs backwards."""
     time = records["time"].to_numpy()
     # NaT compares as False
     return int(np.count_nonzero(time[1:] < time[:-1]))
 
 
 def back_in_time(places: int) -> list[str]:
-    """Warning where there are any."""
+    """Return a warning if there are such places."""
     return [f"time steps back at {counted(places, 'place')}"] if places else []

@@ -1,4 +1,4 @@
-"""Levels of several cells that one row of a log holds: a stream per cell, with the times when it served the phone."""
+"""Levels of several cells in one row of a log: a stream per cell, with the times when it served the phone."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ _RANGE_DBM = (-170.0, -1.0)
 
 
 class Reading(NamedTuple):
-    """Levels of one cell in one row: a row of the table that :func:`streams` takes.
+    """The levels of one cell in one row, a row of the table for :func:`streams`.
 
     Parameters
     ----------
     row : int
         Index into the rows.
     rat : str
-        ``lte``, ``nr``, or empty where the log does not say.
+        ``lte``, ``nr``, or empty if unknown.
     pci, arfcn : float
-        Physical cell identity and carrier, NaN where unknown.
+        Physical cell identity and carrier, NaN if unknown.
     rsrp_dbm : float
     serving : bool
-        Does the log call it the serving cell?
+        True for a serving cell.
     more : str
-        Name of what distinguishes it from other cells of its PCI and carrier, such as a beam.
+        Name that distinguishes cells of one PCI and carrier, such as a beam.
     rsrq_db, rssi_dbm, sinr_db, pathloss_db : float
     """
 
@@ -58,7 +58,7 @@ QUALITIES = Reading._fields[7:]
 
 
 def reading(row: int, fields: Mapping[str, float], *, rat: str, serving: bool) -> Reading:
-    """Levels of one cell from the fields of an object or of a table row, by their names; see :class:`Reading`."""
+    """Return the :class:`Reading` of one cell from the fields of an object or of a table row, by their names."""
     known: dict[str, float] = {}
     for name, value in fields.items():
         what = dictionary.meaning(name)
@@ -81,11 +81,11 @@ def streams(
     quantity: str = "RSRP",
     more: Mapping[str, Mapping[str, Attribute]] | None = None,
 ) -> list[Stream]:
-    """A stream per cell: radio access, PCI and carrier. Every reading with a level is a record.
+    """Return a stream per cell, which is a radio access, PCI and carrier. Every reading with a level is a record.
 
-    A cell is serving from the moment that the log says so until it names another of the same radio access. A PCI that
-    the log knows on one carrier only is one cell, also where a reading names no carrier; of several carriers each is a
-    cell of its own. The same cell a second time in one row of the log is flagged ``cell_twice``.
+    A cell serves from the moment at which the log names it until the log names another one of the same radio access. A
+    PCI with one carrier in the log is one cell, also in readings without a carrier. With several carriers, each is a
+    cell. A second reading of a cell in one row of the log is flagged ``cell_twice``.
 
     Parameters
     ----------
@@ -94,13 +94,13 @@ def streams(
         A table has the fields of :class:`Reading` as columns.
     source : str
     quantity : str
-        The level that they hold.
+        Quantity of the levels.
     more : mapping, optional
-        Further attributes of the cells, by the readings' ``more``.
+        Further attributes of the cells, by ``more`` of the readings.
     """
     rows_or_table = readings if isinstance(readings, pd.DataFrame) else [*readings]
     table = pd.DataFrame(rows_or_table, columns=list(Reading._fields))
-    # stable: of two readings of a row the second is the one flagged cell_twice
+    # stable, so that the second of two readings of a row is flagged cell_twice
     table = table[np.isfinite(table["rsrp_dbm"].to_numpy(np.float64))].sort_values("row", kind="stable")
     table = table.assign(served=_serving(table), pci=table["pci"].where(table["pci"] >= 0, -1.0))
     per_cell: list[Stream] = []
@@ -124,7 +124,7 @@ def streams(
 
 
 def _serving(table: pd.DataFrame) -> FloatArray:
-    """1 where the reading is of the cell that serves, 0 where another does, NaN where nothing is known."""
+    """Return 1 for readings of the serving cell, 0 if another cell serves, NaN if unknown."""
     row, rats, serving = (table[name].to_numpy() for name in ("row", "rat", "serving"))
     # NaN equals nothing: cells without a carrier are compared as -1
     cell = np.stack([table["pci"], table["arfcn"].fillna(-1.0), pd.factorize(table["more"])[0]])
@@ -132,7 +132,7 @@ def _serving(table: pd.DataFrame) -> FloatArray:
     for rat in np.unique(rats[serving.astype(bool)]).tolist():
         of_rat = np.flatnonzero(rats == rat)
         named = of_rat[serving[of_rat].astype(bool)]
-        # all readings of a row at once: the serving one may stand behind its neighbours
+        # all readings of a row at once, because neighbours may come before the serving cell
         last = np.searchsorted(row[named], row[of_rat], side="right") - 1
         of_rat, last = of_rat[last >= 0], last[last >= 0]
         served[of_rat] = serving[of_rat] | (cell[:, of_rat] == cell[:, named[last]]).all(axis=0)
@@ -140,7 +140,7 @@ def _serving(table: pd.DataFrame) -> FloatArray:
 
 
 def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attribute | None]) -> Stream:
-    """Readings of one cell, in the order of the log."""
+    """Return the stream of one cell, in the order of the log."""
     row, level = table["row"].to_numpy(), table["rsrp_dbm"].to_numpy(np.float64, copy=True)
     flag = rows.flag[row]
     outside = ~((level >= _RANGE_DBM[0]) & (level <= _RANGE_DBM[1]))
@@ -150,21 +150,21 @@ def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: str, about: Mapping[str
             f"{_RANGE_DBM[1]:g} dBm (the first: {level[outside][0]:g}; another unit, or an index?): "
             "read as out of coverage"
         )
-    # phones write the end of the scale (3GPP TS 36.133, 9.1.4) where they hear nothing; a weak cell fades down to it
+    # phones write the end of the scale (3GPP TS 36.133, 9.1.4) without a signal; a weak cell fades down to it
     ends = (level == _END_DBM) & (about["quantity"] == "RSRP")
     if ends.any() and not ((level > _END_DBM) & (level < _END_DBM + 10.0)).any():
         outside |= ends
         levels = counted(int(ends.sum()), "level")
         rows.warnings.append(f"{cell}: {levels} of {_END_DBM:g} dBm, none within 10 dB above: read as out of coverage")
     if about["quantity"] == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
-        rows.warnings.append(f"{cell}: RSSI lies below RSRP, which cannot be: are the columns exchanged?")
+        rows.warnings.append(f"{cell}: RSSI is below RSRP, which is impossible: are the columns swapped?")
     _text.add_flag(flag, outside, "out_of_coverage")
     _text.add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")
     level[outside] = np.nan
     values: dict[str, AnyArray] = {"rss_db": level, "serving": table["served"].to_numpy()}
     for name in QUALITIES:
         quality = table[name].to_numpy(np.float64)
-        finite = np.isfinite(quality)  # a ratio or loss written as 'inf' is none
+        finite = np.isfinite(quality)  # 'inf' means a missing ratio or loss
         if finite.any():
             values[name] = np.where(finite, quality, np.nan)
     stream = rows.stream(
@@ -179,24 +179,24 @@ def named(
     rows: _rows.Rows, name: str, values: FloatArray, *, unit: str = "", where: BoolArray | None = None,
     about: Mapping[str, Attribute | None] | None = None, alone: bool = False,
 ) -> Stream | None:  # fmt: skip
-    """Level or KPI stream of a column by its name; of an unknown one, a KPI under its own name.
+    """Return the level or KPI stream of a column by its name, or a KPI if the name is unknown.
 
-    A level of a neighbour that nobody names, one that the base station measured, a statistic, a prediction are KPIs.
+    Levels of neighbours without an identity, levels at the base station, statistics and predictions are KPIs.
 
     Parameters
     ----------
     rows : Rows
     name : str
-        As the log calls it.
+        Name in the log.
     values : (n,)
     unit : str
-        Where the quantity does not say.
+        Unit, if the quantity has none.
     where : (n,) bool, optional
-        Rows that count.
+        Rows of the stream.
     about : mapping, optional
         Further attributes.
     alone : bool
-        No level or rank stands beside it: a ratio to the noise is one.
+        True if there is no level or rank: a ratio to the noise is then the level.
     """
     meaning = dictionary.meaning(name)
     quantity = dictionary.Quantity(name, "kpi", ()) if meaning is None else meaning.quantity

@@ -21,29 +21,28 @@ from . import _sheet
 PLACE = ("latitude_deg", "longitude_deg", "altitude_m")
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 VELOCITIES = ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
-# Attributes of a stream that say how its heights are known.
+# Attributes of a stream about the source of its heights.
 Height = dict[str, Attribute | None]
-# No count is so large.
-# Integers hold neither NaN nor infinity: what is no count becomes -1.
+# Larger numbers, NaN and infinity are not counts and become -1.
 _MOST = 1e9
 
 
 def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> Stream | None:
-    """The telemetry stream of a table; None where it has no position.
+    """Return the telemetry stream of a table, or None if it has no position.
 
-    Rows whose cells of the position are empty are left out unless all are.
+    Rows without a position are omitted unless all rows are.
 
     Parameters
     ----------
     rows : Rows
     sheet : Sheet
     name, source : str
-        Of the stream, and where its pose comes from.
+        Name of the stream, and the source of its pose.
     """
     latitude, longitude = sheet.find("latitude_deg"), sheet.find("longitude_deg")
     if latitude is None or longitude is None:
         if (grid := sheet.find("grid")) is not None:
-            text = "a position on a grid or in one text, which is not read: add columns of latitude and longitude"
+            text = "positions on a grid or in one text are not read: add columns of latitude and longitude"
             rows.warnings.append(f"column {sheet.names[grid]!r}: {text}")
         return None
     known = [(i, what.quantity) for i, what in enumerate(sheet.meanings) if what and what.quantity.name == PLACE[0]]
@@ -75,7 +74,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
         if (column := sheet.find(key)) is not None:
             count = sheet.numbers(column)
             values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
-    where = None if lost.all() else written  # a row of 0, 0 is a reading without a fix
+    where = None if lost.all() else written  # a row at 0, 0 is a reading without a fix
     return rows.stream("telemetry", name, values, where=where, source=source, about=about)
 
 
@@ -100,7 +99,7 @@ def without_fix(sheet: _sheet.Sheet) -> BoolArray:
             # MAVLink counts 1 without a fix and 3 with one; the quality of NMEA, which has no 3, is 1 with a fix
             of_mavlink = re.search("type|status|mode", words) is not None and (values >= 3).any()
             none = values <= float(of_mavlink or ((values == 3).any() and "qual" not in words))
-        # a column that says so throughout is one that the program does not fill
+        # a column with this value throughout is not filled by the program
         if (values[~none] > 0).any():
             unfixed |= none
     return unfixed
@@ -113,7 +112,7 @@ def of_readings(
     lines: _text.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine],
     options: ReadOptions, *, reader: str,
 ) -> ReadResult:  # fmt: skip
-    """Return the telemetry ``vehicle`` of readings with a time and a position; see :func:`._sheet.of_readings`."""
+    """Return the telemetry ``vehicle`` of readings with a time and a position, by :func:`._sheet.of_readings`."""
     sheet = _sheet.of_readings(lines, readings, rejected)
     rows = _sheet.rows(sheet, options, reader=reader) if readings else None
     if rows is None:
@@ -124,15 +123,15 @@ def of_readings(
 
 
 def whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> str:
-    """Return the clause about the one of two angles that has whole degrees only; empty if there is none."""
+    """Return the clause about one of two angles that has whole degrees only, or an empty text."""
     known = [angle[np.isfinite(angle)] for angle in (values[key] for key in PLACE[:2])]
     # a receiver writes decimals even at rest; an index or a count does not
     coarse = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]
-    return f"{names[coarse.index(True)]!r} has whole degrees alone" if coarse[0] != coarse[1] else ""
+    return f"{names[coarse.index(True)]!r} has whole degrees only" if coarse[0] != coarse[1] else ""
 
 
 def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
-    """Put NaN for positions that cannot be (or 0, 0) into a dictionary of columns; their mask."""
+    """Replace impossible positions and 0, 0 by NaN in a dictionary of columns, and return their mask."""
     latitude, longitude = values["latitude_deg"], values["longitude_deg"]
     # receivers write 0, 0 before their first fix
     possible = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
@@ -146,7 +145,7 @@ def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
 
 
 def _height(rows: _rows.Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
-    """Datum and values of the column of heights whose datum is of most use: the dictionary has them in that order."""
+    """Return datum and values of the most useful column of heights; the dictionary has them in that order."""
     column = sheet.find("altitude_m")
     if column is None:
         rows.warnings.append("no column is known as a height: give the track another log, or heights are unknown")
@@ -170,18 +169,18 @@ def _height(rows: _rows.Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
 
 # Columns that name the datum of the heights.
 _OF_DATUM = re.compile(r"(vertical )?(alt|altitude|height)? ?(ref|reference|type|datum|mode|frame)( frame)?")
-# Home moved where it is further than this from where it was [m]; an aircraft that is so much higher has taken off [m].
+# Home has moved if its altitude changes by more than this [m]. An aircraft that is this much higher has taken off [m].
 MOVED_M, _OFF_M = 0.5, 2.0
-# A home this near sea level [m] is not set: the two heights of a record are the same number, but for rounding.
+# A home this near sea level [m] is not set: the two heights of a record are then equal, except for rounding.
 UNSET_M = 0.01
 
 
 def above_home(
     rows: _rows.Rows, time_s: FloatArray, altitude: FloatArray, home_s: FloatArray, home_m: FloatArray
 ) -> FloatArray:
-    """Heights above the home at take-off, of altitudes above sea level and the altitudes of home at their times."""
+    """Return heights above the home at take-off, from altitudes above sea level of the aircraft and of home."""
     if (known_home := np.abs(home_m) > UNSET_M).any() and not known_home.all():
-        # until the autopilot knows its home, it reports the altitude of its filter as the height above home
+        # before home is set, the autopilot reports the altitude of its filter as the height above home
         home_s, home_m = home_s[known_home], home_m[known_home]
         begin = int(np.searchsorted(time_s, home_s[0]))
         step_m = altitude[begin - 1] - altitude[begin] if 0 < begin < len(altitude) else 0.0
@@ -237,19 +236,19 @@ _JITTER_M, _STEADY = 0.1, 0.9
 def above_takeoff(
     rows: _rows.Rows, values: dict[str, AnyArray], datum: str, lost: BoolArray
 ) -> tuple[FloatArray, Height]:
-    """Heights above take-off, and the attributes that say how they are known.
+    """Return heights above take-off, and the attributes about their source.
 
-    Heights above sea level, or above nothing that anybody says, count from the height at rest on the ground before the
-    climb: a hover is no ground. Without such a rest they count from the first position.
+    Heights above sea level or an unknown datum count from the height at rest on the ground before the climb, which is
+    not a hover. If there is no such rest, they count from the first position.
 
     Parameters
     ----------
     rows : Rows
-        ``height_from`` says who told the datum.
+        Their ``height_from`` is the source of the datum.
     values : dict
-        ``latitude_deg``, ``longitude_deg`` and ``altitude_m`` as the log has it.
+        ``latitude_deg``, ``longitude_deg`` and ``altitude_m`` as in the log.
     datum : str
-        As in the dictionary.
+        Datum as in the dictionary.
     lost : bool array, shape (n,)
         Rows without a position.
     """
@@ -270,13 +269,13 @@ def above_takeoff(
     rest = _ground(*(column[known] for column in (rows.time, *(values[name] for name in PLACE))))
     first = float(altitude[known[0]]) if rest is None else rest
     climbs = rest is not None
-    # a hover may begin anywhere: its lowest height says whether 0 was the ground
+    # a hover may begin anywhere: its lowest height shows whether 0 was the ground
     if datum == "unknown" and abs(first if climbs else np.abs(altitude[known]).min()) < _NEAR_ZERO_M:
         return altitude, about | {"height_datum": "take-off"}
     if datum == "unknown" and not climbs:
         rows.warnings.append(
-            f"altitude begins at {first:.1f} m and nothing says above what (sea level, ground or take-off?), nor does "
-            "the track begin on the ground: read as above take-off"
+            f"altitude begins at {first:.1f} m above an unknown datum (sea level, ground or take-off?), and the track "
+            "does not begin on the ground: read as above take-off"
         )
         return altitude, about
     how = "that at rest on the ground" if climbs else "that of the first position"
@@ -288,7 +287,7 @@ def above_takeoff(
 
 # No small aircraft climbs so fast [m/s].
 _FASTEST_MPS = 60.0
-# What begins within a few metres of zero is relative to take-off.
+# Heights that begin within this distance of zero are relative to take-off.
 _NEAR_ZERO_M = 10.0
 # Other heights are damaged or placeholders.
 _POSSIBLE_M = (-1000.0, 20_000.0)
@@ -297,11 +296,11 @@ _DEGREE_M = 111_000.0
 
 
 def _without_first_zeros(altitude: FloatArray, time: AnyArray | None) -> FloatArray:
-    """Altitudes whose first rows are 0 and all others far from it: a receiver before its first fix; NaN there.
+    """Return altitudes with NaN in first rows of 0 if all others are far from 0: the receiver had no fix yet.
 
-    Of heights above nobody knows what, with their times, only where no aircraft climbs so fast.
+    With times, as for an unknown datum, only if the step is faster than any climb.
     """
-    # of heights that are 0 throughout argmax is 0 as well: nothing is left out
+    # argmax is also 0 for heights that are 0 throughout: nothing is removed
     begun = int(np.argmax(np.nan_to_num(altitude) != 0))
     if not begun or np.nanmin(np.abs(altitude[begun:])) < _NEAR_ZERO_M:
         return altitude
@@ -313,9 +312,9 @@ def _without_first_zeros(altitude: FloatArray, time: AnyArray | None) -> FloatAr
 
 
 def _ground(*track: AnyArray) -> float | None:
-    """Height at rest of a track (time, latitude, longitude, altitude) that climbs from it or comes back to it.
+    """Return the height at rest of a track (time, latitude, longitude, altitude) that climbs from it or returns to it.
 
-    A hover is no ground: the aircraft then flies lower than that.
+    A height at which the aircraft hovers is not the ground, because the aircraft also flies lower.
     """
     altitude = track[3]
     for rest in (at_rest(*track), at_rest(*(column[::-1] for column in track))):
@@ -325,7 +324,7 @@ def _ground(*track: AnyArray) -> float | None:
 
 
 def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> float | None:
-    """Height of the ground: where a track begins at one place and one height, the last of that; else None."""
+    """Return the height of the ground if a track begins at rest, else None."""
     seconds = np.abs((time - time[0]) / np.timedelta64(1, "s"))
     north, east = ((column - column[0]) * _DEGREE_M for column in (latitude, longitude))
     step_s = np.maximum(np.abs(np.diff(seconds, prepend=seconds[0] - 1.0)), 0.1)
@@ -342,27 +341,27 @@ def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitud
 
 
 def _attitude(rows: _rows.Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
-    """Angles in degrees: by the unit of the name, by the program, and only then by the values of all three."""
+    """Return angles in degrees by the unit in the name, by the program, or else by the values of all three."""
     columns = {key: column for key in ANGLES if (column := sheet.find(key)) is not None}
     values = {key: sheet.numbers(column) for key, column in columns.items()}
     named = any(sheet.unit(column) for column in columns.values())
     if not named and are_radians(values):
-        rows.warnings.append("nothing names the unit of the angles: by their values they were read as radians, a guess")
+        rows.warnings.append("the unit of the angles is unknown: read as radians by their values, a guess")
         values = {key: np.degrees(value) for key, value in values.items()}
     elif not named and not set(ANGLES) <= set(values) and are_small(values):
         rows.warnings.append(small_angles(values))
     yaw = values.get("yaw_deg")
-    # no aircraft keeps due north to the last digit
+    # no aircraft points due north to the last digit
     if yaw is not None and len(yaw) > 2 and np.isfinite(yaw).any() and not np.nan_to_num(yaw).any():
-        rows.warnings.append("the yaw is 0 throughout: read as not known")
+        rows.warnings.append("the yaw is 0 throughout: read as unknown")
         values["yaw_deg"] = np.full(len(yaw), np.nan)
     return values
 
 
 def small_angles(values: Iterable[str]) -> str:
-    """Sentence about angles whose unit neither a name nor the values tell."""
+    """Return the sentence about angles whose unit is neither in a name nor visible in the values."""
     words = " and ".join(name.removesuffix("_deg") for name in values)
-    return f"nothing names the unit of {words}, and no value is beyond 2 pi: read as degrees; or is it 'yaw [rad]'?"
+    return f"the unit of {words} is unknown, and no value is beyond 2 pi: read as degrees; or is it 'yaw [rad]'?"
 
 
 def are_small(values: dict[str, FloatArray]) -> bool:
@@ -372,9 +371,9 @@ def are_small(values: dict[str, FloatArray]) -> bool:
 
 
 def are_radians(values: dict[str, FloatArray]) -> bool:
-    """Check whether roll, pitch and yaw all lie where radians of an aircraft do, and no degrees are likelier.
+    """Check whether roll, pitch and yaw are in the range of radians.
 
-    In degrees a flight with such values never turned away from north by more than six degrees.
+    In degrees, a flight with such values would never turn by more than six degrees from north.
     """
     if set(values) != set(ANGLES) or not all(np.isfinite(value).any() for value in values.values()):
         return False

@@ -1,8 +1,8 @@
-"""Tables with a header whose columns come in any order; what each holds is said by the dictionary.
+"""Tables with a header and columns in any order; the dictionary contains the meaning of each column.
 
-The header is looked for behind title lines; the separator is the one that the header uses; a decimal comma is read
-where the separator leaves room for one. A header in mid-file begins a new table; rows that are shorter by habit miss
-their last cells; rows that do not fit their header by the ranges of the dictionary are refused.
+The header may follow title lines, and its separator is that of the table. Decimal commas are read if the separator is
+another character. A header in mid-file begins a new table. If a program omits empty last cells, they are read as empty.
+A table whose values do not fit its header by the ranges of the dictionary is refused.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _IsHeader = Callable[[list[str]], bool]
 
 
 def split_row(line: bytes, separator: str) -> list[str]:
-    """Fields of a line; quotes hide separators."""
+    """Return the fields of a line; separators inside quotes do not count."""
     text = line.decode("utf-8-sig", errors="replace")
     if '"' not in text:
         return text.split(separator)
@@ -51,15 +51,9 @@ def split_row(line: bytes, separator: str) -> list[str]:
 
 
 def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, list[str]] | None:
-    """Place, separator and names of the first line that is a header.
-
-    Parameters
-    ----------
-    is_header : callable
-        Of the names as written.
-    """
+    """Return the place, separator and names of the first line that is a header."""
     for i, line in enumerate(lines[:TITLES]):
-        # no header is so long: another kind of file
+        # a longer line is not a header
         if len(line) > 65_536 or b"\0" in line:
             return None
         for separator in SEPARATORS:
@@ -72,7 +66,7 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
 
 
 def starts(head: bytes, is_header: _IsHeader) -> bool:
-    """Check whether a file begins with such a header, title lines aside, and a row of its width soon follows."""
+    """Check whether a file begins with such a header, after title lines, and with rows of its width."""
     lines = [line.rstrip(b"\r") for line in head.split(b"\n")[: 2 * TITLES]]
     header = _header_of(lines, is_header)
     if header is None:
@@ -80,12 +74,12 @@ def starts(head: bytes, is_header: _IsHeader) -> bool:
     at, separator, names = header
     below = [(i, line) for i, line in enumerate(lines[at + 1 :]) if line.strip()]
     widths = [len(fields) for _, fields in islice(_logical(below, separator, len(names)), 5)]
-    # rows may miss trailing cells, or have one more behind a separator at their end
+    # rows may omit their last cells, or have one more after a separator at their end
     return 2 * sum(len(names) < 2 * width and width <= len(names) + 1 for width in widths) >= len(widths)
 
 
 def _number(text: str) -> tuple[float, str]:
-    """Number and unit of a cell; NaN where it is no number."""
+    """Return the number and the unit of a cell, NaN for other text."""
     match = _NUMBER.fullmatch(text.replace("\u2212", "-"))  # the minus sign of typesetting, of word processors
     if match is None or not match[1] or (match[2] and not (dictionary.is_unit(match[2]) or match[2] in _HARMLESS)):
         return np.nan, ""
@@ -104,7 +98,7 @@ _FIXES = tuple((re.compile(form), number) for form, number in (
 
 
 def _fix(text: str) -> str:
-    """Return the number of a fix that is written as a word, such as ``NO_FIX`` or ``RTK_FIXED``; other texts as is."""
+    """Return the number of a fix in words, such as ``NO_FIX`` or ``RTK_FIXED``, and other text unchanged."""
     word = re.sub(r"[^a-z0-9]+", " ", text.lower()).strip()
     if not re.search("[a-z]", word) or word in ("nan", "n a"):
         return text
@@ -117,7 +111,7 @@ _ANGLE = re.compile(rf"([NSEW]?) ?[-+]?[\d.]+(?:{_MARKS}{{1,3}}[\d.]+){{0,2}}{_M
 
 
 def _angle(text: str) -> tuple[float, str]:
-    """Number and unit of a position: also as degrees, minutes and seconds, and with the letter of a hemisphere."""
+    """Return the number and unit of a position, also in degrees, minutes and seconds and with a hemisphere."""
     value, unit = _number(text)
     written = _ANGLE.fullmatch(text) if np.isnan(value) or unit == "w" else None
     if written is None:
@@ -134,7 +128,7 @@ def _angle(text: str) -> tuple[float, str]:
 _HEMISPHERE = re.compile(r"[^A-Za-z]([NSEW])[\])]?\s*$")
 _OF_SIDES = re.compile(r"dir|ref|hemi|lat|lon|\b[ns]\W*[ns]\b|\b[ew]\W*[ew]\b", re.IGNORECASE)
 _VALUE = re.compile(r"\s*[-+\[\"]?\d")
-# Units of cells that change nothing.
+# Units of cells that need no conversion.
 _HARMLESS = ("%", "ms", "s", "Hz", "MHz", "kHz")
 
 
@@ -151,14 +145,14 @@ class Sheet:
         0-based lines of the rows.
     cells : list of list of str, length n
     blank_rows : int array
-        0-based lines of titles, headers and words below the table.
+        0-based lines of titles, headers and text below the table.
     rejected : list of RejectedLine
     notes : dict
-        Sentences about columns, by the column: read otherwise than written.
+        Sentences about columns that are read otherwise than written, by column.
     closed : bool
-        Do rows end with a mark of their own, whatever ends the line?
+        True if rows have their own end mark, so that a missing line end does not matter.
     said : dict
-        Quantities, by the column, of columns whose names say none: what the user says.
+        Quantities that the user maps to columns with other names, by column.
     used : set of int
         Columns that a stream was made of, shared by all parts of the table.
     """
@@ -191,7 +185,7 @@ class Sheet:
 
     @property
     def plain(self) -> list[str]:
-        """Names in plain form, in common words."""
+        """The names in plain form, in common words."""
         return [words for *_, words in self._described[1]]
 
     @property
@@ -201,13 +195,13 @@ class Sheet:
 
     @cached_property
     def meanings(self) -> list[dictionary.Meaning | None]:
-        """Meaning of each column."""
+        """The meaning of each column."""
         said = {i: dictionary.Meaning(row, dictionary.without_unit(self.names[i])[1]) for i, row in self.said.items()}
         known = [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
         return dictionary.of_pairs(zip(self.plain, known, strict=True))
 
     def find(self, *quantities: str) -> int | None:
-        """The column that surest holds one of the quantities; an empty one only where no other does."""
+        """Return the column that fits one of the quantities best, an empty column only if there is no other."""
         known = [
             (not any(cells[i].strip() for cells in self.cells), dictionary.rank_of(meaning.quantity, self.plain[i]), i)
             for i, meaning in enumerate(self.meanings)
@@ -216,17 +210,17 @@ class Sheet:
         return min(known)[2] if known else None
 
     def named(self, *names: str) -> int | None:
-        """The first column of one of some plain names, as the file has them."""
+        """Return the first column with one of some plain names."""
         return next((self._own.index(name) for name in names if name in self._own), None)
 
     def unit(self, column: int) -> str:
-        """Unit that the name of a column writes, or that its program is known to write, or an empty text."""
+        """Return the unit in the name of a column, or that of its program, or an empty text."""
         what, unit, _ = self._described[1][column]
         written = what is not None and what.unit
         return unit if written or unit not in dictionary.OF_INTEGERS or self._in_integers else ""
 
     def unit_read(self, column: int) -> str:
-        """Unit of :meth:`numbers`; empty where the brackets hold something else, such as ``(LTE scell0)``."""
+        """Return the unit of :meth:`numbers`, empty if the brackets contain other text, such as ``(LTE scell0)``."""
         self.numbers(column)
         return dictionary.unit_of(self._cell_units.get(column) or self.unit(column))
 
@@ -241,20 +235,20 @@ class Sheet:
         return bool(len(values) and (np.abs(values) > 1e5).mean() > 0.5 and (values == np.round(values)).all())
 
     def silence(self, where: BoolArray, columns: Iterable[int]) -> None:
-        """Read the cells of some rows as empty."""
+        """Treat the cells of some rows as empty."""
         for column in columns:
             self._silent[column] = where
             self._numbers.pop(column, None)
 
     def add(self, name: str, texts: list[str]) -> None:
-        """A column more."""
+        """Add a column."""
         self.names.append(name)
         self.cells = [[*cells, text] for cells, text in zip(self.cells, texts, strict=True)]
         for cached in ("_described", "meanings"):
             self.__dict__.pop(cached, None)
 
     def part(self, where: BoolArray) -> Sheet:
-        """The rows that a mask holds; notes are shared."""
+        """Return the rows of a mask; notes are shared."""
         return replace(
             self, row=self.row[where], _numbers={}, _cell_units={},
             cells=[cells for cells, inside in zip(self.cells, where.tolist(), strict=True) if inside],
@@ -262,7 +256,7 @@ class Sheet:
         )  # fmt: skip
 
     def texts(self, column: int) -> list[str]:
-        """A column as text."""
+        """Return a column as text."""
         column_texts = [cells[column].strip() for cells in self.cells]
         if column in self._silent:
             both = zip(column_texts, self._silent[column].tolist(), strict=True)
@@ -270,9 +264,9 @@ class Sheet:
         return column_texts
 
     def numbers(self, column: int) -> FloatArray:
-        """A column as numbers in the unit of the dictionary; what is none is NaN. Read only.
+        """Return a column as read-only numbers in the unit of the dictionary, NaN for missing values.
 
-        Levels and positions keep the numbers that stand for none: they are flagged as records.
+        Levels and positions keep the numbers that mean a missing value, because their records are flagged.
         """
         if column not in self._numbers:
             values = self._parsed(column, self.texts(column))
@@ -283,9 +277,9 @@ class Sheet:
                     values = np.where(dictionary.is_none(meaning.quantity, values), np.nan, values)
                 odd = dictionary.impossible(meaning.quantity, values)
                 if meaning.quantity.role == "kpi" and 2 * odd.sum() > np.isfinite(values).sum():
-                    text = f"column {self.names[column]!r}: most values cannot be, such as {values[odd][0]:g}"
+                    text = f"column {self.names[column]!r}: most values are impossible, such as {values[odd][0]:g}"
                     self.notes[column] = f"{text} (another unit, or the column of another quantity?)"
-            values.flags.writeable = False  # the next who asks gets the same
+            values.flags.writeable = False  # all callers share the array
             self._numbers[column] = values
         return self._numbers[column]
 
@@ -294,7 +288,7 @@ class Sheet:
         if self._has_points and _are_thousands(texts):
             texts = [text.replace(",", "") for text in texts]
         elif meaning is not None and meaning.quantity.role == "cell" and self.has_decimal_commas:
-            texts = [text.replace(".", "") for text in texts]  # an EARFCN of 2.300 is no fraction
+            texts = [text.replace(".", "") for text in texts]  # an EARFCN of 2.300 is 2300
         reads = _angle if meaning is not None and meaning.quantity.role == "position" else _number
         if meaning is not None and meaning.quantity.name == "fix":
             texts = [_fix(text) for text in texts]
@@ -310,7 +304,7 @@ class Sheet:
             )
         unit = meaning.unit if meaning is not None and "[" in self.names[column] else ""
         if unit and meaning is not None and meaning.quantity.unit and not dictionary.is_unit(unit):
-            text = f"column {self.names[column]!r}: no unit that is known: read as {meaning.quantity.unit}"
+            text = f"column {self.names[column]!r}: unknown unit, read as {meaning.quantity.unit}"
             self.notes.setdefault(column, text)
         units = {unit for _, unit in parsed.values() if dictionary.is_unit(unit)}
         if not units:
@@ -323,7 +317,7 @@ class Sheet:
         return values
 
     def _angles(self, column: int, quantity: dictionary.Quantity, values: FloatArray) -> FloatArray:
-        """Positions in degrees, of MAVLink's integers and NMEA's degrees and minutes too; west, south: negative."""
+        """Return positions in degrees, also from MAVLink's integers and NMEA's degrees and minutes, with their sign."""
         if quantity.role != "position":
             return values
         if not dictionary.is_unit(self.unit(column)) and (form := dictionary.angle_form(values, quantity)):
@@ -335,7 +329,7 @@ class Sheet:
         positive, negative = "NS" if quantity.name == "latitude_deg" else "EW"
         own = _HEMISPHERE.search(self.names[column])
         if own is not None and own[1] in (positive, negative):
-            # west of a negative number is no east: some write both the letter and the sign
+            # some programs write both the letter and the sign
             return -np.abs(values) if own[1] == negative else values
         for i, name in enumerate(self.names):
             letters = {cells[i].strip().upper() for cells in self.cells[:50]} - {""}
@@ -347,8 +341,8 @@ class Sheet:
 
     @cached_property
     def _has_points(self) -> bool:
-        """Check whether the first row has a decimal point and no comma that parts no thousands: no comma is decimal."""
-        # of the first row alone: a table keeps to one form
+        """Check whether the first row has a decimal point, and commas only between thousands."""
+        # the first row only, because a table has one form
         first = [cell.strip() for cell in self.cells[0]] if self.cells else []
         commas = [cell for cell in first if _DECIMAL_COMMA.fullmatch(cell)]
         return any(_DECIMAL_POINT.fullmatch(cell) for cell in first) and all(map(_THOUSANDS.fullmatch, commas))
@@ -386,19 +380,19 @@ _MOST_NAMED = 20
 _DECIMAL_POINT = re.compile(r"[-+]?\d{1,20}\.\d{1,40}")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d{1,20},\d{1,40}")
 _THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d{0,40})?")
-# Cells that say that there is no value.
+# Text of cells without a value.
 NO_VALUE = {"", "-", "--", "nan", "na", "n/a", "#n/a", "none", "null", "inf", "-inf", "-infinity", "unavailable",
             "unknown", "invalid"}  # fmt: skip
 _NO_ZONE = {*NO_VALUE, "local", "local time"}
 
 
 def _are_thousands(texts: Sequence[str]) -> bool:
-    """Check whether the commas of a column part thousands: ``1,300`` and never ``35,72``."""
+    """Check whether the commas of a column separate thousands: ``1,300`` and never ``35,72``."""
     return any("," in text for text in texts) and all(_THOUSANDS.fullmatch(text) for text in texts if "," in text)
 
 
 def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
-    """The table of a file, None where none of its first lines is its header."""
+    """Return the table of a file, or None if none of its first lines is a header."""
     header = _header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
     if header is None:
         return None
@@ -434,7 +428,7 @@ def _split_places(sheet: Sheet) -> None:
 def of_readings(
     lines: _text.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine]
 ) -> Sheet:
-    """Return the table of readings that no separator divides; lines that are neither read nor rejected are comments.
+    """Return the table of readings without a separator; all other lines that are not rejected are comments.
 
     Parameters
     ----------
@@ -453,7 +447,7 @@ def of_readings(
 
 
 def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
-    """The table below a header; lines above it, headers again and words at the end are comments, torn rows rejected.
+    """Return the table below a header, with titles, repeated headers and text at the end as comments.
 
     Parameters
     ----------
@@ -467,7 +461,7 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     Returns
     -------
     Sheet
-        Of several headers its columns are those of all.
+        It has the columns of all headers, if there are several.
     """
     below = ~lines.blank
     below[: at + 1] = False
@@ -482,7 +476,7 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     return table.sheet(lines, numbers[-1] if numbers else at)
 
 
-# A cell with line breaks has at most so many lines.
+# Most lines of a cell with line breaks.
 _MOST_LINES = 40
 
 
@@ -505,7 +499,7 @@ def _logical(lines: Sequence[tuple[int, bytes]], separator: str, width: int) -> 
 
 
 def _unlike(names: Sequence[str], group: Sequence[str] = ()) -> list[str]:
-    """Names of a header without any twice: with the words of merged cells above them in front, else numbered."""
+    """Return unique names of a header: repeated ones get the text of merged cells above them, or a number."""
     counts, before = Counter(names), Counter[str]()
     unlike, above = [], ""
     for i, name in enumerate(names):
@@ -522,7 +516,7 @@ class _Table:
     def __init__(self, names: list[str], comments: list[int]) -> None:
         self.names, self.comments = names, comments
         self._place = list(range(len(names)))  # column of each field under the present header
-        self._unit = [""] * len(names)  # of each field, where that of the first header was another
+        self._unit = [""] * len(names)  # unit of each field that differs from that of the first header
         self._known, self._turned = {dictionary.without_unit(name)[0] for name in names}, False
         self._row: list[int] = []
         self._cells: list[list[str]] = []
@@ -530,7 +524,7 @@ class _Table:
         self._odd: list[tuple[int, int, int]] = []
 
     def add(self, i: int, fields: list[str]) -> None:
-        """The next line that is not blank."""
+        """Add the next line that is not blank."""
         width = len(self._place)
         words = [text.strip() for text in fields]
         if not any(_VALUE.match(text) for text in words) and (self._is_units(words) or self._is_header(words)):
@@ -545,7 +539,7 @@ class _Table:
             self._odd.append((i, len(fields), width))
 
     def _is_units(self, texts: list[str]) -> bool:
-        """Check whether the line below the names has their units, which become parts of the names."""
+        """Check whether the line below the names contains their units, and add the units to the names."""
         texts = [text.strip("[]()") for text in texts]
         filled = [text for text in texts if text]
         units = sum(dictionary.is_unit(text) or text in _HARMLESS for text in filled)
@@ -555,7 +549,7 @@ class _Table:
         return True
 
     def _is_header(self, texts: list[str]) -> bool:
-        """Check whether a line is a header, of the same columns or of others; what follows is read under it."""
+        """Check whether a line is a header, with the same columns or others, for the lines below it."""
         texts = _unlike(texts)
         bare = [dictionary.without_unit(text) for text in texts]
         both = zip(bare, texts, strict=True)
@@ -586,10 +580,10 @@ class _Table:
         return cells
 
     def sheet(self, lines: _text.Lines, last_line: int) -> Sheet:
-        """The table; rows shorter than their header are read where that is a habit of the program."""
+        """Return the table; rows shorter than their header are read if the program often writes such rows."""
         # the last line may be cut short in every file
         inner, full = [i for i, _ in self._short if i != last_line], bool(self._row)
-        # one short row is torn; a twentieth of all is a program's habit
+        # a single short row is truncated; a twentieth of all rows is a habit of the program
         if len(inner) >= max(2, len(self._row) // 20):
             meanings = [dictionary.meaning(name) for name in self.names]
             read = {i for i, cells in self._short if not _torn(cells, meanings)}
@@ -602,7 +596,7 @@ class _Table:
             notes = {len(self.names): text}
         last = self._row[-1] if self._row else self.comments[-1]
         torn = len(lines) - 1 if lines.unterminated else -1
-        # words below the table, as Nemo writes them, have no separator and begin with no number
+        # text below the table, as in exports of Nemo, has no separator and does not begin with a number
         foot = {
             i
             for i, count, _ in self._odd
@@ -624,7 +618,7 @@ class _Table:
 
 
 def _torn(cells: list[str], meanings: list[dictionary.Meaning | None]) -> bool:
-    """Check whether a row without its last cells is torn: half a position, or a value that its column cannot have."""
+    """Check whether a short row is truncated: it has half a position, or a value that its column cannot have."""
     place = {"latitude_deg": False, "longitude_deg": False}
     for text, meaning in zip(cells, meanings, strict=False):
         if meaning is None:
@@ -638,13 +632,12 @@ def _torn(cells: list[str], meanings: list[dictionary.Meaning | None]) -> bool:
 
 
 def _fitted(rows: list[tuple[int, list[str]]], names: list[str]) -> list[tuple[int, list[str]]]:
-    """Rows without what a separator at the end of rows, or of the header alone, makes of them.
+    """Return rows without the empty field that a separator at the end of rows, or of the header alone, adds.
 
-    An empty field more is the table's habit or none: a row whose time or level has a bare decimal comma looks so, too,
-    and its columns would be those beside.
+    Most rows must have this field: an unquoted decimal comma also adds a field, and shifts the columns.
     """
     longer = [not fields[-1].strip() for _, fields in rows if len(fields) == len(names) + 1]
-    filled = longer.count(False)  # a torn row or two may have a field more, too
+    filled = longer.count(False)  # one or two truncated rows may have a further field, too
     if 2 * longer.count(True) > len(rows) and filled <= max(1, len(rows) // 100):
         more = len(names) + 1
         rows = [(i, row[:-1] if len(row) == more and not row[-1].strip() else row) for i, row in rows]
@@ -654,16 +647,16 @@ def _fitted(rows: list[tuple[int, list[str]]], names: list[str]) -> list[tuple[i
 
 
 def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None = None) -> _rows.Rows | None:
-    """Rows of a table with their times; None where no column is one of times.
+    """Return the rows of a table with their times, or None if the table has no times.
 
     Parameters
     ----------
     column : int, optional
-        Of the times; by default the one that the dictionary finds.
+        Column of the times; by default the one that the dictionary finds.
     """
     known = {i: m.quantity for i, m in enumerate(sheet.meanings) if m is not None and not m.indirect}
     mapped = column is not None
-    if not mapped:  # the user has named the columns: no guess by values overrules that
+    if not mapped:  # columns that the user named are not checked by their values
         _refuse_positions_beside(sheet)
         bounded = {i: q for i, q in known.items() if q.role in ("position", "cell", "rss") and q.can_be[1] < np.inf}
         _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in bounded.items()])
@@ -708,12 +701,12 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
 
 
 _OF_CLOCK = ("date", "zone", "gps_week", "gps_seconds")
-# Begin of a log in a cell of JSON, as Open DroneLog writes it beside relative times.
+# Start of a log in a cell of JSON, written by Open DroneLog together with relative times.
 _START = re.compile(r'"start_time" ?: ?"([^"]{10,40})"')
 
 
 def _to_utc(timed: _rows.Rows, sheet: Sheet, column: int | None) -> None:
-    """Bring times of a scale without leap seconds, which the name of their column writes, to UTC in place."""
+    """Convert times in place to UTC if the name of their column has a scale without leap seconds."""
     words = {*(() if column is None else sheet.plain[column].split())}
     scale = next((scale for scale in _stamps.SCALES_S if scale in words), None)
     if scale is None or timed.relative or any("leap seconds" in text for text in timed.warnings):
@@ -723,7 +716,7 @@ def _to_utc(timed: _rows.Rows, sheet: Sheet, column: int | None) -> None:
 
 
 def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None:
-    """Return the surest column of times: not a local one beside UTC, nor the time of a fix that stands still."""
+    """Return the best column of times: UTC rather than local, and not the time of the last fix, which stands still."""
     column = sheet.find("time")
     times = [i for i, meaning in enumerate(sheet.meanings) if meaning and meaning.quantity.name == "time"]
     if column is None or len(times) < 2:
@@ -743,12 +736,12 @@ def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None
     return moving
 
 
-# A clock stands still where another runs on by more while it shows one time [s].
+# A clock stands still if another one advances by more than this while it shows one time [s].
 _STANDS_S = 2.0
 
 
 def _moves_on(sheet: Sheet, column: int, standing: pd.Series[str], options: ReadOptions) -> bool:
-    """Check whether a column of dated times runs on while another shows the same time."""
+    """Check whether a column of dated times advances while another shows the same time."""
     if not _stamps.is_dated(next(filter(None, sheet.texts(column)), "")) and sheet.find("date") is None:
         return False
     try:
@@ -765,14 +758,14 @@ def _moves_on(sheet: Sheet, column: int, standing: pd.Series[str], options: Read
 
 def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> tuple[str, FloatArray, list[str]]:
     texts = sheet.texts(column)
-    # of a mapped column, too, where it is the time of a day beside its date
+    # also for a mapped column, if it is a time of day with a column of dates
     day = sheet.find("date") if not mapped or column == _time_column(sheet) else None
     if day is not None and day != column and not _stamps.is_dated(next(filter(None, texts), "")):
         pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
         texts = [f"{date} {time}".strip() for date, time in pairs]
     name, unit = dictionary.plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", sheet.names[column])), sheet.unit(column)
     count = next((short for short, c in _text.COUNTS.items() if c.said.search(unit) or c.said.search(name)), None)
-    # the sign for micro is no letter of a plain name: 'Time [\u00b5s]' is 'time s' there
+    # plain names have no letter for micro: 'Time [\u00b5s]' becomes 'time s'
     if unit in ("\u00b5s", "\u03bcs") or (unit and count is None):
         count = "us" if unit in ("\u00b5s", "\u03bcs") else "s"
     written = dictionary.without_unit(sheet.names[column])[1] or any(c.said.search(name) for c in _text.COUNTS.values())
@@ -791,35 +784,35 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
 
 
 def _devices(sheet: Sheet) -> IntArray | None:
-    """Return the number of the device of each row, by all columns of devices; None if there is none."""
+    """Return the number of the device of each row by all columns of devices, or None if there is no such column."""
     columns = [i for i, meaning in enumerate(sheet.meanings) if meaning and meaning.quantity.name == "device"]
     texts = zip(*(sheet.texts(i) for i in columns), strict=True) if columns else ()
     return pd.factorize(pd.Series(list(texts), dtype=object))[0] if columns else None
 
 
 def _zone_beside(sheet: Sheet, column: int, zone: str, texts: list[str], options: ReadOptions) -> tuple[str, list[str]]:
-    """Zone of the times by the column of zones beside them, and the times with their own where it names several."""
+    """Return the zone of the times by the column of zones, and the times with their zones if there are several."""
     cells = sheet.texts(column)
     known = {text: "" if text.lower() in _NO_ZONE else _stamps.beside(text) for text in cells}
     word = next(filter(None, known.values()), "")
     if unknown := next((text for text, own in known.items() if not own and text.lower() not in _NO_ZONE), ""):
-        sheet.notes[column] = f"column {sheet.names[column]!r}: {unknown[:30]!r} is no zone that is known: not used"
+        sheet.notes[column] = f"column {sheet.names[column]!r}: {unknown[:30]!r} is not a known zone: not used"
     elif zone and word and word != zone:
-        sheet.notes[column] = f"column {sheet.names[column]!r} says {word}, the name of the times {zone}: read so"
+        sheet.notes[column] = f"column {sheet.names[column]!r} has {word}, the name of the times {zone}: {zone} is used"
     elif word and options.timezone not in (None, word) and not all(map(_DATED.fullmatch, texts[:3])):
-        text = f"column {sheet.names[column]!r} gives the zone of the times, {word}: --timezone is for times without"
+        text = f"column {sheet.names[column]!r} has the zone of the times, {word}: --timezone is not used"
         sheet.notes[column] = text
     if zone or len({*known.values()}) == 1:
         return zone or word, texts
     both = zip(texts, (known[text] for text in cells), strict=True)
-    # an epoch is UTC whatever the zone
+    # an epoch is UTC in any zone
     return "", [text if _NUMBER.fullmatch(text) else f"{text} {own}".strip() for text, own in both]
 
 
-# Epochs, and times with an offset of their own.
+# Epochs, and times with an offset.
 _DATED = re.compile(r"\d{9,}[.,]?\d*|.*\d(?:Z|[+-]\d\d:?\d\d)")
 _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
-# The order that a name gives: 'date (dd/mm/yyyy)'.
+# The order in a name: 'date (dd/mm/yyyy)'.
 _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 
 
@@ -827,7 +820,7 @@ _MAPPED = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg
 
 
 def way_to_level(sheet: Sheet) -> list[str]:
-    """A sentence with the options that read as the level a column whose name only looks like one, or the RSRQ."""
+    """Return a sentence with the options that read an unknown column or the RSRQ as a level."""
     like = dictionary.like_levels(sheet.names)
     named = [
         i
@@ -848,14 +841,14 @@ def way_to_level(sheet: Sheet) -> list[str]:
 
 
 def _has_levels(sheet: Sheet, column: int) -> bool:
-    """Check whether the numbers of a column are as levels in dBm are, such as those of a tower by its name."""
+    """Check whether the numbers of a column look like levels in dBm, such as those of a column named by a tower."""
     known = sheet.numbers(column)[np.isfinite(sheet.numbers(column))]
     like = len(known) > 1 and (known < -30).mean() > 0.9 and known.min() > -150
     return bool(like and not dictionary.UNLIKE_A_LEVEL.search(sheet.plain[column]))
 
 
 def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:
-    """UTC of a column of GPS weeks and one of the seconds or milliseconds of the week; None where there are none."""
+    """Return UTC from columns of GPS weeks and of seconds or milliseconds of the week, or None if one is missing."""
     week, second = sheet.find("gps_week"), sheet.find("gps_seconds")
     if second is None and time is not None and "gps" in sheet.plain[time]:
         second = time
@@ -882,7 +875,7 @@ def _counts(sheet: Sheet, column: int) -> bool:
 
 
 def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]]) -> None:
-    """Refuse a table whose rows are shifted against its header, by what the dictionary knows of its columns.
+    """Refuse a table whose rows are shifted against its header, by the ranges of the dictionary.
 
     Raises
     ------
@@ -893,7 +886,7 @@ def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray
     if not wrong or not len(wrong[0][1]):
         return
     count = np.sum([mask for *_, mask in wrong], axis=0)
-    # three rows or a twentieth: fewer are damaged, not shifted
+    # fewer than three rows or a twentieth are damaged, not shifted
     few = max(3, len(count) // 20)
     alone = [
         mask
@@ -908,7 +901,7 @@ def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray
 
 
 def _refuse_positions_beside(sheet: Sheet) -> None:
-    """Refuse a table with columns that look like positions and are none, where one that is called so does not."""
+    """Refuse a table with positions in columns of other names, while a column named as a position has none."""
     names = {i: what.quantity.name for i, what in enumerate(sheet.meanings) if what is not None and not what.indirect}
     place = [i for i, name in names.items() if name in ("latitude_deg", "longitude_deg")]
     astray = [i for i in place if np.isfinite(sheet.numbers(i)).sum() > 2 and not _is_place(sheet.numbers(i))]
@@ -918,13 +911,13 @@ def _refuse_positions_beside(sheet: Sheet) -> None:
     others = [i for i, cells in texts.items() if _is_angle(np.array([_number(cell)[0] for cell in cells]))]
     if len(others) >= len(astray):
         beside, empty = sheet.names[others[0]], sheet.names[astray[0]]
-        raise shifted(f"{beside!r} holds values as positions have, {empty!r} does not", "values beside their names")
+        raise shifted(f"{beside!r} has values like positions, {empty!r} does not", "values under their names")
 
 
 def _is_place(values: FloatArray) -> bool:
-    """Check whether numbers can be an angle of the positions of one flight: near each other, and not whole degrees.
+    """Check whether numbers can be an angle of positions of one flight: close together, and not all whole degrees.
 
-    A leg due north keeps one longitude, which may have few decimals.
+    A leg due north has one longitude, perhaps with few decimals.
     """
     known = values[np.isfinite(values)]
     near = len(known) and np.ptp(known) < NEAR_DEG and 1 < np.abs(known).max() <= 180
@@ -932,45 +925,45 @@ def _is_place(values: FloatArray) -> bool:
 
 
 def _is_angle(values: FloatArray) -> bool:
-    """Check whether numbers are written as positions of one flight: with four or more decimals, near each other."""
+    """Check whether numbers look like positions of one flight: close together, with four or more decimals."""
     known = values[np.isfinite(values)]
     # more than three decimals: a thousandth of a degree is 100 m, too coarse for any receiver
     return _is_place(values) and bool((np.abs(known * 1e3 % 1 - 0.5) < 0.499999).mean() > 0.5)
 
 
 def shifted(found: str, expected: str) -> InputError:
-    """Error of a table whose values stand beside their names."""
+    """Return the error for a table whose values are in columns with other names."""
     return InputError(f"the rows do not fit the header: {found}", expected=expected, cause=BESIDE)
 
 
-BESIDE = "a column is missing in the header or in the rows, and all values stand beside their names"
+BESIDE = "a column is missing in the header or in the rows, so that values are under the wrong names"
 
 
-# Whole seconds and a counter that go together differ by less than one; half of one more for rounding.
+# Whole seconds and a counter that belong together differ by less than 1 s, plus 0.5 s for rounding.
 _MOST_APART_NS = 1_500_000_000
-# Half of what a time stamp holds.
+# Half of the range of a time stamp.
 _MOST_NS = 2.0**62
 
 
 def _finer(rows: _rows.Rows, milliseconds: FloatArray) -> None:
-    """Times cut to whole seconds, with the fractions that a column of milliseconds has (AirData)."""
+    """Add the fractions in a column of milliseconds to times in whole seconds (AirData)."""
     time = rows.time.astype(np.int64)
     known = np.isfinite(milliseconds)
     if rows.relative or not known.any() or (time % 1_000_000_000).any():
         return
-    # rounded before it is an integer: 0.1 ms is no whole number of ns in binary
+    # rounded before conversion to integers: 0.1 ms is not an exact number of ns in binary
     counted_ns = np.round(np.where(known, milliseconds, 0.0) * 1e6)
     fits = np.abs(counted_ns).max() < _MOST_NS
     counted = counted_ns.astype(np.int64) if fits else np.zeros_like(time)
     zero = (time - counted)[known]
     if not fits or zero.max() - zero.min() > _MOST_APART_NS:
-        rows.warnings.append("the column of milliseconds does not go with the times: it is left out")
+        rows.warnings.append("the column of milliseconds does not fit the times and is not used")
         return
     rows.time = np.where(known, zero.max() + counted, time).astype("datetime64[ns]")
 
 
 def nothing(data: bytes, reader: str, reason: str) -> ReadResult:
-    """The account of a file without such a table: every line rejected."""
+    """Return the account of a file without such a table, with all lines rejected."""
     lines = _text.split(data)
     filled = np.flatnonzero(~lines.blank)
     rejected = tuple(lines.reject_all(filled, reason))

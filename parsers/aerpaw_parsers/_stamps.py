@@ -1,8 +1,8 @@
 """Dates and times in the forms that programs write, brought to one: ``YYYY-mm-dd HH:MM:SS.f`` with the zone if any.
 
-One parser for all readers and for ``--map``. The zone in the cell wins, then that in the name of the column, then the
-user's. Which of two readings of ``03/04/2025`` holds is decided by the whole column; what it does not say is assumed,
-and a warning says so.
+All readers and ``--map`` use this parser. The zone in the cell wins, then that in the name of the column, then the
+user's. The complete column decides whether ``03/04/2025`` is in March or April; if it cannot, the order is assumed
+and a warning reports it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import ReadOptions
 
 _NAMED_ZONE = r"Z|[A-Z][A-Za-z]+/[A-Z][\w/]+|[A-Z]{2,5}(?![A-Za-z])|(?:UTC|GMT)? ?[+-]\d{1,2}(?::?\d\d)?"
-# Java writes the place behind the offset: 10:00-04:00[America/New_York], 14:00Z[UTC].
+# Java writes the place after the offset: 10:00-04:00[America/New_York], 14:00Z[UTC].
 _PLACE = re.compile(r"(Z|[+-]\d\d:\d\d)\[[\w/+-]+\]$")
-# A zone is not the AM or PM that stands in the same place.
+# AM and PM have the position of a zone, but are not a zone.
 _ZONE = rf"(?: ?[(\[]?(?P<zone>(?:UTC|GMT) ?[+-]\d{{1,2}}(?::?\d\d)?|(?![AaPp][Mm]\b)(?:{_NAMED_ZONE}))[)\]]?)?"
 _CLOCK = (
     r"(?P<hour>\d{1,2})[:.h-](?P<minute>\d\d)(?:[:.m-](?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,40}))?)?"
@@ -32,7 +32,7 @@ _CLOCK = (
 _GAP = r"[T _,:;-]{1,3}(?:at )?"
 _DAY = r"(?:(?:[Mm]on|[Tt]ue|[Ww]ed|[Tt]hu|[Ff]ri|[Ss]at|[Ss]un)[a-z]{0,6}[., ]{1,2})?"
 _WORD = r"(?P<word>[A-Za-z]{3,9})\.?"
-# The date in front of the clock; date(1) puts the year, and the zone, behind it.
+# The date before the clock; date(1) writes the year and the zone after it.
 _DATES = (
     r"(?P<year>\d{4})[-/._ ](?P<month>\d{1,2})[-/._ ](?P<day>\d{1,2})",
     rf"(?P<year>\d{{4}})[-/._ ]?{_WORD}[-/._ ]?(?P<day>\d{{1,2}})",
@@ -48,7 +48,7 @@ _DIGITS = re.compile(
 
 @cache
 def _forms() -> tuple[re.Pattern[str], ...]:
-    """All forms of a date and its clock, compiled for the first log that has such times."""
+    """Return all forms of a date and its clock, compiled when the first log has such times."""
     before = (re.compile(_DAY + date + rf"(?:{_GAP}{_CLOCK})?{_ZONE}") for date in _DATES)
     within = re.compile(_DAY + rf"{_WORD} {{1,2}}(?P<day>\d{{1,2}}) {_CLOCK}{_ZONE} (?P<year>\d{{4}})")
     behind = (re.compile(rf"{_CLOCK}{_ZONE}[ ,]{{1,2}}" + date) for date in _DATES)
@@ -58,9 +58,9 @@ def _forms() -> tuple[re.Pattern[str], ...]:
 _OF_DAY = re.compile(r"T?" + _CLOCK.replace("[:.h-]", ":", 1).replace("[:.m-](?P<second>", ":(?P<second>") + _ZONE)
 # Python, pandas and C print up to 17 digits, decimals of arbitrary precision more: 0.30000000000000004.
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,40})?(?:[eE][-+]?\d{1,3})?")
-# An epoch that a spreadsheet shortened, ``1.74093E+12``: fewer than nine digits behind the first leave out seconds.
+# An epoch shortened by a spreadsheet, ``1.74093E+12``: fewer than nine digits after the first omit seconds.
 _ROUNDED = re.compile(r"\d(?:[.,]\d{0,8})?[eE]\+?0?(?:9|1\d)")
-# What a spreadsheet shows of a time: minutes, seconds, tenths; the hour is lost.
+# A time as a spreadsheet shows it: minutes, seconds and tenths without the hour.
 _MINUTES = re.compile(r"\d{1,2}:\d\d[.,]\d")
 _COMMON = re.compile((_text.TIME + rb"(?:Z|[+-]\d\d:\d\d)?").decode())
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
@@ -69,8 +69,8 @@ _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
     re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
 )
-# Hours east of UTC of the abbreviations that say it, and the zone whose clock they are a part of.
-# Winter zones stand in clocks.WINTER: EST in summer is a question, and CST is that of several countries.
+# Hours east of UTC of unambiguous abbreviations. Winter zones are in text.WINTER, because EST in summer is doubtful and
+# CST is used in several countries.
 _HOURS = {
     "Z": 0.0, "UT": 0.0, "UTC": 0.0, "GMT": 0.0, "EDT": -4.0, "CDT": -5.0, "MDT": -6.0, "PDT": -7.0,
     "HST": -10.0, "CEST": 2.0, "MESZ": 2.0, "EEST": 3.0, "BST": 1.0, "JST": 9.0, "KST": 9.0, "AKDT": -8.0, "AEDT": 11.0,
@@ -85,7 +85,7 @@ _OFFSET = re.compile(r"(?:UTC|GMT)? ?([+-])(\d{1,2}):?(\d\d)?")
 
 
 def _date_in_name(name: str) -> str | None:
-    """The date that a file name carries.
+    """Return the date in a file name.
 
     Examples
     --------
@@ -107,7 +107,7 @@ def _month(word: str) -> int:
 
 
 class _Order:
-    """Order of the three numbers of a date, decided for the whole column, and what was assumed for it."""
+    """The order of the three numbers of a date, decided for the complete column, and warnings about assumptions."""
 
     def __init__(self, texts: Iterable[str], name: str, *, european: bool, day_first: bool | None = None) -> None:
         dates = [match for text in texts if (match := _match(text)) and "a" in match.re.groupindex]
@@ -120,7 +120,7 @@ class _Order:
         firsts = [(int(match[keys[0]]), int(match[keys[1]])) for match in dates]
         # points are the marks of countries that write the day first
         if all(match["mark"] == "." for match in dates) and not self.year_first:
-            return  # 02.03.2025: where points stand, the day comes first
+            return  # 02.03.2025: with points, the day comes first
         if any(first > 12 for first, _ in firsts):
             return
         self.day_first = False
@@ -129,7 +129,7 @@ class _Order:
         if day_first is not None:
             self.day_first = day_first
             return
-        # a log that passes midnight: in one of the orders its days follow each other, in the other they are weeks apart
+        # days of a log that passes midnight follow each other in one order and are weeks apart in the other
         distinct = {match.group("a", "b", "c"): match for match in dates}.values()
         spans_d = [self._span_d(distinct, first) for first in (False, True)]
         if abs(spans_d[0] - spans_d[1]) >= _WEEKS_D:
@@ -138,7 +138,7 @@ class _Order:
         date = _date_in_name(name)
         fits = [first for first in (True, False) if date and self._dated(dates[0], first) == date]
         self.day_first = fits[0] if len(fits) == 1 else european
-        reason = "as where decimal commas are written" if european else "a guess"
+        reason = "as in countries with decimal commas" if european else "a guess"
         reason = "as the date in the file name" if len(fits) == 1 else reason
         word = "day" if self.day_first else "month"
         self.warnings.append(f"the dates can be read with the day or the month first: the {word} was taken, {reason}")
@@ -165,7 +165,7 @@ class _Order:
         return f"{year}-{month:02d}-{day:02d}"
 
     def parts(self, match: re.Match[str], *, day_first: bool | None = None) -> tuple[str, int, int]:
-        """Year, month and day."""
+        """Return year, month and day."""
         groups = match.groupdict()
         if groups.get("a") is None:
             month = int(groups["month"]) if groups.get("month") else _month(groups["word"])
@@ -177,7 +177,7 @@ class _Order:
         return _year(c), int(b if first else a), int(a if first else b)
 
 
-# Two orders of the same dates whose spans differ by as many days are told apart.
+# Two orders of the same dates are distinguished if their spans differ by this number of days.
 _WEEKS_D = 20
 # Two digits of years in which logs of this kind are written.
 _FIRST_YEAR, _LAST_YEAR = 15, 40
@@ -194,7 +194,7 @@ def _match(text: str) -> re.Match[str] | None:
 
 
 def is_dated(text: str) -> bool:
-    """Check whether a time holds its date: as an epoch does, and a date with a clock.
+    """Check whether a time contains its date, like an epoch or a date with a clock.
 
     Examples
     --------
@@ -206,7 +206,7 @@ def is_dated(text: str) -> bool:
 
 
 def _written(text: str, order: _Order, zones: _Zones) -> bytes:
-    """One time in the common form; ``-`` where it is none."""
+    """Return one time in the common form, or ``-`` for other text."""
     match = _match(text)
     if match is None:
         return b"-"
@@ -224,14 +224,14 @@ def _hour(groups: dict[str, str | None]) -> int:
 
 
 class _Zones:
-    """Offsets of the zones that a column's cells or its name write."""
+    """The offsets of the zones in the cells of a column or in its name."""
 
     def __init__(self, options: ReadOptions, header: str) -> None:
         self._own, self._header = options.timezone, header
         self._known: dict[tuple[str, str], str] = {}
 
     def offset(self, written: str | None, date: str) -> str:
-        """``+hh:mm`` of a zone at a date, ``Z``, or an empty text where nothing says it."""
+        """Return ``+hh:mm`` of a zone at a date, ``Z``, or an empty text if the zone is unknown."""
         word = (written or self._header).strip()
         word = word if "/" in word else word.upper()
         if not word:
@@ -249,7 +249,7 @@ class _Zones:
         try:
             moment = datetime.fromisoformat(date)
         except ValueError:
-            return ""  # no date of the calendar: who reads it says so
+            return ""  # not a date of the calendar, which the caller reports
         if self._own and (here := _at(self._own, moment)) is not None and here[1] == word:
             return _shown(here[0])
         if word in _WITH_SUMMER or "/" in word:
@@ -257,9 +257,9 @@ class _Zones:
             return "" if here is None else _shown(here[0])
         if word not in _text.WINTER:
             raise UsageError(
-                f"the times are of a zone that is not known: {word}",
+                f"the times have an unknown zone: {word}",
                 expected="UTC, an offset such as -04:00, or an abbreviation such as EDT",
-                cause="mend the name in the file, or its offset",
+                cause="a misspelt zone: correct it in the file",
             )
         candidates = _text.WINTER[word]
         hours, zone = candidates[0]
@@ -283,7 +283,7 @@ def _shown(hours: float) -> str:
 
 
 def _at(zone: str, moment: datetime) -> tuple[float, str] | None:
-    """Hours east of UTC and the abbreviation of a zone at a wall time; None where there is no such zone."""
+    """Return the hours east of UTC and the abbreviation of a zone at a wall time, or None for an unknown zone."""
     try:
         local = moment.replace(tzinfo=ZoneInfo(zone))
     except (ZoneInfoNotFoundError, ValueError, OSError):
@@ -293,7 +293,7 @@ def _at(zone: str, moment: datetime) -> tuple[float, str] | None:
 
 
 def header_zone(name: str, brackets: str) -> str:
-    """The zone that the name of a column of times writes, in brackets or as its last word; empty where it does not.
+    """Return the zone in the name of a column of times, in brackets or as its last word, else an empty text.
 
     Examples
     --------
@@ -339,31 +339,31 @@ def read(
     european: bool = False, zone: str = "", gps: bool = False, day_first: bool | None = None,
     device: IntArray | None = None,
 ) -> tuple[str, AnyArray, list[str]]:  # fmt: skip
-    """A column of times in any of the known forms.
+    """Return a column of times in any of the known forms.
 
     Parameters
     ----------
     texts : sequence of str
     options : ReadOptions
     unit : {"ns", "us", "ms", "s", "min", "h"}, optional
-        Of numbers, where the head of the column says so and they count from no known origin.
+        Unit of numbers that count from an unknown origin, by the name of the column.
     by_program : bool
-        The unit is only what the program is known to write.
+        True if the unit is only known from the program.
     european : bool
-        Has the table decimal commas? Where they stand, the day comes before the month.
+        True if the table has decimal commas: the day then comes before the month.
     zone : str
-        Of times without one: what the name of the column says.
+        Zone of times without a zone, by the name of the column.
     gps : bool
-        Does the name of the column say that numbers are GPS time?
+        True if numbers are GPS time by the name of the column.
     day_first : bool, optional
-        The order of dates that the name of the column gives.
+        The order of dates by the name of the column.
     device : int array, shape (n,), optional
-        Number of the device that wrote each row: a midnight is one of a device.
+        Number of the device that wrote each row; midnights are found per device.
 
     Returns
     -------
     clock : str
-        As :func:`aerpaw_cmp.logs.rows.times` takes it.
+        Argument of :func:`aerpaw_cmp.logs.rows.times`.
     cells : array, shape (n,)
         Bytes or floats for it.
     warnings : list of str
@@ -412,7 +412,7 @@ _COUNTED = re.compile(r"(.*\d:\d\d:\d\d:)(\d{1,9})(?!\d)(.*)")
 
 
 def _padded(texts: list[str]) -> list[str]:
-    """Return times whose part behind a third colon is a count of ms, us or ns with its leading zeros."""
+    """Return times with leading zeros in the count of ms, us or ns after a third colon."""
     matches = {text: match for text in set(texts) if (match := _COUNTED.fullmatch(text))}
     widths = {len(match[2]) for match in matches.values()}
     if len(widths) < 2:
@@ -427,18 +427,18 @@ _COMPACT = re.compile(r"((\d\d)(\d\d)(\d\d)[ T])?([01]\d|2[0-3])([0-5]\d)([0-5]\
 
 
 def _with_marks(match: re.Match[str]) -> str:
-    """Points in the date, where the day comes before the month, and colons in the time."""
+    """Return a date with points, the day before the month, and a time with colons."""
     date = ".".join(match.group(2, 3, 4)) + " " if match[1] else ""
     return date + ":".join(match.group(5, 6, 7))
 
 
 def refuse_spreadsheets(texts: Sequence[str]) -> None:
-    """Refuse a column of times of which a spreadsheet took something away.
+    """Refuse a column of times that a spreadsheet shortened.
 
     Raises
     ------
     InputError
-        If most of the texts are epochs without their last digits (all rows of minutes or days would share a time), or
+        If most of the texts are epochs without their last digits, so that rows of minutes would share a time, or
         minutes and seconds without the hour.
     """
     rounded = [text for text in texts if _ROUNDED.fullmatch(text)]
@@ -485,7 +485,7 @@ def _likely_units(value: FloatArray) -> list[str]:
 def _numbers(
     value: FloatArray, unit: str | None, options: ReadOptions, *, gps: bool, zone: str
 ) -> tuple[str, AnyArray, list[str]]:
-    """Numbers: epochs by their size, else relative times."""
+    """Return numbers as epochs by their size, else as relative times."""
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
     step, likely = _step(value), _likely_units(value)
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
@@ -544,7 +544,7 @@ def _are_days(value: FloatArray, low: float, high: float) -> bool:
 def _of_day(
     texts: Sequence[str], options: ReadOptions, zone: str, device: IntArray | None = None
 ) -> tuple[str, AnyArray, list[str]]:
-    """Times of the day: their date is that of ``time_origin``, of the file name, or nobody's."""
+    """Return times of day with the date of ``time_origin`` or of the file name, if there is one."""
     matches = [_OF_DAY.fullmatch(text) for text in texts]
     seconds = np.array([_seconds(item.groupdict()) if item else np.nan for item in matches], dtype=np.float64)
     # back by more than half a day is midnight; less is a clock that was set; forward, where another device's rows
@@ -558,15 +558,15 @@ def _of_day(
     own_form = written == "Z" and any(text.startswith("T") for text in texts[:3])  # Nemo Handy's
     if not own_form or not len(first):
         return _on_a_date(seconds, options, [], written)
-    # Nemo Handy marks its local times as UTC, and some of its exports are whole hours off: its summary says the start
+    # Nemo Handy marks its local times as UTC, and some exports are off by hours: its summary contains the start
     hours = 0 if start_s is None else round((float(first[0]) - start_s) / 3600)
     name_s = int(named[1]) * 3600 + int(named[2]) * 60 + int(named[3]) if named else float(first[0])
     if start_s is None and abs(float(first[0]) - name_s) > _NEAR_S:
-        text = "the times are marked as UTC and not those of the program's own file name, which is local: read as UTC"
+        text = "the times are marked as UTC and differ from the local time in the program's file name: read as UTC"
         return _on_a_date(seconds, options, [text], written)
-    warnings = ["the times are marked as UTC but read as local, as the program's own names say"]
+    warnings = ["the times are marked as UTC but read as local, like the program's file names"]
     if hours:
-        warnings.append(f"the times are {hours:+d} h from the start that the summary beside says: read as those, local")
+        warnings.append(f"the times are {hours:+d} h from the start in the summary next to the log: corrected, local")
     return _on_a_date(seconds - 3600.0 * hours, options, warnings)
 
 
@@ -576,7 +576,7 @@ _NEAR_S = 300.0
 
 
 def _session_start_s(options: ReadOptions) -> float | None:
-    """Second of the day at which Nemo's summary of the session, a CSV beside the log, says that it began."""
+    """Return the second of the day at which the session began, by Nemo's summary, a CSV in the same folder."""
     summary = options.neighbour(options.file_name.rpartition(".")[0] + ".csv") if options.neighbour else None
     start = _SESSION_START.search(summary[:4096]) if summary else None
     return None if start is None else int(start[1]) * 3600.0 + int(start[2]) * 60.0
@@ -585,7 +585,7 @@ def _session_start_s(options: ReadOptions) -> float | None:
 def _on_a_date(
     seconds: FloatArray, options: ReadOptions, warnings: list[str], zone: str = ""
 ) -> tuple[str, AnyArray, list[str]]:
-    """Seconds of the first day; relative where nothing says which day that is."""
+    """Return seconds of the first day with their date, or as relative times if the day is unknown."""
     date = options.time_origin[:10] if options.time_origin else _date_in_name(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
         return "relative_s", seconds, [*warnings, "the times have no date and the file name has none either"]

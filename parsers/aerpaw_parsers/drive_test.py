@@ -1,10 +1,9 @@
-"""Exports of drive-test programs and phones: Nemo, XCAL, TEMS, QualiPoc, G-NetTrack; one table of names for all.
+"""Exports of drive-test programs and phones: Nemo, XCAL, TEMS, QualiPoc, G-NetTrack, with one dictionary for all.
 
-A column is told by its name: the quantity (RSRP, RSRQ, RSSI, SINR, path loss, PCI, ARFCN, CQI, throughput, rank),
-the radio access (LTE, NR) and the role of the cell (serving, or the n-th detected or neighbour). Levels with a PCI
-become one stream per cell, ``lte_pci110`` say, whose column ``serving`` is 1 while that cell served; other
-quantities become streams of kind ``kpi``, RI a rank stream (from one). Positions become the telemetry stream
-``phone``.
+The name of a column contains its quantity (RSRP, RSRQ, PCI, ARFCN, rank, ...), the radio access (LTE, NR) and the role
+of the cell (serving, or the n-th neighbour). Levels with a PCI become one stream per cell, such as ``lte_pci110``; its
+column ``serving`` is 1 while that cell serves. Other quantities become streams of kind ``kpi``. RI becomes a rank
+stream (from one), and positions become the telemetry stream ``phone``.
 """
 
 from __future__ import annotations
@@ -24,22 +23,22 @@ from aerpaw_cmp.readers import dictionary
 
 from . import _cells, _identity, _pose, _sheet, aadm_snr, ardupilot_bin, nemo_csv, pose_csv, quectel_ri
 
-# A tower of Lake Wheeler that a column is named by.
+# A tower of Lake Wheeler in the name of a column.
 _TOWER = re.compile(r"\blw ?([1-5])\b")
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
-# A cell that nobody calls serving is not known to serve: one of several does.
+# A cell without the word "serving" may serve or not, if there are several cells.
 _NO, _YES = ("false", "0", "no", "", "n/a", "none", "null", "nan", "-"), ("true", "1", "yes")
 _NEIGHBOURS = ("neighbor", "neighbour", "neighboring", "neighbouring", "detected", "monitored")
 
 
 def is_header(names: list[str]) -> bool:
-    """Check whether names hold a time and a level, ratio or rank."""
+    """Check whether there is a time and a level, ratio or rank among the names."""
     return len(names) > 1 and pose_csv.has_time(names) and pose_csv.has_radio(names)
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether a header of such names stands in front, and it is none of the narrower formats."""
-    # their headers hold a time and a level, too, and their readers know units that no name tells
+    """Check whether a file begins with a header of such names and is not one of the narrower formats."""
+    # their headers have a time and a level, too, and their readers know units that are not in the names
     narrower = [module.READER.sniff for module in (nemo_csv, quectel_ri, aadm_snr, ardupilot_bin)]
     return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 
@@ -51,7 +50,7 @@ class _Cell:
     rat: str
     place: str
     columns: dict[str, int] = field(default_factory=dict)  # by the fields of a reading
-    ports: list[int] = field(default_factory=list)  # levels of single ports beside the cell's own
+    ports: list[int] = field(default_factory=list)  # levels of single ports, in addition to that of the cell
 
     @property
     def serving(self) -> bool:
@@ -59,17 +58,17 @@ class _Cell:
 
     @property
     def measured(self) -> list[int]:
-        """Columns that are no identity."""
+        """The columns that are not identities."""
         return [column for name, column in self.columns.items() if name not in _IDENTITY]
 
 
 _IDENTITY = ("pci", "arfcn")
-# Places that are devices or SIMs: cells of each are series of their own.
+# Places that are devices or SIMs, with separate series for their cells.
 _OWNERS = ("sim", "slot", "dev", "modem", "phone", "ue")
 
 
 def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
-    """Cells of the table, columns of other quantities, columns of rank."""
+    """Return the cells of the table, the columns of other quantities, and those of ranks."""
     cells: dict[tuple[str, str], _Cell] = {}
     fields: dict[tuple[str, str], dict[str, list[int]]] = {}
     others, ranks = [], []
@@ -91,10 +90,10 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
             cell.columns[name], *second = listed if alone else sorted(listed, key=lambda i: _doubts(sheet, i))
             if name == "rsrp_dbm":
                 cell.ports = [i for i in second if _part(sheet, i) != "mean"]
-            others += [i for i in second if i not in cell.ports and name not in _IDENTITY]  # kept as KPIs
+            others += [i for i in second if i not in cell.ports and name not in _IDENTITY]  # read as KPIs
     if sheet.find("neighbouring") is not None and (common := cells.get(("", "serving"))) is not None:
         of_row = {name: column for name, column in common.columns.items() if name in _IDENTITY}
-        for cell in cells.values():  # a cell a row: the identity is that of whichever level the row has
+        for cell in cells.values():  # one cell per row: the identity belongs to any level of the row
             cell.columns = {**of_row, **cell.columns}
     placed = _completed(cells, others)
     if len(placed) == 1:
@@ -111,24 +110,24 @@ def _part(sheet: _sheet.Sheet, column: int) -> str:
 
 
 def _doubts(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, bool, int]:
-    """Order of columns of one quantity of one cell: filled, no mean, no single port, then with most distinct values."""
+    """Return the order of columns of one quantity: filled, not a mean, not a single port, most distinct values."""
     known = sheet.numbers(column)
     count = len(np.unique(known[np.isfinite(known)]))
     return not count, _part(sheet, column) == "mean", _part(sheet, column) == "port", -count
 
 
 def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_Cell]:
-    """Cells with a level; what stands without a radio access, or beside none, is that of the only one of its role.
+    """Return the cells with a level, and add identities without a radio access to the only cell with their role.
 
-    Neighbours whose names tell no radio access are of that of the table, where it names one alone. Levels of neighbours
-    that no column names by a PCI are no levels of a cell: they become KPIs.
+    Neighbours without a radio access in their names get that of the table, if there is only one. Levels of neighbours
+    without a PCI become KPIs.
     """
     for (rat, role), cell in list(cells.items()):
         if "rsrp_dbm" in cell.columns:
             continue
         levels = {key: home for key, home in cells.items() if "rsrp_dbm" in home.columns}
         homes = [home for key, home in levels.items() if key[1] == role and (not rat or key[0] in ("", rat))]
-        if "pci" in cell.columns and role == "serving" and not homes:  # a PCI beside 'rsrp1' or 'RSRP[0]' alone
+        if "pci" in cell.columns and role == "serving" and not homes:  # a PCI with a single level 'rsrp1' or 'RSRP[0]'
             near = [home for home in levels.values() if not home.place.startswith("n")]
             homes = [home for home in near if not rat or home.rat in ("", rat)]
         if len(homes) == 1:
@@ -158,13 +157,13 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell], more: list[str]) -> pd.Da
         values = {name: _or_nan(sheet, cell.columns.get(name), len(level)) for name in _FIELDS.values()}
         none = np.isnan(values["rsrp_dbm"]) & ~(values["pci"] > 0) if cell.rat == "nr" or not cell.serving else False
         # refused above where most are fractions; here a single damaged cell
-        pci = np.where(values["pci"] == np.round(values["pci"]), values["pci"], np.nan)  # a fraction is no identity
+        pci = np.where(values["pci"] == np.round(values["pci"]), values["pci"], np.nan)  # identities are integers
         rat = of_row if technology is not None and not cell.rat else cell.rat
         about = {
             "row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle,
             "more": more if cell.place == "serving" else "",
         }  # fmt: skip
-        # a leg or a neighbour that is not there is no reading
+        # an absent leg or neighbour is not a reading
         tables.append(pd.DataFrame({**values, **about, "pci": pci})[np.isfinite(level) & ~np.asarray(none)])
     joined: pd.DataFrame = pd.concat(tables) if tables else pd.DataFrame(columns=list(_cells.Reading._fields))
     return joined
@@ -175,7 +174,7 @@ _SCANNED = 0.3
 
 
 def _of_one_phone(readings: pd.DataFrame, time: AnyArray) -> pd.DataFrame:
-    """Readings without the claim to serve where rows of one time make it for several cells: a phone has one."""
+    """Return readings without ``serving`` where several cells serve at one time: a phone has one serving cell."""
     claims = readings[readings["serving"].astype(bool)]
     claims = claims.assign(time=time[claims["row"].to_numpy(np.int64)])
     of_time = claims.groupby(["time", "rat"])[["row", "pci", "arfcn"]].nunique()
@@ -188,14 +187,14 @@ def _of_one_phone(readings: pd.DataFrame, time: AnyArray) -> pd.DataFrame:
 
 
 def _identities(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[str]:
-    """PCI and carrier of the serving cell in each row, as text."""
+    """Return PCI and carrier of the serving cell in each row, as text."""
     columns = next((cell.columns for cell in cells if cell.place == "serving"), {})
     texts = [sheet.texts(columns[name]) for name in _IDENTITY if name in columns]
     return ["\t".join(row) for row in zip(*texts, strict=True)] if texts else [""] * len(sheet)
 
 
 def _idle(sheet: _sheet.Sheet) -> BoolArray:
-    """Rows of tables with a cell a row whose cell does not serve."""
+    """Return the rows whose cell does not serve, in tables with one cell per row."""
     idle = np.zeros(len(sheet), dtype=bool)
     for name, words in (("serving", _NO), ("neighbouring", _YES), ("technology", _NEIGHBOURS)):
         if (column := sheet.find(name)) is not None:
@@ -204,7 +203,7 @@ def _idle(sheet: _sheet.Sheet) -> BoolArray:
 
 
 def _rat(technology: str) -> str:
-    """Radio access of what a program calls a technology."""
+    """Return the radio access of a technology as programs name it."""
     word = technology.strip().lower()
     return "nr" if re.search(r"5g|nr", word) else "lte" if re.search(r"4g|lte", word) else ""
 
@@ -218,7 +217,7 @@ def _or_nan(sheet: _sheet.Sheet, column: int | None, count: int) -> FloatArray:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Cells, ranks, KPIs and the track of the phone; UsageError if the clock has no zone and none is given."""
+    """Return cells, ranks, KPIs and the track of the phone, or raise UsageError if the zone of the clock is unknown."""
     sheet = _sheet.read(data, is_header)
     rows = None if sheet is None else _sheet.rows(sheet, options, reader="drive_test")
     if sheet is None or rows is None:
@@ -227,7 +226,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
-    """Streams of a table whose columns have the names of a drive-test program: of each device, of each network."""
+    """Return the streams of a table with names of a drive-test program, for each device and network."""
     _settle_names(sheet)
     streams: list[Stream | None] = []
     for device, of_device, table in _identity.parts(rows, sheet, "device"):
@@ -254,7 +253,7 @@ def of_radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     for cell in cells:
         owner = cell.place if cell.place.startswith(_OWNERS) else ""
         owned.setdefault((owner, ""), []).append(cell)
-        for port in cell.ports:  # of the same cell, under a name of its own
+        for port in cell.ports:  # the same cell under another name
             of_port = {name: i for name, i in cell.columns.items() if name in _IDENTITY} | {"rsrp_dbm": port}
             owned.setdefault((owner, _short(sheet, port)), []).append(replace(cell, columns=of_port))
     several = len({owner for owner, _ in owned}) > 1
@@ -268,7 +267,7 @@ def of_radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     _name_others(rows, sheet, cells, others)
     columns = [*ranks, *others, *_event_columns(sheet, cells)]
     direct = [what.quantity.role for what in sheet.meanings if what is not None and not what.indirect]
-    # alone, a ratio to the noise is what a receiver says of the level
+    # without a level or rank, the ratio to the noise is the receiver's level
     alone = not {"rss", "rank"} & {*direct} and not _of_a_scheduler(rows, sheet)
     shown: list[Stream | None] = []
     for i in columns:
@@ -292,7 +291,7 @@ def _is_level(sheet: _sheet.Sheet, column: int, alone: bool) -> bool:
 
 
 def _is_statistic(sheet: _sheet.Sheet, column: int) -> bool:
-    """Check whether a column is the mean of a level that the table has as measured, too."""
+    """Check whether a column is the mean of a level that is another column of the table."""
     own = sheet.meanings[column]
     if own is None or own.part != "mean":
         return False
@@ -301,26 +300,26 @@ def _is_statistic(sheet: _sheet.Sheet, column: int) -> bool:
 
 
 def _of_a_scheduler(rows: _rows.Rows, sheet: _sheet.Sheet) -> bool:
-    """Check whether a table is of a base station, with columns of the uplink alone: its ratios are of the uplink."""
+    """Check whether a base station wrote the table, with columns of the uplink only."""
     words = {word for name in sheet.plain for word in name.split()}
     if not (words & {"ul", "uplink", "pusch", "pucch"}) or words & {"dl", "downlink", "pdsch", "csi"}:
         return False
     if not words & {"rnti", "ue", "nprb", "prb", "prbs"}:
         return False
     rows.warnings.append(
-        "the table of a scheduler of the uplink: its ratios to the noise are no levels of the downlink"
+        "the table is from a scheduler of the uplink: its ratios to the noise are not levels of the downlink"
     )
     return True
 
 
 def _short(sheet: _sheet.Sheet, column: int) -> str:
-    """Words of a column that are not its quantity, as a name."""
+    """Return the words of a column's name that are not its quantity, as a name."""
     words = re.sub(r"\b(\w*rsrp|dbm|lte|nr|4g|5g|serving)\b", " ", sheet.plain[column])
     return "_".join(words.split()) or f"column{column + 1}"
 
 
 def _name_others(rows: _rows.Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: list[int]) -> None:
-    """Report which of several columns of a cell's level was read, and what became of the others."""
+    """Report which of several columns of a cell's level was read, and how the others were read."""
     for cell in cells:
         level = cell.columns["rsrp_dbm"]
         means = [
@@ -344,7 +343,7 @@ def _renamed(stream: Stream | None, suffix: str) -> Stream | None:
 
 
 def _event_columns(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
-    """Columns beside a serving level with values in rows of their own, which become streams: Nemo's rows are events."""
+    """Return columns of a serving cell with values in rows without its level, as in Nemo's rows of events."""
     columns = []
     for cell in cells:
         if cell.serving:
@@ -354,14 +353,14 @@ def _event_columns(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
 
 
 def _settle_names(sheet: _sheet.Sheet) -> None:
-    """G-NetTrack's ``Level`` is an RSRP on 4G and 5G, an RSCP on 3G and an RxLev on 2G: columns of their own.
+    """Divide G-NetTrack's ``Level`` into columns: RSRP on 4G and 5G, RSCP on 3G, RxLev on 2G.
 
-    Its ``LTERSSI`` is in dBm, from older phones in steps from 0.
+    Its ``LTERSSI`` is in dBm; older phones write steps from 0.
     """
     if sheet.program is None or "level" not in sheet.program.words:
         return
     texts = sheet.texts(column) if (column := sheet.find("technology")) is not None else []
-    # older phones count the RSSI in steps from 0: no dBm is above
+    # levels of 0 dBm and more are steps of older phones
     if (rssi := sheet.named("lterssi")) is not None:
         sheet.silence(sheet.numbers(rssi) >= 0, [rssi])
     level, quality = sheet.named("level"), sheet.named("qual")
@@ -383,8 +382,8 @@ def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     name, cqi = re.sub(r"\W+", "_", sheet.plain[column]), sheet.find("CQI")
     idle = 0 if cqi is None or zero else int(((ri == 0) & (sheet.numbers(cqi) > 0)).sum())
     if 2 * idle > len(ri):
-        text = f"0 beside a CQI in {counted(idle, 'row')}, read as no report: do its ranks count from 0?"
-        rows.warnings.append(f"column {sheet.names[column]!r}: {text} Then give it with --map and --ri-base zero")
+        text = f"0 with a CQI in {counted(idle, 'row')}, read as no report: do its ranks count from 0?"
+        rows.warnings.append(f"column {sheet.names[column]!r}: {text} Then use --map and --ri-base zero")
     source = "scheduled PDSCH rank" if "pdsch" in name else "CSI report"
     return rows.stream(
         "rank", name, values, where=np.isfinite(ri), flag=flag, ri_base=("one", "zero")[zero], source=source
@@ -398,7 +397,7 @@ def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> S
     values, name = sheet.numbers(column), sheet.plain[column]
     meaning, about = sheet.meanings[column], {"node": f"LW{tower[1]}"} if (tower := _TOWER.search(name)) else {}
     if meaning is not None and meaning.place.startswith("cell") and "cell" in name:
-        about |= {"cell": meaning.place, "part": meaning.place}  # no second reading of the first, as 'rsrp 2' may be
+        about |= {"cell": meaning.place, "part": meaning.place}  # unlike 'rsrp 2', not a second reading of one cell
     if tower and name == f"snr {tower[0]}":
         return _rows.snr(rows, about["node"], values)
     where, unit = np.isfinite(values), sheet.unit_read(column)

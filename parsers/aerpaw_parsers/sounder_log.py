@@ -164,7 +164,7 @@ def _piece(lines: _text.Lines, rejects: _text.Rejects) -> _Piece:
         blank += not line.strip()
     odd, wrong_dates = _collect(samples)
     marked, wrong_marks = _collect(marks)
-    rejects.add(lines, wrong_dates + wrong_marks, "the time stamp is no date of the calendar")
+    rejects.add(lines, wrong_dates + wrong_marks, "the time stamp is not a date of the calendar")
     texts = {i: lines.text(i) for i in marked.line[:KEPT_REJECTED].tolist()}
     return _Piece(fixed.join(odd) if len(odd.line) else fixed, marked, texts, len(lines), blank)
 

@@ -158,7 +158,7 @@ def test_one_of_several_logs_under_a_path_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_bytes(VEHICLE)
     (tmp_path / "b.txt").write_bytes(VEHICLE + VEHICLE.splitlines(keepends=True)[-1].replace(b"35.", b"36.", 1))
     write_flight(tmp_path / "f.h5", ingest(sorted(tmp_path.glob("*.txt")), options=OPTIONS))
-    with pytest.raises(UsageError, match=r"2 logs stand under one path: a.txt, b.txt; expected one of them"):
+    with pytest.raises(UsageError, match=r"2 logs under one path: a.txt, b.txt; expected one of them"):
         read_log(tmp_path, "f.h5", OPTIONS)
     for name in ("a.txt", "b.txt"):
         assert read_log(tmp_path, f"f.h5/{name}", OPTIONS).sha256 == read_log(tmp_path, name, OPTIONS).sha256

@@ -64,7 +64,7 @@ def test_one_component_voids_its_quantity_and_no_other(column: str, value: float
 
 def test_exchanged_angles_beyond_the_pole_are_named() -> None:
     result = checked("telemetry", latitude_deg=np.full(5, -112.0), longitude_deg=np.full(5, 40.0))
-    assert "are latitude and longitude exchanged?" in result.warnings[0]
+    assert "are latitude and longitude swapped?" in result.warnings[0]
 
 
 def test_a_rank_above_the_ports_of_the_log_is_flagged() -> None:
@@ -73,7 +73,7 @@ def test_a_rank_above_the_ports_of_the_log_is_flagged() -> None:
     assert frame["flag"].tolist() == ["", "", "rank_above_ports", "", ""]
     assert frame["ri_raw"].tolist() == [1, 2, 3, 0, 2]
     assert np.isnan(frame["rank"][2])
-    assert "on at most 2 ports by the log itself" in result.warnings[0]
+    assert "the log has at most 2 ports" in result.warnings[0]
     unknown = checked("rank", {}, rank=np.array([1.0, 2, 3, np.nan, 2]), ri_raw=np.array([1.0, 2, 3, 0, 2]))
     assert unknown.warnings == ()
 

@@ -163,9 +163,9 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
     "answers of another modem": (
         table("", '[2025-06-10 10:00:0{i}] #RFSTS: "310 26",1795,-101,-67,-15,2242'), InputError, "AT answers of a modem"),
     "an index in front of AERPAW's positions": (
-        table("time,lat,lon,alt,rsrp", EPOCH + f",1.{{i}},{PLACE},{{l}}"), InputError, "holds values as positions have"),
+        table("time,lat,lon,alt,rsrp", EPOCH + f",1.{{i}},{PLACE},{{l}}"), InputError, "has values like positions"),
     "an index in front of positions elsewhere": (
-        table("time,lat,lon,alt,rsrp", EPOCH + ",1.{i},48.13712{i},11.57541{i},{l}"), InputError, "'alt' holds values as"),
+        table("time,lat,lon,alt,rsrp", EPOCH + ",1.{i},48.13712{i},11.57541{i},{l}"), InputError, "'alt' has values like"),
     "a level without its PCI, elsewhere": (
         table("time,pci,rsrp,lat,lon,alt", EPOCH + ",{l},48.13712{i},11.57541{i},520.3,3"), InputError, SHIFTED),
     "GnssLogger": (

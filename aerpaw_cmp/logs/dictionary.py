@@ -442,7 +442,7 @@ def is_none(quantity: Quantity, values: FloatArray) -> BoolArray:
 
 
 def impossible(quantity: Quantity, values: FloatArray) -> BoolArray:
-    """Return the mask of values that a quantity cannot have; identities cannot be fractions."""
+    """Return the mask of values that a quantity cannot have, such as fractions of identities."""
     beyond = (values < quantity.can_be[0]) | (values > quantity.can_be[1])
     if quantity.role == "cell":
         beyond |= np.isfinite(values) & (values != np.round(values))
@@ -613,8 +613,8 @@ PROGRAMS: tuple[Program, ...] = (
         "position lat": "semicircles", "position long": "semicircles"}),
     _program("Open DroneLog", "vps height m,height m", datum="sea level", words={
         r"height m": "height above takeoff", r"velocity ([xyz]) ms": r"velocity \1"}),
-    # its dB are dBm; 1RSS and 2RSS are received by the aircraft, TRSS by the transmitter; FrSky's RSSI is not in dBm,
-    # and Hdg is the course over ground
+    # Its dB are dBm. 1RSS and 2RSS are received by the aircraft, TRSS by the transmitter. FrSky's RSSI is not in dBm,
+    # and Hdg is the course over ground.
     _program("EdgeTX", "date,time,txbat v", "rqly,rsnr db", "date,time,rxbt v", words={
         r"([12])rss( dbm?)?": r"rssi \1", r"trss( dbm?)?": "rssi telemetry", r"rsnr( db)?": "sinr 1",
         r"tsnr( db)?": "sinr telemetry", r"rssi( db)?": "rssi count", r"ptch( rad)?": "pitch", r"hdg( .*)?": "course",
@@ -646,12 +646,12 @@ _CELL_ID = re.compile(r"\b(cell ?id|l?cid|e?ci|nci|[en]?cgi|[eg]nb ?id|sector ?i
 
 
 def names_a_cell(words: str, *, alone: bool = False) -> bool:
-    """Check whether a plain name names a cell, an antenna or a beam; ``alone``: only that of the row itself."""
+    """Check whether a plain name names a cell, an antenna or a beam, only that of the row itself if ``alone``."""
     return _OF_A_CELL.fullmatch(words) is not None or (not alone and _CELL_ID.search(words) is not None)
 
 
 def like_levels(names: Iterable[str]) -> list[str]:
-    """Return those of some unknown names that may be levels; a power next to a voltage is electric."""
+    """Return those of some unknown names that may be levels, except electric power next to a voltage."""
     words = {name: plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)) for name in names}
     electric = any(re.search(r"volt|batt|\bcurrent", text) for text in words.values())
     return [

@@ -257,7 +257,7 @@ def _zip(data: bytes, path: str | Path) -> Iterator[Member]:
     for entry in book.infolist():
         if not entry.is_dir() and not _hidden(entry.filename):
             size = entry.file_size
-            # deflate cannot shrink a file so much: the directory is false
+            # deflate cannot reach this ratio: the directory is false
             lies = size > MOST_BYTES or size > _RATIO * entry.compress_size + _MARGIN
             read = (
                 partial(_refused, f"the member unpacks to {size} bytes", f"at most {MOST_BYTES}", path)

@@ -1,4 +1,4 @@
-"""The flight file: everything that was read, in one HDF5 file, written whole or not at all.
+"""The flight file: all records of some logs in one HDF5 file, which is written atomically.
 
 Layout (root attributes ``format`` = ``aerpaw-cmp flight``, ``version`` = 1)::
 
@@ -7,14 +7,14 @@ Layout (root attributes ``format`` = ``aerpaw-cmp flight``, ``version`` = 1)::
     /files/00000/reasons                  JSON: list of [reason, count, first line, last line]
     /files/00000/streams/00000/meta       JSON: kind, name, columns [{name, type}], attributes
     /files/00000/streams/00000/C00000     values of the first column, and so on
-    /files/00000/streams/00000/C00000.words   JSON: the texts that a text column's codes stand for
+    /files/00000/streams/00000/C00000.words   JSON: the texts of the codes of a text column
 
-JSON is stored as UTF-8 bytes, because HDF5 strings cannot hold the NUL characters that torn logs have. Times are
-int64 nanoseconds of UTC. Nothing in the file needs this package to be read.
+JSON is stored as UTF-8 bytes, because HDF5 strings cannot contain the NUL characters of damaged logs. Times are
+int64 nanoseconds of UTC. The file can be read without this package.
 
-Behind the HDF5 data, where HDF5 does not look, stand the word ``AERPAWCS`` and the SHA-256 of all bytes before it:
-damage is found before HDF5 sees it, which takes some damage for data and never comes back from some. A file without
-it (cut, or written on by another program) is left to HDF5's own checks.
+After the HDF5 data, which HDF5 ignores, come the word ``AERPAWCS`` and the SHA-256 of all bytes before it. Damage is
+thus found before HDF5 reads the file, because HDF5 takes some damage for data and does not return from other damage.
+A file without the SHA-256 (truncated, or changed by another program) gets the checks of HDF5 only.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ class IngestedFile:
     Parameters
     ----------
     path : str
-        As the user or the folder gave it.
+        Path from the user or the folder.
     sha256 : str
-        Of the content after unpacking: a log is known by it, whatever its name or archive.
+        SHA-256 of the content after unpacking, which identifies a log under any name and in any archive.
     result : ReadResult
     holder : str
-        The flight file that the log was read from; empty where it was read itself.
+        The flight file that the log was read from, empty for the log itself.
     """
 
     path: str
@@ -97,8 +97,8 @@ def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
             for i, file in enumerate(files):
                 _write_file(shelf.create_group(f"{i:05d}"), file, sink)
     finally:
-        sink.raise_spared()  # what HDF5 says after a failure is its consequence
-    # HDF5 ignores what stands behind its own end
+        sink.raise_spared()  # errors of HDF5 after a failure follow from it
+    # HDF5 ignores bytes after its own end
     size = stream.seek(0, os.SEEK_END)
     digest = _digest(stream, size)
     stream.seek(size)
@@ -106,7 +106,7 @@ def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
 
 
 def is_flight_file(path: Path) -> bool:
-    """Check whether a file is a flight file as it was written: its content has the SHA-256 at its end."""
+    """Check whether a file is an unchanged flight file, by the SHA-256 at its end."""
     with path.open("rb") as book:
         content = book.seek(0, os.SEEK_END) - len(_SEAL) - _DIGEST_BYTES
         if content <= 0:
@@ -200,7 +200,10 @@ def _write_column(group: Any, name: str, column: pd.Series[Any], kind: str) -> N
 
 
 def _codes(part: AnyArray, number: dict[str | None, int]) -> AnyArray:
-    """Numbers of texts; new texts get the next. Not by pandas: up to 2.3 its factorize ends a text at a NUL."""
+    """Return the numbers of texts, and number new texts.
+
+    The factorize function of pandas up to 2.3 ends a text at a NUL.
+    """
     import numpy as np
     import pandas as pd
 

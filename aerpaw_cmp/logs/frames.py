@@ -29,22 +29,21 @@ _TOWERS = ("LW1", "LW2", "LW3", "LW4", "LW5")
 
 @from_python
 class Logs(dict[str, pd.DataFrame]):
-    """Frames by the name of their stream, with the account of every file.
+    """The frames of logs by the name of their stream, with the account of every file.
 
-    ``frame.attrs`` holds what is true of a whole stream (node, channel, unit, frequency) and its ``reader``, ``file``
-    and ``kind``; the node of a level or rank that the log does not name is the tower in its path (``LW1/power.txt``).
-    A name that several files use becomes ``<file>:<stream>`` for all of them, with the folder where files are called
-    alike.
+    ``frame.attrs`` contains the attributes of the stream (node, channel, unit, frequency) and its ``reader``, ``file``
+    and ``kind``. If a log does not name its node, the node is the tower in its path (``LW1/power.txt``). A name in
+    several files becomes ``<file>:<stream>``, with the folder if files have the same name.
 
     Parameters
     ----------
     files : Ingested
-        As :func:`aerpaw_cmp.logs.ingest.ingest` gives them.
+        Result of :func:`aerpaw_cmp.logs.ingest.ingest`.
 
     Attributes
     ----------
     files : Ingested
-        The records themselves, with rejected lines and warnings.
+        The records, with rejected lines and warnings.
     """
 
     def __init__(self, files: Ingested) -> None:
@@ -89,12 +88,12 @@ class Logs(dict[str, pd.DataFrame]):
         return {k: v for k, v in self.items() if all(v.attrs.get(name) == value for name, value in wanted.items())}
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write every stream with its account into a flight file (HDF5), which :func:`read` reads back.
+        """Write every stream with its account into a flight file (HDF5), which :func:`read` can read.
 
         Parameters
         ----------
         path : path
-            Such as ``flight.h5``; a file that stands there is replaced.
+            Path such as ``flight.h5``; an existing file is replaced.
         """
         write_flight(Path(path).expanduser(), self.files)
 
@@ -117,7 +116,7 @@ def _line(name: str, frame: pd.DataFrame) -> str:
 
 
 def _in_utc(frame: pd.DataFrame) -> pd.DataFrame:
-    """The frame with ``time`` as instants of UTC: records hold UTC without a zone."""
+    """Return the frame with ``time`` in UTC with its zone, which records do not have."""
     out: pd.DataFrame = frame.copy(deep=False)
     out["time"] = pd.to_datetime(out["time"]).dt.tz_localize("UTC")
     return out
@@ -183,7 +182,7 @@ def read(
 
 
 def _matching(source: str | os.PathLike[str]) -> Iterator[Path]:
-    """The path itself, or what its pattern matches."""
+    """Yield the path itself, or the paths that its pattern matches."""
     place = Path(source).expanduser()
     if place.exists() or not glob.has_magic(str(place)):
         yield place
@@ -195,7 +194,7 @@ def _matching(source: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _opened(file: BinaryIO, options: ReadOptions, reader: str | None) -> Ingested:
-    """An open file as a log of its name; archives and HDF5 need a place on the disk."""
+    """Read an open file as a log of its name, through a temporary file, which archives and HDF5 need."""
     name = Path(str(getattr(file, "name", "") or "log")).name
     with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-") as folder:
         place = Path(folder) / name

@@ -55,7 +55,7 @@ class Skipped:
     path: str
     reason: str
     error: AerpawCmpError | None = None
-    """A usage error names an option that this file needs; the other files of the folder may not need it."""
+    """A usage error names an option that this file needs, but perhaps not the other files of the folder."""
 
     @classmethod
     def of(cls, path: Path, names: Collection[str], error: AerpawCmpError) -> Skipped:
@@ -343,7 +343,7 @@ def _refuse_other_kind(path: Path, reader: Reader) -> None:
 
 
 def _head(place: Path) -> bytes:
-    """Return the first bytes of a file, or no bytes if it cannot be read; reading it later reports why."""
+    """Return the first bytes of a file, or no bytes if it cannot be read, which is reported later."""
     try:
         return _raw(place, HEAD_BYTES)
     except InputError:
@@ -380,7 +380,7 @@ def _member(
     options: _OptionsFor | None,
     chosen: Reader | None,
 ) -> IngestedFile:
-    """Read one file of an archive; it is not unpacked if its first bytes are not those of a log."""
+    """Read one file of an archive, and unpack it only if its first bytes are those of a log."""
     # only the beginning, because data sets contain recordings of GiB next to their logs
     head = member.read(DEEP_BYTES)
     if (
@@ -484,7 +484,7 @@ def _source(flight_file: Path, name: str, held: Held | None = None) -> IngestedF
 
 
 def _in_pieces(place: Path, reader: Reader, options: _OptionsFor | None) -> IngestedFile | None:
-    """Read a log in pieces if its reader can, else return None; UTF-16 is converted at once."""
+    """Read a log in pieces if its reader can, else return None, as for UTF-16, which is converted at once."""
     if reader.read_pieces is None or _raw(place, 2) in _UTF_16:
         return None
     chosen, digest = _options(place, options, _neighbour_reader(place)), hashlib.sha256()
@@ -530,7 +530,7 @@ def _read(
 
 
 def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[], ReadResult]) -> ReadResult:
-    """Return the result of a reader with impossible values flagged; errors name the file, unknown to readers."""
+    """Return the result of a reader with impossible values flagged, and name the file in errors."""
     from . import limits, readers  # load pandas, as any reader does
 
     expected, cause = f"lines such as {reader.sample!r}", "a log of another kind, or a damaged one"

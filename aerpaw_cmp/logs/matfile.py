@@ -1,8 +1,8 @@
 """Numeric and character arrays of MATLAB level-5 files, read so that a damaged file is a message.
 
 SciPy's reader is compiled code that trusts the file: a single wrong byte can end the process with a segmentation
-fault, which nobody can catch. Here every size is checked before it is used. What a merged flight and a gain grid need
-is read: full numeric arrays and character matrices, plain or compressed; variables of other classes are left out.
+fault. Here every size is checked before it is used. Full numeric arrays and character matrices are read, plain or
+compressed, because merged flights and gain grids consist of them. Variables of other classes are ignored.
 Layout: "MAT-File Format" (MathWorks), chapter 1, level 5.
 """
 
@@ -22,12 +22,12 @@ from ..common.errors import InputError
 from ..common.units import AnyArray
 
 MAGIC = b"MATLAB 5.0 MAT-file"
-# First bytes of a version 7.3 file: HDF5 behind a block of 512 bytes.
+# First bytes of a version 7.3 file: HDF5 after a block of 512 bytes.
 MAGIC_73 = b"MATLAB 7.3 MAT-file"
-# Of one variable after decompression.
+# Largest size of a variable after decompression.
 MOST_BYTES = 1 << 30
 MOST_RATIO = 100
-# All compressed variables together unpack to at most so many bytes and ``MOST_RATIO`` times the file's size.
+# All compressed variables together unpack to at most these bytes plus ``MOST_RATIO`` times the size of the file.
 FREE_BYTES = 1 << 28
 
 _COMPRESSED, _MATRIX, _INT8, _INT32, _UINT32 = 15, 14, 1, 5, 6
@@ -47,14 +47,14 @@ def _damaged(what: str) -> InputError:
 
 
 def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArray]:
-    """The wanted variables of a file.
+    """Return the wanted variables of a file.
 
     Parameters
     ----------
     data : bytes
         The file.
     wanted : collection of str or None
-        Names, None for all; what the file does not have, or holds in another class, is missing from the result.
+        Names, None for all. Variables that the file does not have, or of other classes, are missing in the result.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
     Raises
     ------
     InputError
-        If it is neither a level-5 nor a version 7.3 file, or any size or type in it cannot be.
+        If it is neither a level-5 nor a version 7.3 file, or a size or type in it is impossible.
 
     Notes
     -----
@@ -86,7 +86,7 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
     allowance = FREE_BYTES + MOST_RATIO * len(data)
     for element in _elements(data, 128, order, padded=False):
         variable = _inflated(element, order, min(allowance, MOST_BYTES)) if element.kind == _COMPRESSED else element
-        # all variables share it: a thousand small bombs are one large
+        # one allowance for all variables: many small zip bombs are as bad as a large one
         allowance -= len(variable.body) if element.kind == _COMPRESSED else 0
         if variable.kind != _MATRIX:
             raise _damaged(f"element of type {variable.kind} where a variable was expected")
@@ -97,20 +97,20 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
 
 
 def names_of(head: bytes) -> list[str]:
-    """Names of the variables of a level-5 file that begin in its first bytes."""
+    """Return the names of the variables of a level-5 file that begin in its first bytes."""
     order, names = "<" if head[126:128] == b"IM" else ">", []
     with suppress(InputError, struct.error, zlib.error):
         for element in islice(_elements(head, 128, order, padded=False, cut=True), 64):
             body = element.body
             if element.kind == _COMPRESSED:
-                # 256 bytes hold flags, dimensions and a name; the tag in front is that of the matrix
+                # 256 bytes contain flags, dimensions and a name, after the tag of the matrix
                 body = zlib.decompressobj().decompress(body, 256)[8:]
             names.append(_head_of(_elements(body, 0, order, padded=True, cut=True))[2])
     return names
 
 
 def _read_hdf5(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArray]:
-    """The wanted variables of a version 7.3 file, read in a process of its own."""
+    """Return the wanted variables of a version 7.3 file, read in a separate process."""
     from ..common.native import read
 
     variables, notes = read("matlab", data)
@@ -120,15 +120,15 @@ def _read_hdf5(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArra
 
 
 def _letters(codes: AnyArray) -> AnyArray:
-    """Rows of a matrix of character codes as text, trailing blanks removed."""
+    """Return the rows of a matrix of character codes as text, without trailing blanks."""
     rows = codes.astype(np.uint16).tolist()
     return np.array(["".join(map(chr, row)).rstrip() for row in rows] or [""], dtype=np.str_)[: len(codes)]
 
 
 def _elements(data: bytes, at: int, order: str, *, padded: bool, cut: bool = False) -> Iterator[_Element]:
-    """Elements one after the other; inside a variable they are padded to eight bytes and may be small.
+    """Yield elements one after the other, padded to eight bytes and perhaps small inside a variable.
 
-    Of data that are ``cut`` the last may be cut, too.
+    The last element of data that are ``cut`` may be truncated.
     """
     while at < len(data):
         if len(data) - at < 8:
@@ -152,7 +152,7 @@ def _elements(data: bytes, at: int, order: str, *, padded: bool, cut: bool = Fal
 def _inflated(element: _Element, order: str, most: int) -> _Element:
     machine = zlib.decompressobj()
     try:
-        # 0 would mean no limit
+        # 0 would mean that there is no limit
         plain = machine.decompress(element.body, max(most, 1))
     except zlib.error as error:
         raise _damaged(str(error)) from None
@@ -173,7 +173,7 @@ def _inflated(element: _Element, order: str, most: int) -> _Element:
 
 
 def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[str, AnyArray | None]:
-    """Name and array of a variable; None for one that is not wanted or of another class."""
+    """Return the name and the array of a variable, None if it is not wanted or has another class."""
     parts = _elements(body, 0, order, padded=True)
     flags, dimensions, title = _head_of(parts)
     # signed: a negative one is damage, and would wrap to a huge one
@@ -203,13 +203,13 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
 
 
 def _head_of(parts: Iterator[_Element]) -> tuple[bytes, bytes, str]:
-    """Flags, dimensions and name of a variable: its first three elements."""
+    """Return flags, dimensions and name of a variable, its first three elements."""
     head = [*islice(parts, 3)]
     if [element.kind for element in head] != [_UINT32, _INT32, _INT8]:
         raise _damaged("a variable without flags, dimensions or name")
     flags, dimensions, name = (element.body for element in head)
     if len(flags) != 8 or len(dimensions) < 8 or len(dimensions) % 4:
-        raise _damaged("dimensions that are no numbers")
+        raise _damaged("dimensions that are not numbers")
     return flags, dimensions, name.decode("ascii", errors="replace")
 
 
@@ -225,7 +225,7 @@ def _numbers(values: _Element, shape: tuple[int, ...], order: str, kind: str) ->
 
 
 def _rows(values: _Element, shape: tuple[int, ...], order: str) -> AnyArray:
-    """Rows of a character matrix as text, trailing blanks removed."""
+    """Return the rows of a character matrix as text, without trailing blanks."""
     encoding = _ENCODINGS.get(values.kind)
     if len(shape) > 2 and math.prod(shape) == shape[0] * shape[-1]:
         shape = shape[0], shape[-1]  # SciPy writes a column of texts with a dimension more

@@ -28,19 +28,19 @@ HEAD_BYTES = 65_536
 # And this much where no log reader knows those.
 DEEP_BYTES = 4 << 20
 
-# Reads a log from pieces of whole lines: the same result whatever their size.
+# A function that reads a log from pieces of complete lines, with a result that does not depend on their size.
 _ReadPieces = Callable[[Iterable[bytes], "ReadOptions"], ReadResult]
 _ReadSections = Callable[[Iterable[bytes], "ReadOptions", float], Iterator[Stream | ReadResult]]
 
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """Facts that a file cannot say about itself. All optional; a reader uses what concerns it.
+    """Facts that are not in a file. All are optional, and a reader uses those that it needs.
 
     Parameters
     ----------
     timezone : str, optional
-        IANA zone of zone-less clocks. A reader that meets such a clock without it raises ``UsageError``.
+        IANA zone of zone-less clocks. A reader raises ``UsageError`` if it needs the zone.
     clock : {"local", "utc", "local_as_utc"}, optional
         Overrides the reader's own rule; ``local_as_utc`` is local wall time stored as if it were UTC.
     time_origin : str, optional
@@ -48,7 +48,7 @@ class ReadOptions:
     gps_rollovers : int
         How often the week number of the log's GPS receiver has rolled over: each adds 1 024 weeks to its times.
     ri_base : {"zero", "one"}, optional
-        What the source prints for rank 1. Readers that know their base ignore it.
+        Number that the source prints for rank 1. Readers of formats with a fixed base ignore it.
     columns : mapping, optional
         Generic CSV only: record column to file column.
     kind : str, optional
@@ -62,12 +62,12 @@ class ReadOptions:
     floor_db : float
         RSS at or below this is out of coverage.
     only_spans : bool
-        Of a large log its account, and of each stream the first and the last record in time and their number.
+        Read of a large log only its account, the first and the last record of each stream, and their number.
     file_name : str
-        Of the log, without folders; set by ``ingest``. For formats whose content does not say what it is.
+        Name of the log without folders, set by ``ingest``, for formats whose content is ambiguous.
     neighbour : callable, optional
-        Content of another file of the log's folder by its name, None where there is none; set by ``ingest``. For
-        formats that keep their samples in a second file.
+        Return the content of another file in the log's folder by its name, or None if it is missing. Set by ``ingest``,
+        for formats with samples in a second file.
     """
 
     timezone: str | None = None
@@ -98,7 +98,7 @@ class Reader:
     title : str
         One line for ``aerpaw-cmp formats``.
     kinds : tuple of str
-        Kinds of stream it can give; none for a file that is known to be no log, and ``title`` says what it is.
+        Kinds of stream that it can return; none for known files that are not logs, with a description in ``title``.
     sample : str
         One typical line.
     sniff : callable
@@ -106,12 +106,12 @@ class Reader:
     read : callable
         ``read(data: bytes, options: ReadOptions) -> ReadResult``.
     pieces : bool
-        Is a file of a few records a piece of the log that its folder holds?
+        True if a file of a few records is a piece of the log in its folder.
     read_pieces : callable, optional
         ``read_pieces(pieces, options) -> ReadResult``: the same from pieces of whole lines, for logs larger than
         memory; see :mod:`aerpaw_cmp.logs.files`.
     read_sections : callable, optional
-        ``read_sections(pieces, options, most)`` gives streams of some ``most`` records each, last the result.
+        ``read_sections(pieces, options, most)`` yields streams of about ``most`` records each, and then the result.
     clock_from, height_from : str
         ``written``, ``program: which``, or ``assumed: what``; see :mod:`aerpaw_cmp.logs.readers`. A stream's own
         attribute of that name wins.
@@ -135,7 +135,7 @@ class Reader:
 
 @contextmanager
 def blaming(plugin: str, doing: str, kind: type[AerpawCmpError] = UsageError) -> Iterator[None]:
-    """Name the plug-in whose code raises inside; the empty name is this project, whose errors pass."""
+    """Name the plug-in in errors that its code raises, unless the name is empty, as for this project."""
     try:
         yield
     except Exception as error:
@@ -182,7 +182,7 @@ def _accepts(reader: Reader, head: bytes) -> bool:
 
 
 def by_name(name: str) -> Reader:
-    """The reader of that name, or ``UsageError`` naming the known ones."""
+    """Return the reader of a name, or raise ``UsageError`` with the known names."""
     for reader in catalogue():
         if reader.name == name:
             return reader
@@ -201,10 +201,10 @@ _BLANK_LINES = re.compile(rb"\A(?:[ \t]*\r?\n)+")
 
 
 def claims(data: bytes) -> list[Reader]:
-    """Readers whose sniffers accept the beginning of a file, blank lines in front of it aside.
+    """Return the readers whose sniffers accept the beginning of a file, without blank lines before it.
 
-    A console or a KML may hold what tells it apart behind much talk or many styles: where no log reader accepts the
-    first ``HEAD_BYTES``, theirs see ``DEEP_BYTES``. Those of files that are no logs are asked last.
+    If no reader of logs accepts the first ``HEAD_BYTES``, the sniffers see ``DEEP_BYTES``, because a console or a KML
+    may be recognised late. Readers of files that are not logs are tried last.
     """
     data = _BLANK_LINES.sub(b"", data[:DEEP_BYTES])
     heads = (data[:HEAD_BYTES], data) if len(data) > HEAD_BYTES else (data,)
@@ -215,7 +215,7 @@ def claims(data: bytes) -> list[Reader]:
 
 
 def identify(data: bytes, *, path: str | None = None) -> Reader:
-    """The one reader whose sniffer accepts the content.
+    """Return the single reader whose sniffer accepts the content.
 
     Raises
     ------
@@ -228,7 +228,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
     # before any sniffer: it is a text, and would be called an unknown one
     if head.startswith(b"version https://git-lfs"):
         raise InputError(
-            "a Git-LFS pointer stands in place of the data",
+            "a Git-LFS pointer instead of the data",
             expected="the log itself",
             cause="the repository was cloned without 'git lfs pull'",
             path=path,
@@ -258,7 +258,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
 def _way_out(head: bytes) -> str:
     titled = re.sub(rb"\A(?:\s*#[^\n]*\n)+", b"", head.lstrip(b"\xef\xbb\xbf \r\n"))
     first = titled.split(b"\n", 1)[0].decode("utf-8", "replace").strip()
-    # the commonest: a decimal comma stands less often than what parts the cells
+    # the most frequent one: a decimal comma is rarer than the separator
     sign = max(",;\t|", key=first.count)
     names = [name.strip().strip('"') for name in first.split(sign)]
     if len(names) > 1 and not first.startswith(("{", "[", "<", "$")) and all(not name[:1].isdigit() for name in names):
@@ -290,7 +290,7 @@ def _way_to_map(names: list[str]) -> str:
         lacking = " or ".join(what for what in ("time", "rss_db") if not fits[what])
         return f"a table of another kind; no column looks like {lacking}"
     pairs = [f"--map {named[0]!r}={what}" for what, named in fits.items() if named]
-    return f"a table of another kind: name what its columns hold: {' '.join(pairs)}"
+    return f"a table of another kind: name its columns: {' '.join(pairs)}"
 
 
 def _excerpt(head: bytes) -> str:
@@ -299,7 +299,7 @@ def _excerpt(head: bytes) -> str:
 
 
 def stated(result: ReadResult, reader: Reader, options: ReadOptions) -> ReadResult:
-    """A result whose streams say where their clock, height and identity are known from."""
+    """Return a result whose streams have the sources of their clock, height and identity."""
     streams = tuple(
         replace(stream, attributes={**stream.attributes, **_origins(stream, reader, options)})
         for stream in result.streams
@@ -330,13 +330,13 @@ def _clock(stream: Stream, reader: Reader, options: ReadOptions) -> str:
 
 
 def _split(what: str, text: str) -> dict[str, Attribute]:
-    """``program: datetime.now()`` as two attributes."""
+    """Return ``program: datetime.now()`` as two attributes."""
     word, _, source = text.partition(": ")
     return {f"{what}_from": word, **({f"{what}_source": source} if source else {})}
 
 
 def named_tower(path: str, towers: Sequence[str]) -> str | None:
-    """The tower of the site whose name stands in a path, the last where several do; ``lw-1`` is LW1."""
+    """Return the tower of the site whose name is in a path (``lw-1`` is LW1), the last one of several."""
     places = {}
     for tower in towers:
         letters = "[-_ ]?".join(map(re.escape, re.findall(r"\d+|[^\W\d_]+", tower)))
@@ -344,5 +344,5 @@ def named_tower(path: str, towers: Sequence[str]) -> str | None:
         ends = r"(?!\d)" if tower[-1:].isdigit() else r"(?![^\W_])"
         for match in re.finditer(rf"(?<![^\W_]){letters}{ends}" if letters else r"(?!)", path, re.IGNORECASE):
             places[match.start()] = tower
-    # the last: file names stand behind folders
+    # the last one, because file names come after folders
     return places[max(places)] if places else None

@@ -1,7 +1,7 @@
-"""The record model: what every reader returns, whatever the format.
+"""The record model: the result of every reader for every format.
 
 A log file becomes a :class:`ReadResult`: streams of records, the account of its lines, and the rejected lines with
-their reasons (the first thousand verbatim, all counted). The accounting law, checked when the result is built::
+their reasons (the first thousand verbatim, all counted). The account is checked when the result is built::
 
     lines == accepted + rejected_count + blank
 
@@ -11,20 +11,20 @@ Columns (UTC ``time`` as naive ``datetime64[ns]``; units in names). Every frame 
 telemetry
     ``latitude_deg longitude_deg altitude_m`` (above take-off) ``roll_deg pitch_deg yaw_deg`` (nose up +,
     right wing down +, yaw clockwise from north) ``velocity_north_mps velocity_east_mps velocity_down_mps
-    fix satellites``, and where the log has it ``battery_v``. What a log does not have is NaN (``fix`` and
-    ``satellites``: -1).
+    fix satellites``, and ``battery_v`` if the log has it. Missing values are NaN (``fix`` and ``satellites``: -1).
 rss
-    ``rss_db``; NaN where out of coverage. Attributes: ``node``, ``channel``, ``unit``
+    ``rss_db`` (NaN: out of coverage). Attributes: ``node``, ``channel``, ``unit``
     (``"dBm"`` or ``"dB re full scale"``), ``frequency_hz``.
 rank
-    ``rank`` (float; NaN = no CSI, never 0), ``ri_raw``, and where the log has them ``rsrp_dbm sinr_db cqi mcs
-    latitude_deg longitude_deg altitude_m``. Attributes: ``ri_base`` (``"one"`` or ``"zero"``).
+    ``rank`` (float; NaN = no CSI, never 0), ``ri_raw``, and ``rsrp_dbm sinr_db cqi mcs
+    latitude_deg longitude_deg altitude_m`` if the log has them. Attributes: ``ri_base`` (``"one"`` or ``"zero"``).
 kpi
     ``value``: any other quantity of a modem or base station (RSRQ, SINR, CQI, throughput, ...); a report does not
     compare it. Attributes: ``quantity``, ``unit``.
 
-A cell: an rss stream may be that of one cell; its attributes then hold ``pci`` and, where known, ``arfcn``, ``band``,
-``rat``, and its column ``serving`` says when the cell served the phone (1, 0; NaN where the log does not say).
+An rss stream of one cell has the attribute ``pci`` and, if known, ``arfcn``, ``band`` and ``rat``.
+
+Its column ``serving`` is 1 while the cell serves the phone, 0 while another cell does, and NaN if unknown.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 Kind = Literal["telemetry", "rss", "rank", "kpi"]
 Attribute = str | float | int | bool
 
-# Columns that a frame of each kind must have, besides ``time``, ``line`` and ``flag``.
+# Columns that a frame of each kind must have in addition to ``time``, ``line`` and ``flag``.
 COLUMNS: dict[str, tuple[str, ...]] = {
     "telemetry": (
         "latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg",
@@ -65,9 +65,9 @@ class Stream:
     frame : pandas.DataFrame
         The records in file order, default integer index.
     attributes : mapping
-        What holds for the whole stream: node, channel, unit, frequency_hz, ri_base, clock.
+        Attributes of the complete stream: node, channel, unit, frequency_hz, ri_base, clock.
     stand_for : int, optional
-        Number of records where the frame holds the first and the last of them in time alone.
+        Number of records, if the frame contains only the first and the last of them in time.
 
     Raises
     ------
@@ -89,18 +89,18 @@ class Stream:
 
     @property
     def rows(self) -> int:
-        """Number of records."""
+        """The number of records."""
         return len(self.frame) if self.stand_for is None else self.stand_for
 
     @property
     def channel(self) -> str:
-        """Channel of the receiver where the log says one, else the name."""
+        """The channel of the receiver if the log has one, else the name."""
         return str(self.attributes.get("channel") or self.name)
 
 
 @dataclass(frozen=True, slots=True)
 class RejectedLine:
-    """A line that is no record: its 1-based number, the reason, and its text (at most 500 characters)."""
+    """A line that is not a record: its 1-based number, the reason, and its text (at most 500 characters)."""
 
     number: int
     reason: str
@@ -109,7 +109,7 @@ class RejectedLine:
 
 @dataclass(frozen=True, slots=True)
 class RejectedReason:
-    """Reason why lines were rejected: their number, and the first and last of them (1-based)."""
+    """A reason why lines were rejected, their number, and the first and last of them (1-based)."""
 
     reason: str
     count: int
@@ -117,12 +117,12 @@ class RejectedReason:
     last: int
 
 
-# Rejected lines of a file that are kept verbatim: the first; all others are counted.
+# The first rejected lines of a file are stored verbatim, and all are counted.
 KEPT_REJECTED = 1000
 
 
 def by_reason(counted: Iterable[RejectedReason]) -> tuple[RejectedReason, ...]:
-    """Counts of one reason as one, in the order of their first lines."""
+    """Join the counts of each reason, in the order of their first lines."""
     known: dict[str, RejectedReason] = {}
     for item in counted:
         old = known.get(item.reason, RejectedReason(item.reason, 0, item.first, item.last))
@@ -133,7 +133,7 @@ def by_reason(counted: Iterable[RejectedReason]) -> tuple[RejectedReason, ...]:
 
 @dataclass(frozen=True, slots=True)
 class ReadResult:
-    """Result of reading one file.
+    """The result of reading one file.
 
     Parameters
     ----------
@@ -144,16 +144,16 @@ class ReadResult:
     lines, accepted, blank : int
         ``blank`` counts blank lines, headers and comments.
     rejected : tuple of RejectedLine
-        Lines that are neither; of more than ``KEPT_REJECTED`` the first are kept.
+        All other lines, at most the first ``KEPT_REJECTED``.
     reasons : tuple of RejectedReason
-        All of them by reason; by default counted from ``rejected``.
+        Number of rejected lines per reason; by default counted from ``rejected``.
     warnings : tuple of str
-        What the user should know, one sentence each.
+        Sentences for the user.
 
     Raises
     ------
     ValueError
-        If the accounting law does not hold.
+        If lines are not the sum of accepted, rejected and blank lines.
     """
 
     reader: str
@@ -166,27 +166,27 @@ class ReadResult:
     reasons: tuple[RejectedReason, ...] = ()
 
     def __post_init__(self) -> None:
-        # readers of small files give the lines alone
+        # readers of small files return the lines only
         if not self.reasons:
             reasons = by_reason(RejectedReason(line.reason, 1, line.number, line.number) for line in self.rejected)
             object.__setattr__(self, "reasons", reasons)
         if len(self.rejected) > KEPT_REJECTED:
-            # the others stay counted in the reasons: a torn log of 1 GB would fill the memory with its text
+            # the other lines are counted in the reasons: the text of a damaged log of 1 GB would fill the memory
             object.__setattr__(self, "rejected", self.rejected[:KEPT_REJECTED])
         if self.lines != self.accepted + self.rejected_count + self.blank:
             raise ValueError(
-                f"accounting law broken by reader {self.reader!r}: {self.lines} lines are not "
-                f"{self.accepted} accepted + {self.rejected_count} rejected + {self.blank} blank"
+                f"reader {self.reader!r} did not account for every line: {self.lines} lines, but {self.accepted} "
+                f"accepted + {self.rejected_count} rejected + {self.blank} blank"
             )
 
     @property
     def rejected_count(self) -> int:
-        """Rejected lines, those that are not kept included."""
+        """The number of rejected lines, including those that are not stored."""
         return sum(item.count for item in self.reasons)
 
 
 def has_wall_clock(start: np.datetime64) -> bool:
-    """Check whether instants are times of day; those of a log with relative times and no origin count from 1970."""
+    """Check whether a log has wall-clock times: relative times without an origin count from 1970."""
     import numpy as np
 
     return bool(start >= np.datetime64("1980-01-01"))

@@ -1,4 +1,4 @@
-"""Routes: where an aircraft is to fly, from a plan, a map, a table of waypoints, or the log of an earlier flight.
+"""Routes of an aircraft, from a plan, a map, a table of waypoints, or the log of an earlier flight.
 
 =====================  ============================================================================================
 file                   heights are brought to take-off by
@@ -47,8 +47,8 @@ _TAKEOFFS, _LANDINGS, _TURN, _RETURN = (22, 84), (21, 85), 115, 20
 _ARDUPILOT = 3
 
 
-# Most points of a route or of a table of points, and most bytes of a file that lists them: a longer one is a log or a
-# mistake, and is refused before all of it is in memory.
+# Most points of a route or table, and most bytes of its file. A larger file is a log or a mistake, and is refused
+# before all of it is in memory.
 MOST_POINTS = 2_000_000
 MOST_BYTES = 256 << 20
 
@@ -64,7 +64,7 @@ def too_many_points(path: str | Path | None = None) -> InputError:
 
 
 def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFrame:
-    """Points of a route, one row each, in the order of flight.
+    """Return the points of a route, one row each, in the order of flight.
 
     Parameters
     ----------
@@ -72,18 +72,17 @@ def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFra
         A QGroundControl plan, ``QGC WPL`` waypoints, a KML with a line or points, a CSV with named columns, or any
         log with positions.
     height_m : float, optional
-        Height above take-off of points that have none.
+        Height above take-off of points without a height.
 
     Returns
     -------
     pandas.DataFrame
-        :data:`COLUMNS`; yaw NaN where the file says none. ``attrs["remarks"]`` is a list of sentences that the user
-        should read.
+        :data:`COLUMNS`, with NaN for an unknown yaw. ``attrs["remarks"]`` is a list of sentences for the user.
 
     Raises
     ------
     InputError
-        If the file is no route, or points have no height and ``height_m`` does not say it.
+        If the file is not a route, or points have no height and ``height_m`` is not given.
     """
     with parsing(path, _EXPECTED):
         place = Path(path)
@@ -101,7 +100,7 @@ def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFra
 
 @dataclass(slots=True)
 class _Route:
-    """Points as they are read: latitude, longitude, height, yaw, seconds; NaN for what is not said."""
+    """The points of a route: latitude, longitude, height, yaw and seconds, NaN if unknown."""
 
     points: list[tuple[float, float, float, float, float]] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
@@ -128,7 +127,7 @@ def _route(data: bytes, path: str | Path) -> _Route:
     if b"<kml" in head:
         return _kml(data)
     if b"\0" in head:
-        raise InputError("binary content that is no route", expected=_EXPECTED)
+        raise InputError("binary content that is not a route", expected=_EXPECTED)
     return _sheet(data)
 
 
@@ -145,7 +144,7 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
     if bad.any():
         first = int(np.flatnonzero(bad)[0])
         place = f"point {first + 1} lies at {table['latitude_deg'][first]:g}, {table['longitude_deg'][first]:g}"
-        raise InputError(place, expected="latitude and longitude in degrees", cause="exchanged columns, or radians")
+        raise InputError(place, expected="latitude and longitude in degrees", cause="swapped columns, or radians")
     silent = table["altitude_m"].isna()
     if silent.any():
         if height_m is None:
@@ -159,8 +158,8 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
 
 
 def _log(path: str | Path) -> _Route:
-    """Track of a log: the clock's zone is of no account."""
-    # any zone and origin: a route has no date
+    """Return the track of a log."""
+    # any zone and origin, because a route has no date
     file = read_file(path, options=ReadOptions(timezone="UTC", time_origin="2000-01-01T00:00:00"))
     tracks = [stream for stream in file.result.streams if "latitude_deg" in stream.frame.columns]
     if not tracks:
@@ -198,7 +197,7 @@ def _plan(data: bytes, path: str | Path) -> _Route:
 
 
 def _items(listed: Sequence[Any]) -> Iterator[_Item]:
-    """Simple items in the order of flight, those of surveys included."""
+    """Yield simple items in the order of flight, including those of surveys."""
     for entry in listed:
         if entry.get("type") == "ComplexItem":
             inner = entry.get("TransectStyleComplexItem", entry).get("Items", ())
@@ -211,7 +210,7 @@ def _items(listed: Sequence[Any]) -> Iterator[_Item]:
 
 
 def _numbers(values: Sequence[Any], count: int = 0) -> tuple[float, ...]:
-    """Numbers, NaN for null."""
+    """Return numbers, NaN for null."""
     numbers = tuple(math.nan if value is None else float(value) for value in values)
     return numbers + (math.nan,) * (count - len(numbers))
 
@@ -228,7 +227,7 @@ def _waypoint_text(text: str) -> _Route:
             values = _numbers(cells[4:11], 7)
         except (ValueError, IndexError) as error:
             raise InputError(f"no waypoint: {line[:60]!r}", expected="12 fields", line=number) from error
-        # line 0 of a waypoint file is home, whatever its command
+        # line 0 of a waypoint file is home, with any command
         if index == 0:
             home = values[4:7]
         else:
@@ -247,7 +246,7 @@ def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, name
     home : tuple of float
         Latitude, longitude and altitude above sea level of the planned take-off; may be empty.
     named_yaw : bool
-        Is the fourth parameter of a waypoint its yaw? ArduPilot ignores it.
+        True if the fourth parameter of a waypoint is its yaw; ArduPilot ignores it.
     """
     # a take-off without coordinates happens at home
     place = home[:2] if len(home) > 1 else (math.nan, math.nan)
@@ -267,7 +266,7 @@ def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, name
 
 
 def _turn(route: _Route, item: _Item) -> None:
-    """Yaw of the last point as CONDITION_YAW sets it."""
+    """Set the yaw of the last point by CONDITION_YAW."""
     degrees, direction, relative = item.numbers[0], item.numbers[2], item.numbers[3]
     if relative == 1:
         route.remark("Turns relative to the course before them are left out.")
@@ -277,11 +276,11 @@ def _turn(route: _Route, item: _Item) -> None:
 
 
 def _height(route: _Route, item: _Item, height: float, home: tuple[float, ...]) -> float:
-    # a landing ends on the ground, whatever altitude its item holds
+    # a landing ends on the ground, regardless of the altitude in its item
     if item.command in _LANDINGS:
         return 0.0
     if item.frame in _SEA_LEVEL_FRAMES:
-        if len(home) < 3 or math.isnan(home[2]) or home[2] == 0.0:  # programs write 0 where nobody set it
+        if len(home) < 3 or math.isnan(home[2]) or home[2] == 0.0:  # programs write 0 if it was not set
             raise InputError(
                 f"a waypoint {height:g} m above sea level, and a home position without an altitude",
                 expected="heights above take-off, or the ground's height at the planned home position",
@@ -297,19 +296,19 @@ def _height(route: _Route, item: _Item, height: float, home: tuple[float, ...]) 
 
 # --- KML ---------------------------------------------------------------------------------------------
 
-# A line whose first point lies no farther below the others does not begin on the ground.
+# A line begins on the ground if its first point is at least this far below the highest one [m].
 _CLIMB_M = 5.0
 
 _HEADING = re.compile(r"\s*(-?\d+(?:\.\d*)?)")
 
 
 def _root(data: bytes) -> ElementTree.Element:
-    """The document; its bytes are UTF-8 whatever its first line declares."""
+    """Return the document, whose bytes are UTF-8 with any declaration."""
     return xml_root(re.sub(rb"\A\s*<\?xml.*?\?>", b"", data, flags=re.DOTALL), None, "a plain KML")
 
 
 def _kml(data: bytes) -> _Route:
-    """Lines and tracks of a map; where it has none, its points in their order."""
+    """Return the lines and tracks of a map, or its points in their order if it has no line."""
     root = _root(data)
     shapes = list(outermost(root, {"LineString", "Point", "Track"}))
     lines = [shape for shape in shapes if plain_tag(shape.tag) != "Point"]
@@ -322,7 +321,7 @@ def _kml(data: bytes) -> _Route:
     for shape in lines or shapes:
         modes = kml.modes_of(shape)
         sea_level |= "absolute" in modes
-        # KML's default; drawn lines then hold a 0 that is no height
+        # the default of KML: a 0 in drawn lines is then not a height
         clamped = not modes or any(mode.startswith("clamp") for mode in modes)
         headings = [float(m[1]) for angles in named(shape, "angles") if (m := _HEADING.match(str(angles.text or "")))]
         for index, place in enumerate(kml.places_of(shape)):
@@ -333,7 +332,7 @@ def _kml(data: bytes) -> _Route:
         zero, highest = route.points[0][2], max(point[2] for point in route.points)
         if highest - zero < _CLIMB_M:
             raise InputError(
-                f"heights of {zero:g} to {highest:g} m above sea level, and nothing says how high the take-off is",
+                f"heights of {zero:g} to {highest:g} m above sea level, and the height of the take-off is unknown",
                 expected="altitudeMode relativeToGround, or a first point on the ground",
                 cause="a line drawn at one height",
             )
@@ -343,12 +342,12 @@ def _kml(data: bytes) -> _Route:
 
 
 def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
-    """Outlines of the areas of a KML, such as a geofence: corners as latitude and longitude [deg].
+    """Return the outlines of the areas of a KML, such as a geofence: corners as latitude and longitude [deg].
 
     Raises
     ------
     InputError
-        The file cannot be read, or has no area.
+        If the file cannot be read, or has no area.
     """
     with parsing(path, "a KML with a Polygon: a geofence"):
         data = as_utf8(read_bytes(path)[0])
@@ -359,7 +358,7 @@ def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
         if not areas:
             raise InputError("a map without an area", expected="a KML with a Polygon: a geofence")
         if not all(abs(latitude) <= 90 and abs(longitude) <= 180 for area in areas for latitude, longitude in area):
-            raise InputError("a corner that is no place on earth", expected="longitude,latitude")
+            raise InputError("a corner that is not a position on Earth", expected="longitude,latitude")
     return areas
 
 
@@ -367,15 +366,15 @@ def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
 
 
 def _sheet(data: bytes) -> _Route:
-    """Waypoints of a table; without a header: latitude, longitude, height, yaw."""
-    # one line at a time: a table that is refused at its limit is never a list of all its cells
+    """Return the waypoints of a table, which without a header are latitude, longitude, height and yaw."""
+    # one line at a time, so that a table beyond the limit is refused before all of it is in memory
     text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", errors="replace")
     lines = (line for line in text if line.strip() and not line.lstrip().startswith("#"))
     head = next(lines, None)
     if head is None:
         raise InputError("the file is empty", expected=_EXPECTED)
     sign = max(",;\t", key=head.count)
-    # quoted names may hold the separator
+    # quoted names may contain the separator
     rows: Iterator[list[str]] = csv.reader(chain([head], lines), delimiter=sign, skipinitialspace=True)
     first = next(rows)
     known = [dictionary.meaning(name) for name in first]
@@ -407,11 +406,11 @@ def _add_row(route: _Route, row: Sequence[str], columns: Mapping[str, int], unit
     row : sequence of str
         Its cells.
     columns : mapping
-        Column of each quantity, -1 where there is none.
+        Column of each quantity, -1 if it is missing.
     units : sequence of str
-        As the names of the columns write them.
+        Units in the names of the columns.
     number : int
-        Of the row, for messages.
+        Number of the row, for messages.
     """
     cells = {key: row[index].strip() if 0 <= index < len(row) else "" for key, index in columns.items()}
     try:
@@ -420,7 +419,9 @@ def _add_row(route: _Route, row: Sequence[str], columns: Mapping[str, int], unit
             for key, cell in cells.items()
         }
     except ValueError as error:
-        raise InputError(f"row {number} holds what is no number ({error})", expected="latitude, longitude") from error
+        raise InputError(
+            f"row {number} has text instead of a number ({error})", expected="latitude, longitude"
+        ) from error
     route.add(*values.values())
 
 

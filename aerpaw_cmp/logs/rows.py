@@ -368,7 +368,7 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
 
 
 def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = None) -> Stream | None:
-    """Return the SNR stream of one tower; levels at or below the floor are flagged ``out_of_coverage``.
+    """Return the SNR stream of one tower, with levels at or below the floor flagged ``out_of_coverage``.
 
     Parameters
     ----------
@@ -498,7 +498,7 @@ def of_ues(
 
 
 def _divided(name: str, where: BoolArray, column: FloatArray, label: str) -> list[tuple[str, BoolArray, float | None]]:
-    """Divide rows by the values of a column if the times of several values overlap; else return them as one part."""
+    """Divide rows by the values of a column if the times of several values overlap, else return one part."""
     known = np.unique(column[where & np.isfinite(column)]).tolist()
     if not _together([np.flatnonzero(where & (column == item))[[0, -1]] for item in known]):
         return [(name, where, known[0] if len(known) == 1 else None)]

@@ -177,7 +177,7 @@ class Rejects:
         self._reasons: list[RejectedReason] = []
 
     def add(self, lines: Lines, numbers: Sequence[int] | IntArray, reason: str) -> None:
-        """Add lines (0-based) of a piece for one reason; the first ones of each piece are stored."""
+        """Add lines (0-based) of a piece for one reason, and store the first ones of each piece."""
         if not len(numbers):
             return
         # numbers count from the first piece of the file

@@ -57,7 +57,7 @@ def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]
 
 
 def format_vehicle_out(frame: pd.DataFrame, timezone: str) -> bytes:
-    """Telemetry as ``vehicleOut``, 10 fields: radians in the order pitch, yaw, roll; CR LF.
+    """Return telemetry as ``vehicleOut`` with 10 fields, radians in the order pitch, yaw, roll, and CR LF.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def format_vehicle_out(frame: pd.DataFrame, timezone: str) -> bytes:
 
 
 def _short(value: float, places: int) -> str:
-    """Rounded as DroneKit rounds, written as Python writes it; -999 stays an integer."""
+    """Return a number rounded like DroneKit and written like Python, -999 as an integer."""
     return "-999" if value == -999.0 else repr(round(value, places) + 0.0)
 
 
@@ -107,7 +107,7 @@ def _tuple(values: list[float], places: int) -> str:
 
 
 def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str) -> bytes:
-    """Levels as the sounder's ``power_log``: ``od -f -w4`` through ``ts``.
+    """Return levels as the sounder's ``power_log``: ``od -f -w4`` through ``ts``.
 
     Parameters
     ----------
@@ -125,11 +125,12 @@ def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str) -> byte
 
     Notes
     -----
-    Samples equal to the one before are suppressed: one ``*`` for the run, as ``od`` does without ``-v``. od's closing
-    offset is written where the log ends inside such a run, whose length would be lost otherwise.
+    Repeated samples are replaced by one ``*``, as ``od`` does without ``-v``.
+
+    If the log ends inside such a run, the closing offset of od is written, because its length would be lost.
     """
     level = unmasked(rss_db)
-    # as float32, as the sounder writes them: equal ones are equal in its digits, too
+    # float32 as in the sounder, so that equal samples have equal digits
     level = np.where(np.isnan(level), _FLT_MIN_DB - _RX_GAIN_DB, level).astype(np.float32)
     stamps = local_text(times, timezone)
     same = np.concatenate(([False], level[1:] == level[:-1])) if len(level) else np.zeros(0, dtype=bool)

@@ -1,6 +1,6 @@
-"""One module per log format; ``READERS`` is the catalogue that aerpaw-cmp finds by its entry point.
+"""The log formats, one module each, and their catalogue ``READERS``, which aerpaw-cmp finds by its entry point.
 
-A module holds its reader as ``READER``, or several as ``READERS``.
+A module has its reader in ``READER``, or several in ``READERS``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """One pose from the messages of any autopilot.
 
-Positions stand at their own times; attitude and velocity are those of the nearest message. Heights count from the home
-at take-off: a home that moves later, or stood elsewhere before, is no ground.
+Positions have their own times, and attitude and velocity are those of the nearest message. Heights count from the home
+at take-off, not from an earlier or later home.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _NEAR_S = 0.5
 
 @dataclass
 class Series:
-    """Messages of one kind: ``time_s`` of the autopilot (n,), their 0-based numbers, and columns (n,)."""
+    """The messages of one kind: ``time_s`` of the autopilot (n,), their 0-based numbers, and columns (n,)."""
 
     time_s: FloatArray
     number: IntArray
     columns: dict[str, FloatArray] = field(default_factory=dict)
 
     def near(self, name: str, time_s: FloatArray) -> FloatArray:
-        """A column at other times: that of the nearest message, NaN where none is near."""
+        """Return a column at other times, from the nearest message, NaN if there is no message nearby."""
         if not len(self.time_s) or name not in self.columns:
             return np.full(len(time_s), np.nan)
         after = np.clip(np.searchsorted(self.time_s, time_s), 0, len(self.time_s) - 1)
@@ -44,31 +44,31 @@ class Series:
         return np.where(np.abs(self.time_s[best] - time_s) <= _NEAR_S, self.columns[name][best], np.nan)
 
 
-# Autopilots count seconds since 1970 or since they were switched on; more is damage, and no room for it in ns.
+# Autopilots count seconds since 1970 or since power-on; larger times are damaged and do not fit in ns.
 _MOST_S = 4e9
 
 NONE = Series(np.zeros(0), np.zeros(0, dtype=np.int64))
 
 
 def gps_utc_s(week: FloatArray, milliseconds: FloatArray) -> FloatArray:
-    """GPS week and milliseconds of the week as seconds of UTC."""
+    """Return seconds of UTC from the GPS week and the milliseconds of the week."""
     return np.asarray(_stamps.GPS_S - _stamps.LEAP_S + week * 604_800.0 + milliseconds / 1e3)
 
 
 def offset_s(utc_s: FloatArray, time_s: FloatArray) -> float | None:
-    """UTC minus the autopilot's clock; None where no message carries both."""
+    """Return UTC minus the autopilot's clock, or None if no message has both."""
     known = (utc_s > 1e9) & (utc_s < _MOST_S) & (np.abs(time_s) < _MOST_S)
     return float(np.median(utc_s[known] - time_s[known])) if known.any() else None
 
 
 @dataclass
 class Flight:
-    """Content of a log of an autopilot.
+    """The content of a log of an autopilot.
 
     Parameters
     ----------
     position : Series
-        Columns ``latitude_deg longitude_deg altitude_m``, or none at all.
+        Columns ``latitude_deg longitude_deg altitude_m``, or no columns.
     attitude : Series
         ``roll_deg pitch_deg yaw_deg``.
     velocity : Series
@@ -78,14 +78,14 @@ class Flight:
     utc_minus_clock_s : float or None
         See :func:`offset_s`.
     home : Series
-        ``altitude_m`` of home above sea level, each time that the log has it; with it the positions' altitude is above
-        sea level, without it above home or, for want of anything else, above the first position.
+        ``altitude_m`` of home above sea level, at all times that the log has it. Altitudes of positions are then above
+        sea level, else above home or above the first position.
     source : str
-        The program, for people.
+        Name of the program.
     name : str
-        Of the stream.
+        Name of the stream.
     system : int, optional
-        Number of the vehicle where a log may hold several.
+        Number of the vehicle, for logs with several vehicles.
     battery : Series
         ``battery_v``.
     """
@@ -106,16 +106,16 @@ def result(
     reader: str, options: ReadOptions, flights: list[Flight], messages: int, damaged: list[RejectedLine],
     radio: Series = NONE,
 ) -> ReadResult:  # fmt: skip
-    """Return a telemetry stream per vehicle and the levels of its radio; all other messages count as comments.
+    """Return a telemetry stream per vehicle and the levels of its radio, with all other messages as comments.
 
     Parameters
     ----------
     reader : str
     options : ReadOptions
     flights : list of Flight
-        Of each vehicle; one at least.
+        One per vehicle, at least one.
     messages : int
-        Sound messages; each of ``damaged`` comes on top.
+        Number of intact messages, without ``damaged``.
     damaged : list of RejectedLine
     radio : Series
         ``RSSI``, ``RemRSSI``, ``Noise`` and ``RemNoise`` of the telemetry radio, in its steps.
@@ -196,7 +196,7 @@ _APART_M, _APART_SHARE, _FIX_3D = 15.0, 0.05, 3
 
 
 def _apart(flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> list[str]:
-    """Return the sentence about positions of the autopilot that are far from those of its receiver; else nothing."""
+    """Return a sentence if positions of the autopilot are far from those of its receiver."""
     fixed = flight.fix.near("fix", time_s) >= _FIX_3D
     there_n, there_e = (np.where(fixed, flight.fix.near(name, time_s), np.nan) for name in _pose.PLACE[:2])
     here_n, here_e = (values[name] for name in _pose.PLACE[:2])
@@ -214,7 +214,7 @@ def _apart(flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> l
 
 
 def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> FloatArray:
-    """Height above home as it was at take-off; without a home above the ground at rest, else the first position."""
+    """Return heights above home at take-off, or above the ground at rest or the first position if home is unknown."""
     altitude: FloatArray = values["altitude_m"]
     known = np.flatnonzero(np.isfinite(altitude))
     if not len(known):
@@ -230,10 +230,10 @@ def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[s
 
 
 def of_both(position: Series, above_home: str) -> Series:
-    """Home of positions that carry their altitude above sea level and their height above home.
+    """Return the home of positions with an altitude above sea level and a height above home.
 
     If home never moves, the height above home is used as logged: it becomes the altitude, above a home at 0. If both
-    are the same number throughout, home was never set and there is none.
+    are the same number throughout, home was never set, and the result is empty.
     """
     altitude, height = position.columns["altitude_m"], position.columns.pop(above_home)
     if not _pose.home_was_set(altitude, height):

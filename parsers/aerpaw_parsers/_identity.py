@@ -27,7 +27,7 @@ _Texts = Mapping[int, list[str]]
 
 # A column with more values than this counts something: it does not name devices or networks.
 _MOST_PARTS = 64
-# A program updates its columns one after the other at a handover: a value in at most this number of rows, and in at
+# At a handover a program updates its columns one after the other. A value in at most this number of rows, and in at
 # most this share of the rows of the other columns' key, is such a delay.
 _LAG_ROWS, _LAG_SHARE = 2, 0.1
 
@@ -168,8 +168,8 @@ def _marks(
 ) -> list[int]:
     """Return the columns without a known quantity whose values are separate networks or devices.
 
-    Such columns are the names of cells if there is no PCI, columns without which most times have several rows (a node,
-    a beam, a direction), and columns that take turns with the level. Devices also differ in their positions.
+    Such columns are the names of cells if there is no PCI, and columns that take turns with the level. A node, a beam
+    or a direction is found because most times have several rows without it. Devices also differ in their positions.
     """
     key = keys[0]
     marks = of_a_cell(sheet) if key == "network" and ("PCI" in keys or sheet.find("PCI") is None) else []
@@ -229,7 +229,7 @@ def _few(texts: Iterable[str]) -> bool:
     return 1 < len({*texts}) <= _MOST_MARKS
 
 
-# Values alternate if this share of the rows has another value than the row before, and if the median step of the level
+# Values alternate if this share of the rows differs from the row before. In addition, the median step of the level
 # within a value is below this share of the median step between values. They take turns if this share of the rows
 # repeats the order of the rows before.
 _CHANGED, _SMALLER, _IN_TURN, _FEWEST = 0.3, 0.5, 0.8, 8

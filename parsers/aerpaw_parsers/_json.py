@@ -1,4 +1,4 @@
-"""JSON lines: one object per line, with the account of those that are none."""
+"""JSON lines: one object per line, with the account of all other lines."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 from aerpaw_cmp.readers import dictionary
 
 _MOST_LINES = 5000
-# Bytes of objects over several lines that were looked at in vain [bytes]: a limit on time.
+# Most bytes of incomplete objects over several lines, as a limit on time.
 _MOST_TRIED = 64 << 20
 
 
 @dataclass
 class Objects:
-    """Objects of a file.
+    """The objects of a file.
 
     Parameters
     ----------
     row : int array, shape (n,)
-        0-based line on which each begins.
+        0-based first line of each object.
     values : list of dict, length n
     rejected : list of RejectedLine
-        Lines that are no object.
+        Lines that are not objects.
     more : int array
-        0-based further lines of objects that are written over several.
+        0-based further lines of objects over several lines.
     closed : bool
-        Does an array close all of them on its line?
+        True if all objects are in an array that ends on its line.
     """
 
     row: IntArray
@@ -44,10 +44,10 @@ class Objects:
 
 
 def objects(lines: _text.Lines) -> Objects:
-    """The objects of a file, one per line or each over several (as programs print them for people).
+    """Return the objects of a file, one per line or each over several lines.
 
-    A file that is one JSON array of them is read, too, on one line or with brackets alone on a line; commas at the end
-    of lines count as nothing.
+    A file may also be one JSON array of objects, on one line or with its brackets on separate lines. Commas at the end
+    of lines are ignored.
     """
     rows: list[int] = []
     values: list[dict[str, Any]] = []
@@ -80,18 +80,18 @@ def _bare(text: bytes) -> bytes:
 
 
 def _loaded(text: bytes) -> tuple[Any, bool]:
-    """Value of a text, None where it is no JSON; and whether it begins an object whose rest may stand on more lines."""
+    """Return the value of a text, None if it is not JSON, and whether it may begin an object over several lines."""
     try:
         return json.loads(text), False
     except json.JSONDecodeError as error:
-        # the error at the very end: what is missing may stand on the next lines
+        # an error at the end of the text: the rest may be on the next lines
         return None, text.startswith(b"{") and error.pos >= len(error.doc)
     except (ValueError, RecursionError):
         return None, False
 
 
 def _several(lines: _text.Lines, first: int) -> tuple[Any, int]:
-    """Object that begins on one line and ends on a later one, and that line; None where there is none."""
+    """Return the object that begins on a line, or None, and the line on which it ends."""
     end = lines.ends[min(first + _MOST_LINES, len(lines) - 1)]
     text = _bare(lines.data[lines.starts[first] : end]).decode("utf-8", "replace")
     try:
@@ -103,13 +103,13 @@ def _several(lines: _text.Lines, first: int) -> tuple[Any, int]:
 
 
 def first(head: bytes) -> dict[str, Any] | None:
-    """The first object of a file, for sniffers; of a first line longer than what they see, None."""
+    """Return the first object of a file for sniffers, or None if its line is longer than the sniffed bytes."""
     for line in head.split(b"\n", 3)[:3]:
         text = line.strip().lstrip(b"\xef\xbb\xbf").lstrip(b"[").rstrip(b",")
         if not text:
             continue
         value, _ = _loaded(text)
-        if value is None:  # perhaps one over several lines
+        if value is None:  # perhaps an object over several lines
             place = head.find(b"{")
             try:
                 value, _ = json.JSONDecoder().raw_decode(head[max(place, 0) :].decode("utf-8", "replace"))
@@ -120,8 +120,8 @@ def first(head: bytes) -> dict[str, Any] | None:
 
 
 def number(value: Any) -> float:
-    """A number or the text of one; what stands for 'unavailable' is NaN."""
-    # a bool is an int in Python, and no measurement
+    """Return a number or the number in a text, NaN if it means 'unavailable'."""
+    # a bool is an int in Python, but not a measurement
     if isinstance(value, bool) or value is None:
         return float("nan")
     try:
@@ -132,24 +132,24 @@ def number(value: Any) -> float:
 
 
 def column(entries: list[dict[str, Any]], *names: str) -> FloatArray:
-    """A key of every object as numbers: of several names, the first that an object has."""
+    """Return a key of every object as numbers, by the first of several names that an object has."""
     return np.array([number(next((entry[name] for name in names if name in entry), None)) for entry in entries])
 
 
 def inside(entry: dict[str, Any], name: str) -> dict[str, Any]:
-    """An object within an object, empty where there is none."""
+    """Return an object within an object, or an empty one."""
     value = entry.get(name)
     return value if isinstance(value, dict) else {}
 
 
 def listed(entry: dict[str, Any], name: str) -> list[dict[str, Any]]:
-    """A list of objects within an object."""
+    """Return a list of objects within an object."""
     value = entry.get(name)
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
 def ue_ranks(rows: _rows.Rows, ues: list[tuple[int, dict[str, Any]]]) -> ReadResult:
-    """Rank streams of UEs, each with its row; what a key holds of the downlink is said by the dictionary."""
+    """Return the rank streams of UEs, each with its row, with the keys that the dictionary finds."""
     entries = [ue for _, ue in ues]
     none = np.full(len(entries), np.nan)
     columns = {"rank": none, "cqi": none, "mcs": none, "rnti": column(entries, "rnti")}
@@ -166,5 +166,5 @@ _OF_UE = ("rank", "cqi", "mcs", "pci")
 
 
 def bracket(line: bytes) -> str | None:
-    """Reason for lines that are no object: brackets of an array around the lines are nothing."""
+    """Return the reason for lines that are not objects, or None for the brackets of an array."""
     return None if line.strip() in (b"[", b"]") else "no JSON object"

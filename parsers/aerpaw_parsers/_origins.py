@@ -1,9 +1,9 @@
-"""Each format's clock and height datum, and who says so: the file itself, its program's source, or nobody."""
+"""The clock and height datum of each format, and their source: the file, its program, or an assumption."""
 
 from __future__ import annotations
 
-# ``written``, or ``program`` or ``assumed`` with what that is, and the readers that it holds for; of the others the
-# reader's own word, which is assumed. A text with an offset, or an epoch, is written.
+# ``written``, or ``program`` or ``assumed`` with its meaning, and the names of the readers. Other readers have their
+# own text, which is assumed. A text with an offset, or an epoch, is written.
 _CLOCKS = {
     "program: ts on the node, local wall time":
         "vehicle_log sounder_log controller_log srsenb_log srsue_log srsran_gnb oai_log",

@@ -145,7 +145,7 @@ def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
 
 
 def _height(rows: _rows.Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
-    """Return datum and values of the most useful column of heights; the dictionary has them in that order."""
+    """Return datum and values of the most useful column of heights, in the order of the dictionary."""
     column = sheet.find("altitude_m")
     if column is None:
         rows.warnings.append("no column is known as a height: give the track another log, or heights are unknown")

@@ -1,4 +1,4 @@
-"""Tables with a header and columns in any order; the dictionary contains the meaning of each column.
+"""Tables with a header and columns in any order, whose meaning is in the dictionary.
 
 The header may follow title lines, and its separator is that of the table. Decimal commas are read if the separator is
 another character. A header in mid-file begins a new table. If a program omits empty last cells, they are read as empty.
@@ -39,7 +39,7 @@ _IsHeader = Callable[[list[str]], bool]
 
 
 def split_row(line: bytes, separator: str) -> list[str]:
-    """Return the fields of a line; separators inside quotes do not count."""
+    """Return the fields of a line, without separators inside quotes."""
     text = line.decode("utf-8-sig", errors="replace")
     if '"' not in text:
         return text.split(separator)
@@ -248,7 +248,7 @@ class Sheet:
             self.__dict__.pop(cached, None)
 
     def part(self, where: BoolArray) -> Sheet:
-        """Return the rows of a mask; notes are shared."""
+        """Return the rows of a mask, which share the notes."""
         return replace(
             self, row=self.row[where], _numbers={}, _cell_units={},
             cells=[cells for cells, inside in zip(self.cells, where.tolist(), strict=True) if inside],
@@ -428,7 +428,7 @@ def _split_places(sheet: Sheet) -> None:
 def of_readings(
     lines: _text.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine]
 ) -> Sheet:
-    """Return the table of readings without a separator; all other lines that are not rejected are comments.
+    """Return the table of readings without a separator, with all other lines as comments unless they are rejected.
 
     Parameters
     ----------
@@ -580,7 +580,7 @@ class _Table:
         return cells
 
     def sheet(self, lines: _text.Lines, last_line: int) -> Sheet:
-        """Return the table; rows shorter than their header are read if the program often writes such rows."""
+        """Return the table, with rows shorter than their header if the program often writes such rows."""
         # the last line may be cut short in every file
         inner, full = [i for i, _ in self._short if i != last_line], bool(self._row)
         # a single short row is truncated; a twentieth of all rows is a habit of the program

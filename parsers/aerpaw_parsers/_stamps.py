@@ -315,7 +315,7 @@ def header_zone(name: str, brackets: str) -> str:
 
 
 def beside(text: str) -> str:
-    """Time zone of a column of zones, as it stands behind a time; of numbers hours, minutes or seconds east of UTC.
+    """Return the zone in a cell of a column of zones, also from hours, minutes or seconds east of UTC.
 
     Examples
     --------
@@ -326,10 +326,10 @@ def beside(text: str) -> str:
     """
     number = re.fullmatch(r"[+-]?\d{1,5}(?:\.\d{1,2})?", text)
     if number is None or re.fullmatch(r"[+-]\d{4}", text):
-        word = text.upper() if text.upper() in {*_HOURS, *_text.WINTER, *_WITH_SUMMER} else text  # 'home' is none
+        word = text.upper() if text.upper() in {*_HOURS, *_text.WINTER, *_WITH_SUMMER} else text  # 'home' is not a zone
         return word if re.fullmatch(_NAMED_ZONE, word) and ("/" not in word or _at(word, datetime.min)) else ""
     hours = float(text)
-    # no zone is further than 14 h from UTC: larger numbers are minutes (840) or seconds
+    # zones are at most 14 h from UTC: larger numbers are minutes (840) or seconds
     hours /= 1 if abs(hours) <= 14 else 60 if abs(hours) <= 840 else 3600
     return _shown(hours)
 

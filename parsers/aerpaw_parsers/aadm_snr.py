@@ -1,4 +1,4 @@
-"""SNR of several towers as CSV: ``time,snr_lw1,snr_lw2,...`` (AADM 2025), local wall time, dB; a stream per tower."""
+"""SNR of several towers as CSV: ``time,snr_lw1,snr_lw2,...`` (AADM 2025) in local wall time and dB."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _HEADER = re.compile(_rows.BOM + rb"time((?:,snr_[A-Za-z0-9]{1,12}){1,16})\s*", 
 
 
 def _row(data: bytes) -> re.Pattern[bytes]:
-    """A group per tower; without a header nothing says which column is which tower."""
+    """Return a pattern with a group per tower, whose names are in the header."""
     header = _HEADER.match(data[:400].lstrip())
     if header is None:
         return re.compile(rb"(?!)(?P<time>)")
@@ -27,7 +27,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     towers = [] if header is None else header[1].decode("ascii").upper().split(",SNR_")[1:]
     for i, tower in enumerate(towers):
         if tower in towers[:i]:
-            rows.warnings.append(f"a second column of {tower} is left out")
+            rows.warnings.append(f"a second column of {tower} is not read")
         else:
             yield _rows.snr(rows, tower, rows.number(f"t{i}"))
 

@@ -1,9 +1,8 @@
 """ArduPilot dataflash log (``.bin``, or ``.log`` as Mission Planner writes it): the aircraft's own pose and velocity.
 
-The format describes itself: every message begins with A3 95 and its number, ``FMT`` messages give the length and
-columns of each; in text each message is a line, ``NAME, value, value``.
-Read are ``POS`` (else ``GPS``), ``ATT``, ``XKF1`` or ``NKF1`` (velocity), ``GPS`` (UTC, fix), ``BAT``
-and ``RAD`` (levels at both ends of the telemetry radio).
+The format describes itself: every message begins with A3 95 and its number, and ``FMT`` messages contain the length and
+columns of each. In text, each message is a line, ``NAME, value, value``. The messages ``POS`` (else ``GPS``), ``ATT``,
+``XKF1`` or ``NKF1`` (velocity), ``GPS`` (UTC, fix), ``BAT`` and ``RAD`` (levels of the telemetry radio) are read.
 Heights are above home at take-off (``RelHomeAlt``), else above the ground at rest or the first position.
 Source: ArduPilot ``libraries/AP_Logger/LogStructure.h``.
 """
@@ -43,7 +42,7 @@ def sniff(head: bytes) -> bool:
 
 
 class _Form:
-    """Layout of one kind of message."""
+    """The layout of one kind of message."""
 
     def __init__(self, length: int, name: str, form: str, columns: list[str]) -> None:
         self.length, self.name, self.columns = length, name, columns
@@ -59,12 +58,12 @@ def _form(body: bytes) -> tuple[int, _Form]:
     return kind, _Form(length, texts[0], texts[1], texts[2].split(","))
 
 
-# Number and values of each message, by its name and the columns that it had: a log may describe a name anew.
+# Number and values of each message, by its name and columns: a log may describe a name more than once.
 _Rows = dict[str, dict[tuple[str, ...], list[tuple[int, tuple[float, ...]]]]]
 
 
 def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
-    """Values of the wanted messages, the number of sound messages, and damaged stretches."""
+    """Return the values of the wanted messages, the number of intact messages, and damaged segments."""
     forms: dict[int, _Form] = {_FMT: _Form(89, "FMT", "BBnNZ", ["Type", "Length", "Name", "Format", "Columns"])}
     by_name: _Rows = {name: {} for name in _WANTED}
     damaged: list[RejectedLine] = []
@@ -74,7 +73,7 @@ def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
         if form is None or form.length < 3 or at + form.length > end:
             next_mark = data.find(_MARK, at + 1)
             next_mark = end if next_mark < 0 else next_mark
-            reason = f"{next_mark - at} bytes at {at} that are no message"
+            reason = f"{next_mark - at} bytes at {at} that are not a message"
             damaged.append(RejectedLine(count + len(damaged) + 1, reason, ""))
             at = next_mark
             continue
@@ -90,12 +89,14 @@ def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
         count += 1
         at += form.length
     if at < end:
-        damaged.append(RejectedLine(count + len(damaged) + 1, f"{end - at} bytes at the end that are no message", ""))
+        damaged.append(
+            RejectedLine(count + len(damaged) + 1, f"{end - at} bytes at the end that are not a message", "")
+        )
     return by_name, count, damaged
 
 
 def _text_messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
-    """The same of a log in text, whose values have their scales already; every line is a message."""
+    """Return the same from a log in text, in which every line is a message with scaled values."""
     columns: dict[str, tuple[str, ...]] = {}
     by_name: _Rows = {name: {} for name in _WANTED}
     damaged: list[RejectedLine] = []
@@ -121,9 +122,9 @@ def _number(cell: str) -> float:
 
 
 def _series(by_name: _Rows, name: str) -> _autopilot.Series:
-    """Messages of one name: of its descriptions the commonest, of instances (filters) the first.
+    """Return the messages of one name with its most frequent description and of its first instance (filter).
 
-    Of several GPS receivers it is the one with most fixes: the first may never have had one.
+    For several GPS receivers, return the one with most fixes, because the first may never have had a fix.
     """
     timed = {names: rows for names, rows in by_name[name].items() if "TimeUS" in names}
     if not timed:
@@ -145,17 +146,17 @@ def _series(by_name: _Rows, name: str) -> _autopilot.Series:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Telemetry ``vehicle``."""
+    """Return the telemetry ``vehicle``."""
     by_name, count, damaged = _text_messages(data) if _TEXT.match(data) else _messages(data)
     series = {name: _series(by_name, name) for name in _WANTED}
     gps = series["GPS"]
     if "Status" in gps.columns:
-        for name in {"Lat", "Lng"} & set(gps.columns):  # 0 and 1 are no fix; at 0, 0 no aircraft flies
+        for name in {"Lat", "Lng"} & set(gps.columns):  # status 0 and 1 mean no fix; positions at 0, 0 are flagged
             gps.columns[name] = np.where(gps.columns["Status"] < _FIX_2D, 0.0, gps.columns[name])
     place = series["POS"] if len(series["POS"].time_s) else gps
     if "Lat" not in place.columns or "Lng" not in place.columns:
         place = _autopilot.Series(gps.time_s[:0], gps.number[:0], {"Lat": gps.time_s[:0], "Lng": gps.time_s[:0]})
-    names = ("Lat", "Lng", "Alt", "RelHomeAlt")  # the yaw of a receiver is none where it has one antenna
+    names = ("Lat", "Lng", "Alt", "RelHomeAlt")  # a receiver with one antenna has no yaw
     position = _named(place, *(name for name in names if name in place.columns))
     position.columns.setdefault("altitude_m", np.full(len(place.time_s), np.nan))
     home = _autopilot.NONE
@@ -170,7 +171,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _named(series: _autopilot.Series, *names: str) -> _autopilot.Series:
-    """Messages with the columns of the record model; of the named columns alone where there are some."""
+    """Return messages with the columns of the record model, from all columns or the named ones."""
     fields = {name: series.columns[name] for name in names or series.columns}
     return _autopilot.Series(series.time_s, series.number, dictionary.record_columns(fields, of=("TimeUS",)))
 

@@ -1,8 +1,9 @@
 """AERPAW's cell search: ``Found CELL MHz, 3500.0, EARFCN, 7399, PHYID, 1, ... PSS power dBm, -30.1, PSR, 2.3, <time>``.
 
-Console and table of srsRAN's program as AERPAW changed it: a line per cell and sweep, its time behind it (milliseconds
-behind a colon, or as ``asctime`` prints it) or in front, from ``ts``. The level is the power of the synchronisation
-signal, no RSRP: a series per PCI and EARFCN.
+Console and table of srsRAN's program as changed by AERPAW: a line per cell and sweep. Its time is at the end (with
+milliseconds after a colon, or in the form of ``asctime``) or at the beginning, from ``ts``.
+
+The level is the power of the synchronisation signal, not an RSRP. There is a series per PCI and EARFCN.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ _ROW = re.compile(
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether a cell stands in it with a time."""
-    # an expression that begins with a line's start is slow: what it must hold is looked for first
+    """Check whether there is a cell with a time."""
+    # an expression that begins at line starts is slow: a fixed text is searched first
     first = _ROW.search(head) if b"Found CELL " in head else None
     return first is not None and bool(first[1] or first[8])
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """A level series per cell; UsageError if no time zone is given."""
+    """Return a level series per cell, or raise UsageError if no time zone is given."""
     lines = _text.split(data)
     row, groups = _text.match(lines, _ROW)
     texts = [(group[7] or group[0]).decode("ascii", "replace") for group in groups]

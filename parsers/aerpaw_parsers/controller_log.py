@@ -1,7 +1,7 @@
 """Console of the AADM controller (stdout through ``ts``): blocks ``[Controller-->UAV] SNR:`` then ``n:value`` lines.
 
-Value lines under ``Download:`` have the same shape and are no levels. All other lines are the console's talk and
-count as comments. One SNR stream per tower number, ``LW<n>``.
+Value lines under ``Download:`` have the same form but are not levels. All other lines count as comments. There is one
+SNR stream per tower number, ``LW<n>``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _BLOCK = re.compile(_STAMP + rb"[^\n]{0,40}?\[Controller-->UAV\] (?P<what>SNR|Do
 
 
 def _no_level(data: bytes, row: IntArray) -> BoolArray:
-    """The block that a value line stands in is that of the last head before it."""
+    """Return the value lines whose block, by the last head before them, does not contain levels."""
     heads, kinds = _lines.match(_lines.split(data), _BLOCK)
     of_levels = np.array([False] + [kind[1] == b"SNR" for kind in kinds], dtype=bool)
     return np.asarray(~of_levels[np.searchsorted(heads, row)])

@@ -1,14 +1,15 @@
 """Merged MATLAB flights: telemetry and level of each channel in one table, as their authors publish them.
 
-Dataset 12 holds ``mpower1 mpower2`` (channels USRP1, USRP2), AFAR's exp-288 files ``mpower mquality``; both have
-``mX mY mZ`` (longitude, latitude, height above take-off), ``mRoll mPitch mYaw`` in degrees and two clocks:
+Dataset 12 has ``mpower1 mpower2`` (channels USRP1, USRP2), and AFAR's exp-288 files ``mpower mquality``. Both have
+``mX mY mZ`` (longitude, latitude, height above take-off) and ``mRoll mPitch mYaw`` in degrees. Their two clocks are
 ``timestamp_power_for_csv`` (text, local) and ``timestamp_power``, **local wall clock stored as if it were UTC**.
-The LTE flights hold ``RSRP RSRP2 RSRQ RSSI`` beside ``mX mY mZ``, with ``timestamp_for_csv`` (text, local) and
-``timestamp_meas``, which **is UTC**: it is taken. Where ``succes`` is 0 no cell was decoded: ``RSRP2`` then says -60,
-the others -inf. Their levels are dB re full scale (the authors take 98 dB off for
-dBm). Their authors' processed files (``lat_s lon_s height_s RSRP_s ori_s``; ``lat_all lon_all h_all power_all
-ori_all``) have no clock: rows are counted at the rate of the raw flights, from 1970. MATLAB 7.3 files (HDF5) are
-read as the older ones are. The lines of the account are rows.
+
+The LTE flights have ``RSRP RSRP2 RSRQ RSSI`` and ``mX mY mZ``, with ``timestamp_for_csv`` (text, local) and
+``timestamp_meas``, which **is UTC** and is used. No cell was decoded where ``succes`` is 0: ``RSRP2`` is then -60, and
+the other levels are -inf. Levels are dB re full scale (the authors subtract 98 dB for dBm).
+
+Processed files (``lat_s lon_s height_s RSRP_s ori_s``; ``lat_all lon_all h_all power_all ori_all``) have no clock: rows
+are counted at the rate of the raw flights, from 1970. The lines of the account are rows.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _PROCESSED = {"RSRP_s": 0.1, "power_all": 0.03276}
 _NAMES = {*_TELEMETRY, *_LEVELS, *_TEXTS, *_EPOCHS, "mSpeed"}
 # Names that only a flight has.
 _SURE = {*_LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
-# Raw positions of the LTE flights, which stand in front of their levels; the interpolated ones are read.
+# Raw positions of the LTE flights, which come before their levels; the interpolated ones are read.
 _GPS = re.compile(r"GPS[xyz]")
 _TEXT = re.compile(_text.TIME)
 
@@ -52,7 +53,7 @@ _TEXT = re.compile(_text.TIME)
 def sniff(head: bytes) -> bool:
     """Check whether it is a MATLAB file whose first variables are those of a merged flight.
 
-    Of a 7.3 file the names lie anywhere: those that stand in what sniffers see decide.
+    Names of a 7.3 file are anywhere in it: those in the sniffed bytes decide.
     """
     if head.startswith(MAGIC_73):
         return any(re.search(rb"\b%s\b" % name.encode(), head) for name in _SURE)
@@ -60,7 +61,7 @@ def sniff(head: bytes) -> bool:
 
 
 def _load(data: bytes) -> dict[str, AnyArray]:
-    """Variables of a flight as flat arrays, in the file's order of rows."""
+    """Return the variables of a flight as flat arrays, in the file's order of rows."""
     return {name: np.asarray(values).ravel() for name, values in read_arrays(data, {*_NAMES, _DECODED}).items()}
 
 
@@ -71,7 +72,7 @@ def _numeric(values: AnyArray, name: str) -> FloatArray:
 
 
 def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
-    """Clock in ns, which rows have one, and its column: true UTC, else text, else epoch, else the count."""
+    """Return the clock in ns, which rows have it, and its column: UTC, else text, else epoch, else the row number."""
     for name in (_UTC, *_TEXTS, *_EPOCHS):
         if name not in table:
             continue
@@ -83,9 +84,9 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
             valid = valid & right
         else:
             epoch = _numeric(table[name], name)
-            # less than 1e8 are day numbers of MATLAB, or seconds of a computer whose clock was never set
+            # numbers below 1e8 are day numbers of MATLAB, or seconds of a clock that was never set
             valid = np.isfinite(epoch) & (epoch > 1e8) & (epoch < 9.2e9)
-            # double precision resolves 2.4e-7 s here: microseconds are what the file can hold
+            # double precision resolves 2.4e-7 s here, so microseconds are exact enough
             wall = np.round(np.where(valid, epoch, 0) * 1e6).astype(np.int64) * 1000
         if valid.any() or name in _EPOCHS:
             return wall, valid, name
@@ -104,7 +105,7 @@ _COUNTED = "row number"
 def _instants(
     table: dict[str, AnyArray], wall: AnyArray, clock: str, options: ReadOptions
 ) -> tuple[_text.Instants, list[str]]:
-    """UTC of each row: text and epoch both hold local wall clock unless ``clock: utc`` says otherwise."""
+    """Return UTC of each row: text and epoch are both local wall clock unless ``clock: utc`` is set."""
     warnings: list[str] = []
     none = np.zeros(len(wall), dtype=bool)
     if clock == _COUNTED:
@@ -124,7 +125,7 @@ def _instants(
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Telemetry ``vehicle`` and one level stream per channel.
+    """Return the telemetry ``vehicle`` and one level stream per channel.
 
     Raises
     ------
@@ -151,7 +152,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _common_length(table: dict[str, AnyArray]) -> int:
-    """Number of rows; of columns of several lengths nobody knows which rows belong together, ``succes`` included."""
+    """Return the number of rows, and refuse columns of several lengths, whose rows cannot be matched."""
     lengths: dict[int, list[str]] = {}
     for name, column in table.items():
         lengths.setdefault(len(column), []).append(name)

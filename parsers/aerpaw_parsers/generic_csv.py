@@ -1,9 +1,9 @@
 """Any CSV with a header, its columns mapped by the user: ``columns: {time: Time, rss_db: Power}``, ``kind: rss``.
 
-A CSV says nothing about its units: it is never guessed, flight.yaml names it. Times are texts (``YYYY-mm-dd
-HH:MM:SS[.f][offset]``, or as tables of other programs have them: ``15.07.2024 11:49:27,231``) or numbers since
-``time_origin`` where that is given, else since 1970 in UTC (``clock: local_as_utc`` for wall time stored so): seconds,
-unless the name of the column, or the steps between the rows, require another unit.
+The columns of a CSV are never guessed: flight.yaml names them. Times are texts (``YYYY-mm-dd HH:MM:SS[.f][offset]``, or
+forms of other programs such as ``15.07.2024 11:49:27,231``) or numbers. Numbers count from ``time_origin`` if it is
+given, else from 1970 in UTC; ``clock: local_as_utc`` is for wall time stored as UTC. They are seconds, unless the name
+of the column, or the steps between the rows, require another unit.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from aerpaw_cmp.readers import dictionary
 from . import _identity, _pose, _sheet
 
 _EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
-# What may stand beside a rank, or beside a level: the positions of a table merged by hand are its track.
+# Further columns of ranks and levels: the positions of a table merged by hand are its track.
 _COMPANIONS: dict[str, tuple[str, ...]] = {"rank": _EXTRA, "rss": (*COLUMNS["telemetry"][:-2], "sinr_db")}
-# Columns that a record of a kind is about.
+# Required columns of each kind.
 _VALUE = {"telemetry": _pose.PLACE, "rss": ("rss_db",), "rank": ("ri_raw",)}
 
 # Units of record columns, by the ends of their names.
 _UNITS = {"_deg": "deg", "_m": "m", "_mps": "m/s", "_dbm": "dBm", "_db": "dB"}
-# Quantities of record columns whose values tell their unit, or that rows do not fit their header.
+# Quantities of record columns whose values show their unit, or that rows do not fit their header.
 _QUANTITIES = {row.name: row for row in dictionary.QUANTITIES if row.role in ("position", "height")}
-# Quantities whose names alone contradict no mapping to a column of the telemetry.
+# Quantities whose names do not contradict a mapping to a column of the telemetry.
 _NO_POSE = ("time", "fix", "satellites")
 # Keys that divide a mapped table, besides devices: each part is a series.
 _KEYS = ("network", "PCI", "ARFCN")
 
 
 def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, int]]:
-    """Kind, and the position of the file column for each record column."""
+    """Return the kind, and the position of the file column for each record column."""
     if options.kind is None:
-        raise UsageError("generic_csv does not know what the file holds", expected="'kind:' telemetry, rss or rank")
+        raise UsageError("the kind of the table is missing", expected="'kind:' telemetry, rss or rank")
     allowed = ["time", *COLUMNS[options.kind], *_COMPANIONS.get(options.kind, ())]
     unknown = sorted(set(options.columns) - set(allowed))
     if unknown:
@@ -71,19 +71,19 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
 
 
 def _values(sheet: _sheet.Sheet, column: int, name: str, options: ReadOptions) -> FloatArray:
-    """A mapped column in the unit of its record column.
+    """Return a mapped column in the unit of its record column.
 
     Raises
     ------
     UsageError
-        If the unit in the file is of another quantity than the mapping.
+        If the unit in the file belongs to another quantity than the mapping.
     """
     values, unit = sheet.numbers(column), sheet.unit_read(column)
     meaning, written = sheet.meanings[column], sheet.names[column]
     if meaning is not None and not _is_of(meaning.quantity, name, options.unit):
         raise UsageError(
-            f"the name of column {written!r} says {meaning.quantity.name}, the mapping {name}",
-            expected="one quantity and unit: mend the mapping, --unit or the header",
+            f"the name of column {written!r} means {meaning.quantity.name}, the mapping {name}",
+            expected="one quantity and unit: correct the mapping, --unit or the header",
         )
     wanted = next(unit for end, unit in (*_UNITS.items(), ("", "")) if name.endswith(end))
     right = unit in ("dBm", "dB", "dB re full scale") if name == "rss_db" else unit == wanted
@@ -109,7 +109,7 @@ def _is_of(quantity: dictionary.Quantity, name: str, unit: str | None) -> bool:
 
 
 def _odd(sheet: _sheet.Sheet, column: int) -> BoolArray:
-    """Cells that are words or infinities; -inf dB is no signal."""
+    """Return the mask of cells that are words or infinities, except -inf dB, which means no signal."""
     values = sheet.numbers(column)
     texts = [text.strip('"').lower() for text in sheet.texts(column)]
     none = np.array([text in _sheet.NO_VALUE and text != "inf" for text in texts], dtype=bool)
@@ -117,18 +117,18 @@ def _odd(sheet: _sheet.Sheet, column: int) -> BoolArray:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Streams of the kind that the options name: one, or one for each device, network and cell that the table names.
+    """Return the streams of the kind in the options, one for each device, network and cell of the table.
 
     Raises
     ------
     UsageError
-        If ``kind``, ``columns``, ``ri_base`` or ``timezone`` is missing or names what is not there.
+        If ``kind``, ``columns``, ``ri_base`` or ``timezone`` is missing, or a named column does not exist.
     """
     lines = _text.split(data)
     if lines.blank.all():
         return ReadResult("generic_csv", (), len(lines), 0, len(lines))
     first = int(np.argmin(lines.blank))
-    # the user has named the columns: the line that has them is the header, else the first, whatever its words
+    # the header is the line with the columns that the user named, else the first line
     known = (item for item in _tables(lines, first) if {*options.columns.values()} <= {*item[2]})
     first, separator, header = next(known, next(_tables(lines, first)))
     kind, where = _checked(options, header)
@@ -163,7 +163,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _tables(lines: _text.Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
-    """Lines that may be the header, from the first on: place, separator and names."""
+    """Yield place, separator and names of lines that may be the header, from the first on."""
     for i in range(first, min(first + _sheet.TITLES, len(lines))):
         line = lines.raw(i).removeprefix(b"\xef\xbb\xbf")
         separator = max(_sheet.SEPARATORS, key=lambda sign: line.count(sign.encode()))
@@ -173,7 +173,7 @@ def _tables(lines: _text.Lines, first: int) -> Iterator[tuple[int, str, list[str
 def _stream(
     rows: _rows.Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], name: str, unit: str
 ) -> Stream | None:
-    """Columns by the rules of the kind, and the attributes that go with them; words in place of numbers are flagged."""
+    """Return the stream of mapped columns by the rules of its kind, with rows flagged that have words as numbers."""
     options, flag = rows.options, rows.flag.copy()
     values: dict[str, AnyArray] = {key: _values(sheet, column, key, options) for key, column in where.items()}
     if {*_pose.PLACE[:2]} <= set(values):
@@ -213,7 +213,7 @@ def _stream(
 
 
 def _lifted(rows: _rows.Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], where: dict[str, int]) -> _pose.Height:
-    """Bring altitudes that the file's own header puts above sea level or the ellipsoid to heights above take-off."""
+    """Convert altitudes above sea level or the ellipsoid, by the header, to heights above take-off."""
     height = sheet.meanings[where["altitude_m"]] if "altitude_m" in where else None
     if height is None or height.quantity.datum not in ("sea level", "ellipsoid") or "latitude_deg" not in values:
         return {}
@@ -224,7 +224,7 @@ def _lifted(rows: _rows.Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], 
 
 
 def _track(rows: _rows.Rows, sheet: _sheet.Sheet, where: dict[str, int], device: str) -> Stream | None:
-    """Positions that stand beside levels, as the track of the flight: a table merged by hand holds both."""
+    """Return positions in the rows of levels as the track of the flight, as in a table merged by hand."""
     names = [name for name in COLUMNS["telemetry"][:-2] if name in where]
     if not {"latitude_deg", "longitude_deg"} <= set(names):
         return None

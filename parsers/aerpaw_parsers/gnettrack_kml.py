@@ -1,7 +1,7 @@
 """G-NetTrack's KML: a placemark per reading, its quantities as ``<Data name="RSRP"><value>-81</value></Data>``.
 
-The names are those of the program's text log, in capitals; time, place and levels are read as from there. Patterns, no
-XML parser: see :mod:`.nemo_kml`.
+The names are those of the program's text log, in capitals, and are read in the same way. The file is read by patterns
+and not by an XML parser, for the reason in :mod:`.nemo_kml`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def sniff(head: bytes) -> bool:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Cells, KPIs and the track of the phone; UsageError if no time zone is given."""
+    """Return cells, KPIs and the track of the phone, or raise UsageError if no time zone is given."""
     lines = _text.split(data)
     begin = [match.start() for match in _PLACEMARK.finditer(data)]
     row = lines.number_at(begin)

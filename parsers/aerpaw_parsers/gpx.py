@@ -26,7 +26,7 @@ from . import _pose, _sheet, drive_test, pose_csv
 _TAG = rb"(?:\w{1,20}:)?(?:trkpt|wpt|rtept)"  # also of a named space, as programs that use an XML library write it
 _POINT = re.compile(rb"<" + _TAG + rb"\b([^<>]{0,200})>(.{0,2000}?)(?:</" + _TAG + rb">)", re.DOTALL)
 _INSIDE = re.compile(rb"<(?:[\w-]{1,20}:)?([\w-]{1,40})(?:\s[^<>]{0,80})?>\s{0,40}([^<>]{1,80}?)\s{0,40}</")
-# In the tag of a point or of an extension, or in the words of a remark: 'RSRP=-80, PCI: 11'.
+# In the tag of a point or of an extension, or in the text of a remark: 'RSRP=-80, PCI: 11'.
 _PAIR = re.compile(rb"\b([A-Za-z][\w-]{0,40})\s?=\s?[\"']\s?([^\"'<>]{0,80}?)\s?[\"']")
 _REMARK = re.compile(rb"\b([A-Za-z][A-Za-z_]{1,40})\s?[=:]\s?(-?\d[\d.]{0,40})(?![\d:])")
 _REMARKS = ("cmt", "desc", "name")

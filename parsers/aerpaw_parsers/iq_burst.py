@@ -42,7 +42,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     named = _NAME.search(options.file_name)
     if named is None:
         raise InputError(
-            "the name of the burst does not say when it was",
+            "the name of the burst does not contain its time",
             expected="results_<Hz>_<samples per s>_<YYYY_mm_dd_HH_MM_SS_mmm>.mat",
             cause="a renamed file",
         )
@@ -50,7 +50,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     text = f"{year}-{month}-{day} {hour}:{minute}:{second}.{part or '0'}".encode()
     instants, valid = _text.texts_to_utc(np.array([text]), options, needed_by="iq_burst")
     if not valid[0]:
-        raise InputError("the date in the burst's name is none of the calendar", expected="YYYY_mm_dd_HH_MM_SS_mmm")
+        raise InputError(
+            "the date in the burst's name is not a date of the calendar", expected="YYYY_mm_dd_HH_MM_SS_mmm"
+        )
     with np.errstate(all="ignore"):  # damaged samples may be any number
         power = np.mean(np.abs(np.atleast_2d(samples)) ** 2, axis=1)
     rows = _rows.Rows(

@@ -1,8 +1,9 @@
 """MAVLink telemetry log of a ground station (``.tlog``): eight bytes of UTC in us, then one packet, and so on.
 
-Read are GLOBAL_POSITION_INT (33: position, height above home, velocity, heading), ATTITUDE (30), GPS_RAW_INT (24: fix)
-and SYS_STATUS (1: battery) of each vehicle that sends positions, and of the component that does: a gimbal's attitude is
-not the aircraft's. Checksums are checked. Source: MAVLink guide, "Packet Serialization".
+The messages GLOBAL_POSITION_INT (33: position, height above home, velocity, heading), ATTITUDE (30), GPS_RAW_INT
+(24: fix) and SYS_STATUS (1: battery) are read. They are those of the component that sends the positions of a vehicle,
+because the attitude of a gimbal is not that of the aircraft. Checksums are checked. Source: MAVLink guide, "Packet
+Serialization".
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _LAYOUT = {
     _POSITION: struct.Struct("<IiiiihhhH"), _ATTITUDE: struct.Struct("<Iffffff"), _GPS: struct.Struct("<QiiiHHHHBB"),
     _STATUS: struct.Struct("<14xH15x"),
 }  # fmt: skip
-# Names of the fields, as MAVLink's description of common messages has them.
+# Names of the fields in MAVLink's description of common messages.
 _FIELDS = {
     _POSITION: ["time_boot_ms", "lat", "lon", "alt", "relative_alt", "vx", "vy", "vz", "hdg"],
     _ATTITUDE: ["time_boot_ms", "roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed"],
@@ -35,7 +36,7 @@ _EARLIEST_US, _LATEST_US = 946_684_800_000_000, 9_200_000_000_000_000
 
 
 def _crc(data: bytes) -> int:
-    """X.25 checksum, as MAVLink uses it."""
+    """Return the X.25 checksum of MAVLink."""
     crc = 0xFFFF
     for byte in data:
         t = byte ^ (crc & 0xFF)
@@ -45,7 +46,7 @@ def _crc(data: bytes) -> int:
 
 
 def _packet(data: bytes, at: int) -> tuple[int, int, tuple[int, int], bytes] | None:
-    """Length with its time, message number, system and component, and payload of a packet; None if there is none."""
+    """Return the length with its time, message number, source and payload of a packet, or None."""
     if at + 16 > len(data):
         return None
     stamp = int.from_bytes(data[at : at + 8], "big")
@@ -59,7 +60,7 @@ def _packet(data: bytes, at: int) -> tuple[int, int, tuple[int, int], bytes] | N
         if at + 18 > len(data):
             return None
         head, source = 10, (data[at + 13], data[at + 14])
-        # a signature of 13 bytes stands behind the checksum where the first flag is set
+        # if the first flag is set, a signature of 13 bytes follows the checksum
         kind, tail = int.from_bytes(data[at + 15 : at + 18], "little"), 15 if data[at + 10] & 1 else 2
     else:
         return None
@@ -92,7 +93,7 @@ def sniff(head: bytes) -> bool:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Telemetry ``vehicle``."""
+    """Return the telemetry ``vehicle``, or one stream per vehicle."""
     messages: dict[int, list[_Message]] = {kind: [] for kind in _EXTRA}
     damaged: list[RejectedLine] = []
     count, at = 0, 0
@@ -102,7 +103,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
             begin = at
             while at < len(data) and _packet(data, at) is None:
                 at = _next_mark(data, at)
-            reason = f"{at - begin} bytes at {begin} that are no packet"
+            reason = f"{at - begin} bytes at {begin} that are not a packet"
             damaged.append(RejectedLine(count + len(damaged) + 1, reason, ""))
             continue
         length, kind, source, payload = packet
@@ -119,13 +120,13 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _next_mark(data: bytes, at: int) -> int:
-    """The next place where a packet could begin: eight bytes before a mark."""
+    """Return the next place where a packet could begin, eight bytes before a mark."""
     places = [place for mark in (b"\xfe", b"\xfd") if (place := data.find(mark, at + 9)) >= 0]
     return min(places) - 8 if places else len(data)
 
 
 def _flight(messages: dict[int, list[_Message]], system: int, name: str) -> _autopilot.Flight:
-    """Messages of a vehicle: of the component whose positions they are, as far as it sends them."""
+    """Return the messages of a vehicle, from the component that sends its positions if possible."""
     sources = [item[1] for item in messages[_POSITION] if item[1][0] == system]
     autopilot = max(set(sources), key=sources.count) if sources else (system, 1)
     series: dict[int, _autopilot.Series] = {}
@@ -146,7 +147,7 @@ def _flight(messages: dict[int, list[_Message]], system: int, name: str) -> _aut
     )  # fmt: skip
 
 
-# MAV_COMPONENT: cameras, gimbals, and what else lies on its own axes.
+# MAV_COMPONENT: cameras, gimbals and other components with their own axes.
 _NO_AUTOPILOT = {*range(100, 106), 154, *range(171, 176)}
 
 

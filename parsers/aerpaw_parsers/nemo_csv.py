@@ -1,7 +1,7 @@
 """Keysight Nemo along a flight, CSV: ``index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi``.
 
-Times are milliseconds relative to an origin that the file does not hold. The rank is that of the scheduled PDSCH,
-one-based; most rows hold a rank alone, or RSRP, SINR and CQI alone, which are streams of their own, too.
+Times are milliseconds relative to an origin that is not in the file. The rank is that of the scheduled PDSCH and counts
+from one. Most rows have only a rank, or only RSRP, SINR and CQI, which are separate streams, too.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ROW = re.compile(
 
 
 def pdsch_rank(rows: _rows.Rows, values: dict[str, FloatArray]) -> Stream | None:
-    """Stream of the scheduled rank; ``values`` holds ``ri_raw`` and what stands beside it."""
+    """Return the stream of the scheduled rank from ``ri_raw`` and further columns in ``values``."""
     raw = values["ri_raw"]
     missing = np.isnan(raw)
     odd = ~missing & ~((raw >= 1) & (raw <= 8) & (raw == np.round(raw)))
@@ -49,7 +49,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     levels = [
         _cells.named(rows, name, values[column], where=np.isfinite(values[column]), about={"rat": "nr"})
         for column, name in _LEVELS
-    ]  # before rows without a rank are flagged so
+    ]  # before rows without a rank get their flag
     place = {name: values[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")}
     track = rows.stream("telemetry", "phone", place, where=np.isfinite(place["latitude_deg"]), source="Nemo rows")
     yield pdsch_rank(rows, dict(values))

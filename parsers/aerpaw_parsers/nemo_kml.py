@@ -1,7 +1,7 @@
 """Measurements of a Keysight Nemo phone, as KML: one placemark description per report, one quantity per file.
 
-Only the description lines are read, by pattern and not as XML: a report stands on one line, and a parser that
-resolves entities has no business with a file from elsewhere. All other lines are markup and count as comments.
+Only the description lines are read, each with one report. They are read by patterns and not as XML, because a parser
+that resolves entities is a risk with a file from elsewhere. All other lines are markup and count as comments.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _GAP = rb"[^\n]{0,60}?"
 _NAME = rb" ?([A-Za-z][A-Za-z0-9 /_.-]{1,40}(?:\([^()=\n]{1,30}\))?) = "
 _RECORD = re.compile(
     rb"rel_time = " + _N + rb" ms" + _GAP + _NAME + _N + rb" ?([A-Za-z/%]{0,8})" + _GAP
-    # the position is needed: the phone stands on the aircraft
+    # the position is needed: the phone is on the aircraft
     + rb"\(lat, lon\) = \(" + _N + rb", ?" + _N + rb"\)" + _GAP + rb"altitude = " + _N + rb" m"
 )  # fmt: skip
 _HINT = re.compile(rb"rel_time = ")
@@ -41,17 +41,17 @@ def sniff(head: bytes) -> bool:
 
 def _reason(line: bytes) -> str | None:
     if _HINT.search(line):
-        return "a Nemo description that lacks time, quantity, position or altitude (torn line?)"
+        return "a Nemo description without time, quantity, position or altitude (torn line?)"
     return None  # markup
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Rank, level or KPI streams, one per quantity that the file holds, and the phone's own track.
+    """Return rank, level or KPI streams, one per quantity in the file, and the track of the phone.
 
     Raises
     ------
     UsageError
-        If ``time_origin`` is no time, or is local and no time zone is given.
+        If ``time_origin`` is not a time, or is local and no time zone is given.
     """
     lines = _text.split(data)
     reports = list(_RECORD.finditer(data))
@@ -64,7 +64,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         clock="relative_s" if in_seconds else "relative_ms",
     )  # fmt: skip
     if in_seconds:
-        rows.warnings.append("the times say ms, but then the phone would fly faster than any aircraft: read as seconds")
+        rows.warnings.append("with times in ms the phone would fly faster than any aircraft: read as seconds")
     position = {name: rows.number(name) for name in _POSITION}
     about: _pose.Height = {}
     if np.isfinite(position["altitude_m"]).any():
@@ -80,26 +80,26 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _in_seconds(time_ms: FloatArray, latitude: FloatArray, longitude: FloatArray) -> bool:
-    """Check whether times called milliseconds are seconds: so read the phone is too fast, and in seconds it is not."""
+    """Check whether times called milliseconds are seconds: the phone would be too fast in ms, but not in s."""
     if len(time_ms) < _FEW:
         return False
     step_m = 111_000.0 * np.hypot(np.diff(latitude), np.diff(longitude) * np.cos(np.radians(latitude[0])))
     step_s = np.abs(np.diff(time_ms)) / 1e3
     moving = (step_s > 0) & (step_m > 0)
     speed_mps = float(np.median(step_m[moving] / step_s[moving])) if moving.sum() >= _FEW else 0.0
-    # a thousand times slower it is a flight: then the unit is wrong, else the positions are
+    # if the phone is still too fast in seconds, the positions are wrong and not the unit
     return FASTEST_MPS < speed_mps <= 1e3 * FASTEST_MPS
 
 
 _FEW = 4
 
 
-# Of the cell that Nemo's CSV calls ``nr``: there RSRP is ``nr_rsrp``.
+# The cell that is called ``nr`` in Nemo's CSV, where its RSRP is ``nr_rsrp``.
 _SERVING = " (NR SpCell)"
 
 
 def _measured(rows: _rows.Rows, name: str, where: BoolArray) -> Stream | None:
-    """Level or KPI stream of one quantity, by the name that it has in Nemo's CSV."""
+    """Return the level or KPI stream of one quantity, under its name in Nemo's CSV."""
     unit = next((text for text in rows.text("unit") if text), "")
     short = f"nr {name.removesuffix(_SERVING)}" if name.endswith(_SERVING) else name
     about = {"rat": "nr"} if short != name else None

@@ -1,7 +1,7 @@
-"""Files that lie beside logs and are none: named, so that a folder's account says what each of its files is.
+"""Files next to logs that are not logs, so that the account of a folder names each of its files.
 
-Each entry is a reader without kinds: its sniffer knows the file, its title says what it is. They are asked where no
-reader of logs knows the content.
+Each entry is a reader without kinds: its sniffer recognises the file, and its title describes it. These readers are
+tried if no reader of logs recognises the content.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _LEVELS = rb"(?i)g-?net ?track|\b(?:rsrp|rssi|rxlev|rscp|level)\b(?:\W|</?[\w:]{
 _TIMED = rb"(?i)\btime|<when>|\b\d\d:\d\d:\d\d\b"
 _PATTERN_MAT = re.compile(r"(?i)(rad_?pat|gain|theta\d?|phi\d?|sa\d{4}|rmwb\d{4}\w*|g[rt]_\w+|pattern\w*|antenna\w*)")
 
-# How a file is known: a pattern that stands in its first bytes, or a function of these.
+# A test of a file: a pattern in its first bytes, or a function of these.
 _Test = bytes | Callable[[bytes], bool]
 
 
@@ -53,15 +53,15 @@ def _refuse(what: str) -> Callable[[bytes, ReadOptions], ReadResult]:
     return read
 
 
-# Name, what it is, and the tests of which all hold.
-# The first whose tests hold names the file: narrow kinds stand in front of wide ones.
+# Name, description, and tests, which must all pass. The first such entry names the file, so that narrow kinds come
+# before wide ones.
 _KINDS: tuple[tuple[str, str, tuple[_Test, ...]], ...] = (
     ("antenna_pattern", "a measured antenna pattern (for 'antenna: {model: file}' in flight.yaml)",
      (rb"(?im)\A[^\0]{0,380}?(?:Frequency ?= ?\d{1,6} ?\(MHz\)|Phi ?= ?-?\d{1,3}(?:\.\d{1,6})? ?\(deg\))"
       rb"|\A[^\0]{0,4080}?^(?:HORIZONTAL\s+\d{1,4}|REVNUM:,TIA)",)),
     ("antenna_grid", "antenna gain grids of MATLAB (for 'antenna: {model: gain_grid}' in flight.yaml)",
      (_MAT, _antenna_mat)),
-    ("matlab_other", "MATLAB variables that are no flight",
+    ("matlab_other", "MATLAB variables that are not a flight",
      (_MAT, lambda head: bool(matfile.names_of(head)), _not(_antenna_mat))),
     ("power_references", "a table of USRP reference powers",
      (rb"\A(?:\xef\xbb\xbf)?Node,Category,Channel,[^\n]{0,80}Gain,Freq_",)),

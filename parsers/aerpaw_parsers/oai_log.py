@@ -5,9 +5,9 @@ average RSRP -78 (16 meas)``. UE: ``RI = 2 i1 = 0.0.0, i2 = 1, SINR = 20 dB, CQI
 dBm,`` in front. All three add one to the index of the report before they print it: RI counts from one. A gNB prints
 the last report, not a mean.
 
-Times, the first that the log has: a stamp of ``ts`` or of srsRAN's form in front of the line or of one above it;
-OAI's own seconds (``log_config ... time``: from an unknown origin unless they are an epoch); else 1.28 s per
-``Frame.Slot`` line, which comes every 128 frames.
+The first of these times is used: a stamp of ``ts`` or of srsRAN's form at the beginning of the line or of one above it;
+OAI's own seconds (``log_config ... time``), from an unknown origin unless they are an epoch. Otherwise a ``Frame.Slot``
+line, which comes every 128 frames, counts 1.28 s.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ _FRAMES_S = 1.28
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether it is OAI's talk with CSI or levels in it."""
+    """Check whether it is output of OAI with CSI or levels."""
     if not any(word in head for word in (b"MAC]", b"PHY]", b"Frame.Slot", b"dlsch_rounds", b"i1 = ")):
-        return False  # at a thousandth of what the expressions take
+        return False  # a thousand times faster than the expressions
     return any(pattern.search(head) for pattern in (_CSI, _LEVEL, _UE)) and re.search(
         rb"\[(?:NR_)?(?:MAC|PHY)\]|Frame\.Slot|dlsch_rounds|\bi1 = ", head
     ) is not None  # fmt: skip
 
 
 def _rows_of(lines: _text.Lines) -> tuple[IntArray, list[dict[str, bytes]], str, AnyArray]:
-    """Lines with a quantity, their values, the clock, and the times."""
+    """Return the lines with a quantity, their values, the clock, and the times."""
     row, quantities, stamps = [], [], []
     stamp, seconds, frame = b"", b"", -1
     for i in range(len(lines)):
@@ -74,7 +74,7 @@ def _rows_of(lines: _text.Lines) -> tuple[IntArray, list[dict[str, bytes]], str,
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Rank stream ``oai`` and RSRP; UsageError if stamps have no zone and none is given."""
+    """Return the rank stream ``oai`` and RSRP, or raise UsageError if the zone of stamps is unknown."""
     lines = _text.split(data)
     row, quantities, clock, time = _rows_of(lines)
     rows = _rows.built(lines, row, {"time": time}, options, reader="oai_log", reason=lambda _line: None, clock=clock)

@@ -1,8 +1,8 @@
 """PawPrints, AERPAW's logger of an Android phone: JSON lines with LTE and NR cells, or the text of 2023.
 
-Since autumn 2024 positions stand in a log of their own, ``location.txt``, as objects (2023: ``GPS_LOG_START,...``).
-``companion_abs_time`` (ms of UTC, the clock of the aircraft's computer) is the time; where a line lacks it,
-``abs_time``, the phone's own. A cell's level is its RSRP; 2147483647 and ``Unavailable`` mean that there is none.
+Since autumn 2024 positions are objects in a separate log, ``location.txt`` (2023: ``GPS_LOG_START,...``). The time is
+``companion_abs_time`` (ms of UTC, the clock of the aircraft's computer), or ``abs_time`` of the phone if it is missing.
+The level of a cell is its RSRP; 2147483647 and ``Unavailable`` mean a missing value.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from . import _cells, _json, _pose
 
 _MARKS = (b'"cells"', b'"latitude"', b'"nr_signal_strength"', b'"connected_pci"', b'"companion_abs_time"')
 
-# A second START on a line is that of the next reading behind a torn one, whose time is another.
+# A second START on a line belongs to the next reading after a truncated one, with another time.
 _TEXT = re.compile(rb"^CELL_LOG_START,(\d{13}),(?:(?!CELL_LOG_START).)*?,?CELL_LOG_STOP[ \t]*\r?$", re.MULTILINE)
 _BLOCK = re.compile(rb"BS_INFO_START,([^\n]*?),?BS_INFO_STOP")
-# Places in a block by its technology; LTE with all quantities switched on in the app, as it is delivered.
+# Places in a block by its technology; LTE with all quantities switched on in the app, as by default.
 _OF_TEXT = {
     b"4G_LTE": {"fields": 19, "connected": 1, "rsrp": 6, "rsrq": 7, "rssi": 8, "sinr": 5, "arfcn": 11, "pci": 12},
     b"5G_NR_SA": {"fields": 19, "connected": 2, "rsrp": 7, "rsrq": 8, "sinr": 9, "arfcn": 13, "pci": 14},
@@ -55,7 +55,7 @@ def _readings(entries: list[dict[str, Any]]) -> Iterator[_cells.Reading]:
 
 
 def _text_cells(line: bytes) -> list[dict[str, Any]] | None:
-    """Cells of a line of the text of 2023 in the words of the JSON; None where a block has other fields."""
+    """Return the cells of a line of the text of 2023 by the names of the JSON, or None for other fields."""
     decoded = []
     for block in _BLOCK.findall(line):
         cells = block.split(b",")
@@ -69,7 +69,7 @@ def _text_cells(line: bytes) -> list[dict[str, Any]] | None:
 
 
 def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
-    """Cells of the text of 2023: ``CELL_LOG_START,<ms of UTC>,...``, a block per cell."""
+    """Return the cells of the text of 2023: ``CELL_LOG_START,<ms of UTC>,...``, a block per cell."""
     lines = _text.split(data)
     row, groups = _text.match(lines, _TEXT)
     cells = [_text_cells(lines.raw(i)) for i in row.tolist()]
@@ -95,7 +95,7 @@ _GPS_SECONDS = re.compile(_GPS_TEXT % rb"(?:\d{13},)?(?P<time>[\d.]{1,20})", re.
 
 
 def _read_location(data: bytes, options: ReadOptions) -> ReadResult:
-    """Positions of the text of 2023: seconds since the start, or milliseconds of UTC, and the place."""
+    """Return the positions of the text of 2023, with seconds since the start or milliseconds of UTC."""
     dated = len(_GPS_EPOCH.findall(data)) == len(_GPS_SECONDS.findall(data))
     rows = _rows.matched(
         data, _GPS_EPOCH if dated else _GPS_SECONDS, options, reader="pawprints",
@@ -106,7 +106,7 @@ def _read_location(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _nr(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
-    """Level of the NR leg: the phone tells it apart from the cells, without a PCI."""
+    """Return the level of the NR leg, which the phone reports separately and without a PCI."""
     legs = [_json.inside(item, "nr_signal_strength") for item in entries]
     level = _json.column(legs, "ss_rsrp")
     if not np.isfinite(level).any():
@@ -121,7 +121,7 @@ def _nr(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
 
 
 def _track(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
-    """Positions, in the object itself or in its ``location``."""
+    """Return the positions in the objects or in their ``location``."""
     places = [{**_json.inside(item, "gps"), **_json.inside(item, "location"), **item} for item in entries]
     names = (("latitude", "lat"), ("longitude", "lon", "lng"), ("altitude", "alt"))
     return _placed(rows, *(_json.column(places, *keys) for keys in names))
@@ -139,7 +139,7 @@ def _placed(rows: _rows.Rows, latitude: FloatArray, longitude: FloatArray, altit
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """A level stream per LTE or NR cell, the level of the NR leg, and the phone's track where it is logged."""
+    """Return a level stream per LTE or NR cell, the level of the NR leg, and the track of the phone."""
     if data[:4096].lstrip().startswith(b"CELL_LOG_START,"):
         return _read_text(data, options)
     if data[:4096].lstrip().startswith(b"GPS_LOG_START,"):
@@ -154,7 +154,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     )  # fmt: skip
     timed = [entries[i] for i in rows.at.tolist()]
     if any("companion_abs_time" not in item and "cells" in item for item in timed):
-        rows.warnings.append("some lines lack companion_abs_time: the phone's own clock was taken there")
+        rows.warnings.append("some lines have no companion_abs_time: the clock of the phone is used there")
     cells = _cells.streams(rows, _readings(timed), source="PawPrints")
     return rows.result([_track(rows, timed), *cells, _nr(rows, timed)])
 

@@ -1,7 +1,7 @@
 """Positions and attitude as CSV with named columns: converted vehicleOut, ArduPilot exports, DJI and AirData records.
 
-Columns come in any order; units in brackets (``[ft]``, ``[MPH]``) are converted; altitudes above sea level are
-brought to heights above the first position. Times without a zone are local unless the column's name says UTC or GPS.
+Columns come in any order. Units in brackets (``[ft]``, ``[MPH]``) are converted, and altitudes above sea level become
+heights above the first position. Times without a zone are local unless the name of the column contains UTC or GPS.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from . import _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, rtk
 
 
 def is_header(names: list[str]) -> bool:
-    """Check whether names hold a position and a time, and no quantity of a radio."""
+    """Check whether there is a position and a time among the names, and no quantity of a radio."""
     known = _quantities(names)
     return ({*_pose.PLACE[:2]} <= known or "grid" in known) and has_time(names) and not has_radio(names)
 
 
 def has_radio(names: list[str]) -> bool:
-    """Check whether names hold a level, a ratio or a rank of the channel."""
+    """Check whether there is a level, a ratio or a rank of the channel among the names."""
     return any(
         what is not None and (what.quantity.role in ("rss", "rank") or what.quantity.name in ("SINR", "RSRQ"))
         for what, *_ in dictionary.described(names)[1]
@@ -39,18 +39,20 @@ def has_time(names: list[str]) -> bool:
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether a header with position and time stands in front, and it is not AERPAW's own layout."""
+    """Check whether a file begins with a header with position and time and is not in AERPAW's own layout."""
     narrower = [module.READER.sniff for module in (vehicle_out, ardupilot_bin, nemo_csv, quectel_ri, rtklib_pos)]
     return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Return the telemetry ``vehicle``; UsageError if the clock has no zone and none is given.
+    """Return the telemetry ``vehicle``.
 
     Raises
     ------
     InputError
         If the positions are on a local grid.
+    UsageError
+        If the zone of the clock is unknown.
     """
     sheet = _sheet.read(data, is_header)
     if sheet is not None and sheet.find("latitude_deg") is None and (grid := sheet.find("grid")) is not None:

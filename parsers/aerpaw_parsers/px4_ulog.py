@@ -1,10 +1,10 @@
 """PX4 log (``.ulg``): position, attitude, velocity and GPS of the aircraft's own log.
 
-The format describes itself: ``F`` messages give the fields of each topic, ``A`` its number, ``D`` its data. Read
-are ``vehicle_global_position``, ``vehicle_attitude`` (quaternion), ``vehicle_local_position`` (velocity) and
-``vehicle_gps_position`` or ``sensor_gps`` (UTC, fix; the position too, where the log has no global position);
-instance 0 of each, of receivers the one with most fixes. Heights are above ``home_position`` as it was at take-off,
-else above the ground at rest or the first position.
+The format describes itself: ``F`` messages contain the fields of each topic, ``A`` its number, ``D`` its data. The
+topics ``vehicle_global_position``, ``vehicle_attitude`` (quaternion) and ``vehicle_local_position`` (velocity) are
+read, and ``vehicle_gps_position`` or ``sensor_gps`` for UTC and fix, or for the position if there is no other. Instance
+0 of each is read, and the receiver with most fixes. Heights are above ``home_position`` at take-off, else above the
+ground at rest or the first position.
 Source: PX4 guide, "ULog File Format".
 """
 
@@ -39,7 +39,7 @@ _KINDS = frozenset(b"BFIMPQADLCSORT")
 
 
 def _layout(text: str) -> np.dtype[np.void] | None:  # type: ignore[type-var]
-    """Layout of a topic; None where it nests another, which none of the wanted ones does."""
+    """Return the layout of a topic, or None if it contains another topic, unlike all wanted ones."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     for part in text.split(";"):
         if not part:
@@ -56,7 +56,7 @@ def _layout(text: str) -> np.dtype[np.void] | None:  # type: ignore[type-var]
 
 
 def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int, list[RejectedLine]]:
-    """Messages of the wanted topics, their numbers, the number of sound messages, and damaged stretches."""
+    """Return the messages of the wanted topics, their numbers, the number of intact messages, and damaged segments."""
     forms: dict[str, str] = {}
     names: dict[int, tuple[str, int]] = {}
     bodies: dict[tuple[str, int], list[bytes]] = {}
@@ -89,7 +89,7 @@ def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int
 
 
 def _best(topics: list[tuple[str, int]], tables: Mapping[tuple[str, int], AnyArray]) -> tuple[str, int] | None:
-    """The instance of a topic with most fixes, of equals the first; None where there is none."""
+    """Return the first instance of a topic with most fixes, or None if there is no instance."""
 
     def fixes(topic: tuple[str, int]) -> int:
         fix = _column(tables[topic], "fix_type")
@@ -106,7 +106,7 @@ def _table(bodies: list[bytes], text: str) -> AnyArray:
     if layout is None or not bodies or "timestamp" not in (layout.names or ()):
         return np.zeros(0, dtype=[("timestamp", "<u8")])
     size = layout.itemsize
-    # padding at the end of a topic is left out of its messages
+    # messages omit the padding at the end of a topic
     return np.frombuffer(b"".join(body[:size].ljust(size, b"\0") for body in bodies), dtype=layout)
 
 
@@ -122,7 +122,7 @@ def _series(table: AnyArray, numbers: list[int], columns: Mapping[str, FloatArra
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Telemetry ``vehicle``."""
+    """Return the telemetry ``vehicle``."""
     tables, numbers, count, damaged = _topics(data)
     gps_name = next((name for name in ("vehicle_gps_position", "sensor_gps") if len(tables[name])), "sensor_gps")
     gps, place_name = tables[gps_name], "vehicle_global_position"
@@ -148,18 +148,18 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _columns(table: AnyArray) -> dict[str, FloatArray]:
-    """Columns of the record model; receivers wrote integers until PX4 1.14, degrees and metres as doubles since."""
+    """Return columns of the record model, from integers of receivers until PX4 1.14, or from doubles."""
     names = [name for name in table.dtype.names or () if table[name].ndim == 1 and table.dtype[name].kind in "iuf"]
     fields = {name: table[name].astype(np.float64) for name in names}
     return dictionary.record_columns(fields, integers=[name for name in names if table.dtype[name].kind != "f"])
 
 
 def _position(table: AnyArray) -> dict[str, FloatArray] | None:
-    """Place and altitude of the estimator's or the receiver's own messages, None where there is none."""
+    """Return position and altitude of the messages of the estimator or the receiver, or None."""
     columns = _columns(table)
     if not len(table) or not {"latitude_deg", "longitude_deg"} <= set(columns):
         return None
-    if "fix" in columns:  # a receiver's own position; at 0, 0 no aircraft flies
+    if "fix" in columns:  # the receiver's own position; positions at 0, 0 are flagged
         columns |= {
             name: np.where(columns["fix"] < _FIX_2D, 0.0, columns[name]) for name in ("latitude_deg", "longitude_deg")
         }
@@ -168,7 +168,7 @@ def _position(table: AnyArray) -> dict[str, FloatArray] | None:
 
 
 def _home(table: AnyArray, numbers: list[int]) -> _autopilot.Series:
-    """Altitude of home each time that it was set; NaN where the autopilot itself calls it not valid."""
+    """Return the altitude of home each time that it was set, NaN if the autopilot marks it as not valid."""
     altitude, valid = _column(table, "alt"), _column(table, "valid_alt")
     if altitude is not None and valid is not None:
         altitude = np.where(valid != 0, altitude, np.nan)
@@ -176,7 +176,7 @@ def _home(table: AnyArray, numbers: list[int]) -> _autopilot.Series:
 
 
 def _angles(table: AnyArray) -> dict[str, FloatArray | None]:
-    """Roll, pitch and yaw of the quaternions (w, x, y, z) from the body (front, right, down) to north, east, down."""
+    """Return roll, pitch and yaw of quaternions (w, x, y, z) from front, right, down to north, east, down."""
     q = _column(table, "q")
     if q is None or q.ndim != 2 or q.shape[1] != 4:
         return {}

@@ -1,8 +1,8 @@
-"""Console of AERPAW's Quectel logger: tables drawn with ``+----+`` and ``|``, each behind a line with its time.
+"""Console of AERPAW's Quectel logger: tables drawn with ``+----+`` and ``|``, each after a line with its time.
 
-Rows ``| 0 | +QENG: "LTE" | ... |`` give the LTE cell, ``NR5G-NSA`` (RSRP, SINR, RSRQ) and ``NR5G-SA`` (RSRP, RSRQ,
-SINR) the NR cell, ``+QNWCFG: "nr5g_csi"`` the rank (from one; 0 means no CSI). Times are local; a row's time is
-that of its table.
+Rows ``| 0 | +QENG: "LTE" | ... |`` contain the LTE cell, ``NR5G-NSA`` (RSRP, SINR, RSRQ) and ``NR5G-SA`` (RSRP, RSRQ,
+SINR) the NR cell, and ``+QNWCFG: "nr5g_csi"`` the rank (from one; 0 means no CSI). Times are local, and the time of a
+row is that of its table.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ _CSI = ("lte_csi", "nr5g_csi")
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether tables of AT answers stand in it."""
+    """Check whether it contains tables of AT answers."""
     return b"|----+" in head and re.search(rb'\|\s*\d+\s*\|\s*"?\+Q(ENG|NWCFG):', head) is not None
 
 
 def _number(cell: bytes) -> float:
     text = cell.strip().strip(b'"')
     value = float(text) if re.fullmatch(rb"[-+]?\d{1,9}(\.\d{1,6})?", text) else np.nan
-    # no value: the least number of 16 bits, also after the firmware's division by ten, and the largest PCI field
+    # missing: the least number of 16 bits, also after the firmware's division by ten, and the largest PCI field
     return np.nan if value in (-32768, -3276, 65535) else value
 
 
 def _tables(lines: _text.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, float]]], list[RejectedLine]]:
-    """Line, time, title and named values of each row that holds a level or a CSI."""
+    """Return line, time, title and named values of each row with a level or a CSI."""
     time = b""
     names: dict[bytes, list[str]] = {}
     entries: list[tuple[int, bytes, str, dict[str, float]]] = []
@@ -54,7 +54,7 @@ def _tables(lines: _text.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, f
         title, cells = row[2], row[3].split(b"|")
         heads = ["mcs", "ri", "cqi", "pmi"] if title.decode("ascii", "replace") in _CSI else names.get(title)
         if heads is None:
-            continue  # neighbours, operators: no record is made of them
+            continue  # neighbours and operators are not read
         if not time or len(cells) != len(heads):
             rejected.append(lines.reject(i, "a table row without a time, or of another width than its head (torn?)"))
             continue
@@ -64,7 +64,7 @@ def _tables(lines: _text.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, f
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Cells by PCI, and rank where CSI tables stand; UsageError if no time zone is given."""
+    """Return cells by PCI, and ranks of CSI tables, or raise UsageError if no time zone is given."""
     lines = _text.split(data)
     entries, rejected = _tables(lines)
     row = np.array([item[0] for item in entries], dtype=np.int64)

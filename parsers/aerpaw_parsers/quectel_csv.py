@@ -1,19 +1,19 @@
 """CSVs of AERPAW's Quectel logger (``csv_kpi``): rank indicator and serving-cell level, both generations.
 
-A console of the modem (RM500Q to RM520N) whose lines carry a stamp holds the same answers, each radio access on its own
-line.
+A console of the modem (RM500Q to RM520N) with time stamps contains the same answers, with each radio access on a
+separate line.
 
-There is no header; a first line may be a bare ``OK``; fields are raw pieces of AT answers with their
-``+QNWCFG: "nr5g_csi"`` prefix. Rows are told apart by the RAT token they carry, never by the file name: an NR5G-SA
-answer is filed under ``..._LTE_only.csv`` by the logger.
+There is no header, and a first line may be a bare ``OK``. Fields are raw pieces of AT answers with their
+``+QNWCFG: "nr5g_csi"`` prefix. Rows are distinguished by their RAT token and not by the file name, because the logger
+writes NR5G-SA answers to ``..._LTE_only.csv``.
 
 ========================= ======= ============================================================
-row                       columns gives
+row                       columns streams
 ========================= ======= ============================================================
 ``+QNWCFG lte_csi`` and   11, 19  rank ``lte_csi`` and ``nr5g_csi`` (MCS, RI, CQI, PMI each)
 ``nr5g_csi``
-LTE + NR5G-NSA            32, 28  rss ``lte_rsrp`` and ``nr_rsrp`` (order RSRP, SINR, RSRQ); of several cells, a
-                                  stream each, ``lte_pci7``
+LTE + NR5G-NSA            32, 28  rss ``lte_rsrp`` and ``nr_rsrp`` (order RSRP, SINR, RSRQ), or a stream per cell,
+                                  ``lte_pci7``
 LTE                       20      rss ``lte_rsrp``
 NR5G-SA                   18      rss ``nr_rsrp`` (order RSRP, RSRQ, SINR)
 ========================= ======= ============================================================
@@ -98,14 +98,14 @@ _SINR_RANGE = (-23.0, 40.0)
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether most of the first lines, a bare OK aside, are AT answers behind a time."""
+    """Check whether most of the first lines, except a bare OK, are AT answers after a time."""
     lines = [line for line in _text.first_lines(head) if line != b"OK" and not _TALK.match(line)]
     return bool(lines) and 2 * sum(_ANY.match(line) is not None for line in lines) > len(lines)
 
 
 def _reason(line: bytes) -> str | None:
     if line.strip() == b"OK":
-        return None  # written by the start script, no answer of the modem
+        return None  # written by the start script, not by the modem
     if b"\0" in line:
         return "NUL bytes in the line (the file system was not synced when power went)"
     if line.startswith(b"[") and _TALK.match(line):
@@ -122,8 +122,8 @@ def _reason(line: bytes) -> str | None:
 
 
 def _table(lines: _text.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
-    """Lines of all kinds of row, and their columns of text; ``form`` is the kind, an index into ``_FORMS``."""
-    # a search of a whole log of CSI would find nothing, slowly
+    """Return the lines of all kinds of row, and their columns of text, with an index into ``_FORMS`` as ``form``."""
+    # searching a log of CSI for other kinds would be slow and find nothing
     serving = b"servingcell" in lines.data or lines.data.startswith(b"[")
     tables: list[tuple[IntArray, dict[str, AnyArray]]] = []
     for i, (pattern, names) in enumerate(_FORMS if serving else _FORMS[:1]):
@@ -140,12 +140,12 @@ def _table(lines: _text.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
     return row[order], table
 
 
-# Forms of a console, where each radio access answers on a line of its own.
+# Forms of a console, with each radio access on a separate line.
 _NSA_FORM, _ALONE = 3, {"lte": 4, "nr5g": 5}
 
 
 def _rank(rows: _rows.Rows, rat: str) -> Stream | None:
-    """Rank stream of one radio access."""
+    """Return the rank stream of one radio access."""
     mcs, ri, cqi, pmi = (rows.number(f"{rat}_{name}") for name in ("mcs", "ri", "cqi", "pmi"))
     flag = rows.flag.copy()
     idle = (mcs == 0) & (ri == 0) & (cqi == 0) & (pmi == 0)
@@ -160,7 +160,7 @@ def _rank(rows: _rows.Rows, rat: str) -> Stream | None:
 
 
 def _levels(rows: _rows.Rows, rat: str, where: BoolArray) -> Iterator[Stream | None]:
-    """RSRP of one radio access, a stream per cell where the log has several; a log of one cell gives one stream."""
+    """Yield the RSRP of one radio access, in one stream or a stream per cell if the log has several cells."""
     rsrp, pci, arfcn = (rows.number(f"{rat}_{name}") for name in ("rsrp", "pci", "arfcn"))
     flag = rows.flag.copy()
     good = (rsrp >= _RSRP_RANGE[0]) & (rsrp <= _RSRP_RANGE[1])
@@ -169,11 +169,11 @@ def _levels(rows: _rows.Rows, rat: str, where: BoolArray) -> Iterator[Stream | N
     if rat == "nr":
         sinr = rows.number("nr_sinr")
         fits = (sinr >= _SINR_RANGE[0]) & (sinr <= _SINR_RANGE[1])
-        # tenths of a decibel on 2020 firmware look like this: never divided silently
+        # firmware of 2020 writes tenths of a decibel, which are flagged and not divided
         _text.add_flag(flag, good & ~fits & ~np.isnan(sinr), "sinr_out_of_range")
         values["sinr_db"] = np.where(fits, sinr, np.nan)
     named = where & (pci >= 0) & (pci <= _MOST_PCI)
-    # infinity sorts behind every carrier and is none
+    # infinity sorts after every carrier and means a missing carrier
     carrier = np.where(arfcn > 0, arfcn, np.inf)
     cells = sorted(set(zip(pci[named].tolist(), carrier[named].tolist(), strict=True)))
     common: dict[str, Attribute | None] = {"unit": rows.options.unit or "dBm", "quantity": "RSRP", "rat": rat}
@@ -196,7 +196,7 @@ _MOST_PCI = 1007
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Rank and level streams, whichever rows the file has.
+    """Return the rank and level streams of the rows in the file.
 
     Raises
     ------

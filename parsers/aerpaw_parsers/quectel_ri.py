@@ -44,5 +44,5 @@ READER = _rows.reader(
     row=_ROW,
     streams=_streams,
     fields=6,
-    otherwise="the time or a number is of another form",
+    otherwise="the time or a number has another form",
 )

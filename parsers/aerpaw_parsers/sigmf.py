@@ -1,16 +1,15 @@
-"""SigMF: the flight that dataset 12 keeps in its meta files, sounder positions, or power of the samples.
+"""SigMF: the flights in the meta files of dataset 12, positions of a sounder, or the power of samples.
 
-Dataset 12 (``captures[]``): ``measurement:values`` {mX, mY, mZ, RSS1, RSS2} with ``measurement:time_stamp``, and
-``gps:position`` {x, y, z} with ``gps:time_stamp``; x is the longitude, y the latitude, z the height above take-off;
-RSS in dB re full scale. A value is a list (a flight) or a number (a burst); a global field of the same name holds
-for captures without it. Sounder: ``core:timestamp`` (epoch), ``core:rx_location``, ``core:rotation``,
-``core:velocity``, ``core:frequency``. SigMF 1.x: ``core:geolocation`` of each capture, above the ellipsoid.
+Dataset 12 (``captures[]``) has ``measurement:values`` {mX, mY, mZ, RSS1, RSS2} with ``measurement:time_stamp``, and
+``gps:position`` {x, y, z} with ``gps:time_stamp``. x is the longitude, y the latitude, z the height above take-off, and
+RSS is in dB re full scale. A value is a list (a flight) or a number (a burst). A global field of the same name is used
+for captures without it. A sounder has ``core:timestamp`` (epoch), ``core:rx_location``, ``core:rotation``,
+``core:velocity`` and ``core:frequency``; SigMF 1.x has ``core:geolocation`` per capture, above the ellipsoid.
 
-Captures of several frequencies give a series each; the bytes of headers (``core:header_bytes``) are no samples, and
-unsigned samples count from the middle of their range. Without values the power of each 20 ms of samples is read from
-the ``.sigmf-data`` beside: 10 log10 of the mean of abs(x)^2 over all of the burst, dB re full scale of the data type.
-Clipped samples and a DC part are reported.
-The lines of the account are those values.
+Each frequency has a series. Header bytes (``core:header_bytes``) are not samples, and unsigned samples count from the
+middle of their range. Without values, levels are the power of each 20 ms of samples in the ``.sigmf-data`` of the same
+folder: 10 log10 of the mean of abs(x)^2 in dB re full scale of the data type. Clipped samples and a DC part are
+reported. The lines of the account are the values.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ _PLACE = (("latitude_deg", ("mY", "y", "latitude", "lat")), ("longitude_deg", ("
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether it is JSON with SigMF's three parts; the global one comes first as a rule."""
+    """Check whether it is JSON with SigMF's three parts, of which the global one usually comes first."""
     text = head.lstrip(b"\xef\xbb\xbf \r\n\t")
     return text[:1] == b"{" and b'"core:datatype"' in head and (b'"captures"' in head or b'"global"' in head)
 
@@ -60,18 +59,18 @@ def _list(value: Any) -> list[Any]:
 
 
 def _merged(meta: dict[str, Any]) -> list[dict[str, Any]]:
-    """Captures, each with the global fields that it lacks."""
+    """Return the captures, each with the global fields that are missing in it."""
     common = {key: value for key, value in _json.inside(meta, "global").items() if ":" in key}
     captures = _json.listed(meta, "captures")
     for capture in captures:
-        # one place for all captures, a global field, is that of a receiver on the ground and no track
+        # a global position for all captures is that of a receiver on the ground, not a track
         point = [*_list(_json.inside(capture, "core:geolocation").get("coordinates")), None, None]
         capture |= {"geolocation": dict(zip("xyz", point, strict=False))} if point[0] is not None else {}
     return [{**common, **capture} for capture in captures] or [common]
 
 
 def _column(captures: list[dict[str, Any]], field: str, *names: str) -> FloatArray:
-    """A quantity of all captures, one behind the other."""
+    """Return a quantity of all captures, one after the other."""
     out: list[float] = []
     for capture in captures:
         place = _json.inside(capture, field)
@@ -81,13 +80,13 @@ def _column(captures: list[dict[str, Any]], field: str, *names: str) -> FloatArr
 
 
 def _times(captures: list[dict[str, Any]], own: str) -> list[str]:
-    """Times of all captures, of a field of their own or the core's."""
+    """Return the times of all captures, from the given field or those of the core."""
     stamps = (next((capture[field] for field in (own, *_TIMES) if field in capture), None) for capture in captures)
     return [str(item) for stamp in stamps for item in _list(stamp)]
 
 
 def _rows_of(texts: list[str], options: ReadOptions) -> _rows.Rows:
-    """Values with times; the lines of the account are the values."""
+    """Return the values with times as rows, which are the lines of the account."""
     clock, cells, warnings = _stamps.read(texts, options)
     relative, instants, valid = _rows.times(cells, options, clock=clock, reader="sigmf")
     keep = np.flatnonzero(valid)
@@ -100,7 +99,7 @@ def _rows_of(texts: list[str], options: ReadOptions) -> _rows.Rows:
 
 
 def _at_frequencies(rows: _rows.Rows, channel: str, values: FloatArray, frequency_hz: FloatArray) -> Iterator[Stream]:
-    """Levels of a channel, a series for each frequency of the captures."""
+    """Yield the levels of a channel, one series per frequency of the captures."""
     level, flag = rows.level(np.where(np.isfinite(values), values, np.nan)[rows.at])
     unit, tuned_hz = rows.options.unit or "dB re full scale", frequency_hz[rows.at]
     known = np.unique(tuned_hz[np.isfinite(tuned_hz)]).tolist()
@@ -116,18 +115,18 @@ def _at_frequencies(rows: _rows.Rows, channel: str, values: FloatArray, frequenc
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Levels per channel and the track, from the meta file or from the samples beside it.
+    """Return levels per channel and the track, from the meta file or from the samples in its folder.
 
     Raises
     ------
     InputError
-        If the file is no JSON, or holds neither values nor positions and its samples are not beside it.
+        If the file is not JSON, or has neither values, positions nor samples.
     """
     try:
         meta = json.loads(data.decode("utf-8-sig", "replace"))
         captures = _merged(meta)
     except (ValueError, RecursionError, AttributeError) as error:
-        found = f"the SigMF meta file is no JSON ({error})"
+        found = f"the SigMF meta file is not JSON ({error})"
         raise InputError(found, expected="a whole file", cause="a cut download") from None
     tables = [*_track(captures, options), *_levels(captures, options)]
     warnings: list[str] = []
@@ -135,7 +134,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         tables += _powers(meta, captures, options, warnings)
     if not tables:
         raise InputError(
-            "the SigMF meta file holds neither values nor positions, and its samples cannot be read",
+            "the SigMF meta file has neither values nor positions, and its samples cannot be read",
             expected=f"measurement:values, core:rx_location, or {_data_name(options)!r} in the same folder",
             cause="".join(dict.fromkeys(warnings)),
         )
@@ -166,7 +165,7 @@ def _levels(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tu
 
 
 def _track(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tuple[_rows.Rows, Stream]]:
-    """Positions: of the measurements, of the GPS, or of the receiver."""
+    """Yield the positions of the measurements, of the GPS, or of the receiver."""
     fields = ("measurement:values", "measurement:time_stamp"), ("gps:position", "gps:time_stamp")
     for field, time in (*fields, ("core:rx_location", "core:timestamp"), ("geolocation", "core:datetime")):
         texts = _times(captures, time)
@@ -193,11 +192,11 @@ def _data_name(options: ReadOptions) -> str:
 def _powers(
     meta: dict[str, Any], captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str]
 ) -> Iterator[tuple[_rows.Rows, Stream]]:
-    """Power of each burst of the samples beside the meta file, ``captures`` with the global fields that they lack."""
+    """Yield the power of each burst of the samples, for captures with their global fields."""
     common = _json.inside(meta, "global")
     samples, full_scale = _samples(common, _json.listed(meta, "captures"), options)
     rate = _json.number(common.get("core:sample_rate"))
-    # without a rate nobody knows how long 20 ms are
+    # without a rate the number of samples in 20 ms is unknown
     if samples is None or not rate > 0:
         return
     size, zero = max(1, round(_BURST_S * rate)), _integer(common.get("core:offset"))
@@ -210,9 +209,9 @@ def _powers(
     for capture, start, end in zip(captures, starts, [*starts[1:], len(samples)], strict=True):
         stamp = next((capture[key] for key in _TIMES if key in capture), None)
         if stamp is None:
-            warnings.append("captures without core:datetime: when they were taken is unknown; they are left out")
+            warnings.append("captures without core:datetime have no time and are not read")
             continue
-        # less than half a burst at the end of a capture gives no level
+        # less than half a burst at the end of a capture is not read
         for at in range(start, end - size // 2, size):
             piece = samples[at : min(at + size, end)].astype(np.float64) - middle
             bursts.append((str(stamp), (at - start) / rate, _json.number(capture.get("core:frequency"))))
@@ -229,7 +228,7 @@ def _powers(
         dc = (np.mean(means, axis=0) ** 2).sum(axis=1)
         above_db = 10 * np.log10(dc / np.maximum(np.mean(powers, axis=0) - dc, 1e-12 * dc))
     for i, (share, dc_db) in enumerate(zip(np.mean(clipped, axis=0), above_db, strict=True)):
-        # floats beyond one are of another scale
+        # floats above one have another scale
         if share > _CLIPPED_SHARE and most <= full_scale * 1.001:
             warnings.append(f"USRP{i + 1}: {share:.1%} of the values are at full scale: clipped, levels are too low")
         if dc_db > _DC_DB:
@@ -245,10 +244,7 @@ def _powers(
 def _samples(
     common: dict[str, Any], captures: list[dict[str, Any]], options: ReadOptions
 ) -> tuple[AnyArray | None, float]:
-    """The samples beside the meta file as they are stored, shape (n, channels, 1 or 2), and the largest of their type.
-
-    None where there are none.
-    """
+    """Return the stored samples, shape (n, channels, 1 or 2), or None, and the full scale of their type."""
     kind = str(common.get("core:datatype", ""))
     data = options.neighbour(_data_name(options)) if options.neighbour else None
     code, full_scale = _SAMPLES.get(kind.split("_")[0], ("", 1.0))
@@ -271,7 +267,7 @@ def _integer(value: Any) -> int:
 
 READER = Reader(
     name="sigmf",
-    title="SigMF meta file: levels and positions (dataset 12, sounder), or power of the samples beside it",
+    title="SigMF meta file: levels and positions (dataset 12, sounder), or power of its samples",
     kinds=("rss", "telemetry"),
     sample='{"global": {"core:datatype": "cf32_le"}, "captures": [{"measurement:values": {"mX": [], "RSS1": []}}]}',
     sniff=sniff, read=read, pieces=True,

@@ -46,7 +46,7 @@ def sniff(head: bytes) -> bool:
 
 @dataclass
 class _Samples:
-    """Samples in file order: 0-based line, wall clock, byte offset, value."""
+    """Samples in the order of the file: 0-based line, wall clock, byte offset, value."""
 
     line: IntArray
     wall: IntArray
@@ -55,7 +55,7 @@ class _Samples:
 
     @classmethod
     def none(cls) -> _Samples:
-        """No samples."""
+        """Return an empty series of samples."""
         empty = np.zeros(0, dtype=np.int64)
         return cls(empty, empty, empty, np.zeros(0))
 
@@ -63,7 +63,7 @@ class _Samples:
         return _Samples(self.line[order], self.wall[order], self.offset[order], self.value[order])
 
     def join(self, *others: _Samples) -> _Samples:
-        """Samples of all in the order of their lines, those of one line in this order."""
+        """Return all samples in the order of their lines, and in this order for one line."""
         parts = (self, *others)
         joined = _Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS))
         if np.all(joined.line[1:] > joined.line[:-1]):
@@ -79,19 +79,19 @@ _POWERS = 10.0 ** np.arange(_VALUE)
 
 
 def _decimals(cells: AnyArray) -> tuple[FloatArray, BoolArray]:
-    """Right-aligned decimals, ``(n, 16)`` uint8, to numbers; what is not plain is left to the line's own pattern.
+    """Convert right-aligned decimals, ``(n, 16)`` uint8, to numbers, and return which of them are plain decimals.
 
-    At most fifteen digits beside a point: as a whole number they are exact, and so is the power of ten that divides
-    them, so that the quotient is the double nearest to what was written, as ``float`` gives it.
+    At most fifteen digits and the power of ten that divides them are exact, so that the quotient is the nearest double,
+    equal to the result of ``float``.
     """
     whole, places = np.zeros(len(cells)), np.zeros(len(cells), dtype=np.uint8)
     negative, point, strange = np.zeros((3, len(cells)), dtype=bool)
     open_, after_digit = np.ones(len(cells), dtype=bool), np.zeros(len(cells), dtype=bool)
     columns = np.ascontiguousarray(cells.T)
     for column in dropwhile(lambda column: (column == 32).all(), columns):
-        value = column - np.uint8(48)  # what is no digit wraps to more than 9
+        value = column - np.uint8(48)  # other characters wrap to more than 9
         digit, minus, dot, space = value <= 9, column == 45, column == 46, column == 32
-        # a space or a minus stands behind spaces only, a point behind a digit and once
+        # only spaces come before a space or a minus, and a digit before the only point
         strange |= ~(digit | ((minus | space) & open_) | (dot & after_digit & ~point))
         negative |= minus
         places += point
@@ -103,9 +103,9 @@ def _decimals(cells: AnyArray) -> tuple[FloatArray, BoolArray]:
 
 
 def _fixed_layout(lines: _text.Lines) -> tuple[_Samples, IntArray]:
-    """Samples of all lines that have exactly the layout of ``ts`` and ``od``, without a Python loop over lines.
+    """Return the samples of all lines in the layout of ``ts`` and ``od``, without a Python loop over lines.
 
-    Second, such lines whose offset is no octal number.
+    Also return the lines of this layout whose offset is not an octal number.
     """
     length = lines.ends - lines.starts
     parts, wrong = [], [np.zeros(0, dtype=np.int64)]
@@ -126,10 +126,10 @@ def _fixed_layout(lines: _text.Lines) -> tuple[_Samples, IntArray]:
 
 @dataclass
 class _Piece:
-    """Content of a piece or section of a log: samples; ``*`` and foot lines (value NaN) with their texts; the account.
+    """The content of a piece or section of a log: samples, ``*`` and foot lines (value NaN), and the account.
 
-    Of a section the first ``known`` samples are also the last of the one before, and ``lines`` are all so far; ``torn``
-    is the 0-based line without an end.
+    The first ``known`` samples of a section are also the last of the section before, and ``lines`` counts all lines so
+    far. ``torn`` is the 0-based line without an end.
     """
 
     samples: _Samples
@@ -142,9 +142,9 @@ class _Piece:
 
 
 def _piece(lines: _text.Lines, rejects: _text.Rejects) -> _Piece:
-    """Samples of od's layout at once, the few other lines one by one."""
+    """Read samples of od's layout at once, and the few other lines one by one."""
     fixed, wrong = _fixed_layout(lines)
-    rejects.add(lines, wrong, "the offset is no octal number: not written by od")
+    rejects.add(lines, wrong, "the offset is not an octal number: not written by od")
     unread = np.ones(len(lines), dtype=bool)
     unread[fixed.line] = unread[wrong] = False
     samples: list[tuple[int, bytes, bytes, float]] = []
@@ -170,7 +170,7 @@ def _piece(lines: _text.Lines, rejects: _text.Rejects) -> _Piece:
 
 
 def _collect(rows: list[tuple[int, bytes, bytes, float]]) -> tuple[_Samples, list[int]]:
-    """Rows with parsed times; second, the lines whose time is none."""
+    """Return the rows with parsed times, and the lines with an invalid time."""
     if not rows:
         return _Samples.none(), []
     line = np.array([row[0] for row in rows], dtype=np.int64)
@@ -191,12 +191,12 @@ def _reason(line: bytes) -> str:
 
 
 def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, list[tuple[int, str]]]:
-    """Samples that ``*`` lines stand for.
+    """Return the samples that ``*`` lines replace.
 
     Returns
     -------
     repeats : _Samples
-        The suppressed samples, times interpolated between the neighbours, ``line`` that of the ``*``.
+        The suppressed samples, with the line of the ``*`` and times between those of the neighbours.
     used : int array
         0-based ``*`` lines that were expanded.
     bad : list of (line, reason)
@@ -235,14 +235,14 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     return repeats, stars.line[chosen], bad
 
 
-# What AERPAW's start scripts and emulator call the three logs: ``2025-01-01_power_log.txt``, ``lw1_snr.txt``.
+# Names of the three logs from AERPAW's start scripts and emulator: ``2025-01-01_power_log.txt``, ``lw1_snr.txt``.
 _NAMED = re.compile(r"(?<![a-z])(power|quality|snr)(?![a-z])|(?:power|quality|snr)(?=_?log)")
 
 
 def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
-    """One stream of levels; power and quality logs look alike, so ``options.channel`` or the file name tells them.
+    """Return one stream of levels, named by ``options.channel`` or the file, because all logs have one layout.
 
-    Of each piece its samples are kept; runs, times and flags are those of all.
+    The samples of all pieces are stored; runs, times and flags are computed for all of them.
 
     Raises
     ------
@@ -255,7 +255,7 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
 
 
 def read_sections(pieces: Iterable[bytes], options: ReadOptions, most: float = np.inf) -> Sections:
-    """The stream in sections of some ``most`` samples and more, last the account and warnings without a stream.
+    """Yield the stream in sections of at least ``most`` samples, and then the account and warnings without a stream.
 
     Raises
     ------
@@ -267,7 +267,7 @@ def read_sections(pieces: Iterable[bytes], options: ReadOptions, most: float = n
         repeats, used, bad = _expand(section.samples, section.marks)
         tally["repeated"] += len(repeats.line)
         if most < np.inf and (bad or tally["repeated"] > _MOST_REPEATS):
-            raise WholeLogError  # how many samples a damaged offset may claim depends on the runs before it
+            raise WholeLogError  # the limit for a damaged offset depends on the runs before it
         feet = section.marks.line[section.marks.offset >= 0].tolist()
         foot = "no value behind the offset (torn last line, or the end of od's input)"
         for i, reason in (*bad, *((i, foot) for i in feet)):
@@ -276,7 +276,7 @@ def read_sections(pieces: Iterable[bytes], options: ReadOptions, most: float = n
         tally["lines"] = section.lines
         stream = _stream(section, repeats, options, tally, notes)
         if most < np.inf and notes:
-            raise WholeLogError  # an hour that a clock showed twice: which of the two depends on a step back later on
+            raise WholeLogError  # an hour that occurs twice: which of the two depends on a later step back
         if stream is not None and len(stream.frame):
             yield stream
     rejected, reasons = rejects.result()
@@ -287,7 +287,7 @@ def read_sections(pieces: Iterable[bytes], options: ReadOptions, most: float = n
 
 
 def _sections(pieces: Iterable[bytes], rejects: _text.Rejects, most: float) -> Iterator[_Piece]:
-    """Sections that end with a sample: its offset, time and value are all that the next one needs of it."""
+    """Yield sections that end with a sample, which is also the first sample of the next section."""
     marks, texts = _Samples.none(), dict[int, str]()
     known, before, blank, unterminated = 0, 0, 0, False
     columns = [Column(kind) for kind in _COLUMNS.values()]
@@ -309,7 +309,7 @@ def _sections(pieces: Iterable[bytes], rejects: _text.Rejects, most: float) -> I
             columns = [Column(kind, getattr(last, name)) for name, kind in _COLUMNS.items()]
             known, blank, marks = 1, 0, marks.take(~inside)
     samples = _Samples(*(column.array() for column in columns))
-    del columns  # logs may have 1 GB: what is taken out of the samples goes at once
+    del columns  # logs may have 1 GB, so that memory is freed at once
     torn = before - 1 if unterminated else -1
     yield _Piece(samples, marks, texts, before, blank, known=known, torn=torn)
 
@@ -317,15 +317,15 @@ def _sections(pieces: Iterable[bytes], rejects: _text.Rejects, most: float) -> I
 def _stream(
     section: _Piece, repeats: _Samples, options: ReadOptions, tally: Counter[str], notes: list[str]
 ) -> Stream | None:
-    """The stream with its flags, ``None`` without samples; ``notes`` receives what its times are warned of."""
+    """Return the stream with its flags, or None without samples, and add warnings about its times to ``notes``."""
     samples = section.samples
     if not len(samples.line):
         return None
     repeated = np.zeros(0, dtype=bool)
     if len(repeats.line):
         samples = samples.join(repeats)
-        repeated = np.isin(samples.line, repeats.line)  # lines of '*' hold nothing else
-    # what is not needed any more makes room at once: logs may have 1 GB
+        repeated = np.isin(samples.line, repeats.line)  # lines of '*' contain no other samples
+    # logs may have 1 GB, so that memory is freed at once
     jump = samples.offset
     jump[1:] -= jump[:-1]
     jump[0] = 0
@@ -359,16 +359,16 @@ def _stream(
 
 
 def _name(options: ReadOptions) -> tuple[str, bool]:
-    """Name of the channel, and whether its levels are ratios."""
+    """Return the name of the channel, and whether its levels are ratios."""
     named = _NAMED.search(options.file_name.lower())
     name = options.channel or (named.group() if named else "power")
     return name, name.lower() in ("quality", "snr")
 
 
 def _warnings(tally: Counter[str], of_times: list[str], options: ReadOptions) -> Iterator[str]:
-    """Sentences on what was counted."""
+    """Yield sentences about the counts."""
     if tally["repeated"]:
-        yield f"{counted(tally['repeated'], 'sample')} put back that od had suppressed as '*'; flagged repeated"
+        yield f"{counted(tally['repeated'], 'sample')} restored that od had replaced by '*'; flagged repeated"
     if tally["lost"]:
         yield f"offsets jump at {counted(tally['lost'], 'place')}: {counted(tally['missing'], 'sample')} missing"
     if tally["back"]:
@@ -377,12 +377,12 @@ def _warnings(tally: Counter[str], of_times: list[str], options: ReadOptions) ->
     yield from _text.back_in_time(tally["time_back"])
     if tally["accepted"] and options.channel is None and not _NAMED.search(options.file_name.lower()):
         yield (
-            "power, quality and SNR logs have one layout: read as power, as the file name does not say; name another "
-            "with the channel option"
+            "power, quality and SNR logs have one layout: read as power, because the file name does not show the kind; "
+            "use the channel option for another kind"
         )
 
 
-# A file's name of the nightly soundings between towers.
+# Name of a file of the nightly soundings between towers.
 _SOUNDING = re.compile(
     r"(?P<transmitter>\w+):(?P<receiver>\w+):(?P<receiver_serial_number>\w+):(?P<receiver_frequency>[\w.]+)"
     r":(?P<receiver_channel>\d):\d{4}-"

@@ -2,12 +2,12 @@
 
 ``[time] lte [pci] rnti cqi ri mcs brate ok nok (%) | ...`` once a second; newer versions print the cell's ``pci``,
 srsLTE before 2020 neither ``rat`` nor bar.
-All other lines are the console's talk and count as comments.
+All other lines count as comments.
 
-What ``ri`` is (srsRAN 4G: the MAC's metrics and ``metrics_stdout.cc``): the MAC adds one to each reported RI,
-averages over the metrics period and clears, and the trace prints ``int(dl_ri)``. So **0 is no report**, 1 is rank 1,
-2 is rank 2, and every value is a *truncated* mean: a second of ranks 1 and 2 prints 1. On a two-port cell the field
-log ``two_ports`` prints 0, 1 and 2; on one port nothing is reported and 0 stands throughout.
+Meaning of ``ri`` in srsRAN 4G (metrics of the MAC, ``metrics_stdout.cc``): the MAC adds one to each reported RI and
+averages over the metrics period, and the trace prints ``int(dl_ri)``. **0 means that there was no report**, 1 is rank
+1, 2 is rank 2. Every value is a *truncated* mean: a second of ranks 1 and 2 prints 1. On a two-port cell the field
+log ``two_ports`` prints 0, 1 and 2; on one port it prints 0 throughout.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MIXED = "srsENB prints the truncated mean of the ranks reported in a second: 1 
 
 
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
-    """Rank ``srsenb``; no rank is above the most transmit channels that the console says above it that it opened."""
+    """Yield the rank ``srsenb``, with the number of transmit channels in the console as the largest rank."""
     ri = rows.number("ri")
     rows.warnings += [_MIXED] if (ri > 0).any() else []
     last = int(rows.row[-1]) if len(rows) else 0

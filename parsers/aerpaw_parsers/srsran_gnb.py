@@ -1,11 +1,11 @@
 """srsRAN Project gNB: the console's table through ``ts``, its log's scheduler lines, and its metrics as JSON.
 
 Console: ``[time] pci rnti | cqi ri mcs brate ok nok (%) ...`` once a second, with or without the bar and the
-columns behind. Log: ``time [METRICS ] ... Scheduler UE ... cqi=15 dl_ri=2.0 dl_mcs=27 ...``. JSON: an object per
+columns after it. Log: ``time [METRICS ] ... Scheduler UE ... cqi=15 dl_ri=2.0 dl_mcs=27 ...``. JSON: an object per
 line with ``timestamp`` (epoch in s, or text) and ``ue_list``, at the top or in ``cells``.
 
-RI counts from one and is the mean over the report period: a value between two ranks is kept as ``rank_mean`` and
-gives no rank.
+RI counts from one and is the mean over the report period. A value between two ranks is stored as ``rank_mean``, and the
+rank is missing.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ def sniff(head: bytes) -> bool:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Rank stream ``gnb`` with CQI and MCS; UsageError if no time zone is given."""
+    """Return the rank stream ``gnb`` with CQI and MCS, or raise UsageError if no time zone is given."""
     pattern = _LOG if _SCHEDULER.search(data) and not _TITLE.search(data) else _ROW
     begun = pattern.search(data)
-    own_stamp = begun is not None and not begun[0].startswith(b"[")  # not that of ts
+    own_stamp = begun is not None and not begun[0].startswith(b"[")  # not written by ts
     if own_stamp and options.clock is None:
         options = replace(options, clock="utc")  # the program's log and metrics are in UTC
     rows = _rows.matched(
@@ -68,7 +68,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def sniff_json(head: bytes) -> bool:
-    """Check whether the first object holds a list of UEs with RI."""
+    """Check whether the first object has a list of UEs with RI."""
     first = _json.first(head)
     if first is None:  # a first line longer than what sniffers see
         return head.lstrip()[:1] == b"{" and b'"ue_list"' in head and re.search(rb'"(dl_)?ri"\s*:', head) is not None

@@ -1,20 +1,20 @@
-"""The log of ``aerpaw-cmp tap``: JSON lines, each with the CRC-32 of what stands before its checksum.
+"""The log of ``aerpaw-cmp tap``: JSON lines, each with the CRC-32 of the bytes before its checksum.
 
 Specification (schema ``aerpaw-cmp-tap/1``). Each line is one object with ``kind`` and the number ``n`` of the record
-in its session; its last key is ``"crc"``: eight hex digits, CRC-32 of the bytes before ``,"crc":"``. Times are
+in its session. Its last key is ``"crc"``: eight hex digits, CRC-32 of the bytes before ``,"crc":"``. Times are
 integers [ns]: UTC since 1970 and the monotonic clock.
 
 ``header``      first line of every segment: ``schema session segment boot_id port settings ri_base``
 ``exchange``    ``query command sent_utc_ns last_utc_ns`` (and ``_mono_``) ``status lines decoded flags``
-``late unsolicited noise``  what belonged to no command
+``late unsolicited noise``  answers without a command
 ``gap``         ``state`` ``open`` at the loss, ``closed`` at the return, with ``from_utc_ns to_utc_ns missed``
-``clock disk alarm prediction``  what else happened
+``clock disk alarm prediction``  other events
 ``rotate end``  last line of a segment, and of the last one
 
-An exchange is accepted: as a record of rank (``nr5g_csi``, ``lte_csi``), of RSS (RSRP of ``servingcell``, NR and LTE,
-a series for each cell: PCI, ARFCN), or as a companion of these. Everything else that is sound counts as comment. The
-time of a record is the middle between command and last byte; ``uncertainty_s`` is half of that span. RSRP and SINR
-beside a rank are those of the last ``servingcell`` within 2 s.
+An exchange is accepted as a record of rank (``nr5g_csi``, ``lte_csi``) or of RSS, or as a companion of these. RSS is
+the RSRP of ``servingcell`` for NR and LTE, with a series per cell (PCI, ARFCN). All other intact lines are comments.
+The time of a record is the middle between command and last byte; ``uncertainty_s`` is half of that span. RSRP and SINR
+of a rank are those of the last ``servingcell`` within 2 s.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
 
 from . import _json
 
-# RSRP and SINR older than this do not stand beside a rank.
+# RSRP and SINR older than this are not added to a rank.
 _COMPANION_S = 2.0
 
 Columns = dict[str, AnyArray]
-# Line of the log, its record, what was decoded of it, its flags.
+# Line of the log, its record, the decoded values, and flags.
 Answer = tuple[int, dict[str, Any], dict[str, Any], list[str]]
 
 
@@ -49,12 +49,12 @@ def sniff(head: bytes) -> bool:
 
 
 def decode_line(line: bytes) -> dict[str, Any]:
-    """One record.
+    """Return the record of a line.
 
     Raises
     ------
     ValueError
-        With the reason, if the line is torn or damaged.
+        If the line is truncated or damaged.
     """
     record = decode_record(line)
     if not isinstance(record.get("kind"), str):
@@ -67,12 +67,12 @@ def decode_line(line: bytes) -> dict[str, Any]:
 
 
 def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
-    """Records of one segment.
+    """Return the records of one segment.
 
     Raises
     ------
     InputError
-        If the schema is a later one than we know.
+        If the schema is another one than :data:`SCHEMA`.
     """
     log = _Log()
     for data in pieces:
@@ -101,8 +101,8 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
 # Attributes of a cell, and the keys under which they were decoded.
 _IDENTITY = {"pci": "pcid", "arfcn": "arfcn", "band": "band"}
 _OF_RANK = {name: name for name in ("rank", "ri_raw", "mcs", "cqi", "pmi")}
-# Each series: its query, the leg of the serving cell, and its columns with the keys under which they were decoded;
-# LTE's SINR is in steps that the manual leaves open.
+# Each series: its query, the leg of the serving cell, and its columns with the keys under which they were decoded.
+# SINR of LTE is in steps that the manual does not specify.
 _SERIES: dict[str, tuple[str, str, dict[str, str]]] = {
     "nr5g": ("nr5g_csi", "", _OF_RANK),
     "lte": ("lte_csi", "", _OF_RANK),
@@ -113,7 +113,7 @@ _SERIES: dict[str, tuple[str, str, dict[str, str]]] = {
 
 
 class _Log:
-    """State kept of a log while it is read."""
+    """The state of a log while it is read."""
 
     def __init__(self) -> None:
         self.header: dict[str, Any] | None = None
@@ -126,7 +126,7 @@ class _Log:
         self.ended = False
 
     def add(self, data: bytes) -> None:
-        """The next lines."""
+        """Read the next lines."""
         records, rejected, blank = _records(data, self.lines)
         self.lines += len(records) + len(rejected) + blank
         self.rejected += rejected
@@ -139,7 +139,7 @@ class _Log:
             self._note(record)
 
     def _note(self, record: dict[str, Any]) -> None:
-        """Note what a record says about the log as a whole: gaps, clock steps, lost records, its end."""
+        """Note events of the complete log in a record: gaps, clock steps, lost records, the end."""
         kind = record["kind"]
         if isinstance(record.get("n"), int):
             self.numbers.add(int(record["n"]))
@@ -162,7 +162,7 @@ class _Log:
         self.ended |= kind in ("end", "rotate")
 
     def warnings(self) -> tuple[str, ...]:
-        """Gaps, clock steps, lost and missing records, torn tail, missing end."""
+        """Return gaps, clock steps, lost and missing records, a truncated last line, and a missing end."""
         texts = list(self.events)
         if self.open_gap is not None:
             texts.append(f"the log ends inside a gap: {self.open_gap.get('reason', '')}")
@@ -170,14 +170,14 @@ class _Log:
         if missing:
             texts.append(f"{missing} record numbers are missing in this segment")
         if self.rejected and self.rejected[-1].reason.startswith("torn tail"):
-            texts.append("the last line is torn (power loss or kill while writing)")
+            texts.append("the last line is truncated (power loss or kill while writing)")
         if not self.ended:
             texts.append("no end record: the session was cut")
         return tuple(texts)
 
 
 def _joined(name: str, pieces: list[Columns]) -> pd.DataFrame | None:
-    """All records of a series as a frame, None where there are none."""
+    """Return all records of a series as a frame, or None if there are no records."""
     some = [piece for piece in pieces if len(piece["time"])]
     if not some:
         return None
@@ -187,7 +187,7 @@ def _joined(name: str, pieces: list[Columns]) -> pd.DataFrame | None:
 
 
 def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]], list[RejectedLine], int]:
-    """Sound records with their line numbers, rejected lines, number of blank lines, behind some lines."""
+    """Return the intact records with their line numbers, rejected lines, and the number of blank lines."""
     lines = data.split(b"\n")
     unterminated = lines[-1] != b""
     if not unterminated:
@@ -203,7 +203,7 @@ def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]]
         line = line.removesuffix(b"\r")
         try:
             record = decode_line(line)
-            if unterminated and number == last:  # whole by its checksum; flagged as in every other reader
+            if unterminated and number == last:  # complete by its checksum, but flagged as in other readers
                 record["flags"] = [*_flags(record), "unterminated_line"]
             records.append((number, record))
         except ValueError as error:
@@ -222,7 +222,7 @@ def _flags(record: dict[str, Any]) -> list[str]:
 
 
 def _columns(answers: list[Answer], names: Mapping[str, str]) -> Columns:
-    """Columns of some answers; ``names`` are those of the numbers and the keys under which they were decoded."""
+    """Return columns of some answers, by their names and the keys under which they were decoded."""
     spans = [(int(record["sent_utc_ns"]), int(record["last_utc_ns"])) for _, record, _, _ in answers]
     columns: Columns = {
         "time": np.array([(sent + last) // 2 for sent, last in spans], dtype=np.int64).astype("datetime64[ns]"),
@@ -238,7 +238,7 @@ def _columns(answers: list[Answer], names: Mapping[str, str]) -> Columns:
 
 
 def _answered(exchanges: list[tuple[int, dict[str, Any]]], query: str, leg: str) -> Iterator[Answer]:
-    """Answers to a query; of a rank a failed exchange is one without it, flagged with its status."""
+    """Yield the answers to a query; a failed exchange of a rank is an answer without it, flagged with its status."""
     for number, record in exchanges:
         decoded = _json.inside(record, "decoded")
         values = _json.inside(decoded, leg) if leg else decoded
@@ -248,7 +248,7 @@ def _answered(exchanges: list[tuple[int, dict[str, Any]]], query: str, leg: str)
 
 
 def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOptions) -> Iterator[Stream]:
-    """Levels of each serving cell: a handover begins another series; of one cell alone the name says no more."""
+    """Yield the levels of each serving cell, whose identity is in the name if there are several."""
     identity = rsrp[list(_IDENTITY)]
     cells = identity.drop_duplicates()
     for values in cells.to_numpy().tolist():
@@ -261,7 +261,7 @@ def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOption
 
 
 def _with_serving_cell(rank: pd.DataFrame, rsrp: pd.DataFrame | None) -> pd.DataFrame:
-    """RSRP and SINR of the last serving-cell answer as columns of the rank frame."""
+    """Add RSRP and SINR of the last serving-cell answer as columns of the rank frame."""
     columns = {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db"}
     if rsrp is None:
         rank[[*columns.values()]] = np.nan

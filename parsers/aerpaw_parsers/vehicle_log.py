@@ -1,9 +1,9 @@
-"""``*_vehicle_log.txt``: what a flight script says (stdout through ``ts``), of which the measured positions are read.
+"""``*_vehicle_log.txt``: the output of a flight script (stdout through ``ts``) with measured positions.
 
 AFAR's search script writes ``Filtered data (avg): Pwr:..,P_Var:.., Qual:..,Q_Var:.., {"lat": .., "lon": .., "alt":
 ..}, heading:..``: the position, level and quality averaged over a stop. Altitude is above take-off, heading in
-degrees clockwise from north. Waypoints, home and predictions are no positions of the aircraft and count as talk.
-Telemetry ``vehicle`` at the stops, and the script's averages as KPIs.
+degrees clockwise from north. Waypoints, home and predictions are not positions of the aircraft and count as comments.
+The streams are the telemetry ``vehicle`` at the stops, and the script's averages as KPIs.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ fields layout
 8      ``n,lon,lat,alt,volt,time,fix,satellites`` (2021)
 ====== =================================================================================================
 
-Further fields behind these are left out. Radians; altitude above take-off; naive local time, or (2026 scripts) UTC
-with an offset.
+Further fields after these are ignored. Angles are in radians, altitude is above take-off, and time is naive local time,
+or UTC with an offset (scripts of 2026).
 Writers: AERPAW/aerpawlib ``examples/v1/{gps_logger,preplanned_trajectory,guided_mission_ping_iperf}.py``.
 """
 
@@ -33,7 +33,7 @@ _NUMBERS = (
 )  # fmt: skip
 _CELL = rb'"?(?P<%s>' + _text.NUMBER + rb'|nan|NaN|None)"?'
 _TRIPLE = rb'"?[(\[]' + b", ?".join([_CELL] * 3) + rb'[)\]]"?'
-_CHARGE = rb'"?(?:' + _text.NUMBER + rb'|nan|NaN|None|)"?'  # voltage and charge: a row without them is one
+_CHARGE = rb'"?(?:' + _text.NUMBER + rb'|nan|NaN|None|)"?'  # voltage and charge may be empty
 _VOLT = rb'"?(?P<volt>' + _text.NUMBER + rb'|nan|NaN|None|)"?'
 _SEP = rb", ?"
 _BODY = (
@@ -54,7 +54,7 @@ _FIELDS = _SEP.join(
 _END = rb"[ ,\t]{0,8}\r?$"
 _MORE = rb"(?:,[^,\n]{0,80})"
 _ROW = re.compile(_FIELDS + _END, re.MULTILINE)
-# A logger that writes further fields behind these: only where most first rows have them: glued rows look so too.
+# A logger may write further fields; most first rows must have them, because joined rows also look like this.
 _LONGER = re.compile(_FIELDS + _MORE + rb"{1,6}" + _END, re.MULTILINE)
 _EITHER = re.compile(_FIELDS + _MORE + rb"{0,6}" + _END, re.MULTILINE)
 _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while there is no fix
@@ -82,7 +82,7 @@ def _reason(line: bytes) -> str | None:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Telemetry of one vehicle.
+    """Return the telemetry of one vehicle.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     pattern = _EITHER if _text.mostly(data, _LONGER) and not _text.mostly(data, _ROW) else _ROW
     rows = _rows.matched(data, pattern, options, reader="vehicle_out", reason=_reason)
     number = {name: _numbers(rows, name) for name in _NUMBERS}
-    for name in ("pitch_11", "yaw_11", "roll_11", "volt_11", "volt_9"):  # they stand elsewhere in other layouts
+    for name in ("pitch_11", "yaw_11", "roll_11", "volt_11", "volt_9"):  # other places in other layouts
         own = name.partition("_")[0]
         number[own] = np.fmax(number[own], _numbers(rows, name))
     jumps = int((np.diff(number["index"]) != 1).sum())
@@ -107,7 +107,7 @@ def _numbers(rows: _rows.Rows, name: str) -> FloatArray:
 
 
 def _values(rows: _rows.Rows, number: dict[str, FloatArray]) -> dict[str, AnyArray]:
-    """Columns of the record model; positions without a fix, and attitudes that no row has, become NaN."""
+    """Return columns of the record model, NaN for positions without a fix and for attitudes of 0 in all rows."""
     place = {f"{name}_deg": number[name] for name in ("latitude", "longitude")} | {"altitude_m": number["altitude"]}
     latitude, longitude, altitude = place.values()
     no_fix = (number["fix"] < 2) | (np.fmin(longitude, latitude) < _INVALID_POSITION) | (altitude < -998.5)
@@ -122,7 +122,7 @@ def _values(rows: _rows.Rows, number: dict[str, FloatArray]) -> dict[str, AnyArr
     if zero.any():
         rows_of = counted(int(zero.sum()), "row has", "rows have")
         text = f"{rows_of} attitude (0,0,0), which AERPAW's converter writes for 'unknown'; flagged"
-        if zero.all():  # level flight due north in every row: no aircraft does that
+        if zero.all():  # not a real attitude: level and due north in every row
             text += " zero_attitude and read as unknown, because no row has another attitude"
             motion = {name: np.full(len(rows), np.nan) for name in motion}
         warnings.append(text)

@@ -108,7 +108,7 @@ def test_a_line_at_one_height_above_sea_level_is_a_question(tmp_path: Path) -> N
     file.write_bytes(
         kml(f"<LineString><altitudeMode>absolute</altitudeMode><coordinates>{flat}</coordinates></LineString>")
     )
-    with pytest.raises(InputError, match="nothing says how high the take-off is"):
+    with pytest.raises(InputError, match="the height of the take-off is unknown"):
         read_route(file)
 
 

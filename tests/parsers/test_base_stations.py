@@ -101,7 +101,7 @@ def test_power_of_sigmf_samples() -> None:
     with pytest.raises(InputError, match="samples cannot be read"):
         read("sigmf", json.dumps(meta).encode())
     meta["captures"] = [{"core:sample_start": 0}]
-    with pytest.raises(InputError, match="when they were taken is unknown"):
+    with pytest.raises(InputError, match="have no time and are not read"):
         read("sigmf", json.dumps(meta).encode(), options)
 
 

@@ -312,4 +312,4 @@ def _says(text: str, *, zero: bool) -> bool:
 def _label(name: str, value: str) -> str:
     # a name begins with a letter: 'sim1', not '1'
     word = re.sub(r"\W+", "_", value).strip("_")
-    return word if word[:1].isalpha() else name.split()[0] + word
+    return word if word[:1].isalpha() else name.partition(" ")[0] + word

@@ -85,7 +85,7 @@ def test_antenna_grids_of_matlab_are_no_flight() -> None:
         identify(file.getvalue())
     file = io.BytesIO()
     scipy.io.savemat(file, {"results": np.zeros(4)})
-    with pytest.raises(InputError, match="no flight"):
+    with pytest.raises(InputError, match="not a flight"):
         identify(file.getvalue())
 
 

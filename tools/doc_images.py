@@ -1,13 +1,12 @@
-"""Remake the pictures of ``docs/images``: the sample's figures, the tutorial's page, the tap.
+"""Remake pictures of ``docs/images``: the tutorial's page and the page of the tap.
 
-python tools/doc_images.py [sample] [tutorial] [tap]     (some 20 minutes for all)
+python tools/doc_images.py [tutorial] [tap]
 
 Figures of the gallery are drawn when the documentation is built; that of docs/performance.md by ``make bench-all``.
 """
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -15,25 +14,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
-FIGURES = ("trajectory", "rss_LW4_USRP1", "rank_histogram_LW1")
 
 
 def run(*words: object) -> None:
-    """Run a command line of this Python in the project's folder; a failure ends the script."""
+    """Run a command line with this Python in the project's folder. A failure ends the script."""
     subprocess.run([sys.executable, *map(str, words)], cwd=ROOT, check=True)
 
 
-def of_the_report() -> None:
-    """Figures of the sample's report."""
-    with tempfile.TemporaryDirectory() as place:
-        out = Path(place) / "report"
-        run("-m", "aerpaw_cmp", "report", "sample_logs/flight.yaml", "-o", out, "--audit", "none", "--figures", "png")
-        for name in FIGURES:
-            shutil.copy(out / "figures" / f"{name}.png", IMAGES / f"sample_{name}.png")
-
-
 def of_the_tutorial() -> None:
-    """The first screen of the report that docs/tutorial.md makes in its fourth step."""
+    """Take a picture of the first screen of the report of docs/tutorial.md, step 4."""
     with tempfile.TemporaryDirectory() as place:
         logs, draft = Path(place) / "try_it", Path(place) / "try_it" / "draft.yaml"
         run("-m", "aerpaw_cmp", "sample", "-o", logs)
@@ -47,9 +36,8 @@ def of_the_tutorial() -> None:
 
 
 def main(names: list[str]) -> None:
-    """Remake the named parts, or all."""
+    """Remake the named pictures, or all."""
     parts = {
-        "sample": of_the_report,
         "tutorial": of_the_tutorial,
         "tap": lambda: run("tools/tap_picture.py", IMAGES / "tap_live.png", IMAGES / "tap_live_phone.png"),
     }

@@ -209,7 +209,7 @@ def _evidence(
 ) -> LevelEvidence:
     """Return the evidence of a series, levels as the page scores them; ``scaled``: heights may have another unit."""
     link = _Direct(data.site, series.tower, replayed)
-    known_db = link.level_db
+    known_db, known_both_db = link.level_db, link.level_of_both_db
     time_s = rss.seconds(series.time)
     order = np.argsort(time_s, kind="stable")
 
@@ -223,7 +223,7 @@ def _evidence(
         floor_db, measured_db = lock.floor_db + lock.offset_db, np.maximum(measured_db, lock.floor_db)
     predicted = np.maximum(simulated_db, floor_db)
 
-    def changed(levels_db: Mapping[_Key, FloatArray]) -> dict[_Key, FloatArray]:
+    def changed(levels_db: Mapping[_Key, FloatArray], known_db: FloatArray = known_db) -> dict[_Key, FloatArray]:
         levels = {key: at_samples(level - known_db) + simulated_db for key, level in levels_db.items()}
         return {key: np.maximum(level, floor_db) - predicted for key, level in levels.items()}
 
@@ -244,10 +244,11 @@ def _evidence(
         uav_elevation_deg=at_samples(directions["uav_elevation_deg"]),
         tower_azimuth_deg=at_samples(directions["azimuth_deg"]),
         turned_db=changed(link.turned_db()),
-        raised_db=changed(link.raised_db()),
+        raised_db=changed(link.raised_db(), known_both_db),
         attitude_db=changed(link.attitude_db(data.settings.rt.attitude)),
         misread_db=changed(
-            link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid], scaled=scaled)
+            link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid], scaled=scaled),
+            known_both_db,
         ),
         other_towers_db={name: predicted + change for name, change in changed(link.other_towers_db()).items()},
         locked=None if series.locked is None else series.locked[order],
@@ -257,7 +258,7 @@ def _evidence(
         learned=_learned_series(data, series),
         transmit_power_dbm=series.link.transmit_power_dbm,
         distance_db=at_samples(link.distance_db),
-        displaced_db=changed(link.displaced_db(known_db)),
+        displaced_db=changed(link.displaced_db(known_both_db), known_both_db),
         floored=any("floor_db" in data.settings.logs[log].model_fields_set for log in np.unique(series.log)),
     )
 
@@ -278,6 +279,11 @@ class _Direct:
     def level_db(self) -> FloatArray:
         return self._level(self.place_m, self.replayed.poses.position_m, self.replayed.poses.rotation)
 
+    @property
+    def level_of_both_db(self) -> FloatArray:
+        """Level with the gain of the tower's antenna, which changes where the direction from the tower does."""
+        return self._level(self.place_m, self.replayed.poses.position_m, self.replayed.poses.rotation, tower=True)
+
     def turned_db(self) -> dict[float, FloatArray]:
         """Levels where the heading is greater; none for isotropic antennas."""
         if not self._has_pattern:
@@ -293,7 +299,7 @@ class _Direct:
         for rise in _RISES_M:
             place = poses.position_m + np.array([0.0, 0.0, rise])
             if len(place) and place[:, 2].min() > -_BELOW_GROUND_M:
-                levels[rise] = self._level(self.place_m, place, poses.rotation)
+                levels[rise] = self._level(self.place_m, place, poses.rotation, tower=True)
         return levels
 
     def attitude_db(self, used: str) -> dict[str, FloatArray]:
@@ -327,7 +333,7 @@ class _Direct:
         for radius, azimuth in product(_RADII_M, _AZIMUTHS_DEG):
             turn = math.radians(azimuth)
             place_m = self.place_m + radius * np.array([math.sin(turn), math.cos(turn), 0.0])
-            change = self._level(place_m, position_m, rotation) - known_db[at]
+            change = self._level(place_m, position_m, rotation, tower=True) - known_db[at]
             levels[radius, azimuth] = known_db + np.interp(np.arange(n), at, change)
         return levels
 
@@ -340,14 +346,16 @@ class _Direct:
         mirrored_m = poses.position_m.copy()
         begin_m = data.track.pose_at(np.array([data.track.start_ns], dtype="datetime64[ns]")).position_m[0, :2]
         mirrored_m[:, :2] = begin_m + (mirrored_m[:, :2] - begin_m)[:, ::-1]
-        levels[_MIRRORED] = self._level(self.place_m, mirrored_m, poses.rotation)
+        levels[_MIRRORED] = self._level(self.place_m, mirrored_m, poses.rotation, tower=True)
         for meaning, scale in _HEIGHTS.items() if scaled else ():
             place = np.column_stack([poses.position_m[:, :2], ground_m + scale * (poses.position_m[:, 2] - ground_m)])
-            levels[meaning] = self._level(self.place_m, place, poses.rotation)
+            levels[meaning] = self._level(self.place_m, place, poses.rotation, tower=True)
         if used != "ignored" and self._has_pattern and track.attitude_known.any():
             for meaning in MISREAD:
                 other = dataclasses.replace(track, rotation=data.track.rotations_if(meaning, time))
-                levels[meaning] = self._level(self.place_m, poses.position_m, attitude_rotation(other, used))
+                levels[meaning] = self._level(
+                    self.place_m, poses.position_m, attitude_rotation(other, used), tower=True
+                )
         return levels
 
     def other_towers_db(self) -> dict[str, FloatArray]:
@@ -364,15 +372,22 @@ class _Direct:
         return not all(isinstance(pattern, Isotropic) for pattern in self.replayed.link.uav_array.patterns)
 
     def directions(self, place_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> dict[str, FloatArray]:
-        """Directions between a place and the UAV."""
-        return rss.link_geometry(place_m, position_m, rotation, uav_mount=self.replayed.link.uav_array.mount)
+        """Return the directions between a place and the UAV, in the frames of both antennas."""
+        (tower_array,) = self.replayed.link.tower_arrays.values()
+        mounts = {"uav_mount": self.replayed.link.uav_array.mount, "tower_mount": tower_array.mount}
+        return rss.link_geometry(place_m, position_m, rotation, **mounts)
 
-    def _level(self, place_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> FloatArray:
-        """Free space and the mean gain of the UAV's elements towards the tower [dB]."""
+    def _level(
+        self, place_m: FloatArray, position_m: FloatArray, rotation: FloatArray, *, tower: bool = False
+    ) -> FloatArray:
+        """Return free space and the mean gain of the UAV's elements [dB]; with ``tower`` also that of the tower's."""
         link, at = self.replayed.link, self.directions(place_m, position_m, rotation)
-        theta, phi = np.radians(90.0 - at["uav_elevation_deg"]), np.radians(at["uav_azimuth_deg"])
-        gain = mean_gain_db(link.uav_array.patterns, theta, phi)
-        return np.asarray(free_space_dbm(place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0] + gain)
+        (tower_array,) = link.tower_arrays.values()
+        level_db = free_space_dbm(place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0]
+        for end, array in (("uav", link.uav_array), ("tower", tower_array))[: 1 + tower]:
+            theta, phi = np.radians(90.0 - at[f"{end}_elevation_deg"]), np.radians(at[f"{end}_azimuth_deg"])
+            level_db = level_db + mean_gain_db(array.patterns, theta, phi)
+        return np.asarray(level_db)
 
 
 _MIRRORED = "east and north of the track are swapped"

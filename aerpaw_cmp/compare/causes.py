@@ -1,15 +1,15 @@
-"""Likely cause of a level error: the one trouble of a log, its settings or its site that explains it, by likelihood.
+"""Likely cause of a level error: a fault of the log, its settings or its site that explains the error by likelihood.
 
-Each trouble changes the predicted level in its own way: by decibels that are known, by columns with free coefficients,
-or by samples that the receiver clipped, whose level is their own mean and which fade less. The offset is fitted beside
-it, and the residual counts as noise of two memories: slow fading is no trouble. Explanations are single troubles
-and two at a time, the second judged by what the first leaves. Each has the marginal likelihood that it gains over all
-channels: coefficients, angles, heights, places and instants are averaged over what they may be, so that a form with
-many free numbers pays for them. A trouble is named where the explanations with it are so much likelier than all without
-it, and where some of the RMSE goes with it. The paired test of two models would ask for a flight much longer than a
-trouble lasts: a trouble of a minute has one sign in each of few stretches.
+Each fault changes the predicted level in its own way: by known decibels, by columns with free coefficients, or by
+samples that the receiver clipped, whose level is their own mean and which fade less. The offset is fitted as well, and
+the residual is noise with a long and a short correlation time, because slow fading is not a fault. Explanations are
+single faults and pairs, the second fault judged by the residual of the first. Each explanation has a marginal
+likelihood over all channels: coefficients, angles, heights, places and instants are averaged over their possible
+values, so that an explanation with many free numbers pays for them. A fault is named if the explanations with it are
+likelier by a margin than all without it, and if it reduces the RMSE. A paired test of two models would need a flight
+much longer than a fault lasts.
 
-A new trouble is a function that yields its :class:`Trial`, and an entry of :data:`CANDIDATES`.
+A new fault is a function that yields its :class:`Trial`, and an entry of :data:`CANDIDATES`.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from .health import Judged, Step, level_of, step_of
 from .noise import LEAST_VARIANCE, START, Memories, MemoryFit, fit_with_memories
 from .statistics import Interval
 
-# Samples are averaged over so long [s], over longer where a flight has more than so many seconds.
+# Samples are averaged over this time [s]. Longer flights have longer means, so that their number is limited.
 BIN_S, _MOST_BINS = 1.0, 2000
-# And as long as the UAV stays so near [m] and turns no further [deg]: fading that stands still is one number, not many.
-# A slow orbit of 1.5 m/s loses no second.
+# Means in which the UAV moves [m] and turns [deg] by less are joined: the fading of a hover is one number, not many.
+# A slow orbit of 1.5 m/s keeps each second.
 _NEAR_M, _NEAR_DEG = 1.0, 5.0
 _FEWEST_BINS, _ENOUGH_BINS = 24, 100
 FEWEST_SAMPLES = 100
-# A trouble is in one flight of ten; named where the odds for it are five to one.
+# A fault occurs in one flight of ten. It is named from odds of five to one.
 _SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
-# Of sentence and next step of a cause: a page begins with sixty in all.
+# Largest number of words of the sentence and next step of a cause: the first paragraph has sixty.
 MOST_CAUSE_WORDS = 28
-# A trouble that takes less than this share off the RMSE is no cause of the error, unless it gains so much a channel:
-# a floor where the flight fades leaves the error of all that is above it.
+# A cause must reduce the RMSE by this share, unless its log likelihood gains the second number per channel: a floor
+# leaves the error of all levels above it.
 _LEAST_SHARE, _CERTAIN = 0.1, 30.0
 # The sentence states the error without a cause and with it: they must differ in print, however certain the cause.
 SHOWN_DB = 0.1
-# Learned antennas miss some decibels of each flight by themselves: less is no trouble of this one.
+# The nearest of all places explains a part of many errors, and learned antennas miss some decibels of each flight.
 _PLACE_SHARE = 0.3
 _OF_ANTENNA, _LEARNED_SHARE = ("heading", "pattern"), 0.25
 # Causes that must bring the error back to what is usual, and the least part of what all candidates take off together.
@@ -65,7 +65,7 @@ class JudgedClock(Protocol):
 
     @property
     def radio_minus_telemetry_s(self) -> float:
-        """Lag [s]; positive: the radio shows later times."""
+        """Lag [s], positive if the radio shows later times."""
 
     @property
     def ci95_s(self) -> Interval:
@@ -73,7 +73,7 @@ class JudgedClock(Protocol):
 
     @property
     def shifted(self) -> bool:
-        """True of a clock that is wrong and was not corrected."""
+        """True if the clock is wrong and was not corrected."""
 
     @property
     def in_words(self) -> str:
@@ -82,39 +82,39 @@ class JudgedClock(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LevelEvidence:
-    """Evidence from which a cause is told: one channel of a flight.
+    """The evidence for a cause: one channel of a flight.
 
     Parameters
     ----------
     time_s : (n,)
-        In order.
+        Instants in order [s].
     measured_db, predicted_db : (n,)
-        Before any offset; NaN where there is none.
+        Levels before any offset; NaN where there is none.
     place_m : (n, 3)
-        Of the UAV.
+        Positions of the UAV [m].
     uav_azimuth_deg, uav_elevation_deg : (n,)
         Direction of the tower in the frame of the UAV's antenna.
     tower_azimuth_deg : (n,)
         Direction of the UAV seen from the tower, clockwise from north.
     name, unit : str
-        Of the channel, and of its measured level.
+        Name of the channel and unit of its measured level.
     start : datetime64
         Instant at which ``time_s`` is 0.
     antenna : {"isotropic", "measured", "learned"}
-        Of the UAV.
+        Kind of the UAV's antenna.
     turned_db, raised_db : mapping of float to (n,)
-        Change of the predicted level where the heading is greater by so many degrees, and where the UAV flies higher by
-        so many metres; ``turned_db`` is empty for antennas without a pattern.
+        Change of the predicted level by an increase of the heading [deg], and of the height [m]. ``turned_db`` is empty
+        for antennas without a pattern.
     attitude_db : mapping of str to (n,)
         Change of the predicted level with other values of ``rt.attitude``.
     misread_db : mapping of str to (n,)
-        Change of the predicted level where the telemetry means something else, by that in words.
+        Change of the predicted level if the telemetry has another meaning, by that meaning in words.
     other_towers_db : mapping of str to (n,)
         Predicted level of each other tower of the site.
     locked, serving : (n,), optional
-        1 in lock or served by this cell, 0 not, NaN unknown, where the log says so.
+        1 in lock or served by this cell, 0 not, NaN unknown; None if the log has no such column.
     clock : JudgedClock, optional
-        The radio clock as it was judged.
+        Test result of the radio clock.
     """
 
     time_s: FloatArray
@@ -137,7 +137,7 @@ class LevelEvidence:
     serving: FloatArray | None = None
     clock: JudgedClock | None = None
     floored: bool = False
-    """True where the settings leave out what lies at the floor: of the lowest links those that fade upwards remain."""
+    """True if the settings remove levels at the floor: of the lowest links only those that fade upwards remain."""
     limits_known: bool = False
     """True if both levels are no lower than the receiver's floor already, as the page counts them."""
     learned: LearnedSeries | None = None
@@ -145,13 +145,13 @@ class LevelEvidence:
     transmit_power_dbm: float = 0.0
     """Transmit power of the predicted level."""
     distance_db: FloatArray | None = None
-    """Part of the predicted level that depends on the distance alone (n,)."""
+    """Part (n,) of the predicted level that depends on the distance alone."""
     displaced_db: Mapping[tuple[float, float], FloatArray] = field(default_factory=dict)
-    """Change of the predicted level with the tower elsewhere, by distance [m] and azimuth [deg]; of all azimuths."""
+    """Change of the predicted level with the tower elsewhere, by distance [m] and azimuth [deg]."""
     swapped_db: FloatArray | None = None
     """Change of the predicted level (n,) if the log is that of the other channel of the tower."""
     least: BoolArray | None = None
-    """Samples at the least level of the log, where it has that again and again, exactly or within its noise."""
+    """Samples (n,) at the least level of the log if that level is frequent, exactly or within its noise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,17 +162,17 @@ class Cause:
     ----------
     name : str
     sentence : str
-        Where it is, with its numbers, and the error with and without it.
+        Channels, numbers, and the RMSE without and with the cause.
     next_step : str
         A clause.
     estimate, ci95 : float, (low, high)
-        Its number (lag [s], angle [deg], height [m], loss, floor or step [dB]; NaN else) and the interval of that.
+        Number of the cause (lag [s], angle [deg], height [m], loss, floor or step [dB]; else NaN) and its interval.
     channels : sequence of str
-        That show it.
+        Channels that show the cause.
     rmse_db, rmse_with_db : float
-        Of these channels without and with it, as means over a second [dB].
+        RMSE of 1-s means of these channels without and with the cause [dB].
     gain : float
-        Log odds of the explanations with it to all without it.
+        Log odds of the explanations with the cause to all without it.
     """
 
     name: str
@@ -188,12 +188,11 @@ class Cause:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """A trouble with its numbers: what it changes, what choosing them costs, and what is said of it.
+    """A fault with its numbers, its effect on the level, and its words.
 
-    ``change_db`` (n,) is added to the predicted level; ``columns`` (n, k) have free coefficients, unit normals before
-    the flight; ``clipped`` (n,) are samples whose level is not that of the link; ``fading`` (n,) is the share of the
-    link's fading that is shown. ``cost`` is the log likelihood that goes where the numbers are averaged over all that
-    they may be.
+    ``change_db`` (n,) is added to the predicted level. ``columns`` (n, k) have free coefficients with a unit normal
+    prior. ``clipped`` (n,) are samples whose level is not that of the link. ``fading`` (n,) is the share of the link's
+    fading that the log shows. ``cost`` is the log likelihood lost by averaging over all possible numbers.
     """
 
     name: str
@@ -209,7 +208,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class _Model:
-    """Some troubles on one channel: the log likelihood that they gain together beyond their cost."""
+    """Some faults on one channel, with the log likelihood that they gain together beyond their cost."""
 
     evidence: LevelEvidence
     trials: tuple[Trial, ...]
@@ -223,7 +222,7 @@ _SOUND: frozenset[str] = frozenset()
 
 
 def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
-    """The trouble that explains the error of a flight; None where none is identified.
+    """Return the fault that explains the error of a flight.
 
     Parameters
     ----------
@@ -232,6 +231,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     Returns
     -------
     Cause or None
+        None if no cause is identified.
     """
     tables = [_models(binned) for evidence in channels if (binned := _binned(evidence)) is not None]
     names = sorted({name for table in tables for names in table for name in names})
@@ -247,7 +247,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     for either in alternatives:
         name = max(either & best)
         shown = [table for table in tables if name in _names(_best(table, best))]
-        # the clearest channel gives the words
+        # the words are those of the channel that shows the cause most clearly
         shown.sort(key=lambda table: -_best(table, {name}).gain)
         if all(
             _explains(other, shown, _lead({other}, odds) / len(channels), (best & certain) - either) for other in either
@@ -255,7 +255,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             named[either] = shown
     if not named:
         return _by_health(None, tables)
-    # a gain over directions takes the place of much else: it is named where nothing else can be
+    # a gain over directions imitates many faults: it is named last
     either = min(named, key=lambda e: (_CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
     cause = _named(sorted(either, key=lambda n: n not in best), named[either], _lead(either, odds))
     return _by_health(cause, tables) if _OF_HEALTH & either else cause
@@ -347,7 +347,7 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     sound = [table[_SOUND] for table in shown]
     if not all(frozenset([name]) in table for table in shown):
         return False
-    # also alone it must bring levels and prediction together, not only their changes from second to second
+    # the cause alone must reduce the RMSE, not only the changes from second to second
     alone_models = [table[frozenset([name])] for table in shown]
     known_db, alone_db = _rmse_db(sound), _rmse_db(alone_models)
     share = max(alone_db / known_db, _share_of_error(shown, beside, {*beside, name})) if known_db else 1.0
@@ -356,12 +356,12 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
         certain, least_share = False, _PLACE_SHARE
     if name in _OF_ANTENNA and sound[0].evidence.antenna == "learned":
         certain, least_share = False, _LEARNED_SHARE
-    # a log of noise, or of a gain control, likes any smoother level: a cause must leave less than a constant does
+    # any smoother level fits a log of noise or of a gain control: the cause must leave less than a constant does
     most = {_CATCH_ALL: 1.0}.get(name, 1.0 - _LEAST_SHARE)
     follows = name in _FOLLOWED
     if follows and any(m.residual_db.std() >= most * m.evidence.measured_db.std() for m in alone_models):
         return False
-    # a floor that the settings leave out explains why the low links that are left look too strong, and is known
+    # a floor that the settings remove is known, and explains why the remaining low links look too strong
     if (name == "floor" and sound[0].evidence.floored) or known_db - alone_db < SHOWN_DB:
         return False
     usual = _usual_db(shown)
@@ -437,17 +437,17 @@ def _names(model: _Model) -> frozenset[str]:
     return frozenset(trial.name for trial in model.trials)
 
 
-def _best(table: _Models, troubles: Set[str]) -> _Model:
-    """The best model of a channel by some troubles or fewer."""
-    return max((model for names, model in table.items() if names <= troubles), key=lambda model: model.gain)
+def _best(table: _Models, faults: Set[str]) -> _Model:
+    """Return the best model of a channel with some faults or a part of them."""
+    return max((model for names, model in table.items() if names <= faults), key=lambda model: model.gain)
 
 
-# Troubles of a channel that are tried two at a time, and of those the ones without which all are looked for again.
+# Numbers of faults of a channel that are combined in pairs, and of faults after which all others are searched again.
 _MOST_TRIED, _MOST_FIRST = 6, 2
 
 
 def _models(e: LevelEvidence) -> _Models:
-    """The likeliest numbers of each trouble, and each two of the best of them: the second judged without the first."""
+    """Return the likeliest model of each fault and of pairs of the best ones."""
     sound = _fitted(e)
 
     def model(*trials: Trial, at: Memories = sound.memories, climb: bool = True) -> _Model:
@@ -457,7 +457,7 @@ def _models(e: LevelEvidence) -> _Models:
         return _Model(e, trials, fit.residual_db, gain, fit.memories)
 
     def best_of(sets: Iterable[tuple[Trial, ...]], at: Memories) -> list[_Model]:
-        """The likeliest of each set of names under some noise, the best of them under their own."""
+        """Return the likeliest model of each set of names, the best ones fitted with their own noise."""
         best: dict[frozenset[str], _Model] = {}
         for trials in sets:
             tried = model(*trials, at=at, climb=False)
@@ -485,7 +485,7 @@ def _candidates(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _without(e: LevelEvidence, first: _Model) -> LevelEvidence:
-    """Evidence whose prediction knows a trouble already."""
+    """Return the evidence with a fault corrected in its prediction."""
     predicted = e.measured_db - first.residual_db
     moved = predicted - e.predicted_db
     others = {name: level + moved for name, level in e.other_towers_db.items()}
@@ -493,8 +493,8 @@ def _without(e: LevelEvidence, first: _Model) -> LevelEvidence:
 
 
 def _share_of_error(shown: Sequence[_Models], before: Set[str], after: Set[str]) -> float:
-    """RMSE with further troubles over that before."""
-    rmse, known = (_rmse_db([_best(table, troubles) for table in shown]) for troubles in (after, before))
+    """Return the RMSE with further faults as a share of the RMSE before."""
+    rmse, known = (_rmse_db([_best(table, faults) for table in shown]) for faults in (after, before))
     return rmse / known if known else 1.0
 
 
@@ -506,7 +506,7 @@ def _named(names: Sequence[str], shown: Sequence[_Models], gain: float) -> Cause
     """Return the cause in words, those of the channel that shows it best; a second name cannot be distinguished."""
     name = names[0]
     trial = shown[0][frozenset([name])].trials[0]
-    # a channel with other numbers, such as those of another clock, would belie the sentence
+    # a channel with other numbers, such as those of another clock, would contradict the sentence
     shown = [table for table in shown if table[frozenset([name])].trials[0].sentence == trial.sentence]
     alone = [table[frozenset([name])] for table in shown]
     rmse, rmse_with = _rmse_db([table[_SOUND] for table in shown]), _rmse_db(alone)
@@ -532,10 +532,10 @@ _ANGLES = ("uav_azimuth_deg", "tower_azimuth_deg")
 
 
 def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
-    """Means over :data:`BIN_S`, and over hovers, of the samples with both levels; None where they are too few."""
+    """Return means over :data:`BIN_S` and over hovers of the samples with both levels; None if they are too few."""
     finite = np.isfinite(evidence.measured_db) & np.isfinite(evidence.predicted_db)
     level = evidence.measured_db[finite]
-    # two levels alone, or so few samples, let no form be recognised
+    # two levels or few samples do not show the form of an error
     if len(level) < FEWEST_SAMPLES or len(np.unique(level)) == 2:
         return None
     time, level = evidence.time_s[finite], evidence.measured_db[finite]
@@ -555,7 +555,7 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
         if not isinstance(value, np.ndarray):
             return value
         if name not in _ANGLES:
-            # what the log does not say counts as in lock and served: a gap is no trouble
+            # treat missing flags as 1: a gap in the log is not an error
             return mean(np.nan_to_num(value, nan=1.0) if name in ("locked", "serving") else value)
         # the mean of 359 and 1 degrees is 0
         turn = np.exp(1j * np.radians(value))
@@ -563,7 +563,7 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
 
     changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
     at = level == level.min()
-    # of rounded levels each is there again and again, the least one less often than the next
+    # each rounded level is frequent, but the least one is rarer than the next
     next_often = (level == level[~at].min()).sum() if not at.all() else 0
     often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level), next_often)
     changed["least"] = np.bincount(place, at) > 0.5 * count if often else _undetected(mean(evidence.measured_db))
@@ -571,14 +571,17 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
 
 
 def _mean(values: FloatArray, place: IntArray, count: AnyArray) -> FloatArray:
-    """Means of values (n,) or (n, k) over the samples of each place, of which there are ``count``."""
+    """Return means of values (n,) or (n, k) over the ``count`` samples of each place."""
     if values.ndim == 1:
         return np.asarray(np.bincount(place, values) / count)
     return np.column_stack([_mean(column, place, count) for column in values.T])
 
 
 def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray:
-    """Number of the place of each second: seconds at which the UAV neither moves nor turns are one."""
+    """Return the number of the place of each second.
+
+    Seconds in which the UAV neither moves nor turns have the same number.
+    """
     azimuth, elevation = np.radians(e.uav_azimuth_deg[finite]), np.radians(e.uav_elevation_deg[finite])
     flat = np.cos(elevation)
     towards = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
@@ -593,14 +596,14 @@ def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray
     return number
 
 
-# A receiver that clips writes one level in so many samples, and in so large a share of them.
+# Least number and share of samples at one level if a receiver clips.
 _AT_END, _SHARE_AT_END = 10, 0.01
 
 
 def _undetected(level_db: FloatArray) -> BoolArray | None:
-    """Samples (n,) about the densest level and below it, where links are lost into that at once: a detector's noise.
+    """Return the samples (n,) near the densest level and below it if links drop to it suddenly: a detector's noise.
 
-    None where the level fades into it, as it does near a floor and where a UAV hovers.
+    Return None if the level fades into it, as near a floor or in a hover.
     """
     ordered, step = np.sort(level_db), np.abs(np.diff(level_db))
     within = np.searchsorted(ordered, ordered + 2.0 * _PILE_DB, "right") - np.arange(len(ordered))
@@ -615,12 +618,13 @@ def _undetected(level_db: FloatArray) -> BoolArray | None:
     return under if at_once and np.median(step[inside]) < _MOST_FADING * fading_db else None
 
 
-# A link is lost by so many times the steps that it fades by: 9 on a receiver with a noisy least level, elsewhere 3.
+# A loss of detection exceeds the usual step of fading by this factor: 9 for a receiver with a noisy least level; other
+# receivers have 3.
 _LOST = 5.0
 
 
 def _fitted(e: LevelEvidence, *trials: Trial, at: Memories = START, climb: bool = True) -> MemoryFit:
-    """Offset and coefficients with some troubles, under noise of the given memories, or the likeliest near them."""
+    """Fit offset and coefficients of some faults, with the given noise or with the likeliest one near it."""
     target = e.measured_db - e.predicted_db
     clipped = np.zeros(len(target), dtype=np.bool_)
     columns, shown = [], np.ones(len(target))
@@ -637,7 +641,7 @@ def _fitted(e: LevelEvidence, *trials: Trial, at: Memories = START, climb: bool 
     fit = fit_with_memories(target[link] / scale, design[link] / scale[:, None], at, climb)
     likelihood, residual = fit.log_likelihood - float(np.log(scale).sum()), np.zeros(len(target))
     residual[link] = fit.residual_db * scale
-    if clipped.any():  # what a receiver writes beyond its limit remembers nothing of the link
+    if clipped.any():  # values beyond the limit of a receiver do not depend on the link
         residual[clipped] = e.measured_db[clipped] - e.measured_db[clipped].mean()
         # their mean and spread are two numbers (Schwarz)
         spread = max(float(residual[clipped].std()), _LEAST_SPREAD_DB)
@@ -646,15 +650,15 @@ def _fitted(e: LevelEvidence, *trials: Trial, at: Memories = START, climb: bool 
 
 
 _LEAST_SPREAD_DB = 0.2
-# Standard deviation of the offset of a log that nobody knows [dB].
+# Standard deviation of an unknown offset [dB].
 _OFFSET_DB = 100.0
 
 
-# --- the troubles --------------------------------------------------------------------------------------------------
+# --- the faults --------------------------------------------------------------------------------------------------
 
 
 def _clock(e: LevelEvidence) -> Iterator[Trial]:
-    """The lag that the judgement of the radio clock has; else the likeliest, for which there are no words."""
+    """Yield the lag of the test of the radio clock, or without one the likeliest lag, which has no name."""
     if e.clock is not None and e.clock.shifted:
         lag = e.clock.radio_minus_telemetry_s
         late = np.interp(e.time_s - lag, e.time_s, e.predicted_db)
@@ -665,7 +669,7 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
         yield from _drifting(e)
         return
     yield from _drifting(e)
-    # a clock may be further off than was looked, or hidden by another trouble: what else fits is no cause then
+    # a lag outside the tested range, or hidden by another fault, must not be attributed to other causes
     levels = np.array([np.interp(e.time_s - lag, e.time_s, e.predicted_db) for lag in _LAGS_S])
     nearer = _nearer(e, levels)
     if not nearer.any():
@@ -713,17 +717,17 @@ def _likelihoods(e: LevelEvidence, levels_db: FloatArray) -> FloatArray:
 
 
 def _nearer(e: LevelEvidence, level_db: FloatArray) -> BoolArray:
-    """Check which levels (..., n) take a share off the error: smoother ones may fade like the log, and be no nearer."""
+    """Check which levels (..., n) reduce the error: a smoother level may fit the changes and not the level."""
     error_db = (e.measured_db - e.predicted_db).std()
     return np.asarray((e.measured_db - level_db).std(axis=-1) <= (1.0 - _LEAST_SHARE) * error_db)
 
 
-# A rival that is no trouble by itself, and lags of a clock that nobody judged.
+# Name of alternatives that are not named as causes, and lags of a clock without a test result.
 _UNNAMED, _LAGS_S = "", np.arange(-60.0, 61.0, 2.0)
 
 
 def _profiled(e: LevelEvidence, trials: Mapping[float, Trial], at: Memories = START) -> Trial:
-    """The best of some values, and the range of those that are nearly as likely, half way to the next that are not."""
+    """Return the trial with the likeliest of some values, and the range of values that are nearly as likely."""
     likelihood = {value: _fitted(e, trial, at=at, climb=False).log_likelihood for value, trial in trials.items()}
     best, tried = max(likelihood, key=lambda value: likelihood[value]), sorted(trials)
     width = np.gradient(tried) if len(tried) > 1 else np.ones(1)
@@ -735,20 +739,20 @@ def _profiled(e: LevelEvidence, trials: Mapping[float, Trial], at: Memories = ST
 
 
 def _concentration(log_likelihood: FloatArray, width: FloatArray) -> float:
-    """Log of the greatest likelihood over its mean, each value with its width."""
+    """Return the log of the greatest likelihood over its mean, which is weighted by the width of each value."""
     top = log_likelihood.max()
     return -math.log(float(np.exp(log_likelihood - top) @ width / width.sum()))
 
 
-# Values between two that were given.
+# Values between two neighbouring ones, as a share of their distance.
 _BETWEEN = np.linspace(-0.8, 0.8, 9)
 
 
 def _tuned(
     e: LevelEvidence, changes_db: Mapping[float, FloatArray], trial: Callable[[float, FloatArray], Trial]
 ) -> Trial:
-    """The best of some values and of those about it, whose changes of the level are interpolated; at 0 is none."""
-    # no change is known of 0: the curve goes through it
+    """Return the trial with the likeliest value, also between the given ones, whose changes are interpolated."""
+    # the value 0 changes nothing, and the interpolation goes through it
     values = sorted({0.0, *changes_db})
     likely = _profiled(e, {value: trial(value, change) for value, change in changes_db.items()})
     best = likely.estimate[0]
@@ -762,16 +766,19 @@ def _tuned(
 
 
 def _spline(knots: FloatArray, at: FloatArray) -> FloatArray:
-    """Weights (m, n) of values at n knots in their cubic spline at m places: scipy.interpolate would load for 0.1 s."""
+    """Return weights (m, n) of values at n knots in a cubic spline at m places.
+
+    scipy.interpolate would load for 0.1 s.
+    """
     n, share = len(knots), (np.append(knots, at)[:, None] - knots[0]) / np.ptp(knots)
-    # no term at the second knot and the last but one: with one cubic at each end no slope has to be known
+    # no term at the second and the last but one knot: one cubic at each end needs no slope
     terms = np.hstack([share ** np.arange(min(n, 4)), np.maximum(share - share[2 : n - 2, 0], 0.0) ** 3])
     return np.asarray(np.linalg.solve(terms[:n].T, terms[n:].T).T)
 
 
 def _heading(e: LevelEvidence) -> Iterator[Trial]:
-    """An antenna turned about the vertical."""
-    # where the logged attitude is not used, an antenna has no heading that could be wrong
+    """Yield an antenna turned about the vertical."""
+    # if the logged attitude is not used, the heading cannot be wrong
     cost = _RARE if "logged" in e.attitude_db else 0.0
 
     def turned(angle: float, change: FloatArray) -> Trial:
@@ -786,9 +793,9 @@ def _heading(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _attitude(e: LevelEvidence) -> Iterator[Trial]:
-    """An attitude that the settings do not use, or should not."""
+    """Yield an attitude that the settings do not use, or should not use."""
     for mode, change in e.attitude_db.items():
-        idle = mode != "ignored"  # a log that is not used has no free number
+        idle = mode != "ignored"  # an unused log has no free number
         yield Trial(
             name="attitude",
             cost=0.0 if idle else _RARE,
@@ -799,7 +806,7 @@ def _attitude(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _height(e: LevelEvidence) -> Iterator[Trial]:
-    """Heights of another datum."""
+    """Yield heights of another datum, and heights that drift."""
 
     def raised(rise: float, change: FloatArray) -> Trial:
         return Trial(
@@ -834,7 +841,7 @@ def _growing(e: LevelEvidence) -> dict[float, FloatArray]:
 
 
 def _misread(e: LevelEvidence) -> Iterator[Trial]:
-    """Telemetry with other units, signs or columns than its reader takes it for."""
+    """Yield telemetry with other units, signs or columns than its reader assumes."""
     for meaning, change in e.misread_db.items():
         yield Trial(
             name="telemetry", cost=math.log(len(e.misread_db)), sentence=meaning,
@@ -843,7 +850,7 @@ def _misread(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _tower(e: LevelEvidence) -> Iterator[Trial]:
-    """The log of another tower."""
+    """Yield the log of another tower."""
     for name, level in e.other_towers_db.items():
         yield Trial(
             name="tower", cost=math.log(len(e.other_towers_db)), sentence=f"the log is that of {name}",
@@ -852,13 +859,13 @@ def _tower(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _place(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the likeliest place of the tower, near the one in the files; the track may be displaced instead."""
+    """Yield the likeliest place of the tower near the one in the files, or an opposite displacement of the track."""
     if not e.displaced_db:
         return
     radii = np.array(sorted({radius for radius, _ in e.displaced_db}))
     azimuths = np.array(sorted({azimuth for _, azimuth in e.displaced_db}))
     table = np.array([[e.displaced_db[radius, azimuth] for azimuth in azimuths] for radius in radii])
-    # the radii grow by a factor: each counts for an area, and far places are unlikely
+    # the radii grow by a factor: each is weighted by its area, and far places are unlikely
     weight = np.repeat(radii**2 * (1.0 + (radii / _NEAR_PLACE_M) ** 2) ** -1.5, len(azimuths))
     gain = _likelihoods(e, e.predicted_db + table.reshape(len(weight), -1))
     cost = _concentration(gain, weight)
@@ -902,7 +909,7 @@ def _channels(e: LevelEvidence) -> Iterator[Trial]:
 
 _CATCH_ALL = "pattern"
 
-# Functions of direction alone: they also take up what a wrong model leaves.
+# Functions of direction alone: they also explain the errors of a wrong model.
 OF_DIRECTION = frozenset({"blocked", _CATCH_ALL})
 # Causes that give way to a step that held-out flights do not show.
 _OF_HEALTH = OF_DIRECTION | {"gain step"}
@@ -924,12 +931,12 @@ _PATTERN = {
 
 
 def _pattern(e: LevelEvidence) -> Iterator[Trial]:
-    """A smooth gain over the directions of the UAV's antenna, in place of the known one."""
+    """Yield a smooth gain over the directions of the UAV's antenna instead of the known one."""
     azimuth, elevation = np.radians(e.uav_azimuth_deg), np.radians(e.uav_elevation_deg)
     axes = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     terms = [term for degree in (1, 2, 3) for term in combinations_with_replacement(axes, degree)]
     columns = [_GAIN_DB * np.prod(term, axis=0) for term in terms]
-    if e.turned_db:  # no known pattern any more: the mean over all headings
+    if e.turned_db:  # remove the known pattern: the mean over all headings
         columns.append(np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1))
     sentence, step = _PATTERN[e.antenna]
     yield Trial(
@@ -937,14 +944,14 @@ def _pattern(e: LevelEvidence) -> Iterator[Trial]:
     )  # fmt: skip
 
 
-# Standard deviations before the flight: of the terms of an antenna's gain, and of steps and losses [dB].
+# Prior standard deviations of the terms of an antenna's gain, of steps and of losses [dB].
 _GAIN_DB, _STEP_DB, _LOSS_DB = 3.0, 8.0, 15.0
-# Log odds against what a log or its settings seldom have.
+# Log odds against rare faults of a log or its settings.
 _RARE = 3.0
 
 
 def _cell(e: LevelEvidence) -> Iterator[Trial]:
-    """A level that changes where another cell serves."""
+    """Yield a level that changes with the serving cell."""
     if e.serving is not None and np.ptp(e.serving) > 0.5:
         yield Trial(
             name="cell", cost=0.0, sentence="the level steps where the phone changes its cell",
@@ -955,8 +962,8 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
 def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the decibels of an amplitude as if it were a power, or the reverse.
 
-    The slope of the levels must say so within an interval, and a path-loss exponent and a gain over elevation must be
-    much less likely: they change levels alike.
+    The interval of the slope must support the factor, and a path-loss exponent and a gain over elevation, which change
+    levels in the same way, must be much less likely.
     """
     up = np.sin(np.radians(e.uav_elevation_deg))
     elevation = _GAIN_DB * np.column_stack([up, up**2, up**3])
@@ -973,12 +980,12 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
             continue
         fit = _fitted(e, trial)
         slope, *apart = (_fitted(e, other, at=fit.memories).log_likelihood for other in others)
-        # what is left above a floor changes by fewer decibels than the link
+        # levels that remain above a floor change by fewer decibels than the link
         least = -math.inf if e.floored else max(apart) + _RARE
         if _is_slope(e, factor, fit.memories) and fit.log_likelihood > max(least, slope):
             yield trial
             return
-    # another slope or exponent has no name: a cause that changes levels alike must be likelier
+    # other slopes and exponents have no name: a cause that changes levels in the same way must be likelier
     yield from (others[0], *others[2:])
 
 
@@ -997,7 +1004,7 @@ def _is_slope(e: LevelEvidence, factor: float, at: Memories) -> bool:
         change = Trial(name="", cost=0.0, sentence="", next_step="", change_db=(slope - 1.0) * e.predicted_db)
         return _fitted(e, change, at=at, climb=False).log_likelihood
 
-    # a parabola through three slopes: the log likelihood is one in the slope
+    # the log likelihood is a parabola in the slope
     below, middle, above = (likelihood(factor + i * step) for i in (-1, 0, 1))
     bend = below - 2.0 * middle + above
     if bend >= 0.0:
@@ -1006,11 +1013,11 @@ def _is_slope(e: LevelEvidence, factor: float, at: Memories) -> bool:
     return abs(best - factor) <= step and abs(best - factor) + 1.96 * sd < 2.0 * step
 
 
-# --- troubles of the receiver ----------------------------------------------------------------------------------------
+# --- faults of the receiver ----------------------------------------------------------------------------------------
 
 
 def _flat(e: LevelEvidence) -> Iterator[Trial]:
-    """One level alone where the model predicts many: a dead input, or a flight below the floor or above the ceiling."""
+    """Yield a constant level: a dead input, or a flight below the floor or above the ceiling."""
     if _is_flat(e):
         yield Trial(
             name="flat", cost=_RARE, next_step="check the receiver's input and gain", change_db=-e.predicted_db,
@@ -1018,7 +1025,7 @@ def _flat(e: LevelEvidence) -> Iterator[Trial]:
         )  # fmt: skip
 
 
-# The middle 80 % of a flat level span less than this share of the predicted ones, as for the clock.
+# The middle 80 % of a flat level span less than this share of the span of the predicted levels, as for the clock.
 _FLAT = 0.2
 
 
@@ -1028,7 +1035,7 @@ def _is_flat(e: LevelEvidence) -> bool:
 
 
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
-    """Noise that the receiver writes without its lock, by the quality in the log."""
+    """Yield the noise that the receiver writes without lock, by the quality in the log."""
     if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
         yield Trial(
             name="lock", cost=0.0, clipped=lost,
@@ -1038,10 +1045,10 @@ def _lock(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
-    """The least level, written again and again: nothing was detected there."""
+    """Yield a frequent least level: nothing was detected there."""
     if not e.limits_known and e.least is not None and e.least.any() and not e.least.all():
         level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
-        # means of seconds spread less than samples do
+        # means over seconds spread less than samples
         top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
         yield Trial(
             name="no detection", cost=0.0, clipped=e.least, estimate=(level, level, level),
@@ -1051,27 +1058,27 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _floor(e: LevelEvidence) -> Iterator[Trial]:
-    """A receiver that shows no level below its floor; what it shows there spreads less."""
-    # else the log itself says where nothing was detected
+    """Yield a receiver that shows no level below its floor."""
+    # without limits in the log, which would show where nothing was detected
     if e.least is None and not e.limits_known and not _is_flat(e):
         yield from _clipping(e, 1.0)
 
 
 def _saturation(e: LevelEvidence) -> Iterator[Trial]:
-    """A receiver that shows no level above its ceiling."""
+    """Yield a receiver that shows no level above its ceiling."""
     drowned = e.unit == "dB" and bool(np.median(e.measured_db) < 0.0)  # a signal below the noise overloads nothing
     if not drowned and not _is_flat(e):
         yield from _clipping(e, -1.0)
 
 
-# Of samples beyond a limit: so many lie further [dB].
+# A limit allows a small share of samples beyond it, and the prediction must exceed it in a larger share [dB].
 _BEYOND_DB, _MOST_BEYOND = 2.0, 0.02
 _FAR_DB, _LEAST_FAR = 3.0, 0.1
 _LEAST_BINS = 5
 
 
 def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
-    """Limits below (``side`` 1) or above (-1) which a receiver shows no level: where it fades no more, and soft."""
+    """Yield limits below (``side`` 1) or above (-1) which a receiver shows no level, hard ones and soft ones."""
     pile = _pile(e, side)
     if pile is not None:
         limit = float(e.measured_db[pile].mean())
@@ -1083,12 +1090,12 @@ def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
         yield _profiled(e, trials)
 
 
-# At a limit of the receiver: so near to the last levels [dB], so large a share of the samples, which fade so much less.
+# Samples at a limit: distance from the last level [dB], least shares of the samples, and their fading as a share.
 _PILE_DB, _LEAST_PILE, _LEAST_CLIPPED, _MOST_FADING = 1.2, 0.1, 0.06, 0.35
 
 
 def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
-    """Samples at the receiver's limit; None where those near the least or greatest level fade as all others do."""
+    """Return the samples at the receiver's limit, or None if those near the end of the levels fade like all others."""
     end = float(np.quantile(e.measured_db, 0.01 if side > 0 else 0.99))
     pile = side * (e.measured_db - end) < _PILE_DB
     step = np.abs(np.diff(e.measured_db))
@@ -1099,7 +1106,7 @@ def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
 
 
 def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
-    """A limit with its words; None where what is measured beyond it shows that nothing is clipped."""
+    """Return a limit with its words, or None if measured levels beyond it show that nothing is clipped."""
     if (side * (e.measured_db - limit) < -_BEYOND_DB).mean() > _MOST_BEYOND:
         return None
     name, words, step = _LIMITS[side]
@@ -1109,7 +1116,7 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
 
 
 def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
-    """Levels to which the power of a limit adds, or which come no nearer than that to a ceiling."""
+    """Return a soft limit: the power of a floor is added, or the level approaches a ceiling."""
     # the median: samples at the limit do not move it
     offset = float(np.median(e.measured_db - e.predicted_db))
     for _ in range(5):
@@ -1117,7 +1124,7 @@ def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
         shown = limit + side * 10.0 * np.log10(1.0 + 10.0 ** (side * (level - limit) / 10.0))
         offset += float(np.mean(e.measured_db - shown))
     trial = _limited(e, limit, side)
-    # a prediction that fades too deep here and there meets no limit of the receiver
+    # a prediction that fades too deeply at a few samples does not show a limit of the receiver
     if trial is None or (side * (limit - level) > _FAR_DB).mean() < _LEAST_FAR:
         return None
     fading = 1.0 / (1.0 + 10.0 ** (side * (limit - level) / 10.0))
@@ -1125,7 +1132,7 @@ def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
 
 
 _LEAST_FADING = 0.1
-# Half of a level so far above a floor is that floor [dB].
+# At this distance above the floor [dB], half of the power is that of the floor.
 _OVER_FLOOR_DB = 3.0
 
 
@@ -1135,12 +1142,12 @@ _LIMITS = {
 }
 
 
-# --- troubles of a part of the flight --------------------------------------------------------------------------------
+# --- faults of a part of the flight --------------------------------------------------------------------------------
 
 
 def _shift(residual: FloatArray, masks: FloatArray, phi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Shift by each mask (m, n), its standard error, and the log likelihood that it gains; offset fitted."""
-    # what the sample before does not foretell: slow fading then is no shift
+    """Return the shift by each mask (m, n), its standard error, and the gain of log likelihood, with a free offset."""
+    # remove what the previous sample predicts, so that slow fading is not taken for a shift
     y = residual[1:] - phi * residual[:-1]
     x = masks[:, 1:] - phi * masks[:, :-1]
     y, x = y - y.mean(), x - x.mean(axis=1, keepdims=True)
@@ -1159,7 +1166,7 @@ _MOSTSTARTS = 600
 
 
 def _blocked(e: LevelEvidence) -> Iterator[Trial]:
-    """A loss in a sector of directions from the tower: searched by 5 degrees, then by one."""
+    """Yield a loss in a sector of directions from the tower, searched by 5 degrees, then by 1 degree."""
     residual = e.measured_db - e.predicted_db
     coarse = [(middle, width) for width in _WIDTHS_DEG for middle in np.arange(0.0, 360.0, 5.0).tolist()]
     shadows = _shadows(e, coarse)
@@ -1181,12 +1188,12 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
             name="blocked", cost=cost, columns=_LOSS_DB * finer[at][:, None],
             estimate=(loss, loss - reach, loss + reach),
             sentence=f"a loss of {loss:.0f} dB towards {first:.0f} to {(first + width) % 360:.0f} degrees",
-            next_step="add to the site what stands there",
+            next_step="add the obstacle to the site",
         )  # fmt: skip
 
 
 def _shadows(e: LevelEvidence, sectors: Sequence[tuple[float, float]]) -> FloatArray:
-    """Share (m, n) of the loss of each sector, by middle and width [deg], that each sample has."""
+    """Return the share (m, n) of the loss of each sector (middle and width [deg]) that each sample has."""
     middle, width = (np.array(column)[:, None] for column in zip(*sectors, strict=True))
     off = np.abs((e.tower_azimuth_deg - middle + 180.0) % 360.0 - 180.0)
     return np.asarray(np.clip(0.5 + (0.5 * width - off) / _EDGE_DEG, 0.0, 1.0))
@@ -1196,15 +1203,15 @@ _CHECK_GAIN = "check the receiver's gain; compare both parts apart"
 
 
 def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
-    """A shift that lasts from an instant to the end."""
+    """Yield a shift that lasts from an instant to the end."""
     residual, n = e.measured_db - e.predicted_db, len(e.time_s)
     starts = np.arange(_LEAST_BINS * 2, n - _LEAST_BINS * 2)
     if not len(starts):
         return
-    # every so many: a step is seen from the bins beside its own
+    # neighbouring bins show the same step
     starts = starts[:: 1 + len(starts) // _MOSTSTARTS]
     masks = (np.arange(n)[None, :] >= starts[:, None]).astype(np.float64)
-    # a gain that creeps is no step, and has no name
+    # a creeping gain is not a step, and has no name
     creep = _STEP_DB * (np.arange(n) / n)[:, None]
     yield Trial(name=_UNNAMED, cost=0.0, sentence="", next_step="", columns=creep)
     for phi in _SEARCHED_PHI:

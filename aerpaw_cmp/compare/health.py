@@ -208,7 +208,7 @@ class Judged:
 
     @property
     def health(self) -> LearnedHealth:
-        """Health of the channel; only of antennas that have one."""
+        """Health of the channel, if its antenna has one."""
         assert self.learned.health is not None
         return self.learned.health
 
@@ -239,8 +239,8 @@ def step_chi2(time_s: FloatArray, error_db: FloatArray, *, noise: Noise) -> tupl
 
     Notes
     -----
-    With the errors e, their covariance C, an offset and a column x, size = x'C^-1 e / x'C^-1 x of columns that are
-    orthogonal to the offset under C, and chi-squared = size^2 x'C^-1 x.
+    For the errors e with covariance C and a column x that is orthogonal to the offset under C, the size is
+    x'C^-1 e / x'C^-1 x, and chi-squared is size^2 x'C^-1 x.
     """
     at = time_s[_LEAST_EACH_SIDE : len(time_s) - _LEAST_EACH_SIDE]
     if not len(at):
@@ -256,7 +256,7 @@ def step_chi2(time_s: FloatArray, error_db: FloatArray, *, noise: Noise) -> tupl
 
 
 def step_of(channels: Sequence[Judged]) -> Step | None:
-    """Return the step that all channels of a flight show together; None if their errors are those of healthy flights.
+    """Return the step that all channels of a flight show together, or None if their errors are usual.
 
     A step must exceed what healthy flights show, must be likelier than a level that creeps, and must leave the error of
     a healthy flight.
@@ -297,7 +297,7 @@ def _likeliest(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OddLevel:
-    """A channel whose level differs from that of held-out flights [dB]; ``where`` also names what it is compared to."""
+    """A channel whose level differs from that of held-out flights [dB], and the channels that show it in words."""
 
     name: str
     where: str
@@ -309,7 +309,7 @@ _ODD_SD, _ODD_DB = 3.5, 4.0
 
 
 def level_of(channels: Sequence[Judged]) -> OddLevel | None:
-    """Return the channel whose offset differs most from its usual one, by itself or against another channel.
+    """Return the channel whose offset, or its difference to another channel, differs most from the usual one.
 
     The difference of two channels varies less than the offset of each, which depends on the gain that the flight used.
     """

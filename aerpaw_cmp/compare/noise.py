@@ -1,4 +1,4 @@
-"""Noise of two memories along a flight, and the fit of coefficients under this noise.
+"""Noise with two correlation times along a flight, and the fit of coefficients under this noise.
 
 The residual of a level is the sum of a slowly and a quickly fading first-order autoregressive sequence.
 
@@ -46,8 +46,8 @@ class Memories:
 _SLOW = (0.8, 0.87, 0.92, 0.95, 0.97, 0.985, 0.995)
 _FAST = (0.0, 0.3, 0.5, 0.7, 0.8)
 _SLOW_SHARE = (0.0, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
-# Shadows of open land are alike over some 37 m (3GPP TR 38.901, table 7.5-6), which 5 m/s fly in 7 s; three times as
-# long is one standard deviation.
+# The correlation length of shadowing in open land is 37 m (3GPP TR 38.901, table 7.5-6): 7 s at 5 m/s.
+# A factor of three is one standard deviation.
 _FADES_S, _FADES_FACTOR = 7.0, math.log(3.0)
 START = Memories(4, 2, 3)
 # The search for the likeliest parameters starts in the middle and at noise without memory.

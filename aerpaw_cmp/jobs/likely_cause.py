@@ -1,4 +1,4 @@
-"""Evidence from which the likely cause of a flight's error is told, gathered from its replayed series."""
+"""Evidence for the likely cause of a flight's error, computed from its replayed series."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ _RISES_M = (-150.0, -100.0, -60.0, -40.0, -25.0, -15.0, 15.0, 25.0, 40.0, 60.0, 
 
 
 def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResult]) -> tuple[Cause | None, str | None]:
-    """The likely cause of the error of a flight over its scored channels; towers that move have none.
+    """Return the likely cause of the error of a flight over its scored channels, and the next step without a cause.
 
-    Without a cause the second is a next step: a calibration, where directions of the UAV's antenna tell some of the
-    error.
+    Towers that move have no cause. The next step is a calibration if a gain over the directions of the UAV's antenna
+    explains a part of the error.
 
     Parameters
     ----------
     data : FlightData
     replays : FlightReplay
     results : sequence of RssResult
-        The compared series.
+        Compared series.
 
     Returns
     -------
@@ -79,13 +79,13 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     cause = flight_cause(evidence)
     late = _late_clock(evidence, [series.tower for series, _, _ in compared])
     by_direction = cause is None or any(name in OF_DIRECTION for name in cause.name.split(" or "))
-    # a clock is judged by itself, and before what directions explain
+    # the test of the clock comes before causes of direction, which imitate a lag
     if late is not None and by_direction:
         return late, None
     # an antenna that the file names is missing: errors by direction are expected, and the first caution has the reason
     if any(not c.used for c in data.settings.cautions) and by_direction:
         return None, "see the first caution: a learned antenna that the flight file names is not used"
-    # learned antennas miss some decibels of any flight
+    # learned antennas have some decibels of error on any flight
     if cause is not None or data.settings.antennas or not gains_by_direction(evidence):
         return cause, None
     return None, _CALIBRATE
@@ -117,7 +117,7 @@ _CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT` with two flights of this site
 def is_simulated(telemetry: Stream) -> bool:
     """Check for the receiver and the battery of ArduPilot's simulator, which AERPAW's emulator runs.
 
-    Of fix 6, 10 satellites and the few voltages of its battery, two are in the log, and what else it has agrees.
+    At least two of its signs (fix 6, 10 satellites, few voltages of the battery) are in the log, and none contradicts.
     """
     rows = telemetry.frame
     if len(rows) < _FEWEST_ROWS:
@@ -133,8 +133,8 @@ def is_simulated(telemetry: Stream) -> bool:
 
 
 _RECEIVER = {"fix": 6, "satellites": 10}
-# Rows of a table from which constant columns, and from which few voltages tell anything. The simulator's battery has
-# three for flying and standing (97 % of the rows of one flight), a real one another in each row (at most 5 %).
+# Least rows for constant columns and for few voltages. The simulator's battery has three voltages in 97 % of the rows
+# of one flight. A real battery has another voltage in each row (at most 5 % share one).
 _FEWEST_ROWS, _FEWEST_VOLTAGES, _SHARE_OF_VOLTAGES = 4, 15, 0.8
 
 SIMULATED = Cause(
@@ -157,7 +157,7 @@ def heights_meant(telemetry: Stream) -> str | None:
     flown, told = flown[near], told[near]
     if min(np.abs(told[:, :2]).sum(), np.abs(told[:, 2]).sum()) < _LEAST_PATH_M:
         return None
-    # speeds of another unit are so along the ground, too
+    # speeds of another unit differ along the ground, too
     along, upwards = ((flown[:, axes] * told[:, axes]).sum() / np.square(told[:, axes]).sum() for axes in (slice(2), 2))
     if upwards * (flown[:, 2] @ told[:, 2]) <= _ALIKE * (flown[:, 2] @ flown[:, 2]):
         return None
@@ -165,10 +165,10 @@ def heights_meant(telemetry: Stream) -> str | None:
     return next((m for m, to_m in meanings.items() if abs(upwards * to_m - along) < _AS_TOLD * along), None)
 
 
-# The log of another unit, by what its heights have to be multiplied with.
+# Factor to metres by meaning of the heights.
 _FOOT_M = 0.3048
 _HEIGHTS = {"the logged heights are in feet": _FOOT_M, "the logged heights were divided by 3.28": 1.0 / _FOOT_M}
-# Four field logs climb at .90 to 1.00 of their speeds; rows further apart [s] tell no path between them.
+# Four field logs climb at .90 to 1.00 of their speeds. Rows further apart [s] do not determine the path between them.
 _AS_TOLD, _ALIKE, _LONG_STEP_S, _LEAST_PATH_M = 0.2, 0.5, 3.0, 10.0
 _SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")
 
@@ -192,7 +192,7 @@ def _with_other(
 
 
 def _learned_series(data: FlightData, series: RssSeries) -> LearnedSeries | None:
-    """Return the learned antenna of a series that has a health; None for other antennas."""
+    """Return the learned antenna of a series if the antenna has a health."""
     antennas = data.settings.antennas
     name = antennas.get(f"{series.tower}.{series.channel}")
     if name is None or "uav" not in antennas:
@@ -207,7 +207,10 @@ def _learned_series(data: FlightData, series: RssSeries) -> LearnedSeries | None
 def _evidence(
     data: FlightData, series: RssSeries, replayed: Replayed, result: RssResult, *, scaled: bool = True
 ) -> LevelEvidence:
-    """Return the evidence of a series, levels as the page scores them; ``scaled``: heights may have another unit."""
+    """Return the evidence of a series with the levels that the page scores.
+
+    With ``scaled`` the heights may have another unit.
+    """
     link = _Direct(data.site, series.tower, replayed)
     known_db, known_both_db = link.level_db, link.level_of_both_db
     time_s = rss.seconds(series.time)
@@ -265,7 +268,7 @@ def _evidence(
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Direct:
-    """Level of the direct path of a series at its poses (m,) [dBm], and what it would be otherwise."""
+    """Level of the direct path of a series at its poses (m,) [dBm], as set and with faults."""
 
     site: Site
     tower: str
@@ -285,7 +288,7 @@ class _Direct:
         return self._level(self.place_m, self.replayed.poses.position_m, self.replayed.poses.rotation, tower=True)
 
     def turned_db(self) -> dict[float, FloatArray]:
-        """Levels where the heading is greater; none for isotropic antennas."""
+        """Return levels with a greater heading, or nothing for isotropic antennas."""
         if not self._has_pattern:
             return {}
         place_m, poses = self.place_m, self.replayed.poses
@@ -294,7 +297,7 @@ class _Direct:
         return {angle: self._level(place_m, poses.position_m, rotation) for angle, rotation in turns.items()}
 
     def raised_db(self) -> dict[float, FloatArray]:
-        """Levels where the UAV is higher, no lower than the ground."""
+        """Return levels with the UAV at other heights above the ground."""
         poses, levels = self.replayed.poses, {}
         for rise in _RISES_M:
             place = poses.position_m + np.array([0.0, 0.0, rise])
@@ -303,7 +306,7 @@ class _Direct:
         return levels
 
     def attitude_db(self, used: str) -> dict[str, FloatArray]:
-        """Levels with another use of the attitude that the log knows."""
+        """Return levels with another use of the logged attitude."""
         track, poses = self.replayed.track, self.replayed.poses
         if track is None or not self._has_pattern or not track.attitude_known.any():
             return {}
@@ -315,18 +318,21 @@ class _Direct:
 
     @property
     def distance_db(self) -> FloatArray:
-        """Free space alone."""
+        """Level of free space alone."""
         link = self.replayed.link
         position_m = self.replayed.poses.position_m
         return np.asarray(free_space_dbm(self.place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
 
     def displaced_db(self, known_db: FloatArray) -> dict[tuple[float, float], FloatArray]:
-        """Return levels with the tower elsewhere, by distance [m] and azimuth [deg]; ``known_db`` with it in place."""
+        """Return levels with the tower elsewhere, by distance [m] and azimuth [deg].
+
+        ``known_db`` is the level with the tower in its place.
+        """
         poses = self.replayed.poses
         n = len(poses.position_m)
         if not n:
             return {}
-        # a change varies slowly along the track: so many poses, and straight lines between them
+        # a change varies slowly along the track: interpolate between some poses
         at = np.unique(np.linspace(0, n - 1, min(n, _DISPLACED_POSES)).astype(np.int64))
         position_m, rotation = poses.position_m[at], poses.rotation[at]
         levels = {}
@@ -359,7 +365,7 @@ class _Direct:
         return levels
 
     def other_towers_db(self) -> dict[str, FloatArray]:
-        """Levels from each other tower of the site."""
+        """Return levels from each other tower of the site."""
         poses = self.replayed.poses
         return {
             name: self._level(neighbour.position_m[None, :], poses.position_m, poses.rotation)
@@ -380,7 +386,7 @@ class _Direct:
     def _level(
         self, place_m: FloatArray, position_m: FloatArray, rotation: FloatArray, *, tower: bool = False
     ) -> FloatArray:
-        """Return free space and the mean gain of the UAV's elements [dB]; with ``tower`` also that of the tower's."""
+        """Return free space and the mean gain of the UAV's antenna [dB], with ``tower`` also of the tower's."""
         link, at = self.replayed.link, self.directions(place_m, position_m, rotation)
         (tower_array,) = link.tower_arrays.values()
         level_db = free_space_dbm(place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0]
@@ -391,7 +397,7 @@ class _Direct:
 
 
 _MIRRORED = "east and north of the track are swapped"
-# Places of the tower that are tried, and poses at which they are.
+# Tried places of the tower, and number of poses at which they are computed.
 _RADII_M, _AZIMUTHS_DEG = (25.0, 40.0, 65.0, 105.0, 170.0, 275.0), tuple(22.5 * i for i in range(16))
 _DISPLACED_POSES = 300
 # A track under another datum may begin so far below the ground [m].

@@ -245,6 +245,8 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     alternatives = _alternatives(best, odds, least)
     certain = frozenset().union(*(either for either in alternatives if len(either) == 1))
     for either in alternatives:
+        if any(either < pair for pair in named):
+            continue
         name = max(either & best)
         shown = [table for table in tables if name in _names(_best(table, best))]
         # the words are those of the channel that shows the cause most clearly
@@ -326,17 +328,22 @@ def _lead(names: Set[str], odds: Mapping[frozenset[str], float]) -> float:
 
 
 def _alternatives(best: Set[str], odds: Mapping[frozenset[str], float], least: float) -> list[frozenset[str]]:
-    """Return the causes that are likelier by a margin than all else: alone, or two that cannot be distinguished."""
+    """Return the causes that are likelier by a margin than all else, pairs that cannot be distinguished first."""
     out = []
-    for name in sorted(best - {_UNNAMED}):
-        if _lead({name}, odds) >= least:
+    leads = {name: _lead({name}, odds) for name in sorted(best - {_UNNAMED})}
+    certain = {name for name, lead in leads.items() if lead >= least + 2.0 * _DISTINCT}
+    for name, lead in leads.items():
+        if lead >= least:
             out.append(frozenset({name}))
-            continue
-        others = {other for some in odds for other in some} - {name, _UNNAMED, *best}
+        others = {other for some in odds for other in some} - {name, _UNNAMED, *certain}
         rival = max(others, key=lambda other: _lead({name, other}, odds), default="")
-        if rival and _lead({name, rival}, odds) >= least:
+        if rival and lead < least + _DISTINCT and _lead({name, rival}, odds) >= least:
             out.append(frozenset({name, rival}))
-    return out
+    return sorted(out, key=lambda either: -len(either))
+
+
+# A cause that leads by less than this above the margin is named together with the next one, if that explains the error.
+_DISTINCT = 1.7
 
 
 def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]) -> bool:
@@ -367,7 +374,7 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     usual = _usual_db(shown)
     if usual is not None:
         # from above the error of any held-out flight to below it
-        restored = name in _RESTORING and known_db > usual[1] >= alone_db
+        restored = name in _RESTORING - {_CATCH_ALL} and known_db > usual[1] >= alone_db
         # an error as large as that of any flight has no such cause
         least_db = usual[1] if name in OF_DIRECTION else usual[0] if name == "saturation" and not certain else 0.0
         enough = known_db > least_db and (name not in _RESTORING or alone_db <= usual[1])
@@ -473,9 +480,11 @@ def _models(e: LevelEvidence) -> _Models:
     models, likely = [model(climb=False), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
     pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
     models += [model(first.trials[0], second.trials[0], at=first.memories) for first, second in pairs]
+    # half or twice the decibels is the name of a slope
+    named = any("decibels" in _names(m) and m.gain > 0.0 for m in alone)
     for first in likely:
-        rest = _without(e, first)
-        further = best_of(((first.trials[0], second) for second in _candidates(rest)), first.memories)
+        rest = [trial for trial in _candidates(_without(e, first)) if trial.name or not named]
+        further = best_of(((first.trials[0], second) for second in rest), first.memories)
         models += [*further, *(model(m.trials[1], climb=False) for m in further)]
     return {_names(m): m for m in sorted(models, key=lambda m: m.gain)}
 
@@ -1162,6 +1171,8 @@ _SEARCHED_PHI = (0.6, 0.93)
 _WIDTHS_DEG = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 # Degrees over which the edge of a shadow fades: a Fresnel zone some hundred metres away.
 _EDGE_DEG = 4.0
+# An obstacle loses more than this. A smaller loss in a sector is usually that of an antenna.
+_LEAST_LOSS_DB = 6.0
 _MOSTSTARTS = 600
 
 
@@ -1173,7 +1184,7 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
     for phi in _SEARCHED_PHI:
         shift, _, gain = _shift(residual, shadows, phi)
         inside = shadows.sum(axis=1)
-        possible = (inside >= _LEAST_BINS) & (shadows.shape[1] - inside >= _LEAST_BINS) & (shift < 0.0)
+        possible = (inside >= _LEAST_BINS) & (shadows.shape[1] - inside >= _LEAST_BINS) & (shift < -_LEAST_LOSS_DB)
         if not possible.any():
             continue
         gain = np.where(possible, gain, -np.inf)
@@ -1181,7 +1192,7 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
         around = [(middle + i, max(width + j, 2.0)) for i in range(-6, 7) for j in range(-8, 9)]
         finer = _shadows(e, around)
         shift, error, gain = _shift(residual, finer, phi)
-        at = int(np.argmax(np.where(shift < 0.0, gain, -np.inf)))
+        at = int(np.argmax(np.where(shift < -_LEAST_LOSS_DB, gain, -np.inf)))
         (middle, width), loss, reach = around[at], -float(shift[at]), 1.96 * float(error[at])
         first = (middle - 0.5 * width) % 360.0
         yield Trial(

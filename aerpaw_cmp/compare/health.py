@@ -188,7 +188,10 @@ _STEP_CHI2, _FURTHER_CHI2 = 25.0, 4.0
 _BEFORE_CREEP = 6.0
 # The mean square of the whitened error of healthy flights is at most 1.2 at LW1.
 _MOST_SQUARE = 1.6
-_LEAST_EACH_SIDE = 10
+# Least number of means before and after a step: a minute.
+_LEAST_EACH_SIDE = 15
+# What a step leaves may not show another step: twice the log likelihood that 99 % of simulated healthy flights have.
+_MOST_LEFT_CHI2 = 18.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -274,7 +277,7 @@ def step_of(channels: Sequence[Judged]) -> Step | None:
             return None
         left.append((time_s, without))
     further, _ = _likeliest(channels, left)
-    return best if further is None or further.chi2 < least else None
+    return best if further is None or further.chi2 < _MOST_LEFT_CHI2 else None
 
 
 def _likeliest(

@@ -1,10 +1,8 @@
-"""The ``predict`` job: level, its interval, probabilities and ranks where nobody has flown yet.
+"""The ``predict`` job: levels with intervals, serving tower and ranks at positions without a flight.
 
-A flight held against what was predicted before it: ``report flight.yaml --against prediction/``.
-
-Maps corrected by flights: raw replay, what ``predict`` says, its standard deviation, ranks of a learned receiver.
-
-Levels are those of the map, in dBm: the mean offset between the logs and the raw replay is taken off.
+The file also scores a flight with an earlier prediction (``report flight.yaml --against prediction/``), and corrects
+maps by flights: raw replay, prediction, its standard deviation, and the ranks of a learned receiver. Levels of a map
+are in dBm, without the mean offset between the logs and the raw replay.
 """
 
 from __future__ import annotations
@@ -87,15 +85,15 @@ from .sources import (
     track_m,
 )
 
-# Directions of the nose that count alike where it is not known.
+# Number of headings with equal weights that are used if the heading is not known.
 HEADINGS = 8
 
-# Targets that are predicted together: bounds the memory.
+# Targets per block, which limits memory.
 AT_ONCE = 50_000
 
 RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
 
-# Column of the probability of lock, where a receiver loses it.
+# Column of the probability of lock, for receivers that can lose it.
 P_LOCK = "p_lock"
 
 _TILE_M = 100.0
@@ -103,18 +101,18 @@ _TILE_M = 100.0
 # Targets at which the channel matrices of a receiver are evaluated.
 MOST_RANKED = 50_000
 
-# Distance that counts as much as a turn of 60 degrees, where a target stands for its neighbours.
+# Distance that is equivalent to a turn of 60 degrees when the nearest ranked target is chosen [m].
 _NOSE_M = 50.0
 
 _FLAG_CODES = {name: code for code, name in enumerate(["", *FLAGS])}
 
-# Receiver of each tower, the link that says its arrays, and the folder of their files.
+# Receiver of each tower, the link with its arrays, and the folder of their files.
 Receivers = Mapping[str, tuple[FittedReceiver, LinkSettings, Path]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
-    """The record of a page, and what maps need besides."""
+    """The record of a page, and further data for maps."""
 
     page: PredictionPage
     targets: Targets
@@ -123,11 +121,11 @@ class Prediction:
 
     @property
     def table(self) -> pd.DataFrame:
-        """Rows of prediction.csv: one per target, tower and channel, then one per target and receiver."""
+        """The rows of prediction.csv: one per target, tower and channel, then one per target and receiver."""
         return self.page.table
 
     def _repr_html_(self) -> str:
-        """First words and the first points for notebooks."""
+        """Return the summary and the first points for notebooks."""
         points = str(self.table.head(10).round(2).to_html(index=False, border=0))
         return f"<p>{escape(self.page.verdict)}</p>{points}"
 
@@ -140,18 +138,18 @@ def predict(
     logs_root: Path | None = None,
     stages: Stages | None = None,
 ) -> Prediction:
-    """Predict levels and ranks at the places that WHERE names.
+    """Predict levels and ranks at the positions that WHERE names.
 
     Parameters
     ----------
     where : Path
         See :func:`.sources.find_targets`.
     flights : sequence of NamedFlight
-        Flights to learn from. Without any, the levels learned for the site are used; if there are none, ray tracing
-        with a wide prior.
+        Flights to learn from. If there are none, the levels learned for the site are used, or else ray tracing with a
+        wide prior.
     options : TargetOptions, optional
     logs_root : Path, optional
-        Where logs resolve.
+        Folder against which the paths of logs resolve.
     stages : Stages, optional
 
     Returns
@@ -161,7 +159,7 @@ def predict(
     Raises
     ------
     UsageError, InputError
-        No source that shares a tower and band, no place to predict.
+        If no source shares a tower and band, or there is no position to predict.
     """
     stages, options = stages or Stages(), options or TargetOptions()
     with stages("read"):
@@ -207,7 +205,7 @@ def predict(
 def _model_fields(
     model: Flown | Memory | Prior, known: Sequence[FlightData], receivers: Sequence[FittedReceiver], table: pd.DataFrame
 ) -> dict[str, Any]:
-    """Fields of the page that tell of the model and what it learned from."""
+    """Return the fields of the page about the model and its training data."""
     guess = outside_share(table)
     expected = (
         float(np.sqrt((table["slow_sd_db"] ** 2).mean())),
@@ -273,14 +271,14 @@ def _model_fields(
 def site_of(
     where: Path | None, flights: Sequence[NamedFlight], known: Sequence[FlightData], named: str | None = None
 ) -> tuple[Site, str | Path]:
-    """Site of a prediction or plan: by name, WHERE where it is a site, that of the flights, that of WHERE.
+    """Return the site of a prediction or plan: the named one, WHERE if it is a site, or that of the flights or WHERE.
 
     Parameters
     ----------
     where : Path or None
     flights : sequence of NamedFlight
     known : sequence of FlightData
-        Their data; all must share the frame of the site.
+        Data of the flights, which must share the frame of the site.
     named : str, optional
         ``--site``.
 
@@ -288,12 +286,12 @@ def site_of(
     -------
     site : Site
     place : str or Path
-        As :func:`~aerpaw_cmp.site.siteyaml.load_site` takes it.
+        The site as an argument of :func:`~aerpaw_cmp.site.siteyaml.load_site`.
 
     Raises
     ------
     UsageError, InputError
-        No site, two sites, no such file.
+        If there is no site, there are two sites, or a file does not exist.
     """
     if where is not None and where.suffix and not where.exists():
         raise InputError("no such file", expected="a site, a route, points or a flight.yaml", path=where)
@@ -321,9 +319,9 @@ def site_of(
 
 
 def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions) -> Memory | Prior:
-    """Return the model of a site without named flights: what was learned for it, else ray tracing with a prior.
+    """Return the model of a site without named flights: the levels learned for it, else ray tracing with a prior.
 
-    A carrier or a power that the user names asks for the prior: learned levels belong to their own.
+    The prior is used if the user names a carrier or a power, because learned levels have their own.
     """
     memory = memory_of(place, site) if options.carrier_hz is None and options.tx_power_dbm is None else None
     if memory is not None:
@@ -337,13 +335,13 @@ def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions)
 
 
 def _nodes_of(where: Path) -> set[str]:
-    """Nodes of the logs of a flight file; none of another WHERE."""
+    """Return the nodes of the logs of a flight file, empty for another WHERE."""
     planned = flight_of(where)
     return set() if planned is None else {log.node for log in planned.logs if log.node}
 
 
 def _check_shared(where: Path, sources: Mapping[str, Source], site: Site, who: str) -> None:
-    """UsageError where the sources share no tower with the site, or none with the planned flight and its band."""
+    """Raise UsageError if no source has a tower of the site, or a tower and band of the planned flight."""
     planned = flight_of(where)
     towers, bands = {s.tower for s in sources.values()}, {s.link.carrier_hz for s in sources.values()}
     nodes = _nodes_of(where) if planned is not None else set(site.towers) | towers
@@ -363,7 +361,7 @@ def _check_shared(where: Path, sources: Mapping[str, Source], site: Site, who: s
 def _best_model(
     targets: Targets, sources: Mapping[str, Source], known: Sequence[FlightData], place: str | Path, remarks: list[str]
 ) -> Flown:
-    """The model that predicts the named flights best; ``remarks`` receives a remark on the choice.
+    """Return the model that predicts the named flights best.
 
     Parameters
     ----------
@@ -371,8 +369,9 @@ def _best_model(
     sources : mapping of str to Source
     known : sequence of FlightData
     place : str or Path
-        Of the site.
+        The site.
     remarks : list of str
+        Receives a remark on the choice.
 
     Returns
     -------
@@ -382,7 +381,9 @@ def _best_model(
     bases, learned = _bases(sources, known, place)
     beyond = bool(np.mean(outside(targets.position_m[targets.known], samples)) > 0.5)
     if beyond:
-        remarks.append("Most points lie outside the flown places: models that remember places are left out.")
+        remarks.append(
+            "Most points are far from all flown positions, so spatial corrections with fitted lengths are not used."
+        )
         bases.pop("none")
     correction = choose(samples, bases, STATED_FIELDS if beyond else ())
     used = learned.get(correction.base, ())
@@ -392,9 +393,9 @@ def _best_model(
 def _bases(
     sources: Mapping[str, Source], known: Sequence[FlightData], place: str | Path
 ) -> tuple[dict[str, Base], dict[str, list[MeasuredPattern | FlightFile]]]:
-    """Models that may carry the prediction, and what they use that was learned from logs.
+    """Return the candidate models, and the learned patterns and settings that they use.
 
-    Models that learned from these very flights elsewhere are left out.
+    A model that was learned from the same flights is not a candidate.
     """
 
     def each(gain: Callable[[Source, LinkSamples], FloatArray]) -> Base:
@@ -434,7 +435,9 @@ def _table(
     learned: tuple[Mapping[str, Source], Flown | Memory | Prior, Receivers],
     progress: Progress,
 ) -> pd.DataFrame:
-    """Rows of every tower and channel, then of every receiver; float32, or a million points take gigabytes.
+    """Return the rows of every tower and channel, then of every receiver.
+
+    Numbers are float32, because a million points would take gigabytes otherwise.
 
     Parameters
     ----------
@@ -489,7 +492,7 @@ def _table(
 
 
 def _stated(model: Flown | Memory | Prior, antenna: str, level_db: AnyArray, slow_db: AnyArray) -> dict[str, AnyArray]:
-    """Columns (n,) of a level: median, standard deviation, interval, and P(lock) of a receiver that loses its lock."""
+    """Return the columns (n,) of a level: median, standard deviation, interval, and P(lock) if lock can be lost."""
     lock = model.lost_lock(antenna, level_db)
     if lock is None:
         fading = model.fading(antenna)
@@ -497,7 +500,7 @@ def _stated(model: Flown | Memory | Prior, antenna: str, level_db: AnyArray, slo
         ends = {"level_db": level_db, "sd_db": sd, "q05_db": level_db - half, "q95_db": level_db + half}
         return ends | {"slow_sd_db": slow_db}
     low, middle, high = (lock.quantile_db(share) for share in (0.5 - 0.5 * BAND, 0.5, 0.5 + 0.5 * BAND))
-    sd = lock.sd_db(middle)  # with and without lock differ for longer than 4 s
+    sd = lock.sd_db(middle)  # the same for means over 4 s, because a loss of lock lasts longer
     ends = {"level_db": level_db + middle, "sd_db": sd, "q05_db": level_db + low, "q95_db": level_db + high}
     parts = {"locked_db": level_db + lock.locked_db, "lost_db": level_db + lock.lost_db}
     spreads = {f"{name}_sd_db": np.full(len(sd), getattr(lock, f"{name}_sd_db")) for name in ("locked", "lost")}
@@ -507,9 +510,9 @@ def _stated(model: Flown | Memory | Prior, antenna: str, level_db: AnyArray, slo
 def _levels(
     targets: Targets, sources: Mapping[str, Source], model: Flown | Memory | Prior, progress: Progress
 ) -> tuple[AnyArray, AnyArray, BoolArray]:
-    """Level, standard deviation of 4 s means (series, n) [dB], and where the model is a guess.
+    """Return level, standard deviation of 4 s means (series, n) [dB], and True where the model is a guess.
 
-    All headings count alike where none is known.
+    Headings have equal weights if the heading is not known.
     """
     level, slow = np.full((2, len(sources), len(targets)), np.nan, dtype=np.float32)
     guess: BoolArray = np.zeros(level.shape, dtype=np.bool_)
@@ -525,7 +528,7 @@ def _levels(
 
 
 def _in_parts(targets: Targets) -> Iterator[tuple[IntArray, float]]:
-    """Targets that have a position, neighbours at a time, and the share that is then done."""
+    """Yield blocks of neighbouring targets with a position, and the share that is done after each."""
     known = np.flatnonzero(targets.known)
     tile = np.floor(targets.position_m[known, :2] / _TILE_M)
     known = known[np.lexsort(tile.T)]
@@ -535,31 +538,31 @@ def _in_parts(targets: Targets) -> Iterator[tuple[IntArray, float]]:
 
 
 def _turns(yaw_deg: FloatArray) -> FloatArray:
-    """Headings that count alike where one is not known [deg]."""
+    """Return the headings that replace unknown ones [deg], or a single one if all are known."""
     count = 1 if np.isfinite(yaw_deg).all() else HEADINGS
     return np.asarray(np.arange(count) * (360.0 / HEADINGS))
 
 
 def _serving(level: AnyArray, slow: AnyArray, channels: Sequence[str]) -> AnyArray:
-    """Probability (series, n) that each tower is the strongest among those of its channel.
+    """Return the probability (series, n) that each tower is the strongest of its channel.
 
-    By Gauss-Hermite quadrature over the tower's own level; levels of towers are taken as independent.
+    Gauss-Hermite quadrature over the level of the tower. Levels of towers are assumed to be independent.
     """
     from scipy.special import ndtr
 
-    # the mean over the normal spread of a level of its own; rivals are independent at each of its values
+    # at each value of the tower's level, the other towers are independent
     nodes, weight = np.polynomial.hermite_e.hermegauss(24)
     out: AnyArray = np.where(np.isfinite(level), np.float32(1.0), np.float32(np.nan))
     # a tower without a path never serves
     filled, sd = np.nan_to_num(level, nan=-1e9), np.nan_to_num(slow, nan=1.0)
     for k, channel in enumerate(channels):
-        rivals = [j for j, name in enumerate(channels) if name == channel and j != k]
-        if not rivals:
+        others = [j for j, name in enumerate(channels) if name == channel and j != k]
+        if not others:
             continue
         total = np.zeros(level.shape[1])
         for node, w in zip(nodes, weight / weight.sum(), strict=True):
             at = filled[k] + node * sd[k]
-            total += w * np.prod([ndtr((at - filled[j]) / sd[j]) for j in rivals], axis=0)
+            total += w * np.prod([ndtr((at - filled[j]) / sd[j]) for j in others], axis=0)
         out[k] *= total
     return out
 
@@ -568,7 +571,7 @@ def _serving(level: AnyArray, slow: AnyArray, channels: Sequence[str]) -> AnyArr
 
 
 def _receivers(known: Sequence[FlightData], place: str | Path, site: Site) -> Receivers:
-    """Receivers that the flights name or the site remembers, by tower."""
+    """Return the receivers that the flights name or that are stored for the site, by tower."""
     out: dict[str, tuple[FittedReceiver, LinkSettings, Path]] = {}
     for data in known:
         if data.settings.rank.receiver is not None:
@@ -587,9 +590,9 @@ def _receivers(known: Sequence[FlightData], place: str | Path, site: Site) -> Re
 def _ranks(
     targets: Targets, receivers: Receivers, site: Site, progress: Progress
 ) -> Iterator[tuple[str, IntArray, FloatArray]]:
-    """Tower, rows (n,) of the targets and probabilities (n, 4) of the ranks by every receiver.
+    """Yield tower, rows (n,) of the targets and probabilities (n, 4) of the ranks for every receiver.
 
-    Of more targets than :data:`MOST_RANKED` the nearest of so many stands for each.
+    If there are more targets than :data:`MOST_RANKED`, each has the probabilities of the nearest ranked target.
     """
     from scipy.spatial import cKDTree
 
@@ -601,7 +604,7 @@ def _ranks(
             continue
         position, yaw, each = targets.position_m[some], targets.yaw_deg[some], []
         turns = _turns(yaw).tolist()
-        few = len(some) * len(turns) <= MOST_RANKED  # more would take more memory at once
+        few = len(some) * len(turns) <= MOST_RANKED  # limits memory
         asked = [turns] if few and not np.isfinite(yaw).any() else [[turn] for turn in turns]
         for together in asked:
             heading = np.where(np.isfinite(yaw), yaw, together[0])
@@ -612,7 +615,7 @@ def _ranks(
                 poses=Poses(position, rotation_from_aircraft(0.0 * heading, 0.0 * heading, heading)),
                 rank=np.full(len(some), np.nan),
                 link=link,
-                # points of a grid lie hours apart: a receiver that averages over seconds averages none of them
+                # points of a grid are hours apart, so that a receiver that averages over seconds does not mix them
                 time_s=targets.time_s[some] if targets.kind == "route" else 1e4 * np.arange(float(len(some))),
             )
             each.append(receiver.forecast(samples, [turn - together[0] for turn in together])[0])
@@ -624,7 +627,7 @@ def _ranks(
 
 
 def _place_and_nose(targets: Targets, rows: IntArray) -> FloatArray:
-    """Place and nose (n, 5) in units [m] in which ranks differ alike."""
+    """Return position and heading (n, 5), scaled so that equal distances [m] change ranks equally."""
     yaw = np.radians(np.nan_to_num(targets.yaw_deg[rows]))
     return np.column_stack([targets.position_m[rows], _NOSE_M * np.sin(yaw), _NOSE_M * np.cos(yaw)])
 
@@ -642,7 +645,7 @@ def run_predict(
     where : Path
         See :func:`.sources.find_targets`.
     flights : sequence of Path
-        Flight files, or calibration.yaml files that list some; none: the memory of the site.
+        Flight files, or calibration.yaml files that list some. If there are none, the learned levels of the site.
     target : TargetOptions
     options : RunOptions
         ``out`` is ``reports/prediction-NAME`` by default.
@@ -681,9 +684,9 @@ def score_against(data: FlightData, folder: Path) -> Against:
     Raises
     ------
     UsageError
-        The flight's own log was learned from; no sample was predicted.
+        If the prediction was learned from the flight's own log, or no sample was predicted.
     InputError
-        The folder holds no prediction.
+        If the folder does not contain a prediction.
     """
     with parsing(folder, "the output folder of 'aerpaw-cmp predict'", any_shape=True):
         about = json.loads(read_bounded(folder / "metrics.json", LARGEST_TABLE))
@@ -727,7 +730,7 @@ def score_against(data: FlightData, folder: Path) -> Against:
 
 
 def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
-    """Samples near predicted points, each with the level that was predicted there."""
+    """Return the samples near predicted points, each with the level that was predicted there."""
     good = np.isfinite(o.samples.residual_db)
     finite = o.part(good)
     index, near = _nearest(finite.samples.position_m, finite.heading_deg, part)
@@ -764,7 +767,7 @@ def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
 
 
 def _rank_score(samples: RankSamples, part: pd.DataFrame) -> ForecastScore | None:
-    """Score of predicted probabilities; the constant forecast beside it is their mean over the predicted points."""
+    """Score predicted probabilities. The constant forecast is their mean over the predicted points."""
     heading_deg = bearing_deg(samples.poses.rotation[:, :, 0])
     index, near = _nearest(samples.poses.position_m, heading_deg, part)
     if near.sum() < FEWEST:
@@ -784,7 +787,7 @@ def _nearest(position_m: FloatArray, heading_deg: FloatArray, part: pd.DataFrame
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CorrectedLevel:
-    """One tower and channel at one height, each (n,) in index order; ``raw_dbm`` with the nose to the north."""
+    """The levels of one tower and channel at one height, each (n,) in index order. ``raw_dbm`` is for heading north."""
 
     link: str
     height_m: float
@@ -805,7 +808,7 @@ class CorrectedMaps:
     prediction: PredictionPage
 
     def layers(self) -> list[Layer]:
-        """For the files beside the page."""
+        """Return the layers for the files next to the page."""
         out = []
         for item in self.levels:
             at = f"h{item.height_m:03.0f}m_{re.sub(r'[^0-9A-Za-z]', '_', item.link)}"
@@ -822,7 +825,7 @@ class CorrectedMaps:
         return out
 
     def page_layers(self, grid: Grid) -> Iterator[page.MapLayer]:
-        """For the linked map: raw and corrected level, standard deviation."""
+        """Yield the layers of the linked map: raw and corrected level, and standard deviation."""
         for item in self.levels:
             axes = {"Link": item.link, **page.at_height(item.height_m)}
             for version, values in (("corrected", item.corrected_dbm), ("raw", item.raw_dbm)):
@@ -833,7 +836,7 @@ class CorrectedMaps:
             )
 
     def rss_maps(self, grid: Grid) -> Iterator[page.RssMap]:
-        """For the figures: maps and distributions of both versions."""
+        """Yield the maps and distributions of both versions for figures."""
         for version in ("raw", "corrected"):
             for item in self.levels:
                 values = item.raw_dbm if version == "raw" else item.corrected_dbm
@@ -846,7 +849,7 @@ class CorrectedMaps:
                 )
 
     def rank_maps(self, grid: Grid) -> Iterator[page.RankMap]:
-        """For figures and the linked map: the most probable rank, and mean probabilities as shares."""
+        """Yield the most probable rank for figures and the linked map, with mean probabilities as shares."""
         for (tower, height), p in self.ranks.items():
             share = np.concatenate([[np.isnan(p[:, 0]).mean()], np.nan_to_num(p).mean(axis=0)])
             rank = grid.raster(likeliest(p)).astype(np.int64)
@@ -854,7 +857,7 @@ class CorrectedMaps:
 
 
 def likeliest(p: FloatArray) -> FloatArray:
-    """Most probable rank (n,) by probabilities (n, 4); 0 where they are NaN."""
+    """Return the most probable rank (n,) for probabilities (n, 4), 0 if they are NaN."""
     return np.where(np.isnan(p[:, 0]), 0, np.nan_to_num(p).argmax(axis=1) + 1)
 
 
@@ -866,17 +869,17 @@ def corrected_maps(
     logs_root: Path | None = None,
     stages: Stages | None = None,
 ) -> CorrectedMaps:
-    """Predict a map's grid from flights, beside the raw replay of the same links.
+    """Predict the grid of a map from flights, and replay the same links without correction.
 
     Parameters
     ----------
     site : str
-        As ``map`` takes it.
+        The site as in the command ``map``.
     spacing_m : float
     heights_m : (sequence of float, sequence of float)
-        Of levels, and of ranks.
+        Heights of levels, and of ranks.
     flights : sequence of NamedFlight
-        To learn from.
+        Flights to learn from.
     logs_root : Path, optional
     stages : Stages, optional
 
@@ -887,7 +890,7 @@ def corrected_maps(
     Raises
     ------
     UsageError, InputError
-        As :func:`.predict.predict`.
+        As for :func:`predict`.
     """
     options = TargetOptions(heights_m=tuple(sorted({*heights_m[0], *heights_m[1]})), spacing_m=spacing_m)
     prediction = predict(Path(site), flights, options, logs_root=logs_root, stages=stages)

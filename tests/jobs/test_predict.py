@@ -76,7 +76,7 @@ def test_points_without_a_position_and_outside_are_flagged(prediction):
     near, far = (rows(prediction, k)["sd_db"].to_numpy() for k in (0, 3))
     assert (far > near).all()
     assert any("1 of 4 points without a position" in text for text in prediction.page.warnings)
-    assert "67 % of the points lie outside" in prediction.page.warnings[0]  # of three with a position
+    assert "67 % of the points are outside the flown area" in prediction.page.warnings[0]  # of three with a position
     shares = [series["share_outside_flown"] for series in prediction_metrics(prediction.page)["series"].values()]
     np.testing.assert_allclose(shares, 2 / 3)
 

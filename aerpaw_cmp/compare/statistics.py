@@ -1,35 +1,25 @@
-"""Statistics of neighbouring samples: intervals, the memory of a series, passes over the same places.
+"""Intervals of correlated samples, passes over the same positions, and fast ranks of channel matrices.
 
-Draws of a process's mean, power and ratio of powers, from one sequence whose memory is not known.
+Neighbouring samples of a flight are correlated, and one flight hardly determines for how long. Intervals of a mean, a
+power and a ratio of powers therefore consider many correlations. The sequence is described by its slowest cosine terms
+(Mueller and Watson 2008, doi:10.1111/j.1468-0262.2008.00868.x): for a given correlation, they are normal with a known
+covariance. Correlations over time last from three times the flight to none. They are exponential, with and without
+white noise, or smooth (Matern 3/2). Correlations over place follow the track. Each counts by its likelihood and by a
+prior weight, which keeps the coverage of 95 % intervals from falling for any of them. The weights alone would make
+other intervals too wide, so the draws are also widened or narrowed by the correlations that the sequence shows. Weights
+and widening factors were found by simulation (``benchmarks/interval_weights.py``).
 
-Neighbouring errors of a flight repeat each other, and how long they do is itself hardly known from one flight. The
-sequence is described by its slowest cosine terms, after Mueller and Watson (2008),
-doi:10.1111/j.1468-0262.2008.00868.x: given a memory, they are normal with a known covariance. Memories from three times
-the flight's length to none at all, rough (exponential) with and without white noise and smooth (Matern 3/2), are
-weighted by how well they explain the terms, and by weights that let no memory's 95 % intervals hold much less. Weights
-alone make others hold more: long memories must be feared though the terms hardly show them. How far out the ends of an
-interval lie among the draws is therefore a matter of the memories that the sequence shows, with the weights and without
-(``benchmarks/interval_weights.py`` finds both by simulation).
+Statistics of ranks and of paired models are means of what each sample adds to them, and have the same intervals.
 
-Uncertainty of numbers that come from neighbouring samples of one flight.
+Passes over the same positions are compared for every pair of flights: 199 000 pairs for 200 flights with ten links. The
+positions of a flight are therefore put into one k-d tree, pairs whose boxes are apart are not searched, and
+links that were sampled together share one search.
 
-Samples a tenth of a second apart repeat each other. Intervals of errors of levels (offset, RMSE, correlation, two
-models in pairs) integrate over how long they do (:mod:`.memory`). Those of ranks rest on blocks: the flight is cut
-into blocks as long as the sequence remembers (Politis and White), blocks are drawn with replacement, and the spread of
-the statistic over the draws, corrected for the finite number of blocks, gives the interval.
-
-Passes over the same places: what two differ by, and every pair of a season at once.
-
-Of 200 flights with ten links there are 199 000 pairs, so each flight's places are put into one k-d tree, pairs of
-flights whose boxes lie apart are not searched, links that were sampled together share one search, and intervals come
-in closed form.
-
-Ranks of many small channel matrices at once, by counting eigenvalues of their Gram matrices.
-
-The number of eigenvalues of ``G = H^H H`` above ``lambda_1 / K^2`` is the number of positive pivots of
-``G - lambda_1 / K^2`` (Sylvester's law of inertia): fifty multiplications for a 4 x 4 matrix, where its singular values
-take LAPACK some four microseconds. A count is certain when it is the same on both sides of the threshold, further
-apart than all that ``lambda_1`` and the pivots may be off. The others are left to singular values.
+Ranks of many small channel matrices are counted by eigenvalues of their Gram matrices. The number of eigenvalues of
+``G = H^H H`` above ``lambda_1 / K^2`` is the number of positive pivots of ``G - lambda_1 / K^2`` (Sylvester's law of
+inertia). That takes fifty multiplications for a 4 x 4 matrix, and LAPACK's singular values take some four microseconds.
+A count is certain if it is the same on both sides of the threshold, at a distance larger than the error of
+``lambda_1`` and the pivots. Singular values decide the others.
 """
 
 from __future__ import annotations
@@ -48,74 +38,74 @@ from numpy.typing import ArrayLike
 
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, Printed, unmasked, wrap_degrees
 
-# Cosine terms that the memory is judged by, of a long sequence; faster ones tell about the power alone. Shorter
-# sequences take the largest of a few numbers: each has its own table of memories.
+# Number of cosine terms of a long sequence that determine its correlation. Faster terms count for the power alone.
+# Shorter sequences use the largest possible one of a few numbers, because each number has its own table.
 TERMS = 48
 _FEWER = np.array([9, 12, 16, 24, 34, TERMS])
 
-# Samples below which nothing is said.
+# Number of samples below which there is no interval.
 FEWEST = 20
 
-# Length of the sequence over the length of its memory (exponential: exp(-rate) is what two ends share).
+# Length of the sequence divided by its correlation length (exp(-rate) is the correlation of the two ends).
 RATES = np.geomspace(0.3, 500.0, 18)
 
-# Share of white noise in the slowest fluctuations.
+# Shares of white noise in the slowest fluctuations.
 WHITE_SHARES = (0.0, 2e-3, 3e-2)
 
-# White noise in the terms of a smooth memory, which fall by the fourth power of their order.
+# White noise in the terms of a smooth correlation, which fall with the fourth power of their order.
 _SMOOTH_FLOOR = 1e-7
 
 Kind = Literal["mean", "power", "ratio"]
 
-# Correlation lengths over the root mean square distance of a track from its centre. Neighbours differ by the root of 2,
-# so that squares of the correlations of one length are those of the next but one below it.
+# Correlation lengths, divided by the root mean square distance of a track from its centre. Consecutive lengths have a
+# ratio of the root of 2: the square of the correlation of one length is that of half the length.
 LENGTHS = 0.06 * 2.0 ** (0.5 * np.arange(12))
 
-# What a correlation over place is mixed with: shares of the power of the slow terms that are white noise, and shares
-# that are correlated over a fortieth of the flight in time, as fading is.
+# Shares of white noise or of fading that are mixed with each correlation over place. They refer to the power of the
+# slow terms. Fading is correlated over a fortieth of the flight.
 PLACE_WHITE = 0.002 * 2.0 ** np.arange(9)
 PLACE_FADING = (0.1, 0.25, 0.5, 0.75)
 _FADING_RATE = 40.0
 
-# Weight of a correlation over place, over the mean weight of one over time, by kind; and the length beyond which it
-# falls as one over the length. The terms hardly distinguish such lengths, while the mean and the power of a test depend
-# on them. Found by simulation; differences of squares are correlated over half of the errors' length.
+# Weight of a correlation over place relative to the mean weight of one over time, and the length above which it falls
+# as 1 / length, by kind. The terms hardly distinguish such lengths, but the mean and the power of a test depend on
+# them. Found by simulation. Differences of squares are correlated over half of the errors' length.
 _PLACE_WEIGHT = {"mean": (0.06, 1.0), "power": (0.06, 1.0), "ratio": (0.07, 0.3)}
 
-# Positions of a track that its correlations are computed from.
+# Largest number of positions from which the correlations of a track are computed.
 _THINNED = 400
 
-# Share of the samples without a position, and distance from the centre of the track [m], at which only time counts: a
-# UAV that hovers is at one place, and what its receiver logs there is noise of the position.
+# Share of samples without a position above which only time counts, and root mean square distance from the centre of
+# the track [m] below which only time counts. The logged positions of a hover are noise.
 _UNPLACED, _HOVER_M = 0.1, 15.0
 
-# Logarithms of the weights in tenths, by kind, rough memories of each white share and smooth ones, and rate. Stretches
-# of the draws in hundredths: what the weighted shares of the memories add, then what the shares without weights do.
+# Logarithms of the weights in tenths, by kind, form (rough with each white share, then smooth) and rate. Widening of
+# the draws in hundredths, by the weighted shares of the correlations and by the shares without weights.
 _TABLES = Path(__file__).with_name("memory_weights.json")
 
-# Of the standard deviation of the logarithm of the power upwards, over that which the fourth moment says; by simulation
-# with Student's t of four degrees of freedom. Most sequences with heavy tails look calmer than the process.
+# Factor of the upward standard deviation of the logarithm of the power relative to that of the fourth moment, by
+# simulation with Student's t of four degrees of freedom. Most sequences with heavy tails look calmer than the process.
 CALM = 1.8
 
-# Parts of a flight whose powers are compared, times the median power from which a part is loud, and samples below which
-# it is not asked: on the simulated kinds of ``benchmarks/coverage_of_intervals.py`` at most 4 % of steady flights have
-# two loud parts (Student's t of four degrees of freedom, 100 samples), others below 1 %.
+# Number of parts of a flight whose powers are compared, the multiple of the median power above which a part is loud,
+# and the smallest number of samples. On the simulated kinds of ``benchmarks/coverage_of_intervals.py``, below 1 % of
+# steady flights have two loud parts, or 4 % for 100 samples of Student's t with four degrees of freedom.
 _PARTS, _LOUD, _FEWEST_FOR_PARTS = 12, 4.0, 60
 
-# A sum over shares that no simulated flight showed may fall to nothing: eight of ten draws stay within the ends.
+# Smallest widening, at which the ends contain eight of ten draws. Sums over unusual shares could otherwise reach 0.
 _LEAST_STRETCH = 0.6
 
-# Draws come in pairs of opposite sign, so that exchanging two models turns an interval about exactly.
+# Draws come in pairs of opposite sign, so that swapping two models reverses an interval exactly.
 _PAIRS = 2048
 
 
 @dataclass(frozen=True, slots=True)
 class Memories:
-    """Memories (m,) at ``terms`` cosine terms: normal distributions of the mean and the terms, up to a scale.
+    """The distributions of mean and cosine terms for m correlations, normal up to a common scale.
 
-    ``whiten`` (m, terms, terms) makes the terms independent, ``log_det`` (m,) is the logarithm of its determinant;
-    ``slope`` (m, terms) and ``variance`` (m,) give mean and variance of the sequence's mean once the terms are known;
-    ``power`` (m,) is that of the terms together.
+    ``whiten`` (m, terms, terms) makes the terms independent. ``log_det`` (m,) is the logarithm of its determinant.
+    For known terms, ``slope`` (m, terms) and ``variance`` (m,) determine mean and variance of the mean of the sequence.
+    ``power`` (m,) is the power of all terms.
     """
 
     whiten: FloatArray
@@ -126,7 +116,7 @@ class Memories:
 
     @classmethod
     def of(cls, covariances: FloatArray) -> Memories:
-        """Return the memories whose mean and terms have these covariances (m, terms + 1, terms + 1)."""
+        """Return the record for covariances of mean and terms (m, terms + 1, terms + 1)."""
         whiten = np.linalg.inv(np.linalg.cholesky(covariances[:, 1:, 1:]))
         cross = covariances[:, 0, 1:]
         slope = np.einsum("mij,mi->mj", whiten, np.einsum("mij,mj->mi", whiten, cross))
@@ -141,7 +131,7 @@ class Memories:
 
 @cache
 def memories(terms: int = TERMS) -> Memories:
-    """Rough memories of each of :data:`WHITE_SHARES`, then smooth ones; :data:`RATES` run fastest."""
+    """Return exponential correlations with each of :data:`WHITE_SHARES`, then smooth ones, at all :data:`RATES`."""
     white = np.eye(terms + 1)
     covariances = [
         (1.0 - share) * 0.5 * rate * _exponential(rate, terms).real + share * white
@@ -151,20 +141,20 @@ def memories(terms: int = TERMS) -> Memories:
 
 
 def place_memories(place_m: FloatArray, terms: int = TERMS) -> Memories | None:
-    """Compute the memories of errors that are correlated over place.
+    """Compute the distributions for errors that are correlated over place.
 
     Parameters
     ----------
     place_m : (n, 3)
         East, north and up of each sample, in time order; NaN if unknown [m].
     terms : int
-        Cosine terms.
+        Number of cosine terms.
 
     Returns
     -------
     Memories or None
-        One for each mixture of :data:`PLACE_WHITE` and :data:`PLACE_FADING` and for each of :data:`LENGTHS`, which run
-        fastest. None if only time counts (:func:`only_time`).
+        For each mixture of :data:`PLACE_WHITE` and :data:`PLACE_FADING`, all :data:`LENGTHS`. None if only time counts
+        (:func:`only_time`).
 
     Notes
     -----
@@ -207,7 +197,7 @@ def _unit(covariance: FloatArray) -> FloatArray:
 
 
 def only_time(place_m: FloatArray | None) -> str:
-    """Return the reason why intervals consider correlation over time alone; empty if they consider place as well.
+    """Return the reason why intervals consider correlation over time alone, empty if they consider place as well.
 
     Parameters
     ----------
@@ -226,14 +216,14 @@ def only_time(place_m: FloatArray | None) -> str:
 
 
 def _smooth(rate: float, terms: int) -> FloatArray:
-    """The same of (1 + rate |s - t|) exp(-rate |s - t|): the exponential less rate times its slope over the rate."""
-    step = 1e-20  # along the imaginary axis: exact to rounding
+    """Return the covariance for (1 + rate |s - t|) exp(-rate |s - t|), by the derivative of the exponential one."""
+    step = 1e-20  # along the imaginary axis, which is exact to rounding
     covariance = _exponential(complex(rate, rate * step), terms)
     return np.asarray(covariance.real - covariance.imag / step)
 
 
 def _exponential(rate: complex, terms: int) -> ComplexArray:
-    """Covariance (terms + 1, terms + 1) of the cosine terms of exp(-rate |s - t|) on the unit interval."""
+    """Return the covariance (terms + 1, terms + 1) of the cosine terms of exp(-rate |s - t|) on the unit interval."""
     order = np.arange(terms + 1)
     sign = np.where(order % 2 == 0, 1.0, -1.0)
     pole = rate**2 + (np.pi * order) ** 2
@@ -248,22 +238,22 @@ def _table(name: str) -> FloatArray:
 
 @cache
 def weights(kind: Kind) -> FloatArray:
-    """Weight (m,) of each memory before any sample is seen."""
+    """Return the prior weight (m,) of each correlation over time."""
     drawn = np.exp(0.1 * _table(kind).ravel())
     return np.asarray(drawn / drawn.sum())
 
 
 @cache
 def stretches(kind: Kind) -> FloatArray:
-    """Stretch of the draws (2, m) that each memory asks for by its weighted share, and adds by its share without."""
-    if kind == "ratio":  # its weights alone hold false verdicts below 5 %
+    """Return the widening of the draws (2, m) per weighted share of each correlation, and per share without weights."""
+    if kind == "ratio":  # weights alone limit false verdicts to 5 %
         return np.repeat([[1.0], [0.0]], len(weights(kind)), axis=1)
     return 0.01 * _table(f"{kind} stretch").reshape(2, -1)
 
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """Cosine terms of a sequence: the slow ones (q,), and power and degrees of freedom of the fast ones."""
+    """The cosine terms of a sequence: the slow ones (q,), and power and degrees of freedom of the fast ones."""
 
     slow: FloatArray
     fast_power: float
@@ -271,33 +261,33 @@ class Terms:
 
 
 def cosine_terms(values: FloatArray) -> Terms:
-    """Cosine terms, scaled so that their squares add up to the mean square about the mean."""
+    """Return the cosine terms, scaled so that their squares add up to the mean square about the mean."""
     from scipy.fft import dct
 
     n = len(values)
     every = dct(values - values.mean(), norm="ortho")[1:] / np.sqrt(n)
     count = int(_FEWER[(n - 1) // 2 >= _FEWER].max())
     fast = np.square(every[count:])
-    # Satterthwaite's: a normal term to the fourth power is on average three times its variance squared
+    # Satterthwaite: the mean fourth power of a normal term is three times its squared variance
     freedom = max(3.0 * float(fast.sum()) ** 2 / max(float((fast * fast).sum()), 1e-300), 1.0)
     return Terms(every[:count], float(fast.sum()), freedom)
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Memories that a sequence may have: over time, then over place, with weights (m,) and stretches (2, m) by kind."""
+    """The possible correlations of a sequence over time, then place, with weights (m,) and widening (2, m)."""
 
     parts: tuple[Memories, ...]
     weights: FloatArray
     stretches: FloatArray
 
     def joined(self, name: str) -> FloatArray:
-        """Return a column of the memories, over time and place."""
+        """Return a column of the records over time and place."""
         return np.concatenate([getattr(part, name) for part in self.parts])
 
 
 def known_memories(kind: Kind, terms: int, place_m: FloatArray | None = None) -> Known:
-    """Return the memories over time, and over place if positions (n, 3) [m] allow it, with what each counts."""
+    """Return the correlations over time, and over place if positions (n, 3) [m] allow it, with their weights."""
     over_time, weight, stretch = memories(terms), weights(kind), stretches(kind)
     over_place = None if place_m is None else place_memories(place_m, terms)
     if over_place is None:
@@ -310,20 +300,20 @@ def known_memories(kind: Kind, terms: int, place_m: FloatArray | None = None) ->
 
 
 def likelihoods(slow: FloatArray, parts: Sequence[Memories] = ()) -> tuple[FloatArray, FloatArray]:
-    """Likelihood (..., m) of each memory, its scale integrated out, and the whitened sum of squares (..., m)."""
+    """Return the likelihood (..., m) of each correlation, integrated over the scale, and whitened sums of squares."""
     parts = parts or (memories(slow.shape[-1]),)
     square = np.concatenate([np.square(slow @ part.whiten.swapaxes(1, 2)).sum(axis=-1).T for part in parts], axis=-1)
     log_det = np.concatenate([part.log_det for part in parts])
     log = log_det - 0.5 * slow.shape[-1] * np.log(np.maximum(square, 1e-300))
-    # over the likeliest: the likelihoods themselves leave the range of numbers
+    # relative to the largest: likelihoods exceed the range of floats
     return np.exp(log - log.max(axis=-1, keepdims=True)), square
 
 
 @cache
 def _random(terms: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Evenly spread draws, the same for every sequence: uniform, chi-squared of ``terms`` degrees, two unit normals.
+    """Return the same evenly spread draws for every sequence: uniform, chi-squared of ``terms`` degrees, two normals.
 
-    A Kronecker sequence in four dimensions.
+    They are a Kronecker sequence in four dimensions.
     """
     from scipy.special import gammaincinv, ndtri
 
@@ -333,12 +323,12 @@ def _random(terms: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def _picked(slow: FloatArray, known: Known) -> tuple[IntArray, FloatArray, float]:
-    """Memory (draws,) and squared scale (draws,) of each draw, and what :func:`_stretched` does to them all."""
+    """Return the correlation (draws,) and squared scale (draws,) of each draw, and the widening of all draws."""
     likelihood, square = likelihoods(slow, known.parts)
     weighted = likelihood * known.weights
     running = np.cumsum(weighted)
     uniform, chi_squared, *_ = _random(len(slow))
-    # a chance near 1 may round to the whole sum
+    # a chance near 1 can round to the sum
     index = np.minimum(np.searchsorted(running, uniform * running[-1]), len(running) - 1)
     own, even = known.stretches
     stretch = float(weighted @ own / running[-1] + likelihood @ even / likelihood.sum())
@@ -346,24 +336,24 @@ def _picked(slow: FloatArray, known: Known) -> tuple[IntArray, FloatArray, float
 
 
 def _stretched(drawn: FloatArray, by: float) -> FloatArray:
-    """Draws moved away from their median: 2.5 % lie where the odds to the power ``by`` did, on either side."""
+    """Move draws away from their median, so that 2.5 % on each side are where the odds to the power ``by`` were."""
     tail = 1.0 / (1.0 + 39.0**by)  # 39 to 1 are the odds of 2.5 %
-    # quantiles, in half the time of NumPy's own
+    # quantiles in half the time of np.quantile
     asked, ranks = (tail, 0.025, 0.5, 0.975, 1.0 - tail), np.linspace(0.0, 1.0, len(drawn))
     low, usual_low, middle, usual_high, high = np.interp(asked, ranks, np.sort(drawn))
-    # each stays in its place: a correlation takes draws of mean and power in pairs
+    # keep the order: the interval of a correlation uses pairs of draws of mean and power
     below, above = (middle - low) / (middle - usual_low), (high - middle) / (usual_high - middle)
     return np.asarray(middle + (drawn - middle) * np.where(drawn < middle, below, above))
 
 
 def memory_share(values: FloatArray) -> float:
-    """Length of the likeliest memory of a sequence (n,), over that of the sequence."""
+    """Return the likeliest correlation length of a sequence (n,), divided by the length of the sequence."""
     likelihood, _ = likelihoods(cosine_terms(values).slow)
     return float(1.0 / np.tile(RATES, len(WHITE_SHARES) + 1)[int(np.argmax(likelihood * weights("power")))])
 
 
 def mean_draws(values: FloatArray, kind: Kind = "mean", place_m: FloatArray | None = None) -> FloatArray:
-    """Draws of the mean of the process minus the mean of the sequence.
+    """Draw the mean of the process minus the mean of the sequence.
 
     Parameters
     ----------
@@ -372,7 +362,7 @@ def mean_draws(values: FloatArray, kind: Kind = "mean", place_m: FloatArray | No
     kind : {"mean", "ratio"}
         Errors, or differences of their squares.
     place_m : (n, 3), optional
-        East, north and up of each sample, NaN if unknown [m]: errors may then be correlated over place as well.
+        East, north and up of each sample, NaN if unknown [m]. Correlation over place is then considered, too.
     """
     if np.ptp(values) == 0.0:
         return np.zeros(2 * _PAIRS)
@@ -386,17 +376,17 @@ def mean_draws(values: FloatArray, kind: Kind = "mean", place_m: FloatArray | No
 
 
 def heavy_tails(values: FloatArray) -> float:
-    """Standard deviation of the logarithm of the mean square (see :data:`CALM`) for tails heavier than normal.
+    """Return the standard deviation of the logarithm of the mean square for heavy tails (see :data:`CALM`).
 
-    The innovations of a first-order autoregression show them where the sequence itself sums over many.
+    The innovations of a first-order autoregression show the tails, because a sample sums over many innovations.
     """
     away, n = values - values.mean(), len(values) - 1
     keep = min(float(away[1:] @ away[:-1]) / float(away @ away), 1.0)
-    both = away[1:] - keep * away[:-1], away[:-1] - keep * away[1:]  # whichever way the time runs
+    both = away[1:] - keep * away[:-1], away[:-1] - keep * away[1:]  # in both directions of time
     square = max((np.square(e) for e in both), key=lambda e: float(e @ e) / max(float(e.mean()) ** 2, 1e-300))
-    # a short normal sequence shows heavy tails by chance: only what is beyond half of its spread counts
+    # Subtract half of the standard error: a short normal sequence shows heavy tails by chance.
     excess = float(square @ square) / n / max(float(square.mean()) ** 2, 1e-300) - 3.0 - np.sqrt(6.0 / n)
-    # a long sequence has met the rare large errors that a short one lacks: sharper by its length, found as CALM was
+    # A long sequence contains the rare large errors that are missing in a short one. Found by simulation, like CALM.
     return float(np.sqrt(max(excess, 0.0) / n) * (300.0 / n) ** 0.1)
 
 
@@ -406,9 +396,9 @@ def loud_part(values: FloatArray) -> tuple[float, float]:
     Returns
     -------
     share, ratio : float
-        Share of the samples in the loud parts, and their mean square over that of the others; 0 and 1 if the sequence
-        is steady. Two parts at least are loud by the innovations of a second-order autoregression, which are hardly
-        correlated, and by their own mean square.
+        Share of the samples in the loud parts, and their mean square divided by that of the others. 0 and 1 if the
+        sequence is steady. At least two parts must be loud by the innovations of a second-order autoregression, which
+        are hardly correlated, and by their own mean square.
     """
     away = values - values.mean()
     if len(away) < _FEWEST_FOR_PARTS or not away.any():
@@ -426,9 +416,9 @@ def loud_part(values: FloatArray) -> tuple[float, float]:
 
 
 def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatArray:
-    """Draws of the mean square about their own mean that sequences of this length and spacing have on average.
+    """Draw the average mean square about their own mean of sequences with this length and spacing.
 
-    In the order of :func:`mean_draws`. What a memory longer than the sequence adds to the mean does not count.
+    Draws have the order of :func:`mean_draws`. A correlation longer than the sequence adds to its mean alone.
 
     Parameters
     ----------
@@ -448,12 +438,12 @@ def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatA
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
     fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
     share, ratio = loud_part(values)
-    # a loud part alone makes the tails of the whole flight heavy, and is counted below
+    # a loud part makes the tails of the flight heavy, and is included below
     heavy = (0.7 if share else 1.0) * heavy_tails(values)
     tails = np.exp(heavy * np.where(normal > 0.0, CALM, 1.0) * normal)
     drawn = (scale * known.joined("power")[index] + fast) * tails
     log = _stretched(np.log(drawn), stretch)
-    # a loud part has fewer independent samples than the flight: what the variance of a weighted mean grows by
+    # a loud part has fewer independent samples than the flight: increase the variance as for a weighted mean
     more = np.sqrt(share * ratio**2 + 1.0 - share) / (share * ratio + 1.0 - share)
     middle = np.median(log)
     return np.tile(np.exp(middle + more * (log - middle)), 2)
@@ -462,26 +452,26 @@ def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatA
 # Bootstrap replicates.
 REPLICATES = 1000
 
-# One seed feeds all resampling: the same logs give the same intervals.
+# One seed for all resampling, so that the same logs have the same intervals.
 SEED = 20_250_210
 
-# Blocks are twice Politis and White's length: that one minimises the error of the variance, not of the coverage.
+# Blocks have twice the length of Politis and White, which minimises the error of the variance, not of the coverage.
 _LONGER = 2.0
 
-# Lags in a row: Politis and White's max(5, sqrt(log10 n)) is 5 for any flight.
+# Number of consecutive insignificant lags: max(5, sqrt(log10 n)) of Politis and White is 5 for any flight.
 _RUN = 5
 
-# Width of an interval over its value from which its lower end alone is given.
+# Width of an interval relative to its value above which only its lower end is reported.
 _BOUND = 2.0
 
-# Stretches of a flight; the share of each comes from the others.
-_STRETCHES = 24
+# Number of segments of a flight. The share in each comes from the others.
+_SEGMENTS = 24
 
-# Share of flights with a false verdict on any channel that is aimed at; at 0.05 it is 1 to 10 % of simulated flights,
-# since chances far out are known less well than an interval's ends.
+# Nominal share of flights with a false verdict on any channel. A nominal 0.05 has 1 to 10 % in simulations, because
+# small chances are known less well than the ends of an interval.
 _FAMILY = 0.02
 
-# Numbers held at once per bootstrap: bounds memory to tens of MiB.
+# Numbers per block of a bootstrap, which limits memory to tens of MiB.
 _HELD = 1 << 21
 
 Interval = tuple[float, float]
@@ -490,16 +480,16 @@ NO_INTERVAL: Interval = (float("nan"), float("nan"))
 
 @dataclass(frozen=True, slots=True)
 class Autocorrelation:
-    """Memory of a sequence.
+    """The effect of the autocorrelation of a sequence.
 
     Parameters
     ----------
     n : int
-        Samples.
+        Number of samples.
     block_length : int
         Block length for the circular block bootstrap [samples].
     n_effective : float
-        Independent samples that would fix the mean equally well, 1 to ``n``; NaN below two samples.
+        Number of independent samples that determine the mean equally well, 1 to ``n``. NaN below two samples.
     """
 
     n: int
@@ -508,22 +498,22 @@ class Autocorrelation:
 
 
 def autocovariance(values: ArrayLike, lags: int) -> FloatArray:
-    """Biased autocovariance at lags 0 .. ``lags`` (by FFT); values (n,) without NaN."""
+    """Return the biased autocovariance at lags 0 to ``lags`` (by FFT) of values (n,) without NaN."""
     x = unmasked(values)
     n = len(x)
-    # twice the length: the transform takes the sequence for a circle
+    # pad to twice the length, because the transform is circular
     size = 1 << (2 * n - 1).bit_length()
     spectrum = np.fft.rfft(x - x.mean(), size)
     return np.asarray(np.fft.irfft(np.abs(spectrum) ** 2, size)[: lags + 1] / n)
 
 
 def _significant(n: int) -> float:
-    """Autocorrelation above which a lag counts (Politis and White's rule)."""
+    """Return the autocorrelation above which a lag is significant (Politis and White's rule)."""
     return 2.0 * float(np.sqrt(np.log10(n) / n))
 
 
 def _cutoff(correlation: FloatArray, n: int) -> int:
-    """Last lag before the autocorrelation stays insignificant for :data:`_RUN` lags (Politis and White's rule)."""
+    """Return the last lag before :data:`_RUN` consecutive insignificant lags (Politis and White's rule)."""
     small = np.abs(correlation[1:]) < _significant(n)
     small_so_far = np.concatenate([[0], np.cumsum(small)])
     runs = small_so_far[_RUN:] - small_so_far[:-_RUN] == _RUN
@@ -531,7 +521,7 @@ def _cutoff(correlation: FloatArray, n: int) -> int:
 
 
 def _flat_top(covariance: FloatArray, n: int) -> tuple[float, float, float]:
-    """Long-run variance, the sum of its lag window and the sum over lag times covariance, by the flat-top window."""
+    """Return long-run variance, sum of the lag window, and sum of lag times covariance, by the flat-top window."""
     lags = min(2 * max(1, _cutoff(covariance / covariance[0], n)), len(covariance) - 1)
     lag = np.arange(1, lags + 1)
     window = np.clip(2.0 * (1.0 - lag / lags), 0.0, 1.0)
@@ -540,10 +530,9 @@ def _flat_top(covariance: FloatArray, n: int) -> tuple[float, float, float]:
 
 
 def _exponential_decay(covariance: FloatArray, n: int) -> tuple[float, float]:
-    """Long-run variance, and the sum over lag times covariance, of white noise plus an exponential memory.
+    """Return long-run variance and sum of lag times covariance for white noise plus an exponential correlation.
 
-    The decay comes from the ratio of neighbouring lags down to a correlation of one half: the lags that the removed
-    mean touches least.
+    The decay is fitted to consecutive lags down to a correlation of one half, which the removed mean changes least.
     """
     correlation = covariance / covariance[0]
     if correlation[1] < _significant(n):
@@ -568,21 +557,19 @@ def autocorrelation(values: ArrayLike) -> Autocorrelation:
     Returns
     -------
     Autocorrelation
-        A constant sequence and fewer than eight samples give blocks of one.
+        Blocks have a length of one for a constant sequence and for fewer than eight samples.
 
     Notes
     -----
-    With the mean taken off, autocovariances are short by V / n, where V is the long-run variance (sum of all
-    autocovariances): on a flight that is a few correlation times long, that hides most of the memory. V is therefore
-    solved for together with the covariances that it completes; where no V below n times the variance does, the
-    sequence is worth one sample.
+    Subtracting the mean makes all autocovariances too small by V / n, where V is the long-run variance (the sum of all
+    autocovariances). On a flight of a few correlation times, this hides most of the correlation. V and the corrected
+    covariances are therefore solved together. If there is no V below n times the variance, the effective size is one.
 
-    V is the larger of two estimates: the flat-top lag window of Politis and White (2004),
-    doi:10.1081/ETC-120028836, and white noise plus an exponential memory (Gudmundson 1991,
+    V is the larger of two estimates. One is the flat-top lag window of Politis and White (2004),
+    doi:10.1081/ETC-120028836. The other is white noise plus an exponential correlation (Gudmundson 1991,
     doi:10.1049/el:19911328). The block length is that of Patton, Politis and White (2009),
-    doi:10.1080/07474930802459016, for the circular block bootstrap; lags are searched up to n / 2 (not sqrt n),
-    because radio samples come many per correlation length, and blocks are at most n / 5. The block variance is short
-    by G / (g L) to first order (Kuensch 1989, doi:10.1214/aos/1176347265).
+    doi:10.1080/07474930802459016, for the circular block bootstrap. Lags are searched up to n / 2 instead of sqrt n,
+    because there are many radio samples per correlation length. Blocks are at most n / 5.
 
     Examples
     --------
@@ -600,20 +587,20 @@ def autocorrelation(values: ArrayLike) -> Autocorrelation:
         covariance = unbiased + hidden
         by_window, width, window_reach = _flat_top(covariance, n)
         by_decay, decay_reach = _exponential_decay(covariance, n)
-        # the window's own sum holds the hidden part width / n times over
-        # a window nearly as long as the flight (infinite) says that it is worth one sample
+        # The sum of the window contains the hidden part width / n times. A window nearly as long as the flight means an
+        # effective size of one.
         by_window = (by_window - width * hidden) / (1.0 - width / n) if width < 0.8 * n else np.inf
         long_run, reach = max(by_window, by_decay), max(window_reach, decay_reach)
         if long_run >= n * covariance[0]:
             return Autocorrelation(n, max(1, n // 5), 1.0)
-        if long_run <= 0.0:  # oscillating: the mean is known at least as well as from independent samples
+        if long_run <= 0.0:  # an oscillation determines the mean at least as well as independent samples
             long_run = float(unbiased[0])
         if abs(long_run / n - hidden) < 1e-3 * unbiased[0]:
             break
         hidden = long_run / n
     slope = max(0.0, 2.0 * reach / long_run)
     length = _LONGER * (1.5 * slope**2 * n) ** (1.0 / 3.0)
-    # five blocks at least: of fewer the draws repeat each other
+    # at least five blocks, because resamples of fewer repeat each other
     block = int(np.clip(np.ceil(length), 1, max(1, n // 5)))
     effective = float(np.clip(n * (unbiased[0] + hidden) / long_run, 1.0, n))
     return Autocorrelation(n, block, effective)
@@ -626,18 +613,18 @@ def bootstrap_means(
     replicates: int = REPLICATES,
     seed: int = SEED,
 ) -> FloatArray:
-    """Column means of circular block resamples.
+    """Return the column means of circular block resamples.
 
     Parameters
     ----------
     columns : (n, m)
-        Samples in time order. Centre them first where squares of large levels would lose digits.
+        Samples in time order. Centre them first if squares of large levels would lose digits.
     block_length : int
-        Samples per block, 1 .. n.
+        Samples per block, 1 to n.
     replicates : int
-        Resamples.
+        Number of resamples.
     seed : int
-        Of the generator.
+        Seed of the generator.
 
     Returns
     -------
@@ -645,8 +632,8 @@ def bootstrap_means(
 
     Notes
     -----
-    The sum over a block is known from its start alone, so a resample is a set of starts: few long blocks are
-    gathered, many short ones counted and multiplied (one matrix product for all replicates).
+    The start of a block determines its sum, so a resample is a set of starts. A few long blocks are gathered. Many
+    short ones are counted and multiplied, which is one matrix product for all replicates.
     """
     n, width = columns.shape
     rng = np.random.default_rng(seed)
@@ -670,7 +657,7 @@ def bootstrap_means(
 
 
 def _block_sums(columns: FloatArray, length: int) -> FloatArray:
-    """Sum of ``length`` rows from every start (n, m), on a circle."""
+    """Return the sum of ``length`` rows from every start (n, m), on a circle."""
     running = np.zeros((len(columns) + length, columns.shape[1]))
     np.cumsum(np.concatenate([columns, columns[: length - 1]]), axis=0, out=running[1:])
     return np.asarray(running[length:] - running[:-length])
@@ -678,17 +665,16 @@ def _block_sums(columns: FloatArray, length: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class ErrorIntervals:
-    """95 % intervals of one measured and simulated sequence of levels.
+    """The 95 % intervals of one measured and simulated sequence of levels.
 
     Parameters
     ----------
     offset_db, rmse_db, correlation : (low, high)
-        NaN ("no interval") of fewer than :data:`~aerpaw_cmp.compare.statistics.FEWEST` samples, or where the
-        statistic does not exist.
+        NaN ("no interval") for fewer than :data:`FEWEST` samples, or if the statistic does not exist.
     autocorrelation : Autocorrelation
-        Of the residual.
+        Effective size and block length of the residual.
     notes : tuple of str
-        Sentences on what limits the intervals.
+        Sentences on the limits of the intervals.
     """
 
     offset_db: Interval
@@ -701,7 +687,7 @@ class ErrorIntervals:
 def error_intervals(
     measured_db: FloatArray, simulated_db: FloatArray, place_m: FloatArray | None = None
 ) -> ErrorIntervals:
-    """Intervals of offset (mean difference), RMSE about it and correlation of the process behind a flight.
+    """Compute the intervals of offset (mean difference), RMSE about it, and correlation of the process of a flight.
 
     Parameters
     ----------
@@ -729,7 +715,7 @@ def error_intervals(
 
 
 def _notes(values: FloatArray, place_m: FloatArray | None) -> Iterator[str]:
-    """Sentences on what limits the intervals of a sequence (n,)."""
+    """Yield sentences on the limits of the intervals of a sequence (n,)."""
     if place_m is not None and (reason := only_time(place_m)):
         yield f"The intervals consider correlation over time alone: {reason}."
     share, ratio = loud_part(values)
@@ -741,7 +727,7 @@ def _notes(values: FloatArray, place_m: FloatArray | None) -> Iterator[str]:
 
 
 def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray, place_m: FloatArray | None) -> Interval:
-    """The route was flown as it was: only slope and rest of the measurement over the simulation are random."""
+    """Return the interval of the correlation for a fixed route: slope and rest of the measurement are random."""
     s, m = simulated_db - simulated_db.mean(), measured_db - measured_db.mean()
     spread = float(s @ s) / len(s)
     if spread == 0.0 or not m.any():
@@ -791,10 +777,10 @@ def influence_interval(
 
 
 def spread_interval(values: FloatArray, place_m: FloatArray | None = None) -> Interval:
-    """95 % interval of the standard deviation that sequences such as this one (n,), in time order, have on average.
+    """Return the 95 % interval of the average standard deviation of sequences such as this one (n,) in time order.
 
-    Wider than :data:`_BOUND` times the value, it is given as a bound: its upper end is infinite. Positions ``place_m``
-    (n, 3) [m] are used as by :func:`mean_draws`.
+    The upper end of an interval wider than :data:`_BOUND` times the value is infinite: it is a lower bound. Positions
+    ``place_m`` (n, 3) [m] are used as by :func:`mean_draws`.
     """
     if len(values) < FEWEST:
         return NO_INTERVAL
@@ -803,10 +789,10 @@ def spread_interval(values: FloatArray, place_m: FloatArray | None = None) -> In
 
 
 def rmse_interval(residual: FloatArray, rmse: float, place_m: FloatArray | None = None) -> Interval:
-    """95 % interval of the root mean square of residuals (n,) in time order, whose value is ``rmse``.
+    """Return the 95 % interval of the root mean square of residuals (n,) in time order, whose value is ``rmse``.
 
-    An offset from a grid, at the edge of its span or beside a floor leaves a mean, which moves both ends as it moves
-    the RMSE. Positions ``place_m`` (n, 3) [m] are used as by :func:`mean_draws`.
+    The residuals have a mean if the offset is on a grid, at the edge of its range or fitted with a floor. The mean
+    changes both ends like the RMSE. Positions ``place_m`` (n, 3) [m] are used as by :func:`mean_draws`.
     """
     if len(residual) < FEWEST:
         return NO_INTERVAL
@@ -815,7 +801,7 @@ def rmse_interval(residual: FloatArray, rmse: float, place_m: FloatArray | None 
 
 
 def _around(estimate: float, drawn: FloatArray) -> Interval:
-    """95 % interval from draws; it holds the estimate."""
+    """Return the 95 % interval of draws, extended to the estimate."""
     if not np.isfinite(estimate) or not np.isfinite(drawn).any():
         return NO_INTERVAL
     low, high = np.nanquantile(drawn, [0.025, 0.975])
@@ -823,21 +809,21 @@ def _around(estimate: float, drawn: FloatArray) -> Interval:
 
 
 def middle_span(values: FloatArray) -> float:
-    """Width of the middle 80 % of values (n,)."""
+    """Return the width of the middle 80 % of values (n,)."""
     return float(np.ptp(np.percentile(values, (10, 90))))
 
 
-# A level that spans less than this share of the predicted ones is flat: a floor, a dead input.
+# A level that spans less than this share of the predicted ones is flat: a noise floor or an input without signal.
 _FLAT = 0.2
 
 
 def is_flat(measured_db: FloatArray, predicted_db: Iterable[FloatArray]) -> bool:
-    """True of a level (n,), n > 0, that hardly varies where every prediction (n,) of it does [dB]."""
+    """Check whether a level (n,), n > 0, hardly varies although every prediction (n,) of it does [dB]."""
     return middle_span(measured_db) < _FLAT * min(map(middle_span, predicted_db))
 
 
 def correlation(first: ArrayLike, second: ArrayLike) -> float:
-    """Pearson correlation over pairs without NaN; NaN where a side is constant or fewer than two pairs exist."""
+    """Return the Pearson correlation over pairs without NaN, NaN if a side is constant or there are fewer than two."""
     a, b = unmasked(first), unmasked(second)
     ok = np.isfinite(a) & np.isfinite(b)
     if ok.sum() < 2 or np.ptp(a[ok]) == 0.0 or np.ptp(b[ok]) == 0.0:
@@ -848,27 +834,27 @@ def correlation(first: ArrayLike, second: ArrayLike) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairedDifference:
-    """Two models on the same samples: whose error is smaller, and how well that is known.
+    """A comparison of two models on the same samples, with the significance of the difference.
 
     Parameters
     ----------
     n : int
-        Samples at which both models have an error.
+        Number of samples at which both models have an error.
     rmse_db, other_rmse_db : float
-        Of the first and of the second model [dB].
+        RMSE of the first and of the second model [dB].
     difference_db : float
-        ``rmse_db - other_rmse_db`` [dB]: negative where the first model is better.
+        ``rmse_db - other_rmse_db`` [dB], negative if the first model is better.
     difference_ci95_db : (low, high)
-        95 % interval of it [dB]; NaN where none can be given, and where one that holds 0 reaches beyond an error of
-        none for either model: the flight is too short for its memory.
+        95 % interval of the difference [dB]. NaN if there is none, or if it contains 0 and would make an error
+        negative: the flight is then too short for its correlation.
     standard_error_db : float
-        Of ``difference_db`` [dB]: half of its central 68 % interval; NaN where none can be given.
+        Half of the central 68 % interval of ``difference_db`` [dB], NaN if there is none.
     mean_square_difference_db2, mean_square_ci95_db2 : float, (low, high)
         Difference of the mean square errors and its interval [dB^2].
     p_value : float
-        Chance of a difference as large between models that are equally good.
+        Probability of a difference as large between equally good models.
     verdict : {"better", "worse", "not significant", "no interval"}
-        What the interval says about the first model; "no interval" where there is no interval.
+        Verdict of the interval on the first model.
     """
 
     n: int
@@ -883,7 +869,7 @@ class PairedDifference:
     verdict: Literal["better", "worse", "not significant", "no interval"]
 
     def in_words(self, other_model: str) -> str:
-        """A clause for a report, such as "worse than free space by 0.6 dB [0.2, 1.0]"."""
+        """Return a clause for a report, such as "worse than free space by 0.6 dB [0.2, 1.0]"."""
         if not self.n:
             return f"no sample in common with {other_model}"
         size = f"{abs(self.difference_db):.1f} dB"
@@ -906,10 +892,10 @@ def paired_difference(
     Parameters
     ----------
     error_db, other_error_db : array_like, (n,)
-        Measured minus predicted, in time order [dB]; samples with a NaN on either side take no part.
+        Measured minus predicted, in time order [dB]. Samples with a NaN on either side are ignored.
     free_offset : bool
-        Each model has an offset of its own fitted on these samples (an error counts about its mean). False for errors
-        on samples kept out of the fit: they count as they are.
+        True if each model has its own offset, so that errors count about their mean. False for held-out errors, which
+        count as they are.
     place_m : (n, 3), optional
         As for :func:`mean_draws`.
 
@@ -919,10 +905,10 @@ def paired_difference(
 
     Notes
     -----
-    With d the difference of the two predictions, which the route fixes, and b the share of it that the measurement asks
-    for, the difference of the mean square errors is (2 b - 1) times the mean square of d: random is what regression on
-    d leaves of the error, times d (Harvey, Leybourne and Newbold 1998, doi:10.1080/07350015.1998.10524759). Each
-    stretch takes b from the other stretches, so that a stretch that alone decides b counts as an accident.
+    Let d be the difference of the two predictions, which the route determines, and b the coefficient of a regression of
+    the error on d. The difference of the mean square errors is (2 b - 1) times the mean square of d. Its random part is
+    d times the residual of that regression (Harvey, Leybourne and Newbold 1998, doi:10.1080/07350015.1998.10524759). In
+    each segment, b comes from the other segments, so that a segment that determines b alone counts as an accident.
 
     Examples
     --------
@@ -947,7 +933,7 @@ def paired_difference(
         bounds = squares[0] / scale, squares[1] / scale
         if bounds[0] <= 0.0 <= bounds[1] and (bounds[0] < -other_rmse or bounds[1] > rmse):
             bounds = NO_INTERVAL
-        # one standard deviation of a normal distribution on either side: heavy tails do not count
+        # the central 68 %, so that heavy tails do not count
         spread = float(0.5 * np.diff(np.quantile(drawn, [0.1587, 0.8413]))[0]) / scale
         chance = 2.0 * min(float(np.mean(drawn <= 0.0)), float(np.mean(drawn >= 0.0)), 0.5)
     return PairedDifference(
@@ -965,14 +951,14 @@ def paired_difference(
 
 
 def undecided(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Part of the difference of the mean squares that each sample (n,) adds by chance [dB^2]."""
+    """Return the random part of the difference of mean squares that each sample (n,) adds [dB^2]."""
     apart = first - second
-    stretch = np.arange(len(apart)) * _STRETCHES // len(apart)
-    products, squares = (np.bincount(stretch, values, _STRETCHES) for values in (first * apart, apart * apart))
-    # hardly a weight: where one stretch holds all of the difference, the others say that the models are equal
+    segment = np.arange(len(apart)) * _SEGMENTS // len(apart)
+    products, squares = (np.bincount(segment, values, _SEGMENTS) for values in (first * apart, apart * apart))
+    # a small weight towards equal models, which decides if one segment contains all of the difference
     even = 1e-3 * squares.sum() + 1e-300
     share = (products.sum() - products + 0.5 * even) / (squares.sum() - squares + even)
-    return np.asarray(2.0 * (first - share[stretch] * apart) * apart)
+    return np.asarray(2.0 * (first - share[segment] * apart) * apart)
 
 
 def pooled_difference(
@@ -981,22 +967,22 @@ def pooled_difference(
     free_offset: bool = True,
     place_m: Sequence[FloatArray] | None = None,
 ) -> PairedDifference:
-    """Two models over all channels of a flight at once.
+    """Compare two models over all channels of a flight at once.
 
     Parameters
     ----------
     channels : sequence of ((n,), (n,), (n,))
-        Per channel: instants, and the errors of the two models at them [dB]. NaN takes no part.
+        Times and the errors of the two models [dB] of each channel. NaN is ignored.
     free_offset : bool
-        Each channel and model has an own offset.
+        True if each channel and model has its own offset.
     place_m : sequence of (n, 3), optional
         Positions of each channel's samples, as for :func:`mean_draws`.
 
     Returns
     -------
     PairedDifference
-        Of the root mean square errors over all samples. Samples of one time stand together whatever their channel, so
-        that fading which the channels share counts as shared.
+        Comparison of the root mean square errors over all samples. Samples of all channels are in time order, so that
+        common fading of the channels counts once.
     """
     parts = []
     for at, (time, error, other) in enumerate(channels):
@@ -1013,11 +999,11 @@ def pooled_difference(
 
 
 def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | None = None) -> list[PairedDifference]:
-    """Verdicts of several channels, corrected for their number (Holm 1979): all that stay are true in 95 % of cases.
+    """Correct the verdicts of several channels for their number (Holm 1979): all that remain are true in 95 % of cases.
 
-    Channels of which the same was ``measured`` count once.
+    Channels with the same ``measured`` levels count once.
     """
-    # Holm's: the least chance is held against the number of all, the next against one less
+    # Holm: the smallest chance is multiplied by the number of channels, the next by one less
     order = sorted(range(len(pairs)), key=lambda i: pairs[i].p_value)
     names = measured or range(len(pairs))
     out, tried = list(pairs), {names[i] for i in order if pairs[i].verdict != "no interval"}
@@ -1032,7 +1018,7 @@ def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | 
 
 
 def paired_verdict(low: float, high: float) -> Literal["better", "worse", "not significant", "no interval"]:
-    """The word that the interval of a difference of errors allows."""
+    """Return the verdict for the interval of a difference of errors."""
     if not (np.isfinite(low) and np.isfinite(high)):
         return "no interval"
     return "better" if high < 0 else "worse" if low > 0 else "not significant"
@@ -1077,16 +1063,16 @@ def share_interval(
     return (0.0 if share == 0.0 else max(0.0, low)), (1.0 if share == 1.0 else min(1.0, high))
 
 
-# Samples of two passes nearer than this were taken at the same place.
+# Distance below which samples of two passes count as taken at the same position [m].
 SAME_PLACE_M = 2.0
 
-# Largest difference of the headings of such samples, where headings count.
+# Largest difference of the headings of such samples, if headings are given [deg].
 _HEADING_WITHIN_DEG = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class Visit:
-    """One pass by itself: places (n, 3) [m], values (n,), NaN where there is none, headings (n,) where they count."""
+    """One pass: positions (n, 3) [m], values (n,), NaN if missing, and optional headings (n,) [deg]."""
 
     position_m: FloatArray
     value: FloatArray
@@ -1094,13 +1080,13 @@ class Visit:
 
     @property
     def places(self) -> _Places:
-        """Of the samples that have a place and a value."""
+        """The positions of samples with a position and a value."""
         known = np.isfinite(self.position_m).all(axis=1) & np.isfinite(self.value)
         return _Places(self.position_m, self.heading_deg, np.flatnonzero(known))
 
 
 def same_places(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> tuple[IntArray, IntArray]:
-    """Indices into both passes: samples with a value, and the nearest ones of the other pass within a radius [m]."""
+    """Return indices into both passes: samples with a value, and the nearest ones of the other pass in a radius [m]."""
     return first.places.partners(second.places, radius_m, _HEADING_WITHIN_DEG)
 
 
@@ -1111,11 +1097,11 @@ class Pass:
     Parameters
     ----------
     flight, link : str
-        Passes of one link and of two flights are compared.
+        Names. Passes of one link and of two flights are compared.
     position_m : ndarray, (n, 3)
-        East, north, up; rows with NaN pair with nothing.
+        East, north, up. Rows with NaN have no partner.
     level_db, residual_db : ndarray, (n,)
-        Measurement, and measurement minus simulation; NaN where there is none.
+        Measurement, and measurement minus simulation, NaN if missing.
     heading_deg : ndarray, (n,), optional
         Clockwise from north.
     """
@@ -1130,22 +1116,23 @@ class Pass:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PassPair:
-    """Two passes of one link; ``first`` and ``second`` count the passes as they were given.
+    """A comparison of two passes of one link, whose indices are ``first`` and ``second``.
 
     Parameters
     ----------
     n : int
-        Samples of the first pass that have a partner.
+        Number of samples of the first pass with a partner.
     rmse_db, offset_db : float
-        Standard deviation and mean of second minus first; NaN without a pair.
+        Standard deviation and mean of second minus first, NaN without a pair.
     rmse_ci95_db : (low, high)
-        Of the RMSE (:func:`spread_interval`).
+        95 % interval of the RMSE (:func:`spread_interval`), with correlation over time alone.
     residual_rmse_db : float
-        The same of the residuals.
+        Standard deviation of the difference of the residuals.
     place_rmse_db, place_correlation, height_difference_m : float
-        Of the mean residuals, and the median difference of the mean heights, over the cells that both have.
+        Standard deviation and correlation of the mean residuals, and median difference of the mean heights, over common
+        cells.
     cells : int
-        Those cells.
+        Number of common cells.
     """
 
     first: int
@@ -1165,7 +1152,7 @@ class PassPair:
 
 
 class _Places:
-    """Samples that have a place and a value, their tree and their box; ``where`` are their numbers in the pass."""
+    """The samples with a position and a value, their tree and their box. ``where`` are their indices in the pass."""
 
     def __init__(self, position_m: FloatArray, heading_deg: FloatArray | None, where: IntArray) -> None:
         self.where = where
@@ -1185,15 +1172,15 @@ class _Places:
         return self._tree
 
     def partners(self, other: _Places, radius_m: float, within_deg: float | None) -> tuple[IntArray, IntArray]:
-        """Numbers, in both passes, of samples and the nearest ones of the other pass; headings agree."""
-        # only what lies in the other's box can pair: most flights of a season end here
+        """Return indices, in both passes, of samples and the nearest ones of the other pass with the same heading."""
+        # only samples in the box of the other pass can pair, which excludes most flights of a campaign
         near = np.flatnonzero(
             ((self.position_m >= other.low - radius_m) & (self.position_m <= other.high + radius_m)).all(axis=1)
         )
         if not len(near):
             return near, near
         distance, nearest = other.tree.query(self.position_m[near], distance_upper_bound=radius_m)
-        # the tree answers infinity where nothing is near enough
+        # the tree returns infinity if there is no near sample
         paired = np.isfinite(distance)
         rows, nearest_rows = near[paired], nearest[paired]
         if within_deg is not None and self.heading_deg is not None and other.heading_deg is not None:
@@ -1205,7 +1192,7 @@ class _Places:
 
 @dataclass(slots=True)
 class _Prepared:
-    """A pass ready to be paired: places of levels and of residuals (by key), and means by cell."""
+    """A pass ready to be paired: keys of the positions of levels and residuals, and means by cell."""
 
     number: int
     flown: Pass
@@ -1217,13 +1204,13 @@ class _Prepared:
 
 
 class PassTable:
-    """Passes ready to be paired.
+    """A table of passes ready to be paired.
 
     Parameters
     ----------
     passes : sequence of Pass
     cell_m : float
-        Edge of the cells of the plan.
+        Side of the square cells on the map [m].
     """
 
     def __init__(self, passes: Sequence[Pass], cell_m: float) -> None:
@@ -1235,14 +1222,14 @@ class PassTable:
             links.setdefault(flown.link, []).append(_prepare(number, flown, cell_m, self._places))
 
     def pairs(self, *, radius_m: float, heading_within_deg: float | None) -> Iterator[PassPair]:
-        """Every pair of two flights' passes on one link, by first flight, second flight and link.
+        """Yield every pair of two flights' passes on one link, by first flight, second flight and link.
 
         Parameters
         ----------
         radius_m : float
             A sample of the first pass pairs with the nearest one of the second within this distance.
         heading_within_deg : float, optional
-            Headings of a pair agree within this, where both passes have headings; None: any heading.
+            Largest difference of the headings of a pair, if both passes have headings. None allows any heading.
 
         Yields
         ------
@@ -1250,7 +1237,7 @@ class PassTable:
         """
         for first, second in combinations(self._flights.values(), 2):
 
-            @cache  # the searches of a pair of flights are shared by its links, and forgotten after it
+            @cache  # the links of a pair of flights share its searches
             def met(mine: bytes, theirs: bytes) -> tuple[IntArray, IntArray]:
                 return self._places[mine].partners(self._places[theirs], radius_m, heading_within_deg)
 
@@ -1276,12 +1263,12 @@ def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Place
 
 
 def _entered(flown: Pass, good: BoolArray, places: dict[bytes, _Places]) -> bytes:
-    """Key of the places of some samples: links that were sampled together have one."""
+    """Store the positions of some samples and return their key, which links that were sampled together share."""
     digest = hashlib.blake2b(good.tobytes(), digest_size=16)
     digest.update(np.ascontiguousarray(flown.position_m).tobytes())
     if flown.heading_deg is not None:
         digest.update(np.ascontiguousarray(flown.heading_deg).tobytes())
-    # by content: links that were sampled together have equal places in arrays of their own
+    # a key by content: links that were sampled together have equal positions in different arrays
     key = digest.digest()
     if key not in places:
         places[key] = _Places(flown.position_m, flown.heading_deg, np.flatnonzero(good))
@@ -1291,28 +1278,28 @@ def _entered(flown: Pass, good: BoolArray, places: dict[bytes, _Places]) -> byte
 def cell_means(
     position_m: FloatArray, residual_db: FloatArray, good: BoolArray, cell_m: float
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Squares of the plan that have a sample: (c, 2) numbers east and north in order, mean residual, mean height.
+    """Return the square cells with a sample, their mean residual and mean height.
 
     Parameters
     ----------
     position_m : (n, 3)
     residual_db : (n,)
     good : (n,) bool
-        Samples that count.
+        True for samples that count.
     cell_m : float
-        Side of a square [m].
+        Side of a cell [m].
 
     Returns
     -------
     cells : (c, 2) int
-        Numbers of the squares, east and north, ascending.
+        Indices of the cells, east and north, ascending.
     residual_db, height_m : (c,)
-        Means over the samples of each square.
+        Means over the samples of each cell.
     """
-    # in the plan: two passes at other heights share their squares
+    # horizontal cells, so that passes at different heights share them
     cells = np.floor(position_m[good, :2] / cell_m).astype(np.int64)
     cell, which = np.unique(cells, axis=0, return_inverse=True)
-    # NumPy 2.0 gives it two dimensions
+    # NumPy 2.0 returns two dimensions
     which = which.reshape(-1)
     count = np.maximum(np.bincount(which, minlength=len(cell)), 1)
     residual = np.bincount(which, weights=residual_db[good], minlength=len(cell)) / count
@@ -1326,12 +1313,12 @@ def _pair(
     met: Callable[[bytes, bytes], tuple[IntArray, IntArray]],
     shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]],
 ) -> PassPair:
-    """Two passes of a link; ``met`` gives the partners of their places by key, ``shared`` keeps their common cells."""
+    """Compare two passes of a link. ``met`` finds partners by the keys of positions, ``shared`` caches common cells."""
     i, j = met(mine.level, theirs.level)
     level = theirs.flown.level_db[j] - mine.flown.level_db[i]
     i, j = met(mine.residual, theirs.residual)
     residual = theirs.flown.residual_db[j] - mine.flown.residual_db[i]
-    cells = mine.residual, theirs.residual  # the same places, so the same cells and heights
+    cells = mine.residual, theirs.residual  # equal positions have the same cells and heights
     if cells not in shared:
         i, j = _common(mine.cells, theirs.cells)
         height = float(np.median(theirs.heights[j] - mine.heights[i])) if len(i) else float("nan")
@@ -1354,16 +1341,16 @@ def _pair(
 
 
 def _common(first: IntArray, second: IntArray) -> tuple[IntArray, IntArray]:
-    """Rows of both that name the same cell, in the order of the cells (both are sorted and have each cell once)."""
-    # one integer per cell: numpy intersects rows of two columns by sorting records, ten times slower
+    """Return the rows of both with the same cell, in the order of the cells. Both are sorted without duplicates."""
+    # one integer per cell: NumPy intersects rows of two columns by sorting records, ten times slower
     a, b = ((cells[:, 0] << 32) + cells[:, 1] for cells in (first, second))
     _, i, j = np.intersect1d(a, b, assume_unique=True, return_indices=True)
     return i, j
 
 
-# Rows or columns, whichever are fewer: the power sums below make a characteristic polynomial up to this order.
+# Largest order of the characteristic polynomial of the power sums below: the smaller of rows and columns.
 LARGEST = 4
-# Matrices at once; they fit into a processor's cache.
+# Matrices per block, which fit into the cache of a processor.
 LANES = 4096
 # Half width of the zone around the threshold, as a share of lambda_1 / K^2, in which singular values decide.
 _GUARD = 1e-3
@@ -1371,15 +1358,15 @@ _ITERATIONS = 8
 
 
 def certain_rank(h: ComplexArray, k: float) -> tuple[IntArray, BoolArray]:
-    """Ranks (t,) of channel matrices (t, n_rx, n_tx) at a ratio ``k``, and where they are beyond doubt.
+    """Return the ranks (t,) of channel matrices (t, n_rx, n_tx) at a ratio ``k``, and True where they are certain.
 
     Matrices without a channel, with an entry that is not finite, or of an extreme scale are never certain.
     """
-    # along the shorter side: the Gram matrix is smaller, and its other eigenvalues are zeros
+    # use the shorter side: its Gram matrix is smaller, and the other eigenvalues are zeros
     x = np.moveaxis(h, 0, 2) if h.shape[2] <= h.shape[1] else np.transpose(h, (2, 1, 0))
-    # matrices along the last axis: each step is one pass over memory
+    # put matrices along the last axis, so that each step is one pass over memory
     x = np.ascontiguousarray(x)
-    with np.errstate(all="ignore"):  # what is not finite is not certain
+    with np.errstate(all="ignore"):  # values that are not finite are not certain
         gram = np.einsum("kit,kjt->ijt", x.conj(), x)
         trace = np.einsum("iit->t", gram).real
         gram /= trace
@@ -1394,10 +1381,10 @@ def certain_rank(h: ComplexArray, k: float) -> tuple[IntArray, BoolArray]:
 
 
 def _largest_eigenvalue(gram: ComplexArray) -> tuple[FloatArray, FloatArray]:
-    """Largest eigenvalue (t,) of Gram matrices (n, n, t) of trace 1, and the last step of Laguerre's iteration.
+    """Return the largest eigenvalue (t,) of Gram matrices (n, n, t) of trace 1, and the last step of the iteration.
 
-    The iteration starts above all roots and comes down, threefold nearer per step or better, also to multiple ones.
-    There rounding of the polynomial moves the root by up to the fourth root of an ulp: within the guard.
+    Laguerre's iteration starts above all roots, and each step divides the distance by three or more, also for multiple
+    roots. There, rounding of the polynomial moves the root by up to the fourth root of an ulp, within the guard.
     """
     square = np.einsum("ikt,kjt->ijt", gram, gram)
     p2 = np.einsum("iit->t", square).real
@@ -1423,7 +1410,7 @@ def _largest_eigenvalue(gram: ComplexArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _positive_pivots(matrix: ComplexArray, shift: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Positive pivots (t,) of Hermitian ``matrix - shift`` (n, n, t), and how far elimination may magnify rounding.
+    """Count the positive pivots (t,) of Hermitian ``matrix - shift`` (n, n, t), and bound the growth of rounding.
 
     The part on and below the diagonal of ``matrix`` is overwritten.
     """

@@ -1,6 +1,6 @@
-"""Questions about logs: what names, files beside them, clocks or the ground contradict; what is assumed.
+"""Questions about logs: contradictions of names, neighbouring files, clocks and ground heights, and assumptions.
 
-Logs of several flights told apart by time and place.
+The file also sorts logs of several flights by time and position.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from ..site.site import Site
 from .clock import Origin, origin_of
 from .track import Track
 
-# Logs that end and begin within this are of one flight: radios are started before the take-off.
+# Logs that end and begin within this belong to one flight, because radios are started before take-off.
 SLACK = np.timedelta64(5, "m")
-# Tracks at one time, but some 5 km apart, are of two aircraft.
+# Tracks at one time but about 5 km apart belong to two aircraft.
 APART_DEG = 0.05
 
 Span = tuple[np.datetime64, np.datetime64]
@@ -35,13 +35,13 @@ Span = tuple[np.datetime64, np.datetime64]
 
 @dataclass
 class Flight:
-    """Files of one flight, and when it was (None: nothing has a wall clock)."""
+    """The files of one flight, and its time span (None without absolute times)."""
 
     files: list[IngestedFile] = field(default_factory=list)
     span: Span | None = None
     place: tuple[float, float] | None = None
     unsure: dict[str, str] = field(default_factory=dict)
-    """Questions about files that may be of another flight, by path."""
+    """Questions about files that may belong to another flight, by path."""
 
     @property
     def measured(self) -> list[Stream]:
@@ -50,19 +50,19 @@ class Flight:
 
     @property
     def complete(self) -> bool:
-        """True if it holds something to compare, and positions to compare it at."""
+        """True if the flight has measurements, and positions for them."""
         measured = self.measured
         tracked = any(_tracks(file) for file in self.files)
         return bool(measured) and (tracked or any("latitude_deg" in stream.frame for stream in measured))
 
 
 def flights(files: Sequence[IngestedFile]) -> list[Flight]:
-    """Flights in the order of time.
+    """Return flights in the order of time.
 
-    Telemetry begins a flight; a radio log belongs to the flight that it shares most time with. Logs with relative
-    times go to the flight on whose track their positions lie, else to that whose files lie in their folder; where
-    that says nothing, to the only flight, or to one of their own. Of several that hold both levels and positions, and
-    no clock beside them, each is a flight.
+    Telemetry begins a flight, and a radio log belongs to the flight with which it shares most time. Logs with relative
+    times belong to the flight on whose track their positions are, or otherwise to the flight in their folder. Without
+    such evidence they belong to the only flight, or to a separate one. If several logs have both levels and positions
+    and there is no absolute time, each is a flight.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
     """
     timed = [(file, span) for file in files if (span := _span_of(file)) is not None]
     groups: list[Flight] = []
-    # tracks first, in the order of time: radio logs then find their flight
+    # tracks first, in the order of time, so that radio logs then find their flight
     for file, span in sorted(timed, key=lambda entry: (not _tracks(entry[0]), entry[1][0])):
         place = _place(file)
         near = [flight for flight in groups if _meet(flight, span, place)]
@@ -81,7 +81,7 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
         flight.files.append(file)
         if _tracks(file) or not any(_tracks(member) for member in flight.files):
             assert flight.span is not None
-            # a radio that was left on does not stretch a flight that has a track
+            # a radio that was left on does not extend a flight that has a track
             flight.span = (min(flight.span[0], span[0]), max(flight.span[1], span[1]))
             flight.place = flight.place or place
     for file in files:
@@ -95,19 +95,19 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
     return sorted(groups, key=lambda group: (group.span is None, (group.span or ())[:1]))
 
 
-# A number of a flight, and a date, in the name of a log or of its folder.
+# Number of a flight, and date, in the name of a log or of its folder.
 _FLIGHT_NUMBER = re.compile(r"(?<![a-z])(flight|flt|sortie|mission)[ _.-]?0*(\d{1,3})(?!\d)", re.IGNORECASE)
 _DATE = re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)")
 
 
 def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
-    """Return the question about a log whose name has another flight or date than the track's; empty if it has none."""
+    """Return the question about a log whose name has another flight or date than the track, or an empty text."""
     names = ["/".join(Path(item.path).parts[-2:]) for item in (file, track)]
     first, second = ({(word.lower(), number) for word, number in _FLIGHT_NUMBER.findall(name)} for name in names)
     if first and second and not first & second:
         (shown, other) = (" ".join(min(found)) for found in (first, second))
         return f"its name has {shown}, that of the track {other}: which flight?"
-    # a clock of its own says more than a name: an evening's flight has the next day in UTC
+    # absolute times outweigh a name, because an evening flight has the next day in UTC
     if _span_of(file) is not None:
         return ""
     dates = [{"-".join(parts) for parts in _DATE.findall(name)} for name in names]
@@ -120,21 +120,21 @@ def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
 
 
 def _span_of(file: IngestedFile) -> Span | None:
-    """First and last time of a file's streams; None where it has no wall clock."""
+    """Return the first and last time of the streams of a file, or None without absolute times."""
     spans = [span for stream in file.result.streams if (span := stream_span(stream)) is not None]
     first = min((begin for begin, _ in spans), default=None)
     return None if first is None or not has_wall_clock(first) else (first, max(end for _, end in spans))
 
 
 def stream_span(stream: Stream) -> Span | None:
-    """First and last time of a stream; None where it has none."""
+    """Return the first and last time of a stream, or None without times."""
     time = stream.frame["time"].to_numpy("datetime64[ns]")
     time = time[~np.isnat(time)]
     return (time.min(), time.max()) if len(time) else None
 
 
 def meet(first: Span, second: Span) -> bool:
-    """Check whether two spans share an instant."""
+    """Check whether two spans overlap."""
     return bool(first[0] <= second[1] and second[0] <= first[1])
 
 
@@ -155,26 +155,26 @@ def _meet(flight: Flight, span: Span, place: tuple[float, float] | None) -> bool
         return False
     if place is None or flight.place is None:
         return True
-    # the margin before and after is for radios: two tracks must share time
+    # the margin before and after is for radios; two tracks must share time
     return meet(flight.span, span) and max(abs(place[0] - flight.place[0]), abs(place[1] - flight.place[1])) < APART_DEG
 
 
 def _shared(first: Span | None, second: Span) -> np.timedelta64:
-    """Time that two spans share; negative where they do not."""
+    """Return the time that two spans share, which is negative if they do not overlap."""
     assert first is not None
     return min(first[1], second[1]) - max(first[0], second[0])
 
 
 def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
-    """Origin under which a log with positions lies on the track of a flight."""
+    """Return the zero of relative times with which a log with positions is on the track of a flight."""
     track = next((track for member in flight.files for track in _tracks(member)), None)
-    # the fullest: a log of a hundred cells has the places of one receiver a hundred times
+    # use the longest stream, because a log of a hundred cells has the positions of one receiver a hundred times
     placed = [stream for stream in file.result.streams if "latitude_deg" in stream.frame]
     fullest = max(placed, key=lambda stream: stream.frame["latitude_deg"].count(), default=None)
     return None if track is None or fullest is None else origin_of(fullest, track)
 
 
-# Two tracks that a log lies on about as well: it may be of either flight.
+# Limits within which a log fits two tracks about equally, so that it may belong to either flight.
 _ALIKE, _ALIKE_M = 2.0, 5.0
 
 
@@ -185,8 +185,8 @@ def _called(flight: Flight) -> str:
 
 
 def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
-    """The flight of a file without a wall clock; a new one is added to ``groups``."""
-    # what holds both levels and positions is a flight by itself: with another in its own time it shares none
+    """Return the flight of a file without absolute times; a new one is added to ``groups``."""
+    # a log with both levels and positions is a separate flight, because relative times share nothing with others
     alone = Flight([file]).complete
     known = [flight for flight in groups if flight.span is not None] if alone else groups
     by_track = [
@@ -216,33 +216,33 @@ _IN_NAME = re.compile(
 )
 _NEMO_START = re.compile(r"^Measurement start;(\d{4} \w{3} \d\d \d\d:\d\d)", re.MULTILINE)
 
-# A name with a date alone may be local or UTC, and of the start or the end.
+# A date in a name may be local or UTC, and that of the start or the end.
 _OF_THE_DAY = timedelta(hours=36)
 
-# A program is started before its radio is.
+# A program is started before its radio.
 _OF_THE_MINUTE = timedelta(minutes=15)
 
-# A track whose lowest height [m] is farther from 0 does not begin at its take-off.
+# A track whose lowest height [m] is farther from 0 does not begin at take-off.
 _GROUND_M = 5.0
 
 
 def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | None) -> list[str]:
-    """Questions of a draft about the streams of a log that it keeps, each with both values.
+    """Return questions of a draft about the streams of a log, each with both values.
 
     Parameters
     ----------
     file : IngestedFile
     streams : sequence of Stream
     timezone : str or None
-        Of clocks without a zone.
+        Zone of clocks without a zone.
     """
     texts = []
     start = _start(streams)
     if start is not None:
         zone = ZoneInfo(timezone) if timezone else None
         starts = _name_starts(file.path)
-        # names of a flight file are those of the machine that made it
-        if not file.holder:  # else a path that the flight file names, of another machine
+        # the names in a flight file are those of the machine that made it
+        if not file.holder:  # the path may be that of another machine
             starts += _summary_starts(Path(file.path))
         texts += [
             f"{where} says {time:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is right?"
@@ -262,10 +262,10 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
     return list(dict.fromkeys(texts))
 
 
-# Nothing flown here goes higher; a lowest height above it is one of another datum [m].
+# No flight is higher, so a lowest height above this has another datum [m].
 _TOO_HIGH_M = 150.0
 
-# Radios are started within this of the telemetry; a whole number of hours apart, a zone is wrong.
+# Radios are started within this time of the telemetry. A difference of full hours shows a wrong zone.
 _TOGETHER_S = 90.0
 
 _MANY_WITHOUT_POSE = 0.1
@@ -278,19 +278,19 @@ def doubts(
     undated: Sequence[str] = (),
     takeoff_ground_m: float = 0.0,
 ) -> tuple[str, ...]:
-    """Clauses on clocks and heights that the first words of a report repeat.
+    """Return clauses about clocks and heights that the summary of a report repeats.
 
     Parameters
     ----------
     track : Track
     telemetry : Stream
-        That it was made from.
+        Telemetry of the track.
     series : sequence of (str, (n,) datetime64)
-        Names and times of what is compared on the track.
+        Names and times of the series that are compared on the track.
     undated : sequence of str
-        Logs with positions whose times the flight file dates, beside telemetry with a clock.
+        Logs with positions that the flight file dates, while the telemetry has absolute times.
     takeoff_ground_m : float
-        Height of the site's ground at the take-off; minus its height above the sea if the log counts from there.
+        Height of the ground of the site at take-off, or minus its height above the sea if the log counts from there.
 
     Returns
     -------
@@ -320,18 +320,18 @@ def doubts(
     return tuple(texts)
 
 
-# A flight has samples below this height above its take-off [m]; else its heights count from the sea.
+# A flight has samples below this height above take-off [m]; otherwise its heights count from the sea.
 _FLOWN_M = 300.0
 
-# Heights that begin within this of the site's ground above the sea probably count from the sea [m].
+# Heights that begin within this of the ground of the site above the sea probably count from the sea [m].
 _NEAR_GROUND_M = 50.0
 
-# A UAV at rest: for this long it does not move by more than this [s, m], and then it climbs [m].
+# A UAV at rest moves by at most this during this time [s, m], and then climbs by this [m].
 _REST_S, _REST_M, _CLIMB_M = 5.0, 0.5, 5.0
 
 
 def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
-    """Check that the heights of a flight count from its take-off, and not from the sea.
+    """Check that the heights of a flight count from take-off, and not from the sea.
 
     Parameters
     ----------
@@ -343,13 +343,13 @@ def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        A clause for the first words of a report if the lowest height is about that of the site's ground above the sea.
+        A clause for the summary of a report if the lowest height is close to the ground of the site above the sea.
 
     Raises
     ------
     InputError
-        If no sample is below :data:`_FLOWN_M`, or if the UAV rests and takes off at about the height of the site's
-        ground above the sea.
+        If no sample is below :data:`_FLOWN_M`, or if the UAV rests and takes off at about the height of the ground of
+        the site above the sea.
     """
     low_m, sea_m = _lowest_m(telemetry), site.ground_above_sea_m
     if low_m is None or "takeoff_from" in telemetry.attributes:
@@ -399,7 +399,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _start(streams: Sequence[Stream]) -> datetime | None:
-    """First time (UTC) of some streams; None without a wall clock."""
+    """Return the first time (UTC) of some streams, or None without absolute times."""
     first = min((span[0] for stream in streams if (span := stream_span(stream)) is not None), default=None)
     if first is None or not has_wall_clock(first):
         return None
@@ -408,7 +408,7 @@ def _start(streams: Sequence[Stream]) -> datetime | None:
 
 
 def _name_starts(path: str) -> list[tuple[str, datetime, str, timedelta]]:
-    """Date, or date and time, in the name of a file."""
+    """Return dates, with or without a time, in the name of a file."""
     starts = []
     for match in _IN_NAME.finditer(Path(path).name):
         parts = [int(part) for part in match.groups() if part is not None]
@@ -422,11 +422,11 @@ def _name_starts(path: str) -> list[tuple[str, datetime, str, timedelta]]:
 
 
 def _summary_starts(path: Path) -> list[tuple[str, datetime, str, timedelta]]:
-    """Start of the measurement in a Nemo summary beside a log."""
+    """Return the start of the measurement from a Nemo summary in the folder of a log."""
     starts = []
     stem = path.name.split(".")[0]
     for name, head in _tables_beside(path):
-        # a folder may hold the summaries of several measurements
+        # a folder may contain summaries of several measurements
         if name.startswith(stem) and (match := _NEMO_START.search(head)) is not None:
             time = datetime.strptime(match[1], "%Y %b %d %H:%M").replace(tzinfo=zones.utc)
             starts.append((f"Measurement start in {name}", time, "%Y-%m-%d %H:%M", _OF_THE_MINUTE))
@@ -434,7 +434,7 @@ def _summary_starts(path: Path) -> list[tuple[str, datetime, str, timedelta]]:
 
 
 def _tables_beside(path: Path) -> Iterator[tuple[str, str]]:
-    """Names and beginnings of the CSVs in a log's folder, or in the folder of the archive that holds it."""
+    """Yield names and first bytes of CSV files in the folder of a log, or of the archive that contains it."""
     if path.parent.is_dir():
         for table in (table for table in sorted(path.parent.glob("*.csv")) if table != path and table.is_file()):
             with table.open("rb") as stream:
@@ -451,15 +451,15 @@ _HEAD_BYTES = 2000
 
 
 def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
-    """Least distance of a time from the start, read as UTC and as local; without a zone in any zone."""
+    """Return the smallest difference of a time from the start, as UTC and as local time (in any zone if unknown)."""
     if not exact:
-        # a date is its noon, give or take
+        # a date is its noon, plus or minus half a day
         return abs(start - time - timedelta(hours=12))
     if zone is not None:
-        # that of the day: a zone has two in a year
+        # the offset of that day, because a zone has two in a year
         offset = start.astimezone(zone).utcoffset() or timedelta(0)
         return min(abs(start - time), abs(start + offset - time))
-    # every zone that there is, by half hours
+    # all zones of the world, in half hours
     return min(abs(start - time + timedelta(minutes=30 * half)) for half in range(-28, 29))
 
 
@@ -473,8 +473,8 @@ def _lowest_m(stream: Stream) -> float | None:
     height = height[np.isfinite(height)]
     if not len(height):
         return None
-    # not the least: one row of a receiver without a fix may be far below
+    # not the minimum, because a row of a receiver without a fix may be far below
     low = float(np.percentile(height, 1.0))
-    # a log may end in the air; a climb from its first row is no jump of a receiver that had no fix
+    # a log may end in the air; a climb from its first row is not a jump of a receiver without a fix
     begins = np.abs(np.diff(height[: len(height) // 100 + 2], prepend=0.0)).max() <= _GROUND_M
     return min(low, float(height[0])) if begins else low

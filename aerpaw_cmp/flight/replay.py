@@ -1,6 +1,6 @@
-"""Replay the series of a flight: poses from the track, one replay per tower and link, foliage as asked.
+"""Replay of the series of a flight: poses from the track, one replay per tower and link, and foliage.
 
-Levels of a flight against a model without antennas, in the directions at both ends.
+The file also computes levels of a flight relative to a model without antennas, in the directions at both ends.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from .training import learned_here
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
-    """Radio clock of one series: what was found, and ``applied_s`` (n,), taken off the radio times for the replay."""
+    """The radio clock of one series: the estimate, and ``applied_s`` (n,), which is subtracted from radio times."""
 
     result: ClockResult
     applied_s: FloatArray
@@ -46,7 +46,7 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Replayed:
-    """One series, replayed: ``valid`` (n,) says at which samples a pose was known; all else has those alone."""
+    """A replayed series. ``valid`` (n,) marks samples with a known pose; other arrays have only these samples."""
 
     link: Link
     poses: Poses
@@ -55,24 +55,24 @@ class Replayed:
     track: TrackPoses | None = None
     clock: Clock | None = None
     tower_m: FloatArray | None = None
-    """Place (poses, 3) of a tower that moves [m]; None of one that stands."""
+    """Position of a tower that moves, shape (poses, 3) [m]; None for a fixed tower."""
     learned: LearnedGain | None = None
-    """Of RSS: what learned antennas add to the level, and their error bars."""
+    """Contribution of learned antennas to the RSS, and its standard deviation."""
 
     def level_dbm(self, kind: Literal["coherent", "power"]) -> FloatArray:
-        """Level (poses,) of the paths, with what learned antennas add towards both ends at once [dBm]."""
+        """Return the level of the paths with the contribution of learned antennas, shape (poses,) [dBm]."""
         level = self.replay.level_dbm(kind)[:, 0]
         return level if self.learned is None else level + self.learned.pair_db
 
     def source_m(self, site: Site) -> FloatArray:
-        """Centre of the tower's array [m]: (1, 3), or (poses, 3) where it moves."""
+        """Return the centre of the array of the tower [m], shape (1, 3), or (poses, 3) if it moves."""
         if self.tower_m is not None:
             return self.tower_m
         (tower,) = self.link.tower_arrays
         return site.towers[tower].position_m[None, :]
 
     def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
-        """Values per replayed pose, put back at their samples (n, ...)."""
+        """Return values per replayed pose at their samples, shape (n, ...)."""
         return _spread(self.valid, values, fill)
 
 
@@ -84,7 +84,7 @@ def _spread(valid: BoolArray, values: FloatArray, fill: float = np.nan) -> Float
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightReplay:
-    """All series of a flight, replayed, in the order of the flight."""
+    """All replayed series of a flight, in the order of the flight."""
 
     rss: tuple[Replayed, ...]
     rank: tuple[Replayed, ...]
@@ -96,7 +96,7 @@ class FlightReplay:
 
 
 def replay_flight(data: FlightData, stages: Stages | None = None) -> FlightReplay:
-    """Clocks and replay alone.
+    """Estimate the clocks and replay all series.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def replay_flight(data: FlightData, stages: Stages | None = None) -> FlightRepla
     Returns
     -------
     FlightReplay
-        Of every RSS and rank series.
+        Replays of every RSS and rank series.
     """
     stages = stages or Stages()
     with stages("clocks"):
@@ -122,7 +122,7 @@ SeriesT = TypeVar("SeriesT", RssSeries, RankSeries)
 
 
 def try_replay(data: FlightData) -> None:
-    """Replay the first known pose of every series, for the errors that a replay of the flight would raise."""
+    """Replay the first known pose of every series, which raises the errors of a complete replay."""
 
     def first(series: SeriesT, known: BoolArray) -> SeriesT:
         at = np.flatnonzero(known & data.tower_at(series.tower, series.time)[1])[:1]
@@ -138,7 +138,7 @@ def try_replay(data: FlightData) -> None:
 def replay_rss(
     data: FlightData, progress: Progress = logged, clocks: Sequence[Clock | None] | None = None
 ) -> list[Replayed]:
-    """Replay every RSS series; series of one tower with equal links are replayed together."""
+    """Replay every RSS series. Series of one tower with equal links share a replay."""
     groups: dict[tuple[str, str], list[int]] = {}
     for index, series in enumerate(data.rss):
         # one search of paths for all channels that share a link
@@ -178,7 +178,7 @@ def replay_rss(
 def _towers_and_poses(
     data: FlightData, tower: str, times: Sequence[Times]
 ) -> tuple[list[BoolArray], list[FloatArray], list[TrackPoses]]:
-    """At which instants a tower and the UAV are known; their places and poses at those."""
+    """Return when a tower and the UAV are known, and their positions and poses at these times."""
     valid, places, tracks = [], [], []
     for time in times:
         place, known = data.tower_at(tower, time)
@@ -190,16 +190,18 @@ def _towers_and_poses(
 
 
 def telemetry_time(time: Times, clock: Clock | None) -> Times:
-    """Radio times on the telemetry's clock."""
+    """Return radio times on the clock of the telemetry."""
     if clock is None:
         return time
     return np.asarray(time - np.round(clock.applied_s * 1e9).astype("timedelta64[ns]"))
 
 
 def estimate_clocks(data: FlightData, progress: Progress = logged) -> list[Clock | None]:
-    """Clock of each RSS series against the telemetry, as ``rss.lag`` asks; series of one computer share it.
+    """Return the clock of each RSS series relative to the telemetry, as ``rss.lag`` specifies.
 
-    Predictions are the image engine's RSS along the track with at most one reflection.
+    Series of one computer share it.
+
+    Predictions are the RSS of the image engine along the track with at most one reflection.
     """
     lag = data.settings.rss.lag
     if lag == "off" or data.track is None:
@@ -215,20 +217,20 @@ def estimate_clocks(data: FlightData, progress: Progress = logged) -> list[Clock
 
 
 def same_computer(data: FlightData) -> list[list[int]]:
-    """RSS series by number, in groups that one computer stamped: those of one tower and those of one file."""
+    """Return the indices of RSS series in groups with one computer: series of one tower and of one file."""
     groups: list[tuple[set[tuple[str, str]], list[int]]] = []
     for index, series in enumerate(data.rss):
         keys = {("file", str(data.settings.logs[log].path)) for log in np.unique(series.log)}
         keys.add(("tower", series.tower))
         shared = [group for group in groups if group[0] & keys]
         groups = [group for group in groups if not group[0] & keys]
-        # groups that this series connects become one
+        # this series joins these groups
         groups.append((keys.union(*(k for k, _ in shared)), [*(i for _, many in shared for i in many), index]))
     return [members for _, members in groups]
 
 
 def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) -> Clock:
-    """The clock of a flight file that states it."""
+    """Return the clock that a flight file states."""
     result = ClockResult(
         receiver=receiver,
         radio_minus_telemetry_s=radio_minus_telemetry_s,
@@ -240,28 +242,28 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
     return Clock(result=result, applied_s=np.full(samples, radio_minus_telemetry_s))
 
 
-# Instants that are replayed at once: bounds memory on flights of more than half an hour.
+# Number of times that are replayed together, which limits the memory on flights over half an hour.
 BLOCK = 100_000
 
-# Sampling of the prediction that a clock is judged by [s]; longer flights take wider steps.
+# Sampling of the prediction for the clock [s]; longer flights have wider steps.
 _CLOCK_STEP_S, _CLOCK_INSTANTS = 0.05, 40_000
 
-# The same of a tower that moves: each place is traced for itself.
+# Sampling for a tower that moves, because each position is traced separately.
 _MOVING_CLOCK_STEP_S = 0.25
 
 
 def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[ClockChannel]:
-    """Levels that one computer stamped and what they depend on along the telemetry, to judge its clock by.
+    """Return levels with time stamps of one computer, and their predictors along the telemetry, for its clock.
 
-    Ratios (the sounder's ``quality``, an SNR) saturate and lose lock where levels do not: they take part only where
-    nothing else was logged.
+    Ratios (the ``quality`` of the sounder, an SNR) saturate and lose lock where levels do not. They are used only if
+    there are no levels.
     """
     assert data.track is not None
     channels = [series for series in channels if series.unit != "dB"] or channels
     start, end = data.track.start_ns, data.track.end_ns
     towers = dict.fromkeys(series.tower for series in channels)
     step = _MOVING_CLOCK_STEP_S if any(tower in data.nodes for tower in towers) else _CLOCK_STEP_S
-    # as many instants at most: hours of flight cost no more than half an hour does
+    # limit the number of times, so that hours of flight cost no more than half an hour
     step = max(step, (end - start) * 1e-9 / _CLOCK_INSTANTS)
     instants = (start + np.round(np.arange(0.0, (end - start) * 1e-9, step) * 1e9).astype(np.int64)).astype(
         "datetime64[ns]"
@@ -286,15 +288,15 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
 
 
 def _along(data: FlightData, different: Sequence[RssSeries], instants: Times, step_s: float) -> list[Along]:
-    """Predictors of the levels of series of one tower and carrier; the replay has at most one reflection."""
+    """Return predictors of the levels of series of one tower and carrier; the replay has at most one reflection."""
     links = [data.link_of(series) for series in different]
-    blocks = np.array_split(instants, max(1, -(-len(instants) // BLOCK)))  # of about one size
+    blocks = np.array_split(instants, max(1, -(-len(instants) // BLOCK)))  # of about equal size
     parts = [_levels_along(data, links, different[0].tower, part) for part in blocks]
     out = []
     for series, link, *mine in zip(different, links, *parts, strict=True):
         columns = {name: np.concatenate([part[name] for part in mine]) for name in mine[0]}
         distance, directions = columns.pop("distance_m"), columns.pop("directions")
-        if learned_here(data, series, link):  # antennas that were learned from this very log know its lag
+        if learned_here(data, series, link):  # antennas that were learned from this log contain its lag
             columns = {"free space": columns["free space"]}
         out.append(Along(start_s=0.0, step_s=step_s, predicted_db=columns, distance_m=distance, directions=directions))
     return out
@@ -303,17 +305,17 @@ def _along(data: FlightData, different: Sequence[RssSeries], instants: Times, st
 def _levels_along(
     data: FlightData, links: Sequence[Link], tower: str, instants: Times
 ) -> Iterator[dict[str, FloatArray]]:
-    """Levels of three models, distance and directions at instants (n,), by link; what differs is antennas alone."""
+    """Yield levels of three models, distance and directions at times (n,) per link; links differ only in antennas."""
     place, known = data.tower_at(tower, instants)
     track = data.poses_at(instants).where(known)
     poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
     field = Field(path_loss(data.site, data.settings.rt, links[0].carrier_hz))
-    # the directions at both ends: gains over them are fitted beside the lag
+    # directions at both ends, because gains over them are fitted together with the lag
     line = track.position_m - place
     distance = np.linalg.norm(line, axis=1)
     unit = line / distance[:, None]
     body = -np.einsum("nij,ni->nj", track.rotation, unit)
-    # the image engine whatever the flight uses: a lag needs no deeper path, and no minute of waiting
+    # use the image engine for all flights, because a lag needs no deeper paths
     search = Search("image", max_depth=depth)
     if tower not in data.nodes:
         traced, sources = replay(data.site, links[0], poses, search), data.site.towers[tower].position_m[None, :]
@@ -338,13 +340,13 @@ def _levels_along(
 
 
 def _clock_levels(data: FlightData, series: RssSeries) -> FloatArray:
-    """Levels (n,) that the clock is judged by: those of a sounder no lower than where it loses its lock."""
+    """Return the levels (n,) for the clock, which end at the lock limit for a sounder."""
     levels = _high_enough(data, series)
     return levels if series.locked is None else np.maximum(levels, LOCK_FLOOR_DB)
 
 
 def _high_enough(data: FlightData, series: RssSeries) -> FloatArray:
-    """Levels (n,), NaN below ``rss.minimum_height_m``."""
+    """Return the levels (n,), NaN below ``rss.minimum_height_m``."""
     least = data.settings.rss.minimum_height_m
     if least is None:
         return series.measured_db
@@ -354,14 +356,14 @@ def _high_enough(data: FlightData, series: RssSeries) -> FloatArray:
 
 
 def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
-    """The clock of a receiver as that of one of its series."""
+    """Return the clock of a receiver as that of one of its series."""
     result = fit.result(series.tower, apply=apply)
     used = result.applied == APPLIED
     return Clock(result=result, applied_s=np.full(len(series.time), fit.correction_s if used else 0.0))
 
 
 def part_of(replayed: Replay, start: int, stop: int) -> Replay:
-    """The replay of poses ``start`` to ``stop``."""
+    """Return the replay of poses ``start`` to ``stop``."""
     if (start, stop) == (0, len(replayed.rss_dbm)):
         return replayed
 
@@ -369,9 +371,9 @@ def part_of(replayed: Replay, start: int, stop: int) -> Replay:
         rows = (paths.pose >= start) & (paths.pose < stop)
         return dataclasses.replace(paths.select(rows), pose=paths.pose[rows] - start)  # type: ignore[type-var]
 
-    # what a part cost is its share of what all did
+    # the time of a part is its share of the total time
     share = (stop - start) / max(len(replayed.rss_dbm), 1)
-    # views, no copies: a long flight has its paths once
+    # views, not copies, because the paths of a long flight are large
     columns: dict[str, Any] = {name: getattr(replayed, name)[start:stop] for name in PER_LINK}
     return dataclasses.replace(
         replayed,
@@ -391,22 +393,22 @@ def replay_rank(data: FlightData, progress: Progress = logged) -> list[Replayed]
         poses, valid, track = rank_poses(data, series)
         towers_m = data.tower_at(series.tower, series.time)[0][valid] if series.tower in data.nodes else None
         progress(f"replay rank {series.tower}: {counted(len(poses), 'pose')}")
-        # H holds reflections alone, so nothing else is searched
+        # H contains reflections only, so no other paths are searched
         replayed = replay_poses(data.site, data.settings.rt, link, poses, towers_m=towers_m, progress=progress)
         out.append(Replayed(link=link, poses=poses, valid=valid, replay=replayed, track=track, tower_m=towers_m))
     return out
 
 
 def rank_poses(data: FlightData, series: RankSeries) -> tuple[Poses, BoolArray, TrackPoses | None]:
-    """Poses of the reports at which the UAV and the tower are known, which those are (n,), and the track at them.
+    """Return poses of reports with known UAV and tower, which reports these are (n,), and the track at them.
 
-    Position and attitude come each from what has them: positions from the log where it holds its own, else from the
-    track; attitude from the track, whoever gave the position. Where the track has none, the UAV array stays as mounted.
+    Positions come from the log if it has them, and otherwise from the track. The attitude comes from the track in both
+    cases. Without an attitude in the track, the UAV array stays as mounted.
     """
     position, valid = rank_positions(series, data.track)
     valid = valid & data.tower_at(series.tower, series.time)[1]
     track = None if data.track is None else data.poses_at(series.time).pick(valid)
-    # without an attitude the array stays as it is mounted in the site
+    # without an attitude the array stays as mounted in the site
     rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
     if track is not None:
         rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
@@ -414,7 +416,7 @@ def rank_poses(data: FlightData, series: RankSeries) -> tuple[Poses, BoolArray, 
 
 
 def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
-    """Body rotations (n, 3, 3) as a value of ``rt.attitude`` wants them."""
+    """Return body rotations (n, 3, 3) for a value of ``rt.attitude``."""
     if mode == "ignored":
         return np.broadcast_to(np.eye(3), (len(track), 3, 3))
     if mode == "logged":
@@ -424,7 +426,7 @@ def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
 
 
 def valid_poses(track: TrackPoses, attitude: str) -> Poses:
-    """The valid ones; of a track that has no other the very arrays, so that a long flight has one copy of them."""
+    """Return the valid poses; a track without invalid poses is not copied."""
     some = track.pick(track.valid)
     return Poses(some.position_m, np.ascontiguousarray(attitude_rotation(some, attitude)))
 
@@ -440,23 +442,23 @@ def replay_poses(
     progress: Progress = logged,
     job: Job | None = None,
 ) -> Replay:
-    """Replay poses as the flight's ``rt`` asks, foliage included; ``engine`` in place of ``rt.engine``.
+    """Replay poses with the settings ``rt`` and foliage.
 
     Parameters
     ----------
     site : Site
     rt : RtSettings
-        Depth, samples, foliage and the rest.
+        Settings of the replay: depth, samples, foliage and others.
     link : Link
-        Carrier, power and arrays; its towers are those of ``site`` by name.
+        Carrier, power and arrays. Its towers are those of ``site`` by name.
     poses : Poses
     towers_m : (poses, 3), optional
-        Places of the one tower of the link, which moves [m].
+        Positions of the only tower of the link, which moves [m].
     engine : {"image", "sionna"}, optional
     progress : Progress
-        Share done; of the sionna engine alone.
+        Is called with the share that is done, for the sionna engine.
     job : Job, optional
-        What the poses are a part of.
+        Job of which the poses are a part.
 
     Returns
     -------
@@ -466,7 +468,7 @@ def replay_poses(
     Raises
     ------
     UsageError
-        What a replay raises.
+        For settings that cannot be replayed.
     """
     engine = engine or rt.engine
     towers = "+".join(link.tower_arrays)
@@ -477,11 +479,11 @@ def replay_poses(
         samples=rt.advanced.samples,
         further=diffracted(rt.diffraction),
     )
-    # the image engine finds the paths of a pose whatever the others are; planes of terrain are numbered as they are met
+    # the image engine finds the paths of a pose independently of others, but numbers planes of terrain in order
     alone = engine == "image" and site.dem is None
     long = alone and len(poses) > BLOCK
     run = Run(
-        # the image engine is done before a bar could be seen
+        # the image engine finishes before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" or long or towers_m is not None else None,
         job=job,
     )
@@ -494,7 +496,7 @@ def replay_poses(
 
 
 def observed_series(data: FlightData, series: RssSeries) -> tuple[Observed, float, float]:
-    """Return the samples of one series at known poses, against free space through the woods that the flight has.
+    """Return the samples of one series at known poses, relative to free space through the woods of the flight.
 
     Parameters
     ----------
@@ -505,14 +507,14 @@ def observed_series(data: FlightData, series: RssSeries) -> tuple[Observed, floa
     -------
     Observed
     float
-        Share of the attitudes that are not logged: heading from the track, level flight.
+        Share of attitudes that are not logged: heading from the track, level flight.
     float
-        Share of the levels without a position.
+        Share of levels without a position.
 
     Raises
     ------
     InputError
-        A flight without telemetry.
+        If the flight has no telemetry.
     """
     if data.track is None:
         raise InputError(f"flight {data.settings.flight.name} has no telemetry", expected="positions and attitude")
@@ -557,7 +559,7 @@ def observed_series(data: FlightData, series: RssSeries) -> tuple[Observed, floa
 
 
 def _through_woods(data: FlightData, series: RssSeries, poses: Poses) -> FloatArray:
-    """Return the level (n,) of the direct path with the loss of woods, without buildings and antennas [dBm]."""
+    """Return the level of the direct path with the loss of woods, without buildings and antennas, shape (n,) [dBm]."""
     plain = {"uav": ArraySettings(), "tower": ArraySettings(), "towers": {}}
     link = series.link.model_copy(update=plain).build([series.tower], data.folder)
     rt = data.settings.rt.model_copy(update={"max_depth": 0, "diffraction": "none"})

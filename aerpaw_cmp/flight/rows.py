@@ -1,10 +1,10 @@
-"""Rows of a log that count: positions that are scored, and a sounder in lock.
+"""The rows of a log that are scored: rows without excluding flags, times of receiver lock, and frozen levels.
 
-Rows of a log that a comparison scores: those that no flag voids.
+Rows are scored unless a flag excludes them.
 
-Times when the receiver of AERPAW's channel sounder was in lock.
+The receiver of the channel sounder of AERPAW is in lock if its quality is near its peak.
 
-Levels that stay the same to all digits while the aircraft flies on: a receiver or logger that stopped.
+A level that is equal to all digits while the aircraft moves is frozen, because the receiver or logger stopped.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from ..logs.records import Stream
 
 
 def unscored(frame: pd.DataFrame) -> BoolArray:
-    """Rows (n,) that carry a flag of :data:`~aerpaw_cmp.logs.limits.UNSCORED`."""
+    """Return rows (n,) with a flag of :data:`~aerpaw_cmp.logs.limits.UNSCORED`."""
     flag = frame["flag"].to_numpy(dtype=object)
     out = np.zeros(len(flag), dtype=np.bool_)
-    # one by one: few rows have a flag
+    # one by one, because few rows have a flag
     for i in np.flatnonzero(flag != ""):
         out[i] = any(word in UNSCORED for word in str(flag[i]).split(";"))
     return out
 
 
 def without_values(stream: Stream, path: str) -> InputError | None:
-    """Return the error of a series of which no row can be scored; None if a row can.
+    """Return the error of a series without any row to score, or None.
 
-    A phone writes -1 for each level of a network that it does not receive: its other series are still good.
+    A phone writes -1 for each level of a network that it does not receive, while its other series are valid.
     """
     try:
         frame, _ = scored_rows(stream, path)
     except InputError as error:
         return error
     value = frame["rss_db" if stream.kind == "rss" else "rank"]
-    # a row without a signal or without CSI has no number either, but its flag is a measurement
+    # a row without a signal or CSI has no number either, but its flag is a measurement
     if value.notna().any() or (frame["flag"] != "").any() or not len(frame):
         return None
     return InputError(
@@ -54,18 +54,18 @@ def without_values(stream: Stream, path: str) -> InputError | None:
 
 
 def scored_rows(stream: Stream, path: str) -> tuple[pd.DataFrame, dict[str, int]]:
-    """The rows that are scored, and how many the others are per flag.
+    """Return the rows that are scored, and the numbers of the others by flag.
 
     Parameters
     ----------
     stream : Stream
     path : str
-        Of its log, for the message.
+        Path of the log, for the message.
 
     Raises
     ------
     InputError
-        If no row is left.
+        If no row remains.
     """
     frame = stream.frame
     void = unscored(frame)
@@ -82,44 +82,45 @@ def scored_rows(stream: Stream, path: str) -> tuple[pd.DataFrame, dict[str, int]
     return frame[~void], dict(words)
 
 
-# Quality [dB] at perfect lock (the peak of 4095 chips), and below which the receiver has lost it.
+# Quality at perfect lock (the peak of 4095 chips), and quality below which lock is lost [dB].
 _LOCK_QUALITY_DB, _LOST_QUALITY_DB = 20.0 * float(np.log10(4095.0)), 60.0
 
-# Level [dB re full scale] below which the receiver loses its lock: what it then writes is noise.
+# Level below which the receiver loses its lock and writes noise [dB re full scale].
 LOCK_FLOOR_DB = -15.0
 
-# A quality of another log stands for a level this near in time.
+# Largest time difference between a level and a quality in another log.
 _WITHIN_S = 0.1
 
 
 def may_lose_lock(stream: Stream) -> bool:
-    """Check whether a stream is the lock quality of the sounder: where locked, it stays near its peak."""
+    """Check whether a stream is the lock quality of the sounder, which stays near its peak in lock."""
     if stream.kind != "rss" or stream.name != "quality":
         return False
     quality = stream.frame["rss_db"].to_numpy(np.float64)
     locked = quality[quality > _LOST_QUALITY_DB]
-    # near its peak wherever it is locked: an SNR of another receiver spreads over tens of decibels
+    # near its peak in lock, while the SNR of other receivers varies by tens of decibels
     return bool(len(locked)) and abs(float(np.median(locked)) - _LOCK_QUALITY_DB) < 3.0
 
 
 def is_sounder_power(stream: Stream) -> bool:
-    """Check whether a stream may be the level beside such a quality."""
+    """Check whether a stream may be the level of such a quality."""
     return stream.kind == "rss" and stream.name == "power" and stream.attributes.get("unit") == "dB re full scale"
 
 
 def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | None, str]:
-    """Lock state of a sounder's receiver at each row of its level.
+    """Return the lock state of the receiver of a sounder at each row of its level.
 
     Parameters
     ----------
     power : Stream
     candidates : iterable of Stream
-        Of the flight, those of the same file first; the first lock quality that shares time with the level is taken.
+        Streams of the flight, those of the same file first. The first lock quality that shares time with the level is
+        used.
 
     Returns
     -------
     (n,) or None, str
-        1 in lock, 0 where lost, NaN unknown, for each row of the level; and what is to be said of the quality's times.
+        1 in lock, 0 without lock, NaN unknown, for each row of the level, and a remark about the times of the quality.
     """
     if not is_sounder_power(power):
         return None, ""
@@ -137,7 +138,7 @@ def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | N
                     "at its own times, 0.032768 s a row"
                 )
         else:
-            order = np.argsort(at, kind="stable")  # a log may have been put together of parts
+            order = np.argsort(at, kind="stable")  # a log may have been joined from parts
             quality = at_times(time, at[order], quality[order], within_s=_WITHIN_S)
         if np.isfinite(quality).any():
             return np.where(np.isfinite(quality), (quality > _LOST_QUALITY_DB).astype(np.float64), np.nan), remark
@@ -149,35 +150,35 @@ def _seconds(stream: Stream) -> FloatArray:
 
 
 FLAG = "level_frozen"
-# A run of one level is suspicious from this duration [s], number of samples and distance flown [m] on.
+# A run of one level is suspicious above this duration [s], number of samples and flown distance [m].
 _LEAST_S, _LEAST, _LEAST_M = 5.0, 10, 15.0
-# Levels in whole and half dB repeat themselves in every hover.
+# Levels in full and half dB repeat in every hover.
 _COARSE_DB = 0.5
-# Chance of such a run, by the share of equal neighbours elsewhere, below which the channel does not explain it.
+# Probability of such a run, from the share of equal neighbours elsewhere, below which chance does not explain it.
 _CHANCE = 1e-6
-# Second differences of noise are larger than its differences (by the root of 3), those of a smooth level are smaller.
+# Second differences of noise exceed its differences (by the root of 3), and those of a smooth level are smaller.
 _NOISY, _LEAP = 1.2, 3.0
 
 
 def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> BoolArray:
-    """Return the mask of samples (n,) that repeat a frozen level, without the first of each run.
+    """Return a mask of samples that repeat a frozen level, without the first of each run, shape (n,).
 
-    A smooth level repeats itself where it passes its maximum or reaches the end of its scale, and goes on from there.
-    It is frozen only if it leaps as the run ends, or if the series ends there with higher and lower levels before. A
-    level with noise is frozen wherever chance does not explain the run.
+    A smooth level is also constant at its maximum or at the end of its scale, and continues from there. It is frozen
+    only if it jumps at the end of the run, or if the series ends there with higher and lower levels before. A noisy
+    level is frozen if chance does not explain the run.
 
     Parameters
     ----------
     time : (n,)
-        datetime64[ns], in order.
+        Times in order, datetime64[ns].
     level_db : (n,)
-        NaN out of coverage.
+        Level; NaN out of coverage.
     position_m : (n, 3)
-        Position of the UAV, NaN if the track does not know it.
+        Position of the UAV, NaN if unknown.
     """
     out = np.zeros(len(level_db), dtype=np.bool_)
     same = np.diff(level_db) == 0
-    # distinct levels: a run that is frozen at a half dB must not make a coarse series of a fine one
+    # use distinct levels, so that a frozen run at a half dB does not make a fine series coarse
     levels = np.unique(level_db[np.isfinite(level_db)]) / _COARSE_DB
     if same.sum() < _LEAST or (np.abs(levels - np.round(levels)) > 1e-6).mean() < 0.5:
         return out
@@ -201,18 +202,18 @@ def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> Bool
 
 
 def _large(difference_db: FloatArray) -> float:
-    """Return the size that nine differences in ten (n,) stay below [dB]; 0 if there is none."""
+    """Return the magnitude below which nine of ten differences (n,) are [dB], or 0 without differences."""
     known = np.abs(difference_db[np.isfinite(difference_db)])
     return float(np.quantile(known, 0.9)) if len(known) else 0.0
 
 
 def _is_noisy(level_db: FloatArray) -> bool:
-    """Check whether a level (n,) changes by noise rather than smoothly; the rounding of a smooth level is not noise."""
+    """Check whether a level (n,) varies by noise and not smoothly; rounding of a smooth level is not noise."""
     step = np.diff(level_db[np.isfinite(level_db)])
     sizes = np.abs(step[step != 0])
     if not len(sizes):
         return False
-    # leaps count as large steps: one of them must not make noise of a smooth level
+    # limit jumps, so that one jump does not make a smooth level noisy
     first, second = (np.minimum(np.abs(d), _large(d)) for d in (step, np.diff(step)))
     rms, rms_second = float(np.sqrt(np.mean(first**2))), float(np.sqrt(np.mean(second**2)))
     return rms_second > _NOISY * rms and rms > sizes.min()

@@ -1,8 +1,8 @@
-"""Planned routes: patterns within an area, and the files that ground stations read.
+"""Planned routes: patterns within an area, and files for ground stations.
 
-Routes within an area: lawnmower and cross, with the nose along the track, fixed, or turned from leg to leg.
+Routes are lawnmowers and crosses, with the nose along the track, fixed, or rotated from leg to leg.
 
-A planned route as files that ground stations read: QGroundControl plan, table of waypoints.
+They are written as a QGroundControl plan and as a table of waypoints.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from ..common.units import FloatArray, spread_out
 from .track import interpolated
 
 Nose = Literal["along", "fixed", "four headings"]
-# How the nose is held: along the track; turned by 90 degrees from leg to leg; to the north.
+# Directions of the nose: along the track, rotated by 90 degrees from leg to leg, or north.
 NOSES: tuple[Nose, ...] = ("along", "four headings", "fixed")
 
-# From the border of the area.
+# Distance from the border of the area.
 MARGIN_M = 3.0
 
-# Shorter legs are left out.
+# Shorter legs are skipped.
 _LEAST_LEG_M = 40.0
 
-# Least spacing of legs.
+# Smallest spacing of legs.
 _CLOSEST_M = 15.0
 
 _TURN_STEPS = 8
-# A slow turn holds each eighth of the compass for this long.
+# A slow rotation stays at each eighth of the compass for this long.
 _TURN_HOLD_S = 8.0
 
 _TURN_POINTS = 4
@@ -46,7 +46,7 @@ _TURN_POINTS = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Waypoint:
-    """A place to fly to: the yaw [deg from north] holds there for ``hold_s`` and on the way to the next."""
+    """A waypoint, whose yaw [deg from north] is kept there for ``hold_s`` and on the way to the next one."""
 
     east_m: float
     north_m: float
@@ -57,7 +57,7 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Route:
-    """A candidate flight, second by second.
+    """A candidate flight with a point per second.
 
     Parameters
     ----------
@@ -75,38 +75,38 @@ class Route:
 
     @property
     def length_m(self) -> float:
-        """Along the track [m]."""
+        """Length along the track [m]."""
         return float(np.linalg.norm(np.diff(self.position_m, axis=0), axis=1).sum())
 
     @property
     def duration_s(self) -> float:
-        """Seconds from the first to the last point."""
+        """Time from the first to the last point [s]."""
         return float(self.time_s[-1] - self.time_s[0])
 
 
 def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float) -> Route:
-    """A route along waypoints at one speed.
+    """Return the route along waypoints at one speed.
 
     Parameters
     ----------
     name : str
     waypoints : sequence of Waypoint
-        Two or more.
+        Two waypoints or more.
     speed_mps : float
 
     Returns
     -------
     Route
-        A point every second.
+        Route with a point every second.
     """
     place = np.array([(w.east_m, w.north_m, w.height_m) for w in waypoints])
-    spans = np.zeros(2 * len(place))  # to each waypoint, and until it is left
+    spans = np.zeros(2 * len(place))  # time to each waypoint, and until it is left
     spans[1::2] = [w.hold_s for w in waypoints]
     spans[2::2] = [float(np.linalg.norm(step)) / speed_mps for step in np.diff(place, axis=0)]
     time, yaw = np.cumsum(spans), np.repeat([w.yaw_deg for w in waypoints], 2)
-    # a little longer: a flight of whole seconds has its last one
+    # slightly longer, so that the last second of a flight of full seconds is included
     seconds = np.arange(0.0, time[-1] + 1e-9, 1.0)
-    # a yaw holds from its waypoint to the next, so that an instant has that of the step before
+    # a yaw is kept from its waypoint to the next, so a time has the yaw of the step before
     before = np.maximum(np.searchsorted(time, np.minimum(seconds, time[-1])) - 1, 0)
     position = interpolated(seconds, time, np.repeat(place, 2, axis=0))
     return Route(
@@ -115,7 +115,7 @@ def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float) -> Route:
 
 
 def allowed_area(fence: Any, avoid: Sequence[Any], towers_m: FloatArray, distance_m: float) -> Any:
-    """The largest connected area within a fence, outside areas to avoid and circles around towers.
+    """Return the largest connected area within a fence, outside areas to avoid and circles around towers.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def allowed_area(fence: Any, avoid: Sequence[Any], towers_m: FloatArray, distanc
     avoid : sequence of shapely Polygon
     towers_m : (t, 2)
     distance_m : float
-        Least horizontal distance to a tower [m].
+        Smallest horizontal distance to a tower [m].
 
     Returns
     -------
@@ -132,10 +132,10 @@ def allowed_area(fence: Any, avoid: Sequence[Any], towers_m: FloatArray, distanc
     Raises
     ------
     UsageError
-        Nothing is left.
+        If no area remains.
     """
     circles = [shapely.Point(*place).buffer(distance_m) for place in towers_m[:, :2]] if distance_m > 0 else []
-    # a buffer of 0 mends outlines that cross themselves
+    # a buffer of 0 repairs outlines that cross themselves
     remaining = fence.buffer(0).difference(shapely.union_all([*avoid, *circles])).buffer(-MARGIN_M)
     parts = [p for p in getattr(remaining, "geoms", [remaining]) if p.area > 0]
     if not parts:
@@ -148,17 +148,17 @@ def allowed_area(fence: Any, avoid: Sequence[Any], towers_m: FloatArray, distanc
 
 
 def lawnmower(area: Any, azimuth_deg: float, spacing_m: float) -> list[FloatArray]:
-    """Legs (2, 2) to and fro across an area, their course clockwise from north; short ones are left out."""
+    """Return legs (2, 2) back and forth across an area at a course clockwise from north, without short ones."""
     centre = area.centroid
     turned = shapely.affinity.rotate(area, azimuth_deg, origin=centre)  # legs now run north
     west, south, east, north = turned.bounds
-    # evenly over the width: the last leg would else lie anywhere between two
+    # evenly over the width, because the last leg would otherwise be anywhere between two
     count = max(int((east - west) // spacing_m), 1)
     at = west + (np.arange(count) + 0.5) * (east - west) / count
     legs, up = [], True
     for x in at:
         cut = turned.intersection(shapely.LineString([(x, south - 1.0), (x, north + 1.0)]))
-        # a leg may cross a hole: several pieces, or a point where it touches a corner
+        # a leg across a hole has several pieces, and one that touches a corner is a point
         pieces = [p for p in getattr(cut, "geoms", [cut]) if p.length >= _LEAST_LEG_M]
         pieces.sort(key=lambda p: p.bounds[1], reverse=not up)
         for piece in pieces:
@@ -171,8 +171,8 @@ def lawnmower(area: Any, azimuth_deg: float, spacing_m: float) -> list[FloatArra
 
 
 def cross(area: Any, azimuth_deg: float) -> list[FloatArray]:
-    """Two legs (2, 2) at right angles through the middle of an area."""
-    # of a bent area the centroid may lie outside
+    """Return two legs (2, 2) at right angles through the middle of an area."""
+    # the centroid of a bent area may be outside
     middle = area.centroid if area.contains(area.centroid) else area.representative_point()
     # longer than the area from any of its points
     reach = 2.0 * math.hypot(area.bounds[2] - area.bounds[0], area.bounds[3] - area.bounds[1])
@@ -187,9 +187,9 @@ def cross(area: Any, azimuth_deg: float) -> list[FloatArray]:
 
 
 def path_within(area: Any, begin: FloatArray, end: FloatArray) -> list[FloatArray]:
-    """Corners between two points of an area (without them), along its border where the straight line leaves it."""
+    """Return the corners between two points of an area, along its border where the straight line is outside."""
     line = shapely.LineString([begin, end])
-    # ends of legs lie on the border, give or take rounding
+    # ends of legs are on the border, except for rounding
     if area.buffer(0.1).covers(line):
         return []
     corners: list[FloatArray] = []
@@ -204,14 +204,14 @@ def path_within(area: Any, begin: FloatArray, end: FloatArray) -> list[FloatArra
         first, last = min(begin_m, end_m), max(begin_m, end_m)
         back = shapely.LineString([*substring(ring, last, ring.length).coords, *substring(ring, 0.0, first).coords])
         back = back if begin_m > end_m else back.reverse()
-        # corners nearer than a metre to their line are no turns to fly
+        # corners less than a metre from their line are not turns
         arc = min((forth, back), key=lambda a: a.length).simplify(1.0)
         corners += [np.array(c) for c in arc.coords]
     return sorted(corners, key=lambda c: float(np.linalg.norm(c - begin))) if len(area.interiors) > 1 else corners
 
 
 def waypoints_of(legs: Sequence[FloatArray], area: Any, height_m: float, nose: Nose) -> list[Waypoint]:
-    """Legs one after the other, joined within the area.
+    """Return the waypoints of consecutive legs, joined within the area.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def waypoints_of(legs: Sequence[FloatArray], area: Any, height_m: float, nose: N
 
 
 def with_turns(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
-    """The route with a slow turn through all headings at some of its points."""
+    """Return the route with a slow rotation through all headings at some of its points."""
     at = set(spread_out(len(waypoints), _TURN_POINTS).tolist())
     out: list[Waypoint] = []
     for i, w in enumerate(waypoints):
@@ -254,7 +254,7 @@ def with_turns(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pattern:
-    """Parameters of a route: ``shape`` lawnmower or cross, course of its legs, height, nose, slow turns or not."""
+    """The parameters of a route: ``shape`` lawnmower or cross, course of its legs, height, nose, and slow rotations."""
 
     shape: Literal["lawnmower", "cross"]
     azimuth_deg: float
@@ -264,7 +264,7 @@ class Pattern:
 
     @property
     def name(self) -> str:
-        """For tables and file names."""
+        """Name for tables and files."""
         nose = {
             "along": "nose along the track",
             "fixed": "nose to the north",
@@ -275,16 +275,16 @@ class Pattern:
 
 
 def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Route:
-    """The densest route of a pattern that a battery allows.
+    """Return the densest route of a pattern within the battery time.
 
     Parameters
     ----------
     pattern : Pattern
     area : shapely Polygon
-        As :func:`allowed_area` gives it.
+        Area of :func:`allowed_area`.
     speed_mps : float
     most_s : float
-        Longest flight [s]; a cross is flown to and fro as often as it allows.
+        Longest flight [s]. A cross is repeated as often as it allows.
 
     Returns
     -------
@@ -293,7 +293,7 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
     Raises
     ------
     UsageError
-        The area is too small for a leg.
+        If the area is too small for a leg.
     """
     west, south, east, north = area.bounds
     widest = math.hypot(east - west, north - south)
@@ -310,14 +310,14 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
     if pattern.shape == "cross":
         legs = cross(area, pattern.azimuth_deg)
         route, more = made(legs), list(legs)
-        # a short cross in a long flight would go on for hours
+        # limit the repetitions, because a short cross in a long flight would take hours
         while route.duration_s < most_s and len(more) < 60:
             more += [leg[::-1] for leg in legs] if (len(more) // max(len(legs), 1)) % 2 else list(legs)
             route = made(more)
         return cut(route, most_s, speed_mps)
     low, high = _CLOSEST_M, widest
     for _ in range(14):
-        # spacings are searched by their ratio: 14 halvings from hundreds of metres
+        # spacings are searched by their ratio, with 14 bisections from hundreds of metres
         middle = math.sqrt(low * high)
         longer = made(lawnmower(area, pattern.azimuth_deg, middle)).duration_s > most_s
         low, high = (middle, high) if longer else (low, middle)
@@ -325,7 +325,7 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
 
 
 def cut(route: Route, most_s: float, speed_mps: float) -> Route:
-    """The part of a route that a battery allows: waypoints and samples."""
+    """Return the part of a route within the battery time: waypoints and samples."""
     if route.duration_s <= most_s:
         return route
     within: list[Waypoint] = []
@@ -344,7 +344,7 @@ def cut(route: Route, most_s: float, speed_mps: float) -> Route:
     return flown(route.name, within, speed_mps)
 
 
-# MAV_FRAME_GLOBAL_RELATIVE_ALT; NAV_WAYPOINT, CONDITION_YAW, DO_CHANGE_SPEED of MAVLink
+# MAV_FRAME_GLOBAL_RELATIVE_ALT, and NAV_WAYPOINT, CONDITION_YAW, DO_CHANGE_SPEED of MAVLink
 _FRAME_ABOVE_HOME, _WAYPOINT, _YAW, _SPEED = 3, 16, 115, 178
 # MAV_AUTOPILOT and MAV_TYPE (quadrotor)
 _ARDUPILOT, _COPTER = 3, 2
@@ -356,25 +356,25 @@ def _places(waypoints: Sequence[Waypoint], frame: SiteFrame) -> list[tuple[float
 
 
 def plan_text(waypoints: Sequence[Waypoint], frame: SiteFrame, speed_mps: float) -> str:
-    """A QGroundControl plan for ArduPilot: each waypoint, then the yaw that holds until the next one.
+    """Return a QGroundControl plan for ArduPilot: each waypoint, then the yaw until the next one.
 
     Parameters
     ----------
     waypoints : sequence of Waypoint
-        Heights above take-off.
+        Waypoints with heights above take-off.
     frame : SiteFrame
     speed_mps : float
 
     Returns
     -------
     str
-        JSON. Take-off, landing and the way there are left to the pilot.
+        JSON. The pilot adds take-off, landing and the ways there.
     """
-    # 1: ground speed; -1: the throttle stays
+    # 1 is ground speed, and -1 keeps the throttle
     items: list[dict[str, Any]] = [_item(_SPEED, [1, speed_mps, -1, 0, 0, 0, 0], frame=2)]
     for latitude, longitude, w in _places(waypoints, frame):
         items.append(_item(_WAYPOINT, [w.hold_s, 0, 0, None, latitude, longitude, w.height_m]))
-        # a command of its own: ArduPilot ignores the yaw of a waypoint
+        # a separate command, because ArduPilot ignores the yaw of a waypoint
         items.append(_item(_YAW, [w.yaw_deg, 0, 0, 0, 0, 0, 0], frame=2))
     for number, item in enumerate(items, start=1):
         item["doJumpId"] = number
@@ -396,6 +396,6 @@ def _item(command: int, params: list[float | None], frame: int = _FRAME_ABOVE_HO
 
 
 def waypoints_csv(waypoints: Sequence[Waypoint], frame: SiteFrame) -> str:
-    """Waypoints as a table: place, height above take-off, yaw until the next one, time to stay."""
+    """Return waypoints as a table: position, height above take-off, yaw until the next one, hold time."""
     rows = [f"{a:.7f},{b:.7f},{w.height_m:g},{w.yaw_deg:.1f},{w.hold_s:g}" for a, b, w in _places(waypoints, frame)]
     return "\n".join(["latitude_deg,longitude_deg,altitude_m,yaw_deg,hold_s", *rows]) + "\n"

@@ -1,8 +1,8 @@
-"""Forward-simulate a planned flight into logs of the real formats, with the truth beside them.
+"""Simulation of a planned flight as logs of the real formats, with a file of the true values.
 
-``flight.plan`` of a flight.yaml says what flies and what is planted (offsets, fading, clock shifts, bad lines);
-its ``logs`` say which files to write and in which format (by ``reader``). The folder that is written holds a
-flight.yaml for ``aerpaw-cmp report``, which must recover what was planted.
+``flight.plan`` of a flight.yaml specifies the route and the simulated errors (offsets, fading, clock shifts, bad
+lines). Its ``logs`` specify the files and their formats (by ``reader``). The written folder contains a flight.yaml for
+``aerpaw-cmp report``, which must recover the simulated errors.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from .replay import replay_poses
 from .settings import FlightFile, LogSettings, PlanSettings, files_of
 from .track import interpolated
 
-# What was planted.
+# File of the true values.
 _TRUTH = "truth.json"
-# The flight file, beside the logs that it names.
+# Flight file in the folder of the logs that it names.
 FLIGHT = "flight.yaml"
-# Readers of the logs that can be written.
+# Readers whose logs can be written.
 _WRITTEN = ("vehicle_out", "sounder_log", "quectel_ri")
-# Below this the simulated level is no signal.
+# Simulated levels below this are no signal.
 _LOWEST_DBM = -400.0
 
 
@@ -48,8 +48,8 @@ _LOWEST_DBM = -400.0
 class Trajectory:
     """A planned trajectory as corner points in time.
 
-    ``time_s`` (corners,) from the start; ``position_m`` (corners, 3) east, north, height above the origin's
-    ground. Between corners the UAV moves in a straight line at constant speed.
+    ``time_s`` (corners,) counts from the start. ``position_m`` (corners, 3) is east, north, and height above the ground
+    at the origin. Between corners the UAV moves in a straight line at constant speed.
     """
 
     time_s: FloatArray
@@ -57,26 +57,26 @@ class Trajectory:
 
     @property
     def duration_s(self) -> float:
-        """From the first to the last corner."""
+        """Time from the first to the last corner."""
         return float(self.time_s[-1])
 
     def position_at(self, time_s: FloatArray) -> FloatArray:
-        """Positions (n, 3) [m] at times [s]."""
+        """Return positions (n, 3) [m] at times [s]."""
         return interpolated(time_s, self.time_s, self.position_m)
 
     def velocity_at(self, time_s: FloatArray) -> FloatArray:
-        """Velocities (n, 3) [m/s] east, north, up; zero while waiting."""
+        """Return velocities (n, 3) east, north, up [m/s], which are zero while the UAV waits."""
         # the last corner belongs to the leg before it
         leg = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.time_s) - 2)
         return np.asarray((np.diff(self.position_m, axis=0) / np.diff(self.time_s)[:, None])[leg])
 
 
-# Of one simulated log: 140 h at ten a second.
+# Largest number of samples of a simulated log: 140 h at ten per second.
 _MAXIMUM_SAMPLES = 5_000_000
 
 
 def plan_trajectory(plan: PlanSettings) -> Trajectory:
-    """Corner times from speeds, climb rates and waiting times.
+    """Return the trajectory with corner times from speeds, climb rates and waiting times.
 
     Examples
     --------
@@ -109,26 +109,26 @@ def plan_trajectory(plan: PlanSettings) -> Trajectory:
     return Trajectory(np.array(times), np.array(positions, dtype=np.float64))
 
 
-# Of multicopters: by least squares over nine flights of two airframes 0.51 to 0.62 beside the wind's.
+# Tilt of multicopters per speed. Least squares over nine flights of two airframes gave 0.51 to 0.62, plus that of wind.
 LEAN_DEG_PER_MPS = 0.6
 
 
 def plan_attitude(trajectory: Trajectory, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Roll, pitch, yaw [deg] of a multirotor on the trajectory: nose along the course, leaning into the motion.
+    """Return roll, pitch, yaw [deg] of a multirotor with its nose along the course, tilted into the motion.
 
-    While the UAV waits it keeps its last heading.
+    While the UAV waits it has its last heading.
     """
     velocity = trajectory.velocity_at(time_s)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    # a hover has no course: the nose stays where it was, and before the first leg where that points
+    # a hover has no course, so the nose stays, and before the first leg it has the direction of that leg
     yaw = pd.Series(np.where(speed > 0.1, bearing_deg(velocity), np.nan))
     return np.zeros(len(time_s)), -LEAN_DEG_PER_MPS * speed, yaw.ffill().bfill().fillna(0.0).to_numpy()
 
 
 def planned_poses(plan: PlanSettings, ground_m: float, step_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Instants (n,) [s], positions (n, 3) [m] and headings (n,) [deg] of a plan; take-off stands at ``ground_m``."""
+    """Return times (n,) [s], positions (n, 3) [m] and headings (n,) [deg] of a plan; take-off is at ``ground_m``."""
     trajectory = plan_trajectory(plan)
-    # a little longer: the end is a sample where the step divides the flight
+    # slightly longer, so that the end is a sample if the step divides the flight
     time_s = np.arange(0.0, trajectory.duration_s + 1e-9, step_s)
     position = trajectory.position_at(time_s)
     position[:, 2] = np.maximum(position[:, 2] + ground_m, MINIMUM_HEIGHT_M)
@@ -138,22 +138,22 @@ def planned_poses(plan: PlanSettings, ground_m: float, step_s: float) -> tuple[F
 def telemetry_frame(
     trajectory: Trajectory, start_utc: pd.Timestamp, interval_s: float, frame: SiteFrame
 ) -> pd.DataFrame:
-    """Telemetry records of the trajectory; altitude counts from the first position.
+    """Return telemetry records of the trajectory, whose altitude counts from the first position.
 
     Parameters
     ----------
     trajectory : Trajectory
     start_utc : Timestamp
-        Of the first row.
+        Time of the first row.
     interval_s : float
-        Between rows [s].
+        Interval between rows [s].
     frame : SiteFrame
-        Local to geographic.
+        Frame that converts local to geographic coordinates.
 
     Returns
     -------
     DataFrame
-        Columns of a telemetry stream (:mod:`aerpaw_cmp.logs.records`), a row per instant.
+        Columns of a telemetry stream (:mod:`aerpaw_cmp.logs.records`), a row per time.
     """
     time_s = np.arange(0.0, trajectory.duration_s + 1e-9, interval_s)
     position = trajectory.position_at(time_s)
@@ -181,7 +181,7 @@ def telemetry_frame(
 
 
 def _times_after(start_utc: pd.Timestamp, seconds: FloatArray) -> pd.Series:
-    """UTC times, naive, rounded to the microsecond that the log formats hold."""
+    """Return naive UTC times, rounded to the microsecond of the log formats."""
     stamps: pd.Series = pd.Series(
         start_utc + pd.to_timedelta(np.round(np.asarray(seconds) * 1e6).astype(np.int64), unit="us")
     )
@@ -191,17 +191,17 @@ def _times_after(start_utc: pd.Timestamp, seconds: FloatArray) -> pd.Series:
 def correlated_noise(
     generator: np.random.Generator, count: int, standard_deviation: float, step_s: float, correlation_s: float
 ) -> FloatArray:
-    """First-order autoregressive Gaussian noise with the stated standard deviation and correlation time.
+    """Return first-order autoregressive Gaussian noise with a standard deviation and a correlation time.
 
     Parameters
     ----------
     generator : Generator
     count : int
-        Samples.
+        Number of samples.
     standard_deviation : float
-        Of each sample.
+        Standard deviation of each sample.
     step_s, correlation_s : float
-        Between samples; time after which the correlation is 1/e [s].
+        Interval between samples, and time after which the correlation is 1/e [s].
 
     Returns
     -------
@@ -213,15 +213,15 @@ def correlated_noise(
         return np.zeros(count)
     keep = np.exp(-step_s / correlation_s)
     white = generator.standard_normal(count) * np.sqrt(1 - keep**2)
-    # the first sample has the full standard deviation: the sequence has gone on for ever
+    # the first sample has the full standard deviation, because the process is stationary
     white[0] /= np.sqrt(1 - keep**2)
     return np.asarray(lfilter([1.0], [1.0, -keep], white) * standard_deviation)
 
 
 def _local_start(start: datetime, timezone: str) -> pd.Timestamp:
-    """The start in its zone; a wall time that never was, or was twice, or no clock can show, is refused."""
+    """Return the start in its zone. A local time that does not exist, or is ambiguous, is refused."""
     try:
-        # NaT for both: pandas would raise exceptions of pytz and of its own
+        # NaT for both, because pandas would raise different exceptions
         local: Any = pd.Timestamp(start.replace(tzinfo=None)).tz_localize(timezone, ambiguous="NaT", nonexistent="NaT")
         if not 1980 <= start.year <= 2200:
             why = "a clock that nothing flew by"
@@ -236,21 +236,21 @@ def _local_start(start: datetime, timezone: str) -> pd.Timestamp:
 
 
 class FlightSimulator:
-    """Writes the logs of one planned flight.
+    """The writer of the logs of one planned flight.
 
     Parameters
     ----------
     settings : FlightFile
-        With ``flight.plan``.
+        Settings with ``flight.plan``.
     site : Site
         The site of the flight.
     folder : Path
-        Where antenna files of the link resolve.
+        Folder of the antenna files of the link.
 
     Attributes
     ----------
     truth_ : dict
-        Everything that was planted, after :meth:`run`.
+        All true values, after :meth:`run`.
     """
 
     def __init__(self, settings: FlightFile, site: Site, folder: Path) -> None:
@@ -261,18 +261,18 @@ class FlightSimulator:
     def run(
         self, out: Path, *, inputs: Iterable[Path] = (), force: bool = False, stages: Stages | None = None
     ) -> list[Path]:
-        """Write a folder with every log of the flight file, the file itself and truth.json; gives the paths written.
+        """Write a folder with every log of the flight file, the file and truth.json, and return the written paths.
 
         Parameters
         ----------
         out : Path
-            Made when missing, replaced as a whole; see :class:`~aerpaw_cmp.common.outputs.OutputFolder`.
+            Folder that is created or replaced; see :class:`~aerpaw_cmp.common.outputs.OutputFolder`.
         inputs : iterable of Path
-            Files that may not lie in it: the flight file and what it names.
+            Files that must not be inside: the flight file and the files that it names.
         force : bool
-            Replace files that were changed after this tool wrote them, too.
+            True to replace files that were changed after this tool wrote them.
         stages : Stages, optional
-            Its progress gets the path of each log.
+            Stages whose progress is called with the path of each log.
 
         Returns
         -------
@@ -282,10 +282,10 @@ class FlightSimulator:
         Raises
         ------
         UsageError
-            Without a plan or a time zone, for readers that have no writer, for towers the site does not have, for
-            a folder that holds what this tool did not write.
+            Without a plan or a time zone, for readers without a writer, for towers that the site does not have, and for
+            a folder with files that this tool did not write.
         OutputError
-            If the disk does not take them.
+            If the files cannot be written.
         """
         plan = self.settings.flight.plan
         if plan is None:
@@ -293,7 +293,7 @@ class FlightSimulator:
         if self.settings.timezone is None:
             raise UsageError("the flight file names no time zone", expected="timezone: America/New_York, say")
         self.plan = plan
-        # by name too: two flights of one seed must not share their fading, which would make them copies of one log
+        # the seed includes the name, because equal fading would make two flights copies of one log
         self.generator = np.random.default_rng([plan.seed, *self.settings.flight.name.encode()])
         self.trajectory = plan_trajectory(plan)
         start = _local_start(plan.start, self.settings.timezone)
@@ -323,15 +323,15 @@ class FlightSimulator:
             return [out / name for name in contents]
 
     def _flight_file(self) -> dict[str, Any]:
-        """The settings as they hold in another folder: site and antenna files by absolute paths."""
-        # what the user stated alone: defaults may change
+        """Return the settings for another folder, with absolute paths of site and antenna files."""
+        # only settings of the user, because defaults may change
         content: dict[str, Any] = self.settings.model_dump(mode="json", exclude_unset=True)
         place = site_place(self.settings.site.file, self.folder)
         content["site"] = {**content.get("site", {}), "file": place if isinstance(place, str) else str(place.resolve())}
         return content | files_of({"link": content["link"]} if "link" in content else {}, self.folder)
 
     def _check_names(self, out: Path) -> None:
-        """UsageError for logs of the flight file that would lie outside ``out``, or twice."""
+        """Refuse logs of the flight file outside ``out``, or named twice."""
         names = [log.path for log in self.settings.logs]
         for name in names:
             inside(out, name, out / FLIGHT, error=UsageError)
@@ -339,7 +339,7 @@ class FlightSimulator:
                 raise UsageError(f"two files of this flight are named {name!r}", expected="a name of its own for each")
 
     def _check_plan(self) -> None:
-        """UsageError for offsets and clock shifts of logs that are not simulated."""
+        """Refuse offsets and clock shifts of logs that are not simulated."""
         links = [f"{log.node}.{log.channel}" for log in self.settings.logs if log.node and log.channel]
         towers = [log.node for log in self.settings.logs if log.node]
         asked = {f"{tower}.{channel}": links for tower, each in self.plan.offsets_db.items() for channel in each}
@@ -352,7 +352,7 @@ class FlightSimulator:
                 )
 
     def _writer(self, log: LogSettings) -> Callable[[], bytes]:
-        """Function that computes a log; UsageError for one that cannot be."""
+        """Return the function that computes a log, or raise UsageError."""
         if log.reader not in _WRITTEN:
             raise UsageError(
                 f"no writer for log {log.path!r} with reader {log.reader!r}", expected="one of " + ", ".join(_WRITTEN)
@@ -370,7 +370,7 @@ class FlightSimulator:
         return partial(self._rss_log, log, tower, link)
 
     def _tried(self, link: Link) -> Link:
-        """Return a link after one replay with it: a dry run refuses what the simulation would refuse."""
+        """Return a link after one replay with it, so that a dry run refuses what the simulation would refuse."""
         replay_poses(self.site, self.settings.rt, link, self._poses(np.zeros(1)))
         return link
 
@@ -380,7 +380,7 @@ class FlightSimulator:
 
     def _poses(self, time_s: FloatArray) -> Poses:
         position = self.trajectory.position_at(time_s)
-        # as the replay does: on the ground itself the two rays cancel
+        # as the replay does, because the two rays cancel on the ground
         position[:, 2] = np.maximum(position[:, 2], MINIMUM_HEIGHT_M)
         if self.settings.rt.attitude == "ignored":
             return Poses(position, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)))
@@ -399,7 +399,7 @@ class FlightSimulator:
             self.generator, len(level), plan.fading_db, plan.rss_interval_s, plan.fading_correlation_s
         )
         out_of_coverage = ~np.isfinite(level) | (level < _LOWEST_DBM)
-        # of the tower's clock: the levels are those of the true time
+        # times are those of the clock of the tower, and levels those of the true time
         shift = plan.clock_shift_s.get(tower, 0.0)
         self.truth_["rss"].setdefault(tower, {})[str(log.channel)] = {
             "offset_db": offset,
@@ -441,19 +441,19 @@ class FlightSimulator:
         return format_ri_csv(records, str(log.timezone or self.settings.timezone))
 
     def _reported(self, rank: IntArray, layers: int) -> IntArray:
-        """Rank that the modem prints: one layer off now and then, 0 without CSI."""
+        """Return the rank that the modem reports: sometimes one layer off, and 0 without CSI."""
         generator, plan = self.generator, self.plan
         off = generator.random(len(rank)) < plan.rank_error_share
         step = np.where(generator.random(len(rank)) < 0.5, -1, 1)
-        # no rank below 1: a modem without a channel reports no CSI, not 0 layers
+        # no rank below 1, because a modem without a channel reports no CSI and not 0 layers
         reported = np.where(off, np.clip(rank + step, 1, layers), rank)
         return np.where(generator.random(len(rank)) < plan.no_csi_share, 0, reported)
 
     def _with_bad_lines(self, data: bytes) -> tuple[bytes, list[str]]:
-        """Insert ``plan.bad_lines`` broken lines at seeded places (never first, so that sniffing still works)."""
+        """Insert ``plan.bad_lines`` broken lines at random positions, but not first, so that the format is still recognised."""
         count = self.plan.bad_lines
         lines = data.splitlines(keepends=True)
-        # too few lines to stay a log with damage in it
+        # too few lines for a log with damage
         if count == 0 or len(lines) < 20:
             return data, []
         end = b"\r\n" if lines[0].endswith(b"\r\n") else b"\n"
@@ -462,7 +462,7 @@ class FlightSimulator:
         )
         damage = []
         for number, place in enumerate(places):
-            # as a killed logger leaves them, and as a console prints between
+            # lines of a killed logger, and console output in between
             torn = lines[place].rstrip()[: max(4, len(lines[place]) // 3)]
             text = torn if number % 2 == 0 else b"Killed by signal 15 " + torn[:8]
             lines.insert(place, text + end)

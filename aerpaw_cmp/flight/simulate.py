@@ -450,7 +450,7 @@ class FlightSimulator:
         return np.where(generator.random(len(rank)) < plan.no_csi_share, 0, reported)
 
     def _with_bad_lines(self, data: bytes) -> tuple[bytes, list[str]]:
-        """Insert ``plan.bad_lines`` broken lines at random positions, but not first, so that the format is still recognised."""
+        """Insert ``plan.bad_lines`` broken lines at random positions, but not first, so that readers know the format."""
         count = self.plan.bad_lines
         lines = data.splitlines(keepends=True)
         # too few lines for a log with damage

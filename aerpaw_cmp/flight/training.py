@@ -193,7 +193,7 @@ def _evidence(first: str, second: str) -> FloatArray:
 
 
 def _memory(left: AnyArray, right: AnyArray, size: int) -> float:
-    """Return the digits per independent pair (Bartlett 1935). Changes of a rank are correlated longer than of a level."""
+    """Return the digits per independent pair (Bartlett 1935), which are more for a rank than for a level."""
     ours, theirs = (np.fft.irfft(np.abs(x) ** 2, size)[: round(_TREND_S / _STEP_S)] for x in (left, right))
     return 2.0 * float((ours * theirs).sum() / max(ours[0] * theirs[0], 1.0)) - 1.0
 

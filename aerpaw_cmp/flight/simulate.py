@@ -450,7 +450,7 @@ class FlightSimulator:
         return np.where(generator.random(len(rank)) < plan.no_csi_share, 0, reported)
 
     def _with_bad_lines(self, data: bytes) -> tuple[bytes, list[str]]:
-        """Insert ``plan.bad_lines`` broken lines at random positions, but not first, so that readers know the format."""
+        """Insert ``plan.bad_lines`` broken lines at random positions, but not in the first line."""
         count = self.plan.bad_lines
         lines = data.splitlines(keepends=True)
         # too few lines for a log with damage

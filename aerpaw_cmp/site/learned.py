@@ -4,8 +4,8 @@ Each entry is a campaign: learned antennas by tower and channel, their airframe,
 the logs (SHA-256) that they were learned from, errors on held-out flights, the source of the flights and the command
 that learns them again. Every table and every entry is verified by its SHA-256 when it is read.
 
-The tables: gain over the full sphere with its standard deviation (also as cuts for planning tools), the gain towards
-both ends at once besides two antennas, and the directions at which a gain is known with its covariance there.
+There are tables of the gain over the full sphere with its standard deviation (also as cuts for planning tools), of the
+gain towards both ends at once, and of directions that determine a gain, with its covariance.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ from .antennas import HIGHEST_DBI, MeasuredPattern, check_power
 
 _INDEX = "learned.yaml"
 
-# Share by which a carrier may differ from the one that a tower's antenna was learned at.
-# Lake Wheeler's bands at 3.3, 3.4 and 3.51 GHz lie 3 % apart: other antennas, other gains.
+# Relative difference of carriers up to which an antenna of a tower is used.
+# The bands of Lake Wheeler at 3.3, 3.4 and 3.51 GHz differ by 3 % and have other antennas and gains.
 BAND = 0.02
 
-# The same for an airframe: 3.3 and 3.51 GHz share 90 % of the variance of its gain. Farther bands were never compared.
+# Limit for an airframe. 3.3 and 3.51 GHz share 90 % of the variance of its gain. There are no data for other bands.
 AIRFRAME_BAND = 0.07
 
 
 class Source(StrictModel):
-    """Source of the flights, as calibration.yaml says."""
+    """The source of the flights, from calibration.yaml."""
 
     title: str = ""
     doi: str = ""
@@ -58,10 +58,10 @@ class Source(StrictModel):
 
 
 class Errors(StrictModel):
-    """Means over held-out series: RMSE [dB] after one offset, and the share inside 90 % intervals.
+    """Mean errors over held-out series: RMSE after one offset [dB], and the share inside 90 % intervals.
 
-    ``rmse_db`` is that of held-out flights; ``height_rmse_db``, ``sector_rmse_db`` and ``heading_rmse_db`` are those of
-    heights, sectors of azimuth at the tower and headings that no other flight has. ``heights_m``: the cruise heights.
+    ``rmse_db`` is that of held-out flights. ``height_rmse_db``, ``sector_rmse_db`` and ``heading_rmse_db`` are those of
+    heights, sectors of azimuth at the tower and headings that no other flight has. ``heights_m`` are cruise heights.
     """
 
     series: int
@@ -73,7 +73,7 @@ class Errors(StrictModel):
     height_rmse_db: float | None = None
     heading_rmse_db: float | None = None
     airframe_rmse_db: float | None = None
-    """Of the airframe of other campaigns alone, on the flights of this one."""
+    """RMSE of the airframe of other campaigns alone, on the flights of this campaign [dB]."""
     heights_m: list[float] = Field(default_factory=list)
 
     def expected(self, height_m: float, *, unseen: bool) -> tuple[Errors, str]:
@@ -84,7 +84,7 @@ class Errors(StrictModel):
         height_m : float
             Cruise height; NaN if it is not known.
         unseen : bool
-            Most directions were not flown.
+            True if most directions were not flown.
         """
         new_height = bool(self.heights_m) and min(abs(height_m - h) for h in self.heights_m) > _SAME_HEIGHT_M
         kinds = (
@@ -98,18 +98,18 @@ class Errors(StrictModel):
         return self.model_copy(update={"rmse_db": rmse_db}), kind
 
 
-# Flights whose cruise heights differ by less are at one height.
+# Flights are at one height if their cruise heights differ by less.
 _SAME_HEIGHT_M = 5.0
 
 
 class LearnedLock(StrictModel):
-    """Lock probability of a receiver: P = 1 / (1 + exp(-per_db (path gain - gain_db))) of the predicted path gain [dB].
+    """The lock probability of a receiver: P = 1 / (1 + exp(-per_db (path gain - gain_db))) [path gain in dB].
 
-    In lock the levels lie about ``locked_db`` at ``gain_db``, ``locked_per_db`` higher for each dB of path gain (less
-    than 1: of weak levels the receiver locks on the strong), with ``locked_sd_db`` in a flight; without lock about
-    ``lost_db`` and so on [unit of the measurement].
-    The scores are means over flights left out: Brier and log score (nat) beside those of each flight's own share, and
-    the RMSE [dB] of all samples where levels below the floor count as the floor.
+    Levels in lock have mean ``locked_db`` at ``gain_db``, increase by ``locked_per_db`` for each dB of path gain (less
+    than 1, because of weak levels only the stronger ones have lock), and have the SD ``locked_sd_db`` in a flight.
+    Levels without lock have mean ``lost_db`` and so on [unit of the measurement]. The scores are means over held-out
+    flights: Brier and log score (nat), those of a constant share, and the RMSE of all samples with levels below the
+    floor counted as the floor [dB].
     """
 
     gain_db: float
@@ -132,7 +132,7 @@ class LearnedLock(StrictModel):
 
 
 class LearnedLevel(StrictModel):
-    """Level of a log minus free space of a transmit power and the gains as written [dB]; ``sd_db``: of a new flight."""
+    """The level of a log minus that of free space with the transmit power and gains as written [dB], with its SD."""
 
     offset_db: float
     sd_db: Annotated[float, Field(gt=0)]
@@ -141,7 +141,7 @@ class LearnedLevel(StrictModel):
 
 
 class LearnedSpread(StrictModel):
-    """Error model of a level besides the SD of the gain: see :class:`aerpaw_cmp.compare.gains.Spread`."""
+    """The error model of a level without the SD of the gain; see :class:`aerpaw_cmp.compare.gains.Spread`."""
 
     own_sd_db: Annotated[float, Field(ge=0)]
     noise_sd_db: Annotated[float, Field(ge=0)]
@@ -151,28 +151,28 @@ class LearnedSpread(StrictModel):
 
 
 class LearnedPair(StrictModel):
-    """Gain towards both ends at once: its table, and the kernel that interpolates it."""
+    """The gain towards both ends at once: its table, and the kernel that interpolates it."""
 
     file: str
     sha256: str | None = None
-    """Of the table, where no index names it."""
+    """SHA-256 of the table, if no index contains it."""
     length: Annotated[float, Field(gt=0)]
     prior_sd_db: Annotated[float, Field(ge=0)]
 
 
 class LearnedAntenna(StrictModel):
-    """Knowledge about a learned antenna besides its table, as a flight file or calibrated.yaml contains it."""
+    """Properties of a learned antenna other than its table, as a flight file or calibrated.yaml contains them."""
 
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-    """Of the table; another table is refused."""
+    """SHA-256 of the table. Another table is refused."""
     command: str
-    """Command that learns it again."""
+    """Command that learns the antenna again."""
     pair: LearnedPair | None = None
     spread: LearnedSpread
 
 
 class LearnedHealth(StrictModel):
-    """Errors of held-out flights of one channel, by which faults of a later flight are judged.
+    """Errors of held-out flights of one channel, with which a later flight is compared.
 
     ``rmse_db`` is the mean RMSE of 1-s means over flights, with its SD. Means over 4 s have a correlated part
     (``slow_sd_db``, with its correlation time and length) and a white part (``white_sd_db``). The usual offset is that
@@ -189,7 +189,7 @@ class LearnedHealth(StrictModel):
     step_chi2: float
     """Largest chi-squared of a step of the level in these flights."""
     channel_difference_sd_db: dict[str, float] = Field(default_factory=dict)
-    """By other channel of the tower: SD over flights of the difference of both offsets."""
+    """SD over flights of the difference of offsets to another channel of the tower, by channel."""
     below_lock_share: float | None = None
     """Mean share of samples without lock; None for receivers that do not report their lock."""
     run_s: float
@@ -197,34 +197,34 @@ class LearnedHealth(StrictModel):
 
     @property
     def most_rmse_db(self) -> float:
-        """RMSE that a healthy flight hardly exceeds: mean + 2 SD [dB]."""
+        """RMSE that healthy flights rarely exceed: mean + 2 SD [dB]."""
         return self.rmse_db + 2.0 * self.rmse_sd_db
 
 
 class LearnedSeries(StrictModel):
-    """Antennas of one tower and channel, and the properties of the levels of that channel."""
+    """The antennas of one tower and channel, and the properties of the levels of that channel."""
 
     tower: str
     channel: str
-    """Label of the antenna in the flights that were learned from; a name, not a condition."""
+    """Label of the antenna in the training flights. It is a name, not a condition."""
     receiver: str = ""
-    """Receiver whose level ``level`` and ``lock`` describe, as ``receiver`` of a flight file; empty: not named."""
+    """Receiver to which ``level`` and ``lock`` apply, as ``receiver`` of a flight file; empty if not named."""
     carrier_hz: float
     tower_file: str
     uav_file: str
     known_file: str
     """Directions at the UAV that determine its gain, and the covariance of the gain there."""
     tower_known_file: str
-    """The same for the tower's antenna."""
+    """Directions at the tower that determine the gain of its antenna, and their covariance."""
     pair: LearnedPair | None = None
     spread: LearnedSpread
     sd_db: float
-    """Mean standard deviation of the level over directions that were flown."""
+    """Mean standard deviation of the level over flown directions."""
     shares_airframe: bool = True
-    """False if the gain of the UAV does not predict held-out flights of its own campaign: it is not used elsewhere."""
+    """False if the gain of the UAV does not predict held-out flights of its campaign. It is then not used elsewhere."""
     lock: LearnedLock | None = None
     level: LearnedLevel | None = None
-    """Of receivers that lose their lock: of the levels in lock."""
+    """Level; for receivers that lose their lock, the level in lock."""
     health: LearnedHealth | None = None
 
     @property
@@ -235,11 +235,11 @@ class LearnedSeries(StrictModel):
 
 
 class LearnedReceiver(StrictModel):
-    """A rank receiver of one tower: error on flights left out as kappa and log score beside the constant forecast."""
+    """A rank receiver of one tower, with kappa and log score on held-out flights and of the constant forecast."""
 
     tower: str
     quantity: str
-    """Rank that it was learned from, such as ``scheduled PDSCH rank``; whatever reader reads it."""
+    """Rank from which it was learned, such as ``scheduled PDSCH rank``, for any reader."""
     carrier_hz: float
     file: str
     kappa: float | None = None
@@ -248,14 +248,14 @@ class LearnedReceiver(StrictModel):
 
 
 class Entry(StrictModel):
-    """Antennas and receivers of one campaign, as one calibration learned them."""
+    """The antennas and receivers of one campaign, learned by one calibration."""
 
     command: str
     made: str
     flights: list[str]
     flown: list[str]
     joined: list[str] = Field(default_factory=list)
-    """Other campaigns whose flights the gain of the UAV was learned from as well."""
+    """Other campaigns whose flights also determine the gain of the UAV."""
     trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]]
     """SHA-256 of all logs of the calibration."""
     source: Source = Source()
@@ -264,20 +264,20 @@ class Entry(StrictModel):
     receivers: list[LearnedReceiver] = Field(default_factory=list)
     ground_roughness_m: float | None = None
     tables: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
-    """SHA-256 of the tables as they were written: nothing else is ever replaced or removed."""
+    """SHA-256 of the tables as written. No other file is replaced or removed."""
     sha256: str = ""
-    """Of all other values of the entry."""
+    """SHA-256 of all other values of the entry."""
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the values, without ``sha256``."""
+        """Return the SHA-256 of the values without ``sha256``."""
         values = self.model_dump(mode="json", exclude={"sha256"}, exclude_none=True)
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
     def about(self, errors: Errors | None = None, kind: str = "on another flight") -> str:
-        """Return one sentence: learned from which flights, and which error to expect (default: held-out flights)."""
+        """Return a sentence about the training flights and the expected error (default: held-out flights)."""
         errors = errors or self.errors
-        days = f" of {', '.join(self.flown)}" if self.flown else ""  # none where the logs have relative times
+        days = f" of {', '.join(self.flown)}" if self.flown else ""  # empty for logs with relative times
         text = f"learned on {counted(len(self.flights), 'flight')}{days}"
         text += f", the UAV also on {', '.join(self.joined)}" if self.joined else ""
         if errors is not None:
@@ -292,7 +292,7 @@ class Entry(StrictModel):
 
 
 class _Foreign(BaseModel, extra="allow"):
-    """An entry of another version: nothing is read of it, but others can be replaced beside it."""
+    """An entry of another version, which is not read but is kept when others are replaced."""
 
     tables: dict[str, str] = Field(default_factory=dict)
 
@@ -301,21 +301,21 @@ _Name = Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
 
 
 class Learned(StrictModel):
-    """All that a site remembers, by name."""
+    """All learned models of a site, by name."""
 
     format: Literal["aerpaw-cmp learned 3"] = "aerpaw-cmp learned 3"
     entries: dict[_Name, Entry] = Field(default_factory=dict)
 
 
 class _Index(Learned):
-    """The same as it is written, with entries of any version."""
+    """The learned models as they are written, with entries of any version."""
 
-    # a newer entry must not be lost because an older version adds one beside it
+    # a newer entry must not be lost when an older version adds another one
     entries: dict[_Name, Entry | _Foreign] = Field(default_factory=dict)  # type: ignore[assignment]
 
 
 def folder_of(site: str | Path) -> Path:
-    """Folder of what a site remembers: beside its file, or in the package."""
+    """Return the folder of the learned models of a site, next to its file or in the package."""
     path = Path(site)
     if path.suffix in (".yaml", ".yml") or path.is_file():
         return path.with_suffix(".learned")
@@ -324,14 +324,14 @@ def folder_of(site: str | Path) -> Path:
 
 
 def read_learned(site: str | Path) -> Learned:
-    """Read the memory of a site; empty for a site without one.
+    """Read the learned models of a site, which are empty if it has none.
 
     Raises
     ------
     UsageError
-        An index that is damaged, or of another version; values that were edited.
+        If the index is damaged, has another version, or was edited.
     InputError
-        It names a file outside its folder.
+        If it names a file outside its folder.
     """
     folder = folder_of(site)
     memory = _read(folder, Learned)
@@ -347,7 +347,7 @@ def read_learned(site: str | Path) -> Learned:
 
 
 def check_index(site: str | Path) -> None:
-    """Check that entries can be added for a site: an index that can be read, whatever the values of its entries.
+    """Check that entries can be added for a site, which needs an index that can be read.
 
     Raises
     ------
@@ -361,22 +361,22 @@ def _read(folder: Path, model: type[Learned]) -> Learned:
     index = inside(folder, _INDEX, folder / _INDEX)
     memory = load_yaml(index, model) if index.is_file() else model()
     for name in {name for entry in memory.entries.values() for name in (*files_of(entry), *entry.tables)}:
-        # before any is opened: an index may come from a stranger
+        # check before a file is opened, because an index may be untrusted
         inside(folder, name, index, plain=True)
     return memory
 
 
 def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, bytes]) -> list[Path]:
-    """Write an entry and its tables (name: content, packed here) into the memory of a site; the index comes last.
+    """Write an entry and its tables into the learned models of a site, with the index last.
 
     Parameters
     ----------
     site : str or Path
     name : str
-        Of the entry; one of this name is replaced.
+        Name of the entry, which replaces one of this name.
     entry : Entry
     files : mapping of str to bytes
-        As the entry names them, with the ending ``.gz``.
+        Content of the tables by name, with the ending ``.gz``; compressed here.
 
     Returns
     -------
@@ -385,20 +385,20 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
     Raises
     ------
     UsageError
-        A file of the name of a table that no calibration wrote; a damaged index.
+        If a file with the name of a table was not written by a calibration, or the index is damaged.
     InputError, OutputError
-        As :func:`read_learned`; the folder cannot be written.
+        As :func:`read_learned`, or if the folder cannot be written.
     """
     folder = folder_of(site)
-    # mtime=0: the same content has the same bytes, and so the same SHA-256
+    # mtime=0, so that the same content has the same bytes and SHA-256
     packed = {file: gzip.compress(content, 9, mtime=0) for file, content in files.items()}
     tables = {file: hashlib.sha256(content).hexdigest() for file, content in packed.items()}
     with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)
-        # two calibrations of one site at once: each must see the other's entry
+        # with two calibrations of one site at once, each must see the entry of the other
         with locked(folder):
             memory = _read(folder, _Index)
-            # what an entry names with its digest is ours, and so is an edited table or one of a killed calibration
+            # files with a digest in an entry are ours, and so are an edited table and tables of a killed calibration
             written = {item for known in memory.entries.values() for item in known.tables.items()}
             for file in packed:
                 place = inside(folder, file, folder / _INDEX, plain=True)
@@ -415,26 +415,29 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
             made = made.model_copy(update={"sha256": made.digest})
             entries = dict(sorted({**memory.entries, name: made}.items()))
             text = dump_yaml(memory.model_copy(update={"entries": entries}).model_dump(mode="json", exclude_none=True))
-            # after the tables that it names: a reader meets no entry without its files
+            # after its tables, so that no entry is without files
             write_whole(folder / _INDEX, text)
             used = {file for known in entries.values() for file in files_of(known)}
             for file, digest in sorted(written):
-                # changed since, it is no longer the table that was written: it stays
+                # a table that was changed later stays
                 if file not in used and (folder / file).is_file() and file_digest(folder / file) == digest:
                     (folder / file).unlink()
     return [folder / _INDEX, *(folder / file for file in files)]
 
 
 def carry_memory(base: str | Path, site: Path) -> list[str]:
-    """Copy the memory of a base beside a site made of it, which has none yet; a line that says so."""
+    """Copy the learned models of a base site next to a new site, and return a line about it."""
     origin, folder = folder_of(base), folder_of(site)
     if not origin.is_dir() or (folder / _INDEX).exists():
         return []
     entries = read_learned(base).entries
     with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)
-        # the index last: until it is there the new site has no memory
-        for name in [*sorted(set().union(*map(files_of, entries.values()))), _INDEX]:  # without it there is no memory
+        # the index last, because without it the new site has no learned models
+        for name in [
+            *sorted(set().union(*map(files_of, entries.values()))),
+            _INDEX,
+        ]:  # without an index there are no learned models
             place = inside(origin, name, origin / _INDEX, plain=True)
             if place.is_file() and not (folder / name).exists():
                 write_whole(folder / name, place.read_bytes())
@@ -442,7 +445,7 @@ def carry_memory(base: str | Path, site: Path) -> list[str]:
 
 
 def memory_lines(site: str | Path) -> list[str]:
-    """Lines that say what a site remembers."""
+    """Return lines about the learned models of a site."""
     lines = []
     for name, entry in read_learned(site).entries.items():
         what = [f"{s.tower}.{s.channel} at {s.carrier_hz / 1e9:g} GHz (SD {s.sd_db:.1f} dB)" for s in entry.series]
@@ -457,18 +460,18 @@ def memory_lines(site: str | Path) -> list[str]:
 
 
 def files_of(entry: Entry | _Foreign) -> set[str]:
-    """Names of the tables of an entry."""
+    """Return the names of the tables of an entry."""
     if isinstance(entry, _Foreign):
         return set(entry.tables)
     return {file for s in entry.series for file in s.files} | {r.file for r in entry.receivers}
 
 
-# Begins the comment that names a calibration and, after ``, from``, its flights.
+# Begin of the comment with the calibration and, after ``, from``, its flights.
 LEARNED = "# aerpaw-cmp calibrate: "
 
 
 def _is_table(place: Path) -> bool:
-    """Check whether a file is a table of some calibration: it begins as one, or is a rank receiver."""
+    """Check whether a file is a table of a calibration or a rank receiver."""
     with suppress(InputError, OSError, EOFError):
         content = read_table(place, "a table")
         return content.startswith(LEARNED.encode()) or (content.startswith(b"{") and b'"trained_on"' in content)
@@ -477,28 +480,28 @@ def _is_table(place: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """SHA-256 of a file as a calibration wrote it, and the command that writes it again."""
+    """The SHA-256 of a file as a calibration wrote it, and the command that writes it again."""
 
     sha256: str
     command: str
 
 
 def read_table(path: Path, expected: str, written: Written | None = None) -> bytes:
-    """Return the content of a table, packed or not.
+    """Return the content of a table, compressed or not.
 
     Parameters
     ----------
     path : Path
     expected : str
-        What the table is, for messages.
+        Kind of the table, for messages.
     written : Written, optional
-        The table must be as it was written.
+        The table must have this SHA-256.
 
     Raises
     ------
     OSError
     InputError
-        Too large, a damaged packed file, or not as it was written.
+        If the file is too large, damaged, or not as it was written.
     """
     content = read_bounded(path, LARGEST_TABLE, expected)
     if written is not None and hashlib.sha256(content).hexdigest() != written.sha256:
@@ -511,7 +514,7 @@ def read_table(path: Path, expected: str, written: Written | None = None) -> byt
     if not content.startswith(b"\x1f\x8b"):
         return content
     with parsing(path, expected, "a cut copy"), gzip.open(path) as book:
-        # one byte more than allowed tells a table that is too large without unpacking all of it
+        # one byte more than allowed shows that a table is too large, without decompressing all of it
         unpacked = book.read(LARGEST_TABLE + 1)
     if len(unpacked) > LARGEST_TABLE:
         raise InputError(f"it unpacks to more than {LARGEST_TABLE} bytes", expected=expected, path=path)
@@ -526,7 +529,7 @@ class Named(StrictModel):
     folder: Path
 
     def antenna(self, end: str, carrier_hz: float) -> LearnedSeries | None:
-        """Return the series whose antenna fits an end (``uav``, ``tower``) of a link; None if there is none."""
+        """Return the series whose antenna fits an end (``uav``, ``tower``) of a link, or None."""
         if end == "tower":
             return next((s for s in self.entry.series if f"{s.tower}.{s.channel}" == self.part), None)
         # an airframe has one antenna for all channels of a band
@@ -548,20 +551,22 @@ def find_named(name: str, folder: Path, end: str = "") -> Named:
     ----------
     name : str
     folder : Path
-        Where sites that are not packaged lie: SITE.learned in it.
+        Folder of sites that are not packaged, with SITE.learned.
     end : {"uav", "tower", "receiver", ""}
-        Part that is wanted: the airframe, the antenna of a tower, a rank receiver, or any.
+        Required part: the airframe, the antenna of a tower, a rank receiver, or any.
 
     Raises
     ------
     UnknownName
-        No such site, entry or part, or a part for another end.
+        If there is no such site, entry or part, or the part is for another end.
     UsageError
-        A memory that cannot be read.
+        If the learned models cannot be read.
     """
     site, _, entry_part = name.rpartition("/")
-    # a site beside the flight file comes before a packaged one of its name
-    place: str | Path = folder.absolute() / f"{site}.yaml"  # the paths in it hold in any working folder
+    # a site next to the flight file comes before a packaged one of that name
+    place: str | Path = (
+        folder.absolute() / f"{site}.yaml"
+    )  # absolute, so that its paths are valid in any working folder
     packaged = folder_of(site)
     if not folder_of(place).is_dir() and packaged.is_absolute() and packaged.is_dir():
         place = site
@@ -591,27 +596,27 @@ def _parts(name: str, entry: Entry, end: str) -> dict[str, str]:
     return parts
 
 
-# Share of the variance by which rounded values may miss the function.
-# The table has gains to 0.01 dB and angles to 0.1 deg: neighbours may contradict by as much.
+# Share of the variance by which rounded values may differ from the function.
+# The table has gains to 0.01 dB and angles to 0.1 deg, so neighbours may contradict by this.
 _NUGGET = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairGain:
-    """A Gaussian process over the directions at both ends, known at some of them.
+    """A Gaussian process over the directions at both ends, with known values at some of them.
 
     Parameters
     ----------
     directions : (k, 6)
-        Unit vectors, from the UAV to the tower in the body and from the tower to the UAV at the mast.
+        Unit vectors from the UAV to the tower in the body frame, and from the tower to the UAV at the mast.
     gain_db : (k,)
-        What the antennas of both ends together leave [dB].
+        Part of the gain that the antennas of both ends do not explain separately [dB].
     sd_db : (k,)
-        Standard deviation of the level that both antennas and this gain predict there [dB].
+        Standard deviation of the level predicted by both antennas and this gain [dB].
     length : float
-        Of the Gaussian kernel of the chord.
+        Length of the Gaussian kernel of the chord.
     prior_sd_db : float
-        Of the gain where nothing is known [dB].
+        Standard deviation of the gain far from known directions [dB].
     """
 
     directions: FloatArray
@@ -623,19 +628,19 @@ class PairGain:
     @cached_property
     def _factor(self) -> Factor:
         matrix = gaussian_kernel(self.directions, self.directions, self.length)
-        # directions flown twice would make two equal rows, which have no factor
+        # repeated directions would make two equal rows, which have no factor
         matrix[np.diag_indices(len(matrix))] += _NUGGET
         return Factor.of(matrix)
 
     def at(self, directions: FloatArray, apart_sd_db: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gain and standard deviation of the level (n,) towards directions (n, 6) [dB].
+        """Return gain and standard deviation of the level towards directions (n, 6), each (n,) [dB].
 
         Parameters
         ----------
         directions : (n, 6)
-            As those of the record.
+            Directions in the form of the record.
         apart_sd_db : (n,)
-            Standard deviation of both antennas as if each were learned alone [dB].
+            Standard deviation of both antennas if each were learned separately [dB].
 
         Returns
         -------
@@ -643,17 +648,17 @@ class PairGain:
 
         Notes
         -----
-        The variance is that of the record by the share of the process that its directions determine, and the sum of
-        the antennas' and of the prior's by the rest.
+        The variance is a mean of that of the record and of the sum of the variances of antennas and prior, weighted by
+        the share of the process that known directions determine.
         """
         gain, sd = np.empty(len(directions)), np.empty(len(directions))
         white = self._factor.whiten(self.gain_db)
-        # bounds the memory of the kernel against all known directions
+        # limit the memory of the kernel against all known directions
         for start in range(0, len(directions), 4096):
             part = slice(start, start + 4096)
             across = gaussian_kernel(directions[part], self.directions, self.length)
             gain[part], known = self._factor.condition(across, white)
-            # a share: rounding takes it beyond 1 at a known direction
+            # rounding can exceed 1 at a known direction
             known = np.minimum(known, 1.0)
             near = across @ self.sd_db**2 / np.maximum(across.sum(axis=1), 1e-12)
             away = apart_sd_db[part] ** 2 + self.prior_sd_db**2
@@ -682,7 +687,7 @@ def read_pair(path: Path, length: float, prior_sd_db: float, written: Written | 
     length, prior_sd_db : float
         Kernel of the gain, as in :class:`PairGain`.
     written : Written, optional
-        The table must be as it was written.
+        The table must have this SHA-256.
 
     Returns
     -------
@@ -691,7 +696,7 @@ def read_pair(path: Path, length: float, prior_sd_db: float, written: Written | 
     Raises
     ------
     InputError
-        Other columns, no row, values that are not finite; a table that is not as it was written.
+        For other columns, no row, values that are not finite, or a table that is not as it was written.
     """
     text = read_table(path, "a table of the gain towards both ends", written).decode("utf-8-sig")
     lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
@@ -733,14 +738,14 @@ class SpherePattern(MeasuredPattern):
     gain_dbi, sd_db : (thetas, phis)
         Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
     notes : str
-        Comments of the file, from which its provenance is read.
+        Comments of the file, which contain the training logs.
 
     Attributes
     ----------
     pair : PairGain or None
-        Gain towards both ends at once, besides that of a tower's antenna.
+        Gain towards both ends at once, in addition to that of the antenna of a tower.
     spread : LearnedSpread or None
-        Error model of a level besides the SD of the gain.
+        Error model of a level without the SD of the gain.
     """
 
     def __init__(
@@ -760,24 +765,24 @@ class SpherePattern(MeasuredPattern):
 
     @property
     def largest_sd_db(self) -> float:
-        """Standard deviation of the gain in the direction that is known least [dB]."""
+        """Largest standard deviation of the gain over all directions [dB]."""
         return float(self._sd_db.max())
 
     def gain_sd_db(self, theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:
-        """Standard deviation of the gain towards directions [dB], bilinear."""
+        """Return the standard deviation of the gain towards directions [dB], bilinear."""
         from scipy.ndimage import map_coordinates
 
         theta, phi = np.broadcast_arrays(np.asarray(theta_rad, dtype=float), np.asarray(phi_rad, dtype=float))
         rows, columns = self._sd_db.shape
-        # the first meridian again behind the last, so that interpolation goes round
+        # repeat the first meridian after the last, so that interpolation is periodic
         wrapped = np.concatenate([self._sd_db, self._sd_db[:, :1]], axis=1)
         at = [theta.ravel() / np.pi * (rows - 1), (phi.ravel() % (2 * np.pi)) / (2 * np.pi) * columns]
         return np.asarray(map_coordinates(wrapped, at, order=1, mode="nearest").reshape(theta.shape))
 
 
 def sphere_grid(step_deg: float = 5.0) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Zenith angles (t,) and azimuths (p,) [deg] of a full sphere, and unit vectors (t, p, 3)."""
-    # both poles, but 360 deg not again: it is 0
+    """Return zenith angles (t,) and azimuths (p,) [deg] of a full sphere, and unit vectors (t, p, 3)."""
+    # both poles, but not 360 deg, which is 0
     theta, phi = np.arange(0.0, 180.0 + step_deg / 2, step_deg), np.arange(0.0, 360.0, step_deg)
     t, p = np.radians(theta)[:, None], np.radians(phi)[None, :]
     vectors = np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
@@ -785,18 +790,18 @@ def sphere_grid(step_deg: float = 5.0) -> tuple[FloatArray, FloatArray, FloatArr
 
 
 def unit_mean_gain(gain_db: FloatArray) -> FloatArray:
-    """A grid (thetas, phis) [dB] shifted so that its mean power over the sphere is that of an isotropic antenna.
+    """Return a grid (thetas, phis) [dB] whose mean power over the sphere is that of an isotropic antenna.
 
-    The level of a learned gain is not identified: it stands in the offset.
+    The level of a learned gain is not determined, because the offset contains it.
     """
     theta = np.linspace(0.0, np.pi, gain_db.shape[0])
-    # area of a ring; a pole has none
+    # area of a ring, which is zero at a pole
     weight = np.sin(theta)[:, None] * np.ones_like(gain_db)
     return np.asarray(gain_db - db_from_power((power_from_db(gain_db) * weight).sum() / weight.sum()))
 
 
 def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] = (), decimals: int = 3) -> str:
-    """Text of an antenna file: comment lines, a header, a line per direction.
+    """Return the text of an antenna file: comment lines, a header, a line per direction.
 
     Parameters
     ----------
@@ -805,7 +810,7 @@ def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] =
     notes : tuple of str
         Comments, a line each.
     decimals : int
-        Of the gains.
+        Decimals of the gains.
 
     Returns
     -------
@@ -824,27 +829,29 @@ def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] =
 
 @parsed("a table of gain over direction")
 def read_sphere_csv(path: str | Path, written: Written | None = None) -> SpherePattern:
-    """Read an antenna file of :func:`sphere_csv`; azimuth counter-clockwise from the device's x axis, elevation up.
+    """Read an antenna file of :func:`sphere_csv`.
+
+    Azimuth is counter-clockwise from the x axis of the device, and elevation is up.
 
     Parameters
     ----------
     path : str or Path
     written : Written, optional
-        The file must be as it was written.
+        The file must have this SHA-256.
 
     Raises
     ------
     InputError
-        Missing columns or directions, values that are no gains, with the line; a file that is not as it was written.
+        For missing columns or directions, values that are not gains, and a file that is not as it was written.
     """
     path = Path(path)
-    # shallow: the pattern of a text is kept, and pair and spread belong to one use of it
+    # shallow, because the pattern of a text is cached, and pair and spread belong to one use of it
     return copy.copy(_pattern_of(read_table(path, "an antenna file", written).decode("utf-8-sig"), path))
 
 
 @lru_cache(maxsize=64)
 def _pattern_of(text: str, path: Path) -> SpherePattern:
-    """The antenna of a file's text; kept, for each draft of a folder reads all of a site's memory."""
+    """Return the antenna of the text of a file, cached because each draft reads all learned models of a site."""
     numbered = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if line.strip() and line[0] != "#"]
     header = [cell.strip() for cell in numbered[0][1].split(",")] if numbered else []
     if header[:3] != list(SPHERE_COLUMNS[:3]):
@@ -859,7 +866,7 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
     _check_grid(azimuth, elevation, len(values), path)
     row = np.argmin(np.abs(elevation[None, :] - values[:, 1:2]), axis=1)
     column = np.argmin(np.abs(azimuth[None, :] - values[:, :1] % 360.0), axis=1)
-    # the grid is complete by number, so a direction twice means another is missing
+    # the grid is complete by number, so a repeated direction means that another is missing
     if len(np.unique(row * len(azimuth) + column)) != len(values):
         raise InputError("a direction is given twice", expected="each direction once", path=path)
     gain, sd = np.zeros((2, len(elevation), len(azimuth)))
@@ -867,17 +874,17 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
     if len(header) > 3:
         sd[row, column] = values[:, 3]
     notes = "\n".join(line for line in text.splitlines() if line.startswith("#"))
-    # the name of the file is that of the antenna in reports
+    # reports use the name of the file for the antenna
     pattern = SpherePattern(path.stem, gain, sd, notes=notes)
     check_power(pattern, path)
     return pattern
 
 
 def _values(numbered: Sequence[tuple[int, str]], width: int, path: Path) -> FloatArray:
-    """Cells (lines, width) of numbered lines; line by line only where that finds the one that is wrong."""
+    """Return the cells of numbered lines (lines, width); lines are read one by one only to find a wrong one."""
     with suppress(ValueError):
         if numbered:
-            # quick for files that are right, which most are
+            # fast for valid files, which most are
             values = np.loadtxt([line for _, line in numbered], delimiter=",", comments=None, ndmin=2)
             if values.shape == (len(numbered), width) and not _refused(values).any():
                 return values
@@ -885,7 +892,7 @@ def _values(numbered: Sequence[tuple[int, str]], width: int, path: Path) -> Floa
 
 
 def _refused(values: FloatArray) -> BoolArray:
-    """Rows (n,) of cells (n, width) that are no gains in a direction."""
+    """Check rows (n,) of cells (n, width) that are not gains in a direction."""
     loud, negative = values[:, 2] > HIGHEST_DBI, (values[:, 3:4] < 0).any(axis=1)
     return np.asarray(~np.isfinite(values).all(axis=1) | loud | negative)
 
@@ -925,27 +932,27 @@ def _check_grid(azimuth: FloatArray, elevation: FloatArray, count: int, path: Pa
 
 
 def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float, notes: Sequence[str] = ()) -> str:
-    """Comments and the two principal cuts in the MSI Planet text format: attenuation below the peak, 360 lines each.
+    """Return comments and the two principal cuts as MSI Planet text: attenuation below the peak, 360 lines each.
 
-    HORIZONTAL runs clockwise seen from above, as azimuths of planning tools do; VERTICAL starts at the horizon in front
-    and goes down first.
+    HORIZONTAL runs clockwise from above, as in planning tools. VERTICAL begins at the horizon in front and goes down
+    first.
 
     Parameters
     ----------
     pattern : MeasuredPattern
     name : str
-        Of the antenna.
+        Name of the antenna.
     carrier_hz : float
     notes : sequence of str
-        A COMMENT line each.
+        Text of COMMENT lines.
 
     Returns
     -------
     str
-        Text with a line end at its end.
+        Text that ends with a line end.
     """
     degrees = np.radians(np.arange(360.0))
-    # minus: HORIZONTAL runs clockwise
+    # minus, because HORIZONTAL runs clockwise
     level = pattern.gain_dbi(np.full(360, np.pi / 2), -degrees)
     below = np.pi / 2 + degrees  # zenith angle on the great circle through the boresight
     over = pattern.gain_dbi(below, np.zeros(360))
@@ -984,7 +991,7 @@ def read_known(path: Path, written: Written | None = None) -> KnownDirections:
     Raises
     ------
     InputError
-        Other columns, rows of another length, values that are not finite; a table that is not as it was written.
+        For other columns or lengths, values that are not finite, or a table that is not as it was written.
     """
     text = read_table(path, _WHAT, written).decode("utf-8-sig")
     lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
@@ -1010,14 +1017,14 @@ def learned_antenna(named: Named, end: str, carrier_hz: float) -> tuple[Path, Le
     named : Named
     end : {"uav", "tower"}
     carrier_hz : float
-        At which it is to be used [Hz].
+        Carrier at which it is used [Hz].
 
     Raises
     ------
     UsageError
-        No antenna of that name for this end, or one of another band.
+        If there is no antenna of that name for this end, or it has another band.
     InputError
-        A table that is damaged, not as it was written, or learned from other logs than its entry names.
+        If the table is damaged, not as it was written, or learned from other logs than its entry names.
     """
     series = named.antenna(end, carrier_hz)
     if series is None:
@@ -1059,9 +1066,9 @@ def receiver_file(named: Named, carrier_hz: float) -> Path:
     Raises
     ------
     UsageError
-        A receiver of another band.
+        If the receiver has another band.
     InputError
-        A table that is damaged, or learned from other logs than its entry says.
+        If the table is damaged, or learned from other logs than its entry names.
     """
     _check_band(named.entry.receivers[0].carrier_hz, carrier_hz, BAND)
     path = named.folder / named.entry.receivers[0].file
@@ -1072,7 +1079,7 @@ def receiver_file(named: Named, carrier_hz: float) -> Path:
 
 
 def check_logs(trained_on: Sequence[str], named: Named, path: Path) -> None:
-    """Refuse a table that was learned from logs which its entry does not name: scores would trust the wrong ones."""
+    """Refuse a table that was learned from logs which its entry does not name, because scores rely on them."""
     strange = set(trained_on) - set(named.entry.trained_on)
     if strange:
         raise InputError(

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri  # every report loads this module: scipy.stats would take it 0.4 s more
 
 from ..common.geodesy import azimuth_rad, bearing_deg, elevation_rad
-from ..common.units import BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
 from .offset import SPAN_DB, OffsetFit, grid_offset, identifiable_range, offset_curve, offset_grid
 from .receiver import brier_losses, log_losses, out_of_group
 from .statistics import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals, rmse_interval
@@ -975,15 +975,25 @@ def compare_serving(served: ArrayLike, predicted_dbm: ArrayLike, cells: Sequence
     return ServingComparison(cells=tuple(cells), confusion=confusion, n=int(known.sum()))
 
 
+def nearest_in_time(times: AnyArray, of: AnyArray) -> tuple[IntArray, AnyArray]:
+    """Return the index in ``of`` (m,) nearest to each of ``times`` (n,), and how far it is; the earlier one of two."""
+    order = np.argsort(of, kind="stable")
+    at = of[order]
+    after = np.clip(np.searchsorted(at, times), 0, len(at) - 1)
+    before = np.maximum(after - 1, 0)
+    index = np.where(np.abs(at[before] - times) <= np.abs(at[after] - times), before, after)
+    return order[index], np.abs(at[index] - times)
+
+
 def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s: float) -> FloatArray:
-    """Values of one clock at the times of another: those of the nearest sample, NaN where none is near.
+    """Return values of one clock at the times of another: those of the nearest sample, NaN if none is near.
 
     Parameters
     ----------
     time_s : array_like, (n,)
         Times asked for [s].
     of_s : array_like, (m,)
-        Times of the values, ascending [s].
+        Times of the values [s].
     values : array_like, (m,)
     within_s : float
         Farther samples do not count [s].
@@ -997,10 +1007,8 @@ def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s:
     column = unmasked(values)
     if not len(sampled_s):
         return np.full(len(instants), np.nan)
-    after = np.clip(np.searchsorted(sampled_s, instants), 0, len(sampled_s) - 1)
-    before = np.maximum(after - 1, 0)
-    near = np.where(np.abs(sampled_s[before] - instants) <= np.abs(sampled_s[after] - instants), before, after)
-    return np.where(np.abs(sampled_s[near] - instants) <= within_s, column[near], np.nan)
+    near, apart_s = nearest_in_time(instants, sampled_s)
+    return np.where(apart_s <= within_s, column[near], np.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Audit of a flight's replays: paths by the other engine, fields by Sionna and by a second implementation.
 
-What the second implementation is given comes from the settings, not from the arrays and losses that the replay made
-of them, so that a fault in between is seen.
+The inputs of the second implementation come from the settings, not from the arrays and losses of the replay, so that
+an error in between is detected.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from ..propagation.search.sionna import free_memory
 from ..site.site import Site
 from .tasks import OutcomeStore, code_digest
 
-# Logged attitudes that are turned into rotations a second time.
+# Number of logged attitudes that are converted to rotations a second time.
 _ATTITUDE_ROWS = 200
 
-# Both are float64; telemetry instants are exact to a nanosecond.
+# Both are float64, and telemetry times are exact to a nanosecond.
 _ATTITUDE_TOLERANCE_RAD = 1e-6
 
-# Of all series together, at least three each: some 0.1 s apiece.
+# Links of all series together, at least three per series. Each takes about 0.1 s.
 _REFERENCE_LINKS_AT_MOST = 64
 
 _TIMES = "The time of the engine is its share for the audited links; that of the reference includes its start-up."
 
-# What no audit of the replay can see.
+# What an audit of the replay cannot detect.
 _NOT_COVERED = (
-    "whether reflection off smooth half-spaces and flat walls is what the place does",
+    "whether the ground and walls of the site reflect like smooth half-spaces",
     "positions of footprints and trees; intervals",
     "terrain that blocks",
 )
@@ -59,16 +59,16 @@ _NOT_COVERED = (
 def audit_replays(
     data: FlightData, replays: Sequence[Replayed], progress: Progress = logged, *, anew: bool = True
 ) -> EngineResult:
-    """The engine record, with the audit where ``rt.audit_links`` asks for one.
+    """Return the engine record, with an audit if ``rt.audit_links`` is above 0.
 
     Parameters
     ----------
     data : FlightData
     replays : sequence of Replayed
-        Of its RSS series, then of its ranks.
+        Replays of its RSS series, then of its ranks.
     progress : Progress
     anew : bool
-        Audit even what this machine audited before.
+        Ignore the cached audit.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def audit_replays(
     if rt.audit_links:
         try:
             checked = _audit_or_read(data, replays, progress, anew=anew)
-        except SionnaMissingError as error:  # all else has the same numbers without it
+        except SionnaMissingError as error:  # all other numbers are the same without Sionna
             if rt.engine == "sionna":
                 raise
             not_audited = str(error)
@@ -102,7 +102,7 @@ def audit_replays(
 def _audit_or_read(
     data: FlightData, replays: Sequence[Replayed], progress: Progress, *, anew: bool
 ) -> AuditResult | None:
-    """The audit, kept by its inputs; read, unless it is to be made anew, where this machine has it."""
+    """Return the audit from the cache, else compute it. ``anew`` ignores the cache."""
     store, key = OutcomeStore(cache_folder("audits"), AuditResult), _content_of(data, replays)
     known: AuditResult | None = None if anew else store.load(key)
     if known is None and (made := _audit(data, replays, progress)) is not None:
@@ -116,7 +116,7 @@ _SETTINGS = {"rt", "link", "rank", "antennas", "towers"}
 
 
 def _content_of(data: FlightData, replays: Sequence[Replayed]) -> str:
-    """SHA-256 of all that an audit looks at: libraries, code, site, logs, settings and replays."""
+    """Return the SHA-256 of all inputs of an audit: libraries, code, site, logs, settings and replays."""
     settings = data.settings.model_dump(mode="json", include=_SETTINGS)
     seen = [
         (r.poses, r.tower_m, *(getattr(r.replay, name) for name in ("towers", "faces", "contributions", *PER_LINK)))
@@ -127,7 +127,7 @@ def _content_of(data: FlightData, replays: Sequence[Replayed]) -> str:
 
 
 def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> AuditResult | None:
-    """One audit over all series: links are shared out in proportion to their poses."""
+    """Audit all series, with links in proportion to their poses."""
     ks = data.settings.rank.k
     total = sum(len(r.poses) for r in replays)
     few = int(np.clip(_REFERENCE_LINKS_AT_MOST // max(len(replays), 1), 3, REFERENCE_LINKS))
@@ -161,7 +161,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
 
 
 def _of_series(rt: RtSettings, site: Site, replayed: Replayed, second: Second) -> Audit:
-    """The audit of one series, as the settings ask for it."""
+    """Audit one series with the search and losses of the settings."""
     return audit(
         site,
         replayed.link,
@@ -173,12 +173,12 @@ def _of_series(rt: RtSettings, site: Site, replayed: Replayed, second: Second) -
     )
 
 
-# At so many moments a tower that moves is audited as one that stands where it was then; each is a scene of its own.
+# A moving tower is audited at this number of times, each time as a fixed tower in a separate scene.
 _MOMENTS = 6
 
 
 def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected]]:
-    """Replays with towers that stand, with what the settings say of them: of a tower that moves some moments."""
+    """Yield replays with fixed towers and their expected inputs. A moving tower is fixed at some times."""
     site = data.site.under(data.settings.rt.foliage)
     for replayed, expected in zip(replays, expectations(data, replays), strict=True):
         if replayed.tower_m is None:
@@ -199,11 +199,11 @@ def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Si
             yield site_with_tower_at(site, tower, replayed.tower_m[at]), moment, expected
 
 
-# --- what the settings say -------------------------------------------------------------------------------------------
+# --- expected inputs -----------------------------------------------------------------------------------------------
 
 
 def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected]:
-    """For each replay what the settings say of its link and losses."""
+    """Return the link and losses of each replay, from the settings."""
     settings = [*(s.link for s in data.rss), *[data.settings.link.rank] * len(data.rank)]
     rt = data.settings.rt
     loss = reference.ExpectedLoss(**{key: value for each in LOSSES for key, value in each.expected(rt).items()})
@@ -216,7 +216,7 @@ def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected
 
 
 def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -> reference.ExpectedLink:
-    """A link of flight.yaml."""
+    """Return the expected link of flight.yaml."""
     wavelength = reference.C_MPS / settings.carrier_hz
     return reference.ExpectedLink(
         carrier_hz=settings.carrier_hz, transmit_power_dbm=settings.transmit_power_dbm,
@@ -230,8 +230,8 @@ def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -
 
 
 def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> reference.ExpectedArray:
-    """An array of flight.yaml, laid out a second time."""
-    elements = settings.elements or 4  # of layout linear
+    """Return the expected array of flight.yaml, computed a second time."""
+    elements = settings.elements or 4  # default of layout linear
     positions = reference.layout_positions(settings.layout, wavelength, elements, settings.positions_m)
     slants = settings.slant_deg if isinstance(settings.slant_deg, list) else [settings.slant_deg]
     pattern = scalar_pattern(load_pattern(settings.antenna, folder, reference.C_MPS / wavelength))
@@ -247,7 +247,7 @@ def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> 
 
 
 def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudit:
-    """Rotations of the track at telemetry instants against the logged angles, turned a second time."""
+    """Compare rotations of the track at telemetry times with those from the logged angles."""
     mode = data.settings.rt.attitude
     if mode == "ignored" or data.track is None:
         turned_anyway = any(np.abs(r.poses.rotation - np.eye(3)).max(initial=0.0) > 0 for r in replays)
@@ -272,7 +272,7 @@ def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudi
 
 
 def _logged_attitudes(files: Sequence[IngestedFile]) -> tuple[AnyArray, FloatArray]:
-    """Instants (n,) and roll, pitch, yaw (n, 3) [deg] of telemetry rows whose instant occurs once."""
+    """Return times (n,) and roll, pitch, yaw (n, 3) [deg] of telemetry rows with a unique time."""
     import pandas as pd
 
     frames = [s.frame for f in files for s in f.result.streams if s.kind == "telemetry"]

@@ -1,6 +1,6 @@
-"""The ``calibrate`` job: antennas as they hang, learned from several flights, scored on what was left out.
+"""The ``calibrate`` job: learn mounted antennas from several flights, and score them on held-out flights.
 
-The lock's part of ``calibrate``: when a receiver is in lock, from the level that other flights predict.
+It also learns when a receiver is in lock, from levels that other flights predict.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ from ..site.learned import AIRFRAME_BAND, KnownDirections, LearnedHealth, Learne
 
 
 def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[str, Learned]) -> dict[str, LearnedLock]:
-    """P(lock) by antenna, of levels that were predicted without the flight at hand, and its scores on flights left out.
+    """Return P(lock) by antenna for levels predicted from other flights, with its scores on held-out flights.
 
     Parameters
     ----------
     observed : sequence of Observed
-        Of all flights.
+        Samples of all flights.
     recipe : Recipe
     fits : mapping of str to Learned
-        What was learned without each flight.
+        Gains learned without each flight.
 
     Returns
     -------
     dict of str to LearnedLock
-        Nothing for receivers that keep their lock, or with fewer than three flights: none could be scored.
+        Empty for receivers that keep their lock, and for fewer than three flights, which cannot be scored.
     """
     able = [o for o in observed if o.locked is not None and np.isfinite(o.locked).any()]
     if len(flights_of(able)) < 3:
@@ -116,7 +116,7 @@ def learned_healths(observed: Sequence[Observed], fits: Mapping[str, Learned]) -
 
 
 def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[str, str], Learned]:
-    """Gains learned without two flights: the levels of the one, in a forecast for the other, know of neither."""
+    """Return gains learned without each pair of flights, so that a forecast for one uses levels that know neither."""
     out: dict[tuple[str, str], Learned] = {}
     for one, other in combinations(groups_of(flights_of(observed)), 2):
         learned = learn([o.samples for o in observed if o.samples.flight not in (*one, *other)], recipe)
@@ -125,7 +125,7 @@ def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[s
 
 
 class _Levels:
-    """Predicted path gain of one series and what was received [dB], where the lock is known."""
+    """Predicted path gain and received level of one series [dB], at samples with a known lock."""
 
     def __init__(self, o: Observed, learned: Learned) -> None:
         assert o.locked is not None
@@ -140,7 +140,7 @@ class _Levels:
 def _learned(
     series: Sequence[Observed], fits: Mapping[str, Learned], pairs: Mapping[tuple[str, str], Learned]
 ) -> LearnedLock | None:
-    """From all flights, scored flight by flight by what the others teach."""
+    """Learn P(lock) from all flights, and score each flight with the fit of the remaining flights."""
     flights = [_Levels(o, fits[o.samples.flight]) for o in series]
     every = learn_detection([(f.level_db, f.detected) for f in flights])
     scores: list[DetectionScore] = []
@@ -172,7 +172,7 @@ def _learned(
     )
 
 
-# Of a receiver that always writes the same level without lock.
+# Smallest SD, for a receiver that always writes the same level without lock [dB].
 _LEAST_SD_DB = 0.5
 
 # Width of the central 90 % of a normal distribution, over its standard deviation.
@@ -180,15 +180,15 @@ _CENTRAL = 3.29
 
 
 def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
-    """Lines of the level over path gain in lock and without, and the spread about each."""
+    """Fit the level over path gain by a line, with and without lock, and return the spread about each line."""
     numbers: dict[str, float] = {}
     for name, in_lock in (("locked", True), ("lost", False)):
         parts = [f.detected == in_lock for f in flights]
         each = [(f.level_db[at] - gain_db, f.measured_db[at]) for f, at in zip(flights, parts, strict=True) if at.any()]
         gain, level = (np.concatenate(values) for values in zip(*each, strict=True))
-        alike = np.concatenate([np.full(len(g), len(g) ** -0.5) for g, _ in each])  # each flight of the same weight
+        alike = np.concatenate([np.full(len(g), len(g) ** -0.5) for g, _ in each])  # equal weights of the flights
         slope, middle = np.polyfit(gain, level, 1, w=alike)
-        # in lock fades are rare and deep: the spread of the central 90 %, or the band of 90 % holds more
+        # in lock, fades are rare and deep: use the central 90 %, so that the 90 % band does not cover more
         central = np.mean([np.ptp(np.quantile(m - slope * g, (0.05, 0.95))) for g, m in each]) / _CENTRAL
         sd = central if in_lock else (level - middle - slope * gain).std()
         numbers |= {f"{name}_db": middle, f"{name}_per_db": slope, f"{name}_sd_db": max(sd, _LEAST_SD_DB)}
@@ -196,9 +196,9 @@ def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
 
 
 def lock_words(lock: LearnedLock) -> str:
-    """Sentences on P(lock), and on the level with a floor, from flights left out."""
+    """Return sentences on P(lock) and on the level with a floor, from held-out flights."""
     return (
-        f"The predicted level gives the probability of lock with a Brier score of {lock.brier:.3f} on flights left out "
+        f"The predicted level gives the probability of lock with a Brier score of {lock.brier:.3f} on held-out flights "
         f"(constant share of each flight: {lock.constant_brier:.3f}), log score {lock.log_score:.3f} "
         f"({lock.constant_log_score:.3f}). Where levels below {lock.floor_db:g} dB re full scale count as "
         f"{lock.floor_db:g}, the RMSE is {lock.floor_rmse_db:.1f} dB; free space: "
@@ -206,24 +206,24 @@ def lock_words(lock: LearnedLock) -> str:
     )
 
 
-# Heights of roughness that are tried [m]; infinite is no ground ray.
+# Roughness heights that are tried [m]. Infinite means no ground ray.
 _ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
 
 
 class PatternsSettings(StrictModel):
-    """Measured patterns that the learned gain stands on; none: isotropic."""
+    """Measured patterns to which the learned gain is added. Default: isotropic."""
 
     uav: AntennaSettings | None = None
     tower: AntennaSettings | None = None
     towers: dict[str, AntennaSettings] = Field(default_factory=dict)
-    """By ``tower.channel``, where they differ."""
+    """Patterns by ``tower.channel``, if they differ."""
 
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
 
 
 class CampaignSettings(StrictModel):
-    """Flights of one campaign: they share their noise, and the gain of the UAV with others of its airframe."""
+    """Flights of one campaign, with common noise. Campaigns with the same airframe share the gain of the UAV."""
 
     flights: Annotated[list[str], Field(min_length=1)]
     source: Source = Source()
@@ -234,12 +234,12 @@ class CalibrationFile(StrictModel):
 
     calibration: _Name
     flights: Annotated[list[str], Field(min_length=1)]
-    """With ``campaigns``: all of theirs."""
+    """All flights, including those of ``campaigns``."""
     campaigns: dict[_Name, CampaignSettings] = Field(default_factory=dict)
-    """Several campaigns, whose flights are learned from together; each becomes an entry of a site."""
+    """Several campaigns, from whose flights antennas are learned together. Each becomes an entry of a site."""
     patterns: PatternsSettings = PatternsSettings()
     source: Source = Source()
-    """Title, DOI and licence of the flights' data, and their airframe: kept beside what a site remembers."""
+    """Title, DOI and licence of the flights' data, and their airframe, stored with the learned models of a site."""
     rank: bool = False
     """Also learn how the receiver decides its rank."""
 
@@ -259,7 +259,7 @@ class CalibrationFile(StrictModel):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroundFit:
-    """Roughness of the ground: log likelihood against no ground ray, per height tried [m]; infinite: no such ray."""
+    """Log likelihood of each roughness height of the ground [m], relative to no ground ray (infinite height)."""
 
     roughness_m: tuple[float, ...]
     log_likelihood: tuple[float, ...]
@@ -274,13 +274,13 @@ class GroundFit:
 
     @property
     def used_m(self) -> float | None:
-        """Height that a replay is to take: the most probable one, or None where no ground ray is as likely."""
+        """The most probable height, for replays. None if no ground ray is as likely."""
         return None if math.isinf(self.likely_m[1]) else self.roughness_m[int(np.argmax(self.log_likelihood))]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
-    """All that a calibration found."""
+    """The result of a calibration."""
 
     settings: CalibrationFile
     flights: tuple[FlightData, ...]
@@ -297,18 +297,18 @@ class Calibration:
     health: Mapping[str, LearnedHealth]
     """Errors of held-out flights by antenna."""
     teaching: frozenset[str]
-    """Campaigns whose gain of the UAV predicts most of their own held-out flights: it may be used elsewhere."""
+    """Campaigns whose gain of the UAV predicts most of their held-out flights, so that it may be used elsewhere."""
     warnings: tuple[str, ...]
     words: tuple[str, ...]
 
     @property
     def fit(self) -> gains.GainFit:
-        """The learned gain over direction: every ``fit.gain`` has one."""
+        """The learned gain over direction."""
         return self.learned.fit
 
     @property
     def pair_term(self) -> gains.Term | None:
-        """The term of the gain towards both ends at once; None if none was learned."""
+        """The term of the joint gain of both ends. None if it was not learned."""
         return next((term for term in self.fit.model.terms if term.frame == "pair"), None)
 
     @property
@@ -317,22 +317,22 @@ class Calibration:
         return [data.settings.flight.name for data in self.flights]
 
     def first_series(self, antenna: str) -> tuple[FlightData, RssSeries]:
-        """The first flight with an antenna, and its series there."""
+        """Return the first flight with an antenna, and its series."""
         return next((data, s) for data in self.flights for s in data.rss if f"{s.tower}.{s.channel}" == antenna)
 
     @property
     def trained_on(self) -> tuple[str, ...]:
-        """SHA-256 of every log that was learned from."""
+        """SHA-256 of every training log."""
         return union(*map(flight_logs, self.flights))
 
     @property
     def marks(self) -> tuple[str, ...]:
-        """Marks of their series."""
+        """Fingerprints of the training series."""
         return marks_of(self.flights)
 
 
 def load_calibration(path: Path, further: Sequence[Path] = ()) -> CalibrationFile:
-    """Read and check a calibration.yaml, or a flight file and ``further``; UsageError as of any settings file."""
+    """Read and check a calibration.yaml, or a flight file and ``further``. UsageError as for any settings file."""
     if (flight := flight_of(path)) is None:
         settings = load_yaml(path, CalibrationFile)
     else:
@@ -355,32 +355,32 @@ def calibrate(
     stages: Stages | None = None,
     score: Sequence[Path] = (),
 ) -> Calibration:
-    """Learn from flights, score.
+    """Learn antennas from flights and score them.
 
     Parameters
     ----------
     settings : CalibrationFile
     flights : sequence of FlightData
-        As :func:`read_flights` gives them.
+        As :func:`read_flights` returns them.
     folder, logs_root : Path
-        Against which patterns resolve, and logs of ``score`` in place of their flight file's folder.
+        Folder for the paths of patterns, and folder for the logs of ``score`` (default: that of their flight file).
     campaigns : mapping of str to str, optional
-        Campaign of each flight, as :func:`read_flights` gives it; by default all flights are of one.
+        Campaign of each flight, as :func:`read_flights` returns it. Default: one campaign.
     stages : Stages, optional
     score : sequence of Path
-        Further flight files, scored with all that was learned.
+        Further flight files, which are scored with all learned antennas.
 
     Returns
     -------
     Calibration
-        What was learned, its scores on flights left out, and the controls.
+        Learned antennas, their scores on held-out flights, and the controls.
 
     Raises
     ------
     UsageError
-        Settings that are wrong; flights that share no tower and channel.
+        If settings are wrong, or the flights share no tower and channel.
     InputError
-        Logs that cannot be read; flights without RSS.
+        If logs cannot be read, or the flights have no RSS.
     """
     stages = stages or Stages()
     campaigns = campaigns or dict.fromkeys((f.settings.flight.name for f in flights), settings.calibration)
@@ -439,7 +439,7 @@ def _score_further(
     learned: Learned,
     observed: Sequence[Observed],
 ) -> tuple[tuple[Score, ...], list[str]]:
-    """Scores of further flights with what was learned, and which of them were learned from."""
+    """Score further flights with the learned antennas, and remark on those that were training flights."""
     distinct, remarks = counted_once([*flights, *further])
     fresh = [data for data in distinct if not any(data is item for item in flights)]
     if not fresh:
@@ -466,7 +466,7 @@ def read_flights(
     names = [data.settings.flight.name for data in out]
     for name in names:
         if names.count(name) > 1:
-            raise UsageError(f"two flights are named {name!r}", expected="an own 'flight: {name: ...}' in each file")
+            raise UsageError(f"two flights are named {name!r}", expected="another 'flight: {name: ...}' in each file")
     of = {file: name for name, campaign in settings.by_campaign().items() for file in campaign.flights}
     campaigns = {name: of.get(file, settings.calibration) for name, file in zip(names, settings.flights, strict=True)}
     return *counted_once(out), campaigns
@@ -487,9 +487,9 @@ def in_campaigns(
     settings : CalibrationFile
     observed : sequence of Observed
     flights : sequence of FlightData
-        That the samples are of.
+        The flights of the samples.
     campaigns : mapping of str to str
-        By flight.
+        Campaign by flight.
 
     Returns
     -------
@@ -512,7 +512,7 @@ def in_campaigns(
         campaign, carrier = campaigns[s.flight], carriers[s.flight, s.antenna]
         band = max(low for low in bands if low <= carrier)
         source = of[campaign].source.airframe if campaign in of else settings.source.airframe
-        # an airframe that is not stated is that of its campaign alone
+        # an airframe without a name belongs to its campaign only
         airframe = campaign if source == Source().airframe else source
         samples = dataclasses.replace(s, campaign=campaign, airframe=f"{airframe}, {band / 1e9:g} GHz")
         return dataclasses.replace(o, samples=samples)
@@ -521,7 +521,7 @@ def in_campaigns(
 
 
 def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
-    """Samples of every series against free space, and what is to be said of them."""
+    """Return the samples of every series relative to free space, and remarks on them."""
     observed: list[Observed] = []
     warnings: list[str] = []
     carriers: dict[str, dict[str, float]] = {}
@@ -538,7 +538,7 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
         if high > 1.02 * low:
             raise UsageError(
                 f"{antenna} was received at {low / 1e9:g} and {high / 1e9:g} GHz",
-                expected="one frequency per tower and channel: an antenna's gain is of its frequency",
+                expected="one frequency per tower and channel, because antenna gain depends on frequency",
                 cause="flights of different experiments, or a wrong link.rss.carrier_hz",
             )
     lonely = [a for a, per_flight in carriers.items() if len(per_flight) == 1]
@@ -546,45 +546,45 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
         raise UsageError(
             "the flights share no tower and channel: " + "; ".join(f"{a} in {next(iter(carriers[a]))}" for a in lonely),
             expected="at least one tower and channel that two flights have",
-            cause="different 'node' or 'channel' beside the logs in the flight files",
+            cause="different 'node' or 'channel' of the logs in the flight files",
         )
     if len(calibration.flights_of(observed)) < 2:
-        warnings.append("one flight alone: nothing can be left out, nothing here is scored, and mounts are unstable")
+        warnings.append("only one flight: no flight can be held out, so nothing is scored, and mounts are unstable")
     elif lonely:
         warnings.append(f"only one flight has {', '.join(lonely)}: learned, but not scored")
     return observed, warnings
 
 
 def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | None, list[str]]:
-    """One series of levels at known poses; None for ratios and without any, and what is to be said of it."""
+    """Return one series of levels at known poses, and remarks. None for ratios, and if no pose is known."""
     name, remarks = f"{data.settings.flight.name}: {series.tower} {series.channel}", []
     if series.channel.lower() in RATIOS:
         if series.channel.lower() != SNR or any(s.channel.lower() not in RATIOS for s in data.rss):
-            return None, [f"{data.settings.flight.name}: {series.channel} is a ratio, no level: left out"]
+            return None, [f"{data.settings.flight.name}: {series.channel} is a ratio, not a level: ignored"]
         remarks.append(
-            f"{data.settings.flight.name}: {series.tower} {SNR} stands for a level: the noise is taken as constant"
+            f"{data.settings.flight.name}: {series.tower} {SNR} is used as a level; the noise is taken as constant"
         )
     observed, guessed, lost = observed_series(data, series)
     if not np.isfinite(observed.samples.residual_db).any():
-        return None, [*remarks, f"{name} has no level at a known pose and is left out"]
+        return None, [*remarks, f"{name} has no level at a known pose and is ignored"]
     if guessed > 0.01:
         share = f"{100 * guessed:.0f} % of the attitudes at {series.tower} {series.channel} are unknown"
         remarks.append(f"{data.settings.flight.name}: {share}: heading from the track, level flight")
     if lost > 0.01:
-        remarks.append(f"{name}: {100 * lost:.0f} % of the levels have no position and are left out")
+        remarks.append(f"{name}: {100 * lost:.0f} % of the levels have no position and are ignored")
     return observed, remarks
 
 
-# --- what is learned -----------------------------------------------------------------------------------------------
+# --- learning ------------------------------------------------------------------------------------------------------
 
 
 def learned_antennas(train: Sequence[gains.LinkSamples]) -> Learned:
-    """Antennas of both ends from means over the bins of a correction, with the model's own strengths to start from."""
+    """Learn antennas of both ends from means over time bins, starting from the model's default strengths."""
     return calibration.learn(train, Recipe(gains.GainModel(bin_s=BIN_S)))
 
 
 def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
-    """Terms and patterns as calibration.yaml asks."""
+    """Return the terms and patterns that calibration.yaml specifies."""
     patterns: dict[str, GainOf] = {}
     if settings.patterns.uav is not None:
         patterns["uav"] = gain_of(settings.patterns.uav, folder)
@@ -602,13 +602,13 @@ def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: P
 
 
 def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
-    """Gain [dBi] of a pattern towards unit vectors (n, 3) of its device frame."""
+    """Return a function for the gain [dBi] of a pattern towards unit vectors (n, 3) in its device frame."""
     pattern = load_pattern(settings, folder)
     return lambda direction: mean_gain_db([pattern], *sphere_angles(direction))
 
 
 def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], learned: Learned) -> GroundFit:
-    """Likelihood of a coherent ground ray of each roughness, the gains integrated out."""
+    """Return the likelihood of a coherent ground ray per roughness, with the gains integrated out."""
     by_name = {data.settings.flight.name: data for data in flights}
     by_series = {(o.samples.flight, o.samples.antenna): o for o in observed}
 
@@ -648,7 +648,7 @@ def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lea
 def _score_all(
     observed: Sequence[Observed], recipe: Recipe, stages: Stages, fits: dict[str, Learned]
 ) -> dict[str, tuple[Score, ...]]:
-    """Every split, on flights that had no part in the fit; fits of one are used by the next.
+    """Score every split on data without a part in the fit. Fits are shared between splits.
 
     Parameters
     ----------
@@ -656,7 +656,7 @@ def _score_all(
     recipe : Recipe
     stages : Stages
     fits : dict of str to Learned
-        Receives what was learned without each flight.
+        Receives the gains learned without each flight.
 
     Returns
     -------
@@ -689,7 +689,7 @@ def _score_all(
 def _controls_of(
     observed: Sequence[Observed], recipe: Recipe, scores: tuple[Score, ...]
 ) -> dict[str, tuple[Score, ...]]:
-    """Wrong frames of the UAV's gain beside its body's, each flight left out; ``scores`` are those of the recipe."""
+    """Score wrong frames for the gain of the UAV on held-out flights. ``scores`` are those of the body frame."""
     if len(calibration.flights_of(observed)) < 2:
         return {}
     left_out, bare = calibration.flight_left_out, dataclasses.replace(recipe, patterns={})
@@ -705,7 +705,7 @@ def _controls_of(
     }
 
 
-# Directions that stand for the gain of an end when its evidence is judged, and the length of its kernel.
+# Directions that represent the gain of an end in its evidence, and the length of its kernel.
 _KNOWN_SHARE, _MOST_KNOWN = 0.002, 100
 _LENGTHS: Mapping[gains.Frame, float] = {term.frame: term.length for term in gains.ANTENNA_TERMS}
 
@@ -728,7 +728,7 @@ def teaching(observed: Sequence[Observed], campaigns: Mapping[str, str], fits: M
     for flight, learned in fits.items():
         series = [o.samples for o in observed if o.samples.flight == flight]
         antenna = next((s.antenna for s in series if s.antenna in learned.fit.antennas), None)
-        if antenna is None:  # nothing that was learned without this flight is of its campaign
+        if antenna is None:  # without this flight, nothing was learned for its campaign
             continue
         process = _airframe(learned, antenna)
         passed.setdefault(campaigns[flight], []).append(FlightEvidence(series).of_airframe(process).fits)
@@ -750,7 +750,7 @@ def _contradictions(
         if alone > min(free, turned):
             out.append(
                 f"{name} contradicts the other campaigns: RMSE {alone:.2f} dB with their airframe, {turned:.2f} dB with"
-                f" it rotated, {free:.2f} dB in free space; give it its own 'source: {{airframe: ...}}'"
+                f" it rotated, {free:.2f} dB in free space; give it a separate 'source: {{airframe: ...}}'"
             )
     return out
 
@@ -767,7 +767,7 @@ def _airframe(learned: Learned, antenna: str) -> KnownProcess:
 
 
 def _mount_warnings(learned: Learned) -> list[str]:
-    """A sentence for every mount that the data do not tell."""
+    """Return a sentence for every mount that the data do not determine."""
     return [
         f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is likeliest, with a standard deviation of "
         f"{mount.azimuth_sd_deg:.0f} deg"

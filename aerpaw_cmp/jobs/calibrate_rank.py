@@ -1,7 +1,7 @@
-"""The receiver's part of ``calibrate``: how the modem decides its rank, learned on flights, scored on those left out.
+"""The receiver's part of ``calibrate``: learn how the modem decides its rank, and score it on held-out flights.
 
-The ground is flat at height 0 and everything else is left out (line of sight and one ground ray): which way the ports
-look and how strong the ground is decide more about the rank than any wall at a rural site.
+The model has only the direct path and one ray off flat ground at height 0: at a rural site the orientation of the ports
+and the strength of the ground ray determine the rank more than any wall.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ..site.learned import read_table
 # First key of a receiver file.
 FORMAT = "aerpaw-cmp receiver 1"
 
-# Ways to slant the four ports of a modem: two diagonals, two upright and two lying, all alike.
+# Slants of the four ports of a modem: two diagonals, two upright and two lying, all equal.
 _SLANTS_DEG: tuple[tuple[float, ...], ...] = (
     (45.0, -45.0, 45.0, -45.0), (45.0, -45.0, -45.0, 45.0), (45.0, 45.0, -45.0, -45.0),
     (-45.0, 45.0, -45.0, 45.0), (-45.0, 45.0, 45.0, -45.0), (-45.0, -45.0, 45.0, 45.0),
@@ -49,18 +49,17 @@ class RankGrid:
     Parameters
     ----------
     yaw_step_deg : float
-        Between mounts of the modem's array.
+        Step between mounts of the modem's array.
     uav_slant_deg : tuple of tuple of float
         Slants of the modem's ports.
     ground : tuple of float
         Amplitude factors on the ground reflection.
     members : int
-        Of the geometries that cannot be told apart, how many the forecast averages.
+        Number of indistinguishable geometries that the forecast averages.
     thin : int
-        Every n-th sample chooses the geometry; all fit.
+        Every n-th sample is used to choose the geometry. All samples are used for the fit.
     shift_s, average_s : tuple of float
-        Seconds by which a report may belong to a later position than the log says, and over which the modelled channel
-        may be averaged.
+        Delays of a report behind the logged position, and averaging times of the modelled channel, that are tried.
     """
 
     yaw_step_deg: float = 30.0
@@ -84,12 +83,12 @@ class RankSamples:
     link: Link
     time_s: FloatArray
     logs: tuple[str, ...] = ()
-    """SHA-256 of the logs that hold the reports."""
+    """SHA-256 of the logs with the reports."""
     mark: str = ""
-    """Of these reports, whatever their log is."""
+    """Fingerprint of these reports, independent of their log."""
 
     def part(self, rows: Any) -> RankSamples:
-        """Some of the samples."""
+        """Return some of the samples."""
         return dataclasses.replace(self, poses=self.poses[rows], rank=self.rank[rows], time_s=self.time_s[rows])
 
 
@@ -103,17 +102,17 @@ class Timing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FittedReceiver:
-    """A receiver at one tower: the geometries that cannot be told apart, best first, and their mean forecast."""
+    """A receiver at one tower: its indistinguishable geometries, best first, and their mean forecast."""
 
     tower: str
     geometries: tuple[Geometry, ...]
     tied: int
     flights: tuple[str, ...]
-    """Names of those that it was fitted on."""
+    """Names of the training flights."""
     trained_on: tuple[str, ...] = ()
-    """SHA-256 of their logs: no score there is worth anything."""
+    """SHA-256 of the training logs, on which it must not be scored."""
     marks: tuple[str, ...] = ()
-    """Of their reports."""
+    """Fingerprints of the training reports."""
     mixture: receiver.ReceiverMixture
     timing: Timing = Timing()
 
@@ -122,9 +121,9 @@ class FittedReceiver:
         return not set(self.trained_on).isdisjoint(samples.logs) or among(samples.mark, self.marks)
 
     def forecast(self, samples: RankSamples, turns_deg: Sequence[float] = (0.0,)) -> tuple[FloatArray, IntArray]:
-        """Probability (n, 4) of each rank, and the one that is said; the mean over turns of the UAV to the right."""
+        """Return the probability of each rank (n, 4) and the decided rank (n,), as a mean over turns of the UAV."""
         turned = [
-            dataclasses.replace(g, uav_yaw_deg=(g.uav_yaw_deg - turn) % 360.0)  # many turned mounts are the same
+            dataclasses.replace(g, uav_yaw_deg=(g.uav_yaw_deg - turn) % 360.0)  # many rotated mounts are equal
             for turn in turns_deg
             for g in self.geometries
         ]
@@ -133,7 +132,7 @@ class FittedReceiver:
         return p, self.mixture.decide(p)
 
     def as_dict(self) -> dict[str, Any]:
-        """For the receiver file."""
+        """Return the content of the receiver file."""
         return {
             "geometries": [dataclasses.asdict(g) for g in self.geometries],
             "tied": self.tied,
@@ -148,7 +147,7 @@ class FittedReceiver:
 
     @classmethod
     def from_dict(cls, tower: str, content: Mapping[str, Any]) -> FittedReceiver:
-        """From :meth:`as_dict`."""
+        """Return the receiver with the content of :meth:`as_dict`."""
         return cls(
             tower=tower,
             geometries=tuple(_geometry(g) for g in content["geometries"]),
@@ -166,32 +165,32 @@ class FittedReceiver:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankCalibration:
-    """Receivers by tower, fitted on all flights, and scores by split: (flight, tower, score)."""
+    """Receivers by tower, fitted on all flights, and their scores by split as (flight, tower, score)."""
 
     receivers: Mapping[str, FittedReceiver]
     scores: Mapping[str, tuple[tuple[str, str, ForecastScore], ...]]
     warnings: tuple[str, ...]
 
     def metrics(self) -> dict[str, list[dict[str, Any]]]:
-        """``rank`` of ``calibrate --json``."""
+        """Return the entry ``rank`` of ``calibrate --json``."""
         return {
             split: [{"flight": flight, "tower": tower, **json_safe(score)} for flight, tower, score in rows]
             for split, rows in self.scores.items()
         }
 
     def text(self) -> str:
-        """The receiver file."""
+        """Return the text of the receiver file."""
         towers = {name: fitted.as_dict() for name, fitted in self.receivers.items()}
         return json.dumps({"format": FORMAT, "towers": towers}, indent=1) + "\n"
 
 
 def read_receiver(path: Path) -> dict[str, FittedReceiver]:
-    """Receivers of a file that ``calibrate`` wrote, by tower.
+    """Read the receivers in a file of ``calibrate``, by tower.
 
     Raises
     ------
     InputError
-        If it is no such file.
+        If it is not such a file.
     """
     with parsing(path, f"a file of format {FORMAT!r}", "a file of another kind", any_shape=True):
         content = json.loads(read_table(path, "a receiver file"))
@@ -206,7 +205,7 @@ def _geometry(values: Mapping[str, Any]) -> Geometry:
 
 
 def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
-    """Reports above ``rank.minimum_height_m`` at known positions."""
+    """Return the reports above ``rank.minimum_height_m`` at known positions."""
     poses, known, _ = rank_poses(data, series)
     low = data.settings.rank.minimum_height_m
     high = np.full(len(poses), True) if low is None else poses.position_m[:, 2] >= low
@@ -215,7 +214,7 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
     if series.tower in data.nodes:
         raise UsageError(
             f"rank of {series.tower} in {data.settings.flight.name}, which moves",
-            expected="a tower that stands still: geometries of the modem are fitted as seen from one place",
+            expected="a fixed tower: geometries of the modem are fitted as seen from one position",
         )
     if ports != {4}:
         raise UsageError(
@@ -236,8 +235,8 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
 
 
 def _powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArray:
-    """Squares (geometries, n, 4) of the singular values of the modelled channels."""
-    order = sorted(range(len(geometries)), key=lambda i: geometries[i].mount_deg)  # best first: mounts come again
+    """Return the squared singular values of the modelled channels, shape (geometries, n, 4)."""
+    order = sorted(range(len(geometries)), key=lambda i: geometries[i].mount_deg)  # neighbours share a mount
     singular = singular_values_of(
         [geometries[i] for i in order], samples.link.tower_arrays[samples.tower], samples.tower_m,
         samples.link.uav_array, samples.poses, samples.link.carrier_hz,
@@ -247,7 +246,7 @@ def _powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArr
 
 
 def features_of(geometries: Sequence[Geometry], samples: RankSamples, timing: Timing | None = None) -> FloatArray:
-    """Features (geometries, n, 4) of the modelled channels."""
+    """Return the features of the modelled channels, shape (geometries, n, 4)."""
     return _features(_powers_of(geometries, samples), samples, timing or Timing())
 
 
@@ -258,7 +257,7 @@ def _features(power: FloatArray, samples: RankSamples, timing: Timing) -> FloatA
 
 
 def candidates(grid: RankGrid, samples: RankSamples) -> tuple[Geometry, ...]:
-    """Geometries to try: upright and rolled by 90 deg (half a turn is the same), lying flat."""
+    """Return the geometries to try: upright and rolled by 90 deg (equal after half a turn), and lying flat."""
     half, full = (np.arange(0.0, end, grid.yaw_step_deg) for end in (180.0, 360.0))
     mounts = [(float(y), 0.0, r) for r in (0.0, 90.0) for y in half] + [(float(y), 90.0, 0.0) for y in full]
     tower = tuple(np.degrees(samples.link.tower_arrays[samples.tower].slant_rad).round(9).tolist())
@@ -266,7 +265,7 @@ def candidates(grid: RankGrid, samples: RankSamples) -> tuple[Geometry, ...]:
 
 
 def samples_by_tower(flights: Sequence[FlightData]) -> dict[str, list[RankSamples]]:
-    """Reports of all flights; InputError without any, UsageError of :func:`rank_samples`."""
+    """Return the reports of all flights by tower. InputError if there are none."""
     towers: dict[str, list[RankSamples]] = {}
     for data in flights:
         for series in data.rank:
@@ -277,14 +276,14 @@ def samples_by_tower(flights: Sequence[FlightData]) -> dict[str, list[RankSample
 
 
 def fit_rank(towers: Mapping[str, Sequence[RankSamples]]) -> RankCalibration:
-    """Fit a receiver per tower on all flights, and score it on each flight left out; InputError of too few reports."""
+    """Fit a receiver per tower on all flights, and score it on held-out flights. InputError for too few reports."""
     receivers, warnings = {}, []
     scores: dict[str, list[tuple[str, str, ForecastScore]]] = {"flight_left_out": [], "sector_left_out": []}
     for tower, samples in towers.items():
         tried = Tried.of(samples)
         receivers[tower] = tried.fit(range(len(samples)))
         if len(samples) < 2:
-            warnings.append(f"rank at {tower}: one flight alone, no flight can be left out and nothing is scored")
+            warnings.append(f"rank at {tower}: only one flight: no flight can be held out, so nothing is scored")
             continue
         for held_out, test in enumerate(samples):
             train = [i for i in range(len(samples)) if i != held_out]
@@ -295,12 +294,12 @@ def fit_rank(towers: Mapping[str, Sequence[RankSamples]]) -> RankCalibration:
         timing = receivers[tower].timing
         if timing.shift_s or timing.average_s:
             warnings.append(
-                f"rank at {tower}: reports go best with positions {timing.shift_s:g} s later than logged and a channel "
-                f"averaged over {timing.average_s:g} s, as sectors left out within the flights say"
+                f"rank at {tower}: on held-out sectors, reports fit best to positions {timing.shift_s:g} s later than "
+                f"logged and a channel averaged over {timing.average_s:g} s"
             )
         if receivers[tower].tied > 1:
             warnings.append(
-                f"rank at {tower}: {receivers[tower].tied} geometries give the same score, among them "
+                f"rank at {tower}: {receivers[tower].tied} geometries have the same score, among them "
                 + "; ".join(g.in_words() for g in receivers[tower].geometries[:3])
             )
     return RankCalibration(
@@ -309,7 +308,7 @@ def fit_rank(towers: Mapping[str, Sequence[RankSamples]]) -> RankCalibration:
 
 
 def _sectors(samples: RankSamples, fitted: FittedReceiver, constant: FloatArray) -> ForecastScore:
-    """Each sector forecast from the others of the same flight, with the geometries of the other flights."""
+    """Score each sector with a forecast from the other sectors of its flight and the geometries of other flights."""
     good = samples.part(samples.rank >= 1)
     groups = receiver.sector_groups(good.poses.position_m, good.tower_m)
     penalty = fitted.mixture.members[0].penalty
@@ -321,7 +320,7 @@ def _sectors(samples: RankSamples, fitted: FittedReceiver, constant: FloatArray)
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """All candidates at thinned samples of each flight, evaluated once: ``power`` (geometries, n, 4) per flight."""
+    """All candidates at thinned samples of each flight. ``power`` has shape (geometries, n, 4) per flight."""
 
     grid: RankGrid
     samples: Sequence[RankSamples]
@@ -331,16 +330,16 @@ class Tried:
 
     @classmethod
     def of(cls, samples: Sequence[RankSamples], grid: RankGrid = RankGrid()) -> Tried:
-        """All candidates of a grid, for flights at one tower."""
+        """Evaluate all candidates of a grid for flights at one tower."""
         geometries = candidates(grid, samples[0])
         thinned = [sample.part(slice(None, None, grid.thin)) for sample in samples]
         return cls(grid, samples, geometries, thinned, [_powers_of(geometries, item) for item in thinned])
 
     def fit(self, flights: Sequence[int] | range) -> FittedReceiver:
-        """Choose geometries and timing, and fit, on some of the flights.
+        """Choose geometries and timing on some flights, and fit the receiver.
 
-        The geometries are chosen without timing first; the best of them choose the timing, with which all geometries
-        are then compared again.
+        Geometries are chosen without timing first. The best geometries determine the timing, with which all geometries
+        are compared again.
         """
         first = self.choose(flights, Timing())
         timing = self.choose_timing(flights, first.order[: self.grid.members])
@@ -365,14 +364,14 @@ class Tried:
         )
 
     def choose(self, flights: Sequence[int] | range, timing: Timing) -> receiver.FeatureChoice:
-        """Compare all geometries on sectors left out within the flights."""
+        """Compare all geometries on held-out sectors within the flights."""
         thinned = [self.thinned[i] for i in flights]
         return receiver.choose_features(
             self.features(flights, timing), np.concatenate([item.rank for item in thinned]), _groups(thinned)
         )
 
     def choose_timing(self, flights: Sequence[int] | range, which: IntArray) -> Timing:
-        """Least log score of the mean forecast of some geometries, on sectors left out within the flights."""
+        """Choose the timing with the smallest log score of the mean forecast on held-out sectors."""
         thinned = [self.thinned[i] for i in flights]
         rank, groups = np.concatenate([item.rank for item in thinned]), _groups(thinned)
         timings = [Timing(shift_s=s, average_s=mean_s) for s in self.grid.shift_s for mean_s in self.grid.average_s]
@@ -381,11 +380,11 @@ class Tried:
     def features(
         self, flights: Sequence[int] | range, timing: Timing, which: IntArray | slice = slice(None)
     ) -> FloatArray:
-        """Features (geometries, n, 4) at the thinned samples of some flights."""
+        """Return features at the thinned samples of some flights, shape (geometries, n, 4)."""
         return np.concatenate([_features(self.power[i][which], self.thinned[i], timing) for i in flights], axis=1)
 
 
 def _groups(samples: Sequence[RankSamples]) -> IntArray:
-    """Sectors of directions; a sector is left out of all flights at once."""
+    """Return the sector of each sample. A sector is held out from all flights at once."""
     position_m = np.concatenate([sample.poses.position_m for sample in samples])
     return receiver.sector_groups(position_m, samples[0].tower_m)

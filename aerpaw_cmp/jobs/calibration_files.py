@@ -46,15 +46,15 @@ from ..site.learned import (
 from .calibrate import Calibration, CalibrationFile, known_directions
 from .calibrate_rank import RankCalibration
 
-# First words of calibrated.yaml, by which an own earlier output is known.
+# First words of calibrated.yaml, which identify an earlier output of this tool.
 _MARK = "# aerpaw-cmp calibrate"
 
-# Share of the variance over both directions that the stored directions leave, and their largest number.
+# Share of the variance over both directions that stored directions may miss, and their largest number.
 _PAIR_SHARE, _MOST_PAIRS = 0.01, 400
 
 
 def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
-    """Every antenna over the sphere, by ``(tower.channel, "uav" or "tower")``."""
+    """Return every antenna over the sphere, by ``(tower.channel, "uav" or "tower")``."""
     theta, azimuth, vectors = sphere_grid()
     flat, shape = vectors.reshape(-1, 3), vectors.shape[:2]
     fit, out = calibration.fit, {}
@@ -79,7 +79,7 @@ def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]
 def _antenna_files(
     calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], carrier_hz: float
 ) -> dict[str, str]:
-    """Content of each file by its name: the full sphere with standard deviation, and cuts for planning tools.
+    """Return the content of each file by name: the full sphere with standard deviation, and cuts for planning tools.
 
     Parameters
     ----------
@@ -110,12 +110,12 @@ def _antenna_files(
 
 
 def _provenance_notes(calibration: Calibration) -> Sequence[str]:
-    """Training logs of every channel: they share a fit."""
+    """Return the notes on training logs, which are common to all channels."""
     return f"{KEY}: {' '.join(calibration.trained_on)}", f"{MARKS}: {' '.join(calibration.marks)}"
 
 
 def _pair_gain(calibration: Calibration, antenna: str) -> PairGain | None:
-    """Return the gain towards both ends at once of an antenna; None if none was learned."""
+    """Return the joint gain of both ends of an antenna. None if it was not learned."""
     fit = calibration.fit
     if (term := calibration.pair_term) is None:
         return None
@@ -131,8 +131,8 @@ def _pair_gain(calibration: Calibration, antenna: str) -> PairGain | None:
 
 
 def _listed(key: str, entries: Sequence[str]) -> list[str]:
-    """Lines of calibrated.yaml that name the training logs."""
-    comment = {KEY: "SHA-256 of the logs: nothing is scored on them", MARKS: "marks, by which copies are known"}[key]
+    """Return the lines of calibrated.yaml that name the training logs."""
+    comment = {KEY: "SHA-256 of the training logs (never scored)", MARKS: "fingerprints, to identify copies"}[key]
     return [f"# {comment}", f"{key}:", *(f"  - '{entry}'" for entry in entries)] if entries else []
 
 
@@ -200,10 +200,10 @@ def settings_text(calibration: Calibration, folder_name: str, files: Mapping[str
         ]
     rough = calibration.ground.used_m
     lines += [
-        "# the gains were learned beside line of sight alone",
+        "# the gains were learned with the direct path only",
         "rt: {engine: image, max_depth: 0, attitude: logged}",
     ] if rough is None else [
-        "# a ground ray of this roughness is likelier than none beside the learned gains",
+        "# with the learned gains, a ground ray of this roughness is likelier than none",
         f"rt: {{engine: image, max_depth: 1, attitude: logged, ground_roughness_m: {rough:g}}}",
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
@@ -212,7 +212,7 @@ def settings_text(calibration: Calibration, folder_name: str, files: Mapping[str
 def _record_of(
     calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], text: str, stages_s: Mapping[str, float]
 ) -> CalibrationData:
-    """All that the page shows.
+    """Return the record of the page.
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ def _record_of(
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """Results learned from the flights of a calibration, and what is to be said of their logs."""
+    """Results of a calibration, with remarks on the logs of its flights."""
 
     settings: CalibrationFile
     flights: tuple[FlightData, ...]
@@ -272,15 +272,15 @@ class Calibrated:
 def write_files(
     calibrated: Calibrated, folder: Path, name: str, stages_s: Mapping[str, float]
 ) -> tuple[dict[str, Any], str]:
-    """Fill the folder of a calibration; gives its metrics and the text of calibrated.yaml.
+    """Write the files of a calibration, and return its metrics and the text of calibrated.yaml.
 
     Parameters
     ----------
     calibrated : Calibrated
     folder : Path
-        Exists, and is swapped for the old one by the caller.
+        Existing folder, which the caller swaps for the old one.
     name : str
-        Of the folder, as the settings name its files.
+        Name of the final folder, for the paths in calibrated.yaml.
     stages_s : mapping of str to float
         Time of each stage [s].
 
@@ -366,7 +366,7 @@ def _learned_series(
         parts = {"tower": antenna, "pair": antenna, "tower_known": antenna, "uav": shared, "known": shared}
         files = {part: f"{safe_name(f'{name}.{owner}.{part}')}.csv.gz" for part, owner in parts.items()}
         notes = {p: (f"aerpaw-cmp calibrate: {name}, {antenna} {p}", *_provenance_notes(calibration)) for p in files}
-        # these are never named alone, and fingerprints are most of a table
+        # flight files never name these tables, and fingerprints would be most of their size
         notes |= {part: notes[part][:2] for part in ("known", "tower_known", "pair")}
         for end in ("tower", "uav"):
             gains = maps[parts[end], end]
@@ -404,18 +404,18 @@ def _learned_series(
     return series, tables
 
 
-# Of a series: their standard deviations stand for its mean.
+# Number of samples for the mean standard deviation of a series.
 _SD_SAMPLES = 200
 
-# Between flights, before any was seen: counts as two. A guess, fitted to no campaign: three of dataset 12, LTE, AFAR
-# and NR are likeliest at 1.0 (without AFAR) to 2.8 dB (without dataset 12), too far apart to learn it from the others.
+# Prior SD of the offset between flights [dB], with the weight of two flights. It is a guess: three of dataset 12, LTE,
+# AFAR and NR give 1.0 dB (without AFAR) to 2.8 dB (without dataset 12), too different to learn it from other campaigns.
 _OFFSET_SD_DB = 1.5
 
 
 def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:
-    """Mean level of the flights above the antennas as written; its error is that of flights left out."""
+    """Return the mean level of the flights above the written antennas, with the error on held-out flights."""
     mine = [o for o in calibration.observed if (o.samples.tower, o.samples.channel) == (series.tower, series.channel)]
-    if mine[0].samples.antenna in calibration.locks:  # without lock a level says nothing of the path
+    if mine[0].samples.antenna in calibration.locks:  # without lock, a level does not depend on the path
         mine = [o.part(o.locked == 1.0) for o in mine if o.locked is not None]
     sent = series.link.transmit_power_dbm
     offsets = [calibration.learned.mean_error(o.samples) + o.sent_dbm - sent for o in mine]
@@ -425,7 +425,7 @@ def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> Le
         if (s.tower, s.channel) == (series.tower, series.channel)
     ]
     n = max(len(squares), 1)
-    # each was predicted by n - 1 others, and misses their mean by n / (n - 1) of what it misses the mean of all
+    # a flight differs from the mean of the n - 1 others by n / (n - 1) of its difference from the mean of all
     variance_db2 = (2.0 * _OFFSET_SD_DB**2 + (1.0 - 1.0 / n) ** 2 * sum(squares)) / (n + 1.0)
     return LearnedLevel(
         offset_db=round(float(np.nanmean(offsets)) + sum(end.level_db for end in ends), 2),
@@ -436,14 +436,14 @@ def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> Le
 
 
 def _at_unit_gain(lock: LearnedLock | None, *ends: AntennaMap) -> LearnedLock | None:
-    """P(lock) of levels that are predicted with the antennas as written."""
+    """Return the lock model for levels predicted with the written antennas."""
     if lock is None:
         return None
     return lock.model_copy(update={"gain_db": round(lock.gain_db - sum(end.level_db for end in ends), 2)})
 
 
 def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, file: str) -> list[LearnedReceiver]:
-    """Receivers that were fitted on flights, with their scores on flights left out."""
+    """Return the fitted receivers with their scores on held-out flights."""
     receivers = []
     for tower in ranked.receivers:
         scores = [score for _, at, score in ranked.scores["flight_left_out"] if at == tower]
@@ -461,7 +461,7 @@ def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, f
 
 
 def _errors(calibration: Calibration, name: str) -> Errors | None:
-    """Return the errors of held-out flights of a campaign, and of parts that no other flight has; None without any."""
+    """Return the errors of held-out flights of a campaign, and of held-out parts. None without held-out flights."""
 
     def mine(split: str) -> list[Score]:
         return [s for s in calibration.scores[split] if calibration.campaigns[s.flight] == name]
@@ -478,5 +478,5 @@ def _errors(calibration: Calibration, name: str) -> Errors | None:
     return Errors(series=len(scores), heights_m=sorted(heights), **values)
 
 
-# Parts of a flight that no other flight has, by the prefix of their error; and the airframe of other campaigns alone.
+# Held-out parts by the prefix of their error. "airframe" has only the airframe of other campaigns.
 _PARTS = {"sector": "sector", "height": "altitude", "heading": "heading", "airframe": "campaign"}

@@ -1,11 +1,10 @@
-"""Many flights and settings: run each, pool the offsets, compare flights at the same places.
+"""Many flights and settings: run each, pool the offsets, compare flights at the same positions.
 
 A campaign.yaml names flight files and, optionally, settings: labels with overrides of flight keys in dotted form
 (``rt.max_depth: 1``). Every setting runs on every flight. A flight that cannot be read is a row with its message.
 
-One flight under one setting: what a worker is given, does and gives back, what is kept and what is to do.
-
-Numbers of a season from the rows of a campaign: held-out errors, ranking, steps of offsets, residuals by place.
+A task is one flight under one setting. Workers run tasks and return rows of numbers, which are stored. The rows of
+several flights give held-out errors, a ranking of settings, steps of offsets, and mean residuals by position.
 """
 
 from __future__ import annotations
@@ -75,12 +74,12 @@ class Task:
     overrides: Overrides
     logs_root: Path | None
     reference: bool = True
-    """Pairs of flights and the season are of this setting: places are kept."""
+    """True for the setting whose flights are compared with each other: its positions are stored."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Rows of one task, or why there are none, and what it cost [s]."""
+    """Rows of one task, or the reason for none, and the time that it took [s]."""
 
     rss: tuple[RssRow, ...] = ()
     rank: tuple[RankRow, ...] = ()
@@ -89,9 +88,9 @@ class Outcome:
 
 
 def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """Outcomes in the order of their tasks; a flight that holds the log of an earlier one is a failure that says so.
+    """Return outcomes in the order of their tasks, with a failure for each flight that repeats an earlier log.
 
-    A log that comes twice, renamed, copied or packed, would be pooled twice and predicted from itself.
+    A log that occurs twice, even renamed, copied or packed, would be pooled twice and predicted from itself.
     """
     home: dict[str, str] = {}
     marked: dict[str, str] = {}
@@ -105,7 +104,7 @@ def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Out
         if copied := next((mark for mark in others if any(among(own, [mark]) for own in marks)), ""):
             message = f"readings of {marked[copied]} in another log"
         if message:
-            outcome = failed_task(task, f"it holds {message}: it is counted once")
+            outcome = failed_task(task, f"it contains {message}, which is counted once")
         else:
             marked |= dict.fromkeys(marks, task.flight)
         counted.append(outcome)
@@ -118,20 +117,20 @@ def _flight_file(path: Path, _size: int, _mtime_ns: int) -> FlightFile:
 
 
 def _settings(task: Task) -> FlightFile:
-    """Return the settings of a task; the learned antennas that they name must fit its overrides."""
+    """Return the settings of a task. UsageError if their learned antennas do not fit its overrides."""
     written = overridden(_flight_file(task.path, *stamp(task.path)), task.overrides)
     return with_learned(written, task.path.parent)
 
 
 @lru_cache(maxsize=2)
 def _logs(key: _Logs) -> Any:
-    """The logs of a flight: settings after settings reads them once."""
+    """Return the logs of a flight, which are read once for all settings."""
     return read_logs(key.settings, key.folder, key.logs_root)
 
 
 @dataclass(frozen=True, slots=True)
 class _Logs:
-    """Inputs on which the reading of logs depends; settings that do not matter to it do not count in comparisons."""
+    """A cache key of logs. It compares only what the reading of logs depends on."""
 
     folder: Path
     logs_root: Path | None
@@ -141,7 +140,7 @@ class _Logs:
 
 
 def flight_data(task: Task) -> FlightData:
-    """Read and gather the flight of a task; errors as in :mod:`aerpaw_cmp.flight.data`."""
+    """Read and gather the flight of a task. Errors are those of :mod:`aerpaw_cmp.flight.data`."""
     settings = _settings(task)
     folder, root = task.path.parent, task.logs_root
     text = "\n".join([str(settings.timezone), *(log.model_dump_json() for log in settings.logs)])
@@ -150,18 +149,18 @@ def flight_data(task: Task) -> FlightData:
 
 
 def run_task(task: Task) -> Outcome:
-    """Replay and compare one flight under one setting; whatever goes wrong becomes a message."""
+    """Replay and compare one flight under one setting. Every exception becomes a message of the outcome."""
     try:
         flight_run = run_flight(flight_data(task), audit=False)
         return _rows_of(task, flight_run.data, flight_run.result)
     except AerpawCmpError as error:
         return failed_task(task, str(error), error)
-    except Exception as error:  # one flight's fault must not cost the others their numbers
+    except Exception as error:  # an error in one flight must not end the other tasks
         return failed_task(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
 
 
 def _rows_of(task: Task, data: FlightData, result: FlightResult) -> Outcome:
-    """Outcome of a flight that was compared."""
+    """Return the outcome of a compared flight."""
     return Outcome(
         rss=tuple(
             _rss_row(task, data.settings.rss, compared, _identity(data, series))
@@ -176,19 +175,19 @@ def _rows_of(task: Task, data: FlightData, result: FlightResult) -> Outcome:
 
 
 def failed_task(task: Task, message: str, error: BaseException | None = None) -> Outcome:
-    """The outcome of a task without numbers; the traceback of an error goes into a file of its own."""
+    """Return the outcome of a failed task: its message, and the traceback for a separate file."""
     text = "" if error is None else "".join(traceback.format_exception(error))
     return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message, traceback=text))
 
 
-# --- as a worker does it --------------------------------------------------------------------------------------------
+# --- tasks of a worker --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Order:
-    """Order to a worker: paths and the digest of what the outcome depends on, as the first process sees it.
+    """A request to a worker: the task, and the digest of its inputs as the planning process sees them.
 
-    ``key`` is None where an input cannot be read, or nothing is kept.
+    ``key`` is None if an input cannot be read, or if outcomes are not stored.
     """
 
     task: Task
@@ -196,10 +195,10 @@ class Order:
 
 
 def carry_out(order: Order) -> Outcome:
-    """Run a task; what runs in worker processes of every kind.
+    """Run a requested task. This function runs in worker processes of every kind.
 
-    The key is computed anew here: a worker that sees another file or runs other code fails the task instead of
-    giving a wrong number under a right name.
+    The key is computed again here, so that a worker with other files or other code fails the task instead of returning
+    a wrong number.
     """
     task = order.task
     try:
@@ -219,7 +218,7 @@ def carry_out(order: Order) -> Outcome:
 
 
 def digest_of(task: Task) -> str:
-    """Digest of the settings and inputs on which the outcome of a task depends.
+    """Return the digest of the settings and inputs on which the outcome of a task depends.
 
     Raises
     ------
@@ -231,9 +230,9 @@ def digest_of(task: Task) -> str:
 
 
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:
-    """An outcome under the names of this campaign; series of samples stay for the first setting alone.
+    """Return an outcome under the names of this campaign, with series of samples for the first setting only.
 
-    Of the others a row holds numbers: the memory of 4000 tasks is that of the flights.
+    Rows of the remaining settings contain only numbers, so that 4000 tasks need no more memory than their flights.
     """
 
     def row(kept_row: RssRow) -> RssRow:
@@ -263,13 +262,13 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
 
 
 def _identity(data: FlightData, series: RssSeries | RankSeries) -> dict[str, Any]:
-    """Fields of a row that say which log it is of, whatever the log is called or packed in."""
+    """Return the fields of a row that identify its log by content, regardless of name and packing."""
     return {"logs": logs_of(data, series), "mark": series_mark(series)}
 
 
 def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mapping[str, Any]) -> RssRow:
     score, clock = result.score, result.further.clock
-    # nothing is pooled or ranked from the flight that its antennas were learned from
+    # a flight from which its own antennas were learned takes no part in pooling and ranking
     measured_db = np.full_like(result.measured_db, np.nan) if result.further.trained_on else result.measured_db
     return RssRow(
         flight=task.flight,
@@ -320,14 +319,14 @@ def _rank_rows(task: Task, result: RankResult, identity: Mapping[str, Any]) -> l
     ]  # fmt: skip
 
 
-# --- what is kept, what is to do -------------------------------------------------------------------------------------
+# --- stored outcomes and remaining tasks ------------------------------------------------------------------------------
 
 
 def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: int) -> list[PlannedStage]:
-    """Tasks of each setting, for a dry run; ``kept`` outcomes stand by the numbers of their tasks.
+    """Return the tasks of each setting for a dry run. ``kept`` has the stored outcomes by task number.
 
-    A task to do takes as long as the kept ones of its setting took on average, else as all of them; unknown where
-    none is kept. ``workers`` do so many side by side.
+    The time of a task is the mean of the stored tasks of its setting, else of all stored tasks, divided by ``workers``.
+    It is unknown if no task is stored.
     """
     spent: dict[str, list[float]] = {}
     for number, outcome in kept.items():
@@ -346,13 +345,13 @@ def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: i
 def kept_outcomes(
     tasks: Sequence[Task], store: OutcomeStore | None, progress: Progress
 ) -> tuple[dict[int, Outcome], dict[int, Order]]:
-    """Outcomes that are there, and what is to be computed, by number."""
+    """Return the stored outcomes and the requests for the remaining tasks, both by task number."""
     outcomes: dict[int, Outcome] = {}
     orders = {number: Order(task=task) for number, task in enumerate(tasks)}
     if store is None:
         return outcomes, orders
     for number, task in enumerate(tasks):
-        with suppress(AerpawCmpError, OSError):  # such a task will say itself what is wrong
+        with suppress(AerpawCmpError, OSError):  # the task itself will report the error
             key = digest_of(task)
             orders[number] = Order(task=task, key=key)
             if isinstance(outcome := store.load(key), Outcome):
@@ -361,7 +360,7 @@ def kept_outcomes(
     for text in store.warnings:
         progress(text)
     if len(outcomes):
-        progress(f"{len(outcomes)} of {counted(len(tasks), 'outcome')} kept from before in {store.folder}")
+        progress(f"{len(outcomes)} of {counted(len(tasks), 'outcome')} stored before in {store.folder}")
     return outcomes, orders
 
 
@@ -372,19 +371,19 @@ def compute(
     store: OutcomeStore | None,
     progress: Progress,
 ) -> None:
-    """Let the workers do what is to do; each outcome is put into ``outcomes`` and kept as soon as it comes.
+    """Let the workers run the remaining tasks. Each outcome is stored as soon as it arrives.
 
     Parameters
     ----------
     orders : mapping of int to Order
-        What is to do, by the number of its task.
+        Requests by task number.
     workers : Workers
     outcomes : dict of int to Outcome
-        Gets the new ones.
+        Receives the new outcomes.
     store : OutcomeStore, optional
-        Keeps the new ones.
+        Stores the new outcomes.
     progress : Progress
-        Tasks done.
+        Receives the number of finished tasks.
     """
     numbers, total, failed = list(orders), len(outcomes) + len(orders), 0
 
@@ -414,7 +413,7 @@ class CampaignFile(StrictModel):
     title: str | None = None
     flights: list[str] = Field(default_factory=list)
     soundings: list[str] = Field(default_factory=list)
-    timezone: str | None = None  # of soundings with local times
+    timezone: str | None = None  # time zone of soundings with local times
     settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
     calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
 
@@ -425,21 +424,21 @@ def load_campaign(path: Path) -> CampaignFile:
     Raises
     ------
     UsageError
-        As :func:`aerpaw_cmp.common.yamlfile.load_yaml`.
+        If the file is wrong, as for :func:`aerpaw_cmp.common.yamlfile.load_yaml`, or names nothing to run.
     """
     campaign = load_yaml(path, CampaignFile)
     if not campaign.flights + campaign.soundings:
         raise UsageError("no flights and no soundings", expected="flights: [FLIGHT.yaml, ...]", path=path)
     if campaign.timezone is not None and not campaign.soundings:
         raise UsageError(
-            "'timezone' without 'soundings', whose times it is for",
+            "'timezone' without 'soundings'",
             expected="the time zone of a flight in its own flight.yaml",
             path=path,
         )
     return campaign
 
 
-# --- all of it --------------------------------------------------------------------------------------------------------
+# --- the job --------------------------------------------------------------------------------------------------------
 
 
 def run(
@@ -450,30 +449,30 @@ def run(
     keep: Path | None = None,
     stages: Stages | None = None,
 ) -> CampaignData:
-    """All flights under all settings, and what can be said only of several flights.
+    """Run all flights under all settings, and compute the numbers that need several flights.
 
     Parameters
     ----------
     campaign : CampaignFile
     folder : Path
-        Against which the paths of flight files resolve.
+        Folder for the paths of flight files.
     options : RunOptions
     keep : Path, optional
-        Folder of outcomes, taken and added to.
+        Folder of stored outcomes, which is read and extended.
     stages : Stages, optional
 
     Returns
     -------
     CampaignData
-        Rows of every flight and setting, pooled offsets, repeats; a flight that failed is among ``failures``.
+        Rows of every flight and setting, pooled offsets, repeats. ``failures`` has the flights that failed.
 
     Raises
     ------
     UsageError
-        Overrides that no flight file could have, two flights of one name.
+        If overrides are invalid, or two flights have one name.
     """
     stages, progress, logs_root = stages or Stages(), options.progress, options.logs_root
-    if options.scheduler is not None:  # workers may stand in another folder
+    if options.scheduler is not None:  # workers may run in another folder
         folder, logs_root = folder.absolute(), None if logs_root is None else logs_root.absolute()
     tasks, files, failures = campaign_tasks(campaign, folder, logs_root)
     settings = campaign.settings or {_AS_WRITTEN: {}}
@@ -518,12 +517,12 @@ def run(
 def campaign_tasks(
     campaign: CampaignFile, folder: Path, logs_root: Path | None = None
 ) -> tuple[list[Task], dict[str, tuple[Path, FlightFile]], list[Failure]]:
-    """Every setting on every flight, the flight files by name, and those that cannot be read.
+    """Return one task per setting and flight, the flight files by name, and the files that cannot be read.
 
     Raises
     ------
     UsageError
-        Overrides that no flight file could have, two flights of one name.
+        If overrides are invalid, or two flights have one name.
     """
     settings = campaign.settings or {_AS_WRITTEN: {}}
     files, failures = _flight_files(campaign, folder, settings)
@@ -536,7 +535,7 @@ def campaign_tasks(
 
 
 def _inputs_of(files: Mapping[str, tuple[Path, FlightFile]], logs_root: Path | None) -> list[Path]:
-    """Flight files and logs that are there; what is missing here is a row of the result."""
+    """Return the existing flight files and logs. A missing one becomes a row of the result."""
     paths = [path for path, _ in files.values()]
     paths += [(logs_root or path.parent) / log.path for path, flight in files.values() for log in flight.logs]
     return [path for path in paths if path.exists()]
@@ -545,7 +544,7 @@ def _inputs_of(files: Mapping[str, tuple[Path, FlightFile]], logs_root: Path | N
 def _flight_files(
     campaign: CampaignFile, folder: Path, settings: Mapping[str, Overrides]
 ) -> tuple[dict[str, tuple[Path, FlightFile]], list[Failure]]:
-    """Flight files that can be read, by name, every override tried on them; and those that cannot."""
+    """Return the readable flight files by name, with all overrides checked, and the failures of the others."""
     files: dict[str, tuple[Path, FlightFile]] = {}
     failures = []
     for entry in campaign.flights:
@@ -570,11 +569,11 @@ def _flight_files(
     return files, failures
 
 
-# --- what only several flights together can give: shared offsets, repeatability, K chosen on the others --------------
+# --- numbers of several flights: shared offsets, repeatability, K chosen on the other flights ------------------------
 
 
 def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], list[PooledOffset]]:
-    """Shared offsets of each setting, entered into the rows and listed by group."""
+    """Return the rows with the shared offset of their setting and group, and the offsets by group."""
     pooled_rows: list[RssRow] = []
     groups: list[PooledOffset] = []
     for setting in dict.fromkeys(row.setting for row in rows):
@@ -621,7 +620,7 @@ def _pooled(setting: str, name: str, rows: list[RssRow], fits: Mapping[Any, Any]
 
 
 def repeats(rows: Sequence[RssRow]) -> list[Repeat]:
-    """Every pair of flights that share a tower and channel, of the rows of one setting, in their order."""
+    """Compare every pair of flights with a common tower and channel. ``rows`` are those of one setting."""
     passes = [
         Pass(
             flight=row.flight,
@@ -651,7 +650,7 @@ def _repeat(pair: PassPair, first: RssRow, second: RssRow, known: int) -> Repeat
 
 
 def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
-    """K chosen on the other flights, for every flight that has others with the same tower and K."""
+    """Choose K on the remaining flights with the same tower and values of K, for every flight."""
     out = []
     for setting, tower in dict.fromkeys((row.setting, row.tower) for row in rows):
         by: dict[str, dict[float, RankRow]] = {}
@@ -663,7 +662,7 @@ def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
             common = [k for k in fits if other_flights and all(k in at for at in other_flights)]
             if not common:
                 continue
-            # K that all other flights have: a mean over fewer of them would compare unlike flights
+            # only values of K that all other flights have, because means over different flights cannot be compared
             chosen = min(common, key=lambda k: finite_mean([at[k].total_variation for at in other_flights]))
             best = min(fits, key=lambda k: fits[k].total_variation)
             out.append(
@@ -688,15 +687,15 @@ _QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 def with_season(
     data: CampaignData, reports: Mapping[str, str] | None = None, sounded: Sequence[NodeOffset] = ()
 ) -> CampaignData:
-    """The campaign with held-out errors in its rows and what they say over the season.
+    """Return the campaign with held-out errors in its rows, and its numbers over several flights.
 
     Parameters
     ----------
     data : CampaignData
     reports : mapping of str to str, optional
-        Address of the report of a flight, against the campaign's folder.
+        Address of the report of each flight, relative to the campaign's folder.
     sounded : sequence of NodeOffset
-        Of soundings between towers (:func:`soundings`), in place of the offsets of the flights.
+        Node offsets from tower-to-tower soundings (:func:`soundings`). They replace the offsets of the flights.
     """
     rows = _held_out_rows(data.rss)
     data = dataclasses.replace(data, rss=tuple(rows))
@@ -723,7 +722,7 @@ def with_season(
 
 
 def _started_of(rows: Iterable[RssRow]) -> dict[str, int]:
-    """First instant of each flight [ns after 1970-01-01]; none where its logs have relative times only."""
+    """Return the start of each flight [ns after 1970-01-01]. Flights with relative times only have none."""
     starts: dict[str, int] = {}
     for row in rows:
         if row.start_ns and has_wall_clock(np.datetime64(row.start_ns, "ns")):
@@ -739,7 +738,7 @@ def _iso(ns: int) -> str:
 
 
 def _held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
-    """Rows with the offset from the other flights of their setting, tower and channel, and what it leaves."""
+    """Return rows with the offset of the other flights of their setting, tower and channel, and the RMSE after it."""
     groups: dict[tuple[str, str, str, str], list[int]] = {}
     for i, row in enumerate(rows):
         groups.setdefault((row.setting, row.tower, row.channel, row.unit), []).append(i)
@@ -759,7 +758,7 @@ def _held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
 
 
 def _error_of(row: RssRow) -> float:
-    """The error that settings are ranked by [dB]: held out, or own where there is no other flight."""
+    """Return the error for the ranking of settings [dB]: held-out, or its own if there is no other flight."""
     return row.held_out_rmse_db if np.isfinite(row.held_out_rmse_db) else row.rmse_db
 
 
@@ -769,22 +768,22 @@ def _error_of(row: RssRow) -> float:
 def rank_settings(
     rows: Iterable[RssRow], settings: Sequence[str], flights: Sequence[str], link: str
 ) -> list[SettingRank]:
-    """Settings by their mean error over flights, and their difference to the first on the same flights and links.
+    """Rank settings by their mean error over flights, with their difference to the first on the same flights.
 
     Parameters
     ----------
     rows : iterable of RssRow
     settings : sequence of str
-        Labels; ties keep their order.
+        Labels. Ties keep their order.
     flights : sequence of str
-        Those that are compared.
+        Flights that are compared.
     link : str
-        What the rows are of, for the record.
+        Link of the rows, for the record.
 
     Returns
     -------
     list of SettingRank
-        Least mean error first; settings without a finite error are left out.
+        Smallest mean error first. Settings without a finite error are omitted.
     """
     table: dict[str, dict[str, dict[str, float]]] = {name: {} for name in settings}
     for row in rows:
@@ -813,7 +812,7 @@ def rank_settings(
 
 
 def _paired(errors: Mapping[str, Any], base: Mapping[str, Any], flights: Sequence[str]) -> FloatArray:
-    """Mean difference on the links that both settings scored, per flight, in the order of the dates."""
+    """Return the mean difference on the links that both settings scored, per flight in the order of ``flights``."""
     differences = []
     for flight in flights:
         links = sorted(set(errors.get(flight, ())) & set(base.get(flight, ())))
@@ -826,7 +825,7 @@ def _paired(errors: Mapping[str, Any], base: Mapping[str, Any], flights: Sequenc
 
 
 def _flown(rows: Sequence[RssRow], order: Sequence[str], started: Mapping[str, int]) -> tuple[NodeOffset, ...]:
-    """Offset of each tower and channel over the flights, less what all share on a flight, and its steps."""
+    """Return the offset of each tower and channel over the flights, minus the common part, and its steps."""
     known = {(row.flight, row.link): row.moments.mean_db for row in rows}
     links = list(dict.fromkeys(row.link for row in rows))
     offsets = np.array([[known.get((flight, link), np.nan) for link in links] for flight in order])
@@ -836,19 +835,19 @@ def _flown(rows: Sequence[RssRow], order: Sequence[str], started: Mapping[str, i
 
 
 def soundings(paths: Sequence[Path], timezone: str | None) -> tuple[NodeOffset, ...]:
-    """Offset of each radio of the towers, night by night (UTC), from soundings between them.
+    """Return the offset of each tower radio per night (UTC), from soundings between towers.
 
     Parameters
     ----------
     paths : sequence of Path
-        Logs, their folders, or a flight file of ``ingest -o``. Streams that name transmitter and receiver count.
+        Logs, their folders, or a flight file of ``ingest -o``. Only streams with transmitter and receiver are used.
     timezone : str, optional
-        Of logs with local times.
+        Time zone of logs with local times.
 
     Raises
     ------
     InputError
-        No log names a link.
+        If no log names a link.
     """
     levels = []
     for file in ingest(paths, options=ReadOptions(timezone=timezone)):
@@ -872,7 +871,7 @@ def soundings(paths: Sequence[Path], timezone: str | None) -> tuple[NodeOffset, 
 
 
 def _radio(link: Mapping[str, Any], end: str) -> str:
-    """Tower, serial number and channel of one end of a link, where the log has them."""
+    """Return tower, serial number and channel of one end of a link, as far as the log has them."""
     serial, channel = link.get(f"{end}_serial_number"), link.get(f"{end}_channel")
     return str(link[end]) + (f" {serial}" if serial else "") + (f":{channel}" if channel else "")
 
@@ -881,7 +880,7 @@ def _radio(link: Mapping[str, Any], end: str) -> str:
 
 
 def _place_map(rows: Sequence[RssRow], cell_m: float) -> PlaceMap | None:
-    """Mean residual of each cell of the plan over flights, towers and channels; None without a cell."""
+    """Return the mean residual of each cell of the map over flights, towers and channels. None without a cell."""
     residuals: dict[tuple[int, int], list[float]] = {}
     for row in rows:
         scored = np.isfinite(row.residual_db) & np.isfinite(row.position_m).all(axis=1)
@@ -897,20 +896,20 @@ def _place_map(rows: Sequence[RssRow], cell_m: float) -> PlaceMap | None:
 
 
 def find_reports(flights: Iterable[str], folder: Path, places: Sequence[Path]) -> dict[str, str]:
-    """Relative addresses of the reports of flights that stand in one of the folders ``places``.
+    """Return relative addresses of the reports of flights in the folders ``places``.
 
     Parameters
     ----------
     flights : iterable of str
     folder : Path
-        Of the campaign's page.
+        Folder of the campaign's page.
     places : sequence of Path
-        Each may hold ``NAME/report.html``, as ``aerpaw-cmp report`` writes it.
+        Folders that may contain ``NAME/report.html`` of ``aerpaw-cmp report``.
 
     Returns
     -------
     dict
-        A folder whose metrics.json is of another flight is no report of this one.
+        Address by flight, if metrics.json in the same folder names that flight.
     """
     reports: dict[str, str] = {}
     for name in flights:

@@ -1,6 +1,6 @@
-"""Compare each replayed series with its measurement: numbers, as :mod:`aerpaw_cmp.compare.result` lists them.
+"""Comparison of each replayed series with its measurement, as the records of :mod:`aerpaw_cmp.compare.result`.
 
-A new number of a tower and channel is a field of ``RssFurther`` there and a function here, called in
+To add a number of a tower and channel, add a field to ``RssFurther`` there and a function here, called in
 :func:`compare_rss_series`.
 """
 
@@ -30,6 +30,7 @@ from ..compare.level import (
     ServingComparison,
     at_times,
     compare_serving,
+    nearest_in_time,
     score_detection,
 )
 from ..compare.receiver import ForecastScore, score_forecast
@@ -68,22 +69,22 @@ if TYPE_CHECKING:
 # Both sides are averaged over these windows to see how much of the error is fading.
 _AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
 
-# Two passes of one place, first and second half of a flight, come this near.
+# Two passes of one position, in the first and second half of a flight, are closer than this [m].
 _PASSES_WITHIN_M = 3.0
 
-# Grounds that are drawn for the error bar of rank agreement, and poses that are replayed over each.
+# Number of random grounds for the error bar of rank agreement, and of poses replayed over each.
 _DRAWS, _POSES = 6, 300
 
-# A shorter stretch of large error is a fade.
+# Shorter segments of large error are fades [s].
 _SHORTEST_S = 5.0
 
 
 def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
-    """Every series against its replay, and every two channels of a tower against each other."""
+    """Compare every series with its replay, and every two channels of a tower with each other."""
     results = []
     for series, replayed in zip(data.rss, replays.rss, strict=True):
         results.append(compare_rss_series(data, series, replayed))
-        give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
+        give_memory_back()  # a series of ten hours leaves some 100 MiB of fragmented memory, which the ranks need
     results = with_corrected_verdicts(results)
     cause, step = cause_of(data, replays, results)
     return FlightResult(
@@ -97,15 +98,15 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     )
 
 
-# A prediction of another cell at most this long before or after stands for the moment: phones report once a second.
+# A predicted level of a cell counts within this time of a sample [s]: phones report once a second.
 _SERVING_WITHIN_S = 1.5
 
 
 def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> ServingComparison | None:
-    """Serving cells of the log against the strongest predicted; None where no log tells which cell serves.
+    """Compare the logged serving cells with the strongest predicted cells. None if no log has the serving cell.
 
-    Compared are the cells that the flight file gives to towers, at the moments when one of them served. Levels are as
-    simulated: cells of one network send alike, and an offset fitted per cell would hide which one is stronger.
+    The comparison has the cells that the flight file assigns to towers, at the times when one of them served. Levels
+    are as simulated: cells of one network have equal power, and an offset per cell would hide which one is stronger.
     """
     cells = [(cell, result) for cell, result in zip(series, results, strict=True) if cell.serving is not None]
     if len(cells) < 2 or not any(np.nansum(cell.serving) for cell, _ in cells if cell.serving is not None):
@@ -133,7 +134,7 @@ def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> Ser
 class Levels:
     """Measured and simulated levels (n,) [dB].
 
-    ``posed`` are the samples with a known pose above the lowest height; ``measured_db`` is NaN elsewhere.
+    ``posed`` is true for samples with a known pose above the lowest height. ``measured_db`` is NaN elsewhere.
     """
 
     measured_db: FloatArray
@@ -142,14 +143,13 @@ class Levels:
 
 
 def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> Levels:
-    """Levels of a series that are compared, as ``rss`` of the flight file asks."""
-    measured = series.measured_db
+    """Return the levels of a series that are compared, by the rules of ``rss`` of the flight file."""
     posed = replayed.valid.copy()
     if settings.minimum_height_m is not None:
         posed[posed] = replayed.poses.position_m[:, 2] >= settings.minimum_height_m
     level_dbm = replayed.level_dbm("power" if settings.field == "power" else "coherent")
     return Levels(
-        measured_db=np.where(posed, measured, np.nan),
+        measured_db=np.where(posed, series.measured_db, np.nan),
         simulated_db=replayed.spread(level_dbm),
         posed=posed,
     )
@@ -157,10 +157,10 @@ def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> L
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Case:
-    """One tower and channel with what every number of it is computed from.
+    """One tower and channel with the inputs of all its numbers.
 
-    ``simple`` are the baselines at the samples; ``trained`` names logs of this flight that its antennas were learned
-    from: then nothing is scored.
+    ``simple`` has the baselines at the samples. ``trained`` names logs of this flight from which its antennas were
+    learned. Such a series has no scores.
     """
 
     data: FlightData
@@ -174,7 +174,7 @@ class _Case:
 
 
 def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> RssResult:
-    """Offset, RMSE, correlation, intervals and baselines of one tower and channel."""
+    """Return offset, RMSE, correlation, intervals and baselines of one tower and channel."""
     settings, case = data.settings.rss, _case(data, series, replayed)
     levels, clock = case.levels, replayed.clock
     score = rss.compare_rss(
@@ -216,10 +216,10 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
 
 
 def stated_spread(replayed: Replayed) -> StatedSpread | None:
-    """Error bars of the simulated level that learned antennas state, along the direct line; None where none does.
+    """Return the error bars that learned antennas state for the level of the direct path. None without such antennas.
 
-    Where only one end is learned, or files hold no gain towards both ends at once, the gains of both ends count as
-    independent; they are learned from the same levels, so the true standard deviation is rather smaller.
+    If only one end is learned, or no file has the gain of both ends together, the gains of both ends are taken as
+    independent. They are learned from the same levels, so the true standard deviation is rather smaller.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def stated_spread(replayed: Replayed) -> StatedSpread | None:
 
 
 def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> StatedSpread | None:
-    """Error bars in two parts, where other flights taught when the receiver loses its lock."""
+    """Add the forecast of a receiver that loses its lock to the error bars, if other flights determined it."""
     series, error_db = case.series, score.residual_db
     lock = None if stated is None else _lock(case)
     locked = (series.locked == 1.0) & np.isfinite(error_db)
@@ -245,7 +245,7 @@ def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | Non
     simulated_db = case.levels.simulated_db
     above_db = simulated_db - series.link.transmit_power_dbm - lock.gain_db
     expected_db = lock.locked_db + lock.locked_per_db * above_db + score.offset_db - simulated_db
-    # a flight that is stronger in lock than others at the same path gain loses its lock later, too
+    # a flight with stronger levels in lock than other flights at the same path gain also loses its lock later
     own_db = (error_db - expected_db)[locked].mean()
     parts = LostLock(
         probability=_forecast(series, lock).probability(simulated_db + own_db),
@@ -258,14 +258,14 @@ def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | Non
 
 
 def _lock(case: _Case) -> LearnedLock | None:
-    """Lock that other flights taught; None of a receiver that never loses it."""
+    """Return the lock model learned from other flights. None if the log has no lock."""
     if case.series.locked is None:
         return None
     return lock_elsewhere(case.data.settings.antennas, case.data.folder)
 
 
 def _forecast(series: RssSeries, lock: LearnedLock) -> DetectionForecast:
-    """P(lock) of the levels of a series."""
+    """Return the forecast of P(lock) for the levels of a series."""
     level_db = lock.gain_db + series.link.transmit_power_dbm
     return DetectionForecast(level_db=level_db, per_db=lock.per_db, share=lock.share)
 
@@ -292,7 +292,7 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
 
 
 def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> RssFurther:
-    """Counts, conditions and, where it may be scored, further views of the error.
+    """Return counts and conditions, and for a scored series further views of the error.
 
     Parameters
     ----------
@@ -340,18 +340,19 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
 
 
 def _bound(series: RssSeries, score: rss.RssComparison) -> str | None:
-    """Reason of an interval of the RMSE that has no upper end."""
+    """Return the reason if the interval of the RMSE has no upper end, else None."""
     if not np.isposinf(score.rmse_ci95_db[1]):
         return None
     known = np.isfinite(score.residual_db)
     order = np.argsort(series.time[known], kind="stable")
     time = series.time[known]
     length_s = (time.max() - time.min()) / np.timedelta64(1, "s")
-    return f"the flight is too short for its memory of {memory_share(score.residual_db[known][order]) * length_s:.0f} s"
+    correlated_s = memory_share(score.residual_db[known][order]) * length_s
+    return f"the flight is too short: its errors are correlated over {correlated_s:.0f} s"
 
 
 def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score: rss.RssComparison) -> float:
-    """RMSE after an own offset where some samples do not count."""
+    """Return the RMSE without the outliers ``wild``, after a separate offset."""
     if not wild.any():
         return score.rmse_db
     inliers_db = np.where(wild, np.nan, levels.measured_db)
@@ -386,10 +387,10 @@ def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[st
 
 
 def _baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
-    """Free space and two-ray (isotropic) at the replayed poses (n,) [dBm]."""
+    """Return free space and two-ray levels (isotropic) at the replayed poses (n,) [dBm]."""
     place, link = site.towers[tower], replayed.link
     source, target = replayed.source_m(site), replayed.poses.position_m
-    if replayed.tower_m is not None:  # a place per pose: (poses, towers, 3)
+    if replayed.tower_m is not None:  # one position per pose: (poses, towers, 3)
         source = source[:, None, :]
     ends = (source, target, link.carrier_hz, link.transmit_power_dbm)
     two_ray = two_ray_dbm(*ends, ground_material=site.ground_material, ground_m=place.ground_m)
@@ -399,7 +400,7 @@ def _baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, Fl
 def _fitted_levels(
     free_space_dbm: FloatArray, measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray
 ) -> dict[str, FloatArray]:
-    """Baselines that know no physics, about the mean level of free space (n,) [dBm]: a constant, and log-distance."""
+    """Return the empirical baselines about the mean of free space (n,) [dBm]: a constant, and log-distance."""
     known = np.isfinite(measured_db) & np.isfinite(free_space_dbm)
     mean = float(free_space_dbm[known].mean()) if known.any() else np.nan
     line = log_distance_level_db(measured_db, distance_m, position_m)
@@ -421,7 +422,7 @@ def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> di
 def _paired(
     levels: Levels, models: Mapping[str, FloatArray], position_m: FloatArray
 ) -> dict[str, statistics.PairedDifference]:
-    """The replay against each other model on the samples that both have, each with its own offset."""
+    """Compare the replay with each model on their common samples, each after a separate offset."""
     error_db = levels.measured_db - levels.simulated_db
     return {
         name: statistics.paired_difference(error_db, levels.measured_db - level, place_m=position_m)
@@ -430,7 +431,7 @@ def _paired(
 
 
 def _averaged(case: _Case) -> dict[str, dict[str, Fit]]:
-    """Both sides averaged alike over windows of time, per simulation."""
+    """Fit both sides after equal averages over time windows, per simulation."""
     replayed, span_db = case.replayed, case.data.settings.rss.span_db
     simulations = {
         "coherent": replayed.spread(replayed.level_dbm("coherent")),
@@ -445,7 +446,7 @@ def _averaged(case: _Case) -> dict[str, dict[str, Fit]]:
 
 
 def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:
-    """The replay's level over the receiver's noise against the logged ratio, without any offset."""
+    """Compare the replayed level above the receiver's noise with the logged ratio, without an offset."""
     if series.noise_dbm is None:
         return None
     error_db = levels.measured_db - (levels.simulated_db - series.noise_dbm)
@@ -461,7 +462,7 @@ def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:
 
 
 def _detection(case: _Case) -> DetectionScore | None:
-    """P(lock), or P(above the floor), and all samples with the floor; None for a level without either."""
+    """Score P(lock) or P(above the floor), and all samples with the floor. None without lock and floor."""
     series, levels, lock = case.series, case.levels, _lock(case)
     if series.locked is not None:
         known, detected, floor_db = np.isfinite(series.locked), series.locked == 1.0, LOCK_FLOOR_DB
@@ -486,7 +487,7 @@ def _detection(case: _Case) -> DetectionScore | None:
 
 
 def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
-    """Every two channels of a tower against each other, where they have instants in common."""
+    """Compare every two channels of a tower at their common times."""
     out = []
     for channel, other_channel in combinations(results, 2):
         if channel.tower != other_channel.tower:
@@ -512,18 +513,13 @@ def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
 
 
 def _same_instants(first: Any, second: Any) -> tuple[IntArray, IntArray]:
-    """Samples of two series that were taken within half a sampling interval of each other."""
+    """Return the samples of two series that were taken within half a sampling interval of each other."""
     if len(first) == len(second) and (first == second).all():
         return np.arange(len(first)), np.arange(len(second))
     if len(first) < 2 or not len(second):
         return np.arange(0), np.arange(0)
-    order = np.argsort(second, kind="stable")
-    ahead = np.clip(np.searchsorted(second[order], first), 0, len(second) - 1)
-    before = np.maximum(ahead - 1, 0)
-    nearer = np.abs(second[order[before]] - first) < np.abs(second[order[ahead]] - first)
-    nearest = order[np.where(nearer, before, ahead)]
-    limit = 0.5 * np.median(np.abs(np.diff(first)))
-    rows = np.flatnonzero(np.abs(second[nearest] - first) <= limit)
+    nearest, apart = nearest_in_time(first, second)
+    rows = np.flatnonzero(apart <= 0.5 * np.median(np.abs(np.diff(first))))
     return rows, nearest[rows]
 
 
@@ -535,28 +531,28 @@ def _has_direct(replayed: Replayed) -> BoolArray:
 
 
 def tower_places(replayed: Replayed) -> FloatArray | None:
-    """Place of a tower that moves at every sample (n, 3) [m]; None of one that stands."""
+    """Return the position of a moving tower at every sample (n, 3) [m]. None for a fixed tower."""
     return None if replayed.tower_m is None else replayed.spread(replayed.tower_m)
 
 
 def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) -> dict[str, FloatArray]:
-    """Quantities that residuals are drawn against, at the samples of the series (n,), by name with unit.
+    """Return the quantities for plots of residuals, at the samples of the series (n,), by name with unit.
 
     Parameters
     ----------
     site : Site
     tower : str
     replayed : Replayed
-        Its poses, arrays and which samples have a pose.
+        Poses, arrays, and the samples that have a pose.
     rt : RtSettings
-        ``foliage`` says whether the depth of foliage counts.
+        The depth of foliage is included unless ``foliage`` is ``none``.
 
     Returns
     -------
     dict of str to (n,)
         ``altitude_m``, ``distance_m``, ``elevation_deg``, ``azimuth_deg``, ``tower_elevation_deg``,
         ``uav_azimuth_deg``, ``uav_elevation_deg``; ``heading_deg`` with a track, ``foliage_depth_m`` with trees.
-        NaN where no pose is known.
+        NaN without a known pose.
     """
     link = replayed.link
     directions = rss.link_geometry(
@@ -581,7 +577,7 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
 
 
 def _worst(case: _Case, residual_db: FloatArray, line_of_sight: FloatArray) -> list[rss.ErrorSpan]:
-    """The spans of largest error, with place and geometry."""
+    """Return the time spans of largest error, with position and geometry."""
     geometry = case.geometry
     context = {
         "los": line_of_sight,
@@ -601,7 +597,7 @@ def _worst(case: _Case, residual_db: FloatArray, line_of_sight: FloatArray) -> l
 
 
 def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed) -> RankResult:
-    """Measured against simulated rank for each K."""
+    """Compare measured with simulated rank for each K."""
     settings = data.settings.rank
     position = replayed.spread(replayed.poses.position_m)
     keep = replayed.valid.copy()
@@ -648,12 +644,12 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
 
 
 def fitted_receiver(data: FlightData, tower: str) -> FittedReceiver | None:
-    """Return the receiver of a tower that the flight file names; None if it names no file.
+    """Return the receiver of a tower that the flight file names. None if it names no file.
 
     Raises
     ------
     InputError
-        A file that cannot be read, or that has no receiver of this tower.
+        If the file cannot be read, or has no receiver of this tower.
     """
     named = data.settings.rank.receiver
     if named is None:
@@ -673,7 +669,7 @@ def fitted_receiver(data: FlightData, tower: str) -> FittedReceiver | None:
 def _receiver_forecast(
     data: FlightData, series: RankSeries
 ) -> tuple[FloatArray | None, ForecastScore | None, tuple[str, ...]]:
-    """Probability (n, 4) of each rank by the receiver of the flight file, its score, and logs that it was fitted on."""
+    """Return the receiver's probability of each rank (n, 4), its score, and this flight's logs if fitted on them."""
     receiver = fitted_receiver(data, series.tower)
     if receiver is None:
         return None, None, ()
@@ -681,7 +677,7 @@ def _receiver_forecast(
 
     samples = rank_samples(data, series)
     probability, decided = receiver.forecast(samples)
-    if receiver.knows(samples):  # nothing is scored where it was fitted
+    if receiver.knows(samples):  # no score on its own training data
         return probability, None, samples.logs
     constant = receiver.mixture.members[0].constant
     return probability, score_forecast(samples.rank, probability, decided, constant), ()
@@ -690,7 +686,7 @@ def _receiver_forecast(
 def _repeated_rank(
     time: Any, position_m: FloatArray, rank: FloatArray, heading_deg: FloatArray | None
 ) -> dict[str, ranks.RankRepeat]:
-    """Agreement of the modem with itself where the second half of the flight passes places of the first."""
+    """Compare the modem's ranks of both halves of the flight at common positions."""
     elapsed = rss.seconds(time)
     with np.errstate(invalid="ignore"):
         late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
@@ -705,15 +701,15 @@ def _repeated_rank(
 def _agreement_by_ground(
     data: FlightData, replayed: Replayed, measured: FloatArray, poses: IntArray, ks: Sequence[float]
 ) -> dict[str, float]:
-    """Standard deviation of a tower's rank agreement, by K, over grounds drawn within the errors of known heights.
+    """Return the standard deviation of a tower's rank agreement by K, over random grounds within their known errors.
 
     Parameters
     ----------
     data : FlightData
     replayed : Replayed
-        Of the rank of one tower.
+        Replay of the rank of one tower.
     measured : (n,)
-        Reported rank, NaN where the modem gave none.
+        Reported rank, NaN if the modem reported no rank.
     poses : (n,)
         The replayed pose of each report.
     ks : sequence of float
@@ -721,7 +717,7 @@ def _agreement_by_ground(
     Returns
     -------
     dict of str to float
-        Empty for sites without ``ground_points``, scenes of triangles and towers that move.
+        Empty for sites without ``ground_points``, scenes of triangles and moving towers.
     """
     model = site_model(data.site_place)
     known = np.flatnonzero(np.isfinite(measured))
@@ -730,7 +726,7 @@ def _agreement_by_ground(
     known = known[spread_out(len(known), _POSES)]
     some = replayed.poses[poses[known]]
     agreed = []
-    # seeds 0, 1, ...: two reports of a flight draw the same grounds, and so state the same number
+    # fixed seeds, so that two reports of a flight state the same number
     for ground in ground_surface(model, data.site.frame).dems(map(np.random.default_rng, range(_DRAWS))):
         h = replay_poses(_on(data.site, ground), data.settings.rt, replayed.link, some).h[:, 0]
         agreed.append([float((ranks.channel_rank(h, k) == measured[known]).mean()) for k in ks])
@@ -738,7 +734,7 @@ def _agreement_by_ground(
 
 
 def _on(site: Site, ground: Dem) -> Site:
-    """The site with towers, buildings and trees on another ground."""
+    """Return the site with towers, buildings and trees on another ground."""
     towers = {
         name: dataclasses.replace(tower, ground_m=float(np.nan_to_num(ground.ground_m(tower.east_m, tower.north_m))))
         for name, tower in site.towers.items()

@@ -1,8 +1,7 @@
-"""The map job: the replay engine plugged into :mod:`aerpaw_cmp.maps.grid`, foliage modes, study, record of the page.
+"""The map job: the replay engine as :mod:`aerpaw_cmp.maps.grid` uses it, foliage modes, study, record of the page.
 
-Paths depend neither on arrays nor on foliage. Each chunk of positions is searched
-once; one element and the arrays, and every foliage mode, are evaluated on the same paths, and a mode re-evaluates only
-the links that foliage touches.
+Paths depend neither on arrays nor on foliage, so each chunk of positions is searched once. Single elements, arrays and
+all foliage modes are evaluated on these paths, and a foliage mode only evaluates the links with foliage.
 """
 
 from __future__ import annotations
@@ -72,14 +71,14 @@ FOLIAGE = ("none", "attenuating", "opaque")
 
 RATIOS = ("spread", "condition")
 
-# Those of the paper.
+# Interpolators of the paper.
 INTERPOLATORS = ("Kriging", "makima", "spline")
 
-# Name of the store with every position of a map in tiles, in the output folder.
+# Name of the store with all positions of a map in tiles, in the output folder.
 ZARR = "maps.zarr"
 
-# A map of more receivers (positions times heights) is written in tiles of so many positions a side (some 0.7 MB of
-# values per tower, height and foliage mode); so many positions of it are drawn and exported beside the store.
+# A map with more than _TILED_ABOVE receivers (positions times heights) is written in tiles with _TILE_CELLS positions
+# per side (about 0.7 MB per tower, height and foliage mode). SHOWN_POSITIONS of them are drawn and exported.
 _TILED_ABOVE, _TILE_CELLS, SHOWN_POSITIONS = 1_000_000, 128, 20_000
 
 
@@ -92,7 +91,7 @@ class MapSettings:
     foliage : tuple of str
         Modes to map, of :data:`FOLIAGE`.
     spacing_m : float
-        Between neighbouring positions.
+        Distance between neighbouring positions.
     rss_altitudes_m, rank_altitudes_m : tuple of float
         Heights above ground.
     ks : tuple of float
@@ -102,20 +101,20 @@ class MapSettings:
     budget : LinkBudget
         Transmit power, receiver noise and the threshold of coverage.
     elements, element_spacing : int, float
-        Of the linear arrays at both ends, along north; spacing in wavelengths.
+        Elements of the linear arrays at both ends, along north, and their spacing in wavelengths.
     max_depth : int
-        Of the replay.
+        Largest number of reflections.
     neighbours, radius_m : int, float
-        M and r0 of the interpolators; the radius grows with a spacing above the paper's, so that M are in reach.
+        M and r0 of the interpolators. The radius grows with a spacing above the paper's, so that M positions are near.
     block_m : float
-        Side of the blocks that are left out whole.
+        Side of the held-out blocks.
     study : bool
-        Correlation, interpolation and their errors, too.
+        Also correlation, interpolation and their errors.
     seed : int
-        Of random samples.
+        Seed of random samples.
     tile_m : float, optional
-        Side of the tiles of a map that is written tile by tile. Default: :data:`_TILE_CELLS` positions where there are
-        more than :data:`_TILED_ABOVE` receivers, else the map is made in one piece.
+        Side of the tiles of a map that is written tile by tile. Default: :data:`_TILE_CELLS` positions for more than
+        :data:`_TILED_ABOVE` receivers, else the map is made in one piece.
     """
 
     foliage: tuple[str, ...] = FOLIAGE
@@ -150,7 +149,7 @@ class MapSettings:
             raise UsageError(f"tiles of {self.tile_m:g} m", expected=f"at least the spacing, {self.spacing_m:g} m")
 
     def tile_cells(self, grid: Grid) -> int | None:
-        """Positions along a side of the tiles that are written one by one; None for a map in one piece."""
+        """Return the number of positions along a side of a tile. None for a map in one piece."""
         if self.tile_m is not None:
             return max(1, round(self.tile_m / self.spacing_m))
         receivers = len(grid) * len({*self.rss_altitudes_m, *self.rank_altitudes_m})
@@ -158,7 +157,7 @@ class MapSettings:
 
     @property
     def shown(self) -> str:
-        """The mode that the study and the paper's rows are about: the paper's, when mapped."""
+        """The foliage mode of the study and of the paper's table: the paper's mode, if it is mapped."""
         return max(self.foliage, key=FOLIAGE.index)
 
     @property
@@ -167,18 +166,18 @@ class MapSettings:
         return self.radius_m * max(1.0, self.spacing_m / cells.PAPER_SPACING_M)
 
 
-# A coarse map in seconds: what ``--quick`` puts in place of the paper's settings.
+# Settings of ``--quick``, a coarse map in seconds.
 QUICK: dict[str, Any] = {"spacing_m": 120.0, "rss_altitudes_m": (30.0, 110.0), "rank_altitudes_m": (3.0, 30.0, 110.0)}
 
 
 def map_settings(fields: Mapping[str, Any], *, quick: bool = False) -> MapSettings:
-    """Return the settings of a map from the fields that were given; None leaves the default."""
+    """Return the settings of a map from given fields. A field of None has its default."""
     stated = {name: value for name, value in fields.items() if value is not None}
     return MapSettings(**({**QUICK, **stated} if quick else stated))
 
 
 def site_carrier_hz(site: str) -> float | None:
-    """Return the carrier of the key ``coverage`` of a site [Hz]; None if it names none."""
+    """Return the carrier of the key ``coverage`` of a site [Hz]. None if it is not set."""
     carrier_ghz = site_model(site).coverage.carrier_ghz
     return None if carrier_ghz is None else carrier_ghz * 1e9
 
@@ -199,9 +198,9 @@ def link_budget(site: str, options: Mapping[str, float | None]) -> LinkBudget:
 
 
 class SiteChannels:
-    """The replay engine as :data:`~aerpaw_cmp.maps.grid.Evaluate`, one per foliage mode, on shared paths.
+    """The replay engine as :data:`~aerpaw_cmp.maps.grid.Evaluate`, one per foliage mode, on common paths.
 
-    The first mode that asks for a chunk has all modes evaluated; the others are kept until asked for.
+    The first request for a chunk evaluates all modes. Their results are stored until each mode requests them.
     """
 
     def __init__(self, site: Site, settings: MapSettings) -> None:
@@ -219,7 +218,7 @@ class SiteChannels:
         self._take_site(site)
 
     def _take_site(self, site: Site) -> None:
-        """Take the part of the site that reaches a tile."""
+        """Use the part of the site that reaches a tile."""
         self.site = site
         apart_m = self.settings.element_spacing * wavelength_m(self.settings.carrier_hz)
         self.siso = self._link(single_element())
@@ -231,7 +230,7 @@ class SiteChannels:
         return Link(self.settings.carrier_hz, towers, array, self.settings.budget.tx_power_dbm, uav_transmits=False)
 
     def of(self, mode: str) -> job.Evaluate:
-        """The evaluation of one foliage mode."""
+        """Return the evaluation of one foliage mode."""
 
         def evaluate(position_m: FloatArray, towers: tuple[str, ...]) -> job.Evaluation:
             if towers != self.names:
@@ -248,7 +247,7 @@ class SiteChannels:
         self._all_modes(position_m[None])
 
     def tile(self, order: TileOrder, progress: Callable[[float], None] | None = None) -> TileDone:
-        """Maps of one tile, with the towers and buildings that can reach it."""
+        """Map one tile with the towers and buildings that can reach it."""
         s = self.settings
         grid = Tiling(Grid.over_area(self.reach.site.area_m, s.spacing_m), order.cells).grid_of(order.number)
         west, east, south, north = grid.area_m
@@ -270,7 +269,7 @@ class SiteChannels:
         }  # fmt: skip
 
     def empty(self, grid: Grid) -> dict[str, job.MapResult]:
-        """Maps by foliage mode without any coverage."""
+        """Return maps by foliage mode without coverage."""
         self._take_site(replace(self.reach.site, towers={}))
         return self._maps(grid)
 
@@ -300,7 +299,7 @@ class SiteChannels:
         return result
 
     def _for_all_towers(self, some: job.Evaluation) -> job.Evaluation:
-        """The evaluation of the towers that reach a tile, with the others out of coverage."""
+        """Return the evaluation of all towers. Towers that do not reach a tile are out of coverage."""
         if len(self.site.towers) == len(self.names):
             return some
         at = [self.names.index(name) for name in self.site.towers]
@@ -334,13 +333,13 @@ class SiteChannels:
     def _shaded(
         self, clear: ComplexArray, replayed: Replay, poses: Poses, link: Link, loss_db: FloatArray | None
     ) -> ComplexArray:
-        """Channel matrices with foliage: those of links without any loss stay as they are."""
+        """Return channel matrices with foliage. Links without loss are not evaluated again."""
         if loss_db is None:
             return clear
         paths, h = replayed.paths, clear.copy()
         touched = np.zeros(h.shape[:2], dtype=np.bool_)
         touched[paths.pose[loss_db > 0], paths.tower[loss_db > 0]] = True
-        # a path of infinite loss is an obstacle, not a weak path
+        # infinite loss means an obstacle, not a weak path
         again = touched[paths.pose, paths.tower] & np.isfinite(loss_db)
         some = channel_matrices(paths.select(again), replayed.faces, self.sources_m, poses, link, loss_db[again])
         h[touched] = some.h[touched]
@@ -349,7 +348,7 @@ class SiteChannels:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TileOrder:
-    """A tile of a map, for a worker: its number among tiles of so many positions a side."""
+    """A request to compute one map tile: its ``number``, with ``cells`` positions per side of a tile."""
 
     site: str
     settings: MapSettings
@@ -359,7 +358,7 @@ class TileOrder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TileDone:
-    """Answer of a worker: maps by foliage mode, and how many paths there were."""
+    """The answer of a worker: maps by foliage mode, and the number of paths."""
 
     maps: Mapping[str, job.MapResult]
     paths: int
@@ -372,36 +371,36 @@ def map_tile(order: TileOrder) -> TileDone:
 
 @lru_cache(maxsize=1)
 def _channels_of(site: str, settings: MapSettings) -> SiteChannels:
-    """Channels of a site, which a worker keeps from tile to tile."""
+    """Return the channels of a site, which a worker reuses for its tiles."""
     return SiteChannels(load_site(site), settings)
 
 
 def _beam_power(h: ComplexArray) -> FloatArray:
-    """Received share of the transmit power of channels (..., n_rx, n_tx): equal feed in phase, mean over receivers."""
+    """Return the received share of the transmit power for channels (..., n_rx, n_tx), with equal feeds in phase."""
     amplitude = h.sum(axis=-1) / np.sqrt(h.shape[-1])
     return np.asarray((amplitude.real**2 + amplitude.imag**2).mean(axis=-1), dtype=np.float64)
 
 
 def level_sd_db(h: ComplexArray) -> FloatArray:
-    """Standard deviation of the level over the element pairs of channels (..., n_rx, n_tx) [dB]."""
+    """Return the standard deviation of the level over the element pairs of channels (..., n_rx, n_tx) [dB]."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(db_from_power(h.real**2 + h.imag**2).std(axis=(-2, -1)))
 
 
 # --- the job -------------------------------------------------------------------------------------------------------
 
-# Draws of M random samples: the number of wins of an interpolator depends on the draw.
+# Number of draws of M random samples. An interpolator wins in some draws only.
 DRAWS = 10
 
 
 @dataclass(slots=True)
 class MapOutcome:
-    """Everything that one run found.
+    """All results of one run.
 
-    ``maps`` by foliage mode; of a map in tiles some positions, as ``tiles`` says. ``studies``: positions out of
-    coverage as no sample ("missing"), as rank 0 ("zero"), and as rank 0 with M random samples within the radius in
-    place of the M nearest ("random"). ``draws``: scores of "random" for each of :data:`DRAWS` draws. ``blocks``:
-    errors of each interpolator with square blocks left out whole.
+    ``maps`` has the maps by foliage mode, for a map in tiles at the positions in ``tiles``. ``studies`` treats
+    positions out of coverage as missing ("missing"), as rank 0 ("zero"), and as rank 0 with M random instead of the M
+    nearest samples ("random"). ``draws`` has the scores of "random" for :data:`DRAWS` draws. ``blocks`` has the errors of each
+    interpolator on held-out square blocks.
     """
 
     site: Site
@@ -444,28 +443,28 @@ def make_maps(
     settings : MapSettings
     stages : Stages
     workers : Workers, optional
-        Share the pieces of the grid.
+        Workers for the pieces of the grid.
     name : str
-        The site as workers load it.
+        Name of the site for workers.
     out : Path, optional
-        Output folder; finished tiles are files of ``NAME.tiles`` in the same folder. None: a map in one piece.
+        Output folder. Finished tiles are files in ``NAME.tiles`` next to it. None: a map in one piece.
 
     Returns
     -------
     MapOutcome
-        Maps by foliage mode; no study yet.
+        Maps by foliage mode, without a study.
 
     Raises
     ------
     UsageError, InputError, OutputError
-        zarr is not installed; tiles were lost; the disk does not take them.
+        If zarr is not installed, tiles were lost, or the disk cannot be written.
     """
     outcome = MapOutcome(site, settings)
     grid = Grid.over_area(site.area_m, settings.spacing_m)
     crew = workers or InProcess()
     share = share_of(stages.progress, "maps")
     tile_cells = None if out is None else settings.tile_cells(grid)
-    # four tiles a worker: with one each all would wait for the slowest
+    # four tiles per worker: with one tile each, all would wait for the slowest worker
     shared = math.ceil(math.sqrt(len(grid) / (4 * crew.count)))
     tiling = Tiling(grid, tile_cells or (shared if crew.count > 1 else max(grid.shape)))
     with stages("maps"):
@@ -525,13 +524,13 @@ def _write_tiles(
         )
     step = math.ceil(math.sqrt(len(tiling.grid) / SHOWN_POSITIONS))
     outcome.maps, outcome.paths = store.every_nth(step)
-    # every n-th position has no neighbours at the distances that the study is about
+    # every n-th position has no neighbours at the distances of the study
     outcome.settings = replace(outcome.settings, study=False)
     outcome.tiles = {"tiles": len(tiling), "positions": len(tiling.grid), "shown_every": step}
 
 
 def _job_of(site: str, settings: MapSettings) -> dict[str, Any]:
-    """All that the values of a map depend on: settings, content of the site's files, program."""
+    """Return all inputs of the values of a map: settings, content of the site's files, program."""
     without = ("study", "neighbours", "radius_m", "block_m", "seed")
     chosen = {key: str(value) for key, value in asdict(settings).items() if key not in without}
     files = [file_digest(file)[:12] for file in inputs_of_site(site)]
@@ -539,7 +538,7 @@ def _job_of(site: str, settings: MapSettings) -> dict[str, Any]:
 
 
 def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[PlannedStage]:
-    """Return the stages of a map, for its dry run; one position is mapped, so that it refuses what the map would."""
+    """Return the stages of a map for its dry run. One position is mapped, so that errors of the map appear."""
     grid = Grid.over_area(place.area_m, settings.spacing_m)
     SiteChannels(place, settings).try_at(np.append(grid.points_m[0, :2], min(settings.rss_altitudes_m, default=30.0)))
     heights, tile = {*settings.rss_altitudes_m, *settings.rank_altitudes_m}, settings.tile_cells(grid)
@@ -566,7 +565,7 @@ def check_study(place: Site, settings: MapSettings) -> None:
 
 
 def study_maps(outcome: MapOutcome, stages: Stages) -> None:
-    """Correlation, interpolation and its errors, on the maps of the paper's foliage mode."""
+    """Compute correlation, interpolation and its errors on the maps of the paper's foliage mode."""
     s, result = outcome.settings, outcome.shown
     heights, rank = rank_fields(result)
     local: dict[str, Any] = {"neighbours": s.neighbours, "radius_m": s.reach_m, "seed": s.seed}
@@ -592,7 +591,7 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
 
 
 def _far_reaching(outcome: MapOutcome) -> dict[str, Predictor]:
-    """Interpolators that reach as far as they must where every sample is far."""
+    """Return interpolators without a limit of distance, for held-out blocks."""
     neighbours = outcome.settings.neighbours
     return {
         "Kriging": OrdinaryKriging(outcome.studies["missing"].fit, neighbours, outside="nearest"),
@@ -612,17 +611,17 @@ def maps_record(
     stages_s: Mapping[str, float],
     paper: Iterable[page.PaperRow] = (),
 ) -> page.MapsData:
-    """The record that :func:`aerpaw_cmp.report.maps.write_maps` turns into files.
+    """Return the record for :func:`aerpaw_cmp.report.maps.write_maps`.
 
     Parameters
     ----------
     outcome : MapOutcome
     name : str
-        Of the maps.
+        Name of the maps.
     stages_s : mapping of str to float
         Seconds per stage.
     paper : iterable of PaperRow
-        The table of what the paper states.
+        Rows of the paper's table.
 
     Returns
     -------
@@ -683,7 +682,7 @@ def _rss_maps(result: job.MapResult, mode: str, budget: LinkBudget) -> Iterator[
 
 
 def _rank_maps(result: job.MapResult, mode: str, tower: str | None = None) -> Iterator[page.RankMap]:
-    """Rank to the serving tower, or to one."""
+    """Yield rank maps of the serving tower, or of one tower."""
     ranks, shares = result.ranks(tower), result.rank_shares(tower)
     for (column, k), (row, height) in itertools.product(enumerate(result.ks), enumerate(result.rank_altitudes_m)):
         yield page.RankMap(
@@ -697,7 +696,7 @@ def _rank_maps(result: job.MapResult, mode: str, tower: str | None = None) -> It
 
 
 def _rank_versions(outcome: MapOutcome) -> Iterator[page.RankMap]:
-    """Traced and learned ranks of every tower whose receiver is learned."""
+    """Yield traced and learned ranks of every tower with a learned receiver."""
     if outcome.corrected is not None:
         for tower in dict.fromkeys(tower for tower, _ in outcome.corrected.ranks):
             yield from _rank_maps(outcome.shown, outcome.settings.shown, tower)
@@ -705,7 +704,7 @@ def _rank_versions(outcome: MapOutcome) -> Iterator[page.RankMap]:
 
 
 def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
-    """Layers of the linked map alone: how many towers cover a position, at what share of heights, which one serves."""
+    """Yield layers for the linked map only: towers in coverage, coverage over heights, and the serving tower."""
     kinds: tuple[job.Antennas, ...] = ("mimo", "siso")
     budget = outcome.settings.budget
     for mode, result in outcome.ordered():
@@ -747,7 +746,7 @@ def _budget_layers(outcome: MapOutcome) -> Iterator[cells.Layer]:
 
 
 def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
-    """Singular-value spread and condition number, then what foliage changes."""
+    """Yield margin and SNR, singular-value spread and condition number, and the effects of foliage."""
     result, s = outcome.shown, outcome.settings
     raster = result.grid.raster
     for layer in _budget_layers(outcome):
@@ -776,7 +775,7 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
 
 
 def _foliage_changes(outcome: MapOutcome) -> Iterator[tuple[str, job.MapResult, job.FoliageDifference]]:
-    """Effect of each foliage mode, where a map without foliage is there to compare with."""
+    """Yield the effect of each foliage mode, if there is a map without foliage."""
     if (clear := outcome.maps.get("none")) is not None:
         yield from (
             (mode, maps, job.foliage_difference(clear, maps)) for mode, maps in outcome.ordered() if mode != "none"
@@ -824,20 +823,20 @@ def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
 
 
 def _notes(outcome: MapOutcome) -> tuple[str, ...]:
-    """Notes on the loss in crowns where it is continued beyond its table, and on tiles."""
+    """Return notes on the link budget, on foliage loss beyond its table, and on tiles."""
     note = p833_note(outcome.settings.carrier_hz) if "attenuating" in outcome.settings.foliage else None
     notes = [outcome.settings.budget.sentence(), *([] if note is None else [note])]
     if outcome.tiles:
         each, all_ = outcome.tiles["shown_every"], outcome.tiles["positions"]
         notes.append(
             f"The map of {counted(all_, 'position')} is in {Path(outcome.tiles['store']).name}. "
-            f"This page and the files beside it hold one in {each} along either axis."
+            f"This page and its files have every {each}th position along each axis."
         )
     return tuple(notes)
 
 
 def _metrics(outcome: MapOutcome) -> dict[str, Any]:
-    """Content of metrics.json beyond the tables of the page."""
+    """Return the content of metrics.json that is not in the tables of the page."""
     result: dict[str, Any] = {
         "paths": outcome.paths,
         "tiles": outcome.tiles,
@@ -860,13 +859,13 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
     return result
 
 
-# --- files beside the page -----------------------------------------------------------------------------------------
+# --- files -------------------------------------------------------------------------------------------------------
 
 
 def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[Path]:
-    """Write layers.csv and maps.kmz, maps.zarr of a map in tiles, and maps.nc where its libraries are installed.
+    """Write layers.csv, maps.kmz, maps.zarr (for a map in tiles), and maps.nc if its libraries are installed.
 
-    ``progress`` is told where it is left out, and why.
+    ``progress`` receives the reason if maps.nc is omitted.
     """
     site, grid = outcome.site, outcome.shown.grid
     flown = [*_budget_layers(outcome), *([] if outcome.corrected is None else outcome.corrected.layers())]
@@ -904,13 +903,13 @@ def _about_maps(site: Site) -> dict[str, str]:
 
 
 def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:
-    """Layers of all modes, with the mode in their names; the serving tower once."""
+    """Return the layers of all modes, with the mode in their names. The serving tower is included once."""
     result: list[cells.Layer] = []
     for mode, maps in outcome.ordered():
         serving, *layers = job.layers_of(maps, towers_too=towers_too)
         result += [] if result else [serving]
         for layer in layers:
-            # a hundredth of a dB is more than the site's data hold, and a third of the bytes
+            # 0.01 dB is finer than the site's data allow, and needs a third of the bytes
             values = layer.values if layer.classes else np.round(layer.values, 2)
             if layer.name.startswith(RATIOS):
                 values = np.minimum(values, job.RATIO_LIMIT_DB)

@@ -1,4 +1,4 @@
-"""Options of every job besides its own settings, and the outcome that every job gives back."""
+"""Options that every job has in addition to its settings, and the outcome that every job returns."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ AGAINST_DISTANCE_M = 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOptions:
-    """Options of a run: where results go and logs lie, what may be replaced, who computes, who is told.
+    """Options of a run: folders of results and logs, what may be replaced, workers and progress.
 
     Parameters
     ----------
     out : Path, optional
-        Results; each job has a default.
+        Folder or file of the results. Each job has a default.
     logs_root : Path, optional
         Folder against which the paths of logs resolve.
     force : bool
-        Replace also what this tool did not write, or what was changed since; never an input.
+        Also replace files that this tool did not write or that were changed since. Inputs are never replaced.
     workers : int
-        Of this machine; 1 computes in this process.
+        Processes on this machine. 1 computes in this process.
     scheduler : str, optional
-        Address of a Dask scheduler, in place of workers here.
+        Address of a Dask scheduler, used instead of local processes.
     progress : Progress
-        Gets stages and the share done.
+        Receives stages and the share done.
     dry : bool
-        Check and write nothing: the job ends by :class:`~aerpaw_cmp.common.stages.NotRun` where computing would begin.
+        Only check: the job ends by :class:`~aerpaw_cmp.common.stages.NotRun` before the computation.
     """
 
     out: Path | None = None
@@ -44,7 +44,7 @@ class RunOptions:
     dry: bool = False
 
     def stages(self, job: str, inputs: Iterable[Path], output: Path) -> Stages:
-        """Stages of a job; those of a dry run end it."""
+        """Return the stages of a job. The stages of a dry run end the job before it computes."""
         plan = Plan(job=job, inputs=tuple(inputs), output=output) if self.dry else None
         return Stages(self.progress, plan=plan)
 
@@ -54,19 +54,19 @@ DEFAULT = RunOptions()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOutcome:
-    """Outcome of a job; one that fails raises with what was found, what was expected and the likely cause.
+    """The outcome of a job that did not fail.
 
     Parameters
     ----------
     folder : Path
     metrics : dict
-        Its metrics.json; empty of a job that measures nothing.
+        Content of metrics.json. Empty for a job without metrics.
     files : tuple of Path
-        What was written, the page first.
+        Files that were written, the page first.
     failed_checks : tuple of str
-        Stated checks that did not hold.
+        Stated checks that failed.
     warnings : tuple of str
-        Sentences for the terminal, of a job whose metrics have none.
+        Sentences for the terminal, if they are not in the metrics.
     """
 
     folder: Path

@@ -25,6 +25,7 @@ from ..common.native import read as read_native
 from ..common.outputs import file_digest
 from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..compare.level import nearest_in_time
 from ..compare.rank import agreement, cohen_kappa, histogram, total_variation
 from ..compare.receiver import score_forecast
 from ..compare.referee import (
@@ -701,14 +702,10 @@ def predicted_at(
 
 def _nearest_times(time: Any, known: Any) -> tuple[IntArray, BoolArray]:
     """Return the nearest predicted time (n,) of each sample, and whether it is near (n,)."""
-    order = np.argsort(known, kind="stable")
-    at = known[order]
-    after = np.clip(np.searchsorted(at, time), min(1, len(at) - 1), len(at) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = np.where(np.abs(at[after] - time) < np.abs(time - at[before]), after, before)
-    steps = np.diff(np.unique(at)) / np.timedelta64(1, "s")
+    index, apart = nearest_in_time(time, known)
+    steps = np.diff(np.unique(known)) / np.timedelta64(1, "s")
     most_s = max(_NEAR_S, 0.51 * float(np.median(steps)) if len(steps) else 0.0)
-    return order[closer], np.asarray(np.abs(at[closer] - time) / np.timedelta64(1, "s") <= most_s)
+    return index, np.asarray(apart / np.timedelta64(1, "s") <= most_s)
 
 
 def _ranks(given: ForeignPrediction, item: RankResult, near_m: float) -> RankVerdict | None:

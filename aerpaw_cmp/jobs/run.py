@@ -23,14 +23,14 @@ _KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
 
 
 def mapping(pairs: list[str]) -> dict[str, Any]:
-    """Reader options of ``--map COLUMN=quantity``: the columns, and the kind of record that they make.
+    """Return the reader options of ``--map COLUMN=quantity``: the columns, and the kind of record.
 
-    ``rank`` stands for a rank indicator that counts from one.
+    ``rank`` means a rank indicator that counts from one.
 
     Raises
     ------
     UsageError
-        If a pair is none, or two name one quantity.
+        If a pair is malformed, or two pairs name one quantity.
     """
     columns: dict[str, str] = {}
     for pair in pairs:
@@ -55,10 +55,7 @@ def run_ingest(
     force: bool = False,
     **options: Any,
 ) -> dict[str, Any]:
-    """Read logs, write the flight file when ``out`` is given, and give the summary of DESIGN section 3.
-
-    With ``draft``, a first flight.yaml is written too, and what is left to check in it stands under "draft".
-    With ``force``, the two may replace files that this tool did not write, but no input.
+    """Read logs and return their summary. Also write a flight file (``out``) and a draft of flight.yaml (``draft``).
 
     Parameters
     ----------
@@ -69,18 +66,19 @@ def run_ingest(
     draft : Path, optional
         The flight.yaml to write.
     site : str, optional
-        Of the draft: packaged, or a site.yaml; lake_wheeler without.
+        Site of the draft: a packaged site or a site.yaml. Default: lake_wheeler.
     reader : str, optional
-        Of all files, in place of recognising them.
+        Reader for all files. Default: each file is recognised.
     force : bool
+        Also replace files that this tool did not write. Inputs are never replaced.
     options
         Fields of :class:`aerpaw_cmp.logs.readers.ReadOptions`.
 
     Returns
     -------
     dict
-        What :func:`aerpaw_cmp.logs.ingest.summary` says; with a draft also ``draft`` and ``drafts``, with ``out`` the
-        names of its ``flights``.
+        As :func:`aerpaw_cmp.logs.ingest.summary`. With a draft also ``draft`` (what to check) and ``drafts`` (paths),
+        with ``out`` the names of its ``flights``.
     """
     from ..logs.flight_file import fill, is_flight_file
     from ..logs.ingest import ingest, summary
@@ -88,11 +86,11 @@ def run_ingest(
     from ..logs.text import zone
 
     if name := options.get("timezone"):
-        zone(name, needed_by="--timezone")  # misspelt, it is no fault of the first log
+        zone(name, needed_by="--timezone")  # a misspelt zone is an error of the command, not of the first log
     if out is not None and draft is not None and os.path.realpath(out) == os.path.realpath(draft):
         raise UsageError("-o and --draft name the same file", expected="two names", path=draft)
     inputs = [*paths, *([] if site is None else [Path(site)])]
-    with ExitStack() as outputs:  # a wrong name is told before the logs are read
+    with ExitStack() as outputs:  # report a wrong output name before the logs are read
         target = None
         if out is not None:
             target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=inputs, force=force))
@@ -100,7 +98,7 @@ def run_ingest(
             from ..flight.drafting.draft import SITE, DraftOptions, drafts
 
             drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=inputs, force=force))
-        only_spans = out is None and draft is None  # nothing else is told of the records
+        only_spans = out is None and draft is None  # the summary needs no more of the records
         files = ingest(paths, options=ReadOptions(only_spans=only_spans, **options), reader=reader)
         account = summary(files)
         if draft is not None:
@@ -113,9 +111,9 @@ def run_ingest(
             try:
                 flights = drafts(files, home, DraftOptions(mapping=mapping, site=site or SITE, **clock))
             except UsageError as error:
-                error.others = files  # what was read of them, and why others were not, shows what is lacking
+                error.others = files  # the account of the files shows what is missing
                 raise
-            # further flights of one folder: beside the first, since paths in a draft are relative to it
+            # drafts of further flights are in the folder of the first, because paths in a draft are relative to it
             numbered = (
                 draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in range(2, len(flights) + 1)
             )
@@ -138,7 +136,7 @@ def run_ingest(
 
 
 def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
-    """Write a folder with the logs that ``flight.plan`` describes, the flight file and what was planted.
+    """Write a folder with the logs that ``flight.plan`` describes, the flight file and the true values.
 
     Parameters
     ----------
@@ -291,7 +289,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
 
 
 def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[str, ...]:
-    """Refuse options that no report can follow; returns the formats of its exports."""
+    """Return the formats of the exports. UsageError for options that exclude each other."""
     from ..report.canvas import STYLES
     from ..report.exports import chosen_formats
     from ..report.flight import FIGURES
@@ -306,14 +304,14 @@ def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[
         # paths in a flight file are relative to its folder
         raise UsageError(
             f"--recommend in another folder than {flight}",
-            expected="a name beside the flight file, whose paths are relative to its folder; or --logs-root",
+            expected="a name in the folder of the flight file, whose paths are relative to it; or --logs-root",
             path=chosen.recommend,
         )
     return chosen_formats(chosen.export)
 
 
 def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[Any, list[Path], Path]:
-    """Settings with what the command line says instead, files that they name, folder of the results."""
+    """Return the settings with those of the command line, the files that they name, and the folder of results."""
     from ..flight.gains import load_with_learned
     from .tasks import inputs_of_flight
 
@@ -326,7 +324,7 @@ def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> 
 
 
 def _with_audit(settings: Any, audit: str | None) -> Any:
-    """The settings with as many audited links as the command line says."""
+    """Return the settings with the number of audited links of the command line."""
     if audit is None:
         return settings
     # more links than any flight has
@@ -338,7 +336,7 @@ def _with_audit(settings: Any, audit: str | None) -> Any:
 
 
 def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
-    """Checks that the report states and that did not hold."""
+    """Return the stated checks that failed."""
     from ..report.page import links_of
 
     failed = []
@@ -461,7 +459,7 @@ def run_map(
     from .sources import files_of, named_flights
     from .workers import open_workers
 
-    # before the site: a misspelt flight is told without reading a map
+    # before the site is read, so that a misspelt flight is reported at once
     known = named_flights(flights)
     place, progress = load_site(site), options.progress
     if flights and settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m)):
@@ -485,7 +483,7 @@ def run_map(
             outcome.corrected = corrected_maps(site, settings.spacing_m, heights, known, options.logs_root, stages)
         if outcome.settings.study:
             mapping.study_maps(outcome, stages)
-        # after the maps: what fails in them is told before minutes of replay
+        # after the maps, so that their errors are reported before minutes of replay
         outcome.flights = tuple(_compared(flight, options, stages) for flight in known)
         with output.filling() as part:
             with stages("export"):
@@ -504,7 +502,7 @@ def run_map(
 
 
 def _compared(flight: Any, options: RunOptions, stages: Stages) -> Any:
-    """A flight replayed and compared, for the figures of a map."""
+    """Replay and compare a flight, for the figures of a map."""
     from ..report.flight_data import report_data
     from .flight_run import run_flight
 
@@ -527,10 +525,9 @@ def run_campaign(
         campaign.yaml.
     options : RunOptions
     keep : Path, optional
-        Folder of the outcomes of single tasks, in place of the user's cache: a rerun, or one after an interruption,
-        computes only what is missing.
+        Folder for the outcomes of single tasks, instead of the user's cache. A rerun computes only what is missing.
     fresh : bool
-        Keep nothing and take nothing.
+        Neither read nor store outcomes.
 
     Returns
     -------
@@ -539,7 +536,7 @@ def run_campaign(
     Raises
     ------
     UsageError
-        A campaign.yaml that is wrong; a flight that cannot be read is a row of the result instead.
+        If campaign.yaml is wrong. A flight that cannot be read is a row of the result instead.
     """
     from ..report.campaign import campaign_metrics, warnings, write_campaign
     from .campaign import find_reports, load_campaign, soundings, with_season
@@ -555,10 +552,10 @@ def run_campaign(
     nodes = soundings(sounded, campaign.timezone) if sounded else ()
     folder = options.out or Path("reports") / campaign.campaign
     stages = options.stages("campaign", inputs, folder)
-    if keep is not None and ":/" in str(keep):  # of an address; a path has one slash there
+    if keep is not None and ":/" in str(keep):  # an address such as s3://; a path has a single slash there
         raise UsageError(f"--keep {keep}", expected="a folder")
     store = None if fresh else keep or cache_folder("outcomes")
-    note = f"finished tasks are kept in {store}, and the same command computes the rest" if store else "nothing is kept"
+    note = f"finished tasks are stored in {store}; the same command computes the rest" if store else "nothing is stored"
     with (
         OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output,
         noting_interrupts(note),
@@ -577,7 +574,7 @@ def run_campaign(
 
 
 def _write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
-    """A file per failed task in ``failures/``: its message, and where in the program it came from."""
+    """Write one file per failed task in ``failures/``: its message and its traceback."""
     from ..report.texts import safe_name
 
     for failure in failures:
@@ -597,14 +594,14 @@ def run_calibrate(
     into_site: str | None = None,
     score: Sequence[Path] = (),
 ) -> JobOutcome:
-    """Learn antennas from flights; write ``calibrated.yaml`` and, in the folder of its name, antennas and page.
+    """Learn antennas from flights and write ``calibrated.yaml`` and a folder of its name with antennas and page.
 
     Parameters
     ----------
     path : Path
         calibration.yaml, or a flight file.
     options : RunOptions
-        ``out`` is the file to write; the folder lies beside it.
+        ``out`` is the file to write. The folder is next to it.
     further : sequence of Path
         Flight files that are learned from, too.
     into_site : str, optional
@@ -626,11 +623,11 @@ def run_calibrate(
 
     settings = load_calibration(path, further)
     if into_site is not None:
-        site_model(into_site)  # a misspelt one is told before the fit, and gets no memory of its own
+        site_model(into_site)  # report a misspelt site before the fit, and store nothing under its name
         check_index(into_site)
     target = options.out or Path(f"{settings.calibration}.calibrated.yaml")
     if target.suffix.lower() not in (".yaml", ".yml"):
-        raise UsageError("the output is no YAML file", expected="-o NAME.yaml", path=target)
+        raise UsageError("the output is not a YAML file", expected="-o NAME.yaml", path=target)
     inputs = input_files(settings, path, options.logs_root)
     inputs += inputs_of_flights([*(path.parent / name for name in settings.flights), *score], options.logs_root)
     inputs += [] if into_site is None else inputs_of_site(into_site)

@@ -1,7 +1,4 @@
-"""A Mitsuba scene to a site.yaml, and any site back to a Mitsuba scene.
-
-The ``antenna export`` job.
-"""
+"""Conversion of a Mitsuba scene to a site.yaml and of any site to a Mitsuba scene, and the ``antenna export`` job."""
 
 from __future__ import annotations
 
@@ -29,14 +26,14 @@ from ..site.site import Site
 from ..site.siteyaml import SceneModel, SiteModel, build_site, inputs_of_site, load_site, site_model
 from .options import JobOutcome
 
-# Thickness given to ground in the export, a slab from which no echo of its second face returns.
+# Thickness of ground in the export [m]: a slab without an echo from its second face.
 HALF_SPACE_THICKNESS_M = 1.0
 
-_LOCAL_NOTE = "this site has no georeference: latitude and longitude count from (0, 0), and no log of a flight fits it"
+_LOCAL_NOTE = "this site has no georeference: latitude and longitude count from (0, 0), so flight logs do not fit it"
 
 
 def is_scene(path: Path) -> bool:
-    """Check whether a file is XML of a Mitsuba scene: its first element is 'scene'."""
+    """Check whether a file is the XML of a Mitsuba scene, with 'scene' as first element."""
     try:
         with path.open("rb") as file:
             head = file.read(65536)
@@ -47,20 +44,20 @@ def is_scene(path: Path) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneOptions:
-    """Facts that a Mitsuba scene does not state about itself.
+    """Facts that a Mitsuba scene does not contain.
 
     Parameters
     ----------
     origin : str, optional
         ``latitude,longitude[,ground height]`` of the scene's (0, 0, 0), or ``local``. Default: the origin of ``base``.
     base : str, optional
-        Site whose towers and settings are kept.
+        Site from which towers and settings are kept.
     towers : sequence of str
         ``name=east,north,height`` [m]: antenna above up = 0 of the scene.
     materials : sequence of str
-        ``id=material`` for materials of the scene that say nothing about radio.
+        ``id=material`` for materials of the scene without radio properties.
     turn_deg : float
-        How far the scene is turned counter-clockwise from above: 0 where x is east and y north.
+        Rotation of the scene, counter-clockwise from above: 0 if x is east and y north.
     """
 
     origin: str | None = None
@@ -71,12 +68,12 @@ class SceneOptions:
 
 
 def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool = False) -> list[str]:
-    """Write a site.yaml that names a Mitsuba scene; gives what was done.
+    """Write a site.yaml that names a Mitsuba scene, and return what was done.
 
     Parameters
     ----------
     path : Path
-        The XML file; it stays where it is.
+        The XML file, which is not copied.
     out : Path
         The site.yaml to write.
     facts : SceneOptions
@@ -86,12 +83,12 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
     Returns
     -------
     list of str
-        What was made of the scene, a line each.
+        One line per action.
 
     Raises
     ------
     UsageError
-        Where the scene lies, or where its towers stand, is not said.
+        If the position of the scene or of its towers is missing.
     """
     named = dict(_pair(text, "--material", "wall=concrete") for text in facts.materials)
     base = None if facts.base is None else site_model(facts.base)
@@ -104,7 +101,7 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
         if ground_plane:
             actions.append(
                 f"the scene has no ground (level surfaces under {share:.0%} of its plan): a plane of medium_dry_ground "
-                f"is added at its lowest point, up = {bounds(scene)[0][2]:g} m; scene.ground_plane: false leaves it out"
+                f"is added at its lowest point, up = {bounds(scene)[0][2]:g} m; scene.ground_plane: false omits it"
             )
         low, high = bounds(scene)
         content: dict[str, Any] = {} if base is None else base.model_dump(mode="json", exclude_defaults=True)
@@ -128,7 +125,7 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
             content["notes"] = [*content.get("notes", []), _LOCAL_NOTE]
             actions.append(_LOCAL_NOTE)
         model = SiteModel.model_validate(content)
-        site = build_site(model, out.resolve().parent)  # what does not fit is said now
+        site = build_site(model, out.resolve().parent)  # reports inconsistent settings now
         actions = [*(note for note in site.notes if " mesh" in note), *actions]
         output.write(sealed(site_yaml(model, header=["made by 'aerpaw-cmp site import' from a scene", *actions])))
     return actions
@@ -174,9 +171,9 @@ def _origin(text: str | None, base: SiteModel | None) -> dict[str, Any]:
     if base is not None:
         return base.origin.model_dump(mode="json", exclude_defaults=True)
     raise UsageError(
-        "a Mitsuba scene does not say where on Earth it lies",
+        "a Mitsuba scene does not contain its position on Earth",
         expected="--origin latitude,longitude[,height] of its point (0, 0, 0), or --base SITE that has its origin",
-        cause="for a scene that lies nowhere: --origin local",
+        cause="for a scene without a position: --origin local",
     )
 
 
@@ -224,14 +221,14 @@ def run_site_export(site: str, out: Path, *, force: bool = False) -> JobOutcome:
 
 
 def export_scene(site: Site, folder: str | Path) -> list[Path]:
-    """The site as ``scene.xml`` with ``meshes/*.ply``, which ``sionna.rt.load_scene`` opens.
+    """Write a site as ``scene.xml`` with ``meshes/*.ply``, which ``sionna.rt.load_scene`` opens.
 
     Parameters
     ----------
     site : Site
-        Any. East is x, north is y, up is z. Trees stay out: to Sionna crowns are slabs and mirrors.
+        East is x, north is y, up is z. Trees are omitted, because Sionna treats crowns as slabs and mirrors.
     folder : str or Path
-        Made when missing; files of the same names are replaced.
+        Created if missing. Files of the same names are replaced.
 
     Returns
     -------
@@ -258,20 +255,20 @@ def export_scene(site: Site, folder: str | Path) -> list[Path]:
 
 
 def _parts(site: Site) -> list[tuple[str, str, Mesh]]:
-    """Title, material and mesh of each part: those of a scene shape by shape, all else by material."""
+    """Return title, material and mesh of each part: one per shape of a scene, else one per material."""
     parts = [(f"all_{_plain(name)}", name, mesh) for name, mesh in site_meshes(site).items()]
     return parts if site.scene is None else [*_parts_of_scene(site.scene), *parts]
 
 
 def _parts_of_scene(scene: TriangleScene) -> Iterator[tuple[str, str, Mesh]]:
-    for number in np.unique(scene.shape):  # none of vegetation, which is a medium
+    for number in np.unique(scene.shape):  # vegetation has no triangles, because it is a medium
         used, place = np.unique(scene.triangles[scene.shape == number], return_inverse=True)
         title = f"{number}_{_plain(scene.shapes[number].removeprefix('mesh-'))[:60]}"
         yield title, scene.materials[number], (scene.vertices_m[used], place.reshape(-1, 3))
 
 
 def _plain(name: str) -> str:
-    """A name as a file name and an identifier."""
+    """Return a name as file name and identifier."""
     return re.sub(r"[^A-Za-z0-9_-]+", "-", name)
 
 
@@ -287,7 +284,7 @@ def _comment(site: Site) -> str:
 def _bsdf_id(name: str) -> str:
     if name == "vacuum":
         return "absorber"
-    # Sionna takes an id that begins with mat-itu_ for a material of P.2040
+    # Sionna uses a material of P.2040 for an id that begins with mat-itu_
     return f"mat-{_plain(name)}" if name.startswith(CONSTANT) else f"mat-itu_{_plain(name)}"
 
 
@@ -312,14 +309,14 @@ def _floats(values: Mapping[str, float]) -> str:
 
 
 def _write_ply(mesh: Mesh, path: Path) -> None:
-    """A binary little-endian PLY, float32 (0.1 mm at 2 km)."""
+    """Write a binary little-endian PLY in float32 (0.1 mm at 2 km)."""
     vertices, triangles = mesh
     head = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
         f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    # packed, as PLY wants it: a count of one byte, then three indices
+    # packed as PLY requires: a count of one byte, then three indices
     faces = np.empty(len(triangles), dtype=[("n", "u1"), ("i", "<i4", 3)])
     faces["n"], faces["i"] = 3, triangles
     path.write_bytes(head.encode() + vertices.astype("<f4").tobytes() + faces.tobytes())
@@ -334,7 +331,7 @@ def run_antenna_export(
     carrier_hz: float | None = None,
     force: bool = False,
 ) -> JobOutcome:
-    """Write a pattern file in the format that the ending of ``out`` says.
+    """Write a pattern file in the format given by the ending of ``out``.
 
     Parameters
     ----------
@@ -342,7 +339,7 @@ def run_antenna_export(
         Any pattern that a flight file may name.
     out : Path
     elevation : Path, optional
-        Second cut, where ``file`` is an azimuth cut.
+        Second cut, if ``file`` is an azimuth cut.
     variable : str, optional
         Grid inside a .mat file.
     carrier_hz : float, optional
@@ -357,13 +354,13 @@ def run_antenna_export(
     with OutputFile(out, own=is_sealed, inputs=inputs, force=force) as output:
         if variable is not None or file.suffix == ".mat":
             if elevation is not None:
-                raise UsageError("an elevation cut beside a gain grid", expected="an azimuth cut as FILE", path=file)
+                raise UsageError("an elevation cut with a gain grid", expected="an azimuth cut as FILE", path=file)
             pattern = read_gain_grid(file, variable or "")
         elif elevation is not None:
             pattern = read_cut_files(file, elevation)
         else:
             pattern = read_pattern_file(file, carrier_hz=carrier_hz)
         text = exported(pattern, file.stem, out, carrier_hz)
-        # MSI begins with NAME: no line may stand in front
+        # MSI must begin with NAME, without a line before it
         output.write(text.encode("utf-8") if out.suffix == ".msi" else sealed(text))
     return JobOutcome(folder=out.parent, files=(out,))

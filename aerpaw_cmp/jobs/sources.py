@@ -1,8 +1,7 @@
-"""The start of a prediction: the places asked for, and the links that can be predicted.
+"""Points and links of a prediction, and the models that predict them.
 
-Places asked for in a prediction: a grid over a site, a planned route, the plan or track of a flight, points.
-
-Links that can be predicted: of the flights that were named, or of the memory of the site.
+Points are a grid over a site, a planned route, the plan or track of a flight, or a table. Links are those of the named
+flights, those with learned antennas and levels of the site, or, before any flight, those of all towers.
 """
 
 from __future__ import annotations
@@ -40,16 +39,16 @@ from ..site.siteyaml import inputs_of_site
 from .calibrate import load_calibration
 from .tasks import inputs_of_flight
 
-# Between points of a route that is given by its corners [m].
+# Distance between points of a route that is given by its corners [m].
 STEP_M = 10.0
 
-# Of a route without times.
+# Speed along a route without times [m/s].
 SPEED_MPS = 8.0
 
 # Upward axis of level flight.
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 
-# Points further away are none [m].
+# Points farther from the site are ignored [m].
 NEAR_M = 1e6
 
 
@@ -62,15 +61,15 @@ class Targets:
     kind : {"grid", "route", "points"}
     name : str
     position_m : (n, 3)
-        East, north, up [m]; NaN where a position is not known.
+        East, north, up [m]. NaN if a position is unknown.
     yaw_deg : (n,)
-        Clockwise from north; NaN: unknown, all headings count alike.
+        Heading, clockwise from north. NaN if unknown: all headings then have equal weights.
     time_s : (n,)
-        Since the first point.
+        Time since the first point.
     up : (3,) or (n, 3), optional
-        Upward axis of the aircraft; level flight without.
+        Upward axis of the aircraft. Default: level flight.
     grid : Grid, optional
-        Of a grid: the points are its positions, height after height.
+        The grid, if the points are its positions, height after height.
     heights_m : tuple of float
     remarks : tuple of str
     """
@@ -90,28 +89,28 @@ class Targets:
 
     @property
     def known(self) -> BoolArray:
-        """Points (n,) that have a position near the site."""
+        """True for points (n,) that have a position near the site."""
         return np.asarray((np.abs(self.position_m) < NEAR_M).all(axis=1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetOptions:
-    """Options of ``predict`` that say where.
+    """Options of ``predict`` for its points.
 
     Parameters
     ----------
     heights_m : tuple of float
-        Of a grid; the first also of route points without a height.
+        Heights of a grid. The first is also that of route points without a height.
     spacing_m : float, optional
-        Distance between the positions of a grid. Default: ``grid_spacing_m``; refused along a route.
+        Distance between the positions of a grid. Default: ``grid_spacing_m``. Refused along a route.
     heading_deg : float, optional
-        At all points; without it that of the route, and where none is said all headings count alike.
+        Heading at all points. Default: that of the route, else all headings with equal weights.
     site : str, optional
-        Where neither flights nor the place name it.
+        The site, if neither flights nor points name it.
     carrier_hz, tx_power_dbm : float, optional
-        Of a prediction before any flight.
+        Carrier and transmit power of a prediction before any flight.
     grid_spacing_m : float
-        Spacing of a grid if nobody names one.
+        Default spacing of a grid.
     """
 
     heights_m: tuple[float, ...] = (40.0,)
@@ -131,20 +130,20 @@ def level_samples(
     time_s: FloatArray,
     up: FloatArray = UPRIGHT,
 ) -> LinkSamples:
-    """Poses of an aircraft as samples without a level.
+    """Return poses of an aircraft as samples without a level.
 
     Parameters
     ----------
     end : (str, str)
         Tower and channel.
     tower_m : (3,)
-        Place of the array [m].
+        Position of the array [m].
     position_m : (n, 3)
     yaw_deg : (n,)
-        Clockwise from north.
+        Heading, clockwise from north.
     time_s : (n,)
     up : (n, 3), optional
-        Upward axis; level flight without.
+        Upward axis. Default: level flight.
 
     Returns
     -------
@@ -169,7 +168,7 @@ def is_settings(path: Path) -> bool:
 
 
 def target_files(where: Path, site: str | None, logs_root: Path | None) -> list[Path]:
-    """Files that WHERE and the site of ``--site`` are read from."""
+    """Return the files that WHERE and the site of ``--site`` are read from."""
     files = [] if site is None else inputs_of_site(site)
     if (flight := flight_of(where)) is not None:
         return [*files, *inputs_of_flight(flight, where, logs_root)]
@@ -179,7 +178,7 @@ def target_files(where: Path, site: str | None, logs_root: Path | None) -> list[
 
 
 def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Path | None = None) -> Targets:
-    """Points that WHERE names.
+    """Read the points that WHERE names.
 
     Parameters
     ----------
@@ -188,7 +187,7 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
     site : Site
     options : TargetOptions
     logs_root : Path, optional
-        Where the logs of a flight file resolve.
+        Folder for the paths of logs in a flight file.
 
     Returns
     -------
@@ -197,7 +196,7 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
     Raises
     ------
     UsageError, InputError
-        What is no place to predict, with the likely cause.
+        If WHERE has no points that can be predicted. The message names the likely cause.
     """
     flight = flight_of(where)
     if flight is not None:
@@ -244,19 +243,19 @@ def _planned(flight: FlightFile, site: Site) -> Targets:
 
 
 def _leaning(position_m: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Upward axes (n, 3) of a multicopter on its way: it leans into its motion."""
+    """Return the upward axes (n, 3) of a multicopter, which leans into its motion."""
     time = np.maximum.accumulate(time_s)
-    # over two seconds: positions of a log are rounded, and aircraft lean no faster
+    # over two seconds, because logged positions are rounded and an aircraft does not lean faster
     begin, end = np.clip(time - 1.0, time[0], None), np.clip(time + 1.0, None, time[-1])
     moved = interpolated(end, time, position_m) - interpolated(begin, time, position_m)
     up = np.radians(LEAN_DEG_PER_MPS) * moved / np.maximum(end - begin, 1e-9)[:, None]
-    # the angle stands for its tangent: a jump of the positions turns no aircraft over
+    # the angle is used as its tangent, so that a jump of the positions cannot turn the aircraft over
     up[:, 2] = 1.0
     return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True))
 
 
 def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
-    """Track of a flight without a plan: its levels are not looked at."""
+    """Return the track of a flight without a plan. The levels of the flight are not used."""
     data: FlightData = load_data(flight, where.parent, logs_root)
     if data.track is None:
         raise UsageError("a flight file without a plan and without telemetry", expected="flight.plan", path=where)
@@ -274,12 +273,12 @@ def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
     )
 
 
-# Columns of a table of points; the last two may be missing.
+# Columns of a table of points. The last two are optional.
 _COLUMNS = ("east_m", "north_m", "height_m", "yaw_deg", "time_s")
 
 
 def _local_points(path: Path) -> Targets | None:
-    """Points of a CSV with east_m, north_m and height_m (and yaw_deg, time_s); None for another file."""
+    """Read points of a CSV with east_m, north_m and height_m (and yaw_deg, time_s). None for other files."""
     if path.suffix.lower() != ".csv":
         return None
     with parsing(path, "columns east_m, north_m, height_m"):
@@ -287,7 +286,7 @@ def _local_points(path: Path) -> Targets | None:
             head = file.readline(HEAD_BYTES).decode("utf-8-sig", errors="replace")
         if not set(_COLUMNS[:3]) <= {name.strip() for name in head.split(",")}:
             return None
-        # a longer table is refused when its limit is passed, not when all of it is in memory
+        # read one row more than allowed, so that a longer table is refused before all of it is in memory
         table = pd.read_csv(
             path, skipinitialspace=True, nrows=MOST_POINTS + 1, encoding="utf-8-sig", index_col=False,
             usecols=lambda name: name.strip() in _COLUMNS,
@@ -317,7 +316,7 @@ def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
         raise InputError(
             f"the route comes no nearer than {away_m / 1000.0:.0f} km to any tower of site {site.name!r}",
             expected="latitude, longitude near the site",
-            cause="latitude and longitude are exchanged" if exchanged else "a route of another place",
+            cause="latitude and longitude are swapped" if exchanged else "a route of another place",
             path=where,
         )
     takeoff_m = site.takeoff_ground_m
@@ -351,23 +350,23 @@ _REPLAYED_AT_ONCE = 20_000
 
 @dataclass(frozen=True, slots=True)
 class NamedFlight:
-    """A flight file that ``--with`` names."""
+    """A flight file of ``--with``."""
 
     path: Path
     settings: FlightFile
 
     def load(self, logs_root: Path | None) -> FlightData:
-        """Its logs and track."""
+        """Read its logs and track."""
         return load_data(self.settings, self.path.parent, logs_root)
 
 
 def named_flights(paths: Sequence[Path]) -> list[NamedFlight]:
-    """Flight files, and those that a calibration.yaml lists.
+    """Read flight files and the flight files listed in a calibration.yaml.
 
     Raises
     ------
     UsageError, InputError
-        As of any settings file.
+        If a file is wrong, as for any settings file.
     """
     out = []
     for path in paths:
@@ -379,13 +378,13 @@ def named_flights(paths: Sequence[Path]) -> list[NamedFlight]:
 
 
 def files_of(flights: Sequence[NamedFlight], logs_root: Path | None) -> list[Path]:
-    """Every file that the flights are read from."""
+    """Return every file that the flights are read from."""
     return [file for flight in flights for file in inputs_of_flight(flight.settings, flight.path, logs_root)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """Link of one tower and channel, as the first flight that has it describes it, or the memory of the site.
+    """A link of one tower and channel, as described by its first flight or by the learned models of the site.
 
     Parameters
     ----------
@@ -393,11 +392,11 @@ class Source:
     link : LinkSettings
     site : Site
     folder : Path
-        Where antenna files resolve.
+        Folder for the paths of antenna files.
     rt, rss : RtSettings, RssSettings
-        How a replay goes, and which sum of its paths counts.
+        Settings of the replay and of the sum of its paths.
     samples : tuple of LinkSamples
-        Of the flights that have it.
+        Samples of all flights with this link.
     """
 
     tower: str
@@ -412,7 +411,7 @@ class Source:
 
     @classmethod
     def of(cls, data: FlightData, series: RssSeries, samples: Sequence[LinkSamples]) -> Source:
-        """As a flight has it; ``samples`` are those of all flights."""
+        """Return the link of a series of a flight. ``samples`` are those of all flights."""
         of_series = tuple(s for s in samples if (s.tower, s.channel) == (series.tower, series.channel))
         return cls(
             tower=series.tower,
@@ -433,21 +432,21 @@ class Source:
 
     @property
     def tower_m(self) -> FloatArray:
-        """Place of the array (3,)."""
+        """Position of the array (3,)."""
         return np.asarray(self.site.towers[self.tower].position_m)
 
     def free_space_db(self, position_m: FloatArray) -> FloatArray:
-        """Level (n,) of free space [dBm]."""
+        """Return the level (n,) of free space [dBm]."""
         place, link = self.tower_m[None, :], self.link
         return np.asarray(free_space_dbm(place, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
 
     def targets(self, position_m: FloatArray, yaw_deg: FloatArray, up: FloatArray = UPRIGHT) -> LinkSamples:
-        """Targets (n,) of an aircraft of an upward axis (3,) or (n, 3) as samples without a level."""
+        """Return targets (n,) of an aircraft with an upward axis (3,) or (n, 3) as samples without a level."""
         time_s = np.zeros(len(yaw_deg))
         return level_samples((self.tower, self.channel), self.tower_m, position_m, yaw_deg, time_s, up)
 
     def replayed_db(self, samples: LinkSamples) -> FloatArray:
-        """Replayed level above free space (n,) of a level aircraft [dB]; NaN without a path."""
+        """Return the replayed level of a level aircraft above free space (n,) [dB]. NaN without a path."""
         link = self.link.build([self.tower], self.folder)
         turn = azimuth_rad(-samples.at_tower) - azimuth_rad(samples.at_uav)
         flat = np.zeros(len(turn))
@@ -463,12 +462,12 @@ class Source:
 
 
 def track_m(samples: LinkSamples) -> FloatArray:
-    """Some 500 positions (n, 2) of a flight, for drawings."""
+    """Return about 500 positions (n, 2) of a flight, for drawings."""
     return np.asarray(samples.position_m[:: max(1, len(samples) // 500), :2])
 
 
 def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dict[str, Source]:
-    """Towers that stand still and their channels that a flight heard, by antenna."""
+    """Return links of fixed towers and the channels that a flight received, by antenna."""
     measured = [o.samples for o in observed if np.isfinite(o.samples.residual_db).any()]
     out: dict[str, Source] = {}
     for data in known:
@@ -477,31 +476,31 @@ def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dic
             if source.samples and series.tower not in data.nodes and series.unit != "dB":
                 out.setdefault(source.antenna, source)
     if not out:
-        raise InputError("no flight has levels of a tower that stands still", expected="RSS logs with positions")
+        raise InputError("no flight has levels of a fixed tower", expected="RSS logs with positions")
     return out
 
 
 # --- models --------------------------------------------------------------------------------------------------------
 
-# Targets further than this from every sample that is known are flagged, horizontally and in height.
+# Targets farther than this from every known sample, horizontally or in height, are flagged [m].
 _HULL_M, _HULL_UP_M = 60.0, 20.0
 
-# Level above free space and standard deviation of 4 s means (n,) [dB], and where the model is a guess.
+# Level above free space and SD of 4 s means, each (n,) [dB], and true where the model extrapolates (n,).
 Levels = tuple[FloatArray, FloatArray, BoolArray]
 
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """The model that the named flights taught: a base with or without a residual field."""
+    """The model learned from the named flights: a base, with or without a spatial correction."""
 
     correction: Correction
     sources: Mapping[str, Source]
     trained_on: Sequence[Sequence[str]] = ()
     marks: Sequence[Sequence[str]] = ()
-    """SHA-256 of what its base knows besides the named flights."""
+    """SHA-256 of the training data of its base, in addition to the named flights."""
 
     def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:
-        """Levels at targets as seen with each of some headings, which count alike; ``run_targets``: their count."""
+        """Return levels at targets, averaged over the headings ``each``. ``run_targets``: targets of the whole run."""
         antenna = each[0].antenna
         level, slow = self.correction.over_headings(each, all_targets=run_targets)
         guess = outside(each[0].position_m, self.sources[antenna].samples)
@@ -516,23 +515,23 @@ class Flown:
         return level, slow, guess
 
     def fading(self, antenna: str) -> Spread:
-        """Spread of samples about their means over 4 s."""
+        """Return the spread of samples about their means over 4 s."""
         sd_db, kurtosis = fading_of(self.sources[antenna].samples, BIN_S)
         return dataclasses.replace(NO_SPREAD, fading_sd_db=sd_db, fading_kurtosis=kurtosis, bin_s=BIN_S)
 
     def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:  # noqa: ARG002
-        """None: of the named flights only the level is learned."""
+        """Return None: only the level is learned from the named flights."""
         return None
 
     def offset_db(self, antenna: str) -> float:
-        """Mean of logged minus replayed levels [dB]."""
+        """Return the mean of logged minus replayed levels [dB]."""
         source = self.sources[antenna]
         binned = [samples.binned(BIN_S) for samples in source.samples]
         return float(np.nanmean([np.nanmean(b.residual_db - source.replayed_db(b)) for b in binned]))
 
 
 class Memory:
-    """The model that the site remembers: antennas and level of each channel, from flights that are not named.
+    """The model stored for the site: learned antennas and level of each channel.
 
     Parameters
     ----------
@@ -546,7 +545,7 @@ class Memory:
         self._gain_db: Predictor = by_degree(lambda samples: known[samples.antenna].gain_db(samples))
 
     def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:  # noqa: ARG002
-        """As :meth:`Flown.levels`; a guess where flights taught less than half of the variance, or off the site."""
+        """Return levels as :meth:`Flown.levels`. It extrapolates off the site and where the gains are hardly known."""
         memory = self.known[each[0].antenna]
         gains, sds = (np.stack(part) for part in zip(*map(self._gain_db, each), strict=True))
         level, spread, gain_variance = memory.level, memory.spread, (sds**2).mean(axis=0)
@@ -558,11 +557,11 @@ class Memory:
         return gains.mean(axis=0) + level.offset_db, np.sqrt(gain_variance + gains.var(axis=0) + variance_db2), guess
 
     def fading(self, antenna: str) -> Spread:
-        """As :meth:`Flown.fading`."""
+        """Return the spread of samples about their means over 4 s."""
         return dataclasses.replace(self.known[antenna].spread, own_sd_db=0.0, noise_sd_db=0.0)
 
     def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:
-        """Forecast in two parts about levels in lock (n,) [dB], of a receiver that loses its lock."""
+        """Return the forecast of a receiver that loses its lock, about levels in lock (n,) [dB]."""
         memory = self.known[antenna]
         lock, level = memory.series.lock, memory.level
         if lock is None:
@@ -577,11 +576,11 @@ class Memory:
         )
 
     def offset_db(self, antenna: str) -> float:
-        """Mean of logged levels minus those of the antennas [dB]."""
+        """Return the mean of logged levels minus those of the antennas [dB]."""
         return self.known[antenna].level.offset_db
 
     def sources(self) -> dict[str, Source]:
-        """Links by antenna, with isotropic ends."""
+        """Return one link per antenna, with isotropic ends."""
         out = {}
         for antenna, memory in self.known.items():
             series, level = memory.series, memory.level
@@ -598,7 +597,7 @@ class Memory:
 
 
 def memory_of(place: str | Path, site: Site) -> Memory | None:
-    """Return the model of the antennas and levels learned for a site; None if no level of its towers was learned."""
+    """Return the model of the antennas and levels learned for a site. None if no level of its towers was learned."""
     known = {
         name: entry
         for name, entry in remembered(place).items()
@@ -607,8 +606,8 @@ def memory_of(place: str | Path, site: Site) -> Memory | None:
     return Memory(known, site) if known else None
 
 
-# Standard deviations of a prediction before any flight [dB]. Offset: transmit power, cables and receiver gain that
-# nobody measured. Antennas: the gain of two unknown antennas over directions (a dipole's nulls, mast, airframe).
+# Standard deviations of a prediction before any flight [dB]. Offset: transmit power, cables and receiver gain, all
+# unmeasured. Antennas: the gain of two unknown antennas over directions (a dipole's nulls, mast, airframe).
 # Shadowing: 3GPP TR 36.777, table B-3, gives 4.2 dB (LoS) and 6 dB (NLoS) for rural aerial links. Fading: Rayleigh's
 # 5.6 dB is the worst case. `benchmarks/first_flight_prediction.py` checks the sum on flights.
 PRIOR_OFFSET_DB, PRIOR_ANTENNA_DB, PRIOR_SHADOWING_DB, PRIOR_FADING_DB = 10.0, 8.0, 6.0, 5.0
@@ -643,7 +642,7 @@ class Prior:
         }  # fmt: skip
 
     def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:  # noqa: ARG002
-        """Return level above free space and standard deviation (n,) [dB]; no heading matters to isotropic antennas."""
+        """Return level above free space and standard deviation (n,) [dB]. Isotropic antennas have no heading."""
         level = self.sources()[each[0].antenna].replayed_db(each[0])
         return level, np.where(np.isfinite(level), self.slow_sd_db, np.nan), np.ones(len(level), dtype=np.bool_)
 
@@ -666,7 +665,7 @@ class Prior:
 
 
 def outside(position_m: FloatArray, flown: Sequence[LinkSamples]) -> BoolArray:
-    """Targets (n,) that are further than :data:`_HULL_M` or :data:`_HULL_UP_M` from every sample."""
+    """Return true for targets (n,) farther than :data:`_HULL_M` or :data:`_HULL_UP_M` from every sample."""
     from scipy.spatial import cKDTree
 
     scaled = np.array([_HULL_M, _HULL_M, _HULL_UP_M])

@@ -39,7 +39,7 @@ from ..site.siteyaml import inputs_of_site, site_files
 def other_inputs(
     settings: FlightFile, flight: Path, logs_root: Path | None = None, learned: Path | None = None
 ) -> tuple[InputFile, ...]:
-    """The flight file, the site file and every file that either names, but for the logs.
+    """Return the flight file, the site file and every file that either names, except the logs.
 
     Parameters
     ----------
@@ -48,15 +48,14 @@ def other_inputs(
     flight : Path
         The flight file.
     logs_root : Path, optional
-        Where logs and antenna files resolve besides the folder of the flight file.
+        Folder for the paths of logs and antenna files, in addition to that of the flight file.
     learned : Path, optional
         calibrated.yaml of ``report --with``.
 
     Returns
     -------
     tuple of InputFile
-        Path as it is named (the packaged site: as the package names it), SHA-256, and as role the key that names it.
-        They have no lines to account for.
+        Path as written, SHA-256, and as role the key that names the file. These files have no lines to account for.
     """
     content = settings.model_dump(exclude={"logs"})
     roots = [flight.parent] if logs_root is None else [logs_root, flight.parent]
@@ -72,12 +71,12 @@ def other_inputs(
 
 
 def inputs_of_flight(settings: FlightFile, flight: Path, logs_root: Path | None = None) -> list[Path]:
-    """Every file that a flight is read from, its site's too: no output may replace one."""
+    """Return every file that a flight and its site are read from. No output may replace one of them."""
     return [*input_files(settings, flight, logs_root), *inputs_of_site(settings.site.file, flight.parent)]
 
 
 def inputs_of_flights(flights: Iterable[Path], logs_root: Path | None = None) -> list[Path]:
-    """Inputs of several flight files; of one that is wrong the file alone."""
+    """Return the inputs of several flight files. For a wrong flight file, return its own path only."""
     files: list[Path] = []
     for flight in flights:
         files.append(flight)
@@ -87,7 +86,7 @@ def inputs_of_flights(flights: Iterable[Path], logs_root: Path | None = None) ->
 
 
 def stamp(path: Path) -> tuple[int, int]:
-    """Size and time of a file: a worker that lives for days must see that it was changed; zeros where there is none."""
+    """Return size and time of a file, from which a long-lived worker sees a change. Zeros if there is no file."""
     try:
         status = os.stat(path)  # noqa: PTH116
     except OSError:
@@ -96,7 +95,7 @@ def stamp(path: Path) -> tuple[int, int]:
 
 
 def digest_of(place: Path) -> str:
-    """SHA-256 of a file, computed once for its size and time: a campaign asks with every task."""
+    """Return the SHA-256 of a file, cached by size and time, because every task of a campaign needs it."""
     return _digest(place, *stamp(place))
 
 
@@ -107,7 +106,7 @@ def _digest(place: Path, _size: int, _mtime_ns: int) -> str:
 
 @lru_cache(maxsize=1024)
 def _learned_on(place: Path, size: int, _mtime_ns: int) -> tuple[str, ...]:
-    """SHA-256 of the logs that a file says it was learned from."""
+    """Return the SHA-256 of the logs that a file lists as its training data."""
     if size > LARGEST_TABLE:
         return ()
     return trained_on(read_table(place, "an input").decode("utf-8", errors="replace"))
@@ -123,7 +122,7 @@ LAYOUT = 8
 _SEAL = b"aerpaw-cmp outcome"
 
 
-# Entry points of readers: those of other packages count with their version.
+# Entry points of readers. Readers of other packages enter the digest with their version.
 READERS = "aerpaw_cmp.readers"
 
 
@@ -135,7 +134,7 @@ class OutcomeStore:
     folder : Path
         Made when the first entry is written.
     kind : type
-        Dataclass of an outcome; an entry is held against its fields, and nothing else is ever built from a file.
+        Dataclass of an outcome. An entry is checked against its fields; no other class is built from a file.
 
     Attributes
     ----------
@@ -145,12 +144,12 @@ class OutcomeStore:
 
     def __init__(self, folder: Path, kind: type) -> None:
         self.folder = folder
-        # a list, since pydantic takes no configuration beside a dataclass
+        # a list, because pydantic accepts no configuration for a dataclass
         self._kind = TypeAdapter(list[kind], config=ConfigDict(arbitrary_types_allowed=True, extra="forbid"))  # type: ignore[valid-type]
         self.warnings: list[str] = []
 
     def check(self) -> None:
-        """UsageError where nothing can be kept in the folder, before anything runs."""
+        """Raise UsageError before the first task if the folder cannot be written."""
         probe = self.folder / f".probe-{os.getpid()}"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -164,17 +163,17 @@ class OutcomeStore:
             ) from None
 
     def load(self, key: str) -> Any | None:
-        """The outcome of a key, or None where there is no sound entry."""
+        """Return the outcome of a key, or None if there is no intact entry."""
         file = self.folder / f"{key}.npz"
         try:
             content = read_sealed(file, _SEAL)
         except ValueError:
-            self.warnings.append(f"a damaged outcome was not used, its task is computed anew: {file}")
+            self.warnings.append(f"a damaged outcome was not used, its task is computed again: {file}")
             return None
         if content is None:
             return None
         try:
-            # a pickle in a shared folder would run whatever its writer wanted
+            # a pickle in a shared folder could run code of its writer
             with parsing(file, any_shape=True), np.load(io.BytesIO(content), allow_pickle=False) as parts:
                 arrays = {name: parts[name] for name in parts.files}
                 return self._kind.validate_python([_with_arrays(json.loads(arrays["content"].tobytes()), arrays)])[0]
@@ -183,7 +182,7 @@ class OutcomeStore:
             return None
 
     def save(self, key: str, outcome: Any) -> None:
-        """Write an entry whole or not at all; nothing where the disk does not take it."""
+        """Write an entry atomically. If the disk cannot be written, store nothing and do not fail."""
         arrays = _Arrays()
         text = json.dumps(_plain(outcome, arrays), default=lambda number: number.item())
         content = np.frombuffer(text.encode(), dtype=np.uint8)
@@ -197,7 +196,7 @@ _ARRAY = "array of the entry"
 
 
 def _plain(value: Any, arrays: _Arrays) -> Any:
-    """A record as JSON takes it."""
+    """Return a record as plain values for JSON, with the names of its arrays."""
     if dataclasses.is_dataclass(value):
         return {field.name: _plain(getattr(value, field.name), arrays) for field in dataclasses.fields(value)}
     if isinstance(value, np.ndarray):
@@ -208,7 +207,7 @@ def _plain(value: Any, arrays: _Arrays) -> Any:
 
 
 def _with_arrays(value: Any, arrays: Mapping[str, AnyArray]) -> Any:
-    """JSON with the arrays in their places."""
+    """Return plain values of JSON with the arrays put back."""
     if isinstance(value, dict):
         named = value.get(_ARRAY)
         return arrays[named] if named else {key: _with_arrays(item, arrays) for key, item in value.items()}
@@ -216,16 +215,16 @@ def _with_arrays(value: Any, arrays: Mapping[str, AnyArray]) -> Any:
 
 
 class _Arrays:
-    """Arrays by name, each once: channels of a tower share times and places, half of all that is kept."""
+    """Arrays by name, each stored once: channels of a tower share times and positions, half of the volume."""
 
     def __init__(self) -> None:
         self.by_name: dict[str, AnyArray] = {}
         self._names: dict[tuple[str, tuple[int, ...], bytes], str] = {}
 
     def put(self, array: AnyArray) -> str:
-        """The name of an array."""
+        """Return the name of an array, which is stored if it is new."""
         if array.dtype.hasobject:  # these would be pickled
-            raise TypeError("an outcome holds no arrays of objects")
+            raise TypeError("an outcome cannot contain arrays of objects")
         name = self._names.setdefault((array.dtype.str, array.shape, array.tobytes()), f"a{len(self._names)}")
         self.by_name[name] = array
         return name
@@ -236,19 +235,19 @@ _WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit
 
 
 def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> list[dict[str, str]]:
-    """Role, path and SHA-256 of every file that an outcome depends on, logs last.
+    """Return role, path and SHA-256 of every file that an outcome depends on, logs last.
 
     Raises
     ------
     OSError
         If a log cannot be read.
     UsageError
-        If the site cannot.
+        If the site cannot be read.
     """
     entries = [
         {"role": other_input.role, "path": other_input.path, "sha256": other_input.sha256}
         for other_input in other_inputs(settings, flight, logs_root)
-        if other_input.role != "flight file"  # what it says stands in the settings, overrides included
+        if other_input.role != "flight file"  # its content is in the settings, with overrides
     ]
     for log in settings.logs:
         path = (logs_root or flight.parent) / log.path
@@ -257,9 +256,9 @@ def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> l
 
 
 def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: object) -> str:
-    """Digest of what an outcome depends on: settings that matter, content of every input, code, and ``more``.
+    """Return the digest of what an outcome depends on: relevant settings, content of inputs, code, and ``more``.
 
-    Labels do not: a flight or a setting that gets another name keeps its outcomes.
+    Labels are not part of it, so a flight or setting with a new name keeps its stored outcomes.
     """
     digest = hashlib.sha256()
     digest.update("\n".join([str(LAYOUT), code_digest(), *map(str, more)]).encode())
@@ -271,7 +270,7 @@ def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: o
 
 @cache
 def code_digest() -> str:
-    """Digest of the source of this program and of the versions of what it computes with."""
+    """Return the digest of this program's source and of the versions of its numerical packages."""
     digest = hashlib.sha256()
     for name in ("aerpaw_cmp", "aerpaw_parsers"):
         with contextlib.suppress(ImportError):

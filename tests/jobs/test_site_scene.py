@@ -65,7 +65,7 @@ def test_in_and_out_and_in_again(room: Path, tmp_path: Path, capsys: pytest.Capt
 
 def test_what_a_scene_does_not_say_is_asked_for(room: Path, tmp_path: Path) -> None:
     out = tmp_path / "site.yaml"
-    with pytest.raises(UsageError, match="does not say where on Earth it lies"):
+    with pytest.raises(UsageError, match="does not contain its position on Earth"):
         run_scene_import(room, out, SceneOptions())
     with pytest.raises(UsageError, match=r"has no towers.*from -50 to 50 m east"):
         run_scene_import(room, out, SceneOptions(origin="local"))

@@ -104,7 +104,7 @@ def test_the_first_sentence_follows_from_the_interval_over_all_channels(report_d
 
 
 def test_a_bound_is_given_with_its_reason(report_data):
-    reason = "the flight is too short for its memory of 40 s"
+    reason = "the flight is too short: its errors are correlated over 40 s"
     panel = with_numbers(report_data.rss[0], rmse_bound=reason)
     intervals = dataclasses.replace(panel.score.intervals, rmse_db=(5.46, np.inf))
     panel = dataclasses.replace(panel, score=dataclasses.replace(panel.score, intervals=intervals))

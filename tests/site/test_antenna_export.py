@@ -112,7 +112,7 @@ def test_what_a_pattern_is_not_is_refused(cuts, tmp_path, capsys):
     assert export(cuts, tmp_path / "out.msi", "--carrier", "3.4e9") == 0
     for words, said in (
         ([str(grid)], "expected one of SA"),
-        ([str(grid), "--variable", "SA", "--elevation", str(cuts[1])], "beside a gain grid"),
+        ([str(grid), "--variable", "SA", "--elevation", str(cuts[1])], "an elevation cut with a gain grid"),
         ([str(tmp_path / "out.msi"), "--carrier", "6e9"], "the pattern has 3.4 GHz"),
     ):
         assert main(["antenna", "export", *words, "-o", str(tmp_path / "new.msi")]) == 2

@@ -4,7 +4,7 @@ A command is a function in a module of this package::
 
     @command("diff", examples=["aerpaw-cmp diff reports/a reports/b"])
     def diff(first: Annotated[Path, Argument(help="...")], force: Force = False) -> int:
-        from ..jobs.diff import run_diff  # here, so that help and completion load nothing
+        from ..jobs.diff import run_diff  # here, so that help and completion load no job
 
 and a line of :mod:`aerpaw_cmp.common.text`. It returns the exit code, or None for 0. The decorator adds ``-h``,
 ``--json``, ``--quiet`` and the examples below the options. :func:`.answered` prints the JSON object.
@@ -51,7 +51,7 @@ Export = Annotated[
 ]
 LogsRoot = Annotated[
     Path | None,
-    Option("--logs-root", help="Folder against which the paths of the logs resolve."),
+    Option("--logs-root", help="Folder for the paths of the logs."),
 ]
 
 
@@ -68,9 +68,7 @@ Flights = Annotated[
         help="Flown flight.yaml to learn from, or calibration.yaml: its flights; repeatable.",
     ),
 ]
-DryRun = Annotated[
-    bool, Option("--dry-run", help="Check everything but the computing, print the stages, write nothing.")
-]
+DryRun = Annotated[bool, Option("--dry-run", help="Check all inputs, print the stages, and write no files.")]
 Quiet = Annotated[
     bool,
     Option("-q", "--quiet", help="Results, warnings and failures only."),

@@ -133,7 +133,7 @@ def print_files(paths: Sequence[Path]) -> None:
             show(path)
 
 
-# Columns up to this width (numbers, times) are never broken.
+# Columns up to this width (numbers, times) are not wrapped.
 _FIXED = 20
 
 

@@ -1,4 +1,4 @@
-"""Speed against error of the engines, and the tool beside its peers, for ``aerpaw-cmp bench``."""
+"""The ``bench`` job: speed against error of the engines, and speed compared with other programs."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ def run_bench(
     report: Path | None = None,
     progress: Progress = logged,
 ) -> dict[str, Any]:
-    """Speed against error of the replay, and how many times faster than its peers each part is, from one run.
+    """Measure speed against error of the replay, and the speed of each part relative to its peer.
 
     Parameters
     ----------
     poses : int
-        Of the flight that is replayed.
+        Number of replayed poses.
     samples : tuple of int
         Rays per tower of the sionna engine.
     ratios : bool
-        Compare with the peers, too.
+        Also compare with the peers.
     report : Path, optional
         Folder of a report, whose model comparison becomes a table.
     progress : Progress
@@ -91,7 +91,7 @@ def _costs(report: Path) -> list[Row]:
 
 
 def _against_peers(progress: Progress) -> dict[str, Any]:
-    """Ratios to each peer, None without it; at equal error first."""
+    """Return the ratio to each peer, at equal error first. None if a peer is not installed."""
     progress("path search against PathSolver, at equal error and at 1e6 samples")
     searches = path_search_ratios()
     progress("Kriging against PyKrige, reading against pandas")
@@ -115,28 +115,27 @@ def speed_against_error(
     depths: Sequence[int] = (0, 1, 2, 3),
     progress: Progress = logged,
 ) -> list[Row]:
-    """Rows of speed against error: ways to replay the same poses, each held against the image engine at depth 2.
+    """Replay the same poses in several ways, and compare each with the image engine at depth 2.
 
     Parameters
     ----------
     site, link, poses
-        What to replay.
+        Inputs of the replay.
     samples : sequence of int
-        Rays of the Sionna rows; empty for none.
+        Rays of the Sionna rows. Empty: no Sionna rows.
     depths : sequence of int
-        Rows of the image engine.
+        Depths of the rows of the image engine.
     progress : callable
-        Told what runs.
+        Receives the row that is running.
 
     Returns
     -------
     list of dict
-        Image engine first: once Sionna is loaded the process stays larger. Each row has ``engine``, ``samples`` (rays
-        per tower and batch), ``arrays`` (H of each element pair in ``float64``, whoever finds the paths), ``depth``,
-        ``seconds`` (wall time, warm), ``links_per_s`` (pose-tower pairs answered), ``peak_mib`` (of the whole process;
-        0 where the system does not say it), ``missing_paths`` and ``extra_paths``, ``rss_max_error_db`` and
-        ``rss_rms_error_db`` over links that both cover (None without one), ``coverage_differs`` (links that one covers)
-        and ``rank_disagreement`` by K.
+        The image engine is first, because Sionna increases the memory of the process for good. Each row has ``engine``,
+        ``samples`` (rays per tower and batch), ``arrays`` (type of H), ``depth``, ``seconds`` (wall time, warm),
+        ``links_per_s`` (pose-tower pairs), ``peak_mib`` (of the process; 0 if unknown), ``missing_paths`` and
+        ``extra_paths``, ``rss_max_error_db`` and ``rss_rms_error_db`` over links with a level in both replays (None
+        without such links), ``coverage_differs`` (links with a level in one replay) and ``rank_disagreement`` by K.
     """
     reference = replay(site, link, poses, Search(max_depth=_DEPTH))
     rows = []
@@ -151,9 +150,9 @@ def speed_against_error(
 
 
 def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: Search) -> Row:
-    """The replay of all poses by an engine."""
+    """Replay all poses with an engine and return its row."""
     sionna = search.engine == "sionna"
-    # without the cache: the time of a search that was stored would be that of reading it
+    # without the cache, because a cached search takes only the time of reading it
     alone = Run(cache_dir="")
     if sionna:
         replay(site, link, poses[:BATCH], search, run=alone)  # compiles the kernels
@@ -175,28 +174,28 @@ def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: S
 
 
 def _measured(action: Callable[[], T]) -> tuple[T, dict[str, float]]:
-    """Result, seconds, and the peak of the process's memory meanwhile [MiB]."""
+    """Return the result of an action, its seconds, and the peak memory of the process [MiB]."""
     begin_peak()
     started = time.perf_counter()
     result = action()
     return result, {"seconds": time.perf_counter() - started, "peak_mib": peak_mib()}
 
 
-# --- beside the peers -----------------------------------------------------------------------------------------------
+# --- comparison with peers --------------------------------------------------------------------------------------------
 
 
 def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5) -> dict[str, Any]:
-    """Path search of the image engine against Sionna's PathSolver, both warm, in this one run.
+    """Compare the path search of the image engine with Sionna's PathSolver, both warm, in one run.
 
     Parameters
     ----------
     poses : int
-        Of :func:`random_scene`.
+        Number of poses of :func:`random_scene`.
     samples : int
-        Of PathSolver.
+        Rays of PathSolver.
     repeats : int
-        Runs of the image engine before, and as many after Sionna's; the median counts. The load of the machine may
-        change in between.
+        Runs of the image engine before and after Sionna, because the load of the machine may change. The median is
+        used.
 
     Returns
     -------
@@ -219,7 +218,7 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
     times = [search() for _ in range(repeats)]
     replay(site, link, some[:BATCH], rays, run=alone)  # compiles the kernels
     theirs = replay(site, link, some, rays, run=alone)
-    # half before and half after: a machine that grows slower meanwhile shifts both
+    # half before and half after, so that a slower machine affects both
     times += [search() for _ in range(repeats)]
     difference = compare(replay(site, link, some), theirs, np.arange(poses))
     seconds = float(np.median(times))
@@ -243,14 +242,13 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
 def path_search_ratios(
     poses: int = 1000, samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000)
 ) -> dict[str, Any]:
-    """Path search of the image engine against PathSolver with ``samples`` (increasing), and at equal error.
+    """Compare path searches for increasing ``samples`` of PathSolver, and at equal error.
 
     Returns
     -------
     dict
-        ``at`` maps samples to the numbers of :func:`path_search`; ``equal_error``
-        is the entry of the fewest samples with which PathSolver finds as many of the paths as with the most: more
-        samples than that buy it nothing, so a ratio to more of them flatters us.
+        ``at`` maps samples to the numbers of :func:`path_search`. ``equal_error`` is the entry with the fewest samples
+        that find as many paths as the most samples. A ratio to more samples would flatter the image engine.
     """
     most = path_search(poses, samples[-1])
     at = {samples[-1]: most}
@@ -263,12 +261,12 @@ def path_search_ratios(
 
 
 def median_seconds(action: Callable[[], Any], repeats: int) -> float:
-    """Median processor time after a warm-up: other work on the machine does not count."""
+    """Return the median processor time after a warm-up, which other programs do not change."""
     return statistics.median(timeit.repeat(action, timer=time.process_time, number=1, repeat=repeats + 1)[1:])
 
 
 def kriging_vs_pykrige(positions: int = 2556) -> Row | None:
-    """One field off its samples, the same 20 neighbours and exponential variogram, against PyKrige's compiled part."""
+    """Compare Kriging with PyKrige's compiled part, with 20 neighbours and one exponential variogram."""
     try:
         from pykrige.ok import OrdinaryKriging as Peer
     except ImportError:
@@ -290,9 +288,9 @@ def kriging_vs_pykrige(positions: int = 2556) -> Row | None:
 
 
 def ingest_vs_pandas(lines: int = 20_523) -> Row:
-    """Reading as many lines of a power log as a real flight has, against ``pandas.read_csv(engine="c")``.
+    """Compare reading a power log of the length of a real flight with ``pandas.read_csv(engine="c")``.
 
-    Ours gives UTC times, levels, flags and the account of every line; pandas columns of text and numbers.
+    The reader returns UTC times, levels, flags and the account of every line; pandas returns text and numbers.
     """
     import pandas as pd
 
@@ -311,13 +309,13 @@ def ingest_vs_pandas(lines: int = 20_523) -> Row:
 
 
 def _beside(ours: Callable[[], Any], peer: Callable[[], Any], **about: int) -> Row:
-    """Seconds of both sides and how many times faster ours is."""
+    """Return the seconds of both programs and their ratio."""
     seconds, theirs = median_seconds(ours, 5), median_seconds(peer, 5)
     return {"ratio": theirs / seconds, "seconds_ours": seconds, "seconds_peer": theirs, **about}
 
 
 def random_scene(poses: int, *, buildings: int = 12, towers: int = 1, seed: int = 1) -> tuple[Site, Link, Poses]:
-    """A scene to measure on: rotated boxes 4 to 12 m high in a field of 600 m, a winding flight 20 to 60 m up.
+    """Return a random scene: rotated boxes of 4 to 12 m height in a field of 600 m, and a flight at 20 to 60 m.
 
     Parameters
     ----------

@@ -253,7 +253,7 @@ class CalibrationFile(StrictModel):
         return {**data, "flights": [name for some in each if isinstance(some, list) for name in some]}
 
     def by_campaign(self) -> dict[str, CampaignSettings]:
-        """Return the campaigns; one with the name of the calibration if none is named."""
+        """Return the campaigns. Without campaigns, return one with the name of the calibration."""
         return self.campaigns or {self.calibration: CampaignSettings(flights=self.flights, source=self.source)}
 
 

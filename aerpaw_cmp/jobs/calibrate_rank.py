@@ -1,7 +1,7 @@
 """The receiver's part of ``calibrate``: learn how the modem decides its rank, and score it on held-out flights.
 
-The model has only the direct path and one ray off flat ground at height 0: at a rural site the orientation of the ports
-and the strength of the ground ray determine the rank more than any wall.
+The model has only the direct path and one ray off flat ground at height 0. At a rural site the orientation of the ports
+and the strength of the ground ray affect the rank more than any wall.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class RankGrid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankSamples:
-    """Reports of one flight at one tower, at known positions: ``rank`` (n,), NaN without CSI; ``time_s`` (n,)."""
+    """Reports of one flight at one tower, at known positions. ``rank`` (n,) is NaN without CSI."""
 
     flight: str
     tower: str

@@ -46,7 +46,7 @@ from ..site.learned import (
 from .calibrate import Calibration, CalibrationFile, known_directions
 from .calibrate_rank import RankCalibration
 
-# First words of calibrated.yaml, which identify an earlier output of this tool.
+# Start of calibrated.yaml, which identifies an earlier output of this tool.
 _MARK = "# aerpaw-cmp calibrate"
 
 # Share of the variance over both directions that stored directions may miss, and their largest number.
@@ -408,7 +408,7 @@ def _learned_series(
 _SD_SAMPLES = 200
 
 # Prior SD of the offset between flights [dB], with the weight of two flights. It is a guess: three of dataset 12, LTE,
-# AFAR and NR give 1.0 dB (without AFAR) to 2.8 dB (without dataset 12), too different to learn it from other campaigns.
+# AFAR and NR give 1.0 dB (without AFAR) to 2.8 dB (without dataset 12). Such different values cannot be learned.
 _OFFSET_SD_DB = 1.5
 
 

@@ -79,7 +79,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Rows of one task, or the reason for none, and the time that it took [s]."""
+    """Rows of one task, or its failure, and the time that it took [s]."""
 
     rss: tuple[RssRow, ...] = ()
     rank: tuple[RankRow, ...] = ()

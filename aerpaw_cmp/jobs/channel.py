@@ -35,8 +35,8 @@ from .tasks import inputs_of_flight
 
 _MOST_POSES = 10_000_000
 
-# Gains and frequency responses that are worked on at once, and held in memory; paths of a link that they are reckoned
-# with, and bytes of a path besides its gains.
+# Bytes of gains and frequency responses per part, and in memory at most. Estimates: paths per link, and bytes per path
+# in addition to its gains.
 _PART_BYTES, MOST_BYTES, _PATHS, _PATH_BYTES = 16 << 20, 2 << 30, 4, 512
 
 
@@ -47,19 +47,19 @@ class ChannelOptions:
     Parameters
     ----------
     route : Path, optional
-        In place of the flight's own track or plan.
+        Route that replaces the flight's track or plan.
     link : str, optional
-        ``rss``, ``rank`` or a channel of the flight file; by default the first channel it names, else ``rss``.
+        ``rss``, ``rank`` or a channel of the flight file. Default: its first channel, else ``rss``.
     towers : sequence of str
-        By default those of the logs, else all of the site.
+        Default: the towers of the logs, else all towers of the site.
     step_s : float
-        Between poses.
+        Time between poses.
     formats : sequence of str
-        Of :data:`aerpaw_cmp.report.channel.FORMATS`.
+        Names in :data:`aerpaw_cmp.report.channel.FORMATS`.
     bandwidth_hz : float, optional
-        Also H at the subcarriers of a band.
+        Bandwidth for H at subcarriers.
     subcarriers : int, optional
-        1024 by default.
+        Number of subcarriers. Default: 1024.
     """
 
     route: Path | None = None
@@ -77,17 +77,17 @@ def channel_parts(
     stages: Stages | None = None,
     room: int | None = None,
 ) -> Iterator[Channel]:
-    """The channel along a flight in parts that follow each other.
+    """Yield the channel along a flight in consecutive parts.
 
     Parameters
     ----------
     data : FlightData
-        With logs read, or of a plan without any.
+        A flight with logs, or with a plan only.
     chosen : ChannelOptions
     stages : Stages, optional
         Times "replay" and "paths".
     room : int, optional
-        Bytes that the parts may have together; None: one part alone, in memory.
+        Largest size of all parts together [bytes]. None: one part, in memory.
 
     Yields
     ------
@@ -96,7 +96,8 @@ def channel_parts(
     Raises
     ------
     UsageError, InputError
-        An unknown tower or link, a band wider than the model's, a route that is none, more than there is room for.
+        If a tower or link is unknown, the band is wider than the model allows, the route cannot be read, or the channel
+        is too large.
     """
     stages, settings, remarks = stages or Stages(), data.settings, list[str]()
     name, link_settings = _chosen_link(settings, chosen)
@@ -106,8 +107,8 @@ def channel_parts(
     check_band(chosen.bandwidth_hz or 0.0, link_settings.carrier_hz)
     link = link_settings.build(towers, data.folder)
     along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
-    # a speed over less than a second is the noise of the positions
-    spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # steps of many seconds are no gaps
+    # a speed over less than one second is mostly noise of the positions
+    spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # long steps are not gaps
     velocity = velocities_mps(along.time_s, along.poses.position_m, *spans)
     if np.isfinite(velocity).any():
         other = None if along.towers_m is None else velocities_mps(along.time_s, along.towers_m, *spans)
@@ -120,15 +121,15 @@ def channel_parts(
     count, links = len(along.poses), len(along.poses) * len(towers)
     pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
     size = _size(pairs, _PATHS, offsets)
-    # a power of two, as the chunks of the file: a part that ended within a chunk would have it deflated twice
+    # a power of two, as the chunks of the file: a part that ends within a chunk would compress the chunk twice
     at_once = 1 << max(0, (_PART_BYTES * count // size).bit_length() - 1)
-    further = " of disk"
+    further = " of disk space"
     if (drawn := settings.rt.engine != "image") or room is None:  # Sionna draws its rays for all poses at once
         at_once, room, size = count, MOST_BYTES, size + _PATH_BYTES * links * _PATHS
-        further = ", or netcdf and csv alone" + (" with rt.engine: image" if drawn else "")
+        further = ", or only netcdf and csv" + (" with rt.engine: image" if drawn else "")
     _refuse(size, f"{counted(count, 'pose')}, {counted(len(towers), 'tower')}", room, further)
     job = None if at_once >= count else Job.of(along.poses.position_m, links)
-    progress = stages.progress if job is None else lambda *_: None  # one of many parts is silent
+    progress = stages.progress if job is None else lambda *_: None  # no progress for single parts
     names = {"": 0}  # the line of sight
     for start in range(0, count, at_once):
         part = along.part(slice(start, start + at_once))
@@ -153,12 +154,12 @@ def channel_parts(
 
 
 def _size(pairs: int, paths: int, offsets_hz: FloatArray | None) -> int:
-    """Bytes of gains and frequency responses of pairs of elements."""
+    """Return the size of gains and frequency responses of element pairs [bytes]."""
     return 16 * pairs * (paths + (0 if offsets_hz is None else len(offsets_hz)))
 
 
 def _refuse(size: int, what: str, room: int, further: str) -> None:
-    """UsageError for more bytes than there is room for: in memory, else on the disk."""
+    """Raise UsageError if a channel needs more than the available bytes, in memory or on the disk."""
     if size > room:
         raise UsageError(
             f"{size / 2**30:.0f} GiB of paths and gains: {what}",
@@ -176,7 +177,7 @@ def _chosen_link(settings: FlightFile, chosen: ChannelOptions) -> tuple[str, Lin
 
 
 def _chosen_towers(data: FlightData, chosen: ChannelOptions, remarks: list[str]) -> list[str]:
-    """Towers by name; those that move stand alone, since each pose has another scene, and along the track."""
+    """Return the towers by name. A moving tower must be alone and along the track: each pose has another scene."""
     if unknown := [name for name in chosen.towers if name not in data.site.towers]:
         raise UsageError(f"the site has no tower {unknown[0]!r}", expected="one of " + ", ".join(data.site.towers))
     logs = [str(log.node) for log in data.settings.logs if log.node in data.site.towers]
@@ -185,23 +186,23 @@ def _chosen_towers(data: FlightData, chosen: ChannelOptions, remarks: list[str])
     if len(fixed) == len(towers) or (len(towers) == 1 and chosen.route is None):
         return towers
     if chosen.towers or not fixed:
-        raise UsageError("a tower that moves, beside others or along a route", expected="it alone, along the track")
-    remarks.append("Towers that move are left out: --tower NAME exports one alone.")
+        raise UsageError("a moving tower with other towers or along a route", expected="it alone, along the track")
+    remarks.append("Moving towers are not exported: --tower NAME exports one of them.")
     return fixed
 
 
 def _steps_s(length_s: float, step_s: float) -> FloatArray:
-    """Instants from 0 to ``length_s`` at equal steps."""
+    """Return times from 0 to ``length_s`` at equal steps [s]."""
     if length_s > _MOST_POSES * step_s:
         raise UsageError(
-            f"{length_s / step_s:.3g} poses", expected=f"at most {_MOST_POSES}", cause="a small --step, no seconds"
+            f"{length_s / step_s:.3g} poses", expected=f"at most {_MOST_POSES}", cause="a --step that is not in seconds"
         )
-    # the end counts as an instant, though sums of steps may round beyond it
+    # include the end, although the sum of steps may round to more
     return np.arange(0.0, length_s + 1e-9, step_s)
 
 
 def _flown(data: FlightData, chosen: ChannelOptions, towers: Sequence[str]) -> Along:
-    """Poses of the track where it is known, and of the tower where it moves."""
+    """Return the known poses of the track, and the positions of a moving tower."""
     if data.track is None:
         raise UsageError("a flight without telemetry", expected="a telemetry log, flight.plan or --route FILE")
     start, length_s = data.track.start_ns, 1e-9 * (data.track.end_ns - data.track.start_ns)
@@ -210,7 +211,7 @@ def _flown(data: FlightData, chosen: ChannelOptions, towers: Sequence[str]) -> A
     place, known = data.tower_at(towers[0], time)
     track = data.poses_at(time).where(known)
     if not track.valid.any():
-        raise UsageError("no instant of the flight has a pose", expected="positions", cause=data.track.why_not(track))
+        raise UsageError("no time of the flight has a pose", expected="positions", cause=data.track.why_not(track))
     left = int((~track.valid).sum())
     return Along(
         name=data.settings.flight.name,
@@ -218,12 +219,12 @@ def _flown(data: FlightData, chosen: ChannelOptions, towers: Sequence[str]) -> A
         time_s=steps[track.valid],
         start=time[0],
         towers_m=place[track.valid] if towers[0] in data.nodes else None,
-        remarks=(f"{left} of {counted(len(time), 'instant')} left out: no pose (telemetry gaps).",) if left else (),
+        remarks=(f"{left} of {counted(len(time), 'instant')} omitted: no pose (telemetry gaps).",) if left else (),
     )
 
 
 def _planned(data: FlightData, route: Path, step_s: float) -> Along:
-    """Poses of a level aircraft along a route or a plan, nose as the route says, else along the course."""
+    """Return poses of a level aircraft along a route or plan, with the heading of the route, else along the course."""
     targets = find_targets(route, data.site, TargetOptions())
     if targets.kind == "grid":
         found = "a site, not a route" if route.exists() else "no such file"
@@ -239,7 +240,7 @@ def _planned(data: FlightData, route: Path, step_s: float) -> Along:
     if not np.isfinite(yaw).all():
         course = bearing_deg(np.gradient(position, axis=0)) if len(position) > 1 else np.zeros(1)
         yaw = np.where(np.isfinite(yaw), yaw, course)
-        remarks = (*remarks, "The route gives no heading: the nose points along the course.")
+        remarks = (*remarks, "The route has no heading: the nose points along the course.")
     level = np.zeros(len(yaw))
     rotation = rotation_from_aircraft(level, level, level + 90.0 if data.settings.rt.attitude == "ignored" else yaw)
     number = np.arange(float(len(time))) if len(time) > 1 and not time.any() else None
@@ -248,27 +249,27 @@ def _planned(data: FlightData, route: Path, step_s: float) -> Along:
 
 
 def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> Callable[[Poses], dict[str, Any]]:
-    """Calibrated levels of poses by remembered antennas, as :class:`Channel` has them; nothing without memory."""
+    """Return a function for the calibrated levels of poses by the site's learned antennas, if there are any."""
     towers, sources = tuple(link.tower_arrays), dict[str, Source]()
     memory = memory_of(data.site_place, data.site)
     if memory is None:
-        remarks.append("No calibrated level: no flight taught the site its antennas (aerpaw-cmp calibrate).")
+        remarks.append("No calibrated level: no antennas were learned for this site (aerpaw-cmp calibrate).")
         return lambda _: {}
-    # antennas of the link's own channel come first (False before True): another near the carrier fills in
+    # antennas of the link's channel come first (False before True), else those of another channel near the carrier
     for source in sorted(memory.sources().values(), key=lambda s: s.channel != name):
         near = abs(source.link.carrier_hz / link.carrier_hz - 1.0) <= BAND
         if source.tower in towers and near and source.tower not in data.nodes:
             sources.setdefault(source.tower, source)
     if not sources:
-        remarks.append("No calibrated level: the site remembers no antenna of these towers near this carrier.")
+        remarks.append("No calibrated level: the site has no learned antennas of these towers near this carrier.")
         return lambda _: {}
     trained_on = union(*(memory.known[source.antenna].entry.trained_on for source in sources.values()))
     if set(trained_on) & set(flight_logs(data)):
-        remarks.append("The calibrated level was learned from this flight's own logs, too: no prediction of it.")
+        remarks.append("The calibrated level was also learned from this flight's logs, so it is not a prediction.")
     units = ", ".join(dict.fromkeys(source.unit for source in sources.values()))
 
     def levels(poses: Poses) -> dict[str, Any]:
-        """Level and standard deviation (poses, towers)."""
+        """Return level and standard deviation (poses, towers)."""
         level, sd = np.full((2, len(poses), len(towers)), np.nan)
         heading, up = bearing_deg(poses.rotation[:, :, 0]), poses.rotation[:, :, 2]
         for tower, source in sources.items():
@@ -281,12 +282,12 @@ def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> C
 
 
 def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFAULT) -> JobOutcome:
-    """Write the channel along a flight in each format that is asked for.
+    """Write the channel along a flight in each requested format.
 
     Parameters
     ----------
     flight : Path
-        flight.yaml: with its logs, with a plan, or with a route beside it.
+        flight.yaml with logs, with a plan, or with a route in ``chosen``.
     chosen : ChannelOptions
     options : RunOptions
         ``out`` is ``reports/channel-NAME`` by default.
@@ -295,24 +296,24 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
     -------
     JobOutcome
     """
-    # the second time "all" is spelled out, so that a missing library is told before hours of replay
+    # the second call expands "all", so that a missing library is reported before hours of replay
     formats = chosen_formats(chosen_formats(chosen.formats, FORMATS), FORMATS)
     settings, stages = load_with_learned(flight), Stages(options.progress)
     root, route = options.logs_root or flight.parent, chosen.route
     if route is None and settings.flight.plan and not all((root / log.path).exists() for log in settings.logs):
-        route = flight  # not flown yet: its plan
+        route = flight  # not flown yet: use its plan
     inputs = [*inputs_of_flight(settings, flight, root), *([] if route is None else target_files(route, None, root))]
     folder = options.out or Path("reports") / f"channel-{settings.flight.name}"
     with OutputFolder(folder, job="channel", inputs=inputs, force=options.force) as output:
         with stages("read"):
             data = (load_data if route is None else unread)(settings, flight.parent, options.logs_root)
         with output.filling() as place:
-            # formats that grow part by part are bounded by the disk, the others by the memory
+            # formats written part by part are limited by the disk, the others by memory
             room = shutil.disk_usage(place).free if STREAMED.issuperset(formats) else None
             parts = channel_parts(data, replace(chosen, route=route), stages, room)
             written, metrics = write_channel(parts, place, formats, stages)
         files = output.placed(written)
-        # of a route: its towers stand, and what is said of nodes that move along a track is not of it
+        # warnings about the track do not concern a route
         read = data.warnings if route is None else [f"{text}." for text in data.site.cautions()]
         warnings = [*read, *metrics.pop("warnings")]
         metrics |= {"files": [*map(str, files)], "warnings": warnings, "stages": stages.seconds}

@@ -84,7 +84,7 @@ _TILED_ABOVE, _TILE_CELLS, SHOWN_POSITIONS = 1_000_000, 128, 20_000
 
 @dataclass(frozen=True, slots=True)
 class MapSettings:
-    """Settings of a map; the defaults are the paper's (arXiv 2502.10324, table II and section VII).
+    """Settings of a map. The defaults are the paper's (arXiv 2502.10324, table II and section VII).
 
     Parameters
     ----------
@@ -399,8 +399,8 @@ class MapOutcome:
 
     ``maps`` has the maps by foliage mode, for a map in tiles at the positions in ``tiles``. ``studies`` treats
     positions out of coverage as missing ("missing"), as rank 0 ("zero"), and as rank 0 with M random instead of the M
-    nearest samples ("random"). ``draws`` has the scores of "random" for :data:`DRAWS` draws. ``blocks`` has the errors of each
-    interpolator on held-out square blocks.
+    nearest samples ("random"). ``draws`` has the scores of "random" for :data:`DRAWS` draws. ``blocks`` has the errors
+    of each interpolator on held-out square blocks.
     """
 
     site: Site

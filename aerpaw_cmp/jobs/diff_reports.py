@@ -1,4 +1,4 @@
-"""``aerpaw-cmp diff``: two reports of one flight, read back from their folders and compared on common samples."""
+"""The ``diff`` job: read two reports of one flight and compare them on common samples."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SIMULATED = "simulated_rank_k"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadReport:
-    """A report as it lies on the disk: metrics.json and its tables of samples."""
+    """A report on the disk: metrics.json and its tables of samples."""
 
     place: Path
     files: tuple[Path, ...]
@@ -42,7 +42,7 @@ class ReadReport:
 
 
 def run_diff(first: Path, second: Path, *, out: Path | None = None, force: bool = False) -> ReportDiff:
-    """Compare two reports; with ``out`` also write ``diff.html`` and ``diff.json`` there.
+    """Compare two reports, and write ``diff.html`` and ``diff.json`` into ``out`` if it is given.
 
     Parameters
     ----------
@@ -51,19 +51,19 @@ def run_diff(first: Path, second: Path, *, out: Path | None = None, force: bool 
     out : Path, optional
         Folder of the results.
     force : bool
-        Write into a folder that holds files of others.
+        Also write into a folder with files of other programs.
 
     Returns
     -------
     ReportDiff
-        What differs in settings, inputs, levels and ranks, and by how much.
+        Differences of settings, inputs, levels and ranks.
 
     Raises
     ------
     UsageError
-        Reports of different flights.
+        If the reports are of different flights.
     InputError
-        What is no report, is of an older version, or is damaged.
+        If a folder is not a report, is of an older version, or is damaged.
     """
     first_report, second_report = _read_report(first), _read_report(second)
     _same_flight(first_report, second_report)
@@ -82,12 +82,12 @@ def run_diff(first: Path, second: Path, *, out: Path | None = None, force: bool 
 
 
 def _read_report(place: Path) -> ReadReport:
-    """Read what a report wrote.
+    """Read metrics.json and the tables of a report.
 
     Raises
     ------
     InputError
-        With what was found, what was expected, and the likely cause.
+        If a file is missing, damaged or of another kind.
     """
     metrics = read_metrics(place / "metrics.json", place)
     files = {kind: place / f"{kind}.csv" for kind in ("rss", "rank")}
@@ -105,16 +105,16 @@ def _read_report(place: Path) -> ReadReport:
 
 
 def read_metrics(file: Path, named: Path) -> dict[str, Any]:
-    """The numbers of a report, ``named`` by its folder or by the file itself."""
+    """Read the numbers of a report, ``named`` by its folder or by the file."""
     if not file.is_file():
         foreign = next((n for n in ("campaign.json", "diff.json") if (named / n).is_file()), None)
         raise InputError(
             "there is no metrics.json" if named.is_dir() else "there is no such file or folder",
             expected="the folder of a report, or its metrics.json",
-            cause=None if foreign is None else f"the folder holds {foreign}: only reports of a flight can be compared",
+            cause=None if foreign is None else f"the folder has {foreign}: only reports of a flight can be compared",
             path=named,
         )
-    with parsing(file, "metrics.json of a report", "a torn copy"):
+    with parsing(file, "metrics.json of a report", "a truncated copy"):
         content = json.loads(read_bounded(file, LARGEST_TABLE, "metrics.json"))
     missing = [
         key for key in _NEEDED if not isinstance(content, dict) or not isinstance(content.get(key), _NEEDED[key])
@@ -126,7 +126,7 @@ def read_metrics(file: Path, named: Path) -> dict[str, Any]:
         missing = ["rss"]
     if missing:
         raise InputError(
-            f"has no {', '.join(map(repr, missing))} as a report writes it",
+            f"has no {', '.join(map(repr, missing))}, which every report writes",
             expected="metrics.json of `aerpaw-cmp report`",
             cause="a map, a calibration, or a report of another version: run the report again",
             path=file,
@@ -135,16 +135,16 @@ def read_metrics(file: Path, named: Path) -> dict[str, Any]:
 
 
 def _table(path: Path, kind: str, columns: Sequence[str]) -> Any:
-    """A table of samples; every fault of it names its line."""
+    """Read a table of samples. Errors name the line."""
     import pandas as pd
 
     texts = {name: "str" for name in ("time_utc", "tower", "channel", "unit") if name in columns}
-    with parsing(path, f"the table {kind}.csv beside metrics.json", "a damaged or edited file"):
+    with parsing(path, f"the table {kind}.csv in the folder of metrics.json", "a damaged or edited file"):
         content = read_bounded(path, LARGEST_TABLE, f"{kind}.csv")
         # a tower may be named NA or nan; read in chunks, a column could get two types
         table = pd.read_csv(BytesIO(content), dtype=texts, keep_default_na=False, na_values=[""], low_memory=False)
     if not content.endswith(b"\n"):
-        raise InputError("the last line does not end", cause="a torn copy", path=path, line=len(table) + 1)
+        raise InputError("the last line does not end", cause="a truncated copy", path=path, line=len(table) + 1)
     if missing := [name for name in columns if name not in table.columns]:
         raise InputError(
             f"has no column {missing[0]!r}", expected=f"the columns of {kind}.csv", cause="an older version", path=path
@@ -158,14 +158,14 @@ def _table(path: Path, kind: str, columns: Sequence[str]) -> Any:
     torn = table["tower"].isna() | table["time_s"].isna()
     if torn.any():
         row = int(np.flatnonzero(torn.to_numpy())[0])
-        raise InputError("a row without a tower or a time", cause="a torn line", path=path, line=row + 2)
+        raise InputError("a row without a tower or a time", cause="a truncated line", path=path, line=row + 2)
     text = [name for name in texts if name in table]
     table[text] = table[text].fillna("").map(unguarded)
     return table
 
 
 def _same_flight(first: ReadReport, second: ReadReport) -> None:
-    """UsageError for reports that have neither name nor log in common."""
+    """Raise UsageError for reports that have neither name nor log in common."""
     names = [side.metrics["flight"] for side in (first, second)]
     logs = [{i.get("sha256") for i in side.metrics["inputs"] if i.get("reader")} for side in (first, second)]
     if names[0] != names[1] and not logs[0] & logs[1]:
@@ -181,7 +181,7 @@ def _same_flight(first: ReadReport, second: ReadReport) -> None:
 
 
 def _compare_reports(first: ReadReport, second: ReadReport) -> ReportDiff:
-    """Everything that differs between two reports."""
+    """Return the differences between two reports."""
     levels, residuals, places = _levels(first, second)
     alone = [sorted(_links(a) - _links(b)) for a, b in ((first, second), (second, first))]
     return ReportDiff(
@@ -200,10 +200,10 @@ def _compare_reports(first: ReadReport, second: ReadReport) -> ReportDiff:
 
 
 def _learned_here(first: ReadReport, second: ReadReport) -> Iterator[str]:
-    """Links whose model was learned from this very log in one of the reports."""
+    """Yield a remark on the links of each report whose model was learned from this flight's log."""
     for side in (first, second):
         if names := [" ".join(link).strip() for link, n in links_of(side.metrics["rss"]).items() if n.get(KEY)]:
-            yield f"{side.place}: {', '.join(names)}: learned from this flight's own log; no error is compared."
+            yield f"{side.place}: {', '.join(names)}: learned from this flight's own log, so errors are not compared."
 
 
 def _side(side: ReadReport) -> ReportSide:
@@ -222,7 +222,7 @@ def _links(side: ReadReport) -> set[str]:
 
 
 def flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and plain values of nested settings; entries of a list by their number."""
+    """Yield dotted keys and plain values of nested settings. Entries of a list have their number as key."""
     if isinstance(value, Mapping) and value:
         for name, item in value.items():
             yield from flat(item, f"{key}.{name}" if key else str(name))
@@ -234,7 +234,7 @@ def flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _entries(first: Any, second: Any) -> Iterator[Entry]:
-    """Keys whose values differ."""
+    """Yield the keys whose values differ."""
     first_values, second_values = dict(flat(first)), dict(flat(second))
     for key in [*first_values, *(key for key in second_values if key not in first_values)]:
         if (key in first_values) != (key in second_values) or first_values[key] != second_values[key]:
@@ -242,7 +242,7 @@ def _entries(first: Any, second: Any) -> Iterator[Entry]:
 
 
 def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterator[InputEntry]:
-    """Files that were added, removed or changed; the same content elsewhere is the same."""
+    """Yield files that were added, removed or changed. A moved file with the same content is unchanged."""
     sides = [{(i.get("role", ""), i["path"]): i.get("sha256") for i in side} for side in (first, second)]
     contents = [{(role, digest) for (role, _), digest in side.items()} for side in sides]
     for role, path in dict.fromkeys([*sides[0], *sides[1]]):
@@ -256,15 +256,15 @@ def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterat
 
 
 def _matched(mine: Any, theirs: Any) -> tuple[verdict.Overlap, Any, Any]:
-    """Rows of two tables of one link at the same instant, in time order; several at one instant in their order."""
+    """Return the rows of two tables of one link at common times. Several rows at one time keep their order."""
 
     def keyed(table: Any) -> Any:
-        # without times of day the seconds after the first sample say when
+        # logs without times of day have seconds after the first sample
         instant = table["time_utc"].where(table["time_utc"] != "", table["time_s"].map("{:.4f}".format))
         return table.assign(_key=instant, _turn=instant.groupby(instant).cumcount()).set_index(["_key", "_turn"])
 
     first, second = keyed(mine), keyed(theirs)
-    # most pairs: two reports of the same logs, whose join would take most of the time
+    # the usual case of two reports of the same logs, where a join would take most of the time
     if first.index.equals(second.index):
         return verdict.Overlap(first=len(first), second=len(second), common=len(first)), first, second
     common = first.index.intersection(second.index, sort=False)
@@ -276,12 +276,12 @@ def _values(table: Any, name: str) -> FloatArray:
     return np.asarray(table[name], dtype=np.float64)
 
 
-# Instants [s] of the common samples of a link, and the residuals of the second and of the first report.
+# Times [s] of the common samples of a link, and the residuals of the second and of the first report.
 _Residuals = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def _instants(table: Any) -> FloatArray:
-    """Seconds after one instant for all links; without times of day, after each link's first sample."""
+    """Return seconds since 1970. For logs without times of day, seconds after the first sample of the link."""
     import pandas as pd
 
     known = pd.to_datetime(table["time_utc"].where(table["time_utc"] != ""), utc=True, errors="coerce")
@@ -290,14 +290,14 @@ def _instants(table: Any) -> FloatArray:
 
 
 def _places_m(table: Any) -> FloatArray:
-    """Position (n, 3) of each sample [m]."""
+    """Return the position of each sample, shape (n, 3) [m]."""
     return np.column_stack([_values(table, name) for name in ("east_m", "north_m", "up_m")])
 
 
 def _levels(
     mine: ReadReport, theirs: ReadReport
 ) -> tuple[list[verdict.LevelDifference], list[_Residuals], list[FloatArray]]:
-    """Each link that both have, and the residuals and positions (n, 3) of its common samples."""
+    """Return the differences of common links, and residuals and positions (n, 3) of their common samples."""
     differences: list[verdict.LevelDifference] = []
     residuals: list[_Residuals] = []
     places: list[FloatArray] = []
@@ -305,7 +305,7 @@ def _levels(
     for (tower, channel), numbers in links_of(mine.metrics["rss"]).items():
         their_numbers = theirs.metrics["rss"].get(tower, {}).get(channel)
         if their_numbers is None or numbers.get(KEY) or their_numbers.get(KEY):
-            continue  # no error of a model is compared on a log that it was learned from
+            continue  # do not compare errors on training logs
         tables = [s.rss[(s.rss["tower"] == tower) & (s.rss["channel"] == channel)] for s in (mine, theirs)]
         overlap, a, b = _matched(*tables)
         first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))

@@ -1,4 +1,4 @@
-"""``aerpaw-cmp explain``: every path of one link at one instant."""
+"""The ``explain`` job: list every path of one link at one time."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ from ..site.site import Site
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Explanation:
-    """One link at one instant.
+    """One link at one time.
 
     Parameters
     ----------
     level_dbm : float
-        Coherent level of the replay, NaN out of coverage: ``simulated_dbm`` of rss.csv with ``rss.field: coherent``.
+        Coherent level of the replay: ``simulated_dbm`` of rss.csv with ``rss.field: coherent``. NaN out of coverage.
     power_sum_dbm : float
-        Of the paths' powers.
+        Sum of the paths' powers.
     absent : tuple of (str, str)
-        Line of sight or ground reflections that are not there, and why.
+        Missing direct path or ground reflections, with the reason.
     """
 
     flight: str
@@ -68,7 +68,7 @@ class Explanation:
     notes: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; what is not finite is None."""
+        """Return plain values for JSON. NaN and infinity become None."""
         absent = [{"path": path, "reason": reason} for path, reason in self.absent]
         return json_object(**(fields_of(self) | {"paths": [path.as_dict() for path in self.paths], "absent": absent}))
 
@@ -83,37 +83,37 @@ def run_explain(
     logs_root: Path | None = None,
     progress: Progress = logged,
 ) -> Explanation:
-    """Explain the link to a tower at the sample nearest to an instant.
+    """Explain the link to a tower at the sample nearest to a time.
 
     Parameters
     ----------
     flight : Path
     time : str
-        Seconds after the first sample of the tower, or ISO 8601; without an offset in the flight's time zone.
+        Seconds after the first sample of the tower, or ISO 8601 (without an offset: in the flight's time zone).
     tower : str
     channel : str, optional
-        Of the RSS logs; "rank" for the rank log. Default: the first series of the tower.
+        Channel of the RSS logs, or "rank" for the rank log. Default: the first series of the tower.
     engine : {"image", "sionna"}, optional
-        Whose paths; default ``rt.engine``.
+        Engine that finds the paths. Default: ``rt.engine``.
     logs_root : Path, optional
     progress : Progress
 
     Returns
     -------
     Explanation
-        The paths of the link with their losses [dB], what is not there and why.
+        The paths of the link with their losses [dB], and missing paths with the reason.
 
     Raises
     ------
     UsageError
-        Unknown tower or channel, a time that is none or lies outside the logs, no pose there.
+        If tower or channel is unknown, the time is malformed or outside the logs, or no pose is known at it.
     """
     settings = load_with_learned(flight)
     data = load_data(settings, flight.parent, logs_root)
     series = _series(data, tower, channel)
     at, seconds = _sample(series, time, settings.timezone)
     link, pose, notes, instant = _pose(data, series, at, progress)
-    if tower in data.nodes:  # as it stood at that moment
+    if tower in data.nodes:  # at its position at that time
         place, known = data.tower_at(tower, instant)
         _check_pose(known, series, at)
         data = dataclasses.replace(data, site=site_with_tower_at(data.site, tower, place[0]))
@@ -124,7 +124,7 @@ def run_explain(
         notes.append(f"{tower} moves: it was at {source[0]:.1f} m east, {source[1]:.1f} m north, {source[2]:.1f} m up")
     paths = _paths(data.site, rt, replayed, link, pose, source)
     if isinstance(series, RssSeries) and settings.rss.field != "coherent":
-        notes.append(f"rss.csv holds rss.field: {settings.rss.field}; the level here is the coherent sum")
+        notes.append(f"rss.csv has rss.field: {settings.rss.field}; the level here is the coherent sum")
     notes += further_path_lines(replayed, np.asarray(source), pose, link)
     measured = float(series.measured_db[at]) if isinstance(series, RssSeries) else None
     return Explanation(
@@ -156,7 +156,7 @@ def _series(data: FlightData, tower: str, channel: str | None) -> RssSeries | Ra
         raise UsageError(
             f"no log of tower {tower!r}",
             expected="one of " + ", ".join(towers),
-            cause="the site has it, the flight has not measured there" if at_site else "a typing error",
+            cause="the site has this tower, but the flight has no log of it" if at_site else "a typing error",
         )
     if channel is None:
         return mine[list(mine)[-1]]
@@ -166,7 +166,7 @@ def _series(data: FlightData, tower: str, channel: str | None) -> RssSeries | Ra
 
 
 def _sample(series: RssSeries | RankSeries, time: str, zone: str | None) -> tuple[int, float]:
-    """Number of the sample nearest to an instant, and its seconds after the first."""
+    """Return the index of the sample nearest to a time, and its seconds after the first sample."""
     first, last = series.time.min(), series.time.max()
     span = float((last - first) / np.timedelta64(1, "s"))
     instant = _instant(time, first, zone)
@@ -204,17 +204,17 @@ def _instant(text: str, first: Any, zone: str | None) -> Any:
 def _pose(
     data: FlightData, series: RssSeries | RankSeries, at: int, progress: Progress
 ) -> tuple[Link, Poses, list[str], Times]:
-    """Link and pose of a sample, as the report replays it, and its instant (1,) on the telemetry's clock."""
+    """Return link and pose of a sample as in the report, notes, and its time (1,) on the telemetry's clock."""
     rt, notes = data.settings.rt, []
     if isinstance(series, RssSeries):
         time = series.time
         if data.settings.rss.lag == "apply" or isinstance(data.settings.rss.lag, float):
-            receiver = tuple(s for s in data.rss if s.tower == series.tower)  # it has a clock of its own
+            receiver = tuple(s for s in data.rss if s.tower == series.tower)  # each receiver has a separate clock
             clocks = estimate_clocks(dataclasses.replace(data, rss=receiver), progress)
             clock = clocks[[s is series for s in receiver].index(True)]
             time = telemetry_time(time, clock)
             if clock is not None and clock.applied_s[at]:
-                notes.append(f"{clock.applied_s[at]:.3f} s are taken off the radio's clock")
+                notes.append(f"{clock.applied_s[at]:.3f} s are subtracted from the radio's clock")
         track = data.poses_at(time[at : at + 1])
         _check_pose(track.valid, series, at)
         return data.link_of(series), valid_poses(track, rt.attitude), notes, time[at : at + 1]
@@ -247,9 +247,9 @@ def _paths(
 
 def _absent(replayed: Replay, source: FloatArray, target: FloatArray) -> Iterator[tuple[str, str]]:
     traced = {tuple(row[row >= 0].tolist()) for row in replayed.paths.faces}
-    otherwise = "geometry allows it: stopped by the terrain, or the ground of another tower"
-    if replayed.engine == "sionna":  # its rays are drawn: too few of them miss paths
-        otherwise = f"nothing is in its way: not found with {replayed.samples} samples per tower"
+    otherwise = "the geometry allows it, but terrain blocks it, or it is on the ground of another tower"
+    if replayed.engine == "sionna":  # with too few rays, Sionna misses paths
+        otherwise = f"not blocked, but not found with {replayed.samples} samples per tower"
     for words, sequence in simple_paths(replayed):
         if tuple(sequence.tolist()) not in traced:
             yield words, why_not(replayed.faces, source, target, sequence, replayed.surfaces) or otherwise

@@ -1,12 +1,11 @@
 """One flight from its data to its numbers: clocks, replay, comparison, audit. Every job on a flight starts here.
 
-A new stage (a ladder of models, the receiver's chain, a further audit) is a function of what stands before it, one
-field of :class:`FlightRun` or of :class:`~aerpaw_cmp.compare.result.FlightResult`, and two lines in :func:`run_flight`.
+To add a stage, write a function of the earlier stages, add a field to :class:`FlightRun` or
+:class:`~aerpaw_cmp.compare.result.FlightResult`, and two lines to :func:`run_flight`.
 
-The ladder of models of a flight: which antennas, attitude, ground, buildings and trees its measurement asks for.
-
-Stages come one after the other (antennas, woods, ground, buildings, relief); each adds variants to the best model so
-far, by the RMSE on held-out segments. Everything but the offset is fixed beforehand.
+The model comparison finds antennas, attitude, ground, buildings and trees that fit the measurement. Its stages
+(antennas, woods, ground, buildings, terrain) each add variants to the best model so far, by the RMSE on held-out
+segments. Only the offset is fitted.
 """
 
 from __future__ import annotations
@@ -56,32 +55,32 @@ from .compare_flight import Levels, compare_flight, fitted_receiver, levels_of
 # Loss of the weakened ground reflection: a smooth half-space reflects more than any field.
 _WEAK_GROUND_DB = 10.0
 
-# A smaller gain is none that a page could show [dB].
+# Smaller gains are not visible on a page [dB].
 _SHOWN_DB = 0.1
 
-# Per series; of longer ones every second, third, ... sample is taken.
+# Largest number of samples per series. A longer series is thinned.
 _MOST_SAMPLES = 4000
 
 AS_SET = "as set in flight.yaml"
 _FREE_SPACE = BASELINE_TITLE["free_space"]
-# Lines that replay nothing: what a model must beat to be worth its name.
+# Models without a replay, which every replay must beat.
 LINES = BASELINE_TITLE["constant"], BASELINE_TITLE["log_distance"]
 
-# Behind the name of a rung that would be scored where it was fitted.
+# Added to the name of a model that would be scored on its training data.
 LEARNED_HERE = " (its antennas were learned on this flight, too: not scored)"
 
 Antennas = Literal["isotropic", "measured", "learned"]
 Ground = Literal["none", "coherent", "weakened", "rough", "power sum"]
-Trees = Literal["none", "p833", "weissberger", "opaque"]
+Trees = Literal["none", "p833", "opaque"]
 Relief = Literal["flat", "offsets", "surface"]
 
-# What the ladder calls the sums and losses of the ground reflection.
+# Names of the sums and losses of the ground reflection.
 _GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "rough": "rough", "power sum": "incoherent"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
-    """One combination of what a replay may hold."""
+    """One combination of the parts of a replay."""
 
     antennas: Antennas = "isotropic"
     attitude: Literal["ignored", "level", "logged"] = "ignored"
@@ -89,17 +88,17 @@ class Model:
     buildings: bool = False
     trees: Trees = "none"
     media: bool = False
-    """The woods that attenuate are media, not single trees."""
+    """True if attenuating woods are media instead of single trees."""
     relief: Relief = "flat"
-    """Ground at the towers and below the paths, in place of that of the flight file."""
+    """Ground at the towers and below the paths, instead of that of the flight file."""
     diffraction: bool = False
-    """Paths over one edge of a building, with the ground on either side."""
+    """Paths over one edge of a building, with ground reflections on both sides."""
     roughness_m: float = 0.0
-    """Of ``ground: rough``: that of the flight file, where it has one."""
+    """Roughness for ``ground: rough``, from the flight file."""
 
     @property
     def name(self) -> str:
-        """Content of the model in words."""
+        """The parts of the model as text."""
         parts = {
             "isotropic": [], "measured": ["antennas"], "learned": ["learned sphere"],
         }[self.antennas]  # fmt: skip
@@ -115,7 +114,7 @@ class Model:
         return _FREE_SPACE if not parts else " + ".join(parts)
 
     def settings(self, max_depth: int) -> dict[str, dict[str, Any]]:
-        """The keys of flight.yaml that make it, ``max_depth`` that of the flight file."""
+        """Return the keys of flight.yaml for this model. ``max_depth`` is that of the flight file."""
         depth = 0 if self.ground == "none" else max(max_depth, 1) if self.buildings else 1
         rt: dict[str, Any] = {
             "max_depth": depth,
@@ -126,7 +125,7 @@ class Model:
         }
         if self.diffraction:
             rt["diffraction"] = "edges"
-        if self.trees in ("p833", "weissberger"):
+        if self.trees == "p833":
             rt["foliage_model"] = self.trees
         return {
             "rt": rt,
@@ -140,7 +139,7 @@ class Model:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightLadder:
-    """The scored ladder; ``models`` are in the order of its rungs (None: the settings of the flight file)."""
+    """The scored models, in the order of ``ladder.rungs``. None is the model of the flight file."""
 
     ladder: Ladder
     models: tuple[Model | None, ...]
@@ -150,14 +149,14 @@ class FlightLadder:
 
     @property
     def recommended(self) -> Model | None:
-        """The recommended model; None where it is that of the flight file, or none."""
+        """The recommended model. None if it is that of the flight file, or if no model is recommended."""
         chosen = self.ladder.recommended
         return None if chosen is None else self.models[chosen]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Series:
-    """One series, thinned: ``rows`` (m,) of its samples, their poses, and which of its replayed poses they are."""
+    """One thinned series: ``rows`` (m,) of its samples, and the indices ``picked`` (m,) of their replayed poses."""
 
     replayed: Replayed
     levels: Levels
@@ -168,7 +167,7 @@ class _Series:
 
 
 def flight_ladder(data: FlightData, replays: FlightReplay) -> FlightLadder | None:
-    """Climb the ladder; None for a flight without RSS, or replayed by rays of another engine than the image method."""
+    """Compare models. None for a flight without RSS, or with another engine than the image method."""
     if not data.rss or data.settings.rt.engine != "image":
         return None
     return _Climber(data, [_sampled(data.rss, i, r, data.settings.rss) for i, r in enumerate(replays.rss)]).climb()
@@ -185,7 +184,7 @@ def _sampled(rss: Sequence[RssSeries], index: int, replayed: Replayed, rules: Rs
 
 
 class _Climber:
-    """Evaluates models on the series of a flight, each search of paths once."""
+    """The evaluation of models on the series of a flight, with one search per set of paths."""
 
     def __init__(self, data: FlightData, series: Sequence[_Series]) -> None:
         self._data, self._series = data, series
@@ -202,14 +201,14 @@ class _Climber:
             (link.carrier_hz, self._sources(s, data.site).tobytes(), self._poses(s, "ignored").position_m.tobytes())
             for link, s in zip(self._links, series, strict=True)
         ]
-        self._like = [ways.index(way) for way in ways]  # by series, the first one with the same paths
+        self._like = [ways.index(way) for way in ways]  # for each series, the first series with the same paths
 
     def climb(self) -> FlightLadder:
-        """All stages."""
+        """Run all stages."""
         rungs = self._lines()
         models: list[Model | None] = [None] * len(rungs)
         best = Model()
-        # a wood takes more than a reflection, which is not seen before it is known
+        # woods first: their loss is larger than the effect of a reflection and would hide it
         for stage in (self._antennas, self._trees, self._ground, self._buildings, self._edges, self._relief):
             for model in stage(best):
                 if model not in models:
@@ -230,9 +229,9 @@ class _Climber:
         return self._better_than_set(self._by_flights_left_out(climbed), climbed)
 
     def _better_than_set(self, *climbed: FlightLadder) -> FlightLadder:
-        """The first whose recommended model is better than the flight as set, significantly; else the flight as set.
+        """Return the first comparison whose recommended model is significantly better than the flight as set.
 
-        Nothing is recommended of a flight that taught its own antennas: as set it has no score.
+        Otherwise the flight as set is recommended, or no model if the flight is a training flight without a score.
         """
         better = (each for each in climbed if self._is_better(each.ladder) and not self._contradicts(each))
         ladder, last = climbed[-1].ladder, len(climbed[-1].ladder.rungs) - 1
@@ -244,8 +243,8 @@ class _Climber:
     def _contradicts(self, climbed: FlightLadder) -> bool:
         """Check whether a model ignores the attitude that its learned antennas were learned with.
 
-        On a third of a flight that once gained 0.4 dB, and on the complete flight it cost 2.1 dB: the flights that the
-        antennas were learned from outweigh a part of one.
+        On a third of a flight such a model gained 0.4 dB, and on the complete flight it lost 2.1 dB. The training
+        flights of the antennas are stronger evidence than a part of one flight.
         """
         chosen = climbed.ladder.recommended
         model = None if chosen is None else climbed.models[chosen]
@@ -254,15 +253,15 @@ class _Climber:
         return model is not None and known and (model.antennas, model.attitude) == ("learned", "ignored")
 
     def _is_better(self, ladder: Ladder) -> bool:
-        """Check that a recommended model gains on the last rung, the flight as set, over all series at once.
+        """Check that a recommended model is better than the flight as set and than a constant, over all series.
 
-        And on the first, a constant level: at one place every model is its offset, and the flattest model gains.
+        The constant is needed because at one position every model is only an offset, and the flattest model is best.
         """
         if ladder.recommended is None:
             return False
         chosen = ladder.error_db[ladder.recommended]
-        # Both must hold, so neither level is corrected for there being two: whichever of the gains is none is taken for
-        # one by its own test in at most 2.5 %, hence both are (intersection-union, Berger 1982, doi 10.2307/1267823).
+        # Both tests must pass, so no correction for two tests is needed: if one gain is not real, its test passes in at
+        # most 2.5 %, and so do both (intersection-union, Berger 1982, doi 10.2307/1267823).
         for other in (ladder.error_db[0], ladder.error_db[-1]):
             columns = [(s.time_s, a, b) for s, a, b in zip(self._series, chosen, other, strict=True)]
             pair = pooled_difference(columns, free_offset=False, place_m=ladder.position_m)
@@ -271,7 +270,7 @@ class _Climber:
         return True
 
     def _by_flights_left_out(self, climbed: FlightLadder) -> FlightLadder:
-        """The learned model, as it was calibrated, where flights left out say that it beats free space."""
+        """Recommend the learned model as calibrated, if it beats free space on held-out flights."""
         antennas = (self._offer or self._data.settings).antennas
         errors = [errors_elsewhere(antennas, series, self._data.folder)[0] for series in self._data.rss]
         known = [error for error in errors if error is not None]
@@ -296,7 +295,7 @@ class _Climber:
             [s.replayed.poses.position_m[s.picked] for s in self._series],
         )
 
-    # the stages: what may be added to the best model so far
+    # the stages, which add parts to the best model so far
 
     def _antennas(self, _best: Model) -> list[Model]:
         patterns = [p for link in self._links for a in _arrays(link) for p in a.patterns]
@@ -325,7 +324,7 @@ class _Climber:
         return [dataclasses.replace(best, buildings=True)]
 
     def _edges(self, best: Model) -> list[Model]:
-        # where the flight asks for them: they were the dearest rung, and the best on none of 28 real series
+        # only if the flight has diffraction: it is the slowest model, and the best on none of 28 real series
         moving = any(s.replayed.tower_m is not None for s in self._series)
         site, asked = self._data.site, self._data.settings.rt.diffraction != "none"
         if not asked or not site.buildings or site.scene is not None or moving:
@@ -341,12 +340,12 @@ class _Climber:
         return [dataclasses.replace(best, trees=kind, media=media and kind != "opaque") for kind in kinds]
 
     def _relief(self, best: Model) -> list[Model]:
-        # without diffraction: over terrain it costs more than all rungs before, and edges of roofs are as they were
+        # without diffraction, which over terrain takes longer than all earlier models
         return [dataclasses.replace(best, relief=kind, diffraction=False) for kind in self._reliefs]
 
     @cached_property
     def _reliefs(self) -> dict[Relief, Site]:
-        """The site with other grounds that its file knows, where the flight has flat ground and no own node."""
+        """The site with the other grounds of its file, if the flight has flat ground and no separate node."""
         data, flat = self._data, self._data.site
         if flat.dem or flat.scene or data.settings.towers or any(t.ground_m for t in flat.towers.values()):
             return {}
@@ -366,7 +365,7 @@ class _Climber:
     def _lines(self) -> list[Rung]:
         zeros = tuple(np.zeros(len(s.rows)) for s in self._series)
         ray_m = tuple(s.replayed.poses.position_m[s.picked] - self._sources(s, self._data.site) for s in self._series)
-        # a pose in the place of the antenna has no logarithm
+        # avoid the logarithm of 0 at the position of the antenna
         range_db = tuple(10.0 * np.log10(np.maximum(np.linalg.norm(a, axis=1), 0.1)) for a in ray_m)
         return [
             Rung(model=name, level_db=zeros, seconds=0.0, regressor_db=x)
@@ -382,7 +381,7 @@ class _Climber:
         return Rung(model=AS_SET, level_db=levels, seconds=seconds)
 
     def _of_flight(self, seconds: Sequence[float]) -> float:
-        """Seconds of a flight from those of its series: channels that share a replay cost it once."""
+        """Return the seconds of a flight. Channels with a common replay are counted once."""
         shared: dict[tuple[str, str], float] = {}
         for series, cost_s in zip(self._data.rss, seconds, strict=True):
             key = series.tower, series.settings_key
@@ -391,7 +390,7 @@ class _Climber:
 
     @cached_property
     def _learned_here(self) -> bool:
-        """True if antennas or settings of the flight file were learned from a log of this very flight."""
+        """True if antennas or settings of the flight file were learned from a log of this flight."""
         pairs = zip(self._data.rss, self._links, strict=True)
         return any(learned_here(self._data, series, link) for series, link in pairs)
 
@@ -406,7 +405,7 @@ class _Climber:
         )
 
     def _level(self, index: int, model: Model) -> tuple[FloatArray, float]:
-        """Level (m,) [dBm] at the thinned samples of a series, and the seconds that the whole series would take."""
+        """Return the level (m,) [dBm] at the thinned samples of a series, and the seconds for all samples."""
         series, link, site = self._series[index], self._links[index], self._site(model.relief)
         if model.antennas == "isotropic":
             link = _isotropic_link(link)
@@ -425,8 +424,8 @@ class _Climber:
         return level, series.step * (search_s + time.perf_counter() - begin)
 
     def _paths(self, index: int, model: Model) -> tuple[Replay, PathSet, list[FloatArray | None], float]:
-        """Replay with the paths of a model, those without an edge that it takes, losses [dB] of both, and seconds."""
-        # antennas and attitude change no path and no loss
+        """Return the replay, its paths without an edge for a model, their losses [dB], and the seconds."""
+        # antennas and attitude do not change paths and losses
         key = self._like[index], dataclasses.replace(model, antennas="isotropic", attitude="ignored")
         if key not in self._lost:
             traced, search_s = self._traced_for(index, model)
@@ -441,8 +440,8 @@ class _Climber:
         return self._lost[key]
 
     def _traced_for(self, index: int, model: Model) -> tuple[Replay, float]:
-        """Replay between single elements, and its seconds."""
-        direct = model.relief != "flat" and model.ground == "none"  # reflections off shaped ground are costly to find
+        """Return the replay between single elements, and its seconds."""
+        direct = model.relief != "flat" and model.ground == "none"  # the search of reflections off terrain is slow
         key = self._like[index], model.buildings, model.diffraction, model.relief, direct
         if key not in self._traced:
             begin = time.perf_counter()
@@ -462,7 +461,7 @@ class _Climber:
         return self._traced[key]
 
     def _sources(self, series: _Series, site: Site) -> FloatArray:
-        """Place of the tower: (1, 3), or (m, 3) at the thinned samples where it moves."""
+        """Return the position of the tower: (1, 3), or (m, 3) at the thinned samples of a moving tower."""
         places = series.replayed.source_m(site)
         return places if series.replayed.tower_m is None else places[series.picked]
 
@@ -477,7 +476,7 @@ def _arrays(link: Link) -> list[Any]:
 
 
 def _isotropic_link(link: Link) -> Link:
-    """The link with isotropic elements."""
+    """Return the link with isotropic elements."""
 
     def other(array: Any) -> Any:
         return dataclasses.replace(array, patterns=tuple(Isotropic() for _ in array.patterns))
@@ -489,18 +488,18 @@ def _isotropic_link(link: Link) -> Link:
 def recommended_changes(
     settings: FlightFile, stated: Mapping[str, Any], model: Model, offered: Mapping[str, str] | None = None
 ) -> dict[KeyPath, Any]:
-    """Keys of a flight file that a model needs otherwise, by path; None for one that has to go.
+    """Return the keys of a flight file that a model changes, by path. None for a key to remove.
 
     Parameters
     ----------
     settings : FlightFile
-        As set, defaults included.
+        Settings of the flight, including defaults.
     stated : mapping
-        Plain values of the keys that the file states.
+        Plain values of the keys in the file.
     model : Model
         See :attr:`FlightLadder.recommended`.
     offered : mapping of str to str, optional
-        Learned antennas of the site by name, which a learned model takes.
+        Learned antennas of the site by name, for a learned model.
 
     Returns
     -------
@@ -530,7 +529,7 @@ def recommended_changes(
 
 
 def _isotropic(content: Mapping[str, Any], path: KeyPath) -> dict[KeyPath, Any]:
-    """Isotropic antennas in the place of all below some keys of a link."""
+    """Return the changes to isotropic antennas below some keys of a link."""
     iso, changes = {"model": "iso"}, dict[KeyPath, Any]()
     for key, value in content.items():
         if key in ("antenna", "antennas"):
@@ -542,7 +541,7 @@ def _isotropic(content: Mapping[str, Any], path: KeyPath) -> dict[KeyPath, Any]:
 
 
 def check_recommended(data: FlightData) -> None:
-    """Refuse to recommend a model for a flight without RSS, or with rays of another engine than the image method."""
+    """Refuse to recommend a model for a flight without RSS, or with another engine than the image method."""
     if not data.rss or data.settings.rt.engine != "image":
         raise _NOT_RECOMMENDED
 
@@ -568,24 +567,24 @@ def recommended_text(settings: FlightFile, ladder: FlightLadder | None, flight: 
     if ladder.recommended is None:
         return text, f"No model is significantly better than {flight.name}: the recommended file is a copy of it."
     text = edited(text, recommended_changes(settings, yaml.safe_load(text), ladder.recommended, ladder.offered))
-    parse_yaml(text, FlightFile)  # a flight file that its own reader refuses is a fault of ours
+    parse_yaml(text, FlightFile)  # the reader must accept the written file
     return text, f"The recommended file has the settings of the model '{ladder.recommended.name}'."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightRun:
-    """Record of what was computed of one flight.
+    """The results of one flight.
 
     Parameters
     ----------
     data : FlightData
-        As read: settings, site, logs, track, series.
+        Settings, site, logs, track, series.
     replays : FlightReplay
         Poses, paths, fields and clock of every series.
     result : FlightResult
-        Numbers alone.
+        Numbers of the comparison.
     ladder : FlightLadder, optional
-        Which models the measurement asks for.
+        Model comparison.
     """
 
     data: FlightData
@@ -603,7 +602,7 @@ def run_flight(
     anew: bool = False,
     ladder: bool = False,
 ) -> FlightRun:
-    """Clocks, replay, comparison, audit and ladder.
+    """Run clocks, replay, comparison, audit and model comparison.
 
     Parameters
     ----------
@@ -611,18 +610,18 @@ def run_flight(
     stages : Stages, optional
         Times "clocks", "replay", "compare", "audit" and "ladder".
     replays : FlightReplay, optional
-        Of this flight, where they were made before (:func:`~aerpaw_cmp.flight.replay.replay_flight`).
+        Existing replays of this flight (:func:`~aerpaw_cmp.flight.replay.replay_flight`).
     audit : bool
-        Also fill ``result.engine``, with the audit by the other engine where ``rt.audit_links`` asks for it.
+        Also fill ``result.engine``, with an audit by the other engine if ``rt.audit_links`` is above 0.
     anew : bool
-        Audit even what this machine audited before.
+        Ignore the cached audit.
     ladder : bool
-        Also score simpler and richer models of the RSS on stretches left out.
+        Also score simpler and richer models of the RSS on held-out segments.
 
     Returns
     -------
     FlightRun
-        Replays, numbers of the comparison, and the ladder where it was asked for.
+        Replays, numbers of the comparison, and the model comparison if requested.
     """
     stages = stages or Stages()
     replays = replays or replay_flight(data, stages)
@@ -649,9 +648,9 @@ def run_flight(
 
 
 def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
-    """Return the stages of a report of a flight that was read, for its dry run; ``figures`` as for the report.
+    """Return the stages of a report for its dry run. ``figures`` is as for the report.
 
-    One pose of every series is replayed and the receiver is read, so that a dry run refuses what the run would refuse.
+    One pose of every series is replayed and the receiver is read, so that errors of the run appear in the dry run.
     """
     try_replay(data)
     for series in data.rank:
@@ -673,7 +672,7 @@ def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
 
 
 def unrivalled(cause: Cause | None, climbed: FlightLadder | None) -> Cause | None:
-    """The likely cause; None of a function of direction where the recommended model gains as much as it does."""
+    """Return the likely cause. None for a function of direction if the recommended model explains as much."""
     if cause is None or cause.name not in OF_DIRECTION or climbed is None or climbed.recommended is None:
         return cause
     at, rmse_db = climbed.ladder.recommended, climbed.ladder.rmse_db
@@ -682,7 +681,7 @@ def unrivalled(cause: Cause | None, climbed: FlightLadder | None) -> Cause | Non
 
 
 def next_step(data: FlightData, result: FlightResult, climbed: FlightLadder | None) -> str | None:
-    """A wider search of the offset, the step against the likely cause, or a model that is better than the one as set.
+    """Return the next step: a wider offset search, the step for the likely cause, or a better model.
 
     Parameters
     ----------
@@ -693,11 +692,11 @@ def next_step(data: FlightData, result: FlightResult, climbed: FlightLadder | No
     Returns
     -------
     str or None
-        A clause; without any of these that of the comparison, and None for a training flight.
+        A clause, by default that of the comparison. None for a training flight.
     """
     beyond = [panel for panel in result.rss if panel.score.at_edge]
     if beyond:
-        # the offset is added to the measurement; ten further decibels, so that no edge is touched again
+        # the offset is added to the measurement; 10 dB more, so that the new optimum is not at an edge
         missing = [float(np.nanmedian(panel.simulated_dbm - panel.measured_db)) for panel in beyond]
         low, high = data.settings.rss.span_db
         ends = (

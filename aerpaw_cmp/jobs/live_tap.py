@@ -1,4 +1,4 @@
-"""``tap`` as a job: one modem or several, with a page where it is wanted."""
+"""The ``tap`` job: one modem or several, and the live page."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..live.feed import Feed
 from ..live.ports import Stop, TapSettings, TapStatus, TapSummary
 from ..live.tap import Tap
 
-# Environment variable with the token of a page beyond the loopback: so that it outlives a restart of the tap.
+# Environment variable with the token of a page beyond the loopback, so that it is the same after a restart.
 TOKEN = "AERPAW_CMP_WEB_TOKEN"
 
 
@@ -32,9 +32,9 @@ class Shown:
     web : str, optional
         HOST:PORT of the page; None: no page.
     flight, telemetry : Path, optional
-        flight.yaml that predicts, and the growing telemetry log.
+        flight.yaml of the prediction, and the growing telemetry log.
     say : callable
-        Gets a line for the terminal.
+        Receives a line for the terminal.
     """
 
     web: str | None
@@ -51,12 +51,12 @@ def tap_modems(
     Parameters
     ----------
     settings : TapSettings
-        Of each; ``port`` and, of several, a folder in ``folder`` are set here.
+        Settings of each modem. ``port``, and for several modems a folder in ``folder``, are set here.
     ports : sequence of str or None
         None: the first AT port of a Quectel modem.
     shown : Shown
     on_status : callable
-        Gets the name of the modem (empty where there is only one) and its status.
+        Receives the name of the modem (empty if there is only one) and its status.
 
     Returns
     -------
@@ -75,9 +75,9 @@ def tap_modems(
         if shown.web is not None:
             feed = Feed(names)
             _serve(stack, feed, twin, shown, ", ".join(names))
-        stop = stack.enter_context(Stop())  # nothing is logged before, so nothing has to end in order
+        stop = stack.enter_context(Stop())  # no log is open before, so an earlier stop needs no care
         alone = len(ports) == 1
-        # one after another: each replays the route that is ahead
+        # one after the other, because each replays the planned route
         predictors = [None if twin is None else twin.predictor() for _ in ports]
 
         def session(number: int) -> TapSummary:
@@ -105,7 +105,7 @@ def _twin(shown: Shown) -> Any:
 
 
 def _serve(stack: contextlib.ExitStack, feed: Feed, twin: Any, shown: Shown, title: str) -> None:
-    """Build the page, serve it as long as the stack lasts, and say where."""
+    """Build the page, serve it until the stack ends, and print its address."""
     from ..live.web import Address, Page, WebServer
     from ..report.live import live_page
 
@@ -118,12 +118,11 @@ def _serve(stack: contextlib.ExitStack, feed: Feed, twin: Any, shown: Shown, tit
 
 
 def _together(session: Callable[[int], TapSummary], count: int, stop: Stop) -> list[TapSummary]:
-    """Run sessions at once, each in its thread; the first fault at a start ends all."""
+    """Run sessions in parallel threads. An error in one session ends all."""
 
     def run(number: int) -> TapSummary:
         try:
             return session(number)
-        # whatever ends one session ends all
         except BaseException:
             stop("error")
             raise
@@ -133,7 +132,7 @@ def _together(session: Callable[[int], TapSummary], count: int, stop: Stop) -> l
 
 
 def _names(paths: Sequence[str]) -> list[str]:
-    """Short names, each once."""
+    """Return short, unique names."""
     names = [Path(path).name or path for path in paths]
     return [name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names, 1)]
 
@@ -150,7 +149,7 @@ def _ended(folder: Path, summaries: Sequence[TapSummary], twin: Any) -> dict[str
 
 
 def _report_commands(folder: Path, twin: Any) -> list[str]:
-    """Commands that make the report of a tapped flight."""
+    """Return the commands for a report of a tapped flight."""
     log = shlex.quote(str(folder))
     telemetry = "VEHICLEOUT_LOG" if twin is None else shlex.quote(str(twin.telemetry))
     zone = "ZONE" if twin is None else twin.settings.timezone

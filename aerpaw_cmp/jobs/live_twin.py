@@ -1,4 +1,4 @@
-"""The flight beside the tap: the replay at the present pose, its map for the page, the same flight flown again."""
+"""The live prediction of a tap: the replay at the current pose, its map for the page, and a simulated repeat flight."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from ..report.live import LiveMap
 from ..site.site import Site
 
 _MAP_HEIGHTS_M = (10.0, 30.0, 50.0, 70.0, 90.0, 110.0)
-# Cells on the longer side of the map behind the flight.
+# Number of cells on the longer side of the background map.
 _MAP_CELLS = 70
 _ROUTE_STEP_S = 2.0
-# Points of the rest of the route in one record.
+# Largest number of points of the remaining route in one record.
 _ROUTE_SHOWN = 40
 _DEMO_OFFSET_DB = -38.0
 _DEMO_FADING_DB = 2.5
@@ -42,7 +42,7 @@ _DEMO_FADING_DB = 2.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveTwin:
-    """A flight file ready to predict: where each pose leads, and at which of its K."""
+    """A flight file prepared for predictions at a pose. ``k`` is the value of K for ranks."""
 
     settings: FlightFile
     site: Site
@@ -52,14 +52,14 @@ class LiveTwin:
 
     @classmethod
     def of(cls, flight: Path, telemetry: Path | None = None) -> LiveTwin:
-        """Twin of a flight file.
+        """Prepare a flight file.
 
         Parameters
         ----------
         flight : Path
-            flight.yaml; the link and the tower of its ``rank`` count, and the middle K.
+            flight.yaml. Link, tower and the middle K of its ``rank`` are used.
         telemetry : Path, optional
-            The growing log; without it, the first telemetry log of the flight file.
+            The growing log. Default: the first telemetry log of the flight file.
         """
         settings = load_with_learned(flight)
         site = choose_site(settings.site, flight.parent)
@@ -74,7 +74,7 @@ class LiveTwin:
         )
 
     def predictor(self) -> Predict:
-        """``predict`` for one modem; it reads the telemetry log on its own."""
+        """Return the prediction function for one modem, which reads the telemetry log."""
         log = _telemetry_log(self.settings)
         follower = TelemetryFollower(
             self.telemetry,
@@ -84,7 +84,7 @@ class LiveTwin:
         return predict_along(follower, partial(self.at, ahead=self.route_ahead()))
 
     def route_ahead(self) -> RouteAhead | None:
-        """Prediction of the planned route that learns in flight; None without a plan."""
+        """Return the prediction of the planned route, which learns during the flight. None without a plan."""
         plan = self.settings.flight.plan
         if plan is None:
             return None
@@ -101,7 +101,7 @@ class LiveTwin:
         return np.asarray(free_space_dbm(tower[None, :], place_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
 
     def at(self, sample: TelemetrySample, ahead: RouteAhead | None = None) -> Prediction:
-        """Prediction at a pose of the telemetry; with ``ahead``, it can learn what is measured there."""
+        """Return the prediction at a pose of the telemetry. With ``ahead`` it also learns from measurements."""
         if not np.isfinite([sample.latitude_deg, sample.longitude_deg, sample.altitude_m]).all():
             return Prediction()
         place, rotation = self._pose(sample)
@@ -119,7 +119,7 @@ class LiveTwin:
     def _learn(
         self, ahead: RouteAhead, place: FloatArray, level: float, utc_ns: int, rsrp_dbm: float
     ) -> dict[str, Any] | None:
-        """The rest of the route for the log and the page, after a record; None between two bins."""
+        """Return the prediction of the remaining route after a record. None between two time bins."""
         free = float(self._free_space(place[None])[0])
         forecast = ahead.add(utc_ns / 1e9, place, rsrp_dbm, {"replay": level, "free space": free})
         if forecast is None:
@@ -134,7 +134,7 @@ class LiveTwin:
         return {"trend": forecast.trend, "level_dbm": median, "interval_dbm": [least, most], "points": shown.tolist()}
 
     def map(self) -> LiveMap:
-        """Predicted rank and level over the site at several heights, the UAV level and heading north."""
+        """Return predicted rank and level over the site at several heights, for a level UAV with heading north."""
         east_min, east_max, north_min, north_max = self.site.area_m
         spacing = max(20.0, max(east_max - east_min, north_max - north_min) / _MAP_CELLS)
         grid = Grid.over_area(self.site.area_m, spacing)
@@ -165,7 +165,7 @@ class LiveTwin:
         return place, rotation_from_aircraft(np.asarray(roll), np.asarray(pitch), np.asarray(sample.yaw_deg))
 
     def _replayed(self, places_m: FloatArray, rotations: FloatArray) -> tuple[Any, FloatArray]:
-        """Rank (n,) at the twin's K and level (n,) [dBm]."""
+        """Return rank (n,) at ``k`` and level (n,) [dBm]."""
         replayed = replay_poses(self.site, self.settings.rt, self.link, Poses(places_m, rotations), engine="image")
         return channel_rank(replayed.h[:, 0], self.k), replayed.rss_dbm[:, 0]
 
@@ -175,7 +175,7 @@ def _telemetry_log(settings: FlightFile) -> LogSettings:
 
 
 class FlownAgain:
-    """The flight of a flight file, flown again from now on, for ``modem-sim``: rank, RSRP, and telemetry that grows.
+    """A simulated repeat of a flight that starts now, for ``modem-sim``: rank, RSRP, and a growing telemetry log.
 
     Parameters
     ----------
@@ -202,10 +202,10 @@ class FlownAgain:
         try:
             self._file = telemetry.open("xb", buffering=0)
         except FileExistsError:
-            raise UsageError("the file is there already", expected="a new name", path=telemetry) from None
+            raise UsageError("the file exists", expected="a new name", path=telemetry) from None
 
     def _levels(self, twin: LiveTwin) -> FloatArray:
-        """RSRP at each line of the telemetry: the replay, an offset, and a fading that remembers two lines."""
+        """Return the RSRP at each line of the telemetry: the replay, an offset, and correlated fading."""
         names = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg")
         rows = self._frame[list(names)].to_numpy(dtype="float64")
         poses = [twin._pose(TelemetrySample(0, *row)) for row in rows]
@@ -215,19 +215,19 @@ class FlownAgain:
         for i in range(1, len(fading)):
             # 0.36 + 0.64 = 1: the variance stays that of one step
             fading[i] = 0.6 * fading[i - 1] + 0.8 * _DEMO_FADING_DB * random.standard_normal()
-        # -140 dBm is the least RSRP that a modem can report
+        # -140 dBm is the lowest RSRP that a modem reports
         return np.asarray(np.nan_to_num(level + _DEMO_OFFSET_DB + fading, nan=-140.0))
 
     @staticmethod
     def _rank_log(settings: FlightFile, folder: Path) -> Callable[[float], int] | None:
-        """Ranks of the flight's first rank log; None: those of the built-in flight."""
+        """Return the ranks of the flight's first rank log. None: use those of the built-in flight."""
         for entry in settings.logs:
             if (ranks := ranks_of(folder / entry.path, entry.options(settings.timezone))) is not None:
                 return ranks
         return None
 
     def rsrp(self, seconds: float) -> float:
-        """RSRP so long after the start [dBm]."""
+        """Return the RSRP at a time after the start [dBm]."""
         return float(np.interp(seconds % self._lasts_s, self._seconds, self._level))
 
     def __call__(self) -> None:
@@ -236,7 +236,7 @@ class FlownAgain:
         while self._due() <= elapsed:
             row = self._frame.iloc[[self._written % len(self._frame)]].copy()
             row["time"] = np.datetime64(self._start_ns + int(self._due() * 1e9), "ns")
-            line = format_vehicle_out(row, self._zone).partition(b",")[2]  # one row is written: its number is ours
+            line = format_vehicle_out(row, self._zone).partition(b",")[2]  # replace the line number
             self._written += 1
             self._file.write(b"%d," % self._written + line)
 

@@ -1,4 +1,4 @@
-"""The ``plan`` command: which flight to fly next, by the standard deviation that each candidate would leave."""
+"""The ``plan`` job: rank candidate flights by how much they would reduce the prediction's standard deviation."""
 
 from __future__ import annotations
 
@@ -54,22 +54,22 @@ from .sources import (
     target_files,
 )
 
-# Target: all directions of the tower seen from the UAV, at all headings.
+# The target of all directions of the tower seen from the UAV, at all headings.
 _SPHERE = "sphere"
 
 _SPHERE_AWAY_M = 150.0
-# Per antenna, while candidates are ranked.
+# Number of targets per antenna in the ranking.
 _MOST_TARGETS = 600
 
-# At points of a target whose heading is open.
+# Number of headings at target points without a heading.
 HEADINGS = 4
 
-# Of one area: geofences are drawn by hand.
+# Largest number of corners of an area: geofences are drawn by hand.
 _MOST_CORNERS = 10_000
-# A target that lies farther outside the geofence throughout, or a geofence outside the site, is refused.
+# A target completely outside the geofence, or a geofence outside the site, is refused beyond this distance [m].
 _FARTHEST_M = 1000.0
 
-# Of the battery, for what a longer flight buys.
+# Shares of the battery for the curve over flight time.
 SHARES = (0.25, 0.5, 0.75, 1.0, 1.5)
 
 _ALLOWED_OUTSIDE_M = 1.0
@@ -84,19 +84,19 @@ class PlanOptions:
     minutes, speed_mps : float
         Battery and speed.
     heights_m : tuple of float
-        Of the tool's own patterns, above take-off.
+        Heights of the tool's patterns, above take-off.
     tower_distance_m : float
-        Least horizontal distance to towers.
+        Smallest horizontal distance to towers.
     fence : Path, optional
-        KML; the area of the site without.
+        KML of the geofence. Default: the area of the site.
     avoid : tuple of Path
         KMLs of no-fly areas.
     routes : tuple of Path
         Further candidates.
     towers : tuple of str
-        Whose antennas count, where no flight names them.
+        Towers whose antennas are considered, if no flight names them.
     target : TargetOptions
-        Heights, spacing and heading of a target that is a grid, and the site where no flight names it.
+        Heights, spacing and heading of a grid as target, and the site if no flight names it.
     """
 
     minutes: float = 15.0
@@ -112,7 +112,7 @@ class PlanOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidate:
-    """A flight to choose: route, pattern (None of a file), why it may not be flown; ranked: what it leaves [dB]."""
+    """A candidate flight: route, pattern (None for a file), reason of a refusal, and the SD after it [dB]."""
 
     route: Route
     pattern: Pattern | None = None
@@ -121,7 +121,7 @@ class Candidate:
 
     @property
     def row(self) -> dict[str, Any]:
-        """For metrics.json."""
+        """The entry of metrics.json."""
         length = {"length_m": self.route.length_m, "minutes": self.route.duration_s / 60.0}
         return {"name": self.route.name, "sd_db": self.sd_db, **length, "refused": self.refused}
 
@@ -129,14 +129,14 @@ class Candidate:
 def _plan_flight(
     target: str, flights: Sequence[NamedFlight], plan: PlanOptions, logs_root: Path | None, stages: Stages
 ) -> PlanPage:
-    """Rank candidate flights by the standard deviation that they would leave over a target.
+    """Rank candidate flights by the standard deviation over a target after each flight.
 
     Parameters
     ----------
     target : str
-        ``sphere``, or what :func:`.sources.find_targets` takes.
+        ``sphere``, or a target of :func:`.sources.find_targets`.
     flights : sequence of NamedFlight
-        That were flown; none: antennas are unknown.
+        Earlier flights. Without them the antennas are unknown.
     plan : PlanOptions
     logs_root : Path or None
     stages : Stages
@@ -144,12 +144,12 @@ def _plan_flight(
     Returns
     -------
     PlanPage
-        Candidates best first, the files of the best, and the standard deviation over the target before and after it.
+        Candidates, best first, the files of the best one, and the standard deviation before and after it.
 
     Raises
     ------
     UsageError, InputError
-        No candidate fits, a target far outside, a route that cannot be read.
+        If no candidate fits, the target is far outside, or a route cannot be read.
     """
     with stages("read"):
         datas, remarks = counted_once([flight.load(logs_root) for flight in flights])
@@ -218,19 +218,19 @@ def _plan_flight(
 
 
 def _sentence(best: Candidate, curve: Sequence[Mapping[str, float]], now_db: float) -> str:
-    """Opening text of the page."""
+    """Return the opening text of the page."""
     minutes = best.route.duration_s / 60.0
     text = (
         f"Fly {best.route.name}: {best.route.length_m / 1000.0:.1f} km, {minutes:.0f} min. It lowers the standard "
         f"deviation over the target from {now_db:.1f} to {best.sd_db:.1f} dB."
     )
     for enough in [p for p in curve if p["minutes"] < 0.9 * minutes][-1:]:
-        text += f" A flight of {enough['minutes']:.0f} min leaves {enough['sd_db']:.1f} dB."
+        text += f" A flight of {enough['minutes']:.0f} min lowers it to {enough['sd_db']:.1f} dB."
     return text
 
 
 def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float], stages: Stages) -> list[Candidate]:
-    """Candidates by what they leave, those that may not be flown last."""
+    """Rank candidates by the standard deviation after them, with refused candidates last."""
     ranked = []
     for number, candidate in enumerate(candidates):
         stages.progress(f"rank {candidate.route.name}", number / len(candidates))
@@ -240,7 +240,7 @@ def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float]
 
 
 def _open_ends(site: Site, plan: PlanOptions) -> dict[str, tuple[str, str]]:
-    """Antennas that nobody has measured: one per tower."""
+    """Return one unmeasured antenna per tower."""
     towers = plan.towers or tuple(site.towers)
     for name in towers:
         if name not in site.towers:
@@ -249,7 +249,7 @@ def _open_ends(site: Site, plan: PlanOptions) -> dict[str, tuple[str, str]]:
 
 
 def _area(site: Site, plan: PlanOptions) -> Any:
-    """Area where a route may run."""
+    """Return the area in which a route is allowed."""
     west, east, south, north = site.area_m
     ground = shapely.box(west, south, east, north)
     fence = ground if plan.fence is None else shapely.union_all(_polygons(plan.fence, site))
@@ -265,7 +265,7 @@ def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
         latitude, longitude = np.array(corners).T
         east, north = site.frame.to_local(latitude, longitude)
         ring = shapely.Polygon(np.column_stack([east, north]))
-        if len(corners) > _MOST_CORNERS or is_tangled(ring):  # what follows is not bounded and hears no Ctrl-C
+        if len(corners) > _MOST_CORNERS or is_tangled(ring):  # a repair has no time limit
             raise InputError(
                 f"an area of {len(corners)} corners that cannot be used",
                 expected=f"at most {_MOST_CORNERS} corners and {MAX_CROSSINGS} crossings of the outline with itself",
@@ -279,11 +279,11 @@ def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
 
 
 def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
-    """The tool's own patterns; those that leave the area on the way between legs are dropped."""
+    """Return the tool's patterns, without those that leave the area between legs."""
     out = []
     shapes = [("lawnmower", 0.0, False), ("lawnmower", 90.0, False), ("lawnmower", 0.0, True), ("cross", 0.0, False)]
     for height, (shape, azimuth, turns), nose in product(plan.heights_m, shapes, NOSES):
-        # where the aircraft turns on its legs all headings are flown already, whichever the nose
+        # a pattern with turns on its legs has all headings for any nose
         if turns and nose != "along":
             continue
         pattern = Pattern(shape=shape, azimuth_deg=azimuth, height_m=height, nose=nose, turns=turns)  # type: ignore[arg-type]
@@ -297,15 +297,15 @@ def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
 
 
 def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
-    """Routes of files, flown at the speed of the plan; why one may not be flown."""
+    """Return routes of files at the speed of the plan, each with the reason if it is refused."""
     out = []
     for path in plan.routes:
         targets = find_targets(path, site, TargetOptions(heights_m=plan.heights_m))
         if targets.kind == "grid" or targets.known.sum() < 2:
-            raise InputError("no route", expected="a .plan, KML, CSV or log with two points or more", path=path)
+            raise InputError("not a route", expected="a .plan, KML, CSV or log with two points or more", path=path)
         place, yaw = targets.position_m[targets.known], targets.yaw_deg[targets.known]
         steps = np.diff(place, axis=0)
-        yaw = np.where(np.isfinite(yaw), yaw, bearing_deg(np.vstack([steps, steps[-1:]])))  # else the nose goes ahead
+        yaw = np.where(np.isfinite(yaw), yaw, bearing_deg(np.vstack([steps, steps[-1:]])))  # else along the course
         ground = site.takeoff_ground_m
         points = [
             Waypoint(east_m=float(p[0]), north_m=float(p[1]), height_m=float(p[2]) - ground, yaw_deg=float(y))
@@ -320,7 +320,7 @@ def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
 
 
 def _corners(points: Sequence[Waypoint]) -> list[Waypoint]:
-    """Waypoints without those that lie straight between their neighbours and keep the yaw."""
+    """Return the waypoints without those on a straight line between their neighbours with the same yaw."""
     place = np.array([(w.east_m, w.north_m, w.height_m) for w in points])
     corners = [points[0]]
     for i in range(1, len(points) - 1):
@@ -333,7 +333,7 @@ def _corners(points: Sequence[Waypoint]) -> list[Waypoint]:
 
 
 def _raised(route: Route, site: Site) -> Route:
-    """Heights above take-off to heights of the site."""
+    """Convert heights above take-off to heights of the site."""
     return replace(route, position_m=route.position_m + np.array([0.0, 0.0, site.takeoff_ground_m]))
 
 
@@ -343,14 +343,14 @@ def _leaves_area(route: Route, area: Any) -> bool:
 
 
 def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, str]]) -> dict[str, LinkSamples]:
-    """Target points (None: all directions) at every antenna, at all headings where the heading is open."""
+    """Return target points (None: all directions) per antenna, at all headings if a point has no heading."""
     out = {}
     for antenna, end in ends.items():
         tower = np.asarray(site.towers[end[0]].position_m)
         if points is None:
             direction = _even_directions(800)
             direction = direction[(direction[:, 2] > 0.03) & (direction[:, 2] < 0.98)]
-            # turns by the golden angle spread headings as evenly as the directions
+            # multiples of the golden angle distribute headings as evenly as directions
             place, yaw = tower + _SPHERE_AWAY_M * direction, 137.508 * np.arange(len(direction)) % 360.0
         else:
             place, yaw = points.position_m[points.known], points.yaw_deg[points.known]
@@ -367,13 +367,13 @@ def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, s
 
 
 def _check_near(what: str, place: Any, area: Any, which: str) -> None:
-    """UsageError where a shape lies farther than :data:`_FARTHEST_M` outside the area."""
+    """Raise UsageError if a shape is farther than :data:`_FARTHEST_M` outside the area."""
     distance_m = shapely.distance(area, place)
     if distance_m > _FARTHEST_M:
         raise UsageError(
             f"the {what} lies {distance_m:.0f} m outside the area {which}",
             expected=f"a {what} within {_FARTHEST_M:g} m of it",
-            cause="another site, or exchanged coordinates",
+            cause="another site, or swapped coordinates",
         )
 
 
@@ -385,7 +385,7 @@ def _samples(route: Route, ends: Mapping[str, tuple[str, str]], site: Site) -> l
 
 
 def _even_directions(count: int) -> FloatArray:
-    """Unit vectors (count, 3) that share the sphere evenly (Fibonacci lattice)."""
+    """Return unit vectors (count, 3) distributed evenly over the sphere (Fibonacci lattice)."""
     k = np.arange(count) + 0.5
     z = 1.0 - 2.0 * k / count
     azimuth = np.pi * (1.0 + math.sqrt(5.0)) * k
@@ -394,7 +394,7 @@ def _even_directions(count: int) -> FloatArray:
 
 
 def _flown_knowledge(series: Sequence[LinkSamples]) -> Known:
-    """Strengths and residual field by the flights that were flown; the model's own without any."""
+    """Return strengths and spatial correction learned from earlier flights, else the defaults of the model."""
     model, residual_field = GainModel(), None
     if series:
         model = learned_antennas(series).model
@@ -404,7 +404,7 @@ def _flown_knowledge(series: Sequence[LinkSamples]) -> Known:
 
 
 def _thinned(samples: LinkSamples, most: int) -> LinkSamples:
-    """Points spread over a target; the step shares no factor with the number of headings."""
+    """Return at most ``most`` samples of a target. The step has no common factor with the number of headings."""
     step = max(1, math.ceil(len(samples) / most))
     step += int(step > 1 and step % 2 == 0)
     return samples.part(np.arange(0, len(samples), step))
@@ -414,14 +414,14 @@ def _rms_of_antennas(sd_db: Mapping[str, FloatArray]) -> FloatArray:
     return np.asarray(np.sqrt(np.mean([sd**2 for sd in sd_db.values()], axis=0)))
 
 
-# Candidates of which the best one counts at each length: a pattern of fewer legs may lie better.
+# Number of best candidates tried at each flight time, because with fewer legs another pattern may be better.
 _CURVE_OF = 3
 
 
 def _curve(
     ranked: Sequence[Candidate], leaves_db: Callable[[Route], float], site: Site, area: Any, plan: PlanOptions
 ) -> list[dict[str, float]]:
-    """Standard deviations that shorter and longer flights of the best candidates leave; of files, shorter ones."""
+    """Return standard deviations after shorter and longer versions of the best candidates. Files get shorter only."""
     out: list[dict[str, float]] = []
     best = [r for r in ranked if not r.refused][:_CURVE_OF]
     for share in SHARES:
@@ -431,13 +431,13 @@ def _curve(
             sd = leaves_db(raised)
             tried.append({"minutes": raised.duration_s / 60.0, "length_m": raised.length_m, "sd_db": sd})
         for point in sorted(tried, key=lambda point: point["sd_db"])[:1]:
-            least = min([point["sd_db"], *(p["sd_db"] for p in out)])  # a longer flight may hold the shorter one
+            least = min([point["sd_db"], *(p["sd_db"] for p in out)])  # a longer flight can include the shorter one
             out.append(point | {"sd_db": least})
     return out
 
 
 def _of_length(candidate: Candidate, share: float, area: Any, plan: PlanOptions) -> Route | None:
-    """A candidate that takes this share of the battery; None of a file for more than it has."""
+    """Return a candidate for this share of the battery. None for more than the length of a file."""
     if candidate.pattern is not None:
         return route_of(candidate.pattern, area, plan.speed_mps, 60.0 * share * plan.minutes)
     full = flown(candidate.route.name, candidate.route.waypoints, plan.speed_mps)
@@ -450,7 +450,7 @@ def run_plan(target: str, flights: Sequence[Path], plan: PlanOptions, options: R
     Parameters
     ----------
     target : str
-        As for :func:`.next_flight.plan_flight`.
+        ``sphere``, or a target of :func:`.sources.find_targets`.
     flights : sequence of Path
     plan : PlanOptions
     options : RunOptions

@@ -1,4 +1,4 @@
-"""A flight in a notebook: ``open_flight("flight.yaml")`` and what can be asked of it."""
+"""The Python interface of a flight: ``open_flight("flight.yaml")`` and the objects that it returns."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def open_flight(
     Parameters
     ----------
     path : path
-        A flight.yaml, or a flight file (HDF5) that ``ingest -o`` or ``Logs.write`` wrote.
+        A flight.yaml, or a flight file (HDF5) of ``ingest -o`` or ``Logs.write``.
     logs_root : path, optional
-        Folder against which the paths of its logs resolve; default its own folder.
+        Folder for the paths of logs. Default: the folder of the flight file.
     overrides : mapping, optional
-        Keys of the flight file in dotted form, changed: ``{"rt.max_depth": 1, "rss.lag": "off"}``.
+        Changed keys of the flight file in dotted form: ``{"rt.max_depth": 1, "rss.lag": "off"}``.
     flight : str, optional
-        Which flight of a flight file that holds several; the message without it names them.
+        Name of the flight, for a flight file with several flights.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def open_flight(
     Raises
     ------
     UsageError, InputError
-        With what was found, expected, and the likely cause.
+        If the flight file or a log is wrong. The message names the likely cause.
 
     Examples
     --------
@@ -72,7 +72,7 @@ def open_flight(
     root = None if logs_root is None else Path(logs_root).expanduser()
     drafted = file.is_file() and is_flight_file(file)
     if flight is not None and not drafted:
-        raise UsageError("flight=NAME beside a flight.yaml", expected="a flight file of several flights", path=file)
+        raise UsageError("flight=NAME with a flight.yaml", expected="a flight file of several flights", path=file)
     written = overridden(_drafted(file, flight) if drafted else load_flight(file), overrides or {})
     data = load_data(with_learned(written, file.parent), file.parent, root)
     for warning in data.warnings:
@@ -82,7 +82,7 @@ def open_flight(
 
 
 def _drafted(file: Path, flight: str | None) -> FlightFile:
-    """Settings that ``ingest --draft`` would write for a flight of a flight file."""
+    """Return the settings that ``ingest --draft`` would write for a flight of a flight file."""
     known = flights_by_name(ingest(file))
     if flight is None and len(known) > 1:
         raise UsageError(f"{len(known)} flights", expected=f"flight='NAME', one of {', '.join(known)}", path=file)
@@ -95,20 +95,20 @@ def _drafted(file: Path, flight: str | None) -> FlightFile:
 
 @from_python
 class Flight:
-    """A checked flight.yaml with its logs read; nothing is replayed before it is asked for.
+    """A checked flight.yaml with its logs. It is replayed only on request.
 
     Parameters
     ----------
     path : Path
-        Of the flight file.
+        Path of the flight file.
     data : FlightData
         Settings, site, logs, track and series.
     logs_root : Path, optional
-        As given.
+        Folder for the paths of logs.
     written : FlightFile, optional
-        Settings as the flight file has them, before learned antennas are added; by default those of ``data``.
+        Settings of the flight file, before learned antennas are added. Default: those of ``data``.
     changed : tuple of str
-        Keys in which its settings are not those of the file.
+        Keys whose settings differ from the file.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class Flight:
 
     @property
     def settings(self) -> FlightFile:
-        """Everything that the flight file says, defaults included."""
+        """The settings of the flight file, including defaults."""
         return self.data.settings
 
     @property
@@ -138,12 +138,12 @@ class Flight:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings that must be known before any number is believed."""
+        """Warnings that concern every number of the flight."""
         return self.data.warnings
 
     @cached_property
     def track(self) -> pd.DataFrame:
-        """Telemetry as poses: ``time east_m north_m up_m heading_deg attitude_known``, one row per instant."""
+        """Telemetry as poses: ``time east_m north_m up_m heading_deg attitude_known``, one row per time."""
         if self.data.track is None:
             return _together([], ["time", "east_m", "north_m", "up_m", "heading_deg", "attitude_known"])
         times = self._telemetry_times()
@@ -157,7 +157,7 @@ class Flight:
 
     @cached_property
     def rss(self) -> pd.DataFrame:
-        """Measured levels: ``time tower channel unit measured_db east_m north_m up_m``; NaN without a signal."""
+        """Measured levels: ``time tower channel unit measured_db east_m north_m up_m``. NaN without a signal."""
         frames = []
         for series in self.data.rss:
             position = np.full((len(series.time), 3), np.nan)
@@ -170,7 +170,7 @@ class Flight:
 
     @cached_property
     def rank(self) -> pd.DataFrame:
-        """Reported ranks: ``time tower rank sinr_db east_m north_m up_m``; NaN where the modem had no CSI."""
+        """Reported ranks: ``time tower rank sinr_db east_m north_m up_m``. NaN if the modem had no CSI."""
         frames = []
         for series in self.data.rank:
             position, _ = rank_positions(series, self.data.track)
@@ -184,35 +184,35 @@ class Flight:
         Parameters
         ----------
         engine : {"image", "sionna"}, optional
-            Default: what the flight file says.
+            Default: the engine of the flight file.
         overrides
-            Keys below ``rt`` of the flight file: ``max_depth=1``, ``foliage="none"``, ``attitude="logged"``. A key
-            elsewhere goes in by a mapping: ``**{"rss.lag": "off"}``.
+            Keys below ``rt`` of the flight file: ``max_depth=1``, ``foliage="none"``, ``attitude="logged"``. Write
+            other keys as a mapping: ``**{"rss.lag": "off"}``.
 
         Raises
         ------
         UsageError
-            A key that flight files do not have, a value of the wrong kind.
+            If a key does not exist, or a value has the wrong type.
         """
         keys = {key if "." in key else f"rt.{key}": value for key, value in overrides.items()}
         if engine is not None:
             keys["rt.engine"] = engine
-        # before the antennas: they must fit the carrier of the overrides
+        # overrides first, because learned antennas must fit their carrier
         settings = with_learned(overridden(self._written, keys), self.path.parent)
         data = gather(settings, self.path.parent, self.data.files, self.logs_root) if keys else self.data
         return ReplayedFlight(data, replay_flight(data))
 
     def compare(self, engine: str | None = None, **overrides: Any) -> Comparison:
-        """Replay and compare; arguments as :meth:`replay`."""
+        """Replay and compare. The arguments are those of :meth:`replay`."""
         return self.replay(engine, **overrides).compare()
 
     def report(self, folder: str | Path, *, force: bool = False, **options: Any) -> Path:
-        """Write the whole report, as ``aerpaw-cmp report`` does, and give the path of its page.
+        """Write the report of ``aerpaw-cmp report``, and return the path of its page.
 
         Parameters
         ----------
         folder : path
-            A report of this tool that stands there is replaced whole; anything else only with ``force``.
+            Folder of the report. A report of this tool is replaced; other files only with ``force``.
         force : bool
         options
             Fields of :class:`aerpaw_cmp.jobs.run.ReportOptions`.
@@ -220,13 +220,13 @@ class Flight:
         Raises
         ------
         UsageError
-            If this flight was opened with overrides: a report is of a file.
+            If this flight was opened with overrides, because a report describes a file.
         """
         if self.changed:
             raise UsageError(
                 f"a report of {self.path.name} with other settings ({', '.join(self.changed)})",
-                expected="the flight file as it stands",
-                cause="open_flight(overrides=...): write them into a flight.yaml of their own",
+                expected="an unchanged flight file",
+                cause="open_flight(overrides=...): write the overrides into a separate flight.yaml",
             )
         from .run import ReportOptions, run_report
 
@@ -235,7 +235,7 @@ class Flight:
         return out / "report.html"
 
     def channel(self, **options: Any) -> Any:
-        """Paths, channel matrices and calibrated levels along the track, as ``aerpaw-cmp channel`` writes them.
+        """Return paths, channel matrices and calibrated levels along the track, as ``aerpaw-cmp channel`` writes them.
 
         Parameters
         ----------
@@ -253,7 +253,7 @@ class Flight:
         return channel_dataset(channel).to_xarray()
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw the trajectory with the towers, seen from above, on matplotlib axes (default: new ones); give them."""
+        """Draw trajectory and towers from above on matplotlib axes (default: new axes), and return the axes."""
         axes = axes if axes is not None else _new_axes()
         axes.plot(self.track.east_m, self.track.north_m, label=self.settings.flight.name)
         for name, tower in self.site.towers.items():
@@ -268,16 +268,16 @@ class Flight:
         track = self.data.track
         assert track is not None
         inside = (times.view("int64") >= track.start_ns) & (times.view("int64") <= track.end_ns)
-        # two logs of one vehicle hold the same instants, and the axis of a table must rise
+        # two logs of one vehicle may have equal times, and the time axis must increase
         return np.unique(times[inside])
 
     def __repr__(self) -> str:
-        """Name, series and track in one line."""
+        """Return name, series and track in one line."""
         name, span = self.settings.flight.name, counted(len(self.track), "pose") if len(self.track) else "no track"
         return f"Flight({name!r}: {len(self.data.rss)} RSS series, {len(self.data.rank)} rank series, {span})"
 
     def _repr_html_(self) -> str:
-        """A table of the series for notebooks."""
+        """Return a table of the series for notebooks."""
         rows = [(s.tower, s.channel, f"RSS [{s.unit}]", len(s.time)) for s in self.data.rss]
         rows += [(s.tower, "", "rank", len(s.time)) for s in self.data.rank]
         return html_table(("tower", "channel", "quantity", "samples"), rows, self.settings.flight.name)
@@ -300,32 +300,32 @@ class ReplayedFlight:
 
     @property
     def series(self) -> dict[Series, Replayed]:
-        """Every series with what was replayed of it, RSS first."""
+        """The replay of every series, RSS before rank."""
         keys = [(s.tower, s.channel) for _, s in self.data.series]
         return dict(zip(keys, self.replays.all, strict=True))
 
     @property
     def rss_dbm(self) -> dict[Series, FloatArray]:
-        """Simulated level (n,) [dBm] at every sample of a series; NaN without a pose or a path."""
+        """Simulated level (n,) [dBm] at every sample of a series. NaN without a pose or a path."""
         return {key: replayed.spread(replayed.replay.rss_dbm[:, 0]) for key, replayed in self.series.items()}
 
     @property
     def h(self) -> dict[Series, ComplexArray]:
-        """Channel matrices (poses, n_rx, n_tx), complex128, at the poses that are known."""
+        """Channel matrices (poses, n_rx, n_tx), complex128, at known poses."""
         return {key: replayed.replay.h[:, 0] for key, replayed in self.series.items()}
 
     @property
     def paths(self) -> dict[Series, PathSet]:
-        """Paths of each series; ``pose`` counts the poses that are known."""
+        """Paths of each series. ``pose`` is the index among known poses."""
         return {key: replayed.replay.paths for key, replayed in self.series.items()}
 
     def to_xarray(self) -> Any:
-        """Levels and channel matrices on an index of time.
+        """Return levels and channel matrices on a time axis.
 
         Returns
         -------
         xarray.DataTree
-            A node ``<tower>/<channel>`` per series; ``time`` is UTC, and holds the poses that are known.
+            A node ``<tower>/<channel>`` per series. ``time`` is UTC and has the known poses.
 
         Raises
         ------
@@ -341,11 +341,11 @@ class ReplayedFlight:
         return _tree(nodes)
 
     def compare(self) -> Comparison:
-        """Offsets, errors, baselines and ranks of every series."""
+        """Compare every series: offsets, errors, baselines and ranks."""
         return Comparison(compare_flight(self.data, self.replays))
 
     def __repr__(self) -> str:
-        """One line per series."""
+        """Return one line per series."""
         return "\n".join(["ReplayedFlight", *(f"  {' '.join(k)}: {v.replay!r}" for k, v in self.series.items())])
 
 
@@ -356,14 +356,14 @@ class Comparison:
     Parameters
     ----------
     result : FlightResult
-        All of them, as records (:mod:`aerpaw_cmp.compare.result`).
+        All numbers as records (:mod:`aerpaw_cmp.compare.result`).
     """
 
     def __init__(self, result: FlightResult) -> None:
         self.result = result
 
     def to_frame(self) -> pd.DataFrame:
-        """One row per RSS series, with its baselines.
+        """Return one row per RSS series, with its baselines.
 
         Columns: ``tower channel n offset_db rmse_db rmse_low_db rmse_high_db correlation at_search_edge`` and
         ``<baseline>_rmse_db``.
@@ -386,7 +386,7 @@ class Comparison:
         return table
 
     def rank_to_frame(self) -> pd.DataFrame:
-        """One row per tower and K: ``tower k n agreement kappa total_variation wasserstein``."""
+        """Return one row per tower and K: ``tower k n agreement kappa total_variation wasserstein``."""
         rows = [
             {"tower": item.tower, "k": k, "n": item.score.n, "agreement": fit.agreement, "kappa": fit.kappa,
              "total_variation": fit.total_variation, "wasserstein": fit.wasserstein}
@@ -397,14 +397,15 @@ class Comparison:
         return table
 
     def to_xarray(self) -> Any:
-        """Measured and simulated levels and ranks on an index of time.
+        """Return measured and simulated levels and ranks on a time axis.
 
         Returns
         -------
         xarray.DataTree
             A node ``<tower>/<channel>`` per RSS series with ``measured_db``, ``calibrated_db`` (measured plus the
-            fitted offset), ``simulated_dbm`` and ``residual_db`` (calibrated minus simulated, NaN where nothing is
-            compared), and ``<tower>/rank`` per rank series with ``measured`` and ``simulated`` by ``k``. Times are UTC.
+            fitted offset), ``simulated_dbm`` and ``residual_db`` (calibrated minus simulated, NaN without a
+            comparison), and ``<tower>/rank`` per rank series with ``measured`` and ``simulated`` by ``k``. Times are
+            UTC.
 
         Raises
         ------
@@ -429,7 +430,7 @@ class Comparison:
         return _tree(nodes)
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw calibrated and simulated levels along time, on axes as :meth:`Flight.plot` takes them."""
+        """Draw calibrated and simulated levels over time on axes as in :meth:`Flight.plot`."""
         axes = axes if axes is not None else _new_axes()
         for item in self.result.rss:
             name, measured_dbm = f"{item.tower} {item.channel}", item.measured_db + item.score.offset_db
@@ -451,7 +452,7 @@ class Comparison:
 
 
 def _node(series: Series) -> str:
-    """The place of a series in a tree, whose names hold no slash."""
+    """Return the node of a series in a tree, whose names cannot contain a slash."""
     return "/".join(name.replace("/", "_") for name in series)
 
 

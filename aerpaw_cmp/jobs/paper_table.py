@@ -1,6 +1,6 @@
-"""Values that arXiv 2502.10324 states about its maps, beside the same quantity of a run.
+"""Values of the maps in arXiv 2502.10324 compared with the same quantities of a run.
 
-What the paper states stands in ``paper_numbers.yaml``; the other side is computed here from the run's own maps.
+The paper's values are in ``paper_numbers.yaml``. The values of the run are computed here from its maps.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ WORDS = {"zero": "Z as rank 0", "missing": "Z left out"}
 
 
 def paper_rows(outcome: MapOutcome) -> Iterator[PaperRow]:
-    """Return all rows in the order of the paper, if the site has its towers and the map is of its kind.
+    """Yield all rows in the order of the paper, if the site has the paper's towers and the map its link budget.
 
-    A map with a link budget of its own is not the paper's. Rows of the study are there only if the study was made.
+    Rows of the study are included only if the study was made.
     """
     if not {f"LW{n}" for n in range(1, 6)} <= set(outcome.site.towers) or outcome.settings.budget != PAPER_BUDGET:
         return
@@ -175,7 +175,7 @@ def _interpolation(outcome: MapOutcome) -> dict[str, str]:
 
 
 def paper_markdown(rows: Iterable[PaperRow]) -> str:
-    """The rows as a Markdown table."""
+    """Return the rows as a Markdown table."""
     lines = ["| where | what | paper | here | figure (--figures png) |", "| --- | --- | --- | --- | --- |"]
     for row in rows:
         figure = f"`figures/{row.figure}.png`" if row.figure else ""

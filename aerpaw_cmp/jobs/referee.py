@@ -1,4 +1,4 @@
-"""Predictions of other programs, scored on one flight beside ours and the baselines.
+"""Predictions of other programs, scored on one flight together with ours and the baselines.
 
 ``report flight.yaml --against FILE``. A prediction of any program is read as one table: CSV, NetCDF, a radio map in
 .npz, or the logs of an emulated flight. Samples are matched to predictions by time where the file has times, else by
@@ -76,7 +76,7 @@ class ForeignPrediction:
     path : Path
         The file or folder.
     program : str
-        What wrote it, as far as the file says.
+        Program that wrote the file, if it is known.
     quantity : str
         One of :data:`QUANTITIES`; empty if only ranks are predicted.
     table : DataFrame
@@ -344,7 +344,7 @@ def _numbers(column: Any) -> Any:
 
 
 def _times(frame: pd.DataFrame, path: Path) -> Any:
-    """Return times (n,) as naive UTC datetime64[ns]; NaT without a column of times."""
+    """Return times (n,) as naive UTC datetime64[ns]. NaT without a column of times."""
     name = next((name for name in ("time_utc", "time") if name in frame), None)
     if name is None:
         return pd.Series(pd.NaT, index=frame.index, dtype="datetime64[ns]")
@@ -367,7 +367,7 @@ def _times(frame: pd.DataFrame, path: Path) -> Any:
 
 
 def _places(frame: pd.DataFrame, path: Path, site: Site) -> AnyArray:
-    """Return east, north, up (n, 3) in the site frame [m]; NaN without columns of positions."""
+    """Return east, north, up (n, 3) in the site frame [m]. NaN without columns of positions."""
     if set(_PLACE) <= set(frame):
         place = np.column_stack([_numbers(frame[name]) for name in _PLACE])
     elif set(_GEOGRAPHIC) <= set(frame):
@@ -486,7 +486,7 @@ class SeriesVerdict:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankVerdict:
-    """Predicted ranks of one tower beside ours, on the same samples.
+    """Predicted ranks of one tower and ours, on the same samples.
 
     ``scores`` has kappa, total variation and agreement by model; ``log_score`` and ``constant_log_score`` are those of
     probabilities, if the prediction has them.
@@ -539,7 +539,7 @@ class Verdict:
         return result
 
     def means(self) -> list[dict[str, Any]]:
-        """Return the means over channels of each model; None for a number that not every channel has."""
+        """Return the means over channels of each model. None for a number that is missing for a channel."""
         rows = []
         for model in dict.fromkeys(name for item in self.series for name in item.cards):
             cards = [item.cards[model] for item in self.series if model in item.cards]
@@ -559,7 +559,7 @@ class Verdict:
                 yield f"{item.tower} {item.channel}", name, card.n, *(getattr(card, key) for key in _HEADS), *apart
 
     def sentence(self) -> str:
-        """Return the result in two sentences: error beside ours, and whether the difference is significant."""
+        """Return the result in two sentences: both errors, and whether the difference is significant."""
         if not self.series:
             return f"{self.name}: ranks only."
         lost = sum(s.unmatched for s in self.series)

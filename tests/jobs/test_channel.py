@@ -363,8 +363,8 @@ def test_times_nodes_and_sizes_that_do_not_fit_are_refused(folder, capsys, tmp_p
     moving.write_text(PLAN + "towers: {N: {track: {path: moves.csv}, height: ground, antenna_height_m: 2}}\n")
     for path, options, expected in (
         (flight, [*late, "csv"], "at most 10000000"),
-        (flight, [*late, "npz", *wide], "netcdf and csv alone."),
-        (drawn, [*late, "csv", *wide], "netcdf and csv alone with rt.engine: image"),
+        (flight, [*late, "npz", *wide], "only netcdf and csv."),
+        (drawn, [*late, "csv", *wide], "only netcdf and csv with rt.engine: image"),
         (moving, ["--tower", "N", "--format", "csv"], "it alone, along the track"),
     ):
         assert main(["channel", str(path), "-o", str(tmp_path / "out"), *options]) == 2

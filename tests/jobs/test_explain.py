@@ -82,7 +82,7 @@ def test_command_line_and_json(flown, capsys):
         ({"time": "-20"}, "before the first"),
         ({"time": "noon"}, "seconds after"),
         ({"tower": "LW9"}, "LW1, LW2"),
-        ({"tower": "LW4"}, "not measured there"),
+        ({"tower": "LW4"}, "the flight has no log of it"),
         ({"channel": "USRP7"}, "USRP1"),
     ],
 )

@@ -89,7 +89,7 @@ def test_levels_of_a_known_flight_without_a_position_are_counted(small, tmp_path
     lines[100:140] = [re.sub(r"^(\d+),[^,]+,[^,]+", r"\1,nan,nan", line) for line in lines[100:140]]
     log.write_text("\n".join(lines) + "\n")
     _, said = observe([flight.load(None) for flight in named_flights([folder / "a.yaml"])])
-    counts = [int(text.split(": ")[2].split(" %")[0]) for text in said if "have no position and are left out" in text]
+    counts = [int(text.split(": ")[2].split(" %")[0]) for text in said if "have no position and are ignored" in text]
     assert len(counts) == 4  # two towers of two channels
     assert all(11 <= count <= 14 for count in counts)
     _, said = observe([flight.load(None) for flight in named_flights([small / "a.yaml"])])

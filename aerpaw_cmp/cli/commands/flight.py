@@ -131,7 +131,7 @@ def _verdict(outcome: Any, strict: bool) -> int:
 
 
 def _print_models(models: Sequence[Mapping[str, Any]]) -> None:
-    """Print one line per model, over all channels; the page has each channel."""
+    """Print one line per model over all channels. The page has each channel."""
     notes = {"recommended": "recommended", "fastest_sufficient": "fastest sufficient"}
     rows = [{**row, "note": ", ".join(notes[key] for key in notes if row[key])} for row in models]
     columns = {
@@ -247,7 +247,7 @@ def calibrate(
         {**forecast, "split": split.replace("_", " ")} for split, scores in m["rank"].items() for forecast in scores
     ]
     columns = {
-        "left out": "split", "flight": "flight", "tower": "tower", "kappa": "kappa:.3f", "agree": "agreement:.3f",
+        "held out": "split", "flight": "flight", "tower": "tower", "kappa": "kappa:.3f", "agree": "agreement:.3f",
         "commonest": "majority_agreement:.3f", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",
         "TV": "total_variation_expected:.3f",
     }  # fmt: skip

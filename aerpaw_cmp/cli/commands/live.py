@@ -106,11 +106,11 @@ class StatusLine:
 
     @property
     def end(self) -> str:
-        """Text that leaves the line behind."""
+        """Text that ends the status line."""
         return "\n" if self._terminal else ""
 
     def __call__(self, name: str, now: Any) -> None:
-        """Show the status of the modem of this name; no name where there is only one."""
+        """Show the status of a modem. The name is empty if there is only one."""
         from ...live.ports import format_status
 
         head = f"{name}: " if name else ""
@@ -128,7 +128,7 @@ class StatusLine:
 
 
 def _needs_posix(command: str) -> None:
-    """Ports are opened with termios and locked with fcntl, which not every system has."""
+    """Refuse a system without termios and fcntl, which open and lock ports."""
     import importlib
 
     for name in ("fcntl", "termios", "pty"):
@@ -152,7 +152,7 @@ def _needs_posix(command: str) -> None:
 def modem_sim(
     link: Annotated[Path | None, Option(help="Symbolic link to the port, updated when the port changes.")] = None,
     flight: Annotated[
-        Path | None, Option(help="flight.yaml: fly it again from now on, with its ranks; needs --telemetry.")
+        Path | None, Option(help="flight.yaml to repeat from now on, with its ranks; requires --telemetry.")
     ] = None,
     telemetry: Annotated[
         Path | None, Option(help="New telemetry file for --flight; it grows during the flight.")

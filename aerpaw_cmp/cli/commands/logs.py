@@ -49,7 +49,7 @@ def ingest(
     from ...logs.ingest import summary as account
 
     if site is not None and draft is None:
-        raise UsageError("--site without --draft", expected="--draft FILE: the site is that of the draft")
+        raise UsageError("--site without --draft", expected="--draft FILE, for which the site is used")
     options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
     if columns:
         # options outweigh a mapping, such as one with the number of rank 1

@@ -1,4 +1,4 @@
-"""Before a flight: ``predict``, ``plan``, ``channel``; ``locate``."""
+"""Commands before a flight (``predict``, ``plan``, ``channel``) and ``locate``."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def predict(
     carrier_ghz: Annotated[
         float | None, Option(min=0.1, max=100.0, help="Carrier of a prediction before any flight [GHz].")
     ] = None,
-    tx_power_dbm: Annotated[float | None, Option(help="Transmit power of the same [dBm].")] = None,
+    tx_power_dbm: Annotated[float | None, Option(help="Transmit power of such a prediction [dBm].")] = None,
     logs_root: LogsRoot = None,
     dry_run: DryRun = False,
     force: Force = False,
@@ -106,9 +106,9 @@ def plan(
         Argument(help="Target: sphere (all directions), a site (a grid), a route, or points."),
     ],
     flights: Flights = None,
-    site: Annotated[str | None, Option(help="Site, where no flight names it.")] = None,
+    site: Annotated[str | None, Option(help="Site, if no flight names it.")] = None,
     tower: Annotated[
-        list[str] | None, Option(help="Tower whose antenna counts, without --with; repeatable  [default: all]")
+        list[str] | None, Option(help="Tower whose antenna is considered, without --with; repeatable  [default: all]")
     ] = None,
     geofence: Annotated[Path | None, _FENCE] = None,
     avoid: Annotated[list[Path] | None, _AVOID] = None,
@@ -117,7 +117,7 @@ def plan(
     speed: Annotated[float, Option(min=0.5, max=40.0, help="Speed [m/s].")] = 8.0,
     height: Annotated[
         list[float] | None,
-        Option(help="Height of the tool's own patterns, and of a target that is a site [m]; repeatable  [default: 40]"),
+        Option(help="Height of the tool's patterns, and of a site as target [m]; repeatable  [default: 40]"),
     ] = None,
     tower_distance: Annotated[float, Option(min=0.0, help="Least distance to towers [m].")] = 30.0,
     out: Annotated[Path | None, output("Output folder  [default: reports/plan-<TARGET>]")] = None,
@@ -125,7 +125,7 @@ def plan(
     dry_run: DryRun = False,
     force: Force = False,
 ) -> None:
-    """Rank candidate flights by the standard deviation that they would leave."""
+    """Rank candidate flights by how much they would reduce the prediction's standard deviation."""
     from ...jobs.next_flight import PlanOptions, run_plan
     from ...jobs.sources import TargetOptions
 

@@ -201,7 +201,7 @@ def test_recommended_file_must_stand_beside_its_flight(tmp_path: Path, capsys: p
     other = tmp_path / "other"
     other.mkdir()
     assert main(["report", str(path), "-o", str(tmp_path / "out"), "--recommend", str(other / "b.yaml")]) == 2
-    assert "beside the flight file" in capsys.readouterr().err
+    assert "in the folder of the flight file" in capsys.readouterr().err
     assert main(["report", str(path), "-o", str(tmp_path / "out"), "--recommend", str(path), "--force"]) == 2
 
 
@@ -209,7 +209,7 @@ def test_recommended_file_must_stand_beside_its_flight(tmp_path: Path, capsys: p
     "model",
     [
         Model(),
-        Model(antennas="measured", attitude="logged", ground="weakened", trees="weissberger"),
+        Model(antennas="measured", attitude="logged", ground="weakened", trees="p833"),
         Model(antennas="learned", attitude="level", ground="power sum", buildings=True, trees="opaque"),
     ],
 )

@@ -685,7 +685,27 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
 def predicted_at(
     given: ForeignPrediction, part: pd.DataFrame, time: Any, position_m: FloatArray, heading_deg: Any, near_m: float
 ) -> tuple[dict[str, FloatArray], BoolArray]:
-    """Return the numbers (n,) predicted for each sample, NaN if none is near, and whether one is near (n,)."""
+    """Return the numbers that are predicted for samples.
+
+    Parameters
+    ----------
+    given : ForeignPrediction
+    part : DataFrame
+        Its rows for the tower and channel of the samples.
+    time : (n,) datetime64[ns]
+    position_m : (n, 3)
+    heading_deg : (n,), optional
+        Headings of the nose.
+    near_m : float
+        Largest distance between a sample and its predicted position.
+
+    Returns
+    -------
+    numbers : dict of str to (n,)
+        By column of the prediction. NaN if no prediction is near.
+    near : (n,) bool
+        True if a prediction is near.
+    """
     part = part[(part["time"] if given.timed else part["east_m"]).notna()]
     if part.empty:
         near: BoolArray = np.zeros(len(time), dtype=np.bool_)

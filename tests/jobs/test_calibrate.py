@@ -173,7 +173,7 @@ def test_one_flight_is_learned_and_not_scored(folder: Path) -> None:
     path = write_yaml(folder / "single.yaml", {"calibration": "single", "flights": ["first.yaml"]})
     calibration, _ = calibrated(path)
     assert not any(calibration.scores.values())
-    assert any("one flight alone" in text for text in calibration.warnings)
+    assert any("only one flight" in text for text in calibration.warnings)
 
 
 @pytest.mark.field

@@ -294,7 +294,7 @@ def without(*keys):
 
 
 BAD = {
-    "a torn last line": (cut_last_line, r"rss\.csv, line \d+: the last line does not end.*torn", InputError),
+    "a torn last line": (cut_last_line, r"rss\.csv, line \d+: the last line does not end.*truncated", InputError),
     "a torn line": (tear_a_line, r"rss\.csv, line 6: .*truncated", InputError),
     "a word": (word_for_number, r"rss\.csv, line 4: column 'measured_db': 'loud'; expected a number", InputError),
     "an older table": (lambda f: change_table(f, "rss", lambda t: t.drop(columns="up_m")), r"no column 'up_m'.*older", InputError),
@@ -306,8 +306,8 @@ BAD = {
     "a map": (lambda f: (f / "metrics.json").write_text('{"grid": {}, "rank": []}'), r"a map, a calibration", InputError),
     "a list": (lambda f: (f / "metrics.json").write_text("[]"), r"has no 'flight'", InputError),
     "deep": (lambda f: (f / "metrics.json").write_text("[" * 100_000), r"metrics.json of a report", InputError),
-    "other kinds": (lambda f: change_metrics(f, lambda m: m.update(inputs=[1])), r"has no 'inputs' as a report", InputError),
-    "numbers for links": (lambda f: change_metrics(f, lambda m: m["rss"].update(LW1=[3])), r"has no 'rss' as a report", InputError),
+    "other kinds": (lambda f: change_metrics(f, lambda m: m.update(inputs=[1])), r"has no 'inputs', which every report writes", InputError),
+    "numbers for links": (lambda f: change_metrics(f, lambda m: m["rss"].update(LW1=[3])), r"has no 'rss', which every report writes", InputError),
     "a torn json": (lambda f: (f / "metrics.json").write_text('{"flight": '), r"a truncated copy", InputError),
     "a campaign": (lambda f: (f / "metrics.json").rename(f / "campaign.json"), r"no metrics\.json.*campaign\.json", InputError),
     "nothing": (shutil.rmtree, r"no such file or folder", InputError),

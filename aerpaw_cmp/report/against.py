@@ -37,7 +37,7 @@ class AgainstSeries(LevelSeries):
 
     @property
     def stated(self) -> Verdict:
-        """Whether the errors are as large as the stated standard deviations."""
+        """True if the errors are as large as the stated standard deviations."""
         verdict = stated_errors(self.error_db, self.sd_db, self.common_db, self.position_m)
         return replace(verdict, where=self.name)
 

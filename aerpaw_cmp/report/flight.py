@@ -384,7 +384,7 @@ def models_card(data: ReportData) -> Card:
         rows=[
             (*of, *(Markup('{} <span class="small">{}</span>').format(
                         number(row.rmse_heldout_db), interval(row.difference_to_best_ci95_db, 2))
-                    for model in names for row in [rows[(model, *of)]]))
+                    for model in names for row in [rows[model, of[0], of[1]]]))
             for of in channels
         ],
         look="dense",

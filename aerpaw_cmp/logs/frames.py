@@ -124,13 +124,9 @@ def _in_utc(frame: pd.DataFrame) -> pd.DataFrame:
 
 @from_python
 def read(
-    path: Source | Iterable[Source],
-    timezone: str | ZoneInfo | None = None,
-    *,
-    reader: str | None = None,
-    time_origin: str | None = None,
-    **options: Any,
-) -> Logs:
+    path: Source | Iterable[Source], timezone: str | ZoneInfo | None = None, *, reader: str | None = None,
+    time_origin: str | None = None, **options: Any,
+) -> Logs:  # fmt: skip
     """Read logs of any known format into pandas frames.
 
     Parameters

@@ -374,12 +374,9 @@ def _archive(place: Path, options: _OptionsFor | None, chosen: Reader | None) ->
 
 
 def _member(
-    path: Path,
-    member: archives.Member,
-    content: Mapping[str, archives.Member],
-    options: _OptionsFor | None,
+    path: Path, member: archives.Member, content: Mapping[str, archives.Member], options: _OptionsFor | None,
     chosen: Reader | None,
-) -> IngestedFile:
+) -> IngestedFile:  # fmt: skip
     """Read one file of an archive, and unpack it only if its first bytes are those of a log."""
     # only the beginning, because data sets contain recordings of GiB next to their logs
     head = member.read(DEEP_BYTES)
@@ -518,13 +515,9 @@ def _neighbour_reader(path: Path) -> Callable[[str], bytes | None]:
 
 
 def _read(
-    path: Path,
-    data: bytes,
-    digest: str,
-    reader: Reader,
-    options: _OptionsFor | None,
+    path: Path, data: bytes, digest: str, reader: Reader, options: _OptionsFor | None,
     neighbour: Callable[[str], bytes | None] | None = None,
-) -> IngestedFile:
+) -> IngestedFile:  # fmt: skip
     chosen = _options(path, options, neighbour or _neighbour_reader(path))
     return IngestedFile(str(path), digest, _checked(path, reader, chosen, lambda: reader.read(data, chosen)))
 

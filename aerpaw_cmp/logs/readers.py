@@ -183,18 +183,19 @@ def _accepts(reader: Reader, head: bytes) -> bool:
 
 def by_name(name: str) -> Reader:
     """Return the reader of a name, or raise ``UsageError`` with the known names."""
-    for reader in catalogue():
-        if reader.name == name:
-            return reader
+    known = {reader.name: reader for reader in catalogue()}
+    if name not in known:
+        raise unknown_name(f"unknown reader {name!r}", name, sorted(known))
+    return known[name]
+
+
+def unknown_name(found: str, name: str, known: Sequence[str]) -> UsageError:
+    """Return the error for an unknown name, with the known names and the most similar one."""
     from difflib import get_close_matches
 
-    known = [reader.name for reader in catalogue()]
     near = get_close_matches(name, known, 1)
-    raise UsageError(
-        f"unknown reader {name!r}",
-        expected="one of " + ", ".join(sorted(known)),
-        cause=f"did you mean {near[0]!r}?" if near else None,
-    )
+    cause = f"did you mean {near[0]!r}?" if near else None
+    return UsageError(found, expected=f"one of {', '.join(known)}", cause=cause)
 
 
 _BLANK_LINES = re.compile(rb"\A(?:[ \t]*\r?\n)+")

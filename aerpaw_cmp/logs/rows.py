@@ -118,17 +118,10 @@ class Rows:
         )
 
     def stream(
-        self,
-        kind: Kind,
-        name: str,
-        values: Mapping[str, AnyArray],
-        *,
-        where: BoolArray | None = None,
-        pick: IntArray | None = None,
-        flag: AnyArray | None = None,
-        about: Mapping[str, Attribute | None] | None = None,
+        self, kind: Kind, name: str, values: Mapping[str, AnyArray], *, where: BoolArray | None = None,
+        pick: IntArray | None = None, flag: AnyArray | None = None, about: Mapping[str, Attribute | None] | None = None,
         **attributes: Attribute | None,
-    ) -> Stream | None:
+    ) -> Stream | None:  # fmt: skip
         """Return a stream of all rows or of those of a mask, or None if it is empty.
 
         Parameters
@@ -200,15 +193,9 @@ class Rows:
 
 
 def matched(
-    data: bytes,
-    pattern: re.Pattern[bytes],
-    options: ReadOptions,
-    *,
-    reader: str,
-    reason: Reason,
-    skip: Callable[[IntArray], BoolArray] | None = None,
-    clock: str = "wall",
-) -> Rows:
+    data: bytes, pattern: re.Pattern[bytes], options: ReadOptions, *, reader: str, reason: Reason,
+    skip: Callable[[IntArray], BoolArray] | None = None, clock: str = "wall",
+) -> Rows:  # fmt: skip
     r"""Return the rows of a log whose lines match a pattern.
 
     Parameters
@@ -244,19 +231,10 @@ def matched(
 
 
 def built(
-    lines: _text.Lines,
-    rows: IntArray,
-    column: dict[str, AnyArray],
-    options: ReadOptions,
-    *,
-    reader: str,
-    reason: Reason,
-    skip: Callable[[IntArray], BoolArray] | None = None,
-    clock: str = "wall",
-    extra: Iterable[RejectedLine] = (),
-    markup: IntArray | None = None,
-    closed: bool = False,
-) -> Rows:
+    lines: _text.Lines, rows: IntArray, column: dict[str, AnyArray], options: ReadOptions, *, reader: str,
+    reason: Reason, skip: Callable[[IntArray], BoolArray] | None = None, clock: str = "wall",
+    extra: Iterable[RejectedLine] = (), markup: IntArray | None = None, closed: bool = False,
+) -> Rows:  # fmt: skip
     """Return rows from their lines and their columns of text, one of them ``time``, as :func:`matched` does.
 
     Parameters
@@ -446,15 +424,9 @@ def mean_rank(
 
 
 def of_ues(
-    rows: Rows,
-    kind: Kind,
-    name: str,
-    values: Mapping[str, FloatArray],
-    *,
-    pick: IntArray | None = None,
-    flag: AnyArray,
-    about: Mapping[str, Attribute | None],
-) -> list[Stream | None]:
+    rows: Rows, kind: Kind, name: str, values: Mapping[str, FloatArray], *, pick: IntArray | None = None,
+    flag: AnyArray, about: Mapping[str, Attribute | None],
+) -> list[Stream | None]:  # fmt: skip
     """Return a stream per UE (RNTI, cell) if several were attached at once, else one stream for all RNTIs.
 
     A UE that attaches again gets a new RNTI.
@@ -528,21 +500,11 @@ BOM = rb"(?:\xef\xbb\xbf)?"
 
 
 def reader(
-    name: str,
-    title: str,
-    *,
-    kinds: tuple[Kind, ...],
-    sample: str,
-    row: Pattern | Callable[[bytes], Pattern],
-    streams: Callable[[Rows], Iterable[Stream | None]],
-    header: Pattern | None = None,
-    mark: Pattern | None = None,
-    torn: Pattern | None = None,
-    otherwise: str = "of another form than the format's rows (torn line?)",
-    fields: int = 0,
-    clock: str = "wall",
-    skip: Callable[[bytes, IntArray], BoolArray] | None = None,
-) -> Reader:
+    name: str, title: str, *, kinds: tuple[Kind, ...], sample: str, row: Pattern | Callable[[bytes], Pattern],
+    streams: Callable[[Rows], Iterable[Stream | None]], header: Pattern | None = None, mark: Pattern | None = None,
+    torn: Pattern | None = None, otherwise: str = "of another form than the format's rows (torn line?)",
+    fields: int = 0, clock: str = "wall", skip: Callable[[bytes, IntArray], BoolArray] | None = None,
+) -> Reader:  # fmt: skip
     r"""Return a reader of lines that a pattern describes.
 
     Parameters

@@ -74,13 +74,9 @@ QUANTITIES = {"pci": "PCI", "arfcn": "ARFCN", "rsrp_dbm": "RSRP", "rsrq_db": "RS
 
 
 def streams(
-    rows: _rows.Rows,
-    readings: pd.DataFrame | Iterable[Reading],
-    *,
-    source: str,
-    quantity: str = "RSRP",
+    rows: _rows.Rows, readings: pd.DataFrame | Iterable[Reading], *, source: str, quantity: str = "RSRP",
     more: Mapping[str, Mapping[str, Attribute]] | None = None,
-) -> list[Stream]:
+) -> list[Stream]:  # fmt: skip
     """Return a stream per cell, which is a radio access, PCI and carrier. Every reading with a level is a record.
 
     A cell serves from the moment at which the log names it until the log names another one of the same radio access. A

@@ -590,31 +590,23 @@ class _Table:
             both = [*zip(self._row, self._cells, strict=True), *(item for item in self._short if item[0] in read)]
             self._row, self._cells = [list(part) for part in zip(*sorted(both), strict=True)] if both else ([], [])
             self._odd = [item for item in self._odd if item[0] not in read]
-        notes = {}
-        if not full and self._cells:
-            text = "no row has as many fields as the header: the last columns were read as empty"
-            notes = {len(self.names): text}
+        text = "no row has as many fields as the header: the last columns were read as empty"
+        notes = {len(self.names): text} if not full and self._cells else {}
         last = self._row[-1] if self._row else self.comments[-1]
         torn = len(lines) - 1 if lines.unterminated else -1
         # text below the table, as in exports of Nemo, has no separator and does not begin with a number
-        foot = {
-            i
-            for i, count, _ in self._odd
-            if i > last and count == 1 and i != torn and not _VALUE.match(lines.raw(i).decode("utf-8", "replace"))
-        }
+        alone = [i for i, count, _ in self._odd if i > last and count == 1 and i != torn]
+        foot = {i for i in alone if not _VALUE.match(lines.raw(i).decode("utf-8", "replace"))}
+        odd = (item for item in self._odd if item[0] not in foot)
         return Sheet(
-            lines=lines,
-            names=self.names,
-            row=np.array(self._row, dtype=np.int64),
+            lines=lines, names=self.names, row=np.array(self._row, dtype=np.int64), notes=notes,
             cells=[[*cells, *[""] * (len(self.names) - len(cells))] for cells in self._cells],
             blank_rows=np.array([*self.comments, *foot], dtype=np.int64),
             rejected=[
                 lines.reject(i, f"{counted(count, 'field')} where the header has {width} (torn line?)")
-                for i, count, width in self._odd
-                if i not in foot
+                for i, count, width in odd
             ],
-            notes=notes,
-        )
+        )  # fmt: skip
 
 
 def _torn(cells: list[str], meanings: list[dictionary.Meaning | None]) -> bool:

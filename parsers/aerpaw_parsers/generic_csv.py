@@ -9,7 +9,6 @@ of the column, or the steps between the rows, require another unit.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from difflib import get_close_matches
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.readers import Reader, ReadOptions, unknown_name
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, Stream
 from aerpaw_cmp.readers import dictionary
 
@@ -45,26 +44,15 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
     if options.kind is None:
         raise UsageError("the kind of the table is missing", expected="'kind:' telemetry, rss or rank")
     allowed = ["time", *COLUMNS[options.kind], *_COMPANIONS.get(options.kind, ())]
-    unknown = sorted(set(options.columns) - set(allowed))
-    if unknown:
-        near = get_close_matches(unknown[0], allowed, 1)
-        raise UsageError(
-            f"'columns:' names {unknown[0]!r}, which a {options.kind} record does not have",
-            expected=", ".join(allowed),
-            cause=f"did you mean {near[0]!r}?" if near else None,
-        )
+    if unknown := sorted(set(options.columns) - set(allowed)):
+        found = f"'columns:' names {unknown[0]!r}, which a {options.kind} record does not have"
+        raise unknown_name(found, unknown[0], allowed)
     lacking = [name for name in ("time", *_VALUE[options.kind]) if name not in options.columns]
     if lacking:
         example = f"e.g. columns: {{{lacking[0]}: {header[0]!r}}}"
         raise UsageError(f"'columns:' lacks {', '.join(lacking)}", expected=example)
-    absent = sorted({name for name in options.columns.values() if name not in header})
-    if absent:
-        near = get_close_matches(absent[0], header, 1)
-        raise UsageError(
-            f"the file has no column {absent[0]!r}",
-            expected="one of " + ", ".join(repr(name) for name in header[:40]),
-            cause=f"did you mean {near[0]!r}?" if near else None,
-        )
+    if absent := sorted({name for name in options.columns.values() if name not in header}):
+        raise unknown_name(f"the file has no column {absent[0]!r}", absent[0], header[:40])
     if options.kind == "rank" and options.ri_base is None:
         raise UsageError("a table does not say whether rank 1 is written as 0 or 1", expected="'ri_base:' zero or one")
     return options.kind, {column: header.index(name) for column, name in options.columns.items()}
@@ -133,6 +121,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     first, separator, header = next(known, next(_tables(lines, first)))
     kind, where = _checked(options, header)
     sheet = _sheet.cut(lines, first, separator, header)
+    sheet.used |= {*where.values()}
     sheet.said = {where[name]: quantity for name, quantity in _QUANTITIES.items() if name in where}
     rows = _sheet.rows(sheet, options, reader="generic_csv", column=where.pop("time"))
     assert rows is not None
@@ -148,11 +137,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         rows.warnings.append(_pose.small_angles(angles))
     streams: list[Stream | None] = []
     for device, of_device, table in _identity.parts(rows, sheet, "device"):
-        divided = (
-            _identity.parts(of_device, table, *_KEYS, level=where.get("rss_db"))
-            if kind != "telemetry"
-            else [("", of_device, table)]
-        )
+        whole, level = [("", of_device, table)], where.get("rss_db")
+        divided = _identity.parts(of_device, table, *_KEYS, level=level) if kind != "telemetry" else whole
         for label, part, cells in divided:
             words = "_".join(word for word in (options.channel or kind, label, device) if word)
             streams.append(_stream(part, cells, kind, where, words, options.unit or unit))
@@ -177,6 +163,7 @@ def _stream(
     options, flag = rows.options, rows.flag.copy()
     values: dict[str, AnyArray] = {key: _values(sheet, column, key, options) for key, column in where.items()}
     if {*_pose.PLACE[:2]} <= set(values):
+        values[_pose.PLACE[0]] = np.where(_pose.without_fix(sheet), np.nan, values[_pose.PLACE[0]])
         coarse = _pose.whole_degrees([sheet.names[where[key]] for key in _pose.PLACE[:2]], values)
         rows.warnings += [f"{coarse}: is it the right column?"] if coarse else []
     about = _lifted(rows, sheet, values, where)
@@ -229,8 +216,8 @@ def _track(rows: _rows.Rows, sheet: _sheet.Sheet, where: dict[str, int], device:
     if not {"latitude_deg", "longitude_deg"} <= set(names):
         return None
     values: dict[str, AnyArray] = {name: sheet.numbers(where[name]) for name in names}
-    about = _lifted(rows, sheet, values, where)
-    flag = _text.flags(len(rows))
+    values[_pose.PLACE[0]] = np.where(_pose.without_fix(sheet), np.nan, values[_pose.PLACE[0]])
+    about, flag = _lifted(rows, sheet, values, where), _text.flags(len(rows))
     name = f"vehicle_{device}" if device else "vehicle"
     return rows.stream("telemetry", name, values, flag=flag, source="mapped columns", about=about)
 

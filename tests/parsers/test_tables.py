@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs.readers import by_name
+from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_parsers import _sheet
 from tests.parsers import samples
@@ -293,3 +293,17 @@ def test_an_empty_field_more_in_every_row_is_nothing() -> None:
     assert column_of(drive_test(data), "rss", "rss_db") == column_of(drive_test(six_rows(GOOD)), "rss", "rss_db")
     odd_row = drive_test(six_rows(GOOD) + b"2025-03-02 10:00:06,35.72,-78.69,30,-86,\n")
     assert (odd_row.accepted, [line.number for line in odd_row.rejected]) == (6, [8])
+
+
+def test_mapped_columns_count_as_read_and_rows_without_a_fix_have_no_position() -> None:
+    rows = [
+        f"2025-06-10T14:00:0{i}Z,{35.9 if i == 0 else 35.7275},-78.696,{i},-8{i},{int(i > 0)},-9{i}" for i in (0, 1)
+    ]
+    table = "when,Lat.,Lon.,H,Lev,gps_valid,signal_B\n" + "\n".join(rows) + "\n"
+    pairs = {"time": "when", "latitude_deg": "Lat.", "longitude_deg": "Lon.", "altitude_m": "H", "rss_db": "Lev"}
+    options = ReadOptions(columns=pairs, kind="rss", unit="dBm")
+    result = by_name("generic_csv").read(table.encode(), options)
+    _, track = result.streams
+    assert np.isnan(track.frame["latitude_deg"]).tolist() == [True, False]
+    (left,) = [text for text in result.warnings if "not read" in text]
+    assert left.endswith(": 'signal_B'")

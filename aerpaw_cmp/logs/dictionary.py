@@ -74,13 +74,15 @@ _FULL_SCALE = "dB re full scale"
 QUANTITIES: tuple[Quantity, ...] = (
     # when; the surest first
     Quantity("time", "time", (
-        r"^time utc usec$", r"^time (edt|est|cdt|cst|mdt|mst|pdt|pst|cest|cet|bst|utc|gmt)$",
-        r"^(measured|recorded|logged|sampled|seen|received|captured|created) at$",
-        r"^(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s| us| ns| iso| unix)?$",
+        r"^time (utc|unix|epoch)( s| ms| us| usec| ns)?$", r"^time (edt|est|cdt|cst|mdt|mst|pdt|pst|cest|cet|bst|gmt)$",
+        r"^((measured|recorded|logged|sampled|seen|received|captured|created) at|recorded|logged)$",
+        r"^(gps |utc |local |log )?(time ?stamp|date ?time|time and date|date and time)"
+        r"( utc| gps| local| ms| s| us| ns| iso| unix)?$",
         r"^(abs|log|pc|device|event|system|utc|gps|local|unix|epoch|server|host|wall|phone|sample|recording|receive)"
-        r" ?time( stamp)?( utc| gps| local| ms| s| us| ns)?$",
+        r" ?(time( stamp)?|clock)( utc| gps| local| ms| s| us| usec| ns)?$",
         r"^(custom )?(update ?)?(local |utc )?time( ?stamp)?( utc| ms| s| us| usec| ns| local| epoch)?$",
-        r"^time ?millisecond$", r"^(rel|relative|elapsed) ?time( ms| s| us| ns)?$", r"^elapsed$", r"^time boot ms$",
+        r"^time ?millisecond$", r"^(rel|relative|elapsed|up) ?time( ms| s| us| ns)?$", r"^(elapsed|millis)$",
+        r"^time boot ms$", r"^time since (start|boot|take ?off|epoch)( s| ms| us)?$",
         r"^((gpst|tai)( time)?|time (gpst|tai))$", r"^(epoch|unix|ts)( ms| s| us| ns| utc)?$", r"^utc$", r"^t( utc)?$",
         r"^(zeit|uhrzeit|zeitstempel|hora|heure)( mesz| mez)?$",
     )),
@@ -481,6 +483,10 @@ def _milliwatts(per_unit: float) -> Callable[[FloatArray], FloatArray]:
     return convert
 
 
+# Voltages that are levels in a receiver of 50 ohm: 0 dBm are 0.224 V, 106.99 dBuV.
+ACROSS_50_OHM = ("dbuv", "db\u00b5v", "db\u03bcv")
+_DBUV_OF_0_DBM = 90 + 10 * float(np.log10(50.0))
+
 # Each unit that a name or a cell may have: the unit in which it is read, and how it becomes that.
 UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     **{word: ("m", _times(factor)) for word, factor in (
@@ -503,7 +509,8 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     "dbfs": (_FULL_SCALE, _times(1.0)),
     "linear": ("dB", _milliwatts(1.0)),
     "mv": ("V", _times(1e-3)),
-    "dbm": ("dBm", _times(1.0)),
+    "dbm": ("dBm", _times(1.0)), "dbuv/m": ("dBuV/m", _times(1.0)),
+    **{word: ("dBm", lambda values: values - _DBUV_OF_0_DBM) for word in ACROSS_50_OHM},
     "dbw": ("dBm", lambda values: values + 30.0),
     "mw": ("dBm", _milliwatts(1.0)), "w": ("dBm", _milliwatts(1e3)), "uw": ("dBm", _milliwatts(1e-3)),
     "\u00b5w": ("dBm", _milliwatts(1e-3)), "nw": ("dBm", _milliwatts(1e-6)), "pw": ("dBm", _milliwatts(1e-9)),

@@ -318,7 +318,7 @@ class Count(NamedTuple):
 COUNTS = {
     "ns": Count(1.0, re.compile(r"\bn(s|sec|anos\w*)\b"), 1e18),
     "us": Count(1e3, re.compile(r"(\b|time|stamp)(us|usec|micros\w*)\b"), 1e15),
-    "ms": Count(1e6, re.compile(r"(\b|time|stamp)ms\b|^m?sec$|millisecond"), 1e12),
+    "ms": Count(1e6, re.compile(r"(\b|time|stamp)ms\b|^m?sec$|millis"), 1e12),
     "s": Count(1e9, re.compile(r" s$|^s$|\bsec(ond)?s\b"), 1e9),
     "min": Count(6e10, re.compile(r"\bmin(ute)?s?\b"), math.inf),
     "h": Count(3.6e12, re.compile(r" h$|^h$|\bh(ou)?rs?\b"), math.inf),

@@ -306,6 +306,10 @@ class Sheet:
         if unit and meaning is not None and meaning.quantity.unit and not dictionary.is_unit(unit):
             text = f"column {self.names[column]!r}: unknown unit, read as {meaning.quantity.unit}"
             self.notes.setdefault(column, text)
+        if self.unit(column) in dictionary.ACROSS_50_OHM:
+            self.notes[column] = (
+                f"column {self.names[column]!r}: dBuV read as dBm in a receiver of 50 ohm, a guess (-107 dB)"
+            )
         units = {unit for _, unit in parsed.values() if dictionary.is_unit(unit)}
         if not units:
             return dictionary.converted(values, self.unit(column))
@@ -373,7 +377,8 @@ class Sheet:
 
 _OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank")
 _WHERE_OR_WHEN = re.compile(
-    r"\b(lat|latitude|lon|lng|long|longitude|alt|altitude|height|date|time|time ?stamp|utc|epoch)\b"
+    r"\b(lat|latitude|lon|lng|long|longitude|alt|altitude|height|date|(date|wall|up)? ?(time|clock)( ?stamp)?|utc"
+    r"|epoch)\b"
 )
 # Names of columns in one sentence.
 _MOST_NAMED = 20
@@ -717,10 +722,14 @@ def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None
         utc = [i for i in times if "utc" in sheet.plain[i].split()]
         both = [i for i in utc if all(_ZONELESS.fullmatch(text) for j in (i, column) for text in sheet.texts(j)[:3])]
         column = next(iter(utc if "local" in sheet.plain[column] else both), column)
-    texts, time_of = pd.Series(sheet.texts(column), dtype=object), dictionary.QUANTITIES[0]
+    time_of = dictionary.QUANTITIES[0]
+    ranked = sorted(times, key=lambda i: dictionary.rank_of(time_of, sheet.plain[i]))
+    if not _is_dated(sheet, column):
+        column = next((i for i in ranked if _is_dated(sheet, i)), column)
+    texts = pd.Series(sheet.texts(column), dtype=object)
     if options is None or not (texts == texts.shift()).any():
         return column
-    rest = sorted((i for i in times if i != column), key=lambda i: dictionary.rank_of(time_of, sheet.plain[i]))
+    rest = [i for i in ranked if i != column]
     moving = next((i for i in rest if _moves_on(sheet, i, texts, options)), column)
     if moving != column:
         text = f"column {sheet.names[column]!r} stands still while {sheet.names[moving]!r} runs on: the latter was read"
@@ -728,20 +737,24 @@ def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None
     return moving
 
 
+def _is_dated(sheet: Sheet, column: int) -> bool:
+    """Check whether the times of a column have a date, their own or that of a column of dates."""
+    first = next(filter(None, sheet.texts(column)), "")
+    return _stamps.is_dated(first) or (":" in first and sheet.find("date") is not None)
+
+
 # A clock stands still if another one advances by more than this while it shows one time [s].
 _STANDS_S = 2.0
 
 
 def _moves_on(sheet: Sheet, column: int, standing: pd.Series[str], options: ReadOptions) -> bool:
-    """Check whether a column of dated times advances while another shows the same time."""
-    if not _stamps.is_dated(next(filter(None, sheet.texts(column)), "")) and sheet.find("date") is None:
-        return False
+    """Check whether a column of times advances while another shows one time, always the same if neither has a date."""
     try:
         clock, cells, _ = _times(sheet, column, options, mapped=False)
         _, instants, valid = _rows.times(cells, options, clock=clock, reader="the table")
     except (InputError, UsageError):
         return False
-    if clock.startswith("relative") or not valid.all():
+    if (clock.startswith("relative") and standing.nunique() > 1 and not options.time_origin) or not valid.all():
         return False
     run = (standing != standing.shift()).cumsum().to_numpy()
     spans = pd.Series(instants.time).groupby(run).agg(["min", "max"])
@@ -808,6 +821,7 @@ _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
 _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 
 
+_OF_LEVELS = ("", "dBm", "dB", "dB re full scale")
 _MAPPED = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg")
 
 
@@ -817,7 +831,7 @@ def way_to_level(sheet: Sheet) -> list[str]:
     named = [
         i
         for i, meaning in enumerate(sheet.meanings)
-        if meaning is None and (sheet.names[i] in like or _has_levels(sheet, i))
+        if meaning is None and sheet.unit_read(i) in _OF_LEVELS and (sheet.names[i] in like or _has_levels(sheet, i))
     ]
     filled = [i for i in (*named, sheet.find("RSRQ")) if i is not None and np.isfinite(sheet.numbers(i)).any()]
     time = _time_column(sheet) if sheet.find("time") is not None else sheet.find("gps_seconds")

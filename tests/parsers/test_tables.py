@@ -229,6 +229,37 @@ def test_the_unit_of_a_program_is_not_read_where_its_steps_would_be_of_no_log() 
         assert any("read as seconds" in text for text in result.warnings) == (step == 1)
 
 
+@pytest.mark.parametrize(("name", "other", "cell"), [
+    ("time_unix_usec", "time_boot_ms", "17409276{i:02d}000000,{i}000"), ("UTC", "Time (s)", "2025-03-02T15:00:{i:02d}Z,{i}"),
+    ("wall_clock", "time", "2025-03-02T15:00:{i:02d}Z,{i}"), ("utc_datetime", "elapsed", "2025-03-02 15:00:{i:02d},{i}"),
+    ("gps_time", "millis", "17409276{i:02d},{i}000"), ("Recorded", "t", "17409276{i:02d}000,{i}"),
+])  # fmt: skip
+def test_a_time_with_a_date_is_read_and_not_the_one_without(name: str, other: str, cell: str) -> None:
+    head = f"{name},{other},Latitude,Longitude,Altitude (m),RSRP\n"
+    result = drive_test((head + "".join(cell.format(i=i) + ",35.72,-78.69,30,-80\n" for i in range(20))).encode())
+    time = result.streams[0].frame["time"]
+    assert time.iloc[0].isoformat() == "2025-03-02T15:00:00"
+    assert (time.diff().iloc[1:].dt.total_seconds() == 1.0).all()
+    assert any(f"not read, though they look like levels, identities, positions or times: {other!r}" in text
+               for text in result.warnings)  # fmt: skip
+
+
+def test_a_clock_that_never_moves_gives_way_to_one_without_dates() -> None:
+    head = "gps_time,time_boot_ms,Latitude,Longitude,Altitude (m),RSRP\n"
+    rows = "".join(f"2025-03-02T15:00:00Z,{i}000,35.72,-78.69,30,-80\n" for i in range(20))
+    result = drive_test((head + rows).encode())
+    assert (result.streams[0].frame["time"].diff().iloc[1:].dt.total_seconds() == 1.0).all()
+    assert any("'gps_time' stands still" in text for text in result.warnings)
+
+
+def test_microvolts_become_dbm_with_the_impedance_in_a_warning() -> None:
+    head = SIX_COLUMNS.replace("dBm", "dB\u00b5V")
+    result = drive_test(six_rows(GOOD.replace("-8{i}", "2{i}"), head=head))
+    level = next(s.frame["rss_db"] for s in result.streams if s.kind == "rss")
+    np.testing.assert_allclose(level.dropna(), [20 + i - 106.99 for i in range(6)], atol=0.01)
+    assert any("50 ohm" in text for text in result.warnings)
+
+
 def test_times_of_the_day_in_digits_are_told_from_counts() -> None:
     stamps = [f"14{i // 60:02d}{i % 60:02d}" for i in range(100)]
     rows = "".join(f"{stamp},35.72,-78.69,30,-80\n" for stamp in stamps)

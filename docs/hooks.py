@@ -2,7 +2,7 @@
 
 - Runs every script of ``docs/gallery``: its figure goes into the gallery, with the script, and in place of the comment
   ``<!-- gallery: NAME -->`` of any page. A script that fails ends the build.
-- Makes text of links that lead out of the documentation (benchmarks, tests), and of roles in docstrings.
+- Replaces links out of the documentation (benchmarks, tests) and roles in docstrings by text.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SCRIPTS = sorted((FOLDER / "gallery").glob("*.py"))
 
 
 def words_of(script: Path) -> tuple[str, str, str]:
-    """Title, text and code of a script: its docstring's first line, the rest of it, what follows."""
+    """Return title, text and code of a script: first line and rest of its docstring, and the code below."""
     source = script.read_text(encoding="utf-8")
     tree = ast.parse(source)
     title, _, text = (ast.get_docstring(tree) or "").partition("\n")
@@ -33,7 +33,7 @@ def words_of(script: Path) -> tuple[str, str, str]:
 
 
 def picture(script: Path) -> bytes:
-    """The SVG of a script's ``figure``; a blank with AERPAW_CMP_DOCS_FIGURES=0, for a quick look at the pages."""
+    """Return the SVG of a script's ``figure``, or a blank if AERPAW_CMP_DOCS_FIGURES is 0 (a fast build)."""
     if os.environ.get("AERPAW_CMP_DOCS_FIGURES") == "0":
         return b'<svg xmlns="http://www.w3.org/2000/svg" width="1" height="1"/>'
     import matplotlib.pyplot as plt
@@ -46,7 +46,7 @@ def picture(script: Path) -> bytes:
 
 
 def gallery() -> str:
-    """The page of all figures with their code."""
+    """Return the page of all figures with their code."""
     parts = [
         "# Gallery",
         "What do two-ray fading, Fresnel coefficients or an antenna pattern look like with this package? `make docs` "
@@ -74,7 +74,7 @@ def _figure(name: str, up: str) -> str:
 
 
 def commands() -> str:
-    """A section per command with its help."""
+    """Return a section per command with its help."""
     from typer.main import get_command
 
     from aerpaw_cmp.cli.app import app
@@ -97,7 +97,7 @@ def commands() -> str:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Put figures and commands in their places; links that leave the documentation become names of files."""
+    """Insert figures and commands, and replace links out of the documentation by file names."""
     up = "../" * page.file.src_uri.count("/")
     markdown = re.sub(r"<!-- gallery: (\w+) -->", lambda match: _figure(match[1], up), markdown)
     if "<!-- commands -->" in markdown:
@@ -106,5 +106,5 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Roles of docstrings, such as ``:class:`~a.b.C` ``, become their last name."""
+    """Replace roles of docstrings, such as ``:class:`~a.b.C` ``, by their last name."""
     return re.sub(r":(?:class|func|meth|data|mod|attr|exc):<code>~?(?:[\w.]+\.)?(\w+)</code>", r"<code>\1</code>", html)

@@ -1,10 +1,10 @@
-"""A campaign on a SLURM cluster: workers are SLURM jobs, the scheduler and the campaign run here.
+"""A campaign on a Slurm cluster: workers are Slurm jobs, scheduler and campaign run in this process.
 
     python slurm_campaign.py campaign.yaml --keep /shared/outcomes [more options of `aerpaw-cmp campaign`]
 
 Run it where `sbatch` works (a login node, or a small job of its own). The environment of this Python and the files of
-the campaign must lie under the same paths on every node. What your site wants (queue, account, memory, time) stands
-in SLURM_CAMPAIGN_..., or change the lines below.
+the campaign must have the same paths on each node. Set queue, account, memory and time in SLURM_CAMPAIGN_..., or change
+the lines below.
 """
 
 import os
@@ -17,9 +17,9 @@ from distributed.security import Security
 
 
 def main() -> int:
-    """Start the workers, run the campaign on them, end them; gives the campaign's exit code."""
+    """Start the workers, run the campaign, end the workers, and return the campaign's exit code."""
     asked = os.environ
-    security = Security.temporary()  # whoever reaches a scheduler without TLS runs programs as you
+    security = Security.temporary()  # anyone who reaches a scheduler without TLS can run programs as you
     with SLURMCluster(
         security=security,
         protocol="tls://",

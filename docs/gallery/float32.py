@@ -2,7 +2,7 @@
 
 The phase of a path is the fractional part of its length in wavelengths. In float32 this number has an error of some
 thousandths of a turn at 1 km and 3.4 GHz, which hides small singular values. The second singular value of a 4 x 4 line
-of sight is then either lost or wrong, and the rank at K = 1000 jumps although nothing in the scene changes. In this
+of sight is then lost or wrong. The rank at K = 1000 jumps although nothing in the scene changes. In this
 figure only the lengths are rounded to float32, once.
 """
 

@@ -1,6 +1,6 @@
 """Rank against distance for four spacings
 
-Rank of a 4 x 4 link at K = 100 as the UAV flies away: wide arrays at the tower keep their rank at longer
+Rank of a 4 x 4 link at K = 100 as the UAV flies away. Wide arrays at the tower keep their rank at longer
 distances, because spherical wave fronts differ between their elements.
 """
 

@@ -15,6 +15,9 @@ from .offset import grid_offset
 # Averaging window of the second error [s].
 WINDOW_S = 1.0
 
+# A level with a smaller standard deviation is constant, apart from rounding [dB].
+_CONSTANT_DB = 1e-6
+
 # Search range of the one offset [dB]: wide enough for logs in dB re full scale against a path loss.
 _RANGE_DB = (-400.0, 400.0)
 
@@ -143,8 +146,8 @@ def level_card(
         offset_db=fit.offset_db,
         rmse_offset_db=fit.rmse_db,
         rmse_1s_db=float(np.sqrt(np.mean((slow + fit.offset_db) ** 2))),
-        correlation=covariance / (spread * varied) if spread and varied else float("nan"),
-        slope=covariance / spread**2 if spread else float("nan"),
+        correlation=covariance / (spread * varied) if min(spread, varied) > _CONSTANT_DB else float("nan"),
+        slope=covariance / spread**2 if spread > _CONSTANT_DB else float("nan"),
         crps_db=crps,
         coverage_90=inside,
         exceedance=tuple(

@@ -80,6 +80,14 @@ def test_thresholds_are_those_of_an_snr_or_measured_deciles() -> None:
     assert measured_thresholds(np.array([np.nan]), ratio=False) == ()
 
 
+def test_a_constant_prediction_has_no_correlation_and_no_slope() -> None:
+    time, measured, _ = series()
+    rounded = np.full(N, -80.0) + np.resize([0.0, 1.4e-14], N)
+    card = level_card(time, measured, PredictedLevel(level_db=rounded), ())
+    assert np.isnan(card.correlation)
+    assert np.isnan(card.slope)
+
+
 def test_nearest_points_by_trying_all() -> None:
     rng = np.random.default_rng(11)
     points, samples = rng.uniform(0.0, 60.0, (80, 3)), rng.uniform(0.0, 60.0, (50, 3))

@@ -231,3 +231,31 @@ def test_each_claim_of_security_names_a_test_that_exists() -> None:
 def test_the_page_of_performance_is_made_from_the_history() -> None:
     history = performance.runs(performance.HISTORY)
     assert (ROOT / "docs" / "performance.md").read_text(encoding="utf-8") == performance.page(history)
+
+
+# Private words of earlier pages (what to write instead: docs/vocabulary.md), and inversions that have to be decoded.
+PRIVATE = re.compile(
+    r"\b(?:anew|whatever|whoever|beside|seldom|planted|rungs?|mends?|whole or|in the mean|stands? (?:in|under|twice)"
+    r"|(?<!there )(?:is|are) no (?!longer)|so (?:many|much) (?:positions|samples|flights)|speaks? for|as it stands|remembers?)\b",
+    re.IGNORECASE,
+)
+
+
+def prose(page: Path) -> list[str]:
+    """Return the sentences of a page, without code, tables, headings and comments."""
+    text = re.sub(r"(?s)\A---\n.*?\n---\n|```.*?```|<!--.*?-->", "", page.read_text(encoding="utf-8"))
+    text = re.sub(r"^(?:[|#]| {4}).*$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"`[^`]+`", "X", re.sub(r"\]\([^)]*\)", "]", text))
+    paragraphs = (" ".join(part.split()) for part in re.split(r"\n\s*\n|\n\s*(?:[-*]|\d+\.) ", text))
+    return [one for part in paragraphs for one in re.split(r"(?<=[.?!:])\s+(?=[A-Z\[*(])", part) if one]
+
+
+def test_pages_use_short_sentences_and_no_private_words() -> None:
+    sentences = {
+        (page.stem, sentence): len(re.findall(r"[\w'-]+", sentence)) for page in PAGES for sentence in prose(page)
+    }
+    assert len(sentences) > 1500
+    assert [key for key in sentences if PRIVATE.search(key[1])] == []
+    long = [key for key, words in sentences.items() if words > 30]
+    assert len(long) <= 0.05 * len(sentences), sorted(long)[:20]
+    assert sum(sentences.values()) <= 17 * len(sentences)

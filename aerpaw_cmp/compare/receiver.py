@@ -32,7 +32,7 @@ from ..common.geodesy import azimuth_rad
 from ..common.text import counted
 from ..common.units import FloatArray, IntArray, unmasked
 from .rank import MAX_RANK, cohen_kappa, kappa_influence, one_hot, total_variation
-from .statistics import NO_INTERVAL, Interval, influence_interval, mean_interval
+from .statistics import NO_INTERVAL, Interval, influence_interval
 
 # What a rank counts in the log score that a forecast held impossible.
 _LEAST_PROBABILITY = 1e-6
@@ -164,7 +164,7 @@ def score_forecast(
         log_score_ci95=influence_interval(float(log.mean()), log, bounds=(0.0, np.inf)),
         constant_log_score=float(log_constant.mean()),
         log_score_gain=float(1.0 - log.mean() / log_constant.mean()),
-        log_score_difference_ci95=mean_interval(log - log_constant),
+        log_score_difference_ci95=influence_interval(float(np.mean(log - log_constant)), log - log_constant),
         total_variation_expected=spread,
         total_variation_ci95=influence_interval(spread, varied, bounds=(0.0, 1.0)),
     )
@@ -705,4 +705,6 @@ def _left_out_losses(x: FloatArray, rank: IntArray, groups: IntArray) -> FloatAr
 
 def _not_worse(difference: FloatArray) -> bool:
     # the same channel by another name differs by rounding alone
-    return bool(np.abs(difference).max() < 1e-9) or not mean_interval(difference)[0] > 0.0
+    if np.abs(difference).max() < 1e-9:
+        return True
+    return not influence_interval(float(difference.mean()), difference)[0] > 0.0

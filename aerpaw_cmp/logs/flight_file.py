@@ -116,7 +116,7 @@ def is_flight_file(path: Path) -> bool:
 
 
 def _digest(book: BinaryIO, size: int) -> bytes:
-    """SHA-256 of the first ``size`` bytes."""
+    """Return the SHA-256 of the first ``size`` bytes."""
     digest = hashlib.sha256()
     book.seek(0)
     while size > 0 and (block := book.read(min(size, 1 << 20))):
@@ -126,7 +126,7 @@ def _digest(book: BinaryIO, size: int) -> bytes:
 
 
 def _refuse_changed(content: bytes, path: str | Path) -> None:
-    """InputError if the file ends with a seal that its content does not have."""
+    """Raise InputError if the file ends with a SHA-256 that is not that of its content."""
     size = len(content) - len(_SEAL) - _DIGEST_BYTES
     if size <= 0 or content[size:-_DIGEST_BYTES] != _SEAL:
         return
@@ -250,7 +250,7 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
 
 
 def _numbered(items: Mapping[str, AnyArray], shelf: str) -> list[str]:
-    """Groups on a shelf, as paths that end with a slash."""
+    """Return the groups below a group as paths that end with a slash."""
     return sorted({shelf + name[len(shelf) :].split("/")[0] + "/" for name in items if name.startswith(shelf)})
 
 

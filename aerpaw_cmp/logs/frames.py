@@ -65,16 +65,16 @@ class Logs(dict[str, pd.DataFrame]):
 
     @property
     def account(self) -> dict[str, Any]:
-        """Lines accepted, rejected and blank of each file, and its streams: what ``ingest --json`` prints."""
+        """The accepted, rejected and blank lines and the streams of each file, as printed by ``ingest --json``."""
         return summary(self.files)
 
     @property
     def notes(self) -> list[str]:
-        """Rejected lines, warnings and files left out, one sentence each."""
+        """The rejected lines, warnings and skipped files, one sentence each."""
         return account_notes(self.account)
 
     def select(self, **wanted: Any) -> dict[str, pd.DataFrame]:
-        """Frames whose attributes have the given values.
+        """Return the frames whose attributes have the given values.
 
         Parameters
         ----------
@@ -98,12 +98,12 @@ class Logs(dict[str, pd.DataFrame]):
         write_flight(Path(path).expanduser(), self.files)
 
     def __repr__(self) -> str:
-        """One line per stream."""
+        """Return a line per stream."""
         lines = ("  " + _line(name, frame) for name, frame in self.items())
         return "\n".join([f"Logs of {counted(len(self.files), 'file')}", *lines])
 
     def _repr_html_(self) -> str:
-        """A table of streams for notebooks."""
+        """Return a table of streams for notebooks."""
         rows = [
             (name, frame.attrs["kind"], frame.attrs["reader"], len(frame), Path(str(frame.attrs["file"])).name)
             for name, frame in self.items()

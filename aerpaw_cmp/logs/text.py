@@ -76,7 +76,7 @@ class Lines:
         return empty
 
     def raw(self, i: int) -> bytes:
-        """Bytes of line ``i``."""
+        """Return the bytes of line ``i``."""
         return self.data[self.starts[i] : self.ends[i]]
 
     def number_at(self, offsets: Iterable[int]) -> IntArray:

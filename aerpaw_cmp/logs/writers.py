@@ -24,7 +24,7 @@ _RX_GAIN_DB = 30.0
 
 
 def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]:
-    """UTC times as naive local text ``YYYY-mm-dd HH:MM:SS.ffffff``.
+    """Return UTC times as naive local text ``YYYY-mm-dd HH:MM:SS.ffffff``.
 
     Parameters
     ----------
@@ -146,13 +146,13 @@ def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str) -> byte
 
 
 def _ri(values: ArrayLike) -> AnyArray:
-    """RI as a Quectel writes it: layers from 1, and 0 for no CSI."""
+    """Return RI in the form of a Quectel: layers from 1, and 0 for no CSI."""
     rank = unmasked(values)
     return np.where(np.isnan(rank), 0, rank).astype(np.int64)
 
 
 def format_ri_csv(frame: pd.DataFrame, timezone: str) -> bytes:
-    """Rank records with positions as the published six-column table ``ID,Time and date,...,NR RI``.
+    """Return rank records with positions as the published six-column table ``ID,Time and date,...,NR RI``.
 
     Parameters
     ----------

@@ -222,6 +222,8 @@ def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[s
     columns, unknown = flight.home.columns, np.full(len(flight.home.time_s), np.nan)
     home = np.isfinite(columns.get("altitude_m", unknown))
     if not home.any():
+        astray = _pose.astray(rows, values)[known]
+        known = known[~astray] if not astray.all() else known
         rest = _pose.at_rest(rows.time[known], *(values[name][known] for name in _pose.PLACE))
         rows.warnings.append(f"no home is known: heights count from {'the first position' if rest is None else 'rest'}")
         return altitude - float(altitude[known[0]] if rest is None else rest)

@@ -288,7 +288,7 @@ def further(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dict[s
 
 
 def attributes_of(written: Mapping[str, str]) -> dict[str, Attribute]:
-    """Attributes of a part: its identities as written, a frequency in Hz."""
+    """Return the attributes of a part: its identities as written, and a frequency in Hz."""
     about: dict[str, Attribute] = {}
     for name, text in written.items():
         value, unit = _SI.fullmatch(text), re.search(r"\b[kmg](?=hz$)", name)

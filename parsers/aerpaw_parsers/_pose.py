@@ -255,8 +255,7 @@ def above_takeoff(
     altitude: FloatArray = values["altitude_m"]
     about: Height = {"height_from": rows.height_from, "height_datum": datum}
     possible = (altitude > _POSSIBLE_M[0]) & (altitude < _POSSIBLE_M[1])
-    track = pd.DataFrame({"time": rows.time, "line": rows.row + 1, **{name: values[name] for name in PLACE}})
-    known = np.flatnonzero(possible & ~lost & ~jumps_of(track)[0])
+    known = np.flatnonzero(possible & ~lost & ~astray(rows, values))
     seconds = np.maximum(np.diff(rows.time[known]) / np.timedelta64(1, "s"), 0.1)
     rate_mps = np.abs(np.diff(altitude[known])) / seconds
     if 2 * (rate_mps > _FASTEST_MPS).sum() > (rate_mps > 0).sum():
@@ -283,6 +282,12 @@ def above_takeoff(
     rows.warnings.append(f"altitudes are above {zero}: {first:.1f} m, {how}, was taken off")
     about |= {"takeoff_from": "rest" if climbs else "first position", "height_taken_off_m": round(first, 3)}
     return altitude - first, about
+
+
+def astray(rows: _rows.Rows, values: Mapping[str, AnyArray]) -> BoolArray:
+    """Return the rows (n,) whose position is a jump of the receiver, from which no height counts."""
+    place = {name: values[name] for name in PLACE}
+    return jumps_of(pd.DataFrame({"time": rows.time, "line": rows.row + 1, **place}))[0]
 
 
 # No small aircraft climbs so fast [m/s].

@@ -46,14 +46,14 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _reading(text: bytes) -> dict[str, str]:
-    """Names and values of a placemark."""
+    """Return the names and values of a placemark."""
     values = {name.decode(): value.decode("utf-8", "replace").strip() for name, value in kml.DATA.findall(text)}
     if (point := kml.POINT.search(text)) is not None:
         place = [b"" if cell is None else cell for cell in point.groups()]
         mode = _MODE.search(text)
         height = "Altitude AGL" if mode is not None and mode[1] == b"relativeToGround" else "Altitude above sea level"
         if not place[2].strip(b"0.") or (mode is not None and mode[1].startswith(b"clamp")):
-            place[2] = b""  # on the ground, as KML draws it: no height
+            place[2] = b""  # drawn on the ground, without a height
         values |= {name: cell.decode() for name, cell in zip((*_PLACE, height), place, strict=True) if cell}
     return values
 

@@ -101,7 +101,7 @@ def _track(rows: _rows.Rows, sheet: _sheet.Sheet, name: str) -> Stream | None:
 
 
 def _torn(lines: _text.Lines, data: bytes, row: object) -> list[RejectedLine]:
-    """Lines on which a point begins that is not whole."""
+    """Return the lines on which an incomplete point begins."""
     tracked = b"<trkpt" in data
     starts = (start.start() for start in _START.finditer(data) if b"trkpt" in start[0] or not tracked)
     begun = np.unique(lines.number_at(starts))

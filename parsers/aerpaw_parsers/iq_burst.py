@@ -1,8 +1,8 @@
-"""One I/Q burst as AERPAW's ``get_IQ.py`` writes it: ``results_<Hz>_<samples per s>_<YYYY_mm_dd_HH_MM_SS_mmm>.mat``.
+"""An I/Q burst of AERPAW's ``get_IQ.py``: ``results_<Hz>_<samples per s>_<YYYY_mm_dd_HH_MM_SS_mmm>.mat``.
 
-``IQ`` is (channels, samples) complex; the level of a channel is the mean power of its samples over the burst, 10
-log10, dB re full scale. The time of the burst is that of the file name, local; a flight is a folder of thousands of
-them, which ``ingest`` reads as one log.
+``IQ`` is (channels, samples) complex. The level of a channel is the mean power of its samples over the burst, 10
+log10, in dB re full scale. The time of the burst is the local time in the file name. A flight is a folder of thousands
+of bursts, which ``ingest`` reads as one log.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ def sniff(head: bytes) -> bool:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """One level per channel, ``USRP1`` and so on.
+    """Return one level per channel, ``USRP1`` and so on.
 
     Raises
     ------
     InputError
-        If there are no samples, or the file name does not say when the burst was.
+        If there are no samples, or the file name does not contain the time of the burst.
     UsageError
         If no time zone is given.
     """
     samples = read_arrays(data, {"IQ"}).get("IQ")
     if samples is None or not samples.size:
-        raise InputError("the burst holds no samples", expected="a variable IQ of channels by samples")
+        raise InputError("the burst has no samples", expected="a variable IQ of channels by samples")
     named = _NAME.search(options.file_name)
     if named is None:
         raise InputError(

@@ -76,14 +76,14 @@ def sniff_json(head: bytes) -> bool:
 
 
 def _ues(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The UEs of an object, at the top or in its cells."""
+    """Yield the UEs of an object, at the top or in its cells."""
     for place in (report, *_json.listed(report, "cells"), *_json.listed(report, "cell_list")):
         for ue in _json.listed(_json.inside(place, "cell_container") or place, "ue_list"):
             yield _json.inside(ue, "ue_container") or ue
 
 
 def read_json(data: bytes, options: ReadOptions) -> ReadResult:
-    """Rank stream ``gnb``: a record per UE and report."""
+    """Return the rank stream ``gnb`` with a record per UE and report."""
     lines = _text.split(data)
     reports = _json.objects(lines)
     row, entries = reports.row, reports.values

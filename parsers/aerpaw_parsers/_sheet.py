@@ -774,6 +774,11 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     if unit in ("\u00b5s", "\u03bcs") or (unit and count is None):
         count = "us" if unit in ("\u00b5s", "\u03bcs") else "s"
     written = dictionary.without_unit(sheet.names[column])[1] or any(c.said.search(name) for c in _text.COUNTS.values())
+    if count and not written and _stamps.are_seconds(sheet.numbers(column), count):
+        text = (
+            f"read as seconds, although {sheet.program.name if sheet.program else 'the program'} usually writes {count}"
+        )
+        sheet.notes[column], count = f"column {sheet.names[column]!r}: {text}", None
     zone = _stamps.header_zone(sheet.names[column], dictionary.in_brackets(sheet.names[column])[1])
     if day is not None and not zone:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
@@ -783,7 +788,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     heads = " ".join(sheet.names[i].lower() for i in (day, column) if i is not None)
     first = _DAY_OR_MONTH.search(heads)
     return _stamps.read(
-        texts, options, unit=count, by_program=not written, european=sheet.has_decimal_commas, zone=zone, gps=gps,
+        texts, options, unit=count, european=sheet.has_decimal_commas, zone=zone, gps=gps,
         day_first=None if first is None else first[1].startswith("d"), device=_devices(sheet),
     )  # fmt: skip
 

@@ -335,9 +335,8 @@ def beside(text: str) -> str:
 
 
 def read(
-    texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, by_program: bool = False,
-    european: bool = False, zone: str = "", gps: bool = False, day_first: bool | None = None,
-    device: IntArray | None = None,
+    texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, european: bool = False, zone: str = "",
+    gps: bool = False, day_first: bool | None = None, device: IntArray | None = None,
 ) -> tuple[str, AnyArray, list[str]]:  # fmt: skip
     """Return a column of times in any of the known forms.
 
@@ -347,8 +346,6 @@ def read(
     options : ReadOptions
     unit : {"ns", "us", "ms", "s", "min", "h"}, optional
         Unit of numbers that count from an unknown origin, by the name of the column.
-    by_program : bool
-        True if the unit is only known from the program.
     european : bool
         True if the table has decimal commas: the day then comes before the month.
     zone : str
@@ -386,11 +383,6 @@ def read(
     # 20250610140000 is a number, too
     if counts * 2 > len(filled) and not any(_DIGITS.fullmatch(text) for text in filled[:3]):
         value = np.array([float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else np.nan for text in shown])
-        step = _step(value)
-        if by_program and unit and step * _text.COUNTS[unit].ns <= _LEAST_NS and "s" in _likely_units(value):
-            clock, value, warnings = _numbers(value, None, options, gps=gps, zone=zone)
-            text = f"the times go in steps of {step:g}: read as seconds, although the program usually writes {unit}"
-            return clock, value, [text, *warnings]
         return _numbers(value, unit, options, gps=gps, zone=zone)
     if sum(_OF_DAY.fullmatch(text) is not None for text in filled) * 2 > len(filled):
         return _of_day(shown, options, zone, device)
@@ -480,6 +472,11 @@ def _likely_units(value: FloatArray) -> list[str]:
         if least <= step <= _LONGEST_STEP_S * 1e9 / _text.COUNTS[unit].ns
         and span <= _FLIGHT_S * 1e9 / _text.COUNTS[unit].ns
     ]  # fmt: skip
+
+
+def are_seconds(value: FloatArray, unit: str) -> bool:
+    """Check whether the steps of numbers are too short in the unit of a program, and likely in seconds."""
+    return _step(value) * _text.COUNTS[unit].ns <= _LEAST_NS and "s" in _likely_units(value)
 
 
 def _numbers(

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -117,6 +121,38 @@ def first(head: bytes) -> dict[str, Any] | None:
                 return None
         return value if isinstance(value, dict) else None
     return None
+
+
+# Objects that only group values: their names say nothing about the values.
+_GROUPS = re.compile(
+    r"(?:(?:gps|gnss|pos(?:ition)?|loc(?:ation)?|coord(?:inate)?s?|geo|data|meta(?:data)?|info|sample|record|measurement"
+    r"|payload|fix|state|telemetry)\.)+"
+)
+# Objects within objects, and entries of a list, beyond which values are not columns.
+_DEPTH, _ENTRIES = 4, 32
+
+
+def flat(entry: dict[str, Any]) -> dict[str, str]:
+    """Return the values of an object and of the objects inside as texts, by names such as ``cell.rsrp``.
+
+    Examples
+    --------
+    >>> flat({"t": 1, "gps": {"lat": 35.7}, "cells": [{"pci": 4}, {"pci": 5}]})
+    {'t': '1', 'lat': '35.7', 'cells.0.pci': '4', 'cells.1.pci': '5'}
+    """
+    written = dict(_values(entry))
+    bare = Counter(_GROUPS.sub("", name, count=1) for name in written)
+    short = {name: _GROUPS.sub("", name, count=1) for name in written}
+    return {short[name] if bare[short[name]] == 1 else name: text for name, text in written.items()}
+
+
+def _values(value: Any, *names: str) -> Iterator[tuple[str, str]]:
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else None
+    if inside is None:
+        yield ".".join(names), "" if value is None else str(value)
+    elif len(names) < _DEPTH:
+        for key, item in islice(inside, _ENTRIES if isinstance(value, list) else None):
+            yield from _values(item, *names, str(key))
 
 
 def number(value: Any) -> float:

@@ -28,7 +28,7 @@ from aerpaw_cmp.logs.limits import NEAR_DEG
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 from aerpaw_cmp.readers import ReadOptions, dictionary
 
-from . import _stamps
+from . import _json, _stamps
 
 SEPARATORS = (",", ";", "\t", "|")
 # Lines in front of a header, at most.
@@ -67,6 +67,9 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
 
 def starts(head: bytes, is_header: _IsHeader) -> bool:
     """Check whether a file begins with such a header, after title lines, and with rows of its width."""
+    if _OBJECT.match(head):  # JSON lines: the names of the values in the first object are the header
+        entry = None if _OF_PROGRAMS.search(head) else _json.first(head)
+        return entry is not None and is_header([*_json.flat(entry)])
     lines = [line.rstrip(b"\r") for line in head.split(b"\n")[: 2 * TITLES]]
     header = _header_of(lines, is_header)
     if header is None:
@@ -76,6 +79,11 @@ def starts(head: bytes, is_header: _IsHeader) -> bool:
     widths = [len(fields) for _, fields in islice(_logical(below, separator, len(names)), 5)]
     # rows may omit their last cells, or have one more after a separator at their end
     return 2 * sum(len(names) < 2 * width and width <= len(names) + 1 for width in widths) >= len(widths)
+
+
+_OBJECT = re.compile(rb"(?:\xef\xbb\xbf)?[\s\[]*\{")
+# Keys of JSON that has its own reader: the tap's, PawPrints' and srsRAN's.
+_OF_PROGRAMS = re.compile(rb'"(schema|log_type|connected_bssid|abs_time|ue_list)"\s*:')
 
 
 def _number(text: str) -> tuple[float, str]:
@@ -398,6 +406,11 @@ def _are_thousands(texts: Sequence[str]) -> bool:
 
 def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
     """Return the table of a file, or None if none of its first lines is a header."""
+    if _OBJECT.match(data):
+        lines = _text.split(data)
+        parsed = _json.objects(lines)
+        readings = [(int(i), _json.flat(entry)) for i, entry in zip(parsed.row, parsed.values, strict=True)]
+        return of_readings(lines, readings, parsed.rejected) if readings else None
     header = _header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
     if header is None:
         return None

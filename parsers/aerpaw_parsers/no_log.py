@@ -85,7 +85,7 @@ _KINDS: tuple[tuple[str, str, tuple[_Test, ...]], ...] = (
      (_mostly(_STAMP + rb"[+#][A-Z0-9]{2,12}: "),)),
     ("gnss_logger", "a log of Android's GnssLogger: save its Fix lines as CSV, with their header",
      (rb"(?m)^# ?Fix,Provider,",)),
-    ("json_records", "JSON records of a layout that is not read: save them as CSV",
+    ("json_records", "JSON records of a layout that is not read: save them as CSV, or as lines of one object each",
      (rb'\A[\s\[]*\{[^\0]{0,2000}?"(?:time\w*|utc|rsrp|pci|lat(?:itude)?)"\s*:',
       _not(rb'"log_type"|"FeatureCollection"'))),
     ("web_page", "a web page (a login or an error page in place of the download?)",

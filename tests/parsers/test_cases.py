@@ -176,7 +176,7 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
     "GeoJSON of levels": (
         '{"type":"FeatureCollection","features":[{"type":"Feature","properties":{"rsrp":-90}}]}', InputError, "of levels"),
     "JSON of a phone": (
-        table("", '{{"time": 174956400{i}, "pci": 11, "rsrp": -9{i}, "lat": 35.728}}')[1:], InputError, "JSON records"),
+        '{"data": [{"time": 1749564000, "pci": 11, "rsrp": -91, "lat": 35.728}]}\n', InputError, "JSON records"),
     "numbers without names": (table("# fc 3.5e9", "174956400{i}.0 {l}"), InputError, "without names or commas"),
     "a web page": ("<!DOCTYPE html><html><body>Log in</body></html>\n", InputError, "a web page"),
     "a table of nobody": (

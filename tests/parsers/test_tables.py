@@ -1,5 +1,6 @@
 """Tables with named columns: widths of rows, what whole columns decide, cells of phones, exports read back."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -242,6 +243,27 @@ def test_a_time_with_a_date_is_read_and_not_the_one_without(name: str, other: st
     assert (time.diff().iloc[1:].dt.total_seconds() == 1.0).all()
     assert any(f"not read, though they look like levels, identities, positions or times: {other!r}" in text
                for text in result.warnings)  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["lines", "array", "indented"])
+def test_json_records_are_a_table_with_a_column_per_value(form: str) -> None:
+    entries = [
+        {
+            "ts": f"{1740927600 + i}000", "gps": {"lat": 35.72, "lon": -78.69, "alt": 30.5},
+            "serving": {"pci": 14, "rsrp": -80.5},
+            "neighbors": [{"pci": 15, "rsrp": -90 - i % 3}, {"pci": 16, "rsrp": -95}][: i % 3],
+        }
+        for i in range(30)
+    ]  # fmt: skip
+    indent = 2 if form == "indented" else None
+    text = "\n".join(map(json.dumps, entries)) if form == "lines" else json.dumps(entries, indent=indent)
+    result = drive_test((text + "\n").encode())
+    cells = {s.attributes["pci"]: len(s.frame["rss_db"].dropna()) for s in result.streams if s.kind == "rss"}
+    assert cells == {14: 30, 15: 20, 16: 10}
+    track = next(s for s in result.streams if s.kind == "telemetry")
+    assert track.frame["time"].iloc[0].isoformat() == "2025-03-02T15:00:00"
+    assert set(track.frame["altitude_m"]) == {30.5}
+    assert not result.rejected
 
 
 def test_a_clock_that_never_moves_gives_way_to_one_without_dates() -> None:

@@ -206,7 +206,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
 
 
 def _offset(offset_db: float) -> str:
-    return f"less its offset of {signed(offset_db)} dB" if np.isfinite(offset_db) else "no offset"
+    return f"minus its offset of {signed(offset_db)} dB" if np.isfinite(offset_db) else "no offset"
 
 
 def _moved(level_dbm: FloatArray, offset_db: float) -> FloatArray:

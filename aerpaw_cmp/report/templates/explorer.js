@@ -188,7 +188,7 @@
     charts.push({ chart: made, host, height });
   }
 
-  const dots = (name, colour, size) => ({ label: name, stroke: colour, fill: colour, paths: () => null, points: { show: true, size, fill: colour, stroke: colour } });
+  const dots = (name, colour, size, hollow = false) => ({ label: name, stroke: colour, fill: colour, paths: () => null, points: { show: true, size, fill: hollow ? "transparent" : colour, stroke: colour } });
   const line = (name, colour, dash, width = 1.5) => ({ label: name, stroke: colour, width, dash, points: { show: false }, spanGaps: false });
   const column = a => Array.from(a, v => Number.isFinite(v) ? v : null);
 
@@ -211,7 +211,7 @@
       // levels as logged; each model is moved to them by its own offset
       const moved = (index, by) => Array.from(get(index), v => Number.isFinite(v) ? v - (by ?? 0) : null), ray = s.models[0];
       const columns = [Array.from(time), column(measured), moved(model.level, model.offset)], series = [dots("measured", css("--measured"), 4), line(model.name, css("--ink"))];
-      const words = [`dots: measured, as logged; line: ${model.name}${model.learned_here ? " with antennas learned from this flight" : ""}, less its offset of ${number(model.offset, 1, "dB")}`], extra = {};
+      const words = [`dots: measured, as logged; line: ${model.name}${model.learned_here ? " with antennas learned from this flight" : ""}, minus its offset of ${number(model.offset, 1, "dB")}`], extra = {};
       if (state.model === 0 && s.models[1]) { columns.push(moved(s.models[1].level, s.models[1].offset)); series.push(line(s.models[1].name, css("--baseline"), [6, 4], 1)); words.push("dashed: " + s.models[1].name); }
       const second = data.rss.find(o => o.name === s.beside), first = second ? 1 : 0; // under the dots and the line of the chosen channel
       if (state.model === 0 && s.band) {
@@ -222,8 +222,8 @@
       const tables = [columns];
       if (second) {
         tables.unshift([Array.from(get(second.time)), moved(second.measured, ray.offset - second.models[0].offset)]);
-        series.unshift(dots(second.name, css("--second"), 3)); extra.parted = s.parted;
-        words.push(`violet dots: ${second.name}, moved by ${number(second.models[0].offset - ray.offset, 1, "dB")}`, ...(s.parted.length ? [`shaded: the two part by more than ${s.parted_db} dB`] : []));
+        series.unshift(dots(second.name, css("--second"), 5, true)); extra.parted = s.parted;
+        words.push(`hollow violet dots: ${second.name}, moved by ${number(second.models[0].offset - ray.offset, 1, "dB")}`, ...(s.parted.length ? [`shaded: the two differ by more than ${s.parted_db} dB`] : []));
       }
       chart(target, `Level [${s.unit}]`, second ? uPlot.join(tables) : columns, series, tall + 30, extra);
       at("legend").textContent = words.join("; ");

@@ -78,7 +78,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^((measured|recorded|logged|sampled|seen|received|captured|created) at|recorded|logged)$",
         r"^(gps |utc |local |log )?(time ?stamp|date ?time|time and date|date and time)"
         r"( utc| gps| local| ms| s| us| ns| iso| unix)?$",
-        r"^(abs|log|pc|device|event|system|utc|gps|local|unix|epoch|server|host|wall|phone|sample|recording|receive)"
+        r"^(abs|log|pc|device|event|system|utc|gps|local|unix|posix|epoch|server|host|wall|phone|sample|recording|receive)"
         r" ?(time( stamp)?|clock)( utc| gps| local| ms| s| us| usec| ns)?$",
         r"^(custom )?(update ?)?(local |utc )?time( ?stamp)?( utc| ms| s| us| usec| ns| local| epoch)?$",
         r"^time ?millisecond$", r"^(rel|relative|elapsed|up) ?time( ms| s| us| ns)?$", r"^(elapsed|millis)$",
@@ -363,7 +363,7 @@ _UNPAIRED = re.compile(rf"{_MEAN.pattern}|\b(nr|ss|lte|4g|5g|cell|serving|primar
 
 
 def of_pairs(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | None]:
-    """Return the meanings of columns, with a place for each level and identity that share their further words.
+    """Return the meanings of columns, with a place for each level and identity that share their other words.
 
     A place with several identities, such as "PCI A" and "PCI B", has several cells: "RSRP A" is the level of the first.
 

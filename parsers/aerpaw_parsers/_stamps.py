@@ -449,8 +449,8 @@ def refuse_spreadsheets(texts: Sequence[str]) -> None:
         )
 
 
-# Lengths of a flight [s], and of the steps between its rows [s], by the unit that numbers without a unit may have:
-# 10 s in steps of 2 ms are likelier milliseconds than 3 h in steps of 2 s.
+# The longest flight [s], the longest step between its rows [s], and the least step of numbers without a unit in each
+# unit that they may have. Steps of 10 may be 10 ms, steps of 5 are 5 s.
 _FLIGHT_S, _LONGEST_STEP_S = 10_800.0, 60.0
 _LEAST_STEPS = {"s": 0.0, "ms": 10.0, "us": 2e3, "ns": 2e6}
 _NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
@@ -459,7 +459,7 @@ _LEAST_NS = 1e6
 
 
 def _step(value: FloatArray) -> float:
-    """Return the median step between rows of different times; NaN if all are the same."""
+    """Return the median step between rows of different times, or NaN if all are the same."""
     steps = np.abs(np.diff(value[np.isfinite(value)]))
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
 

@@ -370,26 +370,20 @@ def _places(frame: pd.DataFrame, path: Path, site: Site) -> AnyArray:
     """Return east, north, up (n, 3) in the site frame [m]. NaN without columns of positions."""
     if set(_PLACE) <= set(frame):
         place = np.column_stack([_numbers(frame[name]) for name in _PLACE])
+        cause = "map coordinates (UTM) instead of metres from the origin"
     elif set(_GEOGRAPHIC) <= set(frame):
         latitude, longitude, height = (np.asarray(_numbers(frame[name])) for name in _GEOGRAPHIC)
-        with np.errstate(invalid="ignore"):
-            east, north = site.frame.to_local(latitude, longitude)
-            swapped = site.frame.to_local(np.clip(longitude, -90, 90), latitude)
-        if np.nanmin(np.hypot(east, north)) > _FAR_M:
-            exchanged = np.nanmin(np.hypot(*swapped)) <= _FAR_M
-            raise InputError(
-                f"the nearest position is {np.nanmin(np.hypot(east, north)) / 1000:.0f} km from the site",
-                expected="latitude_deg, longitude_deg near the site",
-                cause="latitude and longitude are swapped" if exchanged else "a prediction of another place",
-                path=path,
-            )
-        place = np.column_stack([east, north, height + site.takeoff_ground_m])
+        place = np.column_stack([*site.frame.to_local(latitude, longitude), height + site.takeoff_ground_m])
+        swapped = np.hypot(*site.frame.to_local(np.clip(longitude, -90.0, 90.0), latitude))
+        near = np.nanmin(swapped, initial=np.inf) <= _FAR_M
+        cause = "latitude and longitude are swapped" if near else "a prediction of another place"
     else:
         return np.full((len(frame), 3), np.nan)
-    if np.nanmin(np.hypot(place[:, 0], place[:, 1]), initial=np.inf) > _FAR_M:
+    away_m = float(np.nanmin(np.hypot(place[:, 0], place[:, 1]), initial=np.inf))
+    if _FAR_M < away_m < np.inf:
         raise InputError(
-            "every position is more than 50 km from the site's origin", expected="metres east and north of the origin",
-            cause="map coordinates (UTM) instead of metres from the origin", path=path,
+            f"the nearest position is {away_m / 1000:.0f} km from the site's origin",
+            expected=f"positions within {_FAR_M / 1000:.0f} km", cause=cause, path=path,
         )  # fmt: skip
     return place
 
@@ -399,17 +393,16 @@ def _check_levels(level: FloatArray, quantity: str, path: Path) -> None:
     known = level[np.isfinite(level)]
     if not len(known) or not quantity:
         return
-    middle, what = float(np.median(known)), f"a median {quantity} of {np.median(known):.3g}"
+    middle, cause = float(np.median(known)), None
     if known.min() > 0.0 and known.max() < 1.0:
-        raise InputError(
-            what, expected="decibels",
-            cause="a linear gain or power; in decibels it is 10 log10(gain), or 10 log10(P / 1 mW) of P in watts or "
-            "milliwatts", path=path,
-        )  # fmt: skip
-    if quantity == "level_dbm" and middle > 60.0:
-        raise InputError(what, expected="received levels in dBm", cause="a path loss (path_loss_db)", path=path)
-    if quantity == "path_loss_db" and middle < 0.0:
-        raise InputError(what, expected="a loss, above 0", cause="a path gain; its negative is the loss", path=path)
+        cause = "a linear gain or power in watts or milliwatts; 10 log10(gain), or 10 log10(P / 1 mW), is in decibels"
+    elif quantity == "level_dbm" and middle > 60.0:
+        cause = "a path loss (path_loss_db)"
+    elif quantity == "path_loss_db" and middle < 0.0:
+        cause = "a path gain; its negative is the loss"
+    if cause is not None:
+        what = "a loss above 0 dB" if quantity == "path_loss_db" else f"received levels as {quantity}"
+        raise InputError(f"a median {quantity} of {middle:.3g}", expected=what, cause=cause, path=path)
 
 
 def _check_repeats(table: pd.DataFrame, path: Path) -> None:
@@ -584,36 +577,29 @@ class Verdict:
         )
 
 
-def judged(
-    data: FlightData,
-    result: FlightResult,
-    given: Sequence[ForeignPrediction],
-    near_m: float = AGAINST_DISTANCE_M,
-) -> list[Verdict]:
-    """Score predictions of other programs on a flight.
+def judge(
+    given: ForeignPrediction, data: FlightData, result: FlightResult, near_m: float = AGAINST_DISTANCE_M
+) -> Verdict:
+    """Score a prediction of another program on a flight.
 
     Parameters
     ----------
+    given : ForeignPrediction
     data : FlightData
     result : FlightResult
         Ours: levels, baselines and ranks at the same samples.
-    given : sequence of ForeignPrediction
     near_m : float
         Largest distance between a sample and its predicted position.
 
     Returns
     -------
-    list of Verdict
+    Verdict
 
     Raises
     ------
     InputError
-        If none of the predictions of a file is near a sample.
+        If none of the predictions is near a sample.
     """
-    return [_verdict(prediction, data, result, near_m) for prediction in given]
-
-
-def _verdict(given: ForeignPrediction, data: FlightData, result: FlightResult, near_m: float) -> Verdict:
     name = given.path.name
     series = [s for item in result.rss if given.quantity and (s := _series(given, item, data, near_m)) is not None]
     ranks = [r for tower in result.rank if (r := _ranks(given, tower, near_m)) is not None]

@@ -267,11 +267,10 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             record = replace(record, against=before, extra_metrics=extra)
         cards: list[dict[str, Any]] = []
         if given:
-            from .referee import judged
+            from .referee import judge
 
             with stages("score predictions"):
-                verdicts = judged(data, flight_run.result, given, chosen.against_distance_m)
-            cards = [verdict.metrics() for verdict in verdicts]
+                cards = [judge(item, data, flight_run.result, chosen.against_distance_m).metrics() for item in given]
             record = replace(record, extra_metrics={**record.extra_metrics, "referee": cards})
         if target is not None:
             text, sentence = recommended_text(load_flight(flight), flight_run.ladder, flight)

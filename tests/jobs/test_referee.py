@@ -173,7 +173,7 @@ def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
             "map coordinates (UTM)",
         ),
         (lambda f: f.rename(columns={"level_dbm": "path_loss_db"}), "a path gain; its negative is the loss"),
-        (lambda f: f.assign(level_db=10 ** (f.pop("level_dbm") / 10)), "a linear gain or power"),
+        (lambda f: f.assign(level_db=10 ** (f.pop("level_dbm") / 10)), "a linear gain or power in watts"),
         (
             lambda f, place: f.join(place.add([0.0, 0.0, 95.0])).drop(columns="time_utc").drop_duplicates(place.columns),
             "another height datum: the predicted positions are 95 m above the flight",

@@ -38,7 +38,7 @@ class Fault:
 
 FAULTS = (
     Fault("take-off ground not added to the track", "aerpaw_cmp/flight/data.py", "takeoff_m, ground = site.takeoff_ground_m,", "takeoff_m, ground = 0.0,", RAW),
-    Fault("take-off ground not added to ranks", "aerpaw_cmp/flight/data.py", "takeoff_m = site.takeoff_ground_m  # as of the track", "takeoff_m = 0.0  # as of the track", RAW),
+    Fault("take-off ground not added to ranks", "aerpaw_cmp/flight/data.py", "takeoff_m = site.takeoff_ground_m  # altitude_m", "takeoff_m = 0.0  # altitude_m", RAW),
     Fault("attitude held between rows", "aerpaw_cmp/flight/track.py", "Rotation.from_matrix(matrices))(t).as_matrix())", "Rotation.from_matrix(matrices))(at[np.searchsorted(at, t, side='right') - 1]).as_matrix())", "tests/flight/test_track.py"),
     Fault("attitude late by half a second", "aerpaw_cmp/flight/track.py", "Rotation.from_matrix(matrices))(t).as_matrix())", "Rotation.from_matrix(matrices))(np.maximum(t - 0.5, at[0])).as_matrix())", "tests/flight/test_track.py"),
     Fault("positions late by a row", "aerpaw_cmp/flight/track.py", "interpolated(t[valid], self._time_s, self._position)", "interpolated(t[valid] - 1.0, self._time_s, self._position)", "tests/flight/test_track.py"),

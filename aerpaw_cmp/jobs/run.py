@@ -537,7 +537,7 @@ def run_campaign(
     UsageError
         If campaign.yaml is wrong. A flight that cannot be read is a row of the result instead.
     """
-    from ..report.campaign import campaign_metrics, warnings, write_campaign
+    from ..report.campaign import campaign_metrics, edge_warnings, write_campaign
     from .campaign import find_reports, load_campaign, soundings, with_season
     from .campaign import run as run_all
     from .tasks import inputs_of_flights
@@ -567,7 +567,7 @@ def run_campaign(
             write_campaign(finished, place)
             _write_tracebacks(data.failures, place)
     failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
-    failed += [text for text in warnings(data) if "edge of the searched span" in text]
+    failed += edge_warnings(data)
     metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
     return JobOutcome(folder=folder, metrics=metrics, failed_checks=tuple(failed))
 

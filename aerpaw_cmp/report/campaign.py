@@ -454,11 +454,7 @@ def warnings(data: CampaignData) -> list[str]:
         for row in data.rss
         if LEARNED_HERE in row.fitted
     ]
-    out += [
-        f"{row.flight}, {row.setting}, {row.link}: the best offset is at the end of its search range."
-        for row in data.rss
-        if row.at_search_edge
-    ]
+    out += edge_warnings(data)
     out += [
         f"{pair.tower} {pair.channel}: only {100 * pair.share:.0f} % of the samples of {pair.first} have a pair on "
         f"{pair.second}; their repeatability is valid for these positions only."
@@ -473,6 +469,15 @@ def warnings(data: CampaignData) -> list[str]:
     if data.synthetic:
         out.append("Simulated flights, which are not measurements: " + ", ".join(data.synthetic) + ".")
     return list(dict.fromkeys(out))
+
+
+def edge_warnings(data: CampaignData) -> list[str]:
+    """Return a warning per row whose best offset is at the end of its search range, which is a failed check."""
+    return [
+        f"{row.flight}, {row.setting}, {row.link}: the best offset is at the end of its search range."
+        for row in data.rss
+        if row.at_search_edge
+    ]
 
 
 def worst_flights(data: CampaignData) -> list[tuple[str, float, str]]:

@@ -304,6 +304,14 @@ def test_flights_that_never_meet_have_no_floor() -> None:
     assert repeats([low, rss_row("b", "USRP2", np.zeros(50), np.zeros(50))]) == []
 
 
+def test_an_offset_at_the_end_of_its_range_is_a_failed_check(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    narrow = {"narrow": {"rss.span_db": [-0.5, 0.5]}}
+    result(folder, "narrow", settings=narrow)  # without --strict it is reported only
+    capsys.readouterr()
+    result(folder, "narrow", "--strict", "--force", settings=narrow, code=1)
+    assert "failed: first, narrow, LW1 USRP1: the best offset is at the end" in capsys.readouterr().err
+
+
 def test_flights_without_a_sample_that_counts_give_no_number_and_end_nothing(folder: Path) -> None:
     settings = {"as written": {}, "high": {"rss.minimum_height_m": 500}}
     campaign = result(folder, "too_low", "--strict", settings=settings, calibration="all")
@@ -337,7 +345,7 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
     assert not list((folder / "ranks_out").glob("figures/*"))
     page = (folder / "ranks_out" / "campaign.html").read_text(encoding="utf-8")
     assert "Mean RMSE over towers" not in page
-    assert "K chosen on the other flights" in page
+    assert "with the K of the other flights" in page
 
 
 def test_the_campaigns_to_copy_from_load_and_name_flights_that_are_there() -> None:

@@ -189,7 +189,7 @@ def test_an_optimum_at_the_edge_is_an_error_to_look_at(tmp_path: Path) -> None:
     path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at) + 160)})
     (series,) = compared_rss(path)
     assert series.score.at_edge
-    assert any("edge" in text for text in rss_warnings(series))
+    assert any("at the end of its search range" in text for text in rss_warnings(series))
 
 
 def test_radio_samples_outside_the_telemetry_have_no_pose_and_are_not_out_of_coverage(tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ WHITE_SHARES = (0.0, 2e-3, 3e-2)
 # White noise in the terms of a smooth correlation, which fall with the fourth power of their order.
 _SMOOTH_FLOOR = 1e-7
 
-Kind = Literal["mean", "power", "ratio"]
+Kind = Literal["mean", "power", "ratio", "influence"]
 
 # Correlation lengths, divided by the root mean square distance of a track from its centre. Consecutive lengths have a
 # ratio of the root of 2: the square of the correlation of one length is that of half the length.
@@ -70,7 +70,7 @@ _FADING_RATE = 40.0
 # Weight of a correlation over place relative to the mean weight of one over time, and the length above which it falls
 # as 1 / length, by kind. The terms hardly distinguish such lengths, but the mean and the power of a test depend on
 # them. Found by simulation. Differences of squares are correlated over half of the errors' length.
-_PLACE_WEIGHT = {"mean": (0.06, 1.0), "power": (0.06, 1.0), "ratio": (0.07, 0.3)}
+_PLACE_WEIGHT = {"mean": (0.06, 1.0), "power": (0.06, 1.0), "ratio": (0.07, 0.2), "influence": (0.07, 1.0)}
 
 # Largest number of positions from which the correlations of a track are computed.
 _THINNED = 400
@@ -239,14 +239,14 @@ def _table(name: str) -> FloatArray:
 @cache
 def weights(kind: Kind) -> FloatArray:
     """Return the prior weight (m,) of each correlation over time."""
-    drawn = np.exp(0.1 * _table(kind).ravel())
+    drawn = np.exp(0.1 * _table("ratio" if kind == "influence" else kind).ravel())
     return np.asarray(drawn / drawn.sum())
 
 
 @cache
 def stretches(kind: Kind) -> FloatArray:
     """Return the widening of the draws (2, m) per weighted share of each correlation, and per share without weights."""
-    if kind == "ratio":  # weights alone limit false verdicts to 5 %
+    if kind in ("ratio", "influence"):  # weights alone limit false verdicts to 5 %
         return np.repeat([[1.0], [0.0]], len(weights(kind)), axis=1)
     return 0.01 * _table(f"{kind} stretch").reshape(2, -1)
 
@@ -359,8 +359,8 @@ def mean_draws(values: FloatArray, kind: Kind = "mean", place_m: FloatArray | No
     ----------
     values : (n,)
         In time order, at least :data:`FEWEST`.
-    kind : {"mean", "ratio"}
-        Errors, or differences of their squares.
+    kind : {"mean", "ratio", "influence"}
+        Errors, differences of their squares, or what samples add to a statistic.
     place_m : (n, 3), optional
         East, north and up of each sample, NaN if unknown [m]. Correlation over place is then considered, too.
     """
@@ -372,7 +372,7 @@ def mean_draws(values: FloatArray, kind: Kind = "mean", place_m: FloatArray | No
     centre = -(known.joined("slope") @ slow)[index]
     reach = np.sqrt(scale * known.joined("variance")[index]) * _random(len(slow))[2]
     drawn = np.concatenate([centre + reach, centre - reach])
-    return drawn if kind == "ratio" else _stretched(drawn, stretch)
+    return _stretched(drawn, stretch) if kind == "mean" else drawn
 
 
 def heavy_tails(values: FloatArray) -> float:
@@ -775,12 +775,13 @@ def influence_interval(
 
     Notes
     -----
-    The interval of the mean of ``influence`` by the weights of paired differences. On simulated ranks it covers the
-    truth as often as by the weights of offsets, and has half of the width for long correlations.
+    The interval of the mean of ``influence`` by the weights over time of paired differences. On simulated ranks it
+    covers the truth as often as by the weights of offsets, and is narrower: at 1000 samples and 150 m, 1.3 times the
+    width for a known correlation instead of 1.8.
     """
     if len(influence) < FEWEST or not np.isfinite(estimate):
         return NO_INTERVAL
-    low, high = np.clip(_around(estimate, estimate + mean_draws(influence, "ratio", place_m)), *bounds)
+    low, high = np.clip(_around(estimate, estimate + mean_draws(influence, "influence", place_m)), *bounds)
     return float(low), float(high)
 
 

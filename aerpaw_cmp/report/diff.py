@@ -170,7 +170,7 @@ def _alone_in_each(samples: Overlap) -> str:
 def _levels(diff: ReportDiff) -> Table:
     return Table(
         caption="RSS. RMSE on the samples that both reports score, each about its own best offset there; intervals are "
-        "95 %, by blocks of the paired difference.",
+        "95 %, of the paired difference.",
         columns={"Link": HEAD, "Change of RMSE [dB]": RIGHT, "95 %": 3, "Second is": TEXT, "RMSE first, second": RIGHT,
                  "Offset first, second": RIGHT, "Replay moved: RMS, most": RIGHT, "Measured moved: most": 3,
                  "Scored first, second, both": RIGHT, "Samples in one report only": RIGHT},

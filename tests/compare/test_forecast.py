@@ -69,9 +69,9 @@ def test_every_interval_is_that_of_the_influence_of_the_samples():
         value = number(row)
         influence = np.array([599.0 * (value - number(row != left)) for left in row])
         ends = getattr(score, f"{name.replace('_expected', '')}_ci95")
-        assert ends == pytest.approx(np.quantile(value + mean_draws(influence, "ratio"), [0.025, 0.975]), rel=5e-3), (
-            name
-        )
+        assert ends == pytest.approx(
+            np.quantile(value + mean_draws(influence, "influence"), [0.025, 0.975]), rel=5e-3
+        ), name
         assert getattr(score, name, value) == pytest.approx(value), name
     gain = (log - flat).mean()
     assert score.log_score_gain == pytest.approx(-gain / flat.mean())

@@ -221,7 +221,10 @@ def test_an_influence_interval_respects_the_bounds_of_its_statistic():
     assert np.isnan(statistics.influence_interval(0.02, few)).all()
     assert np.isnan(statistics.influence_interval(np.nan, many)).all()
     low, high = statistics.influence_interval(0.02, 0.1 * many, bounds=(0.0, 1.0))
-    assert (low, high) == (0.0, pytest.approx(0.02 + 0.1 * np.quantile(statistics.mean_draws(many, "ratio"), 0.975)))
+    assert (low, high) == (
+        0.0,
+        pytest.approx(0.02 + 0.1 * np.quantile(statistics.mean_draws(many, "influence"), 0.975)),
+    )
 
 
 def test_share_interval_is_wilsons():

@@ -51,6 +51,10 @@ _OF_ANTENNA, _LEARNED_SHARE = ("heading", "pattern"), 0.25
 # Causes that must bring the error back to what is usual, and the least part of what all candidates take off together.
 _RESTORING = frozenset({"pattern", "heading", "height", "telemetry", "clock", "saturation", "place", "channels"})
 _LEAST_PART = 0.5
+# Causes that change the levels of all channels.
+_OF_UAV = frozenset({"height", "heading", "telemetry", "attitude"})
+# A cause that leaves more than this factor of the largest usual error does not explain the error.
+_MOST_LEFT, _LEAVING = 2.0, frozenset({"decibels", "tower"})
 # Causes whose level the log must follow.
 _FOLLOWED = frozenset({"pattern", "heading", "height", "telemetry", "place", "tower"})
 # Half of the 95 % point of chi-squared with one degree of freedom.
@@ -248,7 +252,8 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         if any(either < pair for pair in named):
             continue
         name = max(either & best)
-        shown = [table for table in tables if name in _names(_best(table, best))]
+        # the UAV has one height and one attitude: all channels must show that these are wrong
+        shown = [table for table in tables if either <= _OF_UAV or name in _names(_best(table, best))]
         # the words are those of the channel that shows the cause most clearly
         shown.sort(key=lambda table: -_best(table, {name}).gain)
         if all(
@@ -377,7 +382,8 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
         restored = name in _RESTORING - {_CATCH_ALL} and known_db > usual[1] >= alone_db
         # an error as large as that of any flight has no such cause
         least_db = usual[1] if name in OF_DIRECTION else usual[0] if name == "saturation" and not certain else 0.0
-        enough = known_db > least_db and (name not in _RESTORING or alone_db <= usual[1])
+        most_db = usual[1] if name in _RESTORING else math.inf if name in _LEAVING else _MOST_LEFT * usual[1]
+        enough = known_db > least_db and alone_db <= most_db
         return enough and (share <= 1.0 - least_share or certain or restored)
     return (share <= 1.0 - least_share or certain) and _is_enough(name, shown, known_db, alone_db)
 
@@ -824,29 +830,31 @@ def _height(e: LevelEvidence) -> Iterator[Trial]:
             next_step="check the telemetry's height datum",
         )  # fmt: skip
 
-    def drifting(rise: float, change: FloatArray) -> Trial:
-        return Trial(
-            name="height", cost=_RARE, change_db=change, next_step="check the barometer, or log the height of the GNSS",
-            sentence=f"the logged height drifts by about {-rise:+.0f} m until the end of the flight",
-        )  # fmt: skip
+    if not e.raised_db:
+        return
+    yield _tuned(e, e.raised_db, raised)
+    changes = _growing(e)
+    gain = _likelihoods(e, e.predicted_db + changes)
+    best = int(gain.argmax())
+    yield Trial(
+        name="height", cost=_RARE + _concentration(gain, np.ones(len(gain))), change_db=changes[best],
+        sentence=f"the logged height drifts by about {-_DRIFTS_M[best]:+.0f} m until the end of the flight",
+        next_step="check the barometer, or log the height of the GNSS", estimate=(_DRIFTS_M[best], math.nan, math.nan),
+    )  # fmt: skip
 
-    if e.raised_db:
-        yield _tuned(e, e.raised_db, raised)
-        yield _tuned(e, _growing(e), drifting)
+
+# True minus logged height at the end of a flight [m].
+_DRIFTS_M = tuple(float(sign * rise) for rise in (15, 20, 25, 30, 40, 50, 60, 80, 100) for sign in (-1, 1))
 
 
-def _growing(e: LevelEvidence) -> dict[float, FloatArray]:
-    """Return the changes of the level (n,) by heights whose error grows from 0 to a rise [m] during the flight."""
+def _growing(e: LevelEvidence) -> FloatArray:
+    """Return the changes of the level (m, n) by a height error that grows from 0 to each of the drifts."""
     rises = np.array(sorted({0.0, *e.raised_db}))
     table = np.stack([e.raised_db.get(rise, np.zeros(len(e.time_s))) for rise in rises.tolist()])
     share = (e.time_s - e.time_s[0]) / max(float(np.ptp(e.time_s)), 1e-9)
-    changes = {}
-    for rise in e.raised_db:
-        at = np.interp(rise * share, rises, np.arange(len(rises)))
-        low = np.minimum(at.astype(np.int64), len(rises) - 2)
-        below, above = (table[low + k, np.arange(len(at))] for k in (0, 1))
-        changes[rise] = below + (at - low) * (above - below)
-    return changes
+    at = np.interp(np.outer(_DRIFTS_M, share), rises, np.arange(len(rises)))
+    low, sample = np.minimum(at.astype(np.int64), len(rises) - 2), np.arange(len(share))
+    return np.asarray(table[low, sample] + (at - low) * (table[low + 1, sample] - table[low, sample]))
 
 
 def _misread(e: LevelEvidence) -> Iterator[Trial]:

@@ -84,10 +84,8 @@ def learned_health(flights: Sequence[HeldOut], differences_db: dict[str, list[fl
     places = [_places(f) for f in flights]
     apart = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in places]
     locked = [f.locked for f in flights if f.locked is not None and np.isfinite(f.locked).any()]
-    steps = [
-        step_chi2(*each, noise=_noise([s for s in series if s is not each] or [each]))[1].max(initial=0.0)
-        for each in series
-    ]
+    judged = [step_chi2(*each, noise=_noise([s for s in series if s is not each] or [each])) for each in series]
+    steps = [chi2[np.isfinite(at)].max(initial=0.0) for at, chi2, _ in judged]
     values = {
         "rmse_db": float(np.mean(seconds)),
         "rmse_sd_db": _sd(seconds, _RMSE_SHARE * float(np.mean(seconds))),
@@ -184,8 +182,10 @@ def _decay(apart: Sequence[FloatArray], errors: Sequence[FloatArray], longest: f
 # Chi-squared of a step of two channels that healthy flights exceed once in a thousand; more for each further channel.
 # Simulated healthy flights of 830 s: 95 % below 14 to 15, 99 % below 17 to 20.
 _STEP_CHI2, _FURTHER_CHI2 = 25.0, 4.0
-# A step must be this much better than a level that creeps, as twice a log likelihood.
-_BEFORE_CREEP = 6.0
+# A step must be this much better than a change over these times or over the flight, as twice a log likelihood.
+_BEFORE_SLOWER, _SLOW_S = 3.0, (100.0, 200.0)
+# The step must take this share of its own variance off that of the errors.
+_LEAST_TAKEN = 0.5
 # The mean square of the whitened error of healthy flights is at most 1.2 at LW1.
 _MOST_SQUARE = 1.6
 # Least number of means before and after a step: a minute.
@@ -238,7 +238,8 @@ class Step:
 def step_chi2(time_s: FloatArray, error_db: FloatArray, *, noise: Noise) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return instants (m,), chi-squared (m,) and size (m,) [dB] of a step, by generalised least squares.
 
-    The last element is a level that creeps from the first to the last instant; it has the instant NaN.
+    The last elements are slower changes, over 100 and 200 s about each instant and over the whole flight. They have the
+    instant NaN.
 
     Notes
     -----
@@ -249,33 +250,39 @@ def step_chi2(time_s: FloatArray, error_db: FloatArray, *, noise: Noise) -> tupl
     if not len(at):
         return at, at, at
     steps = (time_s[:, None] >= at[None]).astype(np.float64)
+    since = time_s[:, None] - at[None]
+    slow = [np.clip(0.5 + since / width_s, 0.0, 1.0) for width_s in _SLOW_S]
     creep = (time_s - time_s[0]) / max(float(np.ptp(time_s)), 1e-9)
-    white = noise.whiten(time_s, np.column_stack([np.ones(len(time_s)), error_db, steps, creep]))
+    white = noise.whiten(time_s, np.column_stack([np.ones(len(time_s)), error_db, steps, *slow, creep]))
     unit = white[:, 0] / np.linalg.norm(white[:, 0])
     rest = white[:, 1:] - np.outer(unit, unit @ white[:, 1:])
     power = np.maximum(np.square(rest[:, 1:]).sum(axis=0), 1e-12)
     size = rest[:, 0] @ rest[:, 1:] / power
-    return np.append(at, math.nan), size**2 * power, size
+    return np.append(at, np.full(len(size) - len(at), math.nan)), size**2 * power, size
 
 
 def step_of(channels: Sequence[Judged]) -> Step | None:
     """Return the step that all channels of a flight show together, or None if their errors are usual.
 
-    A step must exceed what healthy flights show, must be likelier than a level that creeps, and must leave the error of
-    a healthy flight.
+    A step must exceed what healthy flights show, must be likelier than a slower change, and must leave the error of a
+    healthy flight.
     """
     series = [binned(c.time_s, c.error_db) for c in channels]
     least = _STEP_CHI2 + _FURTHER_CHI2 * max(len(channels) - 2, 0)
     least = max(least, sum(c.health.step_chi2 for c in channels))
-    best, creep = _likeliest(channels, series)
-    if best is None or best.chi2 < max(least, creep + _BEFORE_CREEP):
+    best, slower = _likeliest(channels, series)
+    if best is None or best.chi2 < max(least, slower + _BEFORE_SLOWER):
         return None
-    left = []
+    left, taken, own = [], 0.0, 0.0
     for channel, (time_s, error_db), size_db in zip(channels, series, best.sizes_db.values(), strict=True):
-        without = error_db - size_db * (time_s + channel.start_s >= best.at_s)
+        step_db = size_db * (time_s + channel.start_s >= best.at_s)
+        without = error_db - step_db
+        taken, own = taken + float(error_db.var() - without.var()), own + float(step_db.var())
         if channel.noise.square(time_s, without) > _MOST_SQUARE * len(time_s):
             return None
         left.append((time_s, without))
+    if taken < _LEAST_TAKEN * own:
+        return None
     further, _ = _likeliest(channels, left)
     return best if further is None or further.chi2 < _MOST_LEFT_CHI2 else None
 
@@ -283,19 +290,27 @@ def step_of(channels: Sequence[Judged]) -> Step | None:
 def _likeliest(
     channels: Sequence[Judged], series: Sequence[tuple[FloatArray, FloatArray]]
 ) -> tuple[Step | None, float]:
-    """Return the likeliest common step of all channels, and chi-squared of a level that creeps."""
+    """Return the likeliest common step of all channels, and chi-squared of the likeliest slower change."""
     each = [step_chi2(*of, noise=channel.noise) for channel, of in zip(channels, series, strict=True)]
     if not each or any(len(at) < 2 for at, _, _ in each):
         return None, 0.0
-    own_s = [at[:-1] + channel.start_s for channel, (at, _, _) in zip(channels, each, strict=True)]
+    own_s = [at[np.isfinite(at)] + channel.start_s for channel, (at, _, _) in zip(channels, each, strict=True)]
     at_s = own_s[0]
-    chi2 = np.sum([np.interp(at_s, own, c[:-1], 0.0, 0.0) for own, (_, c, _) in zip(own_s, each, strict=True)], axis=0)
+
+    def summed(kind: int) -> FloatArray:
+        of = [c[kind * len(own) :][: len(own)] for own, (_, c, _) in zip(own_s, each, strict=True)]
+        return np.sum([np.interp(at_s, own, c, 0.0, 0.0) for own, c in zip(own_s, of, strict=True)], axis=0)
+
+    chi2 = summed(0)
+    slower = max(
+        *(float(summed(1 + kind).max()) for kind in range(len(_SLOW_S))), sum(float(c[-1]) for _, c, _ in each)
+    )
     best = float(at_s[chi2.argmax()])
     sizes = {
         channel.name: float(size_db[np.abs(own - best).argmin()])
         for channel, own, (_, _, size_db) in zip(channels, own_s, each, strict=True)
     }
-    return Step(at_s=best, chi2=float(chi2.max()), sizes_db=sizes), float(sum(c[-1] for _, c, _ in each))
+    return Step(at_s=best, chi2=float(chi2.max()), sizes_db=sizes), slower
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -74,7 +74,8 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     scores = [result.score for _, _, result in compared if result.score.n]
     if scores and pooled_db([score.rmse_db for score in scores], [score.n for score in scores]) < _GOOD_DB:
         return None, None
-    evidence = [_evidence(data, *each, scaled=not meant) for each in compared]
+    rotations: dict[tuple[str, bytes], FloatArray] = {}
+    evidence = [_evidence(data, *each, rotations=rotations, scaled=not meant) for each in compared]
     evidence = [_with_other(e, each, compared, evidence) for e, each in zip(evidence, compared, strict=True)]
     cause = flight_cause(evidence)
     late = _late_clock(evidence, [series.tower for series, _, _ in compared])
@@ -205,19 +206,34 @@ def _learned_series(data: FlightData, series: RssSeries) -> LearnedSeries | None
 
 
 def _evidence(
-    data: FlightData, series: RssSeries, replayed: Replayed, result: RssResult, *, scaled: bool = True
+    data: FlightData,
+    series: RssSeries,
+    replayed: Replayed,
+    result: RssResult,
+    *,
+    rotations: dict[tuple[str, bytes], FloatArray],
+    scaled: bool = True,
 ) -> LevelEvidence:
     """Return the evidence of a series with the levels that the page scores.
 
     With ``scaled`` the heights may have another unit.
     """
-    link = _Direct(data.site, series.tower, replayed)
+    n = len(replayed.poses)
+    # changes vary slowly along the track: compute them at some poses and interpolate
+    some = np.zeros(n, dtype=np.bool_)
+    some[np.linspace(0, max(n - 1, 0), min(n, _MOST_POSES)).astype(np.int64)] = True
+    track = None if replayed.track is None else replayed.track.pick(some)
+    thin = dataclasses.replace(replayed, poses=replayed.poses[some], track=track)
+    link = _Direct(data.site, series.tower, thin, rotations)
     known_db, known_both_db = link.level_db, link.level_of_both_db
     time_s = rss.seconds(series.time)
     order = np.argsort(time_s, kind="stable")
 
     def at_samples(values: FloatArray) -> FloatArray:
         return replayed.spread(values)[order]
+
+    def of_all(values: FloatArray) -> FloatArray:
+        return at_samples(np.interp(np.arange(n), np.flatnonzero(some), values) if n else values)
 
     lock = lock_lost(result)
     simulated_db, floor_db = result.simulated_dbm[order], -math.inf
@@ -227,10 +243,10 @@ def _evidence(
     predicted = np.maximum(simulated_db, floor_db)
 
     def changed(levels_db: Mapping[_Key, FloatArray], known_db: FloatArray = known_db) -> dict[_Key, FloatArray]:
-        levels = {key: at_samples(level - known_db) + simulated_db for key, level in levels_db.items()}
+        levels = {key: of_all(level - known_db) + simulated_db for key, level in levels_db.items()}
         return {key: np.maximum(level, floor_db) - predicted for key, level in levels.items()}
 
-    directions = link.directions(link.place_m, replayed.poses.position_m, replayed.poses.rotation)
+    directions = link.directions(link.place_m, replayed.poses.position_m, replayed.poses.rotation)  # angles wrap
     patterns = replayed.link.uav_array.patterns
     kinds = {"learned": any(isinstance(p, SpherePattern) for p in patterns) or replayed.learned is not None,
              "isotropic": all(isinstance(p, Isotropic) for p in patterns), "measured": True}  # fmt: skip
@@ -250,7 +266,7 @@ def _evidence(
         raised_db=changed(link.raised_db(), known_both_db),
         attitude_db=changed(link.attitude_db(data.settings.rt.attitude)),
         misread_db=changed(
-            link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid], scaled=scaled),
+            link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid][some], scaled=scaled),
             known_both_db,
         ),
         other_towers_db={name: predicted + change for name, change in changed(link.other_towers_db()).items()},
@@ -260,7 +276,7 @@ def _evidence(
         limits_known=lock is not None,
         learned=_learned_series(data, series),
         transmit_power_dbm=series.link.transmit_power_dbm,
-        distance_db=at_samples(link.distance_db),
+        distance_db=of_all(link.distance_db),
         displaced_db=changed(link.displaced_db(known_both_db), known_both_db),
         floored=any("floor_db" in data.settings.logs[log].model_fields_set for log in np.unique(series.log)),
     )
@@ -273,6 +289,8 @@ class _Direct:
     site: Site
     tower: str
     replayed: Replayed
+    rotations: dict[tuple[str, bytes], FloatArray]
+    """Attitudes by another meaning of the telemetry and times, shared by all channels."""
 
     @property
     def place_m(self) -> FloatArray:
@@ -358,10 +376,12 @@ class _Direct:
             levels[meaning] = self._level(self.place_m, place, poses.rotation, tower=True)
         if used != "ignored" and self._has_pattern and track.attitude_known.any():
             for meaning in MISREAD:
-                other = dataclasses.replace(track, rotation=data.track.rotations_if(meaning, time))
-                levels[meaning] = self._level(
-                    self.place_m, poses.position_m, attitude_rotation(other, used), tower=True
-                )
+                # the channels of a tower have the same times
+                key = meaning, time.tobytes()
+                if key not in self.rotations:
+                    self.rotations[key] = data.track.rotations_if(meaning, time)
+                rotation = attitude_rotation(dataclasses.replace(track, rotation=self.rotations[key]), used)
+                levels[meaning] = self._level(self.place_m, poses.position_m, rotation, tower=True)
         return levels
 
     def other_towers_db(self) -> dict[str, FloatArray]:
@@ -400,5 +420,7 @@ _MIRRORED = "east and north of the track are swapped"
 # Tried places of the tower, and number of poses at which they are computed.
 _RADII_M, _AZIMUTHS_DEG = (25.0, 40.0, 65.0, 105.0, 170.0, 275.0), tuple(22.5 * i for i in range(16))
 _DISPLACED_POSES = 300
+# Number of poses at which the other changes of the level are computed.
+_MOST_POSES = 1200
 # A track under another datum may begin so far below the ground [m].
 _BELOW_GROUND_M = 20.0

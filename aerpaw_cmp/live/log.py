@@ -1,8 +1,7 @@
 """The tap's durable log: append-only JSONL segments.
 
 One record is one line, written by one ``write`` to an ``O_APPEND`` file, so a record that was written before a SIGKILL
-is
-in the file. ``fdatasync`` follows at an interval, so a power loss costs at most that interval. Each line ends with
+is in the file. ``fdatasync`` follows at an interval, so a power loss costs at most that interval. Each line ends with
 the CRC-32 of the preceding text, which distinguishes records from truncated or damaged lines.
 
 A disk that is full or read-only does not stop the caller. Records wait in bounded memory, in order, and are written
@@ -22,7 +21,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -65,53 +64,6 @@ def _sync_directory(folder: Path) -> None:
         os.close(fd)
 
 
-class _Syncer(threading.Thread):
-    """A thread that calls ``fdatasync`` in parallel to the polling, so that a slow card does not delay polls."""
-
-    def __init__(self, on_error: Callable[[OSError], None]) -> None:
-        super().__init__(name="tap-fdatasync", daemon=True)
-        self._wanted = threading.Event()
-        self._fd_lock = threading.Lock()
-        self._fd = -1
-        self._ended = False
-        self._on_error = on_error
-
-    def request(self, fd: int) -> None:
-        with self._fd_lock:
-            self._fd = fd
-        self._wanted.set()
-
-    def run(self) -> None:
-        while True:
-            self._wanted.wait()
-            self._wanted.clear()
-            if self._ended:
-                return
-            try:
-                self._sync()
-            except OSError as error:
-                self._on_error(error)
-
-    def _sync(self) -> None:
-        with self._fd_lock:  # held while syncing: the descriptor must not be closed under it
-            # asked for twice while one sync ran, one more holds both
-            fd, self._fd = self._fd, -1
-            if fd >= 0:
-                os.fdatasync(fd)
-
-    @contextlib.contextmanager
-    def quiet(self) -> Iterator[None]:
-        """No sync runs and none is waiting inside."""
-        with self._fd_lock:
-            self._fd = -1
-            yield
-
-    def stop(self) -> None:
-        self._ended = True
-        self._wanted.set()
-        self.join(timeout=5.0)
-
-
 @dataclass(slots=True)
 class LogSettings:
     """Settings for writing the log.
@@ -119,17 +71,17 @@ class LogSettings:
     Parameters
     ----------
     sync_interval_s : float
-        Longest time between a record and its ``fdatasync``; 0: after every record.
+        Longest time between a record and its ``fdatasync``. 0: after every record.
     segment_bytes : int
         A segment is closed at this size.
     segment_s : float
         ... or at this age [s].
     backlog_records, backlog_bytes : int
-        What may wait in memory while the disk takes nothing.
+        Limits of the records that wait in memory while the disk cannot be written.
     retry_s : float
         Pause between attempts on a faulty disk.
     patience_s : float
-        Longest wait of the polling for a record to be written; then it goes on and records wait in memory.
+        Longest wait of the polling for a record to be written. Then the polling continues and records wait in memory.
     """
 
     sync_interval_s: float = 1.0
@@ -194,8 +146,6 @@ class SegmentLog:
     _retry_ns: int = 0
     _backlog: deque[bytes] = field(default_factory=deque)
     _backlog_bytes: int = 0
-    _syncer: _Syncer | None = None
-    _sync_error: OSError | None = None
 
     def open(self) -> None:
         """Make the folder and the first segment."""
@@ -210,48 +160,35 @@ class SegmentLog:
                 cause=_disk_cause(error),
                 path=self.folder,
             ) from None
-        if self.settings.sync_interval_s > 0:
-            self._syncer = _Syncer(self._on_sync_error)
-            self._syncer.start()
 
     def append(self, record: Record) -> bool:
         """Write one record. Return True once the kernel has it, False if it waits in memory.
 
-        The number ``n`` of the record in the session is set here.
+        The number ``n`` of the record in the session is set here. Call :meth:`tick` afterwards.
         """
         record["n"] = self._number
         self._number += 1
-        if self._sync_error is not None:
-            self._fail(self._sync_error)
         self._put(encode_record(record))
         if self._backlog and not self._drain():
             return False
         now = self.clock.mono_ns()
         if self._size >= self.settings.segment_bytes or now - self._opened_ns > self.settings.segment_s * 1e9:
             self._rotate()
-        elif self.settings.sync_interval_s <= 0:
-            self.sync()
-        else:
-            self.tick()
         return self.fault is None
 
     def tick(self) -> None:
-        """Called often: asks for the sync that is due, and tries a faulty disk again."""
-        now = self.clock.mono_ns()
+        """Sync if it is due, and try a faulty disk again. Call it after each record and while there are none."""
         if self.fault is not None:
             self._drain()
-        elif self._dirty and self._syncer is not None and now - self._synced_ns >= self.settings.sync_interval_s * 1e9:
-            self._synced_ns = now
-            self._dirty = False
-            self._syncer.request(self._fd)
+        elif self._dirty and self.clock.mono_ns() - self._synced_ns >= self.settings.sync_interval_s * 1e9:
+            self.sync()
 
     def sync(self) -> None:
         """``fdatasync`` now (gap, rotation, stop)."""
         if self._fd < 0 or self.fault is not None:
             return
         try:
-            with self._syncer.quiet() if self._syncer is not None else contextlib.nullcontext():
-                os.fdatasync(self._fd)
+            os.fdatasync(self._fd)
         except OSError as error:
             self._fail(error)
             return
@@ -265,9 +202,6 @@ class SegmentLog:
         if self.fault is not None:
             self._drain()
         self.sync()
-        if self._syncer is not None:
-            self._syncer.stop()
-            self._syncer = None
         self._close_fd()
         self.lost += len(self._backlog)
 
@@ -347,7 +281,6 @@ class SegmentLog:
         self._dirty = True
 
     def _fail(self, error: OSError) -> None:
-        self._sync_error = None
         if error.errno in (errno.EIO, errno.EROFS, errno.EBADF, errno.ESTALE):
             self._close_fd()  # after a failed sync the kernel may have dropped pages: go on in a new segment
         if self.fault is None:
@@ -356,9 +289,6 @@ class SegmentLog:
             self.on_fault(
                 f"the log cannot be written: {self.fault.reason}. {_disk_cause(error)}; records wait in memory"
             )
-
-    def _on_sync_error(self, error: OSError) -> None:
-        self._sync_error = error  # handled by the polling thread at its next record
 
     def _rotate(self) -> None:
         try:
@@ -399,8 +329,7 @@ class SegmentLog:
 
     def _close_fd(self) -> None:
         if self._fd >= 0:
-            with self._syncer.quiet() if self._syncer is not None else contextlib.nullcontext():
-                os.close(self._fd)
+            os.close(self._fd)
             self._fd = -1
 
 
@@ -418,7 +347,7 @@ def _disk_cause(error: OSError) -> str:
 
 
 class LogWriter:
-    """Writes to a :class:`SegmentLog` in a thread of its own.
+    """A thread that writes to a :class:`SegmentLog` and syncs it.
 
     Parameters
     ----------
@@ -518,22 +447,22 @@ class LogWriter:
                 self._busy = item is not None or sync
             if closing:
                 return
-            self._work(item[0] if item is not None else None, sync)
+            if item is not None:
+                self._append(item[0])
+            if sync:
+                self.log.sync()
             with self._changed:
                 self._busy = False
                 if sync:
                     self._sync_wanted = False
                 self._changed.notify_all()
+            # the polling continues: the kernel has the record
+            self.log.tick()
+            self.free_bytes = self.log.free_bytes()
 
-    def _work(self, record: Record | None, sync: bool) -> None:
+    def _append(self, record: Record) -> None:
         try:
-            if record is not None:
-                self.log.append(record)
-            elif sync:
-                self.log.sync()
-            else:
-                self.log.tick()
-                self.free_bytes = self.log.free_bytes()
+            self.log.append(record)
         except Exception as error:  # one bad record must not end the log
-            self._dropped += record is not None
+            self._dropped += 1
             self._tell(f"a record could not be written: {type(error).__name__}: {error}")

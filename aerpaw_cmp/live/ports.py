@@ -153,11 +153,8 @@ def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
     ------
     PortGoneError
         If it is not there.
-    UsageError
-        If it is a URL of pyserial.
     """
     roots = roots or Roots()
-    _refuse_url(port)
     if port is None:
         candidates = find_candidates(roots)
         if not candidates:
@@ -175,27 +172,6 @@ def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
             if link.resolve() == path.resolve():
                 return PortInfo(link, path.resolve(), "by-id", interface, product)
     return PortInfo(path, path.resolve(), "given", interface, product)
-
-
-_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.]{1,12})://(.*)", re.DOTALL)
-
-
-def _refuse_url(port: str | Path | None) -> None:
-    """Refuse a pyserial URL, because the tap opens devices itself (see the head of this file)."""
-    match = _URL.fullmatch(port) if isinstance(port, str) else None
-    if match is None:
-        return
-    kind, rest = match[1].lower(), match[2]
-    bridge = {
-        "socket": f"socat pty,link=/tmp/modem,rawer tcp:{rest or 'HOST:PORT'}",
-        "loop": "aerpaw-cmp modem-sim --link /tmp/modem",
-    }
-    command = bridge.get(kind, "socat pty,link=/tmp/modem,rawer ...")
-    raise UsageError(
-        f"the port is a URL of pyserial ({kind}://)",
-        expected="a serial device, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
-        cause=f"the tap opens devices only; '{command}' makes one, for 'aerpaw-cmp tap /tmp/modem'",
-    )
 
 
 def holders(path: Path, *, others_only: bool = True) -> list[Holder]:
@@ -402,8 +378,6 @@ class TapSettings:
         Switch CSI reporting on, and restore it on exit (the only command that writes).
     no_csi_alarm_s : float, optional
         Raise an alarm after this time without a rank [s].
-    no_csi_exit : bool
-        End with exit code 1 on that alarm instead of continuing.
     status_s : float
         Interval of the status calls [s].
     duration_s : float, optional
@@ -542,9 +516,9 @@ class TapSummary:
     Parameters
     ----------
     reason : str
-        ``SIGINT``, ``SIGTERM``, ``SIGHUP``, ``duration``, ``no_csi`` or the reason of the caller's stop.
+        ``SIGINT``, ``SIGTERM``, ``SIGHUP``, ``duration`` or the reason of the caller's stop.
     exit_code : int
-        0, or 1 if the no-CSI alarm ended the session or records were lost because of the disk.
+        0, or 1 if records were lost because of the disk.
     segments : tuple of Path
     answers : mapping
         Counts by status, for each query.

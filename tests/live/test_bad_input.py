@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.live.ports import PortGoneError, Roots, SerialPort, TapSettings, find_candidates, find_port, holders
 from benchmarks.simulated_modem import Faults, FaultyModem
 from tests.live.terminals import held, until
@@ -354,24 +354,6 @@ def test_numbers_that_swap_are_followed_by_the_interface(modem, tap, tools, tmp_
     (closed,) = [r for r in records if r["kind"] == "gap" and r["state"] == "closed"]
     assert closed["port"]["path"] == str(roots.dev / "ttyUSB5")
     assert not [h for r in records for h in r.get("lines", []) if isinstance(h, str) and h.startswith("$GP")]
-
-
-@pytest.mark.parametrize(
-    ("url", "words"),
-    [
-        (
-            "socket://10.0.0.2:4001",
-            r"a URL of pyserial \(socket://\).*socat pty,link=/tmp/modem,rawer tcp:10.0.0.2:4001",
-        ),
-        ("rfc2217://host:7000", r"a URL of pyserial \(rfc2217://\).*socat"),
-        ("loop://", r"a URL of pyserial \(loop://\).*modem-sim"),
-        ("spy:///dev/ttyUSB2?file=x", r"a URL of pyserial \(spy://\)"),
-    ],
-)
-def test_urls_of_pyserial_are_refused_by_name(tmp_path, url, words):
-    with pytest.raises(UsageError, match=words):
-        run_tap(TapSettings(tmp_path / "log", url))
-    assert not (tmp_path / "log").exists()
 
 
 @pytest.mark.parametrize("command", ["tap", "modem-sim"])

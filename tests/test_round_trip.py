@@ -159,8 +159,8 @@ def test_reported_ranks_are_one_layer_off_or_without_csi_as_often_as_planned(tmp
 @pytest.mark.parametrize(
     ("log", "words"),
     [
-        ({"path": "p.txt", "reader": "sounder_log", "node": "LW1"}, "does not say whose it is"),
-        ({"path": "p.txt", "reader": "sounder_log", "channel": "USRP1"}, "does not say whose it is"),
+        ({"path": "p.txt", "reader": "sounder_log", "node": "LW1"}, "has no tower or no channel"),
+        ({"path": "p.txt", "reader": "sounder_log", "channel": "USRP1"}, "has no tower or no channel"),
         ({"path": "p.txt", "reader": "sounder_log", "node": "LW9", "channel": "USRP1"}, "the site has no tower 'LW9'"),
         ({"path": "p.txt", "reader": "aadm_snr"}, "no writer for log"),
         (RANKS | {"path": "../p.csv"}, "no file of its folder"),

@@ -290,7 +290,7 @@ def _shown_without(
 
 _NO_OVERLAP = "too few samples at which the telemetry gives a position for every lag of the window"
 _FLAT_LEVEL = "the level stays flat where the model predicts that it varies"
-_ONE_PLACE = "a fifth of the flight alone speaks for a shift"
+_ONE_PLACE = "only one fifth of the flight supports a clock shift"
 _NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
 
 
@@ -352,9 +352,10 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
     against = -float(total[np.abs(lags) <= _SAME_S + 1e-9].max())
     agree = first >= -_AGREE_S and last <= _AGREE_S
     lowest, highest = Printed(low), Printed(high)
-    verdict, reason = CANNOT_TELL, f"lags from {lowest:+.1f} to {highest:+.1f} s explain the level about as well"
+    verdict = CANNOT_TELL
+    reason = f"any lag from {lowest:+.1f} to {highest:+.1f} s explains the level about equally well"
     if against > EVIDENCE_NAT and (near[0] == 0 or near[-1] == len(lags) - 1):
-        reason = f"the best lag lies near the edge of the window ({window_s:g} s): widen rss.advanced.lag_window_s"
+        reason = f"the best lag is near the edge of the window ({window_s:g} s): increase rss.advanced.lag_window_s"
     elif not low <= 0.0 <= high and (against > EVIDENCE_NAT or agree):
         verdict, reason = SHIFTED, ""
     elif agree:
@@ -363,7 +364,7 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
     refused = nats[:, best].max(axis=1) - nats[:, best, total.argmax()]
     if refused.max() > _APART_NAT and np.ptp(list(alone.values())) > _AGREE_S:
         each = ", ".join(f"{name} {Printed(lag):+.1f} s" for name, lag in alone.items())
-        verdict, reason = CANNOT_TELL, f"its channels have clocks of their own, {each}"
+        verdict, reason = CANNOT_TELL, f"its channels have different clocks, {each}"
     return ClockEstimate(
         radio_minus_telemetry_s=float(lags[total.argmax()]),
         ci95_s=(low, high),
@@ -533,7 +534,7 @@ def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray
 def _whitened(
     columns: FloatArray, time_s: FloatArray, memories: Sequence[tuple[float, float]]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return whitened columns (n, memories, ...), and the log determinants (memories,) of their covariances.
+    """Return whitened columns (n, times, ...) for each correlation time, and log determinants of covariances (times,).
 
     A residual with a correlation time and a white share has the covariance exp(-|dt| / memory), plus white^2 on the
     diagonal. A Kalman filter subtracts from each row its expectation from earlier rows.
@@ -602,7 +603,7 @@ class ClockTrap:
 
     def advice(self) -> str:
         """Return cause and remedy as text."""
-        return f"{self.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' beside the log"
+        return f"{self.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' next to the log"
 
 
 def clock_trap(

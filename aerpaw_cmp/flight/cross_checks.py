@@ -45,7 +45,7 @@ class Flight:
 
     @property
     def measured(self) -> list[Stream]:
-        """Streams that can be compared."""
+        """The streams that can be compared."""
         return [stream for file in self.files for stream in file.result.streams if stream.kind in ("rss", "rank")]
 
     @property
@@ -106,7 +106,7 @@ def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
     first, second = ({(word.lower(), number) for word, number in _FLIGHT_NUMBER.findall(name)} for name in names)
     if first and second and not first & second:
         (shown, other) = (" ".join(min(found)) for found in (first, second))
-        return f"its name has {shown}, that of the track {other}: which flight?"
+        return f"its name has {shown}, the name of the track has {other}: which flight?"
     # absolute times outweigh a name, because an evening flight has the next day in UTC
     if _span_of(file) is not None:
         return ""
@@ -115,7 +115,7 @@ def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
     if flown is not None:
         dates[1] |= {str(flown[0].astype("datetime64[D]") + day) for day in (-1, 0, 1)}
     if dates[0] and dates[1] and not dates[0] & dates[1]:
-        return f"its name has {min(dates[0])}, the track is of {max(dates[1])}: which flight?"
+        return f"its name has {min(dates[0])}, the date of the track is {max(dates[1])}: which flight?"
     return ""
 
 
@@ -198,7 +198,7 @@ def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
         rivals = [i for away_m, i in others if away_m < max(_ALIKE * near_m, _ALIKE_M)]
         if rivals:
             called = " and ".join(_called(known[i]) for i in rivals)
-            text = f"its positions lie on the track of the flight {called} too: which flight?"
+            text = f"its positions are also on the track of the flight {called}: which flight?"
             known[best].unsure[file.path] = text
         return known[best]
     folder = Path(file.path).parent
@@ -245,17 +245,17 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
         if not file.holder:  # the path may be that of another machine
             starts += _summary_starts(Path(file.path))
         texts += [
-            f"{where} says {time:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is right?"
+            f"{where} has {time:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is correct?"
             for where, time, form, slack in starts
             if _apart(time, start, zone, exact=slack == _OF_THE_MINUTE) > slack
         ]
         if any(s.attributes.get("clock_from") == "assumed" for s in streams):
-            texts.append(f"the times are read as {_source(streams, 'clock') or 'local wall time'}: right?")
+            texts.append(f"the times are read as {_source(streams, 'clock') or 'local wall time'}: correct?")
     if any(s.attributes.get("height_from") == "assumed" for s in streams):
-        texts.append(f"the heights are read as {_source(streams, 'height') or 'above take-off'}: right?")
+        texts.append(f"the heights are read as {_source(streams, 'height') or 'above take-off'}: correct?")
     for stream in streams:
         sentence = "" if (jumps := jumps_of(stream.frame, f"{stream.kind} {stream.name!r}"))[0].any() else jumps[1]
-        # a draft is checked by its lines that end in a question mark
+        # users check the lines of a draft that end with a question mark
         texts += [f"{sentence.rstrip('?')}?"] if sentence else []
         if stream.kind == "telemetry" and (low := _lowest_m(stream)) is not None and abs(low) > _GROUND_M:
             texts.append(f"the lowest height is {low:.0f} m, expected 0 m: does the track begin in the air?")
@@ -306,13 +306,13 @@ def doubts(
         if (without := float(np.mean(~track.pose_at(time).valid))) > _MANY_WITHOUT_POSE:
             poseless[name] = without
     texts = [
-        f"{_listed(names)} begins {hours:+d} h from the telemetry, as with a wrong time zone"
+        f"{_listed(names)} begins {hours:+d} h from the telemetry, probably because of a wrong time zone"
         for hours, names in apart.items()
     ]
     if poseless:
         texts.append(f"{max(poseless.values()):.0%} of the samples of {_listed(list(poseless))} have no position")
     if undated:
-        texts.append(f"{_listed(undated)} has no clock: by its positions it may be of another flight on this route")
+        texts.append(f"{_listed(undated)} has no clock: by its positions it may belong to another flight on this route")
     low_m, assumed = _lowest_m(telemetry), telemetry.attributes.get("height_from") == "assumed"
     low_m = None if low_m is None else low_m + takeoff_ground_m
     if low_m is not None and (low_m > _TOO_HIGH_M or (assumed and abs(low_m) > _GROUND_M)):

@@ -135,7 +135,7 @@ class RssSeries:
     log: IntArray
     """Number of the log (n,) under ``logs:`` that contains each sample."""
     line: IntArray
-    """Line (n,) of that log."""
+    """Line (n,) of each sample in that log."""
     noise_dbm: float | None = None
     """Noise of the receiver for a signal-to-noise ratio, if its bandwidth or floor is known [dBm]; None for levels."""
     flagged: Mapping[str, int] = field(default_factory=dict)
@@ -276,9 +276,7 @@ def ground_nodes(
     towers, nodes = dict(site.towers), dict[str, Track]()
     for name, node in settings.towers.items():
         if name in site.towers:
-            raise UsageError(
-                f"towers.{name}: site {site.name!r} has a tower of this name", expected="a name of its own"
-            )
+            raise UsageError(f"towers.{name}: site {site.name!r} has a tower of this name", expected="another name")
         place = _node_place(name, node, folder, settings, site)
         if place.track is not None:
             nodes[name] = place.track
@@ -324,7 +322,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
     east, north = site.frame.to_local(latitude, longitude)
     centre = site.frame.to_local(np.array([middle[0]]), np.array([middle[1]]))
     reach_m = float(np.hypot(east - centre[0], north - centre[1]).max())
-    # a node on the ground is logged below it as often as above
+    # GNSS heights of a node on the ground are as often below the ground as above
     up = np.maximum(frame["altitude_m"].to_numpy(np.float64) + site.takeoff_ground_m, MINIMUM_HEIGHT_M)
     height = float(np.nanmedian(up)) if logged and np.isfinite(up).any() else float("nan")
     if logged and not np.isfinite(height):
@@ -349,8 +347,8 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
     if not len(track):
         raise InputError(
             f"towers.{name} moves and no position of its track has a time",
-            expected="a time beside each position",
-            cause="relative times want 'time_origin', local ones 'timezone', beside the track's path",
+            expected="a time for each position",
+            cause="relative times require 'time_origin' and local times 'timezone', next to the track's path",
             path=path,
         )
     remarks = [f"moves {reach_m:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
@@ -497,7 +495,7 @@ def gather(
         measured = (s for s in streams if s.kind in ("rss", "rank"))
         errors = {s.name: error for s in measured if (error := without_values(s, log.path)) is not None}
         streams = [s for s in streams if s.kind not in ("rss", "rank") or s.name not in errors]
-        warnings += [f"{log.path}: {error.found}: it is left out" for error in errors.values()]
+        warnings += [f"{log.path}: {error.found}: it is ignored" for error in errors.values()]
         void += errors.values()
         telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
         heard = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
@@ -512,7 +510,7 @@ def gather(
         placed += [(log.path, stream) for stream in ranked if "latitude_deg" in stream.frame]
         rank += [(log.path, _rank_series(log, stream, site, tower=tower, number=number)) for stream in ranked]
         if unnamed := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
-            warnings.append(f"{log.path}: {counted(len(unnamed), 'cell')} left out that 'cells' does not name")
+            warnings.append(f"{log.path}: {counted(len(unnamed), 'cell')} ignored that 'cells' does not name")
         names = [s.name for s in file.result.streams]
         keys = [*log.skip, *(key for key in log.cells if isinstance(key, str))]
         if unknown := [name for name in keys if name not in names]:
@@ -540,7 +538,7 @@ def gather(
     # without any position, the message about the overlap is better
     if track is None and rss and any(series.position_m is not None for _, series in rank):
         levels = ", ".join(dict.fromkeys(f"{series.tower} {series.channel}" for _, series in rss))
-        warnings.append(f"no telemetry log: the levels of {levels} have no positions and are left out")
+        warnings.append(f"no telemetry log: the levels of {levels} have no positions and are ignored")
         rss = []
     data = dataclasses.replace(
         data,
@@ -669,9 +667,9 @@ def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]
         return []
     shown = ", ".join(map(repr, blind)) + (" is a ratio" if len(blind) == 1 else " are ratios")
     return [
-        f"{log.path}: {shown} to the noise, no level: compared as RSS over constant noise ('bandwidth_hz' and "
-        f"'noise_figure_db' of link.rss make an SNR absolute; 'skip: [{', '.join(blind)}]' beside the path leaves "
-        "it out)"
+        f"{log.path}: {shown} to the noise and not a level: compared as RSS over constant noise ('bandwidth_hz' "
+        f"and 'noise_figure_db' of link.rss make an SNR absolute; 'skip: [{', '.join(blind)}]' next to the path "
+        "excludes it)"
     ]
 
 
@@ -702,15 +700,15 @@ def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximu
     if not len(track) and lacks_height(stream):
         raise InputError(
             f"no altitude in {counted(len(stream.frame), 'telemetry row')}",
-            expected="'height_m: H' beside its path, the height above take-off [m] in all of it, or another track",
-            cause="a phone or a drive-test program that writes latitude and longitude alone",
+            expected="'height_m: H' next to its path, one height above take-off [m], or another track",
+            cause="a phone or a drive-test program that writes only latitude and longitude",
             path=path,
         )
     if not len(track):
         raise InputError(
-            f"{counted(len(stream.frame), 'telemetry row')} without a position that can be",
+            f"{counted(len(stream.frame), 'telemetry row')} without a possible position",
             expected="latitude and longitude in degrees, altitude in metres",
-            cause="a receiver without a fix, or columns exchanged",
+            cause="a receiver without a fix, or swapped columns",
             path=path,
         )
     warnings += [f"{path}: {text}" for text in track.account.warnings]
@@ -734,14 +732,14 @@ def check_place(site: Site, path: str, stream: Stream) -> None:
         return
     # in the order of their frequency
     turned = {
-        "latitude and longitude are exchanged": (longitude, latitude),
-        "the longitude lacks its sign (west is negative)": (latitude, -longitude),
-        "the latitude lacks its sign (south is negative)": (-latitude, longitude),
-        "latitude and longitude are exchanged and a sign is missing": (longitude, -latitude),
+        "latitude and longitude are swapped": (longitude, latitude),
+        "the sign of the longitude is missing (west is negative)": (latitude, -longitude),
+        "the sign of the latitude is missing (south is negative)": (-latitude, longitude),
+        "latitude and longitude are swapped and a sign is missing": (longitude, -latitude),
     }
     causes = [why for why, angles in turned.items() if nearest_m(site, *angles) <= FAR_M]
     raise InputError(
-        f"the positions come no nearer than {near / 1000.0:.0f} km to any tower of site {site.name!r}",
+        f"the positions are at least {near / 1000.0:.0f} km from every tower of site {site.name!r}",
         expected=f"a flight within {FAR_M / 1000.0:.0f} km of a tower",
         cause=causes[0] if causes else "another site, or a log of another flight",
         path=path,
@@ -772,17 +770,17 @@ def _idle_attitude(data: FlightData) -> tuple[str, ...]:
         known = 0 if pose is None else int((pose.attitude_known if mode == "logged" else pose.valid).sum())
         if known == 0:
             why = (
-                "no log holds telemetry"
+                "no log contains telemetry"
                 if pose is None or data.track is None
-                else "the telemetry holds no attitude: level flight along the course stands in"
+                else "the telemetry contains no attitude: level flight along the course is assumed"
                 if pose.valid.any()
-                else f"no sample lies in the telemetry: {data.track.why_not(pose)}"
+                else f"no sample is within the telemetry: {data.track.why_not(pose)}"
             )
             messages.append(f"rt.attitude: {mode} has no effect on {kind} of {tower}: {why}.")
         elif pose is not None and kind == "rank" and not pose.valid.all():
             messages.append(
                 f"rt.attitude: {mode} acts on {known} of {counted(len(time), 'sample')} of {kind} of {tower}: "
-                "the telemetry covers no more."
+                "the telemetry does not cover the others."
             )
     return tuple(dict.fromkeys(messages))
 
@@ -790,8 +788,8 @@ def _idle_attitude(data: FlightData) -> tuple[str, ...]:
 def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:
     if name is None:
         raise UsageError(
-            f"log {log.path!r} does not say which tower it belongs to",
-            expected="'node: LW1', say, beside its path in flight.yaml",
+            f"log {log.path!r} does not specify its tower",
+            expected="the tower, for example 'node: LW1', next to its path in flight.yaml",
         )
     if name not in site.towers:
         raise UsageError(
@@ -898,9 +896,9 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
     parts = sorted((p for p in group if len(p[1].time)), key=lambda p: p[1].time.min()) or [group[0]]
     for (path, before), (later_path, after) in itertools.pairwise(parts):
         if after.time.min() < before.time.max() or _form(before) != _form(after):
-            where, cause = f"two logs hold {what}", "a copy: leave one out, by its path or by 'skip'"
+            where, cause = f"two logs contain {what}", "a copy: remove one path, or use 'skip'"
             if path == later_path:
-                where = f"two streams of one log hold {what}"
+                where = f"two streams of one log contain {what}"
                 cause = (
                     "two cells or devices: name the tower's own by 'cells: {STREAM: TOWER}', 'ingest --all' lists them"
                 )
@@ -943,15 +941,15 @@ def _check_overlap(data: FlightData) -> None:
     """Check that every series shares time with the track of its poses, and with that of a tower that moves."""
     if not data.rss and not data.rank:
         raise UsageError(
-            "none of the logs holds RSS or rank",
+            "none of the logs contains RSS or rank",
             expected="at least one radio log under 'logs'",
-            cause="'skip', 'cells', or a log left out",
+            cause="'skip', 'cells', or a missing line of logs",
         )
     for kind, series in data.series:
         what, placed = f"{kind} of {series.tower}", isinstance(series, RankSeries) and series.position_m is not None
         if data.track is None and not placed:
             raise UsageError(
-                f"{what} has no positions of its own and there is no telemetry log",
+                f"{what} has no positions and there is no telemetry log",
                 expected="a telemetry log (vehicle_out, say) under 'logs'",
             )
         if data.track is not None and not placed:
@@ -977,8 +975,8 @@ def _check_shared(data: FlightData, what: str, time: Times, track: Track, node: 
         of, expected = "the track of this tower", "positions of the node during the flight"
         # a year of 1970 means times from another zero
         if pd.Timestamp(end).year < _FIRST_YEAR:
-            cause = "relative times: they want 'time_origin' beside the log"
-        cause = cause.replace("beside the log", f"beside 'path' in towers.{node}.track")
+            cause = "relative times: they require 'time_origin' next to the log"
+        cause = cause.replace("next to the log", f"next to 'path' in towers.{node}.track")
     raise InputError(f"no overlap in time: {what} spans {shown}, {of} {flown}", expected=expected, cause=cause)
 
 
@@ -989,7 +987,7 @@ def _clock_cause(timezone: str | None, time: Times, start: np.datetime64, end: n
         of, count = ("telemetry", round(apart)) if apart > 0 else ("radio log", -round(apart))
         return (
             f"the week number of a GPS receiver rolled over: the {of} is {count * ROLLOVER_DAYS} days "
-            f"({count * 1024} weeks) early; write 'gps_rollovers: {count}' beside its path"
+            f"({count * 1024} weeks) early; write 'gps_rollovers: {count}' next to its path"
         )
     trap = clock_trap((time.min(), time.max()), (start, end), timezone) if len(time) else None
     return "logs of different flights, or a wrong 'timezone' or 'clock'" if trap is None else trap.advice()

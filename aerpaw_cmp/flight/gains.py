@@ -1,14 +1,10 @@
-"""Gains and losses that a flight file names or that are stored beside a site.
+"""Learned gains of a link, and losses of its paths.
 
-Learned antenna data of a link besides the patterns that the replay takes: both ends at once, error bars.
+The replay uses patterns. This module adds the learned gain of both ends together and its error model, the losses of a
+path (foliage, reflections, rough ground), and notes about foliage models.
 
-Losses of a path of a flight besides its own field: foliage, reflections, rough ground.
-
-The antennas and the receiver that flight.yaml names from the memory of a site: found there, checked, made files.
-
-Reading flight.yaml opens no table; a job that replays or lists its inputs takes this stage after it.
-
-Notes that must be given on foliage models: how far they are stretched or assumed.
+It also replaces the names of learned antennas and receivers in flight settings by files. Reading a flight.yaml opens no
+table, so a job that replays or lists its inputs calls :func:`with_learned`.
 """
 
 from __future__ import annotations
@@ -57,16 +53,16 @@ from .settings import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LearnedGain:
-    """Along the direct line, at the poses of a replay.
+    """The learned gain of a link in the direction of the direct path, at the poses of a replay.
 
     Parameters
     ----------
     pair_db : (poses,)
-        Gain towards both ends at once, to be added to the level [dB]; zero where the files hold none.
+        Gain of both ends together, to add to the level [dB]. Zero if it was not learned.
     sd_db : (poses,)
-        Standard deviation of all learned gain together [dB].
+        Standard deviation of the sum of learned gains [dB].
     spread : Spread
-        Error model of the level besides ``sd_db``: that of the tower's antenna, else of the UAV's.
+        Error model of the level without ``sd_db``, from the tower's antenna, or else from the UAV's.
     """
 
     pair_db: FloatArray
@@ -75,12 +71,12 @@ class LearnedGain:
 
 
 def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain | None:
-    """The learned gain of a link to one tower; None where neither end is learned.
+    """Return the learned gain of a link to one tower. None if no end is learned.
 
     Parameters
     ----------
     link : Link
-        With one tower.
+        Link with one tower.
     poses : Poses
     source_m : (1, 3) or (poses, 3)
         Centre of the tower's array [m].
@@ -104,40 +100,40 @@ def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain 
 
 
 def spread_of(stated: LearnedSpread | None) -> Spread:
-    """Return the error model that a learned antenna states; that of the gain alone if it states none."""
+    """Return the error model of a learned antenna, or only that of the gain if it has no error model."""
     return NO_SPREAD if stated is None else Spread(**stated.model_dump())
 
 
 def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tuple[FloatArray, FloatArray]:
-    """Gain towards both ends at once (n,) and standard deviation (n,) of all learned gain together [dB].
+    """Return the gain of both ends together (n,), and the standard deviation (n,) of all learned gains [dB].
 
-    ``ends``: pattern and directions (n, 3) in its frame, of ``uav`` and ``tower``, or one of them.
+    ``ends`` contains pattern and directions (n, 3) in its frame, for ``uav`` and ``tower``, or one of them.
     """
     square = sum(pattern.gain_sd_db(*sphere_angles(direction)) ** 2 for pattern, direction in ends.values())
     sd_db = np.sqrt(square)
     if len(ends) == 2:
         (uav, at_uav), (tower, at_tower) = ends["uav"], ends["tower"]
-        # a pair's gain is what these two leave together: it means nothing beside another table
-        if tower.pair is not None and uav.trained_on == tower.trained_on:  # of one and the same calibration
+        # the gain of a pair is valid only for the two tables with which it was learned
+        if tower.pair is not None and uav.trained_on == tower.trained_on:  # from one calibration
             return tower.pair.at(np.concatenate([at_uav, at_tower], axis=1), sd_db)
     return np.zeros(len(sd_db)), sd_db
 
 
 def sphere_angles(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Zenith angle and azimuth (...,) [rad] of directions (..., 3)."""
+    """Return zenith angle and azimuth (...,) [rad] of directions (..., 3)."""
     return 0.5 * np.pi - elevation_rad(direction), azimuth_rad(direction)
 
 
 def mean_gain_db(patterns: Sequence[Pattern], theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:
-    """Mean gain (n,) of the elements of an array towards directions of its frame [dBi]; no lower than -60."""
+    """Return the mean gain (n,) of the elements of an array in directions of its frame [dBi], at least -60."""
     fields = [pattern.field(theta_rad, phi_rad) for pattern in patterns]
     power = sum(np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2 for e_theta, e_phi in fields)
-    # a null is -60 dB: no model of a pattern is that sure
+    # nulls are limited to -60 dB: no model of a pattern is more accurate
     return np.asarray(10.0 * np.log10(np.maximum(power / len(patterns), 1e-6)))
 
 
 def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | float:
-    """Gain (poses,) towards both ends at once, to be added to the level [dB]; 0 where none is learned."""
+    """Return the gain (poses,) of both ends together, to add to the level [dB]. 0 if no gain is learned."""
     gain = learned_gain(link, poses, source_m)
     return 0.0 if gain is None else gain.pair_db
 
@@ -146,7 +142,7 @@ def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | floa
 
 
 def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
-    """Return the loss in crowns and in woods as media. None if the site has no trees or ``rt.foliage`` is none."""
+    """Return the loss in crowns and in woods as media. None without trees or foliage."""
     if not site.wooded or rt.foliage == "none":
         return None
     site = site.under(rt.foliage)
@@ -294,7 +290,7 @@ def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
     Parameters
     ----------
     site : Site
-        Its trees and forest stands, and its ground.
+        Site with its trees, woods and ground.
     rt : RtSettings
     carrier_hz : float
 
@@ -319,22 +315,22 @@ def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
     return loss
 
 
-# Lines of sight are the same at any carrier.
+# Sight lines do not depend on the carrier.
 _ANY_HZ = 3.4e9
 
 
 def sight_shares(site: Site, tower: str, poses_m: FloatArray) -> tuple[float, float]:
-    """Shares of the direct lines from a tower to poses (n, 3) [m] that woods shade, and that buildings hide."""
+    """Return the shares of sight lines from a tower to poses (n, 3) [m] through woods, and behind buildings."""
     source = site.towers[tower].position_m
     array = single_element()
     poses = Poses(poses_m, np.broadcast_to(np.eye(3), (len(poses_m), 3, 3)))
-    # without a cache: a draft asks once
+    # without a cache, because a draft needs this once
     seen = replay(site, Link(_ANY_HZ, {tower: array}, array), poses, Search(max_depth=0), run=Run(cache_dir=""))
     return float((direct_foliage_m(source, poses_m, site) > 0.0).mean()), float(1.0 - len(seen.paths) / len(poses_m))
 
 
 def direct_foliage_m(tower_m: FloatArray, poses_m: FloatArray, site: Site) -> FloatArray:
-    """Length (n,) [m] in crowns and stands of the direct lines from a tower (3,), or (n, 3), to poses (n, 3) [m]."""
+    """Return the length (n,) [m] in crowns and woods of sight lines from a tower (3,) or (n, 3) to poses (n, 3) [m]."""
     source = np.broadcast_to(tower_m, poses_m.shape)
     in_crowns = foliage_depth_m(source, np.zeros((len(poses_m), 0, 3)), poses_m, site.trees)
     return in_crowns + stand_depth_m(site, source, poses_m)
@@ -347,9 +343,9 @@ def load_with_learned(path: str | Path, learned: Path | None = None, overrides: 
     ----------
     path : str or Path
     learned : Path, optional
-        calibrated.yaml whose settings take the place of those of the flight file, and of the antennas that it names.
+        calibrated.yaml whose settings replace those of the flight file, also its named antennas.
     overrides : mapping, optional
-        Dotted keys with other values: they come before the antennas, whose band must fit the carrier.
+        Dotted keys with other values. They are applied before the antennas, whose band must fit the carrier.
     """
     settings = with_learned(overridden(load_flight(path), overrides or {}), Path(path).parent)
     return settings if learned is None else joined(settings, learned)
@@ -373,11 +369,11 @@ class _Ends:
     used: set[str] = field(default_factory=set)
 
     def link(self, channel: str | None) -> LinkSettings:
-        """Return the link of a channel; that of ``link.rss`` for None and for a channel without an entry."""
+        """Return the link of a channel. It is ``link.rss`` for None and for a channel without an entry."""
         return self.rss if channel is None else self.channels.get(channel, self.rss)
 
     def use(self, key: str, channel: str | None, name: str, named: Named) -> None:
-        """Put a learned antenna at the end that a key names; a channel of None is the link of all other channels."""
+        """Use a learned antenna at the end that a key names. Channel None is the link of all other channels."""
         tower, link = key.partition(".")[0], self.link(channel)
         before = link.uav if key == "uav" else link.towers.get(tower, link.tower)
         instead = "an isotropic antenna is used instead" if before == ArraySettings() else "that of 'link' is used"
@@ -414,9 +410,9 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
     Raises
     ------
     UnknownName
-        A name that no learned model has, or one for another end.
+        If no learned model has a name, or only for another end.
     UsageError
-        A key of ``antennas`` that is neither ``uav`` nor ``TOWER.CHANNEL``.
+        If a key of ``antennas`` is neither ``uav`` nor ``TOWER.CHANNEL``.
     """
     ends = _Ends(settings.link.rss, dict(settings.link.channels))
     # the airframe last: it belongs to every channel, also to those that antennas of towers bring
@@ -477,7 +473,7 @@ def _named(name: str, folder: Path, end: str, key: str) -> Named | Caution:
 
 
 def _receiver(settings: FlightFile, name: str, folder: Path, ends: _Ends) -> str | None:
-    """Return the file of a rank receiver; None, with the reason in ``ends``, if it does not fit."""
+    """Return the file of a rank receiver. None, with the reason in ``ends``, if it does not fit."""
     if Path(name).suffix == ".json":  # a file that is missing: reading it reports that
         return name
     named = _named(name, folder, "receiver", "rank.receiver")
@@ -497,7 +493,7 @@ def _reason(error: InputError | UsageError) -> str:
 
 
 def foliage_notes(wooded: bool, rt: RtSettings, carriers_hz: Collection[float]) -> tuple[str, ...]:
-    """Notes a report must give on its foliage models, if the site has trees: how far they are stretched or assumed."""
+    """Return notes about extrapolations and assumptions of foliage models, if the site has trees."""
     if not wooded or rt.foliage != "attenuating":
         return ()
     notes = []
@@ -513,7 +509,7 @@ def foliage_notes(wooded: bool, rt: RtSettings, carriers_hz: Collection[float]) 
 
 
 def p833_note(carrier_hz: float) -> str | None:
-    """That P.833's table is continued beyond its end, or None within it."""
+    """Return a note that P.833's table is extrapolated, or None within the table."""
     low, high = P833_TABLE[0][0], P833_TABLE[-1][0]
     if low <= carrier_hz / 1e6 <= high:
         return None

@@ -91,7 +91,7 @@ class FlightReplay:
 
     @property
     def all(self) -> tuple[Replayed, ...]:
-        """RSS first, then rank."""
+        """All replayed series, RSS before rank."""
         return (*self.rss, *self.rank)
 
 
@@ -102,7 +102,7 @@ def replay_flight(data: FlightData, stages: Stages | None = None) -> FlightRepla
     ----------
     data : FlightData
     stages : Stages, optional
-        Times "clocks" and "replay".
+        Receives the times of "clocks" and "replay".
 
     Returns
     -------
@@ -290,7 +290,7 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
 def _along(data: FlightData, different: Sequence[RssSeries], instants: Times, step_s: float) -> list[Along]:
     """Return predictors of the levels of series of one tower and carrier; the replay has at most one reflection."""
     links = [data.link_of(series) for series in different]
-    blocks = np.array_split(instants, max(1, -(-len(instants) // BLOCK)))  # of about equal size
+    blocks = np.array_split(instants, max(1, -(-len(instants) // BLOCK)))  # about equal in size
     parts = [_levels_along(data, links, different[0].tower, part) for part in blocks]
     out = []
     for series, link, *mine in zip(different, links, *parts, strict=True):

@@ -140,7 +140,7 @@ def allowed_area(fence: Any, avoid: Sequence[Any], towers_m: FloatArray, distanc
     parts = [p for p in getattr(remaining, "geoms", [remaining]) if p.area > 0]
     if not parts:
         raise UsageError(
-            "no route fits: the geofence leaves no area",
+            "no route fits: no area remains inside the geofence",
             expected="a geofence with room outside the no-fly areas and the circles around towers",
             cause="a no-fly area that covers it, or too large a distance to towers",
         )
@@ -301,7 +301,7 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
     def made(legs: Sequence[FloatArray]) -> Route:
         if not legs:
             raise UsageError(
-                f"no route fits: no leg of {_LEAST_LEG_M:g} m lies within the geofence",
+                f"no route fits: no leg of {_LEAST_LEG_M:g} m is within the geofence",
                 expected="an area of some hundred metres outside no-fly areas and circles around towers",
             )
         points = waypoints_of(legs, area, pattern.height_m, pattern.nose)

@@ -75,8 +75,8 @@ def scored_rows(stream: Stream, path: str) -> tuple[pd.DataFrame, dict[str, int]
     if void.all():
         raise InputError(
             f"every row of {stream.kind} {stream.name!r} is flagged {', '.join(words)}",
-            expected="values that can be, see docs/formats.md",
-            cause="another unit, or exchanged columns",
+            expected="possible values, see docs/formats.md",
+            cause="another unit, or swapped columns",
             path=path,
         )
     return frame[~void], dict(words)
@@ -134,8 +134,8 @@ def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | N
             quality, shift_s = aligned_quality(time, power.frame["rss_db"].to_numpy(np.float64), quality)
             if shift_s:
                 remark = (
-                    f"the quality is paired with the power by row and runs up to {shift_s:.0f} s ahead: it is taken "
-                    "at its own times, 0.032768 s a row"
+                    f"the quality is paired with the power by row and is up to {shift_s:.0f} s ahead: its own times "
+                    "are used, 0.032768 s per row"
                 )
         else:
             order = np.argsort(at, kind="stable")  # a log may have been joined from parts

@@ -1,9 +1,7 @@
-"""flight.yaml -> checked settings.
+"""Checked settings of a flight.yaml.
 
-Top-level keys of flight.yaml: ``flight site timezone logs link rt rss rank report``. Unknown and duplicate keys
-are errors that name the nearest valid key. Relative paths resolve against the file's folder, or ``--logs-root``.
-
-Checked flight settings with single keys changed, in dotted form: ``rt.max_depth``, ``link.rss.tower.yaw_deg``.
+Unknown and duplicate keys are errors that name the nearest valid key. Relative paths resolve against the file's
+folder, or ``--logs-root``. Overrides change single keys in dotted form: ``rt.max_depth``, ``link.rss.tower.yaw_deg``.
 """
 
 from __future__ import annotations
@@ -58,33 +56,33 @@ class AntennaSettings(StrictModel):
     variable: str | None = None
     """Name of the grid inside a .mat file."""
     elevation: str | None = None
-    """CSV of the elevation cut, where ``file`` is one of the azimuth cut."""
+    """CSV of the elevation cut, if ``file`` contains the azimuth cut."""
     learned: LearnedAntenna | None = None
-    """Of a learned ``sphere``: SHA-256 of its table, and its error model."""
+    """SHA-256 and error model of a learned ``sphere``."""
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
         if (self.file is None) != (self.model not in ("file", "gain_grid", "sphere")):
-            raise ValueError("'file' belongs to model 'file', 'gain_grid' or 'sphere', and only there")
+            raise ValueError("'file' belongs only to model 'file', 'gain_grid' or 'sphere'")
         if self.variable is not None and self.model != "gain_grid":
             raise ValueError("'variable' belongs to model 'gain_grid'")
         if self.elevation is not None and self.model != "file":
-            raise ValueError("'elevation' belongs to model 'file', beside an azimuth cut")
+            raise ValueError("'elevation' belongs to model 'file', together with an azimuth cut")
         return self
 
 
 class ArraySettings(StrictModel):
-    """Elements of one device.
+    """The antenna elements of one device.
 
-    ``layout``: ``single``; ``linear`` (``elements`` at half a wavelength, along the device's left axis);
-    ``tower_comparison`` (60 mm / 1.68 m / 60 mm) and ``uav_comparison`` (2 x 2 at half a wavelength) of
-    arXiv 2502.10324; ``custom`` (``positions_m``). ``yaw_deg`` is counter-clockwise from east (tower) or from the
-    aircraft's nose (UAV with logged attitude); positive ``pitch_deg`` turns the boresight down.
+    Layouts are ``single``, ``linear`` (``elements`` at half a wavelength, along the device's left axis) and ``custom``
+    (``positions_m``). ``tower_comparison`` (60 mm / 1.68 m / 60 mm) and ``uav_comparison`` (2 x 2 at half a
+    wavelength) are those of arXiv 2502.10324. ``yaw_deg`` is counter-clockwise from east (tower) or from the
+    aircraft's nose (UAV with logged attitude). Positive ``pitch_deg`` turns the boresight down.
     """
 
     layout: Literal["single", "linear", "tower_comparison", "uav_comparison", "custom"] = "single"
     elements: Annotated[int, Field(ge=1, le=64)] | None = None
-    """Number of elements of layout ``linear``; 4 by default."""
+    """Number of elements of layout ``linear``. The default is 4."""
     positions_m: Annotated[list[tuple[float, float, float]], Field(max_length=64)] | None = None
     antenna: AntennaSettings = AntennaSettings()
     slant_deg: float | list[float] = 0.0
@@ -100,7 +98,7 @@ class ArraySettings(StrictModel):
         return self
 
     def positions(self, wavelength: float) -> FloatArray:
-        """Element positions (elements, 3) in the device frame [m]."""
+        """Return the element positions (elements, 3) in the device frame [m]."""
         if self.layout == "custom":
             if not self.positions_m:
                 raise UsageError("layout 'custom' without 'positions_m'", expected="a list of [x, y, z] in metres")
@@ -112,7 +110,7 @@ class ArraySettings(StrictModel):
         return linear_array(1 if self.layout == "single" else self.elements or 4, wavelength / 2).positions_m
 
     def build(self, wavelength: float, folder: Path) -> Array:
-        """The array, with patterns loaded from files relative to ``folder``."""
+        """Return the array, with patterns loaded from files relative to ``folder``."""
         positions = self.positions(wavelength)
         # one slant for all, or one for each element
         slant = np.atleast_1d(np.asarray(self.slant_deg, dtype=np.float64))
@@ -126,17 +124,17 @@ class ArraySettings(StrictModel):
         return Array(
             positions,
             np.radians(np.broadcast_to(slant, (len(positions),)).copy()),
-            # one pattern for all elements; measured files may hold several carriers
+            # one pattern for all elements; a measured file can contain several carriers
             (load_pattern(self.antenna, folder, SPEED_OF_LIGHT_MPS / wavelength),),
             mount,
         )
 
 
 def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | None = None) -> Pattern:
-    """The element pattern of the settings; files resolve against ``folder``, the carrier chooses among frequencies."""
+    """Return the element pattern. Files are relative to ``folder``, and the carrier selects the frequency."""
     from ..site import antennas
 
-    # a named model has no file, and none is opened for it
+    # not opened for models without a file
     file = folder / str(settings.file)
     if settings.model == "dipole":
         return antennas.HalfWaveDipole()
@@ -158,7 +156,7 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
 
 
 def _sphere(settings: AntennaSettings, file: Path, folder: Path) -> Pattern:
-    """Return the pattern of a full sphere; a learned one is verified, with its error model."""
+    """Return the pattern of a full sphere. A learned one is verified and has its error model."""
     known = settings.learned
     if known is None:
         return read_sphere_csv(file)
@@ -171,13 +169,13 @@ def _sphere(settings: AntennaSettings, file: Path, folder: Path) -> Pattern:
 
 
 class LinkSettings(StrictModel):
-    """One radio link: carrier, power, and the arrays at both ends."""
+    """A radio link: carrier, power, and the arrays at both ends."""
 
     carrier_hz: CarrierHz
     transmit_power_dbm: float = 40.0
     uav_transmits: bool = True
     bandwidth_hz: Positive | None = None
-    """Below the noise of this bandwidth a link is out of coverage."""
+    """A link is out of coverage below the noise of this bandwidth."""
     noise_figure_db: float | None = None
     tower: ArraySettings = ArraySettings()
     towers: dict[str, ArraySettings] = {}
@@ -191,11 +189,11 @@ class LinkSettings(StrictModel):
 
     @property
     def floor_dbm(self) -> float:
-        """Noise floor of the receiver [dBm]: of its bandwidth, or that of 1 Hz."""
+        """The noise floor of the receiver [dBm] in its bandwidth, or in 1 Hz."""
         return noise_floor_dbm(self.bandwidth_hz or 1.0, self.noise_figure_db or 0.0)
 
     def build(self, tower_names: list[str], folder: Path) -> Link:
-        """The link to the named towers."""
+        """Return the link to the named towers."""
         wavelength = wavelength_m(self.carrier_hz)
         arrays = {name: self.towers.get(name, self.tower).build(wavelength, folder) for name in tower_names}
         return Link(
@@ -213,22 +211,22 @@ class LinksSettings(StrictModel):
 
     rss: LinkSettings = LinkSettings(carrier_hz=3.3e9)
     channels: dict[str, LinkSettings] = {}
-    """RSS link of single channels that differ, by channel name (two antennas point differently)."""
+    """RSS link of channels that differ, by channel name (such as two antennas that point differently)."""
     rank: LinkSettings = LinkSettings(
         carrier_hz=3.4e9,
         uav_transmits=False,
-        bandwidth_hz=20e6,  # rank is reported above the noise of a modem's channel, not of 1 Hz
+        bandwidth_hz=20e6,  # a modem reports rank above the noise of its channel, not of 1 Hz
         tower=ArraySettings(layout="tower_comparison", slant_deg=[45.0, -45.0, 45.0, -45.0], yaw_deg=45.0),
         uav=ArraySettings(layout="uav_comparison", slant_deg=[45.0, -45.0, -45.0, 45.0], yaw_deg=315.0, roll_deg=90.0),
     )
 
     def of(self, channel: str) -> LinkSettings:
-        """The RSS link of a channel."""
+        """Return the RSS link of a channel."""
         return self.channels.get(channel, self.rss)
 
 
 class LogSettings(StrictModel):
-    """One log file and what it cannot say about itself."""
+    """A log file, and facts that it does not contain."""
 
     path: str
     reader: str | None = None
@@ -239,23 +237,23 @@ class LogSettings(StrictModel):
     clock: Literal["local", "utc", "local_as_utc"] | None = None
     time_origin: str | None = None
     gps_rollovers: Annotated[int, Field(ge=0, le=3)] = 0
-    """Rollovers of the week number of the log's GPS receiver: each adds 1 024 weeks to the times."""
+    """Rollovers of the week number of the log's GPS receiver. Each adds 1 024 weeks to the times."""
     ri_base: Literal["zero", "one"] | None = None
     columns: dict[str, str] = {}
     kind: Kind | None = None
     unit: str | None = None
     floor_db: float = -200.0
     cells: dict[Annotated[int | str, Field(union_mode="left_to_right")], str] = {}
-    """Tower of each cell, by PCI, else by the stream's name; PCIs that it does not name are left out."""
+    """Tower of each cell, by PCI or by the stream's name. Other cells are ignored."""
     height_m: float | None = Field(default=None, ge=-1000.0, le=20_000.0)
-    """Of a track whose log has no altitude: above take-off, in all of it."""
+    """Height above take-off of a complete track whose log has no altitude [m]."""
     skip: list[str] = []
-    """Streams of the file to leave out, by name."""
+    """Names of streams of the file to ignore."""
     receiver: str = ""
-    """Name of the receiver that wrote the log, where the log has none: learned levels belong to a receiver."""
+    """Name of the receiver that wrote the log, if the log does not contain it. Learned levels belong to a receiver."""
 
     def options(self, timezone: str | None) -> ReadOptions:
-        """The reader options, with the flight's zone as default."""
+        """Return the reader options, with the flight's zone as default."""
         return ReadOptions(
             timezone=self.timezone or timezone,
             ri_base=self.ri_base,
@@ -266,7 +264,7 @@ class LogSettings(StrictModel):
 
 
 class Waypoint(StrictModel):
-    """A planned point: ``height_m`` above the ground at the origin; the UAV waits there ``hold_s`` seconds."""
+    """A planned point: ``height_m`` above the ground at the origin, where the UAV waits ``hold_s`` seconds."""
 
     label: str = ""
     east_m: float
@@ -276,7 +274,7 @@ class Waypoint(StrictModel):
 
 
 class PlanSettings(StrictModel):
-    """Ground truth that ``aerpaw-cmp simulate`` plants into the logs it writes; all of it goes into truth.json."""
+    """The ground truth of simulated logs. ``aerpaw-cmp simulate`` writes all of it to truth.json."""
 
     start: datetime
     """Local time in the flight's zone."""
@@ -288,14 +286,14 @@ class PlanSettings(StrictModel):
     rss_interval_s: Positive = 0.1
     rank_interval_s: Positive = 0.5
     offsets_db: dict[str, dict[str, float]] = {}
-    """By tower and channel: the offset that the comparison should recover (added to the measurement)."""
+    """Offset that the comparison should recover (added to the measurement), by tower and channel."""
     fading_db: Annotated[float, Field(ge=0)] = 0.0
     """Standard deviation of log-normal fading."""
     fading_correlation_s: Positive = 2.0
     clock_shift_s: dict[str, float] = {}
-    """By tower: the radio clock shows this much more than the telemetry clock."""
+    """Radio clock minus telemetry clock [s], by tower."""
     bad_lines: Annotated[int, Field(ge=0)] = 0
-    """Deliberately broken lines per log file."""
+    """Number of damaged lines per log file."""
     rank_k: Positive = 100.0
     """Singular-value ratio of the simulated modem."""
     rank_error_share: Annotated[float, Field(ge=0, le=1)] = 0.0
@@ -305,9 +303,9 @@ class PlanSettings(StrictModel):
 
 
 class FlightSettings(StrictModel):
-    """Name and kind of the flight."""
+    """The name and kind of the flight."""
 
-    # it names the folder of the report: no blank, no separator, no dot in front
+    # it is the name of the report's folder: no blanks, no separators, no dot in front
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
     title: str | None = None
     synthetic: bool = False
@@ -316,27 +314,27 @@ class FlightSettings(StrictModel):
 
 
 class SiteChoice(StrictModel):
-    """A site and what this flight changes of it."""
+    """A site, and the changes of this flight."""
 
     file: str = "lake_wheeler"
     coordinates: str | None = None
-    """Which published coordinate set of the packaged site."""
+    """Name of a published coordinate set of the packaged site."""
     antenna_height_m: Positive | None = None
-    """Antenna height of every tower, in place of the site's."""
+    """Antenna height of every tower instead of the site's [m]."""
     without_buildings: bool = False
     tower_ground: Literal["flat", "offsets", "surface", "dem"] | None = None
-    """Ground at the towers and below the paths, in place of the site's."""
+    """Ground at the towers and below the paths, instead of the site's."""
 
 
 class GroundNode(StrictModel):
-    """A node of this flight that the site does not list, such as a rover or a second UAV: a place, or its track."""
+    """A node of this flight that is not in the site, such as a rover or a second UAV: its position, or its track."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
     track: LogSettings | None = None
-    """Log with its positions; a node that stands still within ``STANDS_STILL_M`` is at their median."""
+    """Log with its positions. A node that stays within ``STANDS_STILL_M`` is at their median."""
     height: Literal["ground", "logged"] = "ground"
-    """``ground``: the antenna is ``antenna_height_m`` above the ground plane; ``logged``: where the track says."""
+    """``ground``: the antenna is ``antenna_height_m`` above the ground plane. ``logged``: at the track's height."""
     antenna_height_m: Positive = 1.5
 
     @field_validator("track", mode="before")
@@ -350,65 +348,65 @@ class GroundNode(StrictModel):
         if stated not in ((True, True), (False, False)) or all(stated) == (self.track is not None):
             raise ValueError("a tower needs latitude_deg and longitude_deg, or a track")
         if self.height == "logged" and self.track is None:
-            raise ValueError("height: logged needs a track, which is where it is logged")
+            raise ValueError("height: logged needs a track with heights")
         if self.height == "logged" and "antenna_height_m" in self.model_fields_set:
-            raise ValueError("height: logged takes the height from the track: no antenna_height_m beside it")
+            raise ValueError("height: logged takes the height from the track; remove antenna_height_m")
         return self
 
 
 class AdvancedRt(StrictModel):
-    """Knobs of a replay that few flights need."""
+    """Settings of a replay that few flights need."""
 
     samples: Literal["auto"] | Annotated[int, Field(ge=1, le=100_000_000)] = "auto"
-    """Rays per tower of Sionna; ``auto`` raises the number until two pilots find the same paths."""
+    """Rays per tower of Sionna. ``auto`` increases the number until two pilot runs find the same paths."""
     gamma_db_per_m: Positive | None = None
     maximum_loss_db: Positive | None = None
-    """Replace P.833's specific attenuation and largest loss at the carrier."""
+    """Values instead of P.833's specific attenuation and largest loss at the carrier."""
     maximum_gap_s: Positive = 3.0
-    """Telemetry gaps longer than this are not bridged."""
+    """Positions are not interpolated in telemetry gaps longer than this."""
 
 
 class RtSettings(StrictModel):
-    """Settings of the replay of the flight."""
+    """The settings of the replay of a flight."""
 
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
     diffraction: Diffraction = "none"
     """Paths over one edge of a building, in H, levels and ranks."""
     attitude: Literal["logged", "level", "ignored"] = "ignored"
-    """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""
+    """``logged``: the UAV array rotates with the aircraft. ``level``: heading only. ``ignored``: fixed in the site."""
     foliage: Literal["none", "attenuating", "opaque"] = "none"
     foliage_model: Literal["p833", "weissberger"] = "p833"
     leaves: Literal["in", "out"] = "in"
     reflection_loss_db: Annotated[float, Field(ge=0)] = 0.0
-    """Taken from every reflection besides its Fresnel coefficient (rough surfaces); to be fitted on other flights."""
+    """Further loss of every reflection (rough surfaces), fitted on other flights."""
     ground_roughness_m: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Standard deviation of the ground's height: its specular reflection falls by Rayleigh's (Ament's) factor."""
+    """Standard deviation of the ground's height. It weakens the specular reflection by Ament's factor."""
     audit_links: Annotated[int, Field(ge=0)] = 200
     advanced: AdvancedRt = AdvancedRt()
 
 
-# Offsets are tried by 0.1 dB.
+# Offsets are tried in steps of 0.1 dB.
 _WIDEST_DB = 100_000.0
 
 
 class AdvancedRss(StrictModel):
-    """Knobs of the level's comparison that few flights need."""
+    """Settings of the RSS comparison that few flights need."""
 
     lag_window_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
-    """Largest clock difference that is looked for."""
+    """Largest clock difference of the search."""
 
 
 class RssSettings(StrictModel):
-    """Settings of the comparison of RSS."""
+    """The settings of the RSS comparison."""
 
     span_db: tuple[float, float] = (-50.0, 50.0)
     lag: Literal["off", "estimate", "apply"] | float = "estimate"
-    """Radio minus telemetry clock: estimated and shown, estimated and applied, or taken off as given [s]."""
+    """Radio minus telemetry clock: ``off``, ``estimate`` (shown only), ``apply``, or a value to subtract [s]."""
     field: Literal["coherent", "power"] = "coherent"
-    """Which simulated RSS is compared."""
+    """Simulated RSS that is compared."""
     minimum_height_m: float | None = None
-    """Samples below this height are left out of the comparison, and counted."""
+    """Samples below this height are excluded from the comparison, and counted."""
     advanced: AdvancedRss = AdvancedRss()
 
     @field_validator("span_db")
@@ -422,14 +420,14 @@ class RssSettings(StrictModel):
 
 
 class RankSettings(StrictModel):
-    """Settings of the comparison of rank."""
+    """The settings of the rank comparison."""
 
     tower: str = "LW1"
     k: Annotated[list[Positive], Field(min_length=1, max_length=64)] = [10.0, 100.0, 1000.0]
     minimum_height_m: float | None = None
-    """Samples below this height are left out, and counted (the README of a data set may ask for it)."""
+    """Samples below this height are excluded, and counted (the README of a data set can require it)."""
     receiver: str | None = None
-    """Receiver file of ``calibrate``: gives a probability of each rank."""
+    """Receiver file of ``calibrate``, for the probability of each rank."""
 
     @field_validator("k")
     @classmethod
@@ -440,7 +438,7 @@ class RankSettings(StrictModel):
 
 
 class ReportSettings(StrictModel):
-    """Contents of the report."""
+    """The contents of the report."""
 
     waypoints: list[Waypoint] = []
 
@@ -452,28 +450,28 @@ class Caution:
     key: str
     """Key of the flight file, such as ``antennas.uav``."""
     channel: str | None
-    """Channel to which it does not apply; None for all channels that ``link.channels`` does not name."""
+    """Channel to which it does not apply. None for all channels that ``link.channels`` does not name."""
     text: str
-    """Which one is not used, why and what is used instead; or which setting it replaces."""
+    """The antenna or receiver that is not used, the reason and its replacement, or the setting that it replaces."""
     used: bool = False
 
 
 class FlightFile(StrictModel):
-    """The whole flight.yaml."""
+    """All settings of a flight.yaml."""
 
     flight: FlightSettings
     site: SiteChoice = SiteChoice()
     towers: dict[str, GroundNode] = {}
-    """Nodes of this flight beside those of the site (a rover)."""
+    """Nodes of this flight that are not in the site, such as a rover."""
     timezone: str | None = None
     trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = []
-    """SHA-256 of the logs that settings of this file were learned from: nothing is scored on them."""
+    """SHA-256 of the logs from which settings of this file were learned. They are not scored."""
     marks: list[str] = []
-    """Marks of the same logs, by which their copies are known."""
+    """Fingerprints of the same logs, to recognise copies."""
     logs: list[LogSettings]
-    """Logs of the flight; an empty list is enough for a plan or a route."""
+    """Logs of the flight. An empty list is sufficient for a plan or a route."""
     antennas: dict[str, str] = {}
-    """Learned antennas of a site by name, of the ``uav`` and of ``TOWER.CHANNEL``, in place of those of link."""
+    """Names of learned antennas for ``uav`` and ``TOWER.CHANNEL``, instead of those in link."""
     link: LinksSettings = LinksSettings()
     rt: RtSettings = RtSettings()
     rss: RssSettings = RssSettings()
@@ -484,18 +482,18 @@ class FlightFile(StrictModel):
 
     @property
     def cautions(self) -> tuple[Caution, ...]:
-        """Cautions about learned antennas and receivers that the file names: one that does not fit is not used."""
+        """The warnings about learned antennas and receivers in this file. Those that do not fit are not used."""
         return self._cautions
 
     @property
     def lent(self) -> frozenset[str]:
-        """Channels of ``link.channels`` that a calibration or an override added: they may be of another flight."""
+        """The channels of ``link.channels`` from a calibration or an override. Another flight may have them."""
         return self._lent
 
     def changed(
         self, content: Mapping[str, Any], *, cautions: Iterable[Caution] | None = None, lent: Iterable[str] = ()
     ) -> FlightFile:
-        """Return the settings with other values for some top-level keys, which are not checked again."""
+        """Return the settings with other values for some top-level keys. They are not checked again."""
         other = self.model_copy(update=dict(content))
         other._cautions = self._cautions if cautions is None else tuple(cautions)
         other._lent = self._lent | frozenset(lent)
@@ -527,13 +525,13 @@ class FlightFile(StrictModel):
 
 
 class LearnedLink(StrictModel):
-    """The links of calibrated.yaml: channels only."""
+    """The links of calibrated.yaml, which has channels only."""
 
     channels: dict[str, dict[str, Any]] = {}
 
 
 class LearnedSettings(StrictModel):
-    """calibrated.yaml: the part of a flight.yaml that a calibration knows."""
+    """The part of a flight.yaml that a calibration writes to calibrated.yaml."""
 
     trained_on: list[str] = []
     marks: list[str] = []
@@ -552,21 +550,20 @@ def load_flight(path: str | Path) -> FlightFile:
     Returns
     -------
     FlightFile
-        The settings as they are written; :func:`aerpaw_cmp.flight.gains.load_with_learned` adds the learned
-        antennas that they name.
+        The settings as written. :func:`aerpaw_cmp.flight.gains.load_with_learned` adds the learned antennas.
 
     Raises
     ------
     UsageError
-        Unknown or duplicate keys, wrong types, wrong ranges: with the line and the nearest valid key.
+        With line and nearest valid key, for unknown or duplicate keys, wrong types and wrong ranges.
     """
     return load_yaml(Path(path), FlightFile)
 
 
 def files_of(content: Mapping[str, Any], folder: Path, learned: Path | None = None) -> dict[str, Any]:
-    """Settings of a file in a folder, with the files that they name as absolute paths.
+    """Return settings with the files that they name as absolute paths.
 
-    Those of a learned file must lie below its folder.
+    Files that a calibrated.yaml (``learned``) names must be in its folder or below.
     """
 
     def place(value: Any, key: str = "") -> Any:
@@ -587,27 +584,27 @@ def joined(settings: FlightFile, learned: Path) -> FlightFile:
     Parameters
     ----------
     settings : FlightFile
-        With the learned antennas that it names: those of the same end, tower and channel are replaced.
+        Settings with their learned antennas. Those of the same end, tower and channel are replaced.
     learned : Path
-        calibrated.yaml; its files are in its folder.
+        A calibrated.yaml, with its files in the same folder.
 
     Raises
     ------
     UsageError
-        A file that is not a calibrated.yaml, that was edited, or whose settings do not fit this flight.
+        If the file is not a calibrated.yaml, was edited, or does not fit this flight.
     """
     if learned.is_file():
         check_seal(learned)
     known = files_of(load_yaml(learned, LearnedSettings).model_dump(exclude_unset=True), learned.parent, learned)
     taught: dict[str, Any] = known.get("link", {}).get("channels", {})
-    # what the file says, no defaults: a stated default would keep a learned value out
+    # only stated values: a default must not replace a learned value
     stated: dict[str, Any] = settings.model_dump(mode="json", exclude_unset=True)
-    # a channel begins as the RSS link, as with overrides; what was learned comes last
+    # a channel begins as the RSS link, as with overrides; learned values come last
     rss_link = settings.link.rss.model_dump(mode="json", exclude_unset=True)
     channels = dict(stated.get("link", {}).get("channels", {}))
     for name, channel in taught.items():
         before = {**rss_link, **channels.get(name, {})}
-        # a learned 'tower' is that of every tower: one by name would come before it
+        # a learned 'tower' applies to every tower, but an entry of 'towers' would have priority
         towers = {} if "tower" in channel else before.get("towers", {})
         channels[name] = {**before, **channel, "towers": {**towers, **channel.get("towers", {})}}
     stated["link"] = {**stated.get("link", {}), **({"channels": channels} if channels else {})}
@@ -642,20 +639,20 @@ Overrides = Mapping[str, Any]
 
 
 def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
-    """Checked flight settings with dotted keys changed.
+    """Return checked flight settings with dotted keys changed.
 
-    A channel that ``link.channels`` does not name starts as a copy of ``link.rss``; a tower that ``towers`` does not
-    name as a copy of ``tower``.
+    A new channel of ``link.channels`` starts as a copy of ``link.rss``, and a new tower of ``towers`` as a copy of
+    ``tower``.
 
     Raises
     ------
     UsageError
-        A key that flight files do not have (the nearest one is named), a value of the wrong kind.
+        If a key is unknown (the nearest one is named) or a value has the wrong kind.
     """
     if not overrides:
         return settings
     plain = settings.model_dump(mode="python")
-    # what copies are made of comes first, so that they have it, too
+    # the originals of copies first, so that the copies have the same values
     for key in sorted(overrides, key=lambda key: (key.startswith("link.channels."), ".towers." in key)):
         _set(plain, key, overrides[key])
     try:
@@ -663,11 +660,11 @@ def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        # the message names what was typed, also where the mistake is found above or below it
+        # name the override that was typed, also if the error is above or below it
         key = next((k for k in overrides if k.startswith(where) or where.startswith(k)), where)
         message = str(first["msg"]).removeprefix("Value error, ")
         raise UsageError(f"the override {key!r}: found {first['input']!r} at {where}", expected=message) from None
-    # a campaign changes a channel that some of its flights do not have
+    # a campaign can change a channel that some of its flights do not have
     return other.changed({}, lent={*settings.lent, *(other.link.channels.keys() - settings.link.channels.keys())})
 
 
@@ -676,7 +673,7 @@ def _set(plain: dict[str, Any], key: str, value: Any) -> None:
     holder, parts = plain, key.split(".")
     for depth, part in enumerate(parts):
         if not isinstance(level, dict):
-            raise UsageError(f"the override {key!r} goes below {'.'.join(parts[:depth])!r}, which is no group of keys")
+            raise UsageError(f"the override {key!r} goes below {'.'.join(parts[:depth])!r}, which has no keys")
         if part not in level:
             _add(plain, level, parts[:depth], part, key)
         holder, level = level, level[part]
@@ -684,7 +681,7 @@ def _set(plain: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _add(plain: dict[str, Any], level: dict[str, Any], above: list[str], part: str, key: str) -> None:
-    """Make an entry of a mapping with free names; every other unknown key is a mistake."""
+    """Create an entry of a mapping with free names. Refuse every other unknown key."""
     if above == ["link", "channels"]:
         level[part] = deepcopy(plain["link"]["rss"])
         return

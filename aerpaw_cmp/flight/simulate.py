@@ -66,7 +66,7 @@ class Trajectory:
 
     def velocity_at(self, time_s: FloatArray) -> FloatArray:
         """Return velocities (n, 3) east, north, up [m/s], which are zero while the UAV waits."""
-        # the last corner belongs to the leg before it
+        # the last corner belongs to the last leg
         leg = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.time_s) - 2)
         return np.asarray((np.diff(self.position_m, axis=0) / np.diff(self.time_s)[:, None])[leg])
 
@@ -171,7 +171,7 @@ def telemetry_frame(
             "yaw_deg": yaw,
             "velocity_north_mps": velocity[:, 1],
             "velocity_east_mps": velocity[:, 0],
-            # autopilots count downwards
+            # autopilots log the velocity downwards
             "velocity_down_mps": -velocity[:, 2],
             "fix": 4,
             "satellites": 18,
@@ -224,12 +224,12 @@ def _local_start(start: datetime, timezone: str) -> pd.Timestamp:
         # NaT for both, because pandas would raise different exceptions
         local: Any = pd.Timestamp(start.replace(tzinfo=None)).tz_localize(timezone, ambiguous="NaT", nonexistent="NaT")
         if not 1980 <= start.year <= 2200:
-            why = "a clock that nothing flew by"
+            why = "a year outside 1980 to 2200"
         elif not pd.isna(local):
             start_there: pd.Timestamp = local
             return start_there
         else:
-            why = "the clocks changed then: it never was, or it was twice"
+            why = "the clocks changed then: this time does not exist or exists twice"
     except (ValueError, OverflowError) as error:
         why = str(error)
     raise UsageError(f"flight.plan.start {start} in {timezone}", expected="a wall time", cause=why)
@@ -291,7 +291,7 @@ class FlightSimulator:
         if plan is None:
             raise UsageError("the flight file has no plan", expected="flight.plan with start and waypoints")
         if self.settings.timezone is None:
-            raise UsageError("the flight file names no time zone", expected="timezone: America/New_York, say")
+            raise UsageError("the flight file names no time zone", expected="such as timezone: America/New_York")
         self.plan = plan
         # the seed includes the name, because equal fading would make two flights copies of one log
         self.generator = np.random.default_rng([plan.seed, *self.settings.flight.name.encode()])
@@ -336,7 +336,7 @@ class FlightSimulator:
         for name in names:
             inside(out, name, out / FLIGHT, error=UsageError)
             if names.count(name) > 1 or name in (_TRUTH, FLIGHT, SUMS):
-                raise UsageError(f"two files of this flight are named {name!r}", expected="a name of its own for each")
+                raise UsageError(f"two files of this flight are named {name!r}", expected="different names")
 
     def _check_plan(self) -> None:
         """Refuse offsets and clock shifts of logs that are not simulated."""
@@ -347,7 +347,7 @@ class FlightSimulator:
             if name not in valid:
                 key = "clock_shift_s" if valid is towers else "offsets_db"
                 raise UsageError(
-                    f"flight.plan.{key}: no log is of {name!r}",
+                    f"flight.plan.{key}: there is no log of {name!r}",
                     expected="one of " + ", ".join(dict.fromkeys(valid)),
                 )
 
@@ -360,7 +360,7 @@ class FlightSimulator:
         if log.reader == "vehicle_out":
             return partial(self._telemetry_log, log)
         if log.reader == "sounder_log" and (log.node is None or log.channel is None):
-            raise UsageError(f"log {log.path!r} does not say whose it is", expected="'node' and 'channel'")
+            raise UsageError(f"log {log.path!r} has no tower or no channel", expected="'node' and 'channel'")
         links, tower = self.settings.link, log.node or self.settings.rank.tower
         if tower not in self.site.towers:
             raise UsageError(f"the site has no tower {tower!r}", expected="one of " + ", ".join(self.site.towers))

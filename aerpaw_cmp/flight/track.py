@@ -102,11 +102,11 @@ def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
     ]
     if all(after is before for after, before in zip(streams, file.result.streams, strict=True)):
         raise UsageError(
-            f"{log.path}: 'height_m' acts on nothing",
+            f"{log.path}: 'height_m' has no effect",
             expected="a log with positions and no altitude",
-            cause="the log has altitudes of its own, or no positions",
+            cause="the log has altitudes, or no positions",
         )
-    note = f"no altitude in the log: {log.height_m:g} m above take-off in all of it, as height_m says"
+    note = f"no altitude in the log: {log.height_m:g} m above take-off everywhere (height_m)"
     # the question of the reader is answered here
     warnings = [text for text in file.result.warnings if not text.startswith("no column is known as a height")]
     return replace(file, result=replace(file.result, streams=tuple(streams), warnings=(*warnings, note)))
@@ -160,9 +160,9 @@ MISREAD = {
     "the nose follows the course, not the logged yaw": ([0, 1, 2], [0.0, 0.0, 0.0], 0.0),
     "the logged pitch has the wrong sign": ([0, 1, 2], [1.0, -1.0, 1.0], 0.0),
     "the logged roll has the wrong sign": ([0, 1, 2], [-1.0, 1.0, 1.0], 0.0),
-    "the columns of pitch and yaw are exchanged": ([0, 2, 1], [1.0, 1.0, 1.0], 0.0),
-    "the columns of roll and yaw are exchanged": ([2, 1, 0], [1.0, 1.0, 1.0], 0.0),
-    "the columns of roll and pitch are exchanged": ([1, 0, 2], [1.0, 1.0, 1.0], 0.0),
+    "the columns of pitch and yaw are swapped": ([0, 2, 1], [1.0, 1.0, 1.0], 0.0),
+    "the columns of roll and yaw are swapped": ([2, 1, 0], [1.0, 1.0, 1.0], 0.0),
+    "the columns of roll and pitch are swapped": ([1, 0, 2], [1.0, 1.0, 1.0], 0.0),
     "the columns of roll, pitch and yaw are shifted by one": ([1, 2, 0], [1.0, 1.0, 1.0], 0.0),
     "the columns of roll, pitch and yaw are shifted by two": ([2, 0, 1], [1.0, 1.0, 1.0], 0.0),
 }
@@ -216,27 +216,27 @@ class TrackAccount:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings for the user, one sentence each."""
+        """The warnings for the user, one sentence each."""
         reasons = (
             (self.hour_steps, "step(s) of whole hours between telemetry rows: daylight-saving change or a reset clock"),
             (self.steps_sorted, "step(s) back in time between telemetry rows: all rows were sorted by time"),
-            (self.backward_time, "telemetry row(s) out of time order were left out"),
-            (self.duplicate_time, "telemetry row(s) repeat the time stamp before them and were left out"),
-            (self.no_time, "telemetry row(s) without a time stamp were left out"),
-            (self.bad_position, "telemetry row(s) without a position (NaN, -999) were left out"),
-            (self.gaps, f"telemetry gap(s), the longest {self.longest_gap_s:.1f} s, were not bridged"),
-            (self.unknown_attitude, "telemetry row(s) without attitude: level flight along the course stands in"),
-            (self.heading_alone, "telemetry row(s) hold a heading alone: level flight along it stands in"),
+            (self.backward_time, "telemetry row(s) out of time order were ignored"),
+            (self.duplicate_time, "telemetry row(s) repeat the time stamp before them and were ignored"),
+            (self.no_time, "telemetry row(s) without a time stamp were ignored"),
+            (self.bad_position, "telemetry row(s) without a position (NaN, -999) were ignored"),
+            (self.gaps, f"telemetry gap(s), the longest {self.longest_gap_s:.1f} s, were not interpolated"),
+            (self.unknown_attitude, "telemetry row(s) without attitude: level flight along the course is assumed"),
+            (self.heading_alone, "telemetry row(s) contain only a heading: level flight along it is assumed"),
             (
                 self.below_ground,
-                "telemetry row(s) lie below the site's ground plane and are not compared: origin.takeoff_ground_m, or "
-                "an elevation model, says how high the ground is",
+                "telemetry row(s) are below the site's ground plane and are not compared: origin.takeoff_ground_m, or "
+                "an elevation model, specifies the height of the ground",
             ),
         )
         usual_m, high_m = self.sparse_error_m
         sparse = (
-            f"the telemetry has a fix every {self.sparse_s:.0f} s: positions between are a straight line, wrong by "
-            f"about {usual_m:.0f} m in the median and {high_m:.0f} m in one of ten"
+            f"the telemetry has a fix every {self.sparse_s:.0f} s: positions between are interpolated, with a "
+            f"median error of about {usual_m:.0f} m and {high_m:.0f} m in one of ten"
         )
         return (*([sparse] if self.sparse_s else []), *(f"{count} {text}" for count, text in reasons if count))
 
@@ -293,7 +293,7 @@ class TrackPoses:
 
     @property
     def heading_deg(self) -> FloatArray:
-        """Heading of the nose, clockwise from north, [0, 360) deg."""
+        """The heading of the nose, clockwise from north, [0, 360) deg."""
         return np.asarray(bearing_deg(self.rotation[:, :, 0]) % 360.0)
 
 
@@ -389,7 +389,7 @@ def positions_over_time(frame: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
 
 
 class Track:
-    """The flight path of one telemetry stream in a site frame.
+    """A flight path from one telemetry stream, in a site frame.
 
     Parameters
     ----------
@@ -398,7 +398,7 @@ class Track:
     frame : SiteFrame
         Frame of the site.
     maximum_gap_s : float
-        Longer gaps are not bridged [s].
+        Positions are not interpolated in longer gaps [s].
     ground_m : float
         Height of the take-off point above the site origin [m], added to ``altitude_m``.
     ground : callable, optional
@@ -491,7 +491,7 @@ class Track:
         Parameters
         ----------
         times : array_like, (n,)
-            datetime64 (UTC) or epoch seconds; any order.
+            datetime64 (UTC) or epoch seconds, in any order.
 
         Returns
         -------

@@ -5,13 +5,13 @@ A fingerprint recognises a changed copy of a log, but not a second flight of the
 A fingerprint ``<start>f<digits>f<runs>`` has three parts:
 
 - ``start``: half seconds since 1970, empty if the log has no wall clock.
-- ``digits``: the change of a level or a rank every half second, one digit each: mean over 1 s minus mean over 10 s, in
-  steps of 0.4 robust standard deviations. Powers in watts count by their logarithm.
+- ``digits``: one digit every half second for the change of a level or a rank. It is the mean over 1 s minus the mean
+  over 10 s, in steps of 0.4 robust standard deviations. Powers in watts count by their logarithm.
 - ``runs``: the smallest hashes of short runs of raw readings (a bottom-k sketch, Broder 1997), 8 hex digits each.
 
-Two fingerprints are of one log if they share runs, or if their clocks agree and their digits correlate at some lag. The
-digits of a part and of a thinned, resampled, rounded or scaled copy do. Repeated flights of one route share the
-ripple of the ground reflection, so their digits correlate, too: only the clock or the raw readings distinguish them.
+Two fingerprints belong to one log if they share runs, or if their clocks agree and their digits correlate at some lag.
+The digits of a part and of a thinned, resampled, rounded or scaled copy correlate. Those of repeated flights on one
+route also correlate, by the ripple of the ground reflection. Only the clock or the raw readings distinguish them.
 """
 
 from __future__ import annotations
@@ -324,12 +324,12 @@ def counted_once(flights: Sequence[FlightData]) -> tuple[list[FlightData], list[
         name = data.settings.flight.name
         again = {digest: home[digest] for digest in flight_logs(data) if digest in home}
         for digest, first in again.items():
-            remarks.append(f"{name} holds the same log as {first} (SHA-256 {digest[:12]}...): it is counted once")
+            remarks.append(f"{name} contains the same log as {first} (SHA-256 {digest[:12]}...): it is counted once")
         marked = [(logs_of(data, s), series_mark(s)) for _, s in data.series]
         for logs, ours in marked:
             earlier = [] if set(logs) & set(again) else [flight for flight, mark in known if among(ours, [mark])]
             if earlier:
-                remarks.append(f"{name} holds readings of {earlier[0]} in another log: they are counted once")
+                remarks.append(f"{name} contains readings of {earlier[0]} in another log: they are counted once")
                 again |= dict.fromkeys(logs, earlier[0])
         known += [(name, ours) for _, ours in marked]
         rss = tuple(s for s in data.rss if not set(logs_of(data, s)) & set(again))

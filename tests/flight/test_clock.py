@@ -90,7 +90,7 @@ def test_a_planted_lag_is_found_although_no_gain_is_known(lag_s):
 def test_two_loggers_at_one_tower_have_no_common_clock():
     clock = judge_clock([channel(0.0, 1), channel(4.0, 2, name="two")])
     assert (clock.verdict, clock.correction_s) == (CANNOT_TELL, 0.0)
-    assert clock.reason.startswith("its channels have clocks of their own, one +0.")
+    assert clock.reason.startswith("its channels have different clocks, one +0.")
 
 
 def test_clocks_that_agree_are_ok_and_their_intervals_hold():
@@ -233,7 +233,7 @@ def test_a_track_of_one_pose_and_a_level_that_never_changes_are_no_fault():
 def test_a_lag_outside_the_window_is_not_passed_off_as_a_result():
     clock = judge_clock([channel(6.0, 6, gain_db=12.0, memory_db=0.5)], window_s=5.0)
     assert clock.verdict == CANNOT_TELL
-    assert "widen rss.advanced.lag_window_s" in clock.reason
+    assert "increase rss.advanced.lag_window_s" in clock.reason
     assert -5.0 <= clock.ci95_s[0] <= clock.radio_minus_telemetry_s <= clock.ci95_s[1] <= 5.0
 
 
@@ -457,7 +457,7 @@ def test_lags_are_tried_finely_where_one_stands_out(bend: float, finest: float) 
 
 
 def test_an_optimum_between_two_excluded_lags_is_found() -> None:
-    """Two lags explain a level about as well: the second lies half way between lags that are excluded by themselves."""
+    """Two lags explain a level about equally well: the second lies half way between lags that are excluded by themselves."""
     lags = np.arange(-30, 31) * 0.5
 
     def likelihood(some: np.ndarray) -> np.ndarray:

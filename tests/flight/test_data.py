@@ -115,7 +115,7 @@ def test_one_of_two_cells_that_only_a_number_distinguishes_is_chosen_by_its_stre
     begin = 1_748_786_400  # 2025-06-01 14:00:00 UTC, in the sample flight
     rows = (f"{begin + 60 + i},Op,310,{51200001 + i // 20 % 2 * 513},{-80 - 20 * (i // 20 % 2)}" for i in range(120))
     (tmp_path / "phone.csv").write_text("\n".join(["timestamp,operator,mcc,cell_id,rsrp", *rows, ""]))
-    with pytest.raises(UsageError, match=r"two streams of one log hold RSS of LW1 P .*'cells: \{STREAM: TOWER\}'"):
+    with pytest.raises(UsageError, match=r"two streams of one log contain RSS of LW1 P .*'cells: \{STREAM: TOWER\}'"):
         _flight(tmp_path, "path: phone.csv, node: LW1, channel: P")
     (series,) = _flight(tmp_path, "path: phone.csv, channel: P, cells: {rsrp_cell51200001: LW1}").rss
     assert set(series.measured_db) == {-80.0}
@@ -131,7 +131,7 @@ def test_a_rank_log_in_two_parts_is_one_record(tmp_path: Path) -> None:
 
 def test_two_records_of_one_channel_are_refused(tmp_path: Path) -> None:
     logs = [f"path: {SAMPLE / 'LW1' / f'USRP{i}_power_log.txt'}, node: LW1" for i in (1, 2)]
-    with pytest.raises(UsageError, match=r"two logs hold RSS of LW1 power .*USRP1.*USRP2.*'channel'"):
+    with pytest.raises(UsageError, match=r"two logs contain RSS of LW1 power .*USRP1.*USRP2.*'channel'"):
         _flight(tmp_path, *logs)
     assert len(_flight(tmp_path, logs[0], f"{logs[1]}, channel: second").rss) == 2
     with pytest.raises(UsageError, match="rank of LW1"):
@@ -265,8 +265,8 @@ def test_places_are_near_a_tower_up_to_thirty_kilometres(away: float, near: bool
 
 @pytest.mark.parametrize(
     ("turned", "cause"),
-    [(lambda a, o: (o, a), "exchanged"), (lambda a, o: (a, -o), "west"), (lambda a, o: (-a, o), "south"),
-     (lambda a, o: (-o, a), "exchanged and a sign")],
+    [(lambda a, o: (o, a), "swapped"), (lambda a, o: (a, -o), "west"), (lambda a, o: (-a, o), "south"),
+     (lambda a, o: (-o, a), "swapped and a sign")],
 )  # fmt: skip
 def test_angles_that_are_turned_are_told_from_their_place(turned: Any, cause: str) -> None:
     site = load_site("lake_wheeler")

@@ -43,7 +43,7 @@ def test_a_track_at_the_given_height_is_that_of_a_log_that_tells_it(tmp_path: Pa
     times = given.rss[0].time
     np.testing.assert_array_equal(given.track.pose_at(times).position_m, logged.track.pose_at(times).position_m)
     assert given.rss[0].measured_db.tolist() == logged.rss[0].measured_db.tolist()
-    notes = [text for text in given.warnings if "30 m above take-off in all of it" in text]
+    notes = [text for text in given.warnings if "30 m above take-off everywhere" in text]
     assert len(notes) == 1
     assert not [text for text in given.warnings if "give the track another log" in text]
     low = flight(tmp_path, ", height_m: 1.5")
@@ -57,13 +57,13 @@ def test_without_a_height_the_message_names_the_key(tmp_path: Path) -> None:
     write(tmp_path / "phone.csv", altitude=False)
     with pytest.raises(InputError, match="no altitude in") as raised:
         flight(tmp_path, "")
-    assert "'height_m: H' beside its path" in str(raised.value)
+    assert "'height_m: H' next to its path" in str(raised.value)
 
 
 @pytest.mark.parametrize("keys", [", height_m: 30", ", height_m: 0"])
 def test_a_height_beside_a_log_that_tells_it_is_refused(tmp_path: Path, keys: str) -> None:
     write(tmp_path / "phone.csv", altitude=True)
-    with pytest.raises(UsageError, match="'height_m' acts on nothing"):
+    with pytest.raises(UsageError, match="'height_m' has no effect"):
         flight(tmp_path, keys)
 
 

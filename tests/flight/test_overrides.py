@@ -46,9 +46,9 @@ def test_new_channels_and_towers_begin_as_copies_whatever_the_order(settings: Fl
     [
         ("rt.max_deph", 1, "no key 'max_deph' below 'rt'.*max_depth"),
         ("rtt", 1, "no key 'rtt'.*'rt'"),
-        ("rt.engine.kind", 1, "goes below 'rt.engine', which is no group of keys"),
-        ("rt.max_depth.more.still", 1, "goes below 'rt.max_depth', which is no group of keys"),
-        ("logs.0.node", "LW1", "goes below 'logs', which is no group of keys"),
+        ("rt.engine.kind", 1, "goes below 'rt.engine', which has no keys"),
+        ("rt.max_depth.more.still", 1, "goes below 'rt.max_depth', which has no keys"),
+        ("logs.0.node", "LW1", "goes below 'logs', which has no keys"),
         ("rt.max_depth", "deep", "'rt.max_depth': found 'deep'"),
     ],
 )

@@ -162,7 +162,7 @@ def test_a_leg_lasts_as_long_as_its_length_at_the_speed(most_s):
 
 
 def test_an_area_without_room_is_refused():
-    with pytest.raises(UsageError, match="leaves no area"):
+    with pytest.raises(UsageError, match="no area remains"):
         allowed_area(shapely.box(0, 0, 50, 50), [], np.array([[25.0, 25.0, 0.0]]), 60.0)
     with pytest.raises(UsageError, match="no leg of 40 m"):
         route_of(

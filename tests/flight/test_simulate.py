@@ -159,5 +159,5 @@ def test_a_plan_for_a_log_that_is_not_simulated_is_refused(tmp_path: Path, key: 
     assert settings.flight.plan is not None
     plan = settings.flight.plan.model_copy(update={key: value})
     changed = settings.model_copy(update={"flight": settings.flight.model_copy(update={"plan": plan})})
-    with pytest.raises(UsageError, match=rf"flight.plan.{key}: no log is of '{name}'"):
+    with pytest.raises(UsageError, match=rf"flight.plan.{key}: there is no log of '{name}'"):
         FlightSimulator(changed, load_site("lake_wheeler"), SAMPLE).run(tmp_path / "out")

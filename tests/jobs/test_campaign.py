@@ -199,7 +199,7 @@ def test_json_is_alone_on_standard_output(folder: Path, capsys: pytest.CaptureFi
     [
         ({"settings": {"x": {"rt.max_deth": 1}}}, "max_depth"),
         ({"settings": {"x": {"rt.max_depth": 9}}}, "rt.max_depth"),
-        ({"settings": {"x": {"rt.max_depth.y": 1}}}, "which is no group of keys"),
+        ({"settings": {"x": {"rt.max_depth.y": 1}}}, "which has no keys"),
         ({"settings": {"x": {"link.rss.towr.yaw_deg": 10}}}, "tower"),
         ({"settigns": {}}, "did you mean 'settings'"),
         ({"flights": ["first.yaml", "first.yaml"]}, "two flights are named 'first'"),

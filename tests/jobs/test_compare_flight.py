@@ -363,9 +363,9 @@ def test_one_absurd_level_changes_no_number_and_is_told(
 @pytest.mark.parametrize(
     ("written", "instead", "words"),
     [
-        ("t,lat,lon", "t,lon,lat", r"no nearer than \d+ km to any tower.*latitude and longitude are exchanged"),
-        (",-78.", ",78.", "the longitude lacks its sign"),
-        (",35.", ",36.", r"no nearer than 1\d\d km to any tower.*another site"),
+        ("t,lat,lon", "t,lon,lat", r"at least \d+ km from every tower.*latitude and longitude are swapped"),
+        (",-78.", ",78.", "the sign of the longitude is missing"),
+        (",35.", ",36.", r"at least 1\d\d km from every tower.*another site"),
     ],
 )
 def test_exchanged_or_mirrored_angles_are_told_before_anything_else(
@@ -401,7 +401,7 @@ def test_a_rank_log_without_a_clock_may_be_of_another_flight(tmp_path: Path) -> 
     track["t"] += pd.Timestamp(ORIGIN).timestamp()
     track.to_csv(tmp_path / "track.csv", index=False)
     (doubt,) = gathered(write_yaml(path, content)).doubts
-    assert doubt == "ri.csv has no clock: by its positions it may be of another flight on this route"
+    assert doubt == "ri.csv has no clock: by its positions it may belong to another flight on this route"
 
 
 def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> None:
@@ -424,7 +424,7 @@ def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> Non
 def test_an_attitude_that_cannot_act_is_the_first_warning(tmp_path: Path) -> None:
     data = gathered(rank_with_positions(tmp_path, "2025-06-02T14:00:00Z"))
     assert data.warnings[0].startswith(
-        "rt.attitude: logged has no effect on rank of LW1: no sample lies in the telemetry"
+        "rt.attitude: logged has no effect on rank of LW1: no sample is within the telemetry"
     )
     data = gathered(rank_with_positions(tmp_path))
     assert not any("rt.attitude" in text for text in data.warnings)

@@ -194,7 +194,7 @@ def test_calibrate_counts_a_copy_once(folder: Path) -> None:
     calibration, notes = calibrated(write_yaml(folder / "twice.yaml", {"calibration": "twice", "flights": flights}))
     assert [data.settings.flight.name for data in calibration.flights] == ["first"]
     assert not any(calibration.scores.values())
-    assert "nobody_knows_me holds the same log as first (SHA-256 " in notes[0]
+    assert "nobody_knows_me contains the same log as first (SHA-256 " in notes[0]
     three, _ = calibrated(
         write_yaml(folder / "three.yaml", {"calibration": "three", "flights": [*flights, "second.yaml"]})
     )
@@ -219,7 +219,7 @@ def test_a_part_of_a_training_log_in_another_layout_is_known_by_its_readings(fol
     names = ["first.yaml", copy_of(folder, half).name, "second.yaml", "aside.yaml"]
     counted, notes = counted_once([load_data(load_flight(folder / name), folder) for name in names])
     assert [data.settings.flight.name for data in counted] == ["first", "second", "aside"]
-    assert notes == ["nobody_knows_me holds readings of first in another log: they are counted once"]
+    assert notes == ["nobody_knows_me contains readings of first in another log: they are counted once"]
 
 
 def test_two_logs_of_one_flight_in_two_flight_files(folder: Path) -> None:
@@ -240,7 +240,7 @@ def test_campaign_counts_a_copy_once(folder: Path, tmp_path: Path) -> None:
     assert [row["flight"] for row in campaign["rss"]] == ["first", "second"]
     (failure,) = campaign["failures"]
     assert failure["flight"] == "nobody_knows_me"
-    assert failure["message"].startswith("it holds the same log as first (SHA-256 ")
+    assert failure["message"].startswith("it contains the same log as first (SHA-256 ")
 
 
 def test_campaign_counts_a_thinned_copy_once(folder: Path, tmp_path: Path) -> None:
@@ -262,7 +262,7 @@ def test_campaign_counts_a_thinned_copy_once(folder: Path, tmp_path: Path) -> No
         (flight, setting) for flight in ("first", "second") for setting in "ab"
     ]
     assert {f["message"] for f in campaign["failures"]} == {
-        "it holds readings of first in another log: it is counted once"
+        "it contains readings of first in another log: it is counted once"
     }
 
 
@@ -336,4 +336,4 @@ def test_a_quarter_of_an_nr_flight_is_not_scored_by_the_receiver_that_learned_fr
         assert receiver.knows(rank_samples(data, data.rank[0]))
     counted, notes = counted_once(flights)
     assert [data.settings.flight.name for data in counted] == ["whole"]
-    assert notes == ["quarter holds readings of whole in another log: they are counted once"]
+    assert notes == ["quarter contains readings of whole in another log: they are counted once"]

@@ -98,8 +98,7 @@ def run_ingest(
             from ..flight.drafting.draft import SITE, DraftOptions, drafts
 
             drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=inputs, force=force))
-        only_spans = out is None and draft is None  # the summary needs no more of the records
-        files = ingest(paths, options=ReadOptions(only_spans=only_spans, **options), reader=reader)
+        files = ingest(paths, options=ReadOptions(**options), reader=reader)
         account = summary(files)
         if draft is not None:
             keys = ("columns", "kind", "unit", "ri_base")

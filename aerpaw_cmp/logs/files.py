@@ -10,9 +10,6 @@ A line of the log of ``aerpaw-cmp tap`` is a JSON object; its last key is the CR
 
 A log larger than memory is read in pieces of complete lines. The result of ``Reader.read_pieces`` does not depend on
 the size of the pieces: a reader stores a few numbers per piece and completes the result at the end.
-
-If only the number and span of the records are needed, ``Reader.read_sections`` returns them section by section
-(:func:`spans`), because the records of a 2 GB log would fill the memory.
 """
 
 from __future__ import annotations
@@ -25,7 +22,7 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from os.path import isfile
@@ -36,7 +33,6 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.units import AnyArray
-from .records import ReadResult, Stream
 
 _MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\x00": "xz"}
 _PIECE = 2 << 20
@@ -406,13 +402,9 @@ def _counted(chunks: Iterable[bytes], digest: Any) -> Iterator[bytes]:
 class Column:
     """A column that grows in place: joining stored pieces would need twice the memory."""
 
-    def __init__(self, dtype: Any, first: Any = ()) -> None:
-        self._values: AnyArray = np.array(first, dtype=dtype)
-        self._count = len(self._values)
-
-    def __len__(self) -> int:
-        """Count the values."""
-        return self._count
+    def __init__(self, dtype: Any) -> None:
+        self._values: AnyArray = np.zeros(0, dtype=dtype)
+        self._count = 0
 
     def extend(self, piece: AnyArray) -> None:
         """Append values."""
@@ -427,43 +419,3 @@ class Column:
         """Return the column, which is complete then."""
         self._values.resize(self._count, refcheck=False)
         return self._values
-
-
-class WholeLogError(Exception):
-    """A question that needs all records of a log together."""
-
-
-# Streams by section, and at the end the result without streams.
-Sections = Iterator[Stream | ReadResult]
-
-# Records of a section, some 100 MB.
-SECTION = 1 << 20
-
-
-def spans(sections: Sections) -> ReadResult:
-    """Return a result whose streams contain the first and the last record in time, and the number of records.
-
-    Raises
-    ------
-    WholeLogError
-        If values are impossible or days lie between records: such checks need all records together.
-    """
-    import pandas as pd
-
-    from . import limits
-
-    ends: dict[str, Stream] = {}
-    for stream in sections:
-        if isinstance(stream, ReadResult):
-            return replace(stream, streams=tuple(ends.values()))
-        time, before = stream.frame["time"].to_numpy("datetime64[ns]"), ends.get(stream.name)
-        latest = time[:1] if before is None else before.frame["time"].to_numpy("datetime64[ns]")[-1:]
-        checked = limits.check(ReadResult("", (stream,), 0, 0, 0))
-        if checked.warnings or not limits.one_run(np.concatenate([latest, time]).view(np.int64)):
-            break
-        frame, rows = stream.frame.iloc[[int(time.argmin()), int(time.argmax())]], len(time)
-        if before is not None:
-            frame = pd.concat([before.frame, frame]).sort_values("time", kind="stable").iloc[[0, -1]]
-            rows += before.rows
-        ends[stream.name] = replace(stream, frame=frame, stand_for=rows)
-    raise WholeLogError

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from pathlib import Path
@@ -30,9 +29,6 @@ if TYPE_CHECKING:
 
 # Largest content of a packed file that is unpacked in memory.
 MAX_BYTES = 2**32
-
-# A log of fewer bytes takes less than 300 MiB as a whole.
-_LARGE_BYTES = 1 << 28
 
 # A file with more records than this in a stream is a log of its own.
 _PIECE_RECORDS = 50
@@ -485,17 +481,8 @@ def _in_pieces(place: Path, reader: Reader, options: _OptionsFor | None) -> Inge
     if reader.read_pieces is None or _raw(place, 2) in _UTF_16:
         return None
     chosen, digest = _options(place, options, _neighbour_reader(place)), hashlib.sha256()
-    read_pieces, read_sections = reader.read_pieces, reader.read_sections
-
-    def read() -> ReadResult:
-        nonlocal digest
-        if chosen.only_spans and read_sections is not None and place.stat().st_size > _LARGE_BYTES:
-            with suppress(chunks.WholeLogError):
-                return chunks.spans(read_sections(chunks.file_pieces(place, digest), chosen, chunks.SECTION))
-            digest = hashlib.sha256()
-        return read_pieces(chunks.file_pieces(place, digest), chosen)
-
-    result = _checked(place, reader, chosen, read)
+    read_pieces = reader.read_pieces
+    result = _checked(place, reader, chosen, lambda: read_pieces(chunks.file_pieces(place, digest), chosen))
     return IngestedFile(str(place), digest.hexdigest(), result)
 
 

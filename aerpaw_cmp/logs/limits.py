@@ -476,8 +476,6 @@ class _Check:
         # differences as floats: those of int64 would wrap for NaT and for stamps 300 years apart
         time = self.frame["time"].to_numpy("datetime64[ns]")
         stamp: IntArray = time.view(np.int64)
-        if len(stamp) < 2 or one_run(stamp):
-            return
         timed = ~np.isnat(time)
         if timed.sum() < 2 or float(stamp[timed].max()) - float(stamp[timed].min()) <= _APART_S * 1e9:
             return
@@ -498,18 +496,6 @@ class _Check:
             row = int(np.argmax(bad))
             why = "written before the clock was set" if stamp[row] < _CLOCK_SET_NS else "days from all others"
             self._flag(bad, "time_out_of_range", np.datetime_as_string(time[row], unit="s"), why)
-
-
-def one_run(stamp: IntArray) -> bool:
-    """Check whether all stamps [ns] lie within a day, or each within a day of the next one, in constant memory."""
-    low, high = int(stamp.min()), int(stamp.max())
-    if low == np.iinfo(np.int64).min:  # a record without a time
-        return False
-    if high - low <= _APART_S * 1e9:
-        return True
-    step = 1 << 20
-    parts = (np.diff(stamp[first : first + step + 1].astype(np.float64)) for first in range(0, len(stamp) - 1, step))
-    return all(np.abs(part).max() <= _APART_S * 1e9 for part in parts)
 
 
 def _marked(frame: pd.DataFrame, bad: BoolArray, flag: str, void: Sequence[str]) -> pd.DataFrame:

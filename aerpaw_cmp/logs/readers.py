@@ -30,7 +30,6 @@ DEEP_BYTES = 4 << 20
 
 # A function that reads a log from pieces of complete lines, with a result that does not depend on their size.
 _ReadPieces = Callable[[Iterable[bytes], "ReadOptions"], ReadResult]
-_ReadSections = Callable[[Iterable[bytes], "ReadOptions", float], Iterator[Stream | ReadResult]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +60,6 @@ class ReadOptions:
         Unit of RSS where the file does not fix it.
     floor_db : float
         RSS at or below this is out of coverage.
-    only_spans : bool
-        Read of a large log only its account, the first and the last record of each stream, and their number.
     file_name : str
         Name of the log without folders, set by ``ingest``, for formats whose content is ambiguous.
     neighbour : callable, optional
@@ -82,7 +79,6 @@ class ReadOptions:
     frequency_hz: float | None = None
     unit: str | None = None
     floor_db: float = -200.0
-    only_spans: bool = False
     file_name: str = ""
     neighbour: Callable[[str], bytes | None] | None = None
 
@@ -110,8 +106,6 @@ class Reader:
     read_pieces : callable, optional
         ``read_pieces(pieces, options) -> ReadResult``: the same from pieces of whole lines, for logs larger than
         memory; see :mod:`aerpaw_cmp.logs.files`.
-    read_sections : callable, optional
-        ``read_sections(pieces, options, most)`` yields streams of about ``most`` records each, and then the result.
     clock_from, height_from : str
         ``written``, ``program: which``, or ``assumed: what``; see :mod:`aerpaw_cmp.logs.readers`. A stream's own
         attribute of that name wins.
@@ -127,7 +121,6 @@ class Reader:
     read: Callable[[bytes, ReadOptions], ReadResult]
     pieces: bool = False
     read_pieces: _ReadPieces | None = None
-    read_sections: _ReadSections | None = None
     clock_from: str = "assumed: local wall time"
     height_from: str = "assumed: above take-off"
     plugin: str = ""

@@ -66,8 +66,6 @@ class Stream:
         The records in file order, default integer index.
     attributes : mapping
         Attributes of the complete stream: node, channel, unit, frequency_hz, ri_base, clock.
-    stand_for : int, optional
-        Number of records, if the frame contains only the first and the last of them in time.
 
     Raises
     ------
@@ -79,7 +77,6 @@ class Stream:
     name: str
     frame: pd.DataFrame
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
-    stand_for: int | None = None
 
     def __post_init__(self) -> None:
         present = set(self.frame.columns)
@@ -90,7 +87,7 @@ class Stream:
     @property
     def rows(self) -> int:
         """The number of records."""
-        return len(self.frame) if self.stand_for is None else self.stand_for
+        return len(self.frame)
 
     @property
     def channel(self) -> str:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import dropwhile
 
 import numpy as np
@@ -20,7 +20,7 @@ import numpy as np
 from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.files import Column, Sections, WholeLogError
+from aerpaw_cmp.logs.files import Column
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import KEPT_REJECTED, ReadResult, Stream
 
@@ -126,10 +126,9 @@ def _fixed_layout(lines: _text.Lines) -> tuple[_Samples, IntArray]:
 
 @dataclass
 class _Piece:
-    """The content of a piece or section of a log: samples, ``*`` and foot lines (value NaN), and the account.
+    """The content of a log or a piece of it: samples, ``*`` and foot lines (value NaN), and the account.
 
-    The first ``known`` samples of a section are also the last of the section before, and ``lines`` counts all lines so
-    far. ``torn`` is the 0-based line without an end.
+    ``torn`` is the 0-based line without an end.
     """
 
     samples: _Samples
@@ -137,7 +136,6 @@ class _Piece:
     texts: dict[int, str]
     lines: int
     blank: int
-    known: int = 0
     torn: int = -1
 
 
@@ -249,47 +247,26 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     UsageError
         If no time zone is given.
     """
-    *streams, result = read_sections(pieces, options)
-    assert isinstance(result, ReadResult)
-    return replace(result, streams=tuple(item for item in streams if isinstance(item, Stream)))
-
-
-def read_sections(pieces: Iterable[bytes], options: ReadOptions, most: float = np.inf) -> Sections:
-    """Yield the stream in sections of at least ``most`` samples, and then the account and warnings without a stream.
-
-    Raises
-    ------
-    WholeLogError
-        If sections cannot settle what all samples together can.
-    """
     rejects, tally, notes = _text.Rejects(), Counter[str](), list[str]()
-    for section in _sections(pieces, rejects, most):
-        repeats, used, bad = _expand(section.samples, section.marks)
-        tally["repeated"] += len(repeats.line)
-        if most < np.inf and (bad or tally["repeated"] > _MOST_REPEATS):
-            raise WholeLogError  # the limit for a damaged offset depends on the runs before it
-        feet = section.marks.line[section.marks.offset >= 0].tolist()
-        foot = "no value behind the offset (torn last line, or the end of od's input)"
-        for i, reason in (*bad, *((i, foot) for i in feet)):
-            rejects.add_line(i + 1, reason, section.texts.get(i, ""))
-        tally.update(accepted=len(section.samples.line) - section.known + len(used), blank=section.blank)
-        tally["lines"] = section.lines
-        stream = _stream(section, repeats, options, tally, notes)
-        if most < np.inf and notes:
-            raise WholeLogError  # an hour that occurs twice: which of the two depends on a later step back
-        if stream is not None and len(stream.frame):
-            yield stream
+    log = _joined(pieces, rejects)
+    repeats, used, bad = _expand(log.samples, log.marks)
+    feet = log.marks.line[log.marks.offset >= 0].tolist()
+    foot = "no value behind the offset (torn last line, or the end of od's input)"
+    for i, reason in (*bad, *((i, foot) for i in feet)):
+        rejects.add_line(i + 1, reason, log.texts.get(i, ""))
+    tally.update(repeated=len(repeats.line), accepted=len(log.samples.line) + len(used))
+    stream = _stream(log, repeats, options, tally, notes)
     rejected, reasons = rejects.result()
-    yield ReadResult(
-        reader="sounder_log", streams=(), lines=tally["lines"], accepted=tally["accepted"], blank=tally["blank"],
-        rejected=rejected, warnings=tuple(_warnings(tally, notes, options)), reasons=reasons,
+    return ReadResult(
+        reader="sounder_log", streams=() if stream is None else (stream,), lines=log.lines, accepted=tally["accepted"],
+        blank=log.blank, rejected=rejected, warnings=tuple(_warnings(tally, notes, options)), reasons=reasons,
     )  # fmt: skip
 
 
-def _sections(pieces: Iterable[bytes], rejects: _text.Rejects, most: float) -> Iterator[_Piece]:
-    """Yield sections that end with a sample, which is also the first sample of the next section."""
+def _joined(pieces: Iterable[bytes], rejects: _text.Rejects) -> _Piece:
+    """Return the content of all pieces of a log."""
     marks, texts = _Samples.none(), dict[int, str]()
-    known, before, blank, unterminated = 0, 0, 0, False
+    before, blank, unterminated = 0, 0, False
     columns = [Column(kind) for kind in _COLUMNS.values()]
     for data in pieces:
         lines = _text.split(data)
@@ -302,23 +279,15 @@ def _sections(pieces: Iterable[bytes], rejects: _text.Rejects, most: float) -> I
         marks = marks.join(piece.marks) if len(piece.marks.line) else marks
         texts |= {before + i: text for i, text in piece.texts.items()} if len(texts) < KEPT_REJECTED else {}
         before, blank, unterminated = before + len(lines), blank + piece.blank, lines.unterminated
-        if len(columns[0]) > most:
-            samples = _Samples(*(column.array() for column in columns))
-            last, inside = samples.take(np.array([-1])), marks.line < samples.line[-1]
-            yield _Piece(samples, marks.take(inside), texts, before, blank, known=known)
-            columns = [Column(kind, getattr(last, name)) for name, kind in _COLUMNS.items()]
-            known, blank, marks = 1, 0, marks.take(~inside)
     samples = _Samples(*(column.array() for column in columns))
-    del columns  # logs may have 1 GB, so that memory is freed at once
-    torn = before - 1 if unterminated else -1
-    yield _Piece(samples, marks, texts, before, blank, known=known, torn=torn)
+    return _Piece(samples, marks, texts, before, blank, torn=before - 1 if unterminated else -1)
 
 
 def _stream(
-    section: _Piece, repeats: _Samples, options: ReadOptions, tally: Counter[str], notes: list[str]
+    log: _Piece, repeats: _Samples, options: ReadOptions, tally: Counter[str], notes: list[str]
 ) -> Stream | None:
     """Return the stream with its flags, or None without samples, and add warnings about its times to ``notes``."""
-    samples = section.samples
+    samples = log.samples
     if not len(samples.line):
         return None
     repeated = np.zeros(0, dtype=bool)
@@ -343,11 +312,11 @@ def _stream(
     samples.value[silent] = np.nan
     _text.add_flag(flag, silent, "out_of_coverage")
     _text.add_flag(flag, lost, "samples_lost_before")
-    if section.torn >= 0:
-        _text.add_flag(flag, samples.line == section.torn, _text.UNTERMINATED)
+    if log.torn >= 0:
+        _text.add_flag(flag, samples.line == log.torn, _text.UNTERMINATED)
     samples.line += 1
     frame = _text.frame("rss", instants.time, samples.line, flag, {"rss_db": samples.value}, own=True)
-    tally["time_back"] += _text.steps_back(frame)
+    tally["time_back"] = _text.steps_back(frame)
     name, ratio = _name(options)
     attributes = _text.attributes(
         options, channel=name, unit=options.unit or ("dB" if ratio else "dB re full scale"),
@@ -355,7 +324,7 @@ def _stream(
     )  # fmt: skip
     if link := _SOUNDING.match(options.file_name):
         attributes |= _identity.attributes_of({key: text for key, text in link.groupdict().items() if text != "null"})
-    return Stream("rss", name, frame.iloc[section.known :] if section.known else frame, attributes)
+    return Stream("rss", name, frame, attributes)
 
 
 def _name(options: ReadOptions) -> tuple[str, bool]:
@@ -392,5 +361,4 @@ READER = Reader(
     name="sounder_log", title="GNU Radio channel sounder power, quality or SNR log (od text)", kinds=("rss",),
     sample="[2025-01-01 12:00:00.032760] 0000004       -35.12345", sniff=sniff,
     read=lambda data, options: read_pieces((data,), options), read_pieces=read_pieces,
-    read_sections=read_sections,
 )  # fmt: skip

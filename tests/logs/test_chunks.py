@@ -1,7 +1,6 @@
 """The one law of large logs: pieces of any size give what one piece gives; rejected lines are bounded."""
 
 import hashlib
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,10 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.jobs.run import run_ingest
-from aerpaw_cmp.logs import files, limits
-from aerpaw_cmp.logs.ingest import IngestedFile, ingest, summary
-from aerpaw_cmp.logs.readers import ReadOptions, by_name
+from aerpaw_cmp.logs import files
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import by_name
 from aerpaw_cmp.logs.records import KEPT_REJECTED
 from tests.frames import assert_same_result
 from tests.parsers.samples import OPTIONS, SAMPLES, sounder_log
@@ -34,51 +32,6 @@ def test_pieces_of_any_size_are_one_piece(
     read = by_name(reader).read_pieces
     assert read is not None
     assert_same_result(read(files.whole_lines(pieces), OPTIONS), by_name(reader).read(bytes(log), OPTIONS))
-
-
-@given(
-    step=st.integers(1, 40),
-    damage=st.lists(st.tuples(st.floats(0, 1), st.binary(max_size=3)), max_size=3),
-    most=st.integers(1, 200),
-)
-@settings(max_examples=60, deadline=None)
-def test_sections_sum_up_to_the_whole_log(step: int, damage: list[tuple[float, bytes]], most: int) -> None:
-    log = bytearray(sounder_log(100))
-    for at, new in damage:
-        log[int(at * len(log)) : int(at * len(log)) + 2] = new
-    reader, data, lines = by_name("sounder_log"), bytes(log), bytes(log).splitlines(keepends=True)
-    pieces = files.whole_lines(b"".join(lines[first : first + step]) for first in range(0, len(lines), step))
-    assert reader.read_sections is not None
-    try:
-        result = files.spans(reader.read_sections(pieces, OPTIONS, most))
-    except files.WholeLogError:
-        assert damage  # what only the whole log can settle: such a log is read again
-        return
-    whole = limits.check(reader.read(data, OPTIONS))
-    told, expected = (summary([IngestedFile("", "", found)]) for found in (result, whole))
-    assert told == expected
-    assert [len(stream.frame) for stream in result.streams] == [2 for _ in whole.streams]
-
-
-_LINE = b"[2025-11-02 01:30:00.000000] 7000000        %s\n"
-
-
-@pytest.mark.parametrize(
-    ("last", "in_sections"),
-    [(b"", True), (_LINE.replace(b"11-02", b"03-02") % b"999.0", False), (_LINE % b"-45.0", False)],
-    ids=["sound", "an impossible level", "months later, in an hour that the clock showed twice"],
-)
-def test_only_the_span_of_a_large_log_is_held(
-    last: bytes, in_sections: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "x_power_log.txt").write_bytes(sounder_log(2000) + last)
-    options = ReadOptions(timezone=OPTIONS.timezone)
-    whole = ingest(tmp_path, options=options)
-    monkeypatch.setattr(files, "SECTION", 99)
-    monkeypatch.setattr("aerpaw_cmp.logs.ingest._LARGE_BYTES", 99)
-    some = ingest(tmp_path, options=replace(options, only_spans=True))
-    assert summary(some) == summary(whole) == run_ingest([tmp_path], timezone=options.timezone)
-    assert (len(some[0].result.streams[0].frame) == 2) is in_sections
 
 
 def test_a_file_is_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

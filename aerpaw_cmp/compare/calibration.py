@@ -699,7 +699,7 @@ BIN_S = 4.0
 BLOCK_M = 300.0
 
 # Number of groups that are held out in turn if there are more flights than :data:`MOST_GROUPS`. A residual field is
-# then fitted once, without the first group: one flight among many hardly changes it.
+# then fitted once, without the first group. One flight among many hardly changes it.
 _SCORED_GROUPS = 3
 
 OFF = "no correction"

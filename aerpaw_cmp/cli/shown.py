@@ -187,7 +187,7 @@ def number(value: float | None, form: str) -> str:
 
 
 def records(items: Sequence[Any], columns: Mapping[str, str], title: str | None = None) -> None:
-    """Print a table of records or mappings; print nothing without items.
+    """Print a table of records or mappings. Print nothing without items.
 
     Parameters
     ----------

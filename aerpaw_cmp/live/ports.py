@@ -95,7 +95,7 @@ def _list_ports() -> list[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Roots:
-    """The folder of devices and the list of serial ports; tests use others."""
+    """The folder of devices and the list of serial ports. Tests use others."""
 
     dev: Path = Path("/dev")
     ports: Callable[[], list[Any]] = _list_ports

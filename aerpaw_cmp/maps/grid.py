@@ -332,7 +332,7 @@ Evaluate = Callable[[FloatArray, tuple[str, ...]], Evaluation]
 
 @dataclass(frozen=True, slots=True)
 class MapResult:
-    """Maps of one foliage mode. Axes: altitude, (K,) tower, position; positions in the grid's index order.
+    """Maps of one foliage mode. Axes: altitude, (K,) tower, position, with positions in the grid's index order.
 
     Parameters
     ----------

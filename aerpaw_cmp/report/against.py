@@ -17,7 +17,7 @@ from ..compare.verdict import Verdict, stated_errors
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgainstSeries(LevelSeries):
-    """The predicted samples of one tower and channel, shape (n,); levels are in the unit of the log [dB]."""
+    """The predicted samples of one tower and channel, shape (n,). Levels are in the unit of the log [dB]."""
 
     sd_db: FloatArray
     position_m: FloatArray | None = None

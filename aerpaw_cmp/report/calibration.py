@@ -63,7 +63,7 @@ class CalibrationData(Made):
     strengths: Mapping[str, Any]
     ground: Mapping[str, Any] | None
     curve: Sequence[Mapping[str, Any]]
-    """Error by number of training flights, fewest first; empty with fewer than three flights."""
+    """Error by number of training flights, fewest first. Empty with fewer than three flights."""
     one_more_rmse_db: float
     """Expected error with one more flight, extrapolated [dB]; NaN without a curve."""
     antennas: Sequence[AntennaMap]

@@ -630,7 +630,7 @@ def _entries(items: Iterable[Any], without: Sequence[str]) -> list[dict[str, Any
 
 
 def campaign_metrics(data: CampaignData) -> dict[str, Any]:
-    """Return the numbers of the page under stable names; missing numbers are None."""
+    """Return the numbers of the page under stable names. Missing numbers are None."""
     failed = {f.flight for f in data.failures}
     result = {
         "campaign": data.name,
@@ -905,7 +905,7 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
 
 
 def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
-    """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``; return the files, the page first.
+    """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``. Return the files, the page first.
 
     ``pairs.csv`` contains all pairs of flights at the same positions; campaign.json those with the most cells.
     """
@@ -968,7 +968,7 @@ def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
 
 
 def cells(record: Any) -> dict[str, Any]:
-    """Return the fields of a record as cells of a table; an interval ``x_ci95`` becomes ``x_low`` and ``x_high``."""
+    """Return the fields of a record as cells of a table. An interval ``x_ci95`` becomes ``x_low`` and ``x_high``."""
     out: dict[str, Any] = {}
     for entry in dataclasses.fields(record):
         value = getattr(record, entry.name)

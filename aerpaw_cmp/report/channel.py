@@ -355,7 +355,7 @@ def _write_deepmimo(channel: Channel, folder: Path) -> Path:
 
 
 def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    """Return the part of params.json that the loader requires; other settings of its device sets have defaults."""
+    """Return the part of params.json that the loader requires. Other settings of its device sets have defaults."""
     sets = {
         f"txrx_set_{number}": {"name": name, "id": number, f"is_{name}": True, "num_points": every,
                                "num_active_points": active, f"is_{'rx' if name == 'tx' else 'tx'}": False}

@@ -162,7 +162,7 @@ def _predicted(series: AgainstSeries) -> dict[str, Any]:
 
 
 def _time_axis(start: np.datetime64 | None) -> dict[str, str]:
-    """Return the abscissa in seconds after ``start``; without ``start`` the log has relative times."""
+    """Return the abscissa in seconds after ``start``. Without ``start`` the log has relative times."""
     begun = "" if start is None else str(start.astype("datetime64[ms]"))
     return {"label": "" if begun else "Time after the first sample [s]", "start": begun}
 
@@ -226,7 +226,7 @@ OTHER = "others"
 
 
 def shown_confusion(serving: ServingComparison, most: int = MOST_CELLS) -> tuple[list[str], AnyArray]:
-    """Return names and counts of a readable matrix, shape (cells, cells + 1); the last column has no predicted cell.
+    """Return names and counts of a readable matrix, shape (cells, cells + 1). The last column has no predicted cell.
 
     Cells that neither served nor were predicted are not shown. If there are more than ``most``, the cells with fewest
     samples are added up as "others". That row and column contain hits and misses, so their cell has no frame.

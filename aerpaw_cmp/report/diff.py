@@ -55,7 +55,7 @@ class ReportSide:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportDiff:
-    """Two reports, ``first`` and ``second``; every difference is second minus first.
+    """Two reports, ``first`` and ``second``. Every difference is second minus first.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class ReportDiff:
 
     @property
     def differences(self) -> tuple[str, ...]:
-        """Clauses about numbers that differ by more than the tolerance; empty if there are none."""
+        """Clauses about numbers that differ by more than the tolerance. Empty if there are none."""
         return tuple(_differences(self))
 
 
@@ -226,7 +226,7 @@ _DIGEST = re.compile(r"\b([0-9a-f]{12})[0-9a-f.]{20,}")
 
 
 def in_short(value: Any) -> str:
-    """Return the text of a value, with the first 12 digits of each hash and fingerprint; diff.json has all digits.
+    """Return the text of a value, with the first 12 digits of each hash and fingerprint. The file diff.json has all digits.
 
     Examples
     --------

@@ -126,7 +126,7 @@ class Export:
 def points_table(
     kind: str, flight: str, columns: Sequence[Column], links: Iterable[tuple[Any, dict[str, Any]]], frame: SiteFrame
 ) -> Iterator[Points]:
-    """Yield the points of the links of a flight; yields nothing without links.
+    """Yield the points of the links of a flight. Yields nothing without links.
 
     Parameters
     ----------
@@ -417,7 +417,7 @@ class Scale:
     edges: FloatArray | None = None
 
     def bin_of(self, values: FloatArray) -> IntArray:
-        """Return the number of the colour of each value (n,); the last is out of coverage."""
+        """Return the number of the colour of each value (n,). The last is out of coverage."""
         known = np.isfinite(values)
         if self.edges is None:
             number = np.clip(np.nan_to_num(values).astype(np.int64), 0, len(self.colours) - 2) - 1

@@ -48,7 +48,7 @@ GEOMETRY = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputFile:
-    """An input file; for a log, ``lines == accepted + rejected + blank``.
+    """An input file. For a log, ``lines == accepted + rejected + blank``.
 
     ``rejected`` is the number of rejected lines; ``rejected_lines`` may contain only some of them.
     """
@@ -64,7 +64,7 @@ class InputFile:
     warnings: tuple[str, ...] = ()
     rejected_lines: tuple[RejectedLine, ...] = ()
     learned_on: tuple[str, ...] = ()
-    """SHA-256 of the logs that this file was learned from; empty for other files."""
+    """SHA-256 of the logs that this file was learned from. Empty for other files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -286,7 +286,7 @@ def clock_warnings(clocks: Mapping[str, ClockResult], cause: Cause | None = None
 
 
 def _clock_warning(clock: ClockResult) -> str:
-    """Return the sentence about the clock of one receiver; empty if the clock is right."""
+    """Return the sentence about the clock of one receiver. Empty if the clock is right."""
     if clock.applied == NOT_APPLIED:
         return f"rss.lag: apply is set, but the radio clock was not corrected: {clock.reason}."
     if clock.applied == APPLIED:

@@ -92,7 +92,7 @@ def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
 
 
 def _draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
-    """Draw the track of a tower that moves; its symbol is at the middle of the track."""
+    """Draw the track of a tower that moves. Its symbol is at the middle of the track."""
     if (way := panel.tower_m) is not None:
         some = spread_out(len(way), POINTS_PER_LINE)
         label = f"way of {panel.tower}"
@@ -215,7 +215,7 @@ def _moved(level_dbm: FloatArray, offset_db: float) -> FloatArray:
 
 
 def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssResult]) -> Figure:
-    """Draw both channels of a tower and the ray tracing; segments in which they differ are shaded (Fig. 15)."""
+    """Draw both channels of a tower and the ray tracing. Segments in which they differ are shaded (Fig. 15)."""
     start, (first, second) = start_of(data), panels
     fig, ax = subplots((9.2, 3.6))
     for span in pair.score.spans:

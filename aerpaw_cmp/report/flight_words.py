@@ -29,7 +29,7 @@ def filled(texts: Sequence[str], **facts: Any) -> list[str]:
 
 
 def said_of(verdict: Verdict, table: Mapping[str, tuple[str, str]], **facts: Any) -> str:
-    """Return sentence and next step from a table by the cause of a verdict; empty if the table has no such cause."""
+    """Return sentence and next step from a table by the cause of a verdict. Empty if the table has no such cause."""
     if verdict.cause not in table:
         return ""
     low, high = verdict.interval
@@ -141,7 +141,7 @@ RANKING: tuple[tuple[Callable[[set[str]], bool], str], ...] = (
 
 
 def ranking_sentence(verdicts: Mapping[str, str], most: int) -> str:
-    """Return the sentence about the settings that are not significantly worse; at most ``most`` are named."""
+    """Return the sentence about the settings that are not significantly worse. At most ``most`` are named."""
     alike = [name for name, word in verdicts.items() if word != "worse"]
     named = ", ".join(alike[:most]) + (f" and {len(alike) - most} more" if len(alike) > most else "")
     return next(text for holds, text in RANKING if holds(set(verdicts.values()))).format(named=named)
@@ -596,7 +596,7 @@ def _without_cause(pooled: FlightVerdict | None, panels: Sequence[RssResult]) ->
 
 
 def _training(data: ReportData) -> str:
-    """Return the sentence of a training flight; empty if nothing was learned from its logs."""
+    """Return the sentence of a training flight. Empty if nothing was learned from its logs."""
     for panels, what in ((data.rss, "the antennas"), (data.rank, "the receiver")):
         learned = [panel for panel in panels if panel.further.trained_on]
         if learned:
@@ -805,7 +805,7 @@ def points(share: float) -> str:
 
 
 def before_flight(scores: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the sentence about the prediction made before the flight; empty without levels."""
+    """Return the sentence about the prediction made before the flight. Empty without levels."""
     if not scores:
         return ""
     error, inside = (float(np.mean([row[key] for row in scores.values()])) for key in ("rmse_db", "coverage_90"))

@@ -980,7 +980,7 @@ def maps_page(data: MapsData, files: Sequence[str]) -> str:
 
 
 def write_maps(data: MapsData, folder: str | Path, drawn: str = "none") -> list[Path]:
-    """Write ``map.html``, ``metrics.json`` and figures in one format, all or none; return the files, the page first."""
+    """Write ``map.html``, ``metrics.json`` and figures in one format, all or none. Return the files, the page first."""
     folder = Path(folder)
     written = [write_file(folder / "metrics.json", json_text(maps_metrics(data)))]
     specs = [] if drawn == "none" else figure_specs(data)

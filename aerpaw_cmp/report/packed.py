@@ -45,7 +45,7 @@ class PackedArrays:
         self._size = 0
 
     def add(self, values: AnyArray, kind: str = "f4") -> int:
-        """Store values in little endian and return their number; equal arrays share a number."""
+        """Store values in little endian and return their number. Equal arrays share a number."""
         raw = np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()
         key = (kind, raw)
         if key not in self._known:

@@ -31,7 +31,7 @@ def links_of(by_tower: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str],
 
 
 def merge(into: dict[str, Any], numbers: Mapping[str, Any]) -> None:
-    """Merge ``numbers`` into ``into``, key by key; keys that only ``into`` has are unchanged."""
+    """Merge ``numbers`` into ``into``, key by key. Keys that only ``into`` has are unchanged."""
     for key, value in numbers.items():
         if isinstance(value, Mapping) and isinstance(into.get(key), dict):
             merge(into[key], value)
@@ -133,7 +133,7 @@ def as_json(content: Mapping[str, Any]) -> str:
 
 
 def embedded(content: Mapping[str, Any] | None) -> Markup:
-    """Return the data of the script of a page; empty if there are none."""
+    """Return the data of the script of a page. Empty if there are none."""
     return Markup(as_json(content)) if content else Markup("")
 
 

@@ -1,4 +1,4 @@
-"""Text of pages for numbers, intervals and times; names of keys and files."""
+"""Text of pages for numbers, intervals and times, and names of keys and files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ k_key = number_key
 
 
 def iso_time(time: Any) -> Any:
-    """Return times as ISO 8601 text with milliseconds and ``Z``; the text is empty for NaT."""
+    """Return times as ISO 8601 text with milliseconds and ``Z``. The text is empty for NaT."""
     instants = np.asarray(time, dtype="datetime64[ns]")
     # add half a unit, because numpy truncates and a stored 0.9999999 s must not lose a millisecond
     text = np.datetime_as_string((instants + np.timedelta64(500_000, "ns")).astype("datetime64[ms]"), timezone="UTC")
@@ -37,7 +37,7 @@ def safe_name(text: str) -> str:
 
 
 def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
-    """Return a number as text; a missing number is an en dash.
+    """Return a number as text. A missing number is an en dash.
 
     Examples
     --------
@@ -67,12 +67,12 @@ def interval(value: tuple[float | None, float | None] | None, decimals: int = 1)
 
 
 def percent(share: float | None, decimals: int = 0) -> str:
-    """Return a share as a percentage; a missing share is an en dash."""
+    """Return a share as a percentage. A missing share is an en dash."""
     return number(None if share is None else 100 * share, decimals, "%")
 
 
 def minute(instant: str) -> str:
-    """Return an ISO 8601 time of UTC to the minute; other text is returned unchanged.
+    """Return an ISO 8601 time of UTC to the minute. Other text is returned unchanged.
 
     Examples
     --------
@@ -163,7 +163,7 @@ def short(value: Any) -> str:
 
 
 def cut(text: str, most: int = 120) -> str:
-    """Return a text of at most ``most`` characters; a longer one ends in an ellipsis."""
+    """Return a text of at most ``most`` characters. A longer one ends in an ellipsis."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 

@@ -91,7 +91,7 @@ _MAXIMUM_ROW_TREES = 10_000
 
 @dataclass(frozen=True, slots=True)
 class SingleTree:
-    """A tree of a map file in the site frame [m]; sizes that are not stated are None."""
+    """A tree of a map file in the site frame [m]. Sizes that are not stated are None."""
 
     east_m: float
     north_m: float
@@ -529,7 +529,7 @@ def _warn_of_feet(shapes: list[_Shape], actions: list[str]) -> None:
 
 
 def _without_duplicates(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
-    """Drop outlines that cover the same ground as an earlier outline; a stated height is retained."""
+    """Drop outlines that cover the same ground as an earlier outline. A stated height is retained."""
     tree = shapely.STRtree([shape.area for shape in shapes])
     duplicates: set[int] = set()
     for i, shape in enumerate(shapes):

@@ -141,7 +141,7 @@ class LearnedLevel(StrictModel):
 
 
 class LearnedSpread(StrictModel):
-    """The error model of a level without the SD of the gain; see :class:`aerpaw_cmp.compare.gains.Spread`."""
+    """The error model of a level without the SD of the gain. See :class:`aerpaw_cmp.compare.gains.Spread`."""
 
     own_sd_db: Annotated[float, Field(ge=0)]
     noise_sd_db: Annotated[float, Field(ge=0)]
@@ -208,7 +208,7 @@ class LearnedSeries(StrictModel):
     channel: str
     """Label of the antenna in the training flights. It is a name, not a condition."""
     receiver: str = ""
-    """Receiver to which ``level`` and ``lock`` apply, as ``receiver`` of a flight file; empty if not named."""
+    """Receiver to which ``level`` and ``lock`` apply, as ``receiver`` of a flight file. Empty if not named."""
     carrier_hz: float
     tower_file: str
     uav_file: str
@@ -224,7 +224,7 @@ class LearnedSeries(StrictModel):
     """False if the gain of the UAV does not predict held-out flights of its campaign. It is then not used elsewhere."""
     lock: LearnedLock | None = None
     level: LearnedLevel | None = None
-    """Level; for receivers that lose their lock, the level in lock."""
+    """Level. For receivers that lose their lock, the level in lock."""
     health: LearnedHealth | None = None
 
     @property
@@ -881,7 +881,7 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
 
 
 def _values(numbered: Sequence[tuple[int, str]], width: int, path: Path) -> FloatArray:
-    """Return the cells of numbered lines (lines, width); lines are read one by one only to find a wrong one."""
+    """Return the cells of numbered lines (lines, width). Lines are read one by one only to find a wrong one."""
     with suppress(ValueError):
         if numbered:
             # fast for valid files, which most are

@@ -124,7 +124,7 @@ def is_tangled(ring: Polygon) -> bool:
 
 
 def lonlat(point: Any, where: str, path: Path) -> Position:
-    """Return a position that is written longitude first; raise InputError if it is not valid."""
+    """Return a position that is written longitude first. Raise InputError if it is not valid."""
     try:
         longitude, latitude = float(point[0]), float(point[1])
     except (TypeError, ValueError, IndexError, KeyError, OverflowError):
@@ -279,7 +279,7 @@ def metres(text: str) -> float | None:
 
 
 def positive_metres(tags: Mapping[str, str], keys: tuple[str, ...], notes: list[str]) -> float | None:
-    """Return the first valid length among some tags; an invalid value adds a sentence to ``notes``.
+    """Return the first valid length among some tags. An invalid value adds a sentence to ``notes``.
 
     The largest of several values (``8;12``) is used; ``~12`` is 12.
     """
@@ -338,7 +338,7 @@ def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
 
 
 def levels_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
-    """Return the number of levels; the largest of several (``2;3``)."""
+    """Return the number of levels, which is the largest of several (``2;3``)."""
     named = (value.strip() for name, value in tags.items() if _STOREYS.fullmatch(re.sub(r"[^a-z]", "", name.lower())))
     written = next(filter(None, named), "")
     if not written:
@@ -420,7 +420,7 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: L
 
 
 def _sort(element: Element, index: int, data: _Data) -> None:
-    """Store an element under its id; an element that occurs twice has the tags and points of both."""
+    """Store an element under its id. An element that occurs twice has the tags and points of both."""
     if element.get("visible") == "false" or element.get("action") == "delete":
         return
     identity = str(element.get("id", f"without id, element {index + 1}"))
@@ -472,7 +472,7 @@ def _way_outline(identity: str, way: Element, data: _Data, result: MapFile, line
 
 
 def _points(way: Element, data: _Data, outline: Outline) -> list[Position]:
-    """Return the known positions of a way; missing ones are added to ``outline.broken``."""
+    """Return the known positions of a way. Missing ones are added to ``outline.broken``."""
     if isinstance(way.get("geometry"), list):
         points = [point for point in way["geometry"] if point]
         if len(points) < len(way["geometry"]):
@@ -567,7 +567,7 @@ def _inside(ring: list[Position], shell: list[Position]) -> bool:
 
 
 def _by_nesting(rings: list[list[Position]]) -> tuple[list[list[Position]], list[list[Position]]]:
-    """Split rings into outer rings and holes; a ring inside an odd number of others is a hole."""
+    """Split rings into outer rings and holes. A ring inside an odd number of others is a hole."""
     depth = [sum(_inside(ring, other) for other in rings if other is not ring) for ring in rings]
     return (
         [ring for ring, around in zip(rings, depth, strict=True) if around % 2 == 0],

@@ -139,7 +139,7 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
 
 
 def _declare(words: list[str], elements: list[_Element]) -> None:
-    """Read an element of the header, or a property of its last element; other lines raise an error."""
+    """Read an element of the header, or a property of its last element. Other lines raise an error."""
     if words[:1] == ["element"]:
         elements.append(_Element(words[1], int(words[2]), ()))
     elif words[:1] == ["property"]:

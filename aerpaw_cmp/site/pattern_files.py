@@ -178,7 +178,7 @@ def _from_cuts(
     most_db: float = _MOST_OF_CUTS_DB,
     cause: str = "the values are not gain over isotropic",
 ) -> MeasuredPattern:
-    """Return the sphere of two cuts [dBi at each degree]; the module describes the method."""
+    """Return the sphere of two cuts [dBi at each degree]. The module describes the method."""
     for cut in ("HORIZONTAL", "VERTICAL"):
         if cut not in cuts:
             raise InputError(f"no cut {cut}", expected="a horizontal and a vertical cut", path=path)

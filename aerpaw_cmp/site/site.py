@@ -1,4 +1,4 @@
-"""The site model: frozen records in the site frame (east, north, up; metres).
+"""The site model: frozen records in the site frame (east, north, up in metres).
 
 ``up`` is height above the ground at the site origin. The traced ground is the plane ``up = 0``, or one reflecting
 plane per tower if towers have their own ground heights.

@@ -159,7 +159,7 @@ class PolygonModel(StrictModel):
         return self
 
     def polygon(self, frame: SiteFrame) -> Polygon:
-        """Return the polygon in the site frame [m]; raise UsageError unless it is a simple polygon near the site."""
+        """Return the polygon in the site frame [m]. Raise UsageError unless it is a simple polygon near the site."""
         if self.polygon_m is not None:
             _check_near(self.polygon_m, self.name)
             shape = Polygon(self.polygon_m, self.holes_m)
@@ -211,7 +211,7 @@ class TreesModel(TreeSizes):
 
 
 class DemModel(StrictModel):
-    """An elevation model; relative paths start at the folder of site.yaml."""
+    """An elevation model. Relative paths start at the folder of site.yaml."""
 
     path: str
     crs: str | None = None
@@ -219,7 +219,7 @@ class DemModel(StrictModel):
 
 
 class SceneModel(StrictModel):
-    """A scene of triangles; a relative path starts at the folder of site.yaml."""
+    """A scene of triangles. A relative path starts at the folder of site.yaml."""
 
     path: str
     sha256: str | None = None
@@ -230,7 +230,7 @@ class SceneModel(StrictModel):
 
 
 class CoverageModel(StrictModel):
-    """Carrier and link budget of maps and of predictions before any flight; the commands have an option for each."""
+    """Carrier and link budget of maps and of predictions before any flight. The commands have an option for each."""
 
     carrier_ghz: Annotated[float, Field(ge=0.1, le=100)] | None = None
     tx_power_dbm: float | None = None
@@ -363,7 +363,7 @@ def _packaged(name: str) -> tuple[SiteModel, LineOf]:
 
 
 def build_site(model: SiteModel, folder: Path | None = None) -> Site:
-    """Return the site of a checked model with placed trees; relative paths start at ``folder``."""
+    """Return the site of a checked model with placed trees. Relative paths start at ``folder``."""
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
     with _at("dem"):
         dem = _dem(model, frame, folder or Path())
@@ -688,7 +688,7 @@ def _trees(
 
 
 def _single(models: list[SingleTreeModel], sizes: TreeSizes) -> Trees:
-    """Return trees with their own sizes; crowns begin at the same share of the height as those of all trees."""
+    """Return trees with their own sizes. Crowns begin at the same share of the height as those of all trees."""
     for index, model in enumerate(models):
         with _at("trees", "single", index):
             _check_near([model.at_m], "trees.single")
@@ -753,7 +753,7 @@ def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: 
 
 
 def inputs_of_site(site: str | Path, folder: Path = Path()) -> list[Path]:
-    """Return the site file and the files that it names; empty if its reader reports an error."""
+    """Return the site file and the files that it names. Empty if its reader reports an error."""
     with suppress(AerpawCmpError, OSError):
         return [place for _, _, place in site_files(str(site), folder)]
     return []

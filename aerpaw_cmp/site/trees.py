@@ -39,7 +39,7 @@ TrunkDiameter = Annotated[float, Field(gt=0, le=THICKEST_TRUNK_M)]
 
 
 class TreeSizes(StrictModel):
-    """The sizes of trees; the base of the crown is at a share of the height."""
+    """The sizes of trees. The base of the crown is at a share of the height."""
 
     height_m: TreeHeight = 20.0
     crown_diameter_m: CrownDiameter = 10.0

@@ -226,7 +226,9 @@ _DIGEST = re.compile(r"\b([0-9a-f]{12})[0-9a-f.]{20,}")
 
 
 def in_short(value: Any) -> str:
-    """Return the text of a value, with the first 12 digits of each hash and fingerprint. The file diff.json has all digits.
+    """Return the text of a value, with the first 12 digits of each hash and fingerprint.
+
+    The file diff.json has all digits.
 
     Examples
     --------

@@ -131,11 +131,13 @@ def speed_against_error(
     Returns
     -------
     list of dict
-        The image engine is first, because Sionna increases the memory of the process for good. Each row has ``engine``,
-        ``samples`` (rays per tower and batch), ``arrays`` (type of H), ``depth``, ``seconds`` (wall time, warm),
-        ``links_per_s`` (pose-tower pairs), ``peak_mib`` (of the process; 0 if unknown), ``missing_paths`` and
-        ``extra_paths``, ``rss_max_error_db`` and ``rss_rms_error_db`` over links with a level in both replays (None
-        without such links), ``coverage_differs`` (links with a level in one replay) and ``rank_disagreement`` by K.
+        The image engine is first, because Sionna increases the memory of the process for good. A row has
+
+        - ``engine``, ``samples`` (rays per tower and batch), ``arrays`` (type of H), ``depth``;
+        - ``seconds`` (wall time, warm), ``links_per_s`` (pose-tower pairs), ``peak_mib`` (of the process; 0 if unknown);
+        - ``missing_paths``, ``extra_paths``, ``coverage_differs`` (links with a level in one replay only);
+        - ``rss_max_error_db``, ``rss_rms_error_db`` over links with a level in both replays (None without such links);
+        - ``rank_disagreement`` by K.
     """
     reference = replay(site, link, poses, Search(max_depth=_DEPTH))
     rows = []

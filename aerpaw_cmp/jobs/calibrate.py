@@ -293,7 +293,7 @@ class Calibration:
     ground: GroundFit
     curve: tuple[CurvePoint, ...]
     locks: Mapping[str, LearnedLock]
-    """By antenna, of receivers that lose their lock."""
+    """Lock models by antenna, for receivers that lose their lock."""
     health: Mapping[str, LearnedHealth]
     """Errors of held-out flights by antenna."""
     teaching: frozenset[str]

@@ -134,7 +134,7 @@ def speed_against_error(
         The image engine is first, because Sionna increases the memory of the process for good. A row has
 
         - ``engine``, ``samples`` (rays per tower and batch), ``arrays`` (type of H), ``depth``;
-        - ``seconds`` (wall time, warm), ``links_per_s`` (pose-tower pairs), ``peak_mib`` (of the process; 0 if unknown);
+        - ``seconds`` (wall time, warm), ``links_per_s`` (pose-tower pairs), ``peak_mib`` (process; 0: unknown);
         - ``missing_paths``, ``extra_paths``, ``coverage_differs`` (links with a level in one replay only);
         - ``rss_max_error_db``, ``rss_rms_error_db`` over links with a level in both replays (None without such links);
         - ``rank_disagreement`` by K.

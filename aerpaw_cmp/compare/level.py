@@ -1,17 +1,11 @@
-"""Levels against their prediction: RSS, detection, serving cells, scores.
+"""Comparison of measured levels with predictions: RSS, detection, serving cells and scores.
 
-Measured against simulated received signal strength of one tower and channel.
+The functions take arrays in time order with one entry per sample, NaN if it is missing. They do not depend on files,
+sites or engines.
 
-Every function takes arrays in time order, one entry per sample, NaN where there is none, and knows nothing of
-files, sites or engines.
-
-Scores of levels that were predicted: after a flight, and of entries of benchmarks/published.
-
-A level that a receiver detects or loses: the probability of either, and the level with a floor.
-
-Serving cell: the one that the prediction says is strongest, against the one that the phone was on.
-
-The numbers of an audit of fields, and how those of several replays add up.
+The module compares the measured and simulated signal strength of one tower and channel, scores predictions after a
+flight and entries of benchmarks/published, and models receivers that lose a signal or have a floor. It compares the
+predicted strongest cell with the serving cell of a phone, and adds up the numbers of audits of fields.
 """
 
 from __future__ import annotations
@@ -24,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtr, ndtri  # every report loads this module: scipy.stats would take it 0.4 s more
+from scipy.special import ndtr, ndtri  # every report loads this module, and scipy.stats takes 0.4 s
 
 from ..common.geodesy import azimuth_rad, bearing_deg, elevation_rad
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
@@ -32,14 +26,14 @@ from .offset import SPAN_DB, OffsetFit, grid_offset, identifiable_range, offset_
 from .receiver import brier_losses, log_losses, out_of_group
 from .statistics import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals, rmse_interval
 
-# Two channels of one receiver "part" where they differ by more than this [dB].
+# Two channels of one receiver "part" if they differ by more than this [dB].
 PART_DB = 10.0
-# Over means of so long [s].
+# Averaging time of their difference [s].
 _PART_S = 1.0
 
 
 def seconds(time: ArrayLike) -> FloatArray:
-    """Seconds since the first instant, from datetime64 or from seconds."""
+    """Return the seconds since the first instant, from datetime64 or from seconds."""
     array = np.asarray(time)
     if array.dtype.kind == "M":
         stamp = array.astype("datetime64[ns]")
@@ -56,19 +50,19 @@ class RssComparison:
     Parameters
     ----------
     offset_db, rmse_db : float
-        Grid-search offset (added to the measurement) and what remains [dB].
+        Grid-search offset (added to the measurement) and RMSE with it [dB].
     n : int
-        Pairs that count.
+        Number of compared pairs.
     n_out_of_coverage, n_measured_out, n_simulated_out : int
         Samples at a known pose with no measured signal or no simulated path (either; each).
     n_no_pose : int
-        Samples without a pose: they belong to no comparison.
+        Samples without a pose, which are not compared.
     at_edge : bool
         The offset lies at the edge of the search span.
     correlation : float
         Pearson; NaN for constant series.
     intervals : ErrorIntervals
-        95 % intervals and the residual's memory.
+        95 % intervals, and the correlation of the residual.
     identifiable_db : (low, high)
         Offsets within 0.1 dB of the least RMSE.
     baselines : mapping of str to OffsetFit
@@ -80,7 +74,7 @@ class RssComparison:
     fitted_on_scored : tuple of str
         Names of the numbers that were fitted on the samples they are scored on.
     residual_db : (samples,)
-        ``measured + offset - simulated``, NaN where no pair.
+        ``measured + offset - simulated``, NaN without a pair.
     """
 
     offset_db: float
@@ -167,12 +161,12 @@ def compare_rss(
     )
 
 
-# Among the numbers that were fitted on the very samples they would be scored on.
+# Name of the antennas among the numbers that were fitted on the scored samples.
 LEARNED_HERE = "antennas"
 
 
 def without_errors(score: RssComparison) -> RssComparison:
-    """A comparison on the flight that the antennas were learned from: offset, counts and baselines, no error."""
+    """Return a comparison without errors, for a training flight of the antennas: offset, counts and baselines."""
     none = (float("nan"), float("nan"))
     return replace(
         score,
@@ -184,16 +178,18 @@ def without_errors(score: RssComparison) -> RssComparison:
     )
 
 
-# Levels farther than this many interquartile ranges outside the quartiles are outlying: of a normal distribution one
-# in 10^9, and a deep fade of a real flight is not.
+# Levels farther than this many interquartile ranges outside the quartiles are outlying. A normal distribution has one
+# in 10^9, and deep fades of real flights are nearer.
 _FENCE = 4.0
 
-# Least interquartile range that counts: a UAV that hovers has next to none.
+# Least interquartile range [dB], because a UAV that hovers has almost none.
 _NARROWEST_DB = 5.0
 
 
 def outliers(level_db: ArrayLike) -> BoolArray:
-    """Samples (n,) whose level lies far outside the flight's own distribution; they are flagged, not dropped.
+    """Return the samples (n,) whose level lies far outside the distribution of the flight.
+
+    They are flagged, not dropped.
 
     Examples
     --------
@@ -210,7 +206,7 @@ def outliers(level_db: ArrayLike) -> BoolArray:
 
 
 def _levels(values: ArrayLike) -> FloatArray:
-    """Levels as floats; infinities (no power) become NaN."""
+    """Return levels as floats, with NaN for infinities (no power)."""
     array = unmasked(values)
     return np.where(np.isfinite(array), array, np.nan)
 
@@ -225,16 +221,16 @@ def _rmse_interval(difference: FloatArray, fit: OffsetFit, place_m: FloatArray |
 
 
 def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> FloatArray:
-    """Moving average of power over a centred window.
+    """Return the moving average of power over a centred window.
 
     Parameters
     ----------
     time_s : array_like, (n,)
         Instants [s] (or datetime64) in any order.
     level_db : array_like, (n,)
-        Levels [dB]; NaN does not take part and stays NaN.
+        Levels [dB]. NaN is ignored and stays NaN.
     window_s : float
-        Full width [s]; 0 gives the levels back.
+        Full width [s]. With 0 the levels are returned unchanged.
 
     Notes
     -----
@@ -250,7 +246,7 @@ def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> Fl
     rows = rows[np.argsort(time[rows], kind="stable")]
     t, x = time[rows], level[rows]
     top = x.max()
-    # relative to the strongest: levels re full scale of any gain stay in range
+    # powers relative to the strongest level stay in range for any gain
     power = power_from_db(x - top)
     first = np.searchsorted(t, t - 0.5 * window_s, side="left")
     last = np.searchsorted(t, t + 0.5 * window_s, side="right")
@@ -259,11 +255,10 @@ def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> Fl
 
 
 def _window_sums(values: FloatArray, first: Any, last: Any) -> FloatArray:
-    """Sums of values[first:last] for windows that move forward.
+    """Return the sums of values[first:last] for windows that move forward.
 
-    A running sum would lose weak windows behind strong ones (1e-16 of the total), so sums restart: every window is
-    covered by two aligned pieces of length 2^j each of which was summed on its own (a sparse table), the rest by
-    one more level down; log2(n) passes.
+    A running sum would lose weak windows after strong ones (1e-16 of the total). Therefore each window is the sum of
+    aligned pieces of 2^j values, which are summed separately (a sparse table with log2(n) passes).
     """
     total = np.zeros(len(first))
     at, remaining = first.copy(), last - first
@@ -288,7 +283,7 @@ def averaged_fits(
     *,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> dict[str, dict[str, OffsetFit]]:
-    """Simulations against the measurement, both sides averaged alike.
+    """Return the offset fits of simulations, with the same average on measurement and simulation.
 
     Parameters
     ----------
@@ -297,7 +292,7 @@ def averaged_fits(
     simulations : mapping of str to array_like (n,)
         Levels by name, such as "coherent", "power_sum" or "local_mean".
     averages : mapping of str to callable
-        Means of levels (n,), NaN where either side has none, such as :func:`local_mean_db`.
+        Means of levels (n,), such as :func:`local_mean_db`. The levels are NaN if one side is missing.
     span_db : (float, float)
         Offset search.
 
@@ -329,12 +324,12 @@ def link_geometry(
     tower_mount: FloatArray | None = None,
     uav_mount: FloatArray | None = None,
 ) -> dict[str, FloatArray]:
-    """Variables that the residual may depend on, for every pose.
+    """Return the variables on which the residual may depend, for each pose.
 
     Parameters
     ----------
     tower_m : (3,), (1, 3) or (n, 3)
-        Array centre, east-north-up, of a tower that moves at every pose [m].
+        Array centre, east-north-up [m]; for each pose if the tower moves.
     position_m : (n, 3)
         UAV [m].
     rotation : (n, 3, 3), optional
@@ -345,9 +340,9 @@ def link_geometry(
     Returns
     -------
     dict of str to ndarray (n,)
-        ``distance_m``, ``elevation_deg`` and ``azimuth_deg`` of the UAV from the tower (clockwise from north),
+        ``distance_m``, ``elevation_deg`` and ``azimuth_deg`` of the UAV from the tower (clockwise from north).
         ``tower_azimuth_deg`` and ``tower_elevation_deg`` in the tower's array frame (azimuth from its boresight
-        towards its left), ``height_m``; with ``rotation`` also ``heading_deg``, ``uav_azimuth_deg`` and
+        towards its left). ``height_m``. With ``rotation`` also ``heading_deg``, and ``uav_azimuth_deg`` and
         ``uav_elevation_deg`` of the tower in the UAV's array frame.
 
     Examples
@@ -376,22 +371,22 @@ def link_geometry(
 
 
 def _direction_deg(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Azimuth from x towards y and elevation above the x-y plane [deg]."""
+    """Return azimuth from x towards y and elevation above the x-y plane [deg]."""
     return np.degrees(azimuth_rad(vector)), np.degrees(elevation_rad(vector))
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorSpan:
-    """A stretch of the flight where the error is large and of one sign.
+    """A segment of the flight with a large error of one sign.
 
     Parameters
     ----------
     start_s, end_s : float
-        Seconds, as in the input (datetime64 input: since the first instant).
+        Seconds as in the input, or since the first instant of datetime64 input.
     n : int
         Samples.
     mean_db : float
-        Mean residual; positive: measured stronger than simulated.
+        Mean residual, positive if the measured level is stronger.
     position_m : tuple of float
         Mean east, north, up of the span [m]; empty if no positions were given.
     geometry : mapping of str to float
@@ -416,7 +411,7 @@ def error_spans(
     threshold_db: float | None = None,
     largest: int = 10,
 ) -> list[ErrorSpan]:
-    """Stretches of largest error, worst first (mean error times the root of the duration).
+    """Return the segments with the largest error, ordered by mean error times the root of the duration.
 
     Parameters
     ----------
@@ -425,14 +420,14 @@ def error_spans(
     position_m : (n, 3), optional
         East, north, up [m].
     context : mapping of str to array_like (n,), optional
-        What the geometry was; known names: ``los`` (bool), ``foliage_m``, ``elevation_deg`` (from the tower),
+        Geometry of the samples. Known names: ``los`` (bool), ``foliage_m``, ``elevation_deg`` (from the tower),
         ``height_m``, ``heading_deg``, ``coherent_minus_power_sum_db`` (how deep the simulation fades).
     window_s : float
-        The residual is averaged over this window before it is judged [s].
+        Averaging window of the residual [s].
     threshold_db : float, optional
-        A span is where the average exceeds this; by default 1.5 times the RMSE.
+        Least average residual of a span; by default 1.5 times the RMSE.
     largest : int
-        Spans that are given at most.
+        Largest number of spans.
 
     Returns
     -------
@@ -450,7 +445,7 @@ def error_spans(
     smooth = _window_sums(r, first, last) / (last - first)
     limit = 1.5 * float(np.sqrt(np.mean(r**2))) if threshold_db is None else threshold_db
     sign = np.where(smooth > limit, 1, np.where(smooth < -limit, -1, 0))
-    # a gap longer than the window parts a stretch: nobody knows what was between
+    # a gap longer than the window separates segments, because the error in the gap is unknown
     cut = (np.diff(sign) != 0) | (np.diff(t) > max(window_s, 1e-9))
     bounds = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(t)]])
     where = {name: np.asarray(values)[ok] for name, values in (context or {}).items()}
@@ -470,13 +465,13 @@ def error_spans(
                 geometry={name: _typical(values[a:b]) for name, values in where.items()},
             )
         )
-    # a stretch of one sample has no duration, and still counts
+    # a segment of one sample has no duration, but must not get the weight 0
     spans.sort(key=lambda span: -abs(span.mean_db) * np.sqrt(span.end_s - span.start_s + 1e-3))
     return spans[:largest]
 
 
 def _typical(values: Any) -> float:
-    """Median without NaN."""
+    """Return the median without NaN."""
     known = np.asarray(values, dtype=np.float64)
     known = known[np.isfinite(known)]
     return float(np.median(known)) if len(known) else float("nan")
@@ -484,16 +479,16 @@ def _typical(values: Any) -> float:
 
 @dataclass(frozen=True, slots=True)
 class ChannelDifference:
-    """Two channels of one receiver against each other.
+    """The comparison of two channels of one receiver.
 
     Parameters
     ----------
     n : int
-        Samples that both have.
+        Number of samples that both channels have.
     mean_db, std_db, correlation : float
-        Of first minus second.
+        Mean and standard deviation of first minus second [dB], and correlation of both.
     spans : list of ErrorSpan
-        Where they part, with the geometry there.
+        Segments in which the channels part, with their geometry.
     """
 
     n: int
@@ -511,7 +506,7 @@ def channel_difference(
     position_m: FloatArray | None = None,
     context: Mapping[str, ArrayLike] | None = None,
 ) -> ChannelDifference:
-    """Difference of two channels, and where they part by more than :data:`PART_DB` after their mean difference.
+    """Return the difference of two channels, and segments in which it is farther than :data:`PART_DB` from its mean.
 
     Parameters
     ----------
@@ -520,21 +515,21 @@ def channel_difference(
     first_db, second_db : array_like, (n,)
         Levels of the two channels at these instants [dB].
     position_m : (n, 3), optional
-        For the places at which they part.
+        Positions, for the places at which the channels part [m].
     context : mapping of str to array_like (n,), optional
-        Geometry that may explain it, as in :func:`error_spans`.
+        Geometry that may explain the difference, as in :func:`error_spans`.
 
     Returns
     -------
     ChannelDifference
-        Mean and spread of first minus second [dB], their correlation, and the spans where they part; NaN without pairs.
+        The numbers are NaN without pairs.
     """
     first, second = _levels(first_db), _levels(second_db)
     ok = np.isfinite(first) & np.isfinite(second)
     if not ok.any():
         return ChannelDifference(n=0)
     difference = first - second
-    # the channels of a receiver have gains of their own
+    # each channel of a receiver has its own gain
     mean = float(difference[ok].mean())
     residual = difference - mean
     spans = error_spans(
@@ -552,7 +547,7 @@ def channel_difference(
 # Averaging window of the second error [s].
 WINDOW_S = 4.0
 
-# Nominal share of the interval whose coverage is told.
+# Nominal coverage of the interval whose coverage is scored.
 COVERAGE = 0.9
 
 
@@ -568,7 +563,7 @@ class LevelSeries:
     measured_db, level_db : (n,)
         Measured and predicted median [dB].
     sd_db : (n,), optional
-        Standard deviation of the prediction [dB]; without it nothing of a distribution is scored.
+        Standard deviation of the prediction [dB]. Without it no distribution is scored.
     own_offset : bool
         Score after the mean error of the series is removed.
     """
@@ -587,13 +582,13 @@ class LevelSeries:
 
     @property
     def error_db(self) -> FloatArray:
-        """Measured minus predicted (n,), less the bias where the series has an offset of its own [dB]."""
+        """Measured minus predicted (n,), without the bias if the series has its own offset [dB]."""
         error = self.measured_db - self.level_db
         return np.asarray(error - error.mean() if self.own_offset else error)
 
 
 def crps_normal(error_db: FloatArray, sd_db: FloatArray) -> FloatArray:
-    """Continuous ranked probability score (n,) of normal forecasts [dB].
+    """Return the continuous ranked probability score (n,) of normal forecasts [dB].
 
     Source: Gneiting and Raftery (2007), doi:10.1198/016214506000001437, eq. 21.
 
@@ -608,7 +603,7 @@ def crps_normal(error_db: FloatArray, sd_db: FloatArray) -> FloatArray:
 
 
 def level_scores(series: Sequence[LevelSeries]) -> dict[str, float]:
-    """Scores of one task: the mean over its series, so that a long flight counts no more than a short one.
+    """Return the scores of one task: means over its series, so that long and short flights have the same weight.
 
     Parameters
     ----------
@@ -630,7 +625,7 @@ def level_scores(series: Sequence[LevelSeries]) -> dict[str, float]:
 def _series_scores(s: LevelSeries) -> dict[str, float]:
     error = s.error_db
     slow = local_mean_db(s.time_s, s.measured_db, WINDOW_S) - local_mean_db(s.time_s, s.level_db, WINDOW_S)
-    # the mean of local means is not that of the samples: it has an offset of its own
+    # the mean of local means differs from that of the samples and needs its own offset
     slow = slow - slow.mean() if s.own_offset else slow
     scores = {
         "rmse_db": float(np.sqrt(np.mean(error**2))),
@@ -653,13 +648,13 @@ _SEGMENTS = 10
 
 _PENALTY = 1.0
 _SPAN_DB = 60.0
-# Samples of either kind that a score needs.
+# Least number of detected and of undetected samples for a score.
 _FEWEST = 50
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectionForecast:
-    """P(detected) of a predicted level, learned on flights: logistic in the level.
+    """A forecast of P(detected) from a predicted level: a logistic function learned from flights.
 
     Parameters
     ----------
@@ -668,7 +663,7 @@ class DetectionForecast:
     per_db : float
         Slope of the log odds.
     share : float
-        Of detected samples, mean over the flights: the forecast of who knows no level.
+        Share of detected samples, mean over the flights: the forecast without a level.
     """
 
     level_db: float
@@ -676,14 +671,14 @@ class DetectionForecast:
     share: float
 
     def probability(self, level_db: FloatArray) -> FloatArray:
-        """P(detected) (n,) at predicted levels (n,) [dB]."""
+        """Return P(detected) (n,) at predicted levels (n,) [dB]."""
         from scipy.special import expit
 
         return np.asarray(expit(self.per_db * (level_db - self.level_db)))
 
 
 def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> DetectionForecast | None:
-    """P(detected) of predicted levels, each flight of the same weight; None where either outcome is rare.
+    """Learn P(detected) from predicted levels, with the same weight for each flight.
 
     Parameters
     ----------
@@ -693,7 +688,7 @@ def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> Detectio
     Returns
     -------
     DetectionForecast or None
-        None, too, where the detected samples do not have the higher levels.
+        None if one outcome is rare, or if the detected samples do not have the higher levels.
     """
     from scipy.optimize import minimize
 
@@ -724,7 +719,7 @@ def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> Detectio
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectionScore:
-    """Score of a log whose receiver loses its lock, or ends at a floor.
+    """The score of a log whose receiver loses its lock or has a floor.
 
     Parameters
     ----------
@@ -732,18 +727,18 @@ class DetectionScore:
         Lower levels count as this one [unit of the measurement].
     n, n_detected : int
     brier, constant_brier, log_score, constant_log_score : float
-        Of P(detected) from the predicted level; constant: this flight's own share, the best that knows no level. Brier
-        counts one of the two outcomes: 0 to 1. Log score in nat.
+        Scores of P(detected) from the predicted level, and of the constant share of this flight, which is the best
+        forecast without a level. The Brier score counts one of the two outcomes (0 to 1). The log score is in nat.
     learned_on : str
-        ``other flights``, or ``held-out segments``: each segment of this flight from the others.
+        ``other flights``, or ``held-out segments`` if each segment of this flight is predicted from the others.
     offset_db, rmse_db : float
-        All samples, both sides no lower than the floor; the offset is added to the measurement.
+        Offset (added to the measurement) and RMSE of all samples, with both levels no lower than the floor.
     rmse_ci95_db : (low, high)
-        Of ``rmse_db``, as other levels have it.
+        95 % interval of ``rmse_db``.
     free_space_rmse_db : float
-        The same of free space.
+        RMSE of free space with the same floor.
     detected_rmse_db : float
-        Of the detected samples alone, at that offset. They are selected by their level: never to be given alone.
+        RMSE of the detected samples at that offset. They are selected by level, so never show this number alone.
     reliability : tuple of (float, float, int)
         Mean probability, share detected and samples, in fifths of the probability.
     """
@@ -763,7 +758,7 @@ class DetectionScore:
     learned_on: str
     rmse_ci95_db: Interval = NO_INTERVAL
     locks: bool = False
-    """The log itself says when the receiver was in lock; else a sample without a level was not detected."""
+    """True if the log contains the lock. Otherwise samples without a level count as not detected."""
 
 
 def score_detection(
@@ -777,33 +772,34 @@ def score_detection(
     forecast: DetectionForecast | None = None,
     position_m: FloatArray | None = None,
 ) -> DetectionScore | None:
-    """Score of a log in two parts; None where either outcome is rare.
+    """Return the scores of detection and of levels with a floor.
 
     Parameters
     ----------
     time_s : (n,)
     measured_db, simulated_db : (n,)
-        Measured NaN: below the floor. Samples without a simulated level take no part.
+        A measured NaN is below the floor. Samples without a simulated level are not scored.
     detected : (n,) bool
     floor_db : float
         Floor of the measurement.
     free_space_db : (n,)
         Level of free space, for comparison.
     forecast : DetectionForecast, optional
-        Learned on other flights, of ``simulated_db``; without, each segment is forecast from the others.
+        Forecast from ``simulated_db``, learned from other flights. By default each segment is forecast from the others.
     position_m : (n, 3), optional
         As for :func:`compare_rss`.
 
     Returns
     -------
     DetectionScore or None
+        None if one outcome is rare.
     """
     finite = np.isfinite(simulated_db) & np.isfinite(time_s)
     time, simulated, detected = time_s[finite], simulated_db[finite], detected[finite]
     measured = np.maximum(np.nan_to_num(measured_db[finite], nan=floor_db), floor_db)
     if min(int(detected.sum()), int((~detected).sum())) < _FEWEST:
         return None
-    # as ranks 1 and 2: the regression of ranks serves here, too
+    # outcomes as ranks 1 and 2, for the regression of ranks
     outcome = detected.astype(np.int64) + 1
     if forecast is None:
         stated = _held_out(time, simulated, outcome)
@@ -832,19 +828,20 @@ def score_detection(
 
 
 def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> FloatArray:
-    """Probabilities (n, 2) of each segment by the level, learned in the others."""
+    """Return the probabilities (n, 2) of each segment by the level, learned from the other segments."""
     segment = np.minimum((time_s - time_s.min()) / max(np.ptp(time_s), 1e-9) * _SEGMENTS, _SEGMENTS - 1).astype(
         np.int64
     )
     stated = out_of_group(level_db[:, None], outcome, segment, _PENALTY)[:, :2]
-    # two outcomes of the four that a receiver of ranks knows
+    # the regression has four outcomes, of which two are used
     return np.asarray(stated / stated.sum(axis=1, keepdims=True))
 
 
 def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: float) -> OffsetFit:
-    """Offset of least RMSE where both sides count as no lower than the floor; pairs (n,) with a NaN do not count.
+    """Return the offset with the least RMSE if both levels (n,) are no lower than the floor.
 
-    It is added to the measurement, and lies within 60 dB of the median above the floor.
+    Pairs with a NaN are ignored. The offset is added to the measurement, and lies within 60 dB of the median above the
+    floor.
     """
     finite = np.isfinite(measured_db) & np.isfinite(simulated_db)
     order = np.flatnonzero(finite)[np.argsort(simulated_db[finite])]
@@ -852,7 +849,7 @@ def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: flo
     above = measured > floor_db
     middle = float(np.median((simulated - measured)[above])) if above.any() else 0.0
     grid = offset_grid(span_db=(middle - _SPAN_DB, middle + _SPAN_DB))
-    # below the floor a prediction counts as the floor: the first k of the order, the others move with the offset
+    # the first k predictions of the order are below the floor and count as the floor; the others move with the offset
     low = np.concatenate([[0.0], np.cumsum((measured - floor_db) ** 2)])
     difference = simulated - measured
     first, second = (np.concatenate([[0.0], np.cumsum(difference**power)]) for power in (1, 2))
@@ -871,28 +868,28 @@ def _reliability(stated: FloatArray, detected: BoolArray) -> tuple[tuple[float, 
     return tuple((float(stated[g].mean()), float(detected[g].mean()), int(g.sum())) for g in groups if g.any())
 
 
-# Between two values of AERPAW's sounder [s]: 4095 chips and the rest of its correlation.
+# Time between two values of AERPAW's sounder [s]: 4095 chips and the rest of the correlation.
 BASE_S = 0.032768
 
-# Correlation that the sounder's own time base must add before it is taken.
+# Least gain of correlation for which the sounder's own time base is used.
 _BETTER = 0.1
 
 
 def aligned_quality(time_s: FloatArray, power_db: FloatArray, quality_db: FloatArray) -> tuple[FloatArray, float]:
-    """Quality at the times of the power where a merged table paired them by row.
+    """Return the quality at the times of the power if a merged table paired both by row.
 
-    Rows were dropped from the power when it was merged with the telemetry, not from the quality: row i then holds the
-    quality of :data:`BASE_S` * i after the first.
+    When power and telemetry were merged, rows of the power were dropped and rows of the quality were not. Row i then
+    contains the quality at :data:`BASE_S` * i after the first row.
 
     Parameters
     ----------
     time_s, power_db, quality_db : (n,)
-        Of one table.
+        Columns of one table.
 
     Returns
     -------
     (n,), float
-        Quality, NaN where none is left, and the largest shift [s]; 0 where the rows are paired in time.
+        Quality, NaN after its last value, and the largest shift [s], which is 0 if the rows are paired in time.
     """
     base_s = np.arange(len(time_s)) * BASE_S + time_s[0]
     moved = np.interp(time_s, base_s, quality_db, right=np.nan)
@@ -906,14 +903,14 @@ def aligned_quality(time_s: FloatArray, power_db: FloatArray, quality_db: FloatA
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServingComparison:
-    """Serving cells, logged against predicted.
+    """The comparison of logged and predicted serving cells.
 
     Parameters
     ----------
     cells : tuple of str
     confusion : (cells, cells + 1) int
-        Samples by the cell that served (row) and the one predicted strongest (column); the last column counts samples
-        at which no cell is predicted at all.
+        Samples by serving cell (row) and predicted strongest cell (column). The last column counts samples without a
+        predicted cell.
     n : int
         Samples with a serving cell among ``cells``.
     """
@@ -924,16 +921,16 @@ class ServingComparison:
 
     @property
     def hit_share(self) -> float:
-        """Share of the samples whose serving cell is the one predicted strongest; NaN without samples."""
+        """Share of the samples whose serving cell is predicted to be the strongest, or NaN without samples."""
         return float(np.trace(self.confusion) / self.n) if self.n else float("nan")
 
     @property
     def majority_share(self) -> float:
-        """Share that always naming the cell that served most would hit: what a prediction has to beat."""
+        """Share of the commonest serving cell, which a prediction must exceed."""
         return float(self.confusion.sum(axis=1).max() / self.n) if self.n else float("nan")
 
     def as_dict(self) -> dict[str, Any]:
-        """For metrics.json."""
+        """Return the values for metrics.json."""
         names = (*self.cells, "none")
         return {
             "cells": list(self.cells),
@@ -948,14 +945,14 @@ class ServingComparison:
 
 
 def compare_serving(served: ArrayLike, predicted_dbm: ArrayLike, cells: Sequence[str]) -> ServingComparison:
-    """Serving-cell hits and the confusion matrix.
+    """Count the serving cells that are predicted to be the strongest, and the confusion matrix.
 
     Parameters
     ----------
     served : array_like, int, (n,)
-        Index of the serving cell; negative where it is not known or none of ``cells``: left out.
+        Index of the serving cell. Samples with a negative index (unknown, or not in ``cells``) are ignored.
     predicted_dbm : array_like, (n, cells)
-        NaN where no path is predicted. Of equal levels the first cell counts as strongest.
+        Predicted levels, NaN without a path. The first of equal levels counts as the strongest.
     cells : sequence of str
 
     Examples
@@ -963,20 +960,20 @@ def compare_serving(served: ArrayLike, predicted_dbm: ArrayLike, cells: Sequence
     >>> compare_serving([0, 1, 1, -1], [[-70, -80], [-75, -71], [-60, -90], [-60, -90]], ["a", "b"]).confusion.tolist()
     [[1, 0, 0], [1, 1, 0]]
     """
-    # unknown is no cell: -1 would be the last one as an index
+    # unknown cells are removed below, because -1 would index the last cell
     index = np.nan_to_num(unmasked(served), nan=-1.0).astype(np.int64)
     level: FloatArray = unmasked(predicted_dbm)
     known = index >= 0
     filled = np.where(np.isnan(level), -np.inf, level)
     strongest = np.where(np.isnan(level).all(axis=1), len(cells), filled.argmax(axis=1) if len(cells) else 0)
     confusion = np.zeros((len(cells), len(cells) + 1), dtype=np.int64)
-    # add.at counts a pair as often as it comes; += would count it once
+    # add.at counts repeated pairs; += would count each pair once
     np.add.at(confusion, (index[known], strongest[known]), 1)
     return ServingComparison(cells=tuple(cells), confusion=confusion, n=int(known.sum()))
 
 
 def nearest_in_time(times: AnyArray, of: AnyArray) -> tuple[IntArray, AnyArray]:
-    """Return the index in ``of`` (m,) nearest to each of ``times`` (n,), and how far it is; the earlier one of two."""
+    """Return the index in ``of`` (m,) nearest to each of ``times`` (n,), the earlier one of two, and its distance."""
     order = np.argsort(of, kind="stable")
     at = of[order]
     after = np.clip(np.searchsorted(at, times), 0, len(at) - 1)
@@ -991,12 +988,12 @@ def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s:
     Parameters
     ----------
     time_s : array_like, (n,)
-        Times asked for [s].
+        Requested times [s].
     of_s : array_like, (m,)
         Times of the values [s].
     values : array_like, (m,)
     within_s : float
-        Farther samples do not count [s].
+        Largest time to the nearest sample [s].
 
     Returns
     -------
@@ -1013,24 +1010,25 @@ def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldAudit:
-    """Differences that the two references found.
+    """The differences from two references.
 
     Parameters
     ----------
     paths, power_max_db, power_rms_db, phase_max_rad, phase_rms_rad
-        Against Sionna's own coefficients: paths compared, worst and root-mean-square differences.
+        Number of paths compared with Sionna's coefficients, and the largest and root-mean-square differences.
     link_rss_max_db : float
-        Of the coherent RSS of links whose paths are all shorter than 300 m, against Sionna.
+        Largest difference of the coherent RSS from Sionna, for links whose paths are all shorter than 300 m.
     reference_links, reference_paths, h_max_error, rss_max_error_db, rank_differs
-        Against the second implementation: largest difference of H, relative; of RSS; links with another rank.
+        Comparison with the second implementation: largest relative difference of H, largest difference of RSS, and
+        links with another rank.
     attitude_rows, attitude_max_rad
-        Logged attitudes turned into rotations a second time.
+        Logged attitudes that were converted to rotations a second time.
     missing_paths, phantom_paths : int
-        Paths that a reference has and whose existence is beyond doubt; paths that cannot exist.
+        Paths that exist for certain and are missing, and paths that cannot exist.
     doubtful : int
-        Paths and links that were not judged, since a micrometre decides (float32: two millimetres).
+        Paths and links that were not compared because a micrometre decides (float32: two millimetres).
     failures : tuple of str
-        What is out of tolerance, in words.
+        Values out of tolerance, in words.
     not_covered : tuple of str
     """
 
@@ -1060,7 +1058,7 @@ class FieldAudit:
         return len(self.failures)
 
     def __add__(self, other: FieldAudit) -> FieldAudit:
-        """Both together: counts add up, the worst stays."""
+        """Return the sum of counts and the largest errors of both audits."""
         values: dict[str, Any] = {
             name: _together(name, getattr(self, name), getattr(other, name)) for name in self.__slots__
         }
@@ -1070,7 +1068,7 @@ class FieldAudit:
 
 
 def _together(name: str, mine: Any, theirs: Any) -> Any:
-    """Texts once each, the larger of two errors, the sum of two counts."""
+    """Return distinct texts, the larger of two errors, or the sum of two counts."""
     if isinstance(mine, tuple):
         return tuple(dict.fromkeys((*mine, *theirs)))
     worst = name.endswith(("_max_db", "_max_m", "_max_rad", "_max_error", "_max_error_db"))

@@ -1,20 +1,16 @@
-"""The rank that a receiver reports: its forecast, and its decision as learned from flights.
+"""Forecasts of the rank that a receiver reports, and its decision, learned from flights.
 
-Forecasts of rank: a probability for each rank, and what they are worth against the reports of a modem.
+A forecast is a probability for each rank. It is scored by the log score, a proper score, and compared with the constant
+forecast, which is the histogram of the training flights. Kappa and agreement score the rank that is decided from the
+probabilities, and are compared with the commonest rank.
 
-A probability forecast is judged by a proper score (nobody gains by saying what he does not believe), the log score,
-beside that of a constant forecast, the histogram of the training flights. Kappa and agreement judge the one rank that
-a decision makes of the probabilities, beside what always saying the commonest rank agrees.
+A receiver chooses the rank with the largest throughput at its noise, from a codebook and a channel estimate that logs do
+not contain. The module learns how often each rank is reported for ratios of singular values and a level of the modelled
+channel, by a multinomial logistic regression with a ridge penalty. Simpler rules for comparison are one threshold per
+stream, and an ordered regression (one linear score, and one limit between neighbouring ranks).
 
-Rank decision of a receiver, learned on flights: from singular values and level to a probability of each rank.
-
-A receiver picks the rank that promises most throughput at its noise, from a codebook and an estimate of the channel
-that no log holds. What can be learned is how often it says 1, 2, 3 or 4 where the modelled channel has certain ratios
-of singular values and a certain level: a multinomial logistic regression with a ridge penalty. Simpler rules stand
-beside it: one threshold per stream, and an ordered regression (one linear score, one cut between neighbouring ranks).
-
-Which antenna geometry the channel is modelled with is chosen by the log score on sectors of directions left out within
-the training flights (:func:`choose_features`), never on the flight that is scored.
+The antenna geometry of the modelled channel is chosen by the log score on held-out sectors of the training flights
+(:func:`choose_features`), and never on the scored flight.
 """
 
 from __future__ import annotations
@@ -39,12 +35,12 @@ _LEAST_PROBABILITY = 1e-6
 
 
 def log_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
-    """Logarithmic score of each sample [nat]: ``-ln p(reported rank)``; smaller is better.
+    """Return the logarithmic score of each sample [nat], ``-ln p(reported rank)``.
 
     Parameters
     ----------
     probability : (n, ranks)
-        Of rank 1 .. ranks; rows sum to one.
+        Probability of each rank, with rows that sum to one.
     rank : (n,)
         Reported.
 
@@ -61,7 +57,7 @@ def log_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
 
 
 def brier_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
-    """Brier score of each sample: ``sum_r (p_r - [r = rank])^2``, 0 to 2; smaller is better.
+    """Return the Brier score of each sample, ``sum_r (p_r - [r = rank])^2``, from 0 to 2.
 
     Notes
     -----
@@ -76,7 +72,7 @@ def brier_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
 
 
 def constant_forecast(rank: ArrayLike, ranks: int = MAX_RANK) -> FloatArray:
-    """Histogram of training ranks (ranks,), each rank counted once more, so that none is impossible."""
+    """Return the histogram of training ranks (ranks,) with one more count per rank, so that no rank is impossible."""
     values = unmasked(rank)
     count = np.bincount(values[values >= 1].astype(np.int64), minlength=ranks + 1)[1:] + 1.0
     return np.asarray(count / count.sum())
@@ -84,14 +80,14 @@ def constant_forecast(rank: ArrayLike, ranks: int = MAX_RANK) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForecastScore:
-    """Score of a forecast on samples that had no part in its fit.
+    """The score of a forecast on samples that were not fitted.
 
     Parameters
     ----------
     n : int
         Samples with a report and a forecast.
     kappa, agreement : float
-        Of the decided rank.
+        Scores of the decided rank.
     majority_agreement : float
         Agreement of always saying the commonest rank of these samples (known only afterwards).
     log_score, constant_log_score : float
@@ -99,7 +95,7 @@ class ForecastScore:
     log_score_gain : float
         Share by which the forecast is below the constant one.
     log_score_difference_ci95 : (low, high)
-        Of forecast minus constant [nat], on the same samples.
+        95 % interval of forecast minus constant on the same samples [nat].
     total_variation_expected : float
         Between the mean probabilities and the measured histogram.
     kappa_ci95, log_score_ci95, total_variation_ci95 : (low, high)
@@ -130,18 +126,18 @@ def score_forecast(
     Parameters
     ----------
     measured : array_like, (n,)
-        Reported rank, NaN where none.
+        Reported rank, NaN if missing.
     probability : (n, ranks)
         NaN where there is no forecast.
     decided : array_like, (n,)
-        The one rank said; 0 where there is no forecast.
+        Decided rank, 0 without a forecast.
     constant : (ranks,)
         The constant forecast, from the flights of the fit (:func:`constant_forecast`).
 
     Returns
     -------
     ForecastScore
-        All NaN where no sample has both.
+        All values are NaN if no sample has both.
     """
     ri, decision = unmasked(measured).ravel(), unmasked(decided).ravel()
     counts = (ri >= 1) & (decision >= 1) & np.isfinite(probability).all(axis=1)
@@ -187,7 +183,7 @@ _HELD = 1 << 22
 
 
 def stream_features(sigma: ArrayLike) -> FloatArray:
-    """Features that a receiver may decide by: ratios of singular values and level.
+    """Return features on which a receiver may base its decision: ratios of singular values, and level.
 
     Parameters
     ----------
@@ -215,29 +211,29 @@ def stream_features(sigma: ArrayLike) -> FloatArray:
 
 
 def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s: float) -> FloatArray:
-    """Mean of squared singular values over a while around each sample, some seconds later.
+    """Return the means of squared singular values over a window around each sample, shifted by some seconds.
 
     Parameters
     ----------
     power : (..., n, m)
         Squares of singular values.
     time_s : (n,)
-        Of the samples, in any order [s].
+        Times of the samples in any order [s].
     shift_s : float
-        Positive: the report belongs to a later position than the log says [s].
+        Positive if the report belongs to a later position than in the log [s].
     average_s : float
-        Length of the mean, centred; 0: the sample next in time.
+        Length of the centred mean [s]. With 0 the nearest sample in time is used.
 
     Returns
     -------
     (..., n, m)
-        Where no sample lies in the interval (a gap, the end of the log), the sample next in time stands for the mean.
+        Means. The nearest sample in time is used if the interval contains no sample (a gap, the end of the log).
 
     Notes
     -----
-    A receiver decides by an estimate that is seconds old, the network grants what was reported before that, and the
-    positions of a handset lag as well: neither can be told from a log. Ripple of a modelled channel that is finer than
-    these seconds says nothing about a report.
+    A receiver uses an estimate that is seconds old, the network grants what was reported before, and the positions of a
+    handset are late as well. A log does not separate these delays. Ripple of a modelled channel within these seconds
+    does not affect a report.
 
     Examples
     --------
@@ -246,7 +242,7 @@ def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s:
     """
     order = np.argsort(time_s, kind="stable")
     time, centre = time_s[order], time_s + shift_s
-    # an instant at an end of the interval counts, whatever its rounding
+    # an instant at an end of the interval counts, regardless of rounding
     low = np.searchsorted(time, centre - 0.5 * average_s - 1e-9)
     high = np.searchsorted(time, centre + 0.5 * average_s + 1e-9, side="right")
     after = np.searchsorted(time, centre).clip(0, len(time) - 1)
@@ -260,7 +256,7 @@ def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s:
 
 
 def sector_groups(position_m: FloatArray, tower_m: FloatArray, sectors: int = 8) -> IntArray:
-    """Sector of directions from the tower of each sample (n,), with about equally many samples in each.
+    """Return the sector of directions from the tower of each sample (n,), with about equal numbers of samples.
 
     Sectors left out are directions that the fit never saw; neighbouring samples in time mostly share one.
     """
@@ -283,7 +279,7 @@ class Receiver:
     coefficient : (ranks, 1 + features)
         Per rank: constant, then one per standardised feature.
     mean, scale : (features,)
-        Of the training features.
+        Mean and scale of the training features.
     decision_weight : (ranks,)
         The decided rank is that of the largest probability times weight. All ones: the most probable rank. Others are
         fitted for kappa on out-of-sector forecasts of the training flights (:func:`decision_weights`).
@@ -304,16 +300,16 @@ class Receiver:
     n: int
 
     def probabilities(self, features: FloatArray) -> FloatArray:
-        """Probability (n, ranks) of each rank at features (n, features); NaN where a feature is NaN."""
+        """Return the probability (n, ranks) of each rank at features (n, features), NaN if a feature is NaN."""
         return _softmax(_design((features - self.mean) / self.scale) @ self.coefficient.T)
 
     def decide(self, probability: FloatArray) -> IntArray:
-        """One rank (n,) per row of probabilities; 0 where there is none."""
+        """Return one rank (n,) per row of probabilities, or 0 for a row of NaN."""
         return decide(probability, self.decision_weight)
 
     @classmethod
     def from_dict(cls, numbers: Mapping[str, Any]) -> Receiver:
-        """From its fields as JSON has them.
+        """Create a receiver from its fields in JSON.
 
         Raises
         ------
@@ -331,7 +327,7 @@ class Receiver:
 
 
 def decide(probability: FloatArray, weight: FloatArray) -> IntArray:
-    """Rank (n,) of the largest ``probability * weight``; 0 where the probabilities are NaN."""
+    """Return the rank (n,) of the largest ``probability * weight``, or 0 if the probabilities are NaN."""
     alive = np.asarray(np.isfinite(probability).all(axis=1))
     best = np.argmax(np.where(alive[:, None], probability, 0.0) * weight, axis=1) + 1
     return np.where(alive, best, 0).astype(np.int64)
@@ -351,7 +347,7 @@ def _fitted(x: FloatArray, rank: IntArray, penalty: float) -> Receiver:
 
 
 def _training(features: FloatArray, rank: ArrayLike, groups: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
-    """Features (geometries, n, features), ranks and groups of the samples that have a rank and all features."""
+    """Return features (geometries, n, features), ranks and groups of the samples with a rank and all features."""
     ri = unmasked(rank)
     good = np.asarray((ri >= 1) & np.isfinite(features).all(axis=(0, 2)))
     y = ri[good].astype(np.int64)
@@ -364,8 +360,8 @@ def _training(features: FloatArray, rank: ArrayLike, groups: IntArray) -> tuple[
 
 
 def _standard(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean and scale per feature; a constant feature keeps scale 1 and says nothing."""
-    # over the samples: the axis before the last, whatever stands in front
+    """Return mean and scale per feature. A constant feature has scale 1 and no effect."""
+    # the axis of the samples is the last but one
     scale = x.std(axis=-2)
     return x.mean(axis=-2), np.asarray(np.where(scale > 1e-9, scale, 1.0))
 
@@ -380,29 +376,29 @@ def _design(x: FloatArray) -> FloatArray:
 
 
 def _softmax(score: FloatArray) -> FloatArray:
-    # less the largest: exp would overflow
+    # subtract the largest score, because exp would overflow
     e = np.exp(score - _over_ranks(np.maximum, score)[..., None])
     return np.asarray(e / _over_ranks(np.add, e)[..., None])
 
 
 def _over_ranks(operation: np.ufunc, values: FloatArray) -> FloatArray:
-    """``operation.reduce`` over the last axis, which has a few elements only: ten times as fast, the same bits."""
+    """Reduce the last axis, which has few elements, ten times as fast as ``operation.reduce`` with the same bits."""
     return np.asarray(reduce(operation, np.moveaxis(values, -1, 0)))
 
 
 def out_of_group(x: FloatArray, rank: IntArray, groups: IntArray, penalty: float) -> FloatArray:
-    """Forecast (..., n, ranks) of each group by a regression on all the others.
+    """Return the forecast (..., n, ranks) of each group by a regression on all other groups.
 
     Parameters
     ----------
     x : (..., n, features)
-        Leading axes are further sets of features of the same samples, fitted at once.
+        Leading axes are further sets of features of the same samples, which are fitted together.
     rank : (n,) int
         1 to :data:`~aerpaw_cmp.compare.rank.MAX_RANK`.
     groups : (n,) int
-        Each is left out once.
+        Group of each sample. Each group is held out once.
     penalty : float
-        Of the squared coefficients (ridge).
+        Weight of the squared coefficients (ridge).
 
     Returns
     -------
@@ -421,17 +417,19 @@ def out_of_group(x: FloatArray, rank: IntArray, groups: IntArray, penalty: float
 def _fit_multinomial(
     x: FloatArray, rank: IntArray, weight: FloatArray, penalty: float, *, steps: int = 30
 ) -> FloatArray:
-    """Coefficients (..., ranks, 1 + features) of the largest penalised log likelihood, by damped Newton steps.
+    """Return the coefficients (..., ranks, 1 + features) of the largest penalised log likelihood.
+
+    The search uses damped Newton steps.
 
     Parameters
     ----------
     x : (..., n, features)
         Standardised.
     weight : (n,)
-        Of each sample, 0 or 1.
+        Weight of each sample, 0 or 1.
     penalty : float
-        ``penalty / 2`` times the squares of all slopes is added to minus the log likelihood, and a thousandth of it
-        for the constants, which fixes the common shift that probabilities do not see.
+        ``penalty / 2`` times the squares of all slopes is added to minus the log likelihood. The constants have a
+        thousandth of this weight, which determines their common shift.
 
     Notes
     -----
@@ -442,7 +440,7 @@ def _fit_multinomial(
     target = one_hot(rank) * weight[:, None]
     ridge = np.full(width, penalty)
     ridge[0] = 1e-3 * penalty
-    # half a report more: a rank that nobody reported starts at a finite constant
+    # add half a report, so that the constant of a rank without reports is finite
     start = np.log((target.sum(axis=0) + 0.5) / (weight.sum() + 0.5 * MAX_RANK))
     coefficient = np.zeros((*lead, MAX_RANK, width))
     coefficient[..., 0] = start - start.mean()
@@ -464,7 +462,7 @@ def _fit_multinomial(
         gradient = np.swapaxes(p * weight[:, None] - target, -1, -2) @ design + ridge * coefficient
         hessian = _hessian(design, transposed, p, weight, ridge)
         flat = gradient.reshape(*lead, MAX_RANK * width, 1)
-        # as a matrix of one column: NumPy 2 takes a stack of vectors for one matrix
+        # pass a matrix of one column, because NumPy 2 takes a stack of vectors for one matrix
         step = np.linalg.solve(hessian, flat)[..., 0].reshape(coefficient.shape)
         damping = np.ones((*lead, 1, 1))
         for _halving in range(12):
@@ -497,15 +495,15 @@ def _hessian(
 
 
 def decision_weights(probability: FloatArray, rank: IntArray, groups: IntArray) -> FloatArray:
-    """Weights (ranks,) of the decision: those of largest kappa, if they earn it where they were not chosen; else ones.
+    """Return the weights (ranks,) of the decision with the largest kappa, or ones if held-out groups do not gain.
 
     Parameters
     ----------
     probability : (n, ranks)
-        Forecasts of groups left out.
+        Forecasts of held-out groups.
     rank : (n,) int
     groups : (n,) int
-        Each is decided once with the weights that suit the others.
+        Group of each sample. Each group is decided with the weights that suit the other groups.
     """
     weighed, plain = np.zeros_like(rank), decide(probability, np.ones(MAX_RANK))
     for group in np.unique(groups):
@@ -520,13 +518,13 @@ def decision_weights(probability: FloatArray, rank: IntArray, groups: IntArray) 
 
 
 def _kappa_weights(probability: FloatArray, rank: IntArray) -> FloatArray:
-    """Weights (ranks,) for the largest kappa: one for ranks below the commonest, one for those above.
+    """Return the weights (ranks,) with the largest kappa: one for ranks below the commonest rank, one for those above.
 
-    Always the most probable rank says the commonest one too often: kappa pays for the rare ones. Two weights on a grid,
-    the nearest to none at equal kappa.
+    The most probable rank is the commonest one too often, and kappa rewards rare ranks. The two weights are searched on
+    a grid. At equal kappa the weights nearest to 1 are used.
     """
     commonest = int(np.bincount(rank).argmax())
-    # those near none first: a further one must be better to be taken
+    # weights near 1 first: a farther weight must be better
     exponents = sorted(np.arange(-3, 13) / 10.0, key=abs)
     best, weights = -np.inf, np.ones(MAX_RANK)
     ranks = np.arange(1, MAX_RANK + 1)
@@ -541,27 +539,27 @@ def _kappa_weights(probability: FloatArray, rank: IntArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReceiverMixture:
-    """Receivers of several geometries that the training flights cannot tell apart: the mean of their forecasts.
+    """The mean forecast of receivers of several geometries that the training flights cannot distinguish.
 
     Parameters
     ----------
     members : tuple of Receiver
         One per geometry, best first.
     decision_weight : (ranks,)
-        As of a :class:`Receiver`, for the mean.
+        Weights of the decision for the mean forecast.
     """
 
     members: tuple[Receiver, ...]
     decision_weight: FloatArray
 
     def probabilities(self, features: FloatArray) -> FloatArray:
-        """Mean probability (n, ranks) at features (members, n, features)."""
+        """Return the mean probability (n, ranks) at features (members, n, features)."""
         return np.asarray(
             np.mean([member.probabilities(x) for member, x in zip(self.members, features, strict=True)], axis=0)
         )
 
     def decide(self, probability: FloatArray) -> IntArray:
-        """One rank (n,) per row of probabilities; 0 where there is none."""
+        """Return one rank (n,) per row of probabilities, or 0 for a row of NaN."""
         return decide(probability, self.decision_weight)
 
 
@@ -573,13 +571,13 @@ def fit_mixture(
     Parameters
     ----------
     features : (geometries, n, features)
-        Those of :attr:`FeatureChoice.tied`, say.
+        For example, those of :attr:`FeatureChoice.tied`.
     rank : array_like, (n,)
-        Reported rank; samples without (NaN, 0) or without features take no part.
+        Reported rank. Samples without a rank (NaN, 0) or without features are ignored.
     groups : (n,) int
-        Each is left out once, e.g. :func:`sector_groups`.
+        Group of each sample, e.g. :func:`sector_groups`. Each group is held out once.
     penalties : sequence of float
-        To choose from, by the log loss on groups left out.
+        Penalties to choose from, by the log loss on held-out groups.
 
     Returns
     -------
@@ -589,7 +587,7 @@ def fit_mixture(
     Raises
     ------
     InputError
-        Fewer than :data:`FEWEST` samples, or one rank only: nothing to learn from.
+        If there are fewer than :data:`FEWEST` samples, or one rank only.
     """
     x, y, group = _training(features, rank, groups)
     means = [np.mean([out_of_group(item, y, group, penalty) for item in x], axis=0) for penalty in penalties]
@@ -605,21 +603,21 @@ def fit_mixture(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FeatureChoice:
-    """Choice of the modelled channel that explains the training ranks best, and of those that do as well.
+    """The modelled channels that explain the training ranks best.
 
     Parameters
     ----------
     best : int
-        Index of the candidate with the least log score on groups left out.
+        Index of the candidate with the least log score on held-out groups.
     order : (tried,) int
         Candidates that were cross-validated, best first.
     log_score : (tried,)
-        On groups left out [nat], in that order.
+        Log score on held-out groups [nat], in that order.
     tied : tuple of int
-        Candidates that the data cannot tell from the best: the 95 % interval of the difference of their log scores on
-        the same samples holds 0. The best comes first.
+        Candidates that are not significantly worse than the best: the 95 % interval of the difference of log scores on
+        the same samples contains 0. The best comes first.
     candidates : int
-        How many there were.
+        Number of candidates.
     """
 
     best: int
@@ -636,23 +634,23 @@ def choose_features(
     *,
     finalists: int = 60,
 ) -> FeatureChoice:
-    """Choose between candidate geometries by groups left out within the training flights.
+    """Choose between candidate geometries by held-out groups of the training flights.
 
     Parameters
     ----------
     features : (candidates, n, features)
-        Of every candidate at the same samples.
+        Features of each candidate at the same samples.
     rank : array_like, (n,)
     groups : (n,) int
-        Each is left out once.
+        Group of each sample. Each group is held out once.
     finalists : int
-        Only those with the best likelihood on the training samples themselves are cross-validated: all candidates have
-        equally many coefficients, and a fit costs a tenth of a cross-validation.
+        Number of candidates that are cross-validated. They have the best likelihood on the training samples: all
+        candidates have equal numbers of coefficients, and a fit takes a tenth of the time of a cross-validation.
 
     Returns
     -------
     FeatureChoice
-        The best candidate, those tied with it, and the finalists by their log score.
+        Best candidate, candidates that are not significantly worse, and finalists by log score.
 
     Raises
     ------
@@ -662,7 +660,7 @@ def choose_features(
     x, y, group = _training(features, rank, groups)
     step = max(1, _HELD // (x.shape[1] * (x.shape[2] + 1) * MAX_RANK))
     rough = np.concatenate([_own_losses(x[i : i + step], y) for i in range(0, len(x), step)])
-    # stable, to nine digits: of candidates equal but for rounding (mounts half a turn apart) the first listed stays
+    # stable sort of nine digits: the first of candidates that differ by rounding (mounts half a turn apart) stays first
     final = np.argsort(np.round(rough, 9), kind="stable")[:finalists]
     losses = np.concatenate([_left_out_losses(x[final[i : i + step]], y, group) for i in range(0, len(final), step)])
     score = losses.mean(axis=1)
@@ -674,7 +672,7 @@ def choose_features(
 
 
 def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray) -> float:
-    """Log score of the mean forecast of several geometries on groups left out.
+    """Return the log score of the mean forecast of several geometries on held-out groups.
 
     Parameters
     ----------
@@ -685,7 +683,7 @@ def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray) -> flo
     Returns
     -------
     float
-        [nat].
+        Log score [nat].
     """
     x, y, group = _training(features, rank, groups)
     return float(log_losses(out_of_group(x, y, group, _CHOICE_PENALTY).mean(axis=0), y).mean())
@@ -693,7 +691,7 @@ def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray) -> flo
 
 def _own_losses(x: FloatArray, rank: IntArray) -> FloatArray:
     z = _standardised(x)
-    # a rough likelihood is enough to leave candidates out
+    # a rough likelihood is enough to exclude candidates
     weights = _fit_multinomial(z, rank, np.ones(len(rank)), _CHOICE_PENALTY, steps=6)
     p = _softmax(_design(z) @ np.swapaxes(weights, -1, -2))
     return np.array([log_losses(item, rank).mean() for item in p])

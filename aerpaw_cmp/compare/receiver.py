@@ -4,10 +4,10 @@ A forecast is a probability for each rank. It is scored by the log score, a prop
 forecast, which is the histogram of the training flights. Kappa and agreement score the rank that is decided from the
 probabilities, and are compared with the commonest rank.
 
-A receiver chooses the rank with the largest throughput at its noise, from a codebook and a channel estimate that logs do
-not contain. The module learns how often each rank is reported for ratios of singular values and a level of the modelled
-channel, by a multinomial logistic regression with a ridge penalty. Simpler rules for comparison are one threshold per
-stream, and an ordered regression (one linear score, and one limit between neighbouring ranks).
+A receiver chooses the rank with the largest throughput at its noise. It uses a codebook and a channel estimate, which
+logs do not contain. The module learns how often each rank is reported for ratios of singular values and a level of the
+modelled channel, by a multinomial logistic regression with a ridge penalty. Simpler rules for comparison are one
+threshold per stream, and an ordered regression (one linear score, and one limit between neighbouring ranks).
 
 The antenna geometry of the modelled channel is chosen by the log score on held-out sectors of the training flights
 (:func:`choose_features`), and never on the scored flight.

@@ -95,7 +95,7 @@ _START = _Parts(5.0, 0.3, 1.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Along:
-    """Predictors of the level of a channel, at equally spaced times of the telemetry; NaN without a pose.
+    """Predictors of the level of a channel, at equally spaced times of the telemetry. NaN without a pose.
 
     Parameters
     ----------
@@ -219,8 +219,8 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
 
     Notes
     -----
-    Means y over a second are normal with mean offset + slope log10(d) + p(t - lag), p the prediction of a model, and
-    three random parts: gains over the direction at either end (Gaussian processes), a correlated residual
+    Means y over a second are normal with mean offset + slope log10(d) + p(t - lag), where p is the prediction of a
+    model. Three parts are random: gains over the direction at either end (Gaussian processes), a correlated residual
     (Ornstein-Uhlenbeck) and a white residual. Offset, slope and gains are integrated out, and the scale is profiled.
     The correlation time, the white share and the gains maximise the likelihood on a small grid, per channel, at lag 0
     or at the most likely lag of a model. Each lag counts with the model that explains it best, so a model that is not
@@ -498,7 +498,7 @@ def _calm(mean_db: FloatArray) -> FloatArray:
 
 
 def _averaged(table: FloatArray, width: float) -> FloatArray:
-    """Return the running mean of a table (g, k) over rows; NaN if a row has NaN.
+    """Return the running mean of a table (g, k) over rows. NaN if a row has NaN.
 
     Attitudes vary within a mean of the level. Taken at single times they would make the likelihood jump by 10 nat
     between lags 0.1 s apart, and one of the jumps would look like a sharp optimum.
@@ -703,8 +703,8 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     It is None if there is no such time, or more than one.
 
     Both logs contain positions of the aircraft: the log at relative times t, the track at UTC. The search finds the
-    shift s with the smallest median of |p_log(t) - p_track(t + s)|: in steps of a second, then of 0.1 s around the
-    best.
+    shift s with the smallest median of |p_log(t) - p_track(t + s)|. Its steps are a second, then 0.1 s around the best
+    shift.
 
     Parameters
     ----------
@@ -766,14 +766,14 @@ def _points(frame: pd.DataFrame, most: int | None) -> tuple[AnyArray, FloatArray
 
 
 def _metres(points: FloatArray, about: FloatArray) -> FloatArray:
-    """Return positions in metres relative to the first; heights as logged, 0 if missing."""
+    """Return positions in metres relative to the first. Heights as logged, 0 if missing."""
     return np.column_stack([rough_m(points[:, 0], points[:, 1], about[0]), np.nan_to_num(points[:, 2])])
 
 
 def _median_distances(
     shifts: FloatArray, time_s: FloatArray, log_m: FloatArray, track_s: FloatArray, track_m: FloatArray
 ) -> FloatArray:
-    """Return the median distance for each shift; NaN if less than half of the log is within the track."""
+    """Return the median distance for each shift. NaN if less than half of the log is within the track."""
     parts = [np.zeros(0)]
     for some in np.array_split(shifts, -(-len(shifts) // _SHIFTS_AT_ONCE) or 1):
         time = time_s + some[:, None]
@@ -789,7 +789,7 @@ _SHIFTS_AT_ONCE = 500
 
 
 def _medians(values: FloatArray, counts: BoolArray) -> FloatArray:
-    """Return the median of each row (n, m) over the values with ``counts``; NaN if there are none."""
+    """Return the median of each row (n, m) over the values with ``counts``. NaN if there are none."""
     ordered = np.sort(np.where(counts, values, np.inf), axis=1)
     number, row = counts.sum(axis=1), np.arange(len(values))
     low, high = np.maximum(number - 1, 0) // 2, np.minimum(number // 2, values.shape[1] - 1)

@@ -185,7 +185,7 @@ def _called(flight: Flight) -> str:
 
 
 def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
-    """Return the flight of a file without absolute times; a new one is added to ``groups``."""
+    """Return the flight of a file without absolute times. A new one is added to ``groups``."""
     # a log with both levels and positions is a separate flight, because relative times share nothing with others
     alone = Flight([file]).complete
     known = [flight for flight in groups if flight.span is not None] if alone else groups

@@ -137,13 +137,13 @@ class RssSeries:
     line: IntArray
     """Line (n,) of each sample in that log."""
     noise_dbm: float | None = None
-    """Noise of the receiver for a signal-to-noise ratio, if its bandwidth or floor is known [dBm]; None for levels."""
+    """Noise of the receiver for a signal-to-noise ratio, if its bandwidth or floor is known [dBm]. None for levels."""
     flagged: Mapping[str, int] = field(default_factory=dict)
     """Numbers of rows of the log that are excluded because of a flag, by flag."""
     serving: FloatArray | None = None
-    """Serving state of a cell: 1 if it served the phone, 0 if another did, NaN unknown (n,); None for other levels."""
+    """Serving state of a cell: 1 if it served the phone, 0 if another did, NaN unknown (n,). None for other levels."""
     locked: FloatArray | None = None
-    """Receiver lock of a sounder: 1 in lock, 0 without lock, NaN unknown (n,); None for other levels."""
+    """Receiver lock of a sounder: 1 in lock, 0 without lock, NaN unknown (n,). None for other levels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +194,7 @@ class FlightData:
         return [*(("RSS", s) for s in self.rss), *(("rank", s) for s in self.rank)]
 
     def link_of(self, series: RssSeries | RankSeries) -> Link:
-        """Return the link of a series to its tower; antenna files are read once."""
+        """Return the link of a series to its tower. Antenna files are read once."""
         settings = series.link if isinstance(series, RssSeries) else self.settings.link.rank
         key = f"{series.tower} {series.settings_key if isinstance(series, RssSeries) else series.channel}"
         if key not in self._links:
@@ -207,7 +207,7 @@ class FlightData:
         return self.track.pose_at(time)
 
     def tower_at(self, tower: str, time: Times) -> tuple[FloatArray, BoolArray]:
-        """Return the array centre of a tower at times (n,), and whether it is known (n,); unknown positions are NaN.
+        """Return the array centre of a tower at times (n,), and whether it is known (n,). Unknown positions are NaN.
 
         The shape is (1, 3) for a fixed tower, and (n, 3) for one that moves.
         """
@@ -747,7 +747,7 @@ def check_place(site: Site, path: str, stream: Stream) -> None:
 
 
 def nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) -> float:
-    """Return the smallest horizontal distance of positions to any tower [m]; NaN without a position."""
+    """Return the smallest horizontal distance of positions to any tower [m]. NaN without a position."""
     # impossible angles are refused by another check, and would stop the projection
     can = (np.abs(latitude_deg) <= 90.0) & (np.abs(longitude_deg) <= 180.0)
     if not can.any():
@@ -918,7 +918,7 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
 
 
 def _joined(parts: Sequence[RssSeries | RankSeries], name: str) -> AnyArray:
-    """Return a column of all parts, NaN for parts without it, such as a serving cell; empty if no part has it."""
+    """Return a column of all parts, NaN for parts without it, such as a serving cell. Empty if no part has it."""
     arrays = [getattr(part, name) for part in parts]
     if not any(isinstance(value, np.ndarray) for value in arrays):
         return np.empty(0)

@@ -46,7 +46,7 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Replayed:
-    """A replayed series. ``valid`` (n,) marks samples with a known pose; other arrays have only these samples."""
+    """A replayed series. ``valid`` (n,) marks samples with a known pose. Other arrays have only these samples."""
 
     link: Link
     poses: Poses
@@ -55,7 +55,7 @@ class Replayed:
     track: TrackPoses | None = None
     clock: Clock | None = None
     tower_m: FloatArray | None = None
-    """Position of a tower that moves, shape (poses, 3) [m]; None for a fixed tower."""
+    """Position of a tower that moves, shape (poses, 3) [m]. None for a fixed tower."""
     learned: LearnedGain | None = None
     """Contribution of learned antennas to the RSS, and its standard deviation."""
 
@@ -288,7 +288,7 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
 
 
 def _along(data: FlightData, different: Sequence[RssSeries], instants: Times, step_s: float) -> list[Along]:
-    """Return predictors of the levels of series of one tower and carrier; the replay has at most one reflection."""
+    """Return predictors of the levels of series of one tower and carrier. The replay has at most one reflection."""
     links = [data.link_of(series) for series in different]
     blocks = np.array_split(instants, max(1, -(-len(instants) // BLOCK)))  # about equal in size
     parts = [_levels_along(data, links, different[0].tower, part) for part in blocks]
@@ -305,7 +305,7 @@ def _along(data: FlightData, different: Sequence[RssSeries], instants: Times, st
 def _levels_along(
     data: FlightData, links: Sequence[Link], tower: str, instants: Times
 ) -> Iterator[dict[str, FloatArray]]:
-    """Yield levels of three models, distance and directions at times (n,) per link; links differ only in antennas."""
+    """Yield levels of three models, distance and directions at times (n,) per link. Links differ only in antennas."""
     place, known = data.tower_at(tower, instants)
     track = data.poses_at(instants).where(known)
     poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
@@ -426,7 +426,7 @@ def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
 
 
 def valid_poses(track: TrackPoses, attitude: str) -> Poses:
-    """Return the valid poses; a track without invalid poses is not copied."""
+    """Return the valid poses. A track without invalid poses is not copied."""
     some = track.pick(track.valid)
     return Poses(some.position_m, np.ascontiguousarray(attitude_rotation(some, attitude)))
 

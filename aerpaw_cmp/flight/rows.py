@@ -208,7 +208,7 @@ def _large(difference_db: FloatArray) -> float:
 
 
 def _is_noisy(level_db: FloatArray) -> bool:
-    """Check whether a level (n,) varies by noise and not smoothly; rounding of a smooth level is not noise."""
+    """Check whether a level (n,) varies by noise and not smoothly. Rounding of a smooth level is not noise."""
     step = np.diff(level_db[np.isfinite(level_db)])
     sizes = np.abs(step[step != 0])
     if not len(sizes):

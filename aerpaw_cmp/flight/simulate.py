@@ -40,7 +40,7 @@ _TRUTH = "truth.json"
 FLIGHT = "flight.yaml"
 # Readers whose logs can be written.
 _WRITTEN = ("vehicle_out", "sounder_log", "quectel_ri")
-# Simulated levels below this are no signal.
+# Simulated levels below this mean that there is no signal.
 _LOWEST_DBM = -400.0
 
 
@@ -126,7 +126,7 @@ def plan_attitude(trajectory: Trajectory, time_s: FloatArray) -> tuple[FloatArra
 
 
 def planned_poses(plan: PlanSettings, ground_m: float, step_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times (n,) [s], positions (n, 3) [m] and headings (n,) [deg] of a plan; take-off is at ``ground_m``."""
+    """Return times (n,) [s], positions (n, 3) [m] and headings (n,) [deg] of a plan. Take-off is at ``ground_m``."""
     trajectory = plan_trajectory(plan)
     # slightly longer, so that the end is a sample if the step divides the flight
     time_s = np.arange(0.0, trajectory.duration_s + 1e-9, step_s)
@@ -282,8 +282,8 @@ class FlightSimulator:
         Raises
         ------
         UsageError
-            Without a plan or a time zone, for readers without a writer, for towers that the site does not have, and for
-            a folder with files that this tool did not write.
+            If the plan or the time zone is missing, a reader has no writer, a tower is unknown, or the folder contains
+            files that this tool did not write.
         OutputError
             If the files cannot be written.
         """

@@ -129,8 +129,8 @@ def height_in_name(path: str) -> float | None:
 _MAXIMUM_GAP_S = 3.0
 
 # Sparse telemetry is joined by straight lines if nine of ten fixes are no farther apart than this [m], which is the
-# distance of 14 s at 2 m/s. On a faster flight its steady legs are joined: intervals of which one end is this close to
-# the line between the neighbouring fixes (7.7 m for nine of ten in the field data). Turns are not joined.
+# distance of 14 s at 2 m/s. On a faster flight only its steady legs are joined. One end of such an interval is this
+# close to the line between the neighbouring fixes (7.7 m for nine of ten in the field data).
 _SPARSE_APART_M, _SPARSE_ERROR_M = 100.0, 10.0
 
 # An interval of sparse telemetry longer than this multiple of the usual one is a gap.
@@ -177,8 +177,9 @@ class TrackAccount:
     rows : int
         Rows of the telemetry frame.
     no_time, duplicate_time, backward_time, bad_position : int
-        Rows that are not used for positions: no time stamp; the stamp of the row before; a stamp earlier than one
-        before it (or, if that excludes fewer rows, later than one after it); NaN, -999 or impossible coordinates.
+        Rows that are not used for positions. They have no time stamp, the stamp of the row before, a stamp earlier than
+        one before it, or impossible coordinates (also NaN and -999). If that excludes fewer rows, a stamp later than
+        one after it counts as backward instead.
     steps_sorted : int
         Steps back in time of a shuffled file, whose rows were sorted because the path is then shorter.
     unknown_attitude : int
@@ -288,7 +289,7 @@ class TrackPoses:
 
     @property
     def reason(self) -> AnyArray:
-        """Reasons why poses are not valid (n,), from :data:`REASONS`; empty for valid poses."""
+        """Reasons why poses are not valid (n,), from :data:`REASONS`. Empty for valid poses."""
         return np.asarray(REASONS)[self.reason_code]
 
     @property
@@ -327,8 +328,8 @@ _SAME_S = 1e-6
 def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
     """Return the rows of a strictly increasing clock, and the numbers of duplicate and backward rows.
 
-    A stamp is backward if an earlier row is later. A single wrong stamp in the future would then exclude all rows after
-    it, so the mirrored rule (a stamp later than that of a later row is wrong) is used if it excludes fewer rows.
+    A stamp is backward if an earlier row is later. With this rule a wrong stamp in the future excludes all rows after
+    it. If it excludes fewer rows, the mirrored rule is used: a stamp later than that of a later row is wrong.
     """
     if not len(stamp):
         return np.zeros(0, dtype=bool), 0, 0
@@ -690,7 +691,7 @@ def _differences_mps(t: FloatArray, position_m: FloatArray, span_s: float) -> Fl
 
 
 def _courses(velocity: FloatArray) -> FloatArray:
-    """Return the course over ground [deg clockwise from north]; at rest the last course is used, or else the first."""
+    """Return the course over ground [deg clockwise from north]. At rest the last course is used, or else the first."""
     course = bearing_deg(velocity)
     moving = np.flatnonzero(np.hypot(velocity[:, 0], velocity[:, 1]) >= _COURSE_SPEED_MPS)
     if not len(moving):

@@ -39,7 +39,7 @@ from .settings import FlightFile
 _STEP_S, _MEAN_S, _TREND_S = 0.5, 1.0, 10.0
 _LONGEST_S = 4 * 3600.0  # longer logs have a fingerprint of their beginning
 
-# Digits of a change: 7 is no change, and dots are half seconds without readings.
+# Digits of a change: 7 means unchanged, and dots are half seconds without readings.
 _DIGITS, _MIDDLE, _PER_SD, _GAP = "0123456789abcde", 7, 2.5, "."
 
 _BEGIN = "f"
@@ -51,8 +51,8 @@ _SLACK, _HOUR = 120, 7200
 # log. The largest z of two logs of the field is 7.3, the next 5.7; the smallest for a changed copy is 8.6.
 _FEWEST, _LEAST_R, _LEAST_Z = 80, 0.5, 7.5
 
-# Readings of a run, changes in it (a constant level repeats in every log), and strides of readings, because a copy with
-# half or a quarter of the rows then has the same runs.
+# Readings of a run, changes in it (a constant level repeats in every log), and strides of readings. A copy with half or
+# a quarter of the rows has the same runs.
 _RUN, _LEAST_CHANGES, _STRIDES = 24, 8, (1, 2, 4)
 
 # A series with fewer different values has no runs, because ranks along one route change similarly on every flight.
@@ -200,7 +200,7 @@ def _memory(left: AnyArray, right: AnyArray, size: int) -> float:
 
 @lru_cache(maxsize=32)
 def _spectra(mark: str, size: int) -> AnyArray:
-    """Return spectra of the known digits of a fingerprint, its changes and their squares; other characters are gaps."""
+    """Return spectra of the known digits of a fingerprint, its changes and their squares. Other characters are gaps."""
     code = np.frombuffer(mark.encode("ascii", "replace"), dtype=np.uint8)
     digit = np.full(256, np.nan)
     digit[list(_DIGITS.encode())] = np.arange(len(_DIGITS)) - _MIDDLE

@@ -85,7 +85,7 @@ def test_a_link_stays_and_its_file_is_written(tmp_path: Path) -> None:
 def test_no_ordinary_file_is_replaced(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for target in (tmp_path / "pipe", tmp_path, Path(os.devnull)):
-        with pytest.raises(UsageError, match="no ordinary file"):
+        with pytest.raises(UsageError, match="not a regular file"):
             write_file(target, force=True)
     with pytest.raises(UsageError, match="no such folder"):
         write_file(tmp_path / "none" / "a")

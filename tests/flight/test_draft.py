@@ -277,7 +277,7 @@ def test_the_place_is_looked_at_before_the_logs(logs: Path, capsys: pytest.Captu
     assert main(["ingest", str(logs), "--draft", str(logs / "nowhere" / "flight.yaml")]) == 2  # and not: timezone
     assert "no such folder" in capsys.readouterr().err
     assert main(["ingest", str(logs), "--draft", str(logs)]) == 2
-    assert "no ordinary file" in capsys.readouterr().err
+    assert "not a regular file" in capsys.readouterr().err
 
 
 def test_the_command_does_not_overwrite(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:

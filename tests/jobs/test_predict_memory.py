@@ -189,8 +189,8 @@ def test_remembered_antennas_stand_beside_other_bases_but_not_on_their_own_fligh
     known = {name: predict.predict(flown / "aside.yaml", named_flights([flown / f"{name}.yaml"]),
                                TargetOptions(site=str(flown / "mine.yaml"))) for name in ("aside", "first")}  # fmt: skip
     bases = {name: {row["base"] for row in said.page.candidates} for name, said in known.items()}
-    assert "antennas that the site remembers" in bases["aside"]
-    assert "antennas that the site remembers" not in bases["first"]
+    assert "learned antennas of the site" in bases["aside"]
+    assert "learned antennas of the site" not in bases["first"]
     assert not isinstance(known["first"].model, Memory)
 
 

@@ -60,8 +60,13 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
             if separator.encode() not in line:
                 continue
             names = [name.strip() for name in split_row(line, separator)]
-            if len(names) > 1 and is_header(names):
-                return i, separator, names
+            below = [name.strip() for name in split_row(lines[i + 1], separator)] if i + 1 < len(lines) else []
+            filled = [name or group for group, name in zip(names, below, strict=False)]
+            # merged cells of groups above the names: the names fill the cells that are empty here
+            grouped = any(name and not group for group, name in zip(names, below, strict=False))
+            grouped &= len(below) == len(names) and not any(map(_VALUE.match, below))
+            if len(names) > 1 and is_header(filled if grouped else names):
+                return i + grouped, separator, filled if grouped else names
     return None
 
 

@@ -51,6 +51,8 @@ _OF_ANTENNA, _LEARNED_SHARE = ("heading", "pattern"), 0.25
 # Causes that must bring the error back to what is usual, and the least part of what all candidates take off together.
 _RESTORING = frozenset({"pattern", "heading", "height", "telemetry", "clock", "saturation", "place", "channels"})
 _LEAST_PART = 0.5
+# Another tower and another place imitate many errors of the position, and a step imitates other faults of a receiver.
+_LEAST_PARTS = {"tower": 0.75, "place": 0.75, "gain step": 0.5}
 # Causes that change the levels of all channels.
 _OF_UAV = frozenset({"height", "heading", "telemetry", "attitude"})
 # A cause that leaves more than this factor of the largest usual error does not explain the error.
@@ -322,8 +324,8 @@ def _rivalled(step: Step, known: Sequence[tuple[Judged, _Models]]) -> bool:
     return max(squares.values(), default=0.0) > step.chi2 - _RARE
 
 
-# Twice the log likelihood that a free coefficient takes up where there is nothing to explain.
-_NAT_OF_COLUMN = 2.0
+# Mean fall of the square by a free coefficient that explains nothing.
+_NAT_OF_COLUMN = 1.0
 
 
 def _lead(names: Set[str], odds: Mapping[frozenset[str], float]) -> float:
@@ -361,9 +363,11 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
         return False
     # the cause alone must reduce the RMSE, not only the changes from second to second
     alone_models = [table[frozenset([name])] for table in shown]
+    if name in _OF_UAV and any(model.gain <= 0.0 for model in alone_models):
+        return False
     known_db, alone_db = _rmse_db(sound), _rmse_db(alone_models)
     share = max(alone_db / known_db, _share_of_error(shown, beside, {*beside, name})) if known_db else 1.0
-    certain, least_share = lead >= _CERTAIN, _LEAST_SHARE
+    certain, least_share = lead >= _CERTAIN and share <= 1.0 - 0.5 * _LEAST_SHARE, _LEAST_SHARE
     if name == "place":  # the nearest of all places takes up a part of many an error
         certain, least_share = False, _PLACE_SHARE
     if name in _OF_ANTENNA and sound[0].evidence.antenna == "learned":
@@ -400,10 +404,11 @@ def _usual_db(shown: Sequence[_Models]) -> tuple[float, float] | None:
 
 def _is_enough(name: str, shown: Sequence[_Models], known_db: float, alone_db: float) -> bool:
     """Check whether a cause takes off half of what all candidates take off together."""
-    if name not in _RESTORING:
+    part = _LEAST_PARTS.get(name, _LEAST_PART if name in _RESTORING else 0.0)
+    if part == 0.0:
         return True
     together_db = math.sqrt(float(np.mean([_together_db(table) ** 2 for table in shown])))
-    return alone_db <= known_db - _LEAST_PART * (known_db - together_db)
+    return alone_db <= known_db - part * (known_db - together_db)
 
 
 def _together_db(table: _Models) -> float:

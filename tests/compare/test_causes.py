@@ -503,6 +503,25 @@ def test_held_out_flights_decide_on_steps_and_levels(change: str, size_db: float
         assert flight_cause(other) is None
 
 
+def test_a_heading_that_one_of_two_channels_shows_is_not_that_of_the_uav() -> None:
+    sound, other = _sound(), replace(_sound(4), name="LW1 B")
+    turned, both = (replace(e, measured_db=e.measured_db + e.turned_db[90.0]) for e in (sound, other))
+    for channels, name in (([turned, both], "heading"), ([turned, other], NONE)):
+        cause = flight_cause(channels)
+        assert (NONE if cause is None else cause.name) == name
+
+
+def test_heights_that_drift_are_named_with_their_drift() -> None:
+    sound = _sound()
+    raised = {float(rise): 0.1 * rise * np.sin(sound.time_s / 13.0) for rise in (-100, -40, -15, 15, 40, 100)}
+    drift = 0.1 * -40.0 * sound.time_s / sound.time_s[-1] * np.sin(sound.time_s / 13.0)
+    cause = flight_cause([replace(sound, raised_db=raised, measured_db=sound.measured_db + drift)])
+    assert cause is not None
+    assert cause.name == "height"
+    assert "the logged height drifts by about +" in cause.sentence
+    assert cause.estimate == pytest.approx(-40.0, abs=12.0)
+
+
 @pytest.mark.parametrize("levels", ["few", "two"])
 def test_too_few_samples_or_levels_have_no_cause(levels: str) -> None:
     stepped = _planted()["gain step"]

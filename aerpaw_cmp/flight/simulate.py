@@ -318,7 +318,9 @@ class FlightSimulator:
             }
             with output.filling() as folder:
                 for name, content in contents.items():
-                    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                    # below the folder only: one that was removed during the run must not be created again
+                    for parent in reversed(Path(name).parents[:-1]):
+                        (folder / parent).mkdir(exist_ok=True)
                     (folder / name).write_bytes(content)
             return [out / name for name in contents]
 

@@ -261,7 +261,7 @@ _OTHER = re.compile(
 _INDIRECT = re.compile(
     r"\b(ul|uplink|pusch|pucch|srs|at (the )?(gnb|enb|bs)|(gnb|enb|bs) (rx|rssi|received)|min|minimum|max|maximum|std"
     r"|stdev|sigma|var|variance|thresh(old)?|predicted|prediction|simulated|expected|target|model(led)?|error|delta|diff"
-    r"|offset|count)\b"
+    r"|offset|count|ref|des(ired)?|set ?point|cmd|command)\b"
 )
 
 
@@ -342,8 +342,10 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     texts = [_JOINED.sub(r"neighbour \1 ", text).replace("  ", " ") for text in dict.fromkeys(texts)]
     hits = ((row, text) for text in texts for form, row in _forms() if form.search(text))
     row, text = next(hits, (None, ""))
+    if row is not None and row.role == "other":  # a tower, a target and an antenna have levels, too
+        row, text = next((hit for hit in hits if hit[0].role in ("rss", "rank", "kpi", "cell")), (None, ""))
     # 'rx [dBm]' is a level, and no name of a receiver
-    if row is None or row.role == "other" or (row.role == "identity" and is_unit(unit)):
+    if row is None or (row.role == "identity" and is_unit(unit)):
         return None
     if row.unit and unit in UNITS and (UNITS[unit][0] != row.unit) and row.role in ("position", "angle", "velocity"):
         unit = ""  # 'Longitude (W)' counts no watts, 'vel_n_m_s' no metres
@@ -361,6 +363,23 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
 # Words that pairs of an identity and a level do not share, or that only name the radio access or the serving cell.
 _UNPAIRED = re.compile(rf"{_MEAN.pattern}|\b(nr|ss|lte|4g|5g|cell|serving|primary|pcell|pscell|spcell|dbm?)\b")
 
+_PAIRED = ("RSRP", "RSSI", "RSCP")
+# Words for a cell, a beam or an access point, and words that follow them.
+_WHO = re.compile(
+    r"\b(tower|node|site|base ?station|bs|[eg]nb|cell|sector|beam|ssb|ap|access point|b?ssid|e?ci|nci|l?cid|[en]?cgi"
+    r"|rnti|gateway|gw|mac)\b"
+)
+_OF_WHO = re.compile(r"\b(id|identity|name|no|num|number|index|address|addr)\b")
+
+
+def _split(name: str, what: Meaning | None) -> tuple[str, str]:
+    """Return the words of a name for a cell other than its PCI, and the words that an identity and a level share."""
+    bare = re.sub(r"(?<=[a-z])(?=\d)", " ", without_unit(name)[0])
+    kind = "" if what and what.quantity.role != "identity" else " ".join(part[0] for part in _WHO.finditer(bare))
+    form = next((form for form, row in _forms() if what and row.name == what.quantity.name), _OF_WHO)
+    rest = _OF_WHO.sub(" ", _WHO.sub(" ", form.sub(" ", bare)))
+    return kind, " ".join(_UNPAIRED.sub(" ", rest).split())
+
 
 def of_pairs(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | None]:
     """Return the meanings of columns, with a place for each level and identity that share their other words.
@@ -372,23 +391,36 @@ def of_pairs(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | No
     >>> names = ["PCI A", "RSRP A", "PCI B", "RSRP B"]
     >>> [what.place for what in of_pairs([(name, meaning(name)) for name in names])]
     ['cell a', 'cell a', 'cell b', 'cell b']
+
+    Other identities, such as "CID_1" or "AP1", have the role ``mark`` if at least two share the words of a level:
+
+    >>> names = ["AP1", "RSSI1", "AP2", "RSSI2"]
+    >>> [(what.quantity.role, what.place) for what in of_pairs([(name, meaning(name)) for name in names])]
+    [('mark', 'cell1'), ('rss', 'cell1'), ('mark', 'cell2'), ('rss', 'cell2')]
     """
-    forms, known = {row.name: form for form, row in _forms()}, [*columns]
-    cells: dict[tuple[str, str], dict[str, set[str]]] = {}
-    words = [
-        " ".join(_UNPAIRED.sub(" ", forms[what.quantity.name].sub(" ", without_unit(name)[0])).split()) if what else ""
-        for name, what in known
+    named = [(*_split(name, what), what) for name, what in columns]
+    levels = {rest: what for _, rest, what in named if what and what.quantity.name in _PAIRED}
+    marked = {rest for kind, rest, _ in named if kind and rest in levels}
+    marked = marked if len(marked) > 1 else set()
+    words = [rest for _, rest, _ in named]
+    known = [
+        replace(levels[rest], quantity=Quantity(kind, "mark", ())) if kind and rest in marked else what
+        for kind, rest, what in named
     ]
-    for rest, (_, what) in zip(words, known, strict=True):
-        if what is not None and what.quantity.name in ("PCI", "RSRP", "RSSI", "RSCP"):
-            role = "PCI" if what.quantity.name == "PCI" else "level"
+    cells: dict[tuple[str, str], dict[str, set[str]]] = {}
+    for rest, what in zip(words, known, strict=True):
+        if what is not None and (what.quantity.name in (*_PAIRED, "PCI") or what.quantity.role == "mark"):
+            role = "level" if what.quantity.name in _PAIRED else "identity"
             cells.setdefault((role, what.place), {}).setdefault(rest, set()).add(what.rat)
     placed = []
-    for rest, (_, what) in zip(words, known, strict=True):
-        shared = {} if what is None else cells.get(("PCI", what.place), {})
-        pairs = what is not None and rest in shared and rest in cells.get(("level", what.place), {})
-        several = any({*shared.get(rest, ())} & rats for other, rats in shared.items() if other != rest)
-        placed.append(replace(what, place=f"cell {rest}") if what and pairs and several and rest else what)
+    for rest, what in zip(words, known, strict=True):
+        shared = {} if what is None else cells.get(("identity", what.place), {})
+        if what is not None and rest in shared and rest in cells.get(("level", what.place), {}):
+            several = any(shared[rest] & rats for other, rats in shared.items() if other != rest)
+            # the target of a handover has an identity, the target of a model has none
+            indirect = what.indirect and _INDIRECT.search(rest.replace("target", "")) is not None
+            what = replace(what, place=f"cell {rest}" if several and rest else what.place, indirect=indirect)
+        placed.append(what)
     return placed
 
 

@@ -110,7 +110,9 @@ def streams(
             about: dict[str, Attribute | None] = {"quantity": quantity, "rat": rat or None}
             about["pci"] = int(identity) if identity >= 0 else None
             about["arfcn"] = int(carrier) if np.isfinite(carrier) else None
-            words = [rat, f"pci{about['pci']}" if identity >= 0 else "rsrp"]
+            level = quantity.lower() if quantity in QUANTITIES.values() else "rsrp"
+            words = [rat, f"pci{about['pci']}" if identity >= 0 else level]
+            words += [level] if identity >= 0 and level != "rsrp" else []
             words += [f"arfcn{about['arfcn']}"] if several and np.isfinite(carrier) else []
             for further, part in of_carrier.groupby("more") if more else [("", of_carrier)][: len(of_carrier)]:
                 name = "_".join(word for word in (*words, str(further)) if word)

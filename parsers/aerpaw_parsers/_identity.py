@@ -279,12 +279,20 @@ def further(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dict[s
     texts = {i: _named(sheet, i) for i in of_a_cell(sheet)}
     chosen = refining(texts, _with_level(sheet), base)
     sheet.used |= {i for i, values in _values(texts).items() if len(values) <= _MOST_PARTS}
-    labels, about = [""] * len(sheet), dict[str, dict[str, Attribute]]()
-    for row in range(len(sheet)) if chosen else ():
-        written = {sheet.plain[i]: texts[i][row] for i in chosen if texts[i][row]}
-        labels[row] = "_".join(_label(name, text) for name, text in written.items())
-        about.setdefault(labels[row], attributes_of(written))
-    return labels, about
+    about: dict[str, dict[str, Attribute]] = {}
+    return labels(sheet, chosen, about), about
+
+
+def labels(sheet: _sheet.Sheet, columns: Sequence[int], about: dict[str, dict[str, Attribute]]) -> list[str]:
+    """Return the name of what some columns identify in each row, and add its attributes by that name to ``about``."""
+    of_row, texts = [""] * len(sheet), {i: _named(sheet, i) for i in columns}
+    # the same cell has the same name in 'CID 1' and 'CID 2'
+    kinds = {i: m.quantity.name if (m := sheet.meanings[i]) else sheet.plain[i] for i in columns}
+    for row in range(len(sheet)) if columns else ():
+        written = {kinds[i]: texts[i][row] for i in columns if texts[i][row]}
+        of_row[row] = "_".join(_label(name, text) for name, text in written.items())
+        about.setdefault(of_row[row], attributes_of(written))
+    return of_row
 
 
 def attributes_of(written: Mapping[str, str]) -> dict[str, Attribute]:

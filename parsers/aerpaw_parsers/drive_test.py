@@ -18,7 +18,7 @@ from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.logs.records import Attribute, ReadResult, Stream
 from aerpaw_cmp.readers import dictionary
 
 from . import _cells, _identity, _pose, _sheet, aadm_snr, ardupilot_bin, nemo_csv, pose_csv, quectel_ri
@@ -51,6 +51,8 @@ class _Cell:
     place: str
     columns: dict[str, int] = field(default_factory=dict)  # by the fields of a reading
     ports: list[int] = field(default_factory=list)  # levels of single ports, in addition to that of the cell
+    marks: list[int] = field(default_factory=list)  # identities besides the PCI
+    quantity: str = "RSRP"  # of the level
 
     @property
     def serving(self) -> bool:
@@ -71,8 +73,10 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
     """Return the cells of the table, the columns of other quantities, and those of ranks."""
     cells: dict[tuple[str, str], _Cell] = {}
     fields: dict[tuple[str, str], dict[str, list[int]]] = {}
-    others, ranks = [], []
+    others, ranks, marks = [], [], []
     for i, meaning in enumerate(sheet.meanings):
+        if meaning is not None and meaning.quantity.role == "mark":
+            marks.append((i, meaning))
         if meaning is None or meaning.quantity.role not in ("rss", "rank", "kpi", "cell"):
             continue
         name, role = _FIELDS.get(meaning.quantity.name), meaning.quantity.role
@@ -91,6 +95,12 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
             if name == "rsrp_dbm":
                 cell.ports = [i for i in second if _part(sheet, i) != "mean"]
             others += [i for i in second if i not in cell.ports and name not in _IDENTITY]  # read as KPIs
+    with_rsrp = {place for (_, place), cell in cells.items() if "rsrp_dbm" in cell.columns}
+    for cell in cells.values():
+        cell.marks = [i for i, mark in marks if mark.place == cell.place and mark.rat in ("", cell.rat)]
+        apart = cell.marks or ("pci" in cell.columns and cell.place != "serving")
+        if "rssi_dbm" in cell.columns and cell.place not in with_rsrp and apart:
+            cell.columns["rsrp_dbm"], cell.quantity = cell.columns.pop("rssi_dbm"), "RSSI"
     if sheet.find("neighbouring") is not None and (common := cells.get(("", "serving"))) is not None:
         of_row = {name: column for name, column in common.columns.items() if name in _IDENTITY}
         for cell in cells.values():  # one cell per row: the identity belongs to any level of the row
@@ -135,20 +145,22 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
             home.rat = home.rat or rat
             twice = [name for name in cell.columns if name in home.columns and name not in _IDENTITY]
             others += [cell.columns[name] for name in twice]
-            home.columns = {**cell.columns, **home.columns}
+            home.columns, home.marks = {**cell.columns, **home.columns}, home.marks or cell.marks
             del cells[(rat, role)]
     named, several = {cell.rat for cell in cells.values()} - {""}, len(cells) > 1
     for key, cell in list(cells.items()):
         if len(named) == 1 and not cell.serving:
             cell.rat = cell.rat or next(iter(named))
-        nameless = "pci" not in cell.columns and cell.place != "serving" and several
+        nameless = "pci" not in cell.columns and not cell.marks and cell.place != "serving" and several
         if "rsrp_dbm" not in cell.columns or nameless:
             others += cell.measured
             del cells[key]
     return list(cells.values())
 
 
-def _readings(sheet: _sheet.Sheet, cells: list[_Cell], more: list[str]) -> pd.DataFrame:
+def _readings(
+    sheet: _sheet.Sheet, cells: list[_Cell], more: list[str], known: dict[str, dict[str, Attribute]]
+) -> pd.DataFrame:
     technology = sheet.find("technology")
     of_row = np.array([] if technology is None else [_rat(text) for text in sheet.texts(technology)], dtype=object)
     idle, tables = _idle(sheet), []
@@ -161,12 +173,28 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell], more: list[str]) -> pd.Da
         rat = of_row if technology is not None and not cell.rat else cell.rat
         about = {
             "row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle,
-            "more": more if cell.place == "serving" else "",
+            "more": more if cell.place == "serving" else "", "mark": _identity.labels(sheet, cell.marks, known),
+            "column": "" if cell.place == "serving" and not cell.marks else cell.place.replace(" ", "_"),
         }  # fmt: skip
         # an absent leg or neighbour is not a reading
         tables.append(pd.DataFrame({**values, **about, "pci": pci})[np.isfinite(level) & ~np.asarray(none)])
     joined: pd.DataFrame = pd.concat(tables) if tables else pd.DataFrame(columns=list(_cells.Reading._fields))
-    return joined
+    return _marked(joined) if tables else joined
+
+
+def _marked(readings: pd.DataFrame) -> pd.DataFrame:
+    """Return readings whose ``more`` contains the identity other than a PCI, or the column of levels without any.
+
+    Next to a PCI, such an identity counts only if one PCI has two of them.
+    """
+    known, marks = readings["pci"].notna(), readings["mark"]
+    both = (known & marks.ne("")).to_numpy()
+    if not _identity.refining({0: marks.tolist()}, both, readings["pci"].astype(str).tolist()):
+        marks = marks.where(~known, "")
+    marks = marks.where(known | marks.ne(""), readings["column"])
+    more = ["_".join(filter(None, pair)) for pair in zip(readings["more"], marks, strict=True)]
+    marked: pd.DataFrame = readings.assign(more=more)
+    return marked
 
 
 # Share of the times with several cells that call themselves serving from which a table is a scan.
@@ -247,23 +275,24 @@ def of_radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     cells, others, ranks = _places(sheet)
     of_row = (sheet.find(name) for name in ("technology", "serving", "neighbouring"))
     sheet.used |= {*others, *ranks, *(i for i in of_row if i is not None)}
-    sheet.used |= {i for cell in cells for i in (*cell.columns.values(), *cell.ports)}
+    sheet.used |= {i for cell in cells for i in (*cell.columns.values(), *cell.ports, *cell.marks)}
     more, about = _identity.further(sheet, _identities(sheet, cells))
-    owned: dict[tuple[str, str], list[_Cell]] = {}
+    owned: dict[tuple[str, str, str], list[_Cell]] = {}
     for cell in cells:
         owner = cell.place if cell.place.startswith(_OWNERS) else ""
-        owned.setdefault((owner, ""), []).append(cell)
+        owned.setdefault((owner, "", cell.quantity), []).append(cell)
         for port in cell.ports:  # the same cell under another name
             of_port = {name: i for name, i in cell.columns.items() if name in _IDENTITY} | {"rsrp_dbm": port}
-            owned.setdefault((owner, _short(sheet, port)), []).append(replace(cell, columns=of_port))
-    several = len({owner for owner, _ in owned}) > 1
+            owned.setdefault((owner, _short(sheet, port), cell.quantity), []).append(replace(cell, columns=of_port))
+    several = len({owner for owner, *_ in owned}) > 1
     levels = [
         _renamed(stream, "_".join(word for word in (owner if several else "", port) if word))
-        for (owner, port), part in owned.items()
+        for (owner, port, quantity), part in owned.items()
         for stream in _cells.streams(
-            rows, _of_one_phone(_readings(sheet, part, more), rows.time), source="drive test", more=about
+            rows, _of_one_phone(_readings(sheet, part, more, about), rows.time), source="drive test", more=about,
+            quantity=quantity,
         )
-    ]
+    ]  # fmt: skip
     _name_others(rows, sheet, cells, others)
     columns = [*ranks, *others, *_event_columns(sheet, cells)]
     direct = [what.quantity.role for what in sheet.meanings if what is not None and not what.indirect]

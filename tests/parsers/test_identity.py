@@ -139,3 +139,53 @@ def test_an_identity_is_that_of_the_level_whose_other_words_it_shares(
         for stream in read(tmp_path / "x.csv", text).streams if stream.kind == "rss"
     }  # fmt: skip
     assert levels == {11: 30, 12: 30}
+
+
+def levels_by_cell(path: Path, names: str, rows: list[str]) -> list[list[float]]:
+    """Distinct levels of each series, in order."""
+    text = f"timestamp,{names}\n" + "".join(f"{1749564000 + i},{row}\n" for i, row in enumerate(rows))
+    return sorted(sorted(set(s.frame["rss_db"].dropna())) for s in read(path, text).streams if s.kind == "rss")
+
+
+@pytest.mark.parametrize(("first", "second", "quantity"), [
+    ("CID_1", "CID_2", "RSRP_{}"), ("eNB1", "eNB2", "RSRP{}"), ("BSSID 1", "BSSID 2", "RSSI {}"),
+    ("AP1", "AP2", "RSSI{}"), ("Top1 ECI", "Top2 ECI", "Top{} RSRP"), ("SSID_1", "SSID_2", "RSSI_{} (dBm)"),
+    ("Tower 1 ID", "Tower 2 ID", "Tower {} RSRP"), ("Beam 1", "Beam 2", "RSRP {}"), ("CID", "CID_2", "RSRP_{}"),
+])  # fmt: skip
+@pytest.mark.parametrize("cells", [("51200001", "51200514"), ("lab", "roof")])
+def test_an_identity_other_than_a_pci_belongs_to_its_level(
+    first: str, second: str, quantity: str, cells: tuple[str, str], tmp_path: Path
+) -> None:
+    names = f"{first},{quantity.format(1)},{second},{quantity.format(2)}"
+    names = names.replace("RSRP_1", "RSRP") if first == "CID" else names
+    a, b = cells
+    rows = [f"{a},-70,{b},-95" if i % 3 else f"{b},-94,{a},-71" for i in range(30)]
+    assert levels_by_cell(tmp_path / "x.csv", names, rows) == [[-95, -94], [-71, -70]]
+    rows = [f",-50,{b},-95" if i % 3 else f"{b},-94,,-52" for i in range(30)]  # neither is the same cell for sure
+    assert levels_by_cell(tmp_path / "x.csv", names, rows) == [[-95, -94], [-52], [-50]]
+
+
+@pytest.mark.parametrize(("names", "rows"), [
+    ("PCI_1,CID_1,RSRP_1,PCI_2,CID_2,RSRP_2", ("11,501,-70,11,502,-95", "11,502,-94,11,501,-71")),
+    ("eNB 1,Sector 1,RSRP 1,eNB 2,Sector 2,RSRP 2", ("31,1,-70,31,2,-95", "31,2,-94,31,1,-71")),
+    ("PCI A,RSSI A,PCI B,RSSI B", ("11,-70,12,-95", "12,-94,11,-71")),
+    ("serving_cid,serving_rsrp,neighbor_cid,neighbor_rsrp", ("501,-70,502,-95", "502,-94,501,-71")),
+    ("Source PCI,Source RSRP,Target PCI,Target RSRP", ("11,-70,12,-95", "12,-94,11,-71")),
+    ("Source PCI,RSRP,Target PCI,Target RSRP", ("11,-70,12,-95", "12,-94,11,-71")),
+    ("source_cid,source_rsrp,target_cid,target_rsrp", ("501,-70,502,-95", "502,-94,501,-71")),
+])  # fmt: skip
+def test_all_identities_of_a_level_count(names: str, rows: tuple[str, str], tmp_path: Path) -> None:
+    found = levels_by_cell(tmp_path / "x.csv", names, [rows[i % 3 == 0] for i in range(30)])
+    assert found == [[-95, -94], [-71, -70]]
+
+
+@pytest.mark.parametrize("name", ["Target RSRP", "model RSRP", "RSRP ref", "expected_rsrp"])
+def test_a_level_of_a_model_without_an_identity_is_not_a_level(name: str, tmp_path: Path) -> None:
+    assert levels_by_cell(tmp_path / "x.csv", f"PCI,RSRP,{name}", ["11,-70,-95"] * 30) == [[-70]]
+
+
+@pytest.mark.parametrize(
+    "name", ["Reference Signal Received Power (RSRP)", "Tower RSRP", "Antenna RSRP", "Payload RSRP"]
+)
+def test_words_of_gimbals_and_towers_do_not_hide_a_level(name: str, tmp_path: Path) -> None:
+    assert levels_by_cell(tmp_path / "x.csv", f"PCI,{name}", ["11,-70"] * 30) == [[-70]]

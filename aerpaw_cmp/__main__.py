@@ -27,16 +27,16 @@ from .common.interrupts import SIGNALLED
 INTERNAL_ERROR = 70
 OUTPUT_FAULT = 3
 BROKEN_PIPE = 141
-# Set by a shell that asks what may follow on the line.
+# A shell sets this variable to request completions of the command line.
 _COMPLETE = "_AERPAW_CMP_COMPLETE"
-# Typer's word for: do not look for a shell above this process (there may be none), it stands on the command line.
+# With this variable, Typer takes the shell from the command line instead of the parent process (there may be none).
 _SHELL_IS_NAMED = "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"
 ISSUES = "the project's issue tracker"
 # Threads of BLAS: the tool solves many small systems, on which several threads wait for each other (3.6 times the
-# processor time of the sample's report). What the user set stays.
+# processor time of the sample's report). Values that the user has set are not changed.
 BLAS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
-# Faults of a path itself, which pathlib's own questions such as ``is_dir`` raise.
+# Errors of invalid paths, which methods of pathlib such as ``is_dir`` raise.
 _UNUSABLE = (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENOTDIR, errno.EIO, errno.ESTALE)
 LONGEST_NAME = 120
 
@@ -82,7 +82,7 @@ def _unknown_command(name: str) -> str:
 
 
 def _quick_answer(arguments: list[str]) -> int | None:
-    """Answer what needs no library; None when the command line itself has to run."""
+    """Handle a command line that needs no library. Return None if the application has to run."""
     from .common.text import COMMANDS
 
     if _COMPLETE in os.environ:
@@ -116,7 +116,7 @@ def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
         step = next_step(error, arguments)
         return f"{text}{gap}Next: {step}" if step else text, error.exit_code
     if callable(wording := getattr(error, "format_message", None)):
-        # a wrong option or argument; known by its method, since typer may bring its own copy of click
+        # a wrong option or argument; recognised by its method, because typer may contain its own copy of click
         context = getattr(error, "ctx", None)
         command = context.command_path if context else "aerpaw-cmp"
         return f"{command}: {wording().rstrip('.')}; '{command} --help' tells the options", 2
@@ -146,7 +146,7 @@ def _is_homeless() -> bool:
 
 
 def _notes(error: BaseException | None) -> list[str]:
-    """Notes on what is kept, from the exception and those that it came of."""
+    """Return the notes about stored results of an exception and of its causes."""
     notes: list[str] = []
     while error is not None:
         notes += [note for note in getattr(error, "__notes__", ()) if note not in notes]
@@ -159,7 +159,7 @@ def _run(arguments: list[str]) -> int:
 
     code = cli.main(arguments)
     if code == SIGNALLED + signal.SIGINT:
-        interrupts.raise_interrupt()  # typer gives this code for what came as it read the words
+        interrupts.raise_interrupt()  # typer returns this code for an interrupt while it parsed the arguments
     return code
 
 
@@ -195,17 +195,17 @@ def main(arguments: list[str] | None = None) -> int:
             with interrupts.noted():
                 code = _run(arguments)
     except KeyboardInterrupt as interrupt:
-        exec("")  # CPython remembers an interrupt that left an exec(), and would end by the signal in place of 130
+        exec("")  # after an interrupt in exec(), CPython would end by the signal instead of with code 130
         code = _interrupted(interrupt)
     except Exception as error:
         code = _failed(error, debug, arguments)
     if own_process:
-        gc.freeze()  # memory goes back with the process; a last look at all objects takes 0.3 s
+        gc.freeze()  # the process ends and frees its memory: a last garbage collection would take 0.3 s
     return _code_of_output(code)
 
 
 def _interrupted(interrupt: KeyboardInterrupt) -> int:
-    """Tell what is kept; 128 and the number of the signal."""
+    """Report stored results. Return 128 plus the number of the signal."""
     from .common.errors import one_line
 
     by = interrupts.last()
@@ -214,7 +214,7 @@ def _interrupted(interrupt: KeyboardInterrupt) -> int:
 
 
 def _failed(error: Exception, debug: bool, arguments: list[str]) -> int:
-    if type(error).__name__ == "Abort":  # click's word for a Ctrl-C at a prompt
+    if type(error).__name__ == "Abort":  # click raises Abort for a Ctrl-C at a prompt
         return SIGNALLED + signal.SIGINT
     if debug:
         import traceback

@@ -113,7 +113,7 @@ def command(
 
 
 class Interrupted(BaseException):
-    """An interrupted command; ``error`` contains the message about stored results."""
+    """An interrupted command: ``error`` contains the message about stored results."""
 
     def __init__(self, error: KeyboardInterrupt) -> None:
         super().__init__(str(error))

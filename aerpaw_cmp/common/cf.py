@@ -216,7 +216,7 @@ class GrowingNetcdf:
     def _append(self, data: Any) -> None:
         if self._book is None:
             self._sink.write(netcdf_bytes(data, self._grows))
-            # h5py goes on where netCDF4 began: that library appends to no stream
+            # h5py goes on where netCDF4 began, because netCDF4 cannot append to a stream
             self._book = library("h5py").File(self._sink, "r+")
             for variable in self._book.values():
                 if "_FillValue" in variable.attrs and not np.isnan(variable.attrs["_FillValue"][0]):

@@ -31,19 +31,19 @@ def _feed(digest: Any, value: Any) -> None:
     if isinstance(value, np.ndarray) and value.dtype != object:
         digest.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
     elif dataclasses.is_dataclass(value):
-        # what a record leaves out of its comparison is made of the rest: equal records have one name
+        # fields excluded from comparison derive from the others, so equal records get the same digest
         _feed(digest, [getattr(value, item.name) for item in dataclasses.fields(value) if item.compare])
     elif isinstance(value, BaseGeometry):
         digest.update(value.wkb)
     elif isinstance(value, Mapping):
         _feed(digest, list(value.items()))
     elif isinstance(value, (list, tuple, np.ndarray)):
-        # with its length, so that [[1], 2] is not [[1, 2]]
+        # include the length, so that [[1], 2] and [[1, 2]] differ
         digest.update(f"[{len(value)}".encode())
         for item in value:
             _feed(digest, item)
     else:
-        # not str: the text '1' is another value than the number
+        # use repr, because the text '1' and the number 1 are different values
         digest.update(repr(value).encode() + b"\n")
 
 

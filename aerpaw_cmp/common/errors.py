@@ -223,7 +223,7 @@ def parsed(expected: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
     return decorate
 
 
-# Arguments of Python that have another name than the option of the command line.
+# Python arguments whose name differs from the command-line option.
 _IN_PYTHON = {"--with": "learned", "--force": "force=True"}
 
 
@@ -263,7 +263,7 @@ def from_python(public: _T) -> _T:
             refused = re.fullmatch(r"\w+\.__init__(\(\) got an unexpected keyword argument .*)", str(error))
             raise TypeError(function.__name__ + refused[1]) if refused else error from None
         except AttributeError as error:
-            # names that fit() makes end in an underscore: one that the object itself lacks says what to do
+            # names that fit() creates end in an underscore: report that fit() must be called first
             if error.obj is not (arguments or (None,))[0] or not (error.name or "").endswith("_"):
                 raise
             raise UsageError(f"{function.__qualname__} before fit()", expected="fit() first") from None
@@ -317,7 +317,7 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     words = [word for word in arguments[:2] if not word.startswith("-")]
     command = " ".join(["aerpaw-cmp", *words[: 2 if words[:1] in (["site"], ["antenna"]) else 1]])
     place = None if error.path is None else Path(error.path)
-    if place is not None and not _exists(place):  # as the flight file names it
+    if place is not None and not _exists(place):  # the name in the flight file
         candidates = (Path(word).parent / place for word in arguments if word.endswith(_SETTINGS))
         place = next(filter(_exists, candidates), place)
     if "there is no telemetry log" in error.found:

@@ -44,7 +44,7 @@ def inside(
     AerpawCmpError
         If the name is absolute, contains ``..`` or NUL, or a link on its path leaves the folder.
     """
-    parts = PureWindowsPath(name)  # both separators, drives, and all that POSIX knows
+    parts = PureWindowsPath(name)  # refuse both separators, drives, and absolute POSIX paths
     depth, place = len(parts.parts), folder.joinpath(*parts.parts)
     wrong = not depth or parts.anchor or ".." in parts.parts or "\0" in name or (plain and depth > 1)
     if wrong or not Path(os.path.realpath(place)).is_relative_to(os.path.realpath(folder)):
@@ -67,7 +67,7 @@ def cache_folder(*parts: str) -> Path:
     return folder.expanduser().joinpath(*parts)
 
 
-# Entries of the cache by their place: the name alone would fit a Git object, where the folder is one of the user's.
+# Match cache entries by their path: the name alone could also be a Git object in a user's folder.
 _ENTRY = re.compile(
     r"[0-9a-f]{64}\.npz|llvm/[0-9a-f]{24}|(outcomes|audits)/[0-9a-f]{64}\.(npz|json)"
     r"|compiled/kernels-[0-9a-f]{16}/[^\n]+\.(kernel|compiled)"
@@ -85,7 +85,7 @@ def clear_cache() -> tuple[int, int]:
             if _ENTRY.fullmatch(path.relative_to(folder).as_posix()) and not path.is_symlink():
                 size, files = size + path.stat().st_size, files + 1
                 path.unlink()
-                with contextlib.suppress(OSError):  # the last one takes its folder along
+                with contextlib.suppress(OSError):  # the last link also removes the folder
                     path.parent.rmdir()
     return files, size
 
@@ -124,7 +124,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
     OSError
         If the folder is missing, full or not writable.
     """
-    # a name has at most 255 bytes, and mkstemp adds its own
+    # a name has at most 255 bytes, and mkstemp adds some
     prefix = f".{target.name[:40]}."
     _clear_old_parts(target.parent, prefix)
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=prefix, suffix=".part")
@@ -132,7 +132,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
     part = Path(name)
     try:
         yield part
-        part.chmod(plain_mode())  # mkstemp makes files private; these are ordinary ones
+        part.chmod(plain_mode())  # mkstemp makes private files: set the usual permissions
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
@@ -171,7 +171,7 @@ def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
         size = os.fstat(file.fileno()).st_size
         chunks: list[bytes] = []
         total = 0
-        # counted too: pipes, devices and files of /proc say that they have 0 bytes
+        # counted too: pipes, devices and files of /proc report a size of 0 bytes
         while size <= most and total <= most and (chunk := file.read(_CHUNK)):
             chunks.append(chunk)
             total += len(chunk)
@@ -249,7 +249,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 def plain_mode() -> int:
     """Return the permissions of an ordinary new file."""
-    # the mask can be read by setting it alone
+    # the only way to read the mask is to set it
     mask = os.umask(0)
     os.umask(mask)
     return 0o666 & ~mask

@@ -28,7 +28,7 @@ def gaussian_kernel(first: FloatArray, second: FloatArray, length: float) -> Flo
     from scipy.spatial.distance import cdist
 
     kernel = np.asarray(cdist(first, second, "sqeuclidean"))
-    kernel /= -2.0 * length**2  # in place: a second and a third matrix of this size cost as much as the exponentials
+    kernel /= -2.0 * length**2  # in place: two more matrices of this size would take as long as the exponentials
     np.exp(kernel, out=kernel)
     return kernel
 
@@ -112,7 +112,7 @@ class Factor:
         """``C^-1``, at a third of what solving for the unit matrix takes."""
         from scipy.linalg.lapack import dpotri
 
-        # LAPACK fills one triangle and leaves what was in the other
+        # LAPACK fills one triangle and does not clear the other
         triangle = np.tril(dpotri(self.lower, lower=True)[0])
         return np.asarray(triangle + np.tril(triangle, -1).T)
 
@@ -147,7 +147,7 @@ def determining(
         at, known = int(remaining.argmax()), rows[: len(chosen)]
         rows[len(chosen)] = (kernel(points[at : at + 1], points)[0] - known[:, at] @ known) / math.sqrt(remaining[at])
         remaining = np.maximum(remaining - rows[len(chosen)] ** 2, 0.0)
-        # exactly: rounding would leave a rest, and the same point be taken twice
+        # exactly 0: after rounding errors, the same point could be selected again
         remaining[at] = 0.0
         chosen.append(at)
     return np.array(chosen, dtype=np.int64)

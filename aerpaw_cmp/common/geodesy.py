@@ -44,7 +44,7 @@ class SiteFrame:
         from pyproj import Proj
 
         projection = Proj(proj="aeqd", lat_0=self.latitude_deg, lon_0=self.longitude_deg, ellps="WGS84")
-        # made once: building it takes a hundred times as long as using it for a place
+        # created once: building it takes a hundred times as long as converting a position
         object.__setattr__(self, "_projection", projection)
 
     def to_local(self, latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -91,7 +91,7 @@ def elevation_rad(vectors: FloatArray) -> FloatArray:
 
 def unit_vectors(vectors: FloatArray) -> FloatArray:
     """Return vectors (n, 3) scaled to length one. Zero vectors stay zero."""
-    # 0 / 1e-300 is 0 and changes no real length; 0 / 0 would be NaN with a warning
+    # 0 / 1e-300 is 0 and does not change any real length; 0 / 0 would be NaN with a warning
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300))
 
 

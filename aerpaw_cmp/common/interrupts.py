@@ -30,16 +30,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     _Handler = Callable[[int, FrameType | None], Any] | int | signal.Handlers | None
 
-# What ends a command in order.
+# Signals that end a command after it has cleaned up.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# Plus the number of the signal: the exit code.
+# The exit code is this plus the number of the signal.
 SIGNALLED = 128
 
 # Undone when :func:`noted` ends: hidden places whose owner an interrupt did not let finish its first step.
 AT_END: list[Callable[[], None]] = []
 
-# How long compiled code may go on after a signal: half of the second within which a command should end.
+# Time that compiled code may continue after a signal: half of the second within which a command should end.
 PATIENCE_S = 0.5
 
 _signalled = False
@@ -84,7 +84,7 @@ def noted() -> Iterator[None]:
         return
     _last = signal.SIGINT
     previous = sys.unraisablehook
-    # Python shows a traceback of what it swallows: this one is not lost
+    # Python prints a traceback for exceptions that it ignores, but this interrupt is not lost
     sys.unraisablehook = lambda what: None if what.exc_type is KeyboardInterrupt else previous(what)
     try:
         with _watched():
@@ -128,7 +128,7 @@ def _clear() -> None:
 
 @contextmanager
 def _watched() -> Iterator[None]:
-    """Let a second thread look after signals that the first one does not hear."""
+    """Start a thread that handles signals while the main thread is in code that cannot."""
     read, write = os.pipe()
     # set_wakeup_fd refuses a descriptor that could block the handler
     os.set_blocking(write, False)
@@ -140,7 +140,7 @@ def _watched() -> Iterator[None]:
     finally:
         ended.set()
         signal.set_wakeup_fd(before)
-        # the other thread reads the end of the pipe, and goes
+        # the second thread ends when it reads the end of the pipe
         os.close(write)
 
 
@@ -193,7 +193,7 @@ class _Descriptor(io.FileIO):
                 return super().write(data)
             except OSError as error:
                 self.fault = error
-        # as if all were written: a caller that gets less writes again, for ever
+        # report all bytes as written: otherwise the caller would try again forever
         return memoryview(data).nbytes
 
 
@@ -206,10 +206,10 @@ def guard() -> None:
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         closed = _is_closed(number)
         if closed:
-            os.open(os.devnull, os.O_RDONLY)  # the lowest free number: this one
+            os.open(os.devnull, os.O_RDONLY)  # the lowest free descriptor is the one that was closed
         stream = getattr(sys, name)
         buffer = getattr(stream, "buffer", None)
-        raw = getattr(buffer, "raw", buffer)  # the same where PYTHONUNBUFFERED is set
+        raw = getattr(buffer, "raw", buffer)  # keep the buffering that PYTHONUNBUFFERED selects
         if number and (closed or stream is None or (type(raw) is io.FileIO and raw.fileno() == number)):
             encoding = getattr(stream, "encoding", None) or "utf-8"
             setattr(sys, name, _stream(number, encoding, buffered=buffer is None or buffer is not raw))
@@ -225,7 +225,7 @@ def _is_closed(number: int) -> bool:
 
 def _stream(number: int, encoding: str, *, buffered: bool) -> io.TextIOWrapper:
     raw = _Descriptor(number, "w", closefd=False)
-    # a name that the terminal cannot show is no reason to fail
+    # do not fail because the terminal cannot show a character
     return io.TextIOWrapper(
         io.BufferedWriter(raw) if buffered else raw,  # type: ignore[arg-type]
         encoding=encoding,

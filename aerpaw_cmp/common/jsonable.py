@@ -41,9 +41,9 @@ def json_safe(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return _listed(value)
     if isinstance(value, (list, tuple, set, frozenset)):
-        # a set of words has another order in each process
+        # the order of a set of strings differs between processes
         return [json_safe(item) for item in (sorted(value) if isinstance(value, (set, frozenset)) else value)]
-    # before the integers: True is one of them
+    # test this before integers, because bool is a subclass of int
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     if isinstance(value, (int, np.integer)):

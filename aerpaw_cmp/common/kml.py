@@ -12,7 +12,7 @@ import io
 import re
 import zipfile
 from collections.abc import Iterator, Mapping
-from html import escape  # that of xml.sax would load OpenSSL
+from html import escape  # the escape function of xml.sax would load OpenSSL
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.parsers import expat
@@ -35,7 +35,7 @@ def xml_root(data: bytes, path: Path | None, expected: str) -> ElementTree.Eleme
     if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
         raise InputError("the XML declares entities, or is not UTF-8", expected=expected, path=path)
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()  # a KML with gx:Track and no xmlns:gx is common
-    # one piece of text for an element: expat hands it on line by line else
+    # one piece of text for an element: otherwise expat returns it line by line
     parser.buffer_text = True
     parser.StartElementHandler = builder.start
     parser.EndElementHandler, parser.CharacterDataHandler = builder.end, builder.data
@@ -131,7 +131,7 @@ def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
     return [part for place in places for part in ([place] if len(place) <= 3 else _in_threes(place))]
 
 
-# Longitudes and latitudes of one area differ by less [deg]; a longitude and a latitude in the same place do not.
+# Longitudes and latitudes of one area differ by less [deg]; a longitude and a latitude differ by more.
 _AREA_DEG = 5.0
 
 
@@ -255,7 +255,7 @@ def write_archive(path: Path, title: str, description: str, body: str, pictures:
     )
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in {"doc.kml": document.encode(), **pictures}.items():
-            # named here: writestr by name would stamp the hour
+            # create the entry here, because writestr would add the current time
             entry = zipfile.ZipInfo(name, _DATE)
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, content)
@@ -297,7 +297,7 @@ class _Sheet:
         import matplotlib
         from PIL import Image, ImageDraw, ImageFont
 
-        # a little transparent: the ground shows through
+        # partly transparent, so that the ground is visible
         self.picture = Image.new("RGBA", (round(width * _DPI), round(height * _DPI)), (255, 255, 255, 230))
         self.pen = ImageDraw.Draw(self.picture)
         self._font = ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", 12)

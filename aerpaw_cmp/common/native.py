@@ -80,7 +80,7 @@ def _in_child(kind: str, data: bytes) -> tuple[int, bytes, bytes]:
     return child.returncode, child.stdout, child.stderr
 
 
-# All that the child sees of the environment: no HDF5_PLUGIN_PATH, no GDAL_DRIVER_PATH; threads cost memory limits.
+# The environment variables of the child process: no HDF5_PLUGIN_PATH, no GDAL_DRIVER_PATH; threads cost memory limits.
 _ENVIRON = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
 
 
@@ -95,7 +95,7 @@ def _unpacked(content: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
 
 def main(kind: str) -> None:
     """Read a file from standard input and write its arrays to standard output."""
-    # first: after the rights have gone, no library could be loaded
+    # load libraries first: without the rights they could not be loaded
     reader = READERS[kind]()
     data = sys.stdin.buffer.read()
     give_up_rights()
@@ -116,7 +116,7 @@ def answer(reader: Read, data: bytes) -> tuple[int, bytes, bytes]:
         return 1, b"", f"{type(error).__name__}: {one_line(str(error))}".encode()
     head = json.dumps({"names": list(arrays), "notes": notes}).encode()
     out = io.BytesIO()
-    # by position: as keywords, names such as 'file' and 'allow_pickle' would be savez's own
+    # pass names in a dictionary: 'file' and 'allow_pickle' are keywords of savez
     np.savez(out, np.frombuffer(head, dtype=np.uint8), *arrays.values())
     return 0, out.getvalue(), b""
 
@@ -177,7 +177,7 @@ def _hdf5(depth: int, netcdf: bool = False) -> Read:
         for name, value in (("version", 1), ("text", "a"), ("MATLAB_class", np.bytes_(b"double"))):
             book["x"].attrs[name] = book.attrs[name] = value
         book.flush()
-        read(book.id.get_file_image())  # loads what h5py and NumPy load late: later they cannot
+        read(book.id.get_file_image())  # import what h5py and NumPy import late, because files cannot be opened later
     # loads zipfile, which answer() needs when nothing can be opened any more
     np.savez(io.BytesIO(), np.zeros(1))
     return read
@@ -232,7 +232,7 @@ class _Items:
                 raise InputError(f"the file has more than {_MOST_ITEMS} items", expected="a log", cause="no log")
             address = h5py.h5o.get_info(item.id).addr
             if address in self._seen:
-                continue  # a second name, or a circle
+                continue  # the file is linked twice, or contains itself
             self._seen.add(address)
             if isinstance(item, h5py.Group) and depth > 1:
                 self._walk(item, f"{place}/", depth - 1)
@@ -261,7 +261,7 @@ def _geotiff() -> Read:
     import rasterio
     from rasterio.io import MemoryFile
 
-    warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # the caller's message says it
+    warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # the caller reports the cause
 
     def read(data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
         # by its driver: GDAL takes a text that begins with <VRTDataset> for a list of other files
@@ -280,7 +280,7 @@ def _geotiff() -> Read:
     with MemoryFile() as file:
         with file.open(driver="GTiff", width=2, height=2, count=1, dtype="float32", crs="EPSG:32617") as image:
             image.write(np.ones((1, 2, 2), dtype=np.float32))
-        read(file.read())  # opens the data base of coordinate systems, and loads what is loaded late
+        read(file.read())  # open the database of coordinate systems and load all late imports
     return read
 
 

@@ -198,7 +198,7 @@ class OutputFile:
         return self
 
     def _refuse(self) -> None:
-        """UsageError unless the target may be written."""
+        """Raise UsageError if the target must not be written."""
         if not _taken(self.target):
             return
         if not self.target.is_file():
@@ -228,7 +228,7 @@ class OutputFile:
         place = self._place
         assert place is not None, "used as a context"
         with explained_os_errors(self.named):
-            # a copy: closing the stream would close what holds the lock
+            # use a copy, because closing the stream would release the lock
             with os.fdopen(os.dup(place.descriptor), "r+b") as stream:
                 if callable(content):
                     content(stream)
@@ -237,7 +237,7 @@ class OutputFile:
                 stream.flush()
                 os.fchmod(stream.fileno(), plain_mode())
                 os.fsync(stream.fileno())
-            self._refuse()  # what came there meanwhile is not replaced either
+            self._refuse()  # do not replace a file that was created meanwhile
             place.refuse_gone()
             raise_interrupt()
             with held():
@@ -308,7 +308,7 @@ class OutputFolder:
         self.named, self.target = Path(target), _real(Path(target))
         self._job, self._inputs, self._force = job, tuple(inputs), force
         self._place: _Place | None = None
-        self._made: list[Path] = []  # parents made for this run, removed again where it fails
+        self._made: list[Path] = []  # parent folders created for this run are removed if the run fails
         self._written = False
 
     def __enter__(self) -> OutputFolder:
@@ -321,7 +321,7 @@ class OutputFolder:
                 self._refuse_content()
                 (self._place.part / _UNFINISHED).touch()
             except BaseException:
-                # Python calls it for a block that was entered alone
+                # Python calls this only if the block was entered
                 self.__exit__(None, None, None)
                 raise
         return self
@@ -406,7 +406,7 @@ class OutputFolder:
         head = f"{_SUMS_HEAD} the files of one run of '{self._job}'; 'sha256sum -c {SUMS}' checks them\n"
         (place.part / SUMS).write_text(head + sums, encoding="utf-8")
         _sync_tree(place.part)
-        self._refuse_content()  # what came there meanwhile
+        self._refuse_content()  # a file that was created meanwhile
         replaced = self.target.is_dir()
         for folder in (place.part, *(entry for entry in place.part.rglob("*") if entry.is_dir())):
             before = self.target / folder.relative_to(place.part)
@@ -421,7 +421,7 @@ class OutputFolder:
             place.part.rename(self.target)
         _sync_folder(self.target.parent)
         if replaced:
-            with contextlib.suppress(OSError):  # the results stand; the next run tries again
+            with contextlib.suppress(OSError):  # the results are complete, and the next run tries again
                 _clear(place.part)
 
 
@@ -497,7 +497,7 @@ class _Place:
         self._further: list[int] = []
         self._left = False
         with explained_os_errors(named):
-            with held():  # an interrupt finds the place either registered in AT_END or not created
+            with held():  # interrupts wait, so that a created file is always registered in AT_END
                 self.descriptor = self._claim(folder)
                 AT_END.append(self.leave)
             try:
@@ -582,7 +582,8 @@ class _Place:
         if self.leave in AT_END:
             AT_END.remove(self.leave)
         descriptors = (self.descriptor, *self._further)
-        if any(self._is_there(descriptor) for descriptor in descriptors):  # else another run's place, or none
+        # otherwise the folder belongs to another run or does not exist
+        if any(self._is_there(descriptor) for descriptor in descriptors):
             with contextlib.suppress(OSError):
                 _clear(self.part) if self.part.is_dir() else self.part.unlink()
         for descriptor in descriptors:
@@ -679,7 +680,7 @@ def _names_swapped(first: Path, second: Path) -> bool:
 
 
 def _sync_tree(folder: Path) -> None:
-    # deepest first: a name is on the disk after what it names
+    # deepest first: sync the content of a folder before the folder
     for parent, _, names in os.walk(folder, topdown=False):
         for name in names:
             if not Path(parent, name).is_symlink():
@@ -754,7 +755,7 @@ class Sink:
         if self._failure is None:
             try:
                 return action(*given)
-            # an interrupt, too: HDF5 would be left in the middle of a write
+            # also catch interrupts: they could stop HDF5 in the middle of a write
             except BaseException as failure:
                 self._failure = failure
         return instead

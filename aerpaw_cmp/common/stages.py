@@ -26,7 +26,7 @@ class Progress(Protocol):
     def __call__(self, text: str, fraction: float | None = None, /) -> object: ...  # noqa: D102
 
 
-# a package prints nothing of its own accord: who wants its log gives this logger a handler, or calls basicConfig
+# a library does not print its log by default: add a handler to this logger or call basicConfig
 logging.getLogger("aerpaw_cmp").addHandler(logging.NullHandler())
 
 
@@ -191,5 +191,5 @@ def give_memory_back() -> None:
 def _library() -> ctypes.CDLL | None:
     try:
         return ctypes.CDLL(None)
-    except (OSError, TypeError):  # no such thing as the running program's own symbols there
+    except (OSError, TypeError):  # not possible there: the symbols of the running program are not available
         return None

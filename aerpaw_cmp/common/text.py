@@ -55,11 +55,12 @@ def counted(number: int, noun: str, plural: str = "") -> str:
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 
 
-# also behind a semicolon: where that parts cells, what follows begins a cell
-# and an apostrophe of the log itself: unguarded() would take it for one of ours
+# also behind a semicolon: where it separates cells, the next character begins a cell, and unguarded() would remove an
+# apostrophe of the log
 _BEGINNING = re.compile(r"(^|;)(?=[=+\-@\t\r'])")
 _GUARDED = re.compile(r"(^|;)'")
-# within a comment a separator begins a cell, too; numbers stay as they are, since some comments hold tables of them
+# within a comment a separator begins a cell, too; numbers stay as they are, because some comments contain tables of
+# numbers
 _IN_COMMENT = re.compile(r"([,;\t]\s*)(?=[=@]|[+\-](?![\d.]|inf|nan))")
 
 
@@ -76,7 +77,7 @@ def guarded(table: Any) -> Any:
             if words:
                 texts = table[name].astype(object)
                 guarded_columns[name] = texts.replace({word: guarded_text(word) for word in words})
-    # the table of the caller stays as it is: numbers are read from it afterwards
+    # copy, because the caller reads numbers from its table afterwards
     return table.assign(**guarded_columns) if guarded_columns else table
 
 

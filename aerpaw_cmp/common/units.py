@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# SciPy takes every name of NumPy, and the reader of Fortran among them loads for 0.08 s.
+# SciPy imports every name of NumPy, including f2py, which takes 0.08 s.
 if "f2py" in np.__all__:
     np.__all__.remove("f2py")
 
@@ -31,7 +31,7 @@ MINIMUM_HEIGHT_M = 0.5
 
 
 # Thermal noise at 290 K [dBm in 1 Hz]: -173.98 (Boltzmann's constant: SI, exact).
-# Radio carriers [Hz] that a setting can mean: a smaller number is in megahertz or gigahertz, a larger one twice so.
+# Radio carriers [Hz] that a setting can mean: a smaller number is in MHz or GHz; a larger number was converted twice.
 LOWEST_CARRIER_HZ, HIGHEST_CARRIER_HZ = 1e6, 1e12
 
 THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0

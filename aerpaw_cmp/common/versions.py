@@ -39,17 +39,17 @@ def commit() -> str:
     if not (package.parent / ".git").exists():
         return ""
     release = f"v{__version__}"
-    # --long counts the commits behind a tag also where there are none, so that the answer has one form
+    # --long always adds the number of commits after the tag, so that the output has one form
     ask = ["git", "-C", str(package.parent), "describe", "--tags", "--always", "--long", "--abbrev=7"]
     try:
-        # no shell: the path of a checkout may hold blanks and quotes
+        # no shell: the path of a checkout may contain blanks and quotes
         told = subprocess.run(
             [*ask, "--dirty=.dirty", "--match", release], capture_output=True, text=True, check=True, timeout=10
         )
     except (OSError, subprocess.SubprocessError):
         return UNKNOWN
     answer = told.stdout.strip()
-    # a release is its tag, clean: nothing behind it and no ".dirty"
+    # a release is a clean checkout of its tag: no later commits and no ".dirty"
     return "" if answer.startswith(f"{release}-0-g") and "." not in answer[len(release) :] else answer.split("-g")[-1]
 
 

@@ -65,8 +65,8 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 class StrictModel(pydantic.BaseModel):
     """The base class of all settings: no unknown keys, only finite numbers, and no change after loading."""
 
-    # neither NaN nor infinity: comparisons do not refuse NaN, and JSON contains neither. Deferred: a validator of a
-    # part is built with that of the whole, once, and never if it is not used.
+    # neither NaN nor infinity: comparisons do not refuse NaN, and JSON contains neither. Deferred: the validators of
+    # all parts are built together on first use.
     model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True
     )
@@ -82,7 +82,7 @@ def nearest(name: object, choices: Iterable[str]) -> str | None:
     >>> nearest("zzz", ["flight"]) is None
     True
     """
-    # a wrong case is the commonest slip
+    # wrong case is the most common mistake
     by_lower = {choice.lower(): choice for choice in choices}
     matches = difflib.get_close_matches(str(name).lower(), by_lower, n=1, cutoff=0.5)
     return by_lower[matches[0]] if matches else None
@@ -96,7 +96,7 @@ def nearest_zone(name: str) -> str | None:
     >>> nearest_zone("America/NewYork"), nearest_zone("new york"), nearest_zone("EDT")
     ('America/New_York', 'America/New_York', None)
     """
-    zones = available_timezones() if len(name) > 4 else ()  # abbreviations are like too many
+    zones = available_timezones() if len(name) > 4 else ()  # abbreviations are similar to too many names
     if "/" in name:
         return nearest(name, zones)
     cities = {zone.rpartition("/")[2]: zone for zone in sorted(zones)}
@@ -155,7 +155,7 @@ def _dumper() -> Any:
         """Quotes what our reader would not take for a word."""
 
         def ignore_aliases(self, _: Any) -> bool:
-            return True  # equal lists are written out: '&id001' helps no reader
+            return True  # equal lists are written out: '&id001' does not help a reader
 
     def word(dumper: Any, text: str) -> Any:
         quoted = not isinstance(_plain_value(text), str)
@@ -232,7 +232,7 @@ def _parse(text: str, path: str | Path | None) -> _Document:
         mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         cause = "tabs cannot indent in YAML; use blanks" if _tab_indents(text, mark) else None
-        # PyYAML's word for control characters
+        # PyYAML's term for control characters
         if "unacceptable" in problem:
             cause = "a log, or another binary file, in place of the settings"
         raise UsageError(
@@ -395,7 +395,7 @@ def _explain(
     return UsageError(f"{len(findings)} problems\n  " + "\n  ".join(shown), path=path)
 
 
-# Kinds of settings files by keys that only they have all of; a campaign may say how its flights share a calibration.
+# Kinds of settings files and the keys that identify them. A campaign may also specify a shared calibration.
 _SIGNS = {
     "campaign, which 'aerpaw-cmp campaign FILE' reads": {"campaign"},
     "calibration, which 'aerpaw-cmp calibrate FILE' reads": {"calibration", "flights"},
@@ -408,7 +408,7 @@ def _kind(keys: Iterable[str]) -> str | None:
     return next((kind for kind, signs in _SIGNS.items() if signs.issubset(keys)), None)
 
 
-# Parts of a location that say which member of a union was tried; no key of ours has such a name.
+# Parts of a location that say which member of a union was tried. No key of this package has such a name.
 _MEMBER = re.compile(r"literal\[.*\]|float|int|str|bool")
 
 # What is expected, by pydantic's name of the error.
@@ -515,7 +515,7 @@ def edited(text: str, changes: Mapping[KeyPath, Any]) -> str:
             wanted = _put(wanted, path, value)
             new = _edited(new, path, value)
         alone = yaml.safe_load(new) == wanted
-    except yaml.YAMLError:  # an anchor went, its alias stayed
+    except yaml.YAMLError:  # an anchor was removed, but its alias remains
         alone = False
     if not alone:
         keys = ", ".join(".".join(path) for path in changes)
@@ -552,7 +552,7 @@ def _edited(text: str, path: KeyPath, value: Any) -> str:
 
 def _flow(value: Any) -> str:
     """A value on one line."""
-    # a width that nothing reaches: a broken line would need the indent of its place; a bare word ends in "..." there
+    # a width that no line reaches, because wrapped lines would need an indent. PyYAML ends a plain scalar with "..."
     line: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6)
     return line.removesuffix("\n").removesuffix("\n...")
 
@@ -599,7 +599,7 @@ def named_files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str,
     """Dotted key, text and place of every value that names a file."""
     for key, text in _texts(content, ""):
         for root in roots:
-            # most texts name nothing: a Path is made of those that do
+            # most names do not exist, and creating a Path is slow
             if os.path.isfile(os.path.join(root, text)):  # noqa: PTH113, PTH118  never raises
                 yield key, text, root / text
                 break

@@ -734,7 +734,7 @@ class Correction:
     ----------
     base : str
     predictor : callable
-        Prediction of the base, learned from all flights.
+        Prediction of the model ``base``, learned from all flights.
     title : str
         Title of the residual field, or :data:`OFF`.
     model : FieldModel

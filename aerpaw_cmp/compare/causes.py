@@ -513,7 +513,7 @@ def _without(e: LevelEvidence, first: _Model) -> LevelEvidence:
 
 
 def _share_of_error(shown: Sequence[_Models], before: Set[str], after: Set[str]) -> float:
-    """Return the RMSE with further faults as a share of the RMSE before."""
+    """Return the ratio of the RMSE with the faults ``after`` to the RMSE with the faults ``before``."""
     rmse, known = (_rmse_db([_best(table, faults) for table in shown]) for faults in (after, before))
     return rmse / known if known else 1.0
 
@@ -1047,7 +1047,7 @@ def _flat(e: LevelEvidence) -> Iterator[Trial]:
         )  # fmt: skip
 
 
-# The middle 80 % of a flat level span less than this share of the span of the predicted levels, as for the clock.
+# A level is flat if its central 80 % span less than this share of that of the predicted levels.
 _FLAT = 0.2
 
 
@@ -1168,7 +1168,7 @@ _LIMITS = {
 
 
 def _shift(residual: FloatArray, masks: FloatArray, phi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the shift by each mask (m, n), its standard error, and the gain of log likelihood, with a free offset."""
+    """Return the level shift in each mask (m, n), its standard error and the gain in log likelihood."""
     # remove what the previous sample predicts, so that slow fading is not taken for a shift
     y = residual[1:] - phi * residual[:-1]
     x = masks[:, 1:] - phi * masks[:, :-1]

@@ -50,7 +50,7 @@ _SLOW_SHARE = (0.0, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
 # A factor of three is one standard deviation.
 _FADES_S, _FADES_FACTOR = 7.0, math.log(3.0)
 START = Memories(4, 2, 3)
-# The search for the likeliest parameters starts in the middle and at noise without memory.
+# The search for the likeliest parameters starts at the middle of the grid and at white noise.
 _STARTS = (START, Memories(0, 0, 0))
 
 

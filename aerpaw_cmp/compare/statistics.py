@@ -786,7 +786,7 @@ def influence_interval(
 
 
 def spread_interval(values: FloatArray, place_m: FloatArray | None = None) -> Interval:
-    """Return the 95 % interval of the average standard deviation of sequences such as this one (n,) in time order.
+    """Return the 95 % interval of the standard deviation of a correlated sequence (n,) in time order.
 
     The upper end of an interval wider than :data:`_BOUND` times the value is infinite: it is a lower bound. Positions
     ``place_m`` (n, 3) [m] are used as by :func:`mean_draws`.
@@ -1095,7 +1095,7 @@ class Visit:
 
 
 def same_places(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> tuple[IntArray, IntArray]:
-    """Return indices into both passes: samples with a value, and the nearest ones of the other pass in a radius [m]."""
+    """Pair each sample of one pass with the nearest sample of the other within a radius [m]. Return both indices."""
     return first.places.partners(second.places, radius_m, _HEADING_WITHIN_DEG)
 
 

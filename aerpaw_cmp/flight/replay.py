@@ -217,7 +217,7 @@ def estimate_clocks(data: FlightData, progress: Progress = logged) -> list[Clock
 
 
 def same_computer(data: FlightData) -> list[list[int]]:
-    """Return the indices of RSS series in groups with one computer: series of one tower and of one file."""
+    """Return the indices of RSS series, grouped by the computer that logged them: series share a tower or a file."""
     groups: list[tuple[set[tuple[str, str]], list[int]]] = []
     for index, series in enumerate(data.rss):
         keys = {("file", str(data.settings.logs[log].path)) for log in np.unique(series.log)}

@@ -213,7 +213,7 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
     ports = {len(link.uav_array), len(link.tower_arrays[series.tower])}
     if series.tower in data.nodes:
         raise UsageError(
-            f"rank of {series.tower} in {data.settings.flight.name}, which moves",
+            f"rank of {series.tower} in {data.settings.flight.name}, a mobile node",
             expected="a fixed tower: geometries of the modem are fitted as seen from one position",
         )
     if ports != {4}:

@@ -230,7 +230,7 @@ def digest_of(task: Task) -> str:
 
 
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:
-    """Return an outcome under the names of this campaign, with series of samples for the first setting only.
+    """Return a stored outcome with the flight and setting names of ``task``. Only the first setting keeps its samples.
 
     Rows of the remaining settings contain only numbers, so that 4000 tasks need no more memory than their flights.
     """

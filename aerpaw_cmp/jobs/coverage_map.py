@@ -897,7 +897,7 @@ def _about_maps(site: Site) -> dict[str, str]:
     about = file_attributes(
         title=site.name,
         source="ray tracing",
-        comment="A missing level has no path. A rank of 0 is a code: no path.",
+        comment="A missing level or a rank of 0 means that there is no path.",
     )
     return about | ({"acknowledgement": site.credit} if site.credit else {})
 

@@ -113,7 +113,7 @@ def run_explain(
     series = _series(data, tower, channel)
     at, seconds = _sample(series, time, settings.timezone)
     link, pose, notes, instant = _pose(data, series, at, progress)
-    if tower in data.nodes:  # at its position at that time
+    if tower in data.nodes:  # a mobile node: use its position at that time
         place, known = data.tower_at(tower, instant)
         _check_pose(known, series, at)
         data = dataclasses.replace(data, site=site_with_tower_at(data.site, tower, place[0]))

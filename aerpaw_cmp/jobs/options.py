@@ -32,7 +32,7 @@ class RunOptions:
     progress : Progress
         Receives stages and the share done.
     dry : bool
-        Only check: the job ends by :class:`~aerpaw_cmp.common.stages.NotRun` before the computation.
+        Only check the inputs: the job raises :class:`~aerpaw_cmp.common.stages.NotRun` before the computation.
     """
 
     out: Path | None = None

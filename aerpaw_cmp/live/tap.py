@@ -664,7 +664,8 @@ class Tap:
     # telling ----------------------------------------------------------------------------------------------
 
     def _say_once(self, text: str) -> None:
-        if text not in self._said and len(self._said) < 100:  # texts of others may differ every time
+        # limited, because messages of other programs may differ every time
+        if text not in self._said and len(self._said) < 100:
             self._said.add(text)
             self._say(text)
 

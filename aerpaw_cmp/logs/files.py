@@ -416,6 +416,6 @@ class Column:
         self._count = end
 
     def array(self) -> AnyArray:
-        """Return the column, which is complete then."""
+        """Return the column. Call this when all pieces have been added."""
         self._values.resize(self._count, refcheck=False)
         return self._values

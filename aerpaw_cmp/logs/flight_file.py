@@ -209,7 +209,7 @@ def _codes(part: AnyArray, number: dict[str | None, int]) -> AnyArray:
 
     cells = part.tolist()
     code = {}
-    for cell in dict.fromkeys(cells):  # few of a column differ
+    for cell in dict.fromkeys(cells):  # a column has few different values
         text = None if pd.isna(cell) else str(cell)
         code[cell] = number.setdefault(text, len(number) - 1)
     return np.fromiter(map(code.__getitem__, cells), np.int32, len(cells))

@@ -502,7 +502,7 @@ BOM = rb"(?:\xef\xbb\xbf)?"
 def reader(
     name: str, title: str, *, kinds: tuple[Kind, ...], sample: str, row: Pattern | Callable[[bytes], Pattern],
     streams: Callable[[Rows], Iterable[Stream | None]], header: Pattern | None = None, mark: Pattern | None = None,
-    torn: Pattern | None = None, otherwise: str = "of another form than the format's rows (torn line?)",
+    torn: Pattern | None = None, otherwise: str = "does not have the form of the format's rows (truncated line?)",
     fields: int = 0, clock: str = "wall", skip: Callable[[bytes, IntArray], BoolArray] | None = None,
 ) -> Reader:  # fmt: skip
     r"""Return a reader of lines that a pattern describes.

@@ -258,9 +258,9 @@ class Layer:
     values : (n,)
         In index order; NaN (classes: 0) is out of coverage.
     unit : str
-        Such as ``"dBm"``; ``"1"`` for classes and ratios.
+        Unit, for example ``"dBm"``; ``"1"`` for classes and ratios.
     quantity : str
-        Such as ``"RSS MIMO"``.
+        Name of the quantity, for example ``"RSS MIMO"``.
     classes : tuple of str
         Names of the values 0, 1, ... of a layer of classes.
     height_m : float

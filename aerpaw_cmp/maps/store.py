@@ -222,7 +222,7 @@ def _apart(tower: Tower, box_m: FloatArray) -> FloatArray:
     return np.maximum(np.maximum(box_m[0, :2] - at, at - box_m[1, :2]), 0.0)
 
 
-# Files of a tile store; of another run's, too, which a finished run removes.
+# Names of tile files, also those of other runs: a finished run removes them.
 _TILE_FILE = re.compile(r"tile-[0-9a-f]{16}-\d+|\.tile-[0-9a-f]{16}-\d+\.\w+\.part")
 
 

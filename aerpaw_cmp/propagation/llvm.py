@@ -59,7 +59,8 @@ _FOLDERS = (
 _NAME = re.compile(r"libLLVM(?:-(?P<dash>\d+(?:\.\d+)*))?\.(?:so|dylib)(?:\.(?P<dot>\d+(?:\.\d+)*))?")
 
 # One triangle of ground, one link: the direct and the reflected path of known length, by the kinds of instructions that
-# Sionna's solver compiles to. With LLVM 15 on AVX-512 it aborts as the solver does; loading Sionna would take 2 s.
+# Sionna's solver compiles to. With LLVM 15 on AVX-512 this program aborts like Sionna's solver, but Sionna takes 2 s to
+# load.
 TRIAL_PROGRAM = """
 import json, math, sys
 try:

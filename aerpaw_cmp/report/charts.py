@@ -220,7 +220,7 @@ def _forecast(data: ReportData, panel: RankResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# Cells with a row of their own. The others are added up.
+# The cells with most samples get a row each. The remaining cells share one row.
 MOST_CELLS = 16
 OTHER = "others"
 

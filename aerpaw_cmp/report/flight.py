@@ -581,7 +581,7 @@ def page(data: ReportData, files: Sequence[str]) -> str:
     linked = payload(data, charts) if data.rss or data.rank else None
     made = f"Made {minute(data.generated)} · site {data.site.name}"
     if data.engine:
-        replayed = f"{number(data.engine.links, 0)} positions x channels replayed in {duration(data.engine.seconds)}"
+        replayed = f"{number(data.engine.links, 0)} links replayed in {duration(data.engine.seconds)}"
         made += f" · {replayed}"
     settings = [data.settings, {"engine": data.engine.settings} if data.engine else {}]
     return Page(

@@ -124,7 +124,7 @@ def streams(
 def _serving(table: pd.DataFrame) -> FloatArray:
     """Return 1 for readings of the serving cell, 0 if another cell serves, NaN if unknown."""
     row, rats, serving = (table[name].to_numpy() for name in ("row", "rat", "serving"))
-    # NaN equals nothing: cells without a carrier are compared as -1
+    # NaN is not equal to NaN: replace missing carriers by -1
     cell = np.stack([table["pci"], table["arfcn"].fillna(-1.0), pd.factorize(table["more"])[0]])
     served = np.full(len(table), np.nan)
     for rat in np.unique(rats[serving.astype(bool)]).tolist():

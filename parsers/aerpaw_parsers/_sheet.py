@@ -727,7 +727,7 @@ def _to_utc(timed: _rows.Rows, sheet: Sheet, column: int | None) -> None:
     if scale is None or timed.relative or any("leap seconds" in text for text in timed.warnings):
         return
     timed.time = timed.time - np.timedelta64(_stamps.SCALES_S[scale], "s")
-    timed.warnings.append(f"the times are {scale.upper()}: {_stamps.SCALES_S[scale]} s were taken off for UTC")
+    timed.warnings.append(f"the times are {scale.upper()}: {_stamps.SCALES_S[scale]} s were subtracted to get UTC")
 
 
 def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None:

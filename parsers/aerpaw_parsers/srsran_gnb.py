@@ -92,7 +92,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     if options.clock is None:
         options = replace(options, clock="utc")
     clock, time, warnings = _stamps.read(texts, options)
-    # an object without UEs is sound: no torn line
+    # an object without UEs is valid and not a truncated line
     mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host: no record is made of them
     rows = _rows.built(
         lines, row[with_ue], {"time": time}, options, reader="srsran_json", reason=_json.bracket, clock=clock,

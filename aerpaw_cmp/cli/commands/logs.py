@@ -52,7 +52,7 @@ def ingest(
         raise UsageError("--site without --draft", expected="--draft FILE, for which the site is used")
     options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
     if columns:
-        # options outweigh a mapping, such as one with the number of rank 1
+        # options have precedence over a mapping, for example one that contains the number of rank 1
         options = run.mapping(columns) | {key: value for key, value in options.items() if value is not None}
         reader = reader or "generic_csv"
     try:

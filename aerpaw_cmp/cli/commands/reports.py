@@ -58,7 +58,7 @@ def _print_explanation(explanation: Any) -> None:
     heads = ["path", "m", "ns", "departure az / el deg", "arrival az / el deg", "dBm", "phase deg"]
     if rows:
         table(heads, rows, f"{counted(len(rows), 'path')} by engine {explanation.engine}")
-        # the deepest path has all terms, in the order in which they are met
+        # the path with most interactions lists all terms in order
         deepest_first = sorted(explanation.paths, key=lambda path: -path.depth)
         names = list(dict.fromkeys(name for path in deepest_first for name in path.terms_db))
         power = f"{explanation.transmit_power_dbm:+.2f}"
@@ -107,7 +107,7 @@ def diff(
     return 1 if strict and comparison.differences else 0
 
 
-# Changes of one kind that are printed.
+# Largest number of changes of one kind that are printed.
 _SHOWN = 20
 
 

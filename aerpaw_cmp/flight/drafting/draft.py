@@ -108,7 +108,7 @@ def _loss(data: FlightData, time: Times, counts: tuple[int, int, int]) -> str:
     """Return the reason why less than half of the values of a series are compared. Empty if more are compared."""
     valued, placed, high = counts
     if not valued:
-        return "no sample holds a value (out of coverage, or no report)"
+        return "no sample has a value (out of coverage, or no report)"
     if high and placed >= 0.5 * valued:
         return ""
     if placed and placed >= 0.5 * valued:

@@ -554,7 +554,7 @@ def _antennas_for(
             # antennas that do not predict other flights are not offered to a receiver with another unit
             if named_odds < 0.0 and not item.teaches:
                 continue
-            # antennas of another name must also win against their airframe at an unknown antenna
+            # antennas with a different name must also fit better than their airframe with an unknown antenna
             airframe = item.airframe if item.teaches and named_odds <= 0.0 else None
             odds = evidence.of_link(number, item.moments, airframe).with_prior(named_odds)
             best = chosen.setdefault(item.name, {})

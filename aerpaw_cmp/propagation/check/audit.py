@@ -193,7 +193,7 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
     return FieldAudit(phantom_paths=count, failures=failures)
 
 
-_STANDS = "paths at forests that are a medium"
+_STANDS = "paths near forests modelled as a medium"
 _ON_TERRAIN = "reflections off shaped ground"
 
 

@@ -94,7 +94,7 @@ def returned(thickness: Any, root_re: Any, root_im: Any) -> tuple[Any, Any]:
 def reflection(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
     """Return TE and TM coefficients (re and im of each) of slabs. Infinite thickness means a half-space.
 
-    ``material`` is the permittivity (re, im) and the thickness in wavelengths, as in all formulas of a face.
+    ``material`` is a tuple: real and imaginary part of the permittivity, and the thickness in wavelengths.
     """
     eta_re, eta_im, thickness = material
     te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)

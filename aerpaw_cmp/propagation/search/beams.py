@@ -43,7 +43,7 @@ SLACK_M = 1e-5
 # How far outside its triangles a reflection point may lie [m]: the seams inside a face.
 EDGE_M = 1e-6
 
-# Share of a triangle's height by which a segment must meet it to cut it beyond doubt.
+# A segment certainly cuts a triangle if it passes its edges by this share of the triangle's height.
 _SOLID_MARGIN = 1e-6
 
 

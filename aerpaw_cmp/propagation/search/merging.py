@@ -105,11 +105,12 @@ def next_leaf(
     Parameters
     ----------
     lower, upper, child
-        As of a :class:`BoxTree`; a tuple of all its columns would be counted in and out at every leaf.
+        Columns of a :class:`BoxTree`. They are separate, because compiled code would count references to a tuple at
+        every leaf.
     todo : (DEEPEST,) int
-        Nodes that wait; at the beginning the root, 0.
+        Stack of nodes to visit. At the start it contains only the root, 0.
     waiting : int
-        How many they are.
+        Number of nodes in ``todo``.
     missed : function
         ``missed(lower, upper, node, region)``: :func:`box_missed`, or another of this file.
     region : tuple

@@ -762,7 +762,7 @@ def trace_back(
     -------
     vertices_m : (paths, depth, 3)
     good : (paths,) bool
-        Every point inside its face, and the sides in order.
+        True if each reflection point is inside its face and each path stays on the reflecting side.
     """
     count, depth = sequence.shape
     vertices = np.zeros((count, depth, 3))

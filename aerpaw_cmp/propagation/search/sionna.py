@@ -692,7 +692,7 @@ def _groups(faces: Faces, sources_m: FloatArray, usable: BoolArray | None) -> It
         return
     patterns, which = np.unique(usable, axis=0, return_inverse=True)
     for index, pattern in enumerate(patterns):
-        # walls and roofs left out as mirrors still hide; a ground that is not this tower's does not exist for it
+        # walls and roofs that are not mirrors still block paths; grounds of other towers are removed
         yield np.flatnonzero(which.reshape(-1) == index), np.flatnonzero(pattern | (faces.solid >= 0))
 
 

@@ -83,8 +83,23 @@ def fit_with_memories(residual: FloatArray, design: FloatArray, at: Memories, cl
     """Fit the coefficients of a design (n, k) to a residual (n,) under noise with the given parameters.
 
     Coefficients have a unit normal prior: the likelihood is integrated over them, and the residual of the fit uses
-    their posterior means. The size of the noise is the likeliest one. With ``climb`` the parameters are those of the
-    highest likelihood that a search from ``at`` and from fixed starts finds.
+    their posterior means. The size of the noise is the most likely one.
+
+    Parameters
+    ----------
+    residual : ndarray, (n,)
+        Errors of consecutive means [dB].
+    design : ndarray, (n, k)
+        Effect of each coefficient.
+    at : Memories
+        Parameters of the noise, or the start of the search.
+    climb : bool
+        Search the parameters of highest likelihood, from ``at`` and from fixed starts.
+
+    Returns
+    -------
+    MemoryFit
+        Log likelihood, residual and parameters of the noise.
     """
     from scipy.linalg.lapack import dtbtrs  # scipy.signal would load for 0.4 s
 

@@ -95,11 +95,11 @@ class ModelRow:
     seconds : float
         Time to compute the levels of the flight [s].
     recommended : bool
-        As in :class:`LadderRow`.
+        The same as in :class:`LadderRow`.
     fastest_sufficient : bool
         True for the fastest model whose difference to the best is not significant.
     elsewhere_db : (float, float), optional
-        As in :class:`LadderRow`.
+        The same as in :class:`LadderRow`.
     """
 
     model: str

@@ -787,7 +787,7 @@ def score_detection(
     forecast : DetectionForecast, optional
         Forecast from ``simulated_db``, learned from other flights. By default each segment is forecast from the others.
     position_m : (n, 3), optional
-        As for :func:`compare_rss`.
+        The same as in :func:`compare_rss`.
 
     Returns
     -------

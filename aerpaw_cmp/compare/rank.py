@@ -671,7 +671,7 @@ def compare_ranks(
     measured, simulated : array_like, (n,)
         Ranks of the same samples: NaN unknown, 0 no channel.
     place_m : (n, 3), optional
-        As for :func:`compare_rank`.
+        The same as in :func:`compare_rank`.
     replicates : int
         Number of swaps of the permutation test.
 

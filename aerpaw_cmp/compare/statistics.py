@@ -426,7 +426,7 @@ def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatA
         In time order, at least :data:`FEWEST`. Tails heavier than normal and loud parts (:func:`loud_part`) widen the
         draws.
     place_m : (n, 3), optional
-        As for :func:`mean_draws`.
+        The same as in :func:`mean_draws`.
     """
     if np.ptp(values) == 0.0:
         return np.zeros(2 * _PAIRS)
@@ -694,7 +694,7 @@ def error_intervals(
     measured_db, simulated_db : (n,)
         Pairs in time order, without NaN [dB].
     place_m : (n, 3), optional
-        As for :func:`mean_draws`.
+        The same as in :func:`mean_draws`.
 
     Returns
     -------
@@ -764,7 +764,7 @@ def influence_interval(
     influence : (n,)
         What each sample adds to the statistic, to first order and up to a constant, in time order.
     place_m : (n, 3), optional
-        As for :func:`mean_draws`.
+        The same as in :func:`mean_draws`.
     bounds : (low, high)
         The range of the statistic.
 
@@ -906,7 +906,7 @@ def paired_difference(
         True if each model has its own offset, so that errors count about their mean. False for held-out errors, which
         count as they are.
     place_m : (n, 3), optional
-        As for :func:`mean_draws`.
+        The same as in :func:`mean_draws`.
 
     Returns
     -------
@@ -1043,7 +1043,7 @@ def share_interval(
     indicator : (n,)
         1 for each sample that counts, else 0, in time order.
     place_m : (n, 3), optional
-        As for :func:`mean_draws`.
+        The same as in :func:`mean_draws`.
     sequence : (n,), optional
         The sequence that the indicator comes from: its effective size counts at a share of 0 or 1.
 

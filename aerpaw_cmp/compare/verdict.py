@@ -490,7 +490,7 @@ def stated_errors(
     common_db : float or (n,)
         Part of that standard deviation that a whole flight can share (an offset) [dB].
     place_m : (n, 3), optional
-        As for :func:`~aerpaw_cmp.compare.statistics.mean_draws`.
+        The same as in :func:`~aerpaw_cmp.compare.statistics.mean_draws`.
 
     Returns
     -------
@@ -974,7 +974,7 @@ def rank_difference(
     first, second : tuple of two (n,)
         Reported and simulated rank of each report on the common samples in time order. NaN if missing, 0 if no path.
     place_m : (n, 3), optional
-        As for :func:`level_difference`.
+        The same as in :func:`level_difference`.
 
     Returns
     -------

@@ -890,7 +890,7 @@ def corrected_maps(
     Raises
     ------
     UsageError, InputError
-        As for :func:`predict`.
+        The same as in :func:`predict`.
     """
     options = TargetOptions(heights_m=tuple(sorted({*heights_m[0], *heights_m[1]})), spacing_m=spacing_m)
     prediction = predict(Path(site), flights, options, logs_root=logs_root, stages=stages)

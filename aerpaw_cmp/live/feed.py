@@ -37,13 +37,14 @@ _GPS_LOST_S = 5.0
 _CLOCK_OFF_S = 2.0
 _DISK_LOW_BYTES = 200 * 2**20
 _STEP_SHOWN_S = 30.0
-# A shorter step moves a sample along the flight by less than its position is known; the log and its warnings have it.
+# Shorter steps are in the log only: they move a sample by less than the error of its position.
 _STEP_S = 0.2
 _POINTS_AHEAD = 40
 
 MEASURED = ("t", "rank", "rsrp", "sinr")
 PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_low", "level_high", "east", "north", "up")
-# Errors that a record of unexpected content can raise. It is left out of the page, and no poll waits for it.
+# Errors that a record of unexpected content can raise. Such a record is not shown on the page, and polls do not wait
+# for it.
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
 # a version, then two rows for each of at most sixteen modems; a longer text is not a cursor of this page
 _CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
@@ -287,7 +288,7 @@ class Feed:
             cell = decoded.get("nr") or {}
             modem.rsrp_dbm, modem.sinr_db = _finite(cell.get("rsrp_dbm")), _finite(cell.get("sinr_db"))
         elif record["query"] == RI_QUERY:
-            # the modem looked at its state somewhere between the question and the end of its answer
+            # the modem read its rank between the query and the end of the answer
             t = self._seconds(modem, (record["sent_mono_ns"] + record["last_mono_ns"]) // 2)
             rank = _finite(decoded.get("rank"))
             modem.rank = None if rank is None else int(rank)
@@ -314,7 +315,7 @@ class Feed:
         low, high = record.get("rank_interval") or (None, None)
         level_low, level_high = record.get("level_interval_dbm") or (None, None)
         level, offset = record.get("level_dbm"), modem.offset_db
-        # without an offset the replay says a level of its own scale, which no axis of RSRP can show
+        # without an offset, the replayed level is not in the units of the RSRP axis
         level = None if level is None or offset is None else level + offset
         modem.predicted.add(
             (
@@ -330,11 +331,11 @@ class Feed:
         if modem.connected:
             modem.rank_s = self._seconds(modem, record["mono_ns"])
         else:
-            modem.rank = modem.rsrp_dbm = modem.sinr_db = None  # what was last measured is not what is now
+            modem.rank = modem.rsrp_dbm = modem.sinr_db = None  # the last measured values are not valid during a gap
 
     def _take_clock(self, modem: _Modem, record: Record) -> None:
         step_s = record["step_ns"] / 1e9
-        if abs(step_s) >= max(_STEP_S, modem.period_s / 2):  # a slower tap has its samples farther apart
+        if abs(step_s) >= max(_STEP_S, modem.period_s / 2):  # samples of a slow tap are farther apart
             modem.step_s = self._seconds(modem, record["mono_ns"])
             modem.step_text = f"the wall clock stepped by {step_s:+.3f} s"
 
@@ -390,7 +391,7 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
         alarms["disk"] = f"less than {_DISK_LOW_BYTES // 2**20} MiB left on the log's disk"
     if modem.step_s is not None and now - modem.step_s < _STEP_SHOWN_S:
         alarms["step"] = modem.step_text
-    # a line may wait before it is written, but none comes before its time: less counts on that side
+    # a line may be written late but never early, so the limit for early lines is smaller
     if modem.delay_s is not None and (modem.delay_s < -_CLOCK_OFF_S / 4 or modem.delay_s > _CLOCK_OFF_S):
         ahead = "ahead of" if modem.delay_s < 0 else "behind"
         alarms["clock"] = f"the telemetry's clock is {abs(modem.delay_s):.1f} s {ahead} this computer's"

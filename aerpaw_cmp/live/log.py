@@ -267,7 +267,7 @@ class SegmentLog:
         # a part that could not be cut off becomes a separate line, which its checksum refuses
         data = b"\n" + line if self._torn else line
         written = os.write(self._fd, data)
-        # the disk filled up within the line
+        # the disk became full within the line
         if written < len(data):
             try:
                 os.ftruncate(self._fd, self._size)
@@ -320,7 +320,7 @@ class SegmentLog:
             self._close_fd()
             self._segment -= 1
             with contextlib.suppress(OSError):
-                path.unlink()  # it holds nothing but a torn header
+                path.unlink()  # it contains only a truncated header
             raise
         self._number += 1
         self.path = path
@@ -381,7 +381,7 @@ class LogWriter:
 
     def messages(self) -> list[str]:
         """Return the messages about the disk since the last call."""
-        # by number: the writing thread may add messages meanwhile
+        # read the number once, because the writing thread may add messages meanwhile
         return [self._messages.popleft() for _ in range(len(self._messages))]
 
     def open(self) -> None:
@@ -403,7 +403,7 @@ class LogWriter:
                 self._bytes -= self._queue.popleft()[1]
                 self._dropped += 1
             self._changed.notify_all()
-            # during a stall that was waited for once, do not wait again
+            # wait only once during a stall of the disk
             done = not stalled and self._changed.wait_for(self._idle, settings.patience_s)
         return done and self.log.fault is None
 

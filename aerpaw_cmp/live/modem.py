@@ -252,7 +252,7 @@ def _nr(names: Sequence[str], fields: Sequence[str | None], flags: list[str]) ->
 
 
 def _lte(fields: Sequence[str | None], flags: list[str]) -> Values:
-    # 'sinr_raw': dB or 5 X - 20 by firmware, the manual does not decide; so no unit
+    # 'sinr_raw' has no unit: it is in dB or 5 X - 20 depending on the firmware, and the manual does not specify which
     values = _named(_LTE, fields, flags, "lte.")
     code = values["bandwidth_code"]
     values["bandwidth_mhz"] = _LTE_BANDWIDTH_MHZ[code] if code is not None and code < len(_LTE_BANDWIDTH_MHZ) else None
@@ -338,7 +338,7 @@ def _decode_identity(lines: Sequence[str], flags: list[str]) -> Values:
     return values
 
 
-# All that the tap may ask, by name.
+# Queries that the tap may send, by name.
 QUERIES: Mapping[str, Query] = {
     query.name: query
     for query in (

@@ -104,7 +104,7 @@ class Roots:
         """Return ``(vendor:product, interface)`` of each USB serial port, by the name of its device."""
         devices = {}
         for port in self.ports():
-            # the kernel's name of the interface, such as 1-1:1.2; a device of one interface has none
+            # the kernel's name of the interface, such as 1-1:1.2; a device with one interface does not have such a name
             interface = re.search(r":\d+\.(\d+)$", port.location or "")
             if port.vid is not None:
                 number = int(interface[1]) if interface else 0
@@ -274,10 +274,10 @@ class SerialPort:
             if users:
                 raise _busy(path, users)
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # the lock keeps out other taps alone; this refuses every further open, but for root
+            # the lock excludes other taps only; TIOCEXCL makes any further open fail, except for root
             fcntl.ioctl(fd, termios.TIOCEXCL)
             make_raw(fd, termios.B115200)
-            users = holders(path)  # again: someone may have come between
+            users = holders(path)  # check again: another process may have opened the port meanwhile
             if users:
                 raise _busy(path, users)
         except (OSError, termios.error, AerpawCmpError) as error:
@@ -345,7 +345,7 @@ class SerialPort:
 def make_raw(fd: int, baud: int) -> None:
     """Set a port to no echo, no line editing, 8N1 and no flow control, and keep its input queue."""
     _, _, cflag, _, _, _, cc = termios.tcgetattr(fd)
-    # HUPCL is kept: whether a modem is notified that its port closes is the system's choice
+    # keep HUPCL: the system decides whether a modem is notified when its port closes
     cflag = (cflag & termios.HUPCL) | termios.CS8 | termios.CREAD | termios.CLOCAL
     cc[termios.VMIN], cc[termios.VTIME] = 1, 0
     # every flag of input, output and local mode changes or delays bytes, so all are cleared
@@ -411,7 +411,7 @@ class TapSettings:
     roots: Roots = field(default_factory=Roots)
 
     def __post_init__(self) -> None:
-        # asked this way round, NaN is refused as well
+        # this form of the test also refuses NaN
         for name in ("ri_hz", "answer_timeout_s", "probe_timeout_s", "silent_s", "status_s", "reconnect_min_s"):
             if not 0 < getattr(self, name) < 1e6:
                 raise UsageError(f"{name} is {getattr(self, name)}", expected="a positive number")
@@ -505,7 +505,7 @@ class StatusNotifier:
             while (status := self._queue.get()) is not None:
                 self._on_status(status)
         except Exception:
-            while self._queue.get() is not None:  # broken: only empty the queue
+            while self._queue.get() is not None:  # the stream is broken: discard the queue
                 pass
 
 

@@ -62,7 +62,7 @@ class Prediction:
     learn: Learn | None = None
 
 
-# ``predict(utc_ns)``; None: nothing is known of that time.
+# ``predict(utc_ns)``; None: the pose at that time is unknown.
 Predict = Callable[[int], "Prediction | None"]
 
 
@@ -123,7 +123,7 @@ class RunningInterval:
         outside = bounds is not None and not bounds[0] <= residual <= bounds[1]
         if bounds is not None:
             self.given += 1
-            # counted before the residual is added: an interval must not depend on the value that it is judged by
+            # count before adding the residual: an interval must not depend on the value that tests it
             self.inside += not outside
         if len(self._sorted) >= self._least:
             self._tails += self.STEP * (1.0 - self._share - outside)
@@ -246,7 +246,7 @@ class TelemetrySample:
 
 
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg", "fix")
-# Looks at the log over which its least delay is taken: a line may wait some time before it is written.
+# Number of reads of the log from which the smallest delay is taken, because lines may be written late.
 _DELAYS = 20
 
 
@@ -352,7 +352,7 @@ class TelemetryFollower:
             return b""
         except OSError as error:
             raise InputError(f"cannot be read ({error.strerror})", expected="a telemetry log", path=self.path) from None
-        # the last line may be half written: it waits for its rest
+        # the last line may be incomplete: keep it until the rest is written
         end = data.rfind(b"\n") + 1
         self._position += end
         return data[:end]

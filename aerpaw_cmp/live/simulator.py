@@ -24,7 +24,7 @@ from ..logs.readers import ReadOptions, identify
 from .modem import QUERIES
 from .ports import Stop, make_raw
 
-# Time before an answer.
+# Delay of each answer.
 _LATENCY_S = 0.02
 
 
@@ -169,8 +169,8 @@ class ModemSimulator:
             make_raw(slave, termios.B115200)
             node = Path(os.ttyname(slave))
         finally:
-            os.close(slave)  # only the tap shall hold the port
-        # a reader that stops reading must not hold the thread for ever
+            os.close(slave)  # only the tap must have the port open
+        # a reader that stops reading must not block the thread for ever
         os.set_blocking(master, False)
         self._master = master
         link = self.link

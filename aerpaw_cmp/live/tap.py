@@ -58,9 +58,9 @@ __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_stat
 
 # A jump of the wall clock against the monotonic one beyond this is recorded.
 _CLOCK_STEP_NS = 50_000_000
-# Two clocks that are read farther apart than this tell nothing about each other: the process was paused between them.
+# Readings of the two clocks farther apart than this are not compared, because the process was paused between them.
 _PAUSE_NS = 5_000_000
-# Gets each record once the log has it, and each status, in the polling thread: it must neither wait nor raise.
+# A function that receives each logged record and each status in the polling thread. It must neither wait nor raise.
 Watch = Callable[["Record | TapStatus"], None]
 
 RATE_WINDOW_S = 10.0
@@ -314,7 +314,7 @@ class Tap:
         ports = []
         with contextlib.suppress(PortGoneError):
             now = find_port(last.path, roots)
-            if now.interface == last.interface:  # else the number now belongs to another port of the modem
+            if now.interface == last.interface:  # otherwise this number now belongs to another port of the modem
                 ports.append(now)
         if last.product is not None:
             known = {port.device for port in ports}
@@ -330,7 +330,7 @@ class Tap:
         self._port = SerialPort.open(info.path)
         self._first_bytes = bytearray()
         try:
-            # the second probe only where the first gets no answer
+            # probe again only if the first probe gets no answer
             if not any(self._probe() for _ in range(2)):
                 raise _not_a_modem(info.path, bytes(self._first_bytes))
         finally:
@@ -365,7 +365,7 @@ class Tap:
 
     def _lost(self, reason: str) -> None:
         with contextlib.suppress(PortGoneError):
-            self._drain()  # what still waits in the port, before it is closed
+            self._drain()  # read what is still in the port before it is closed
         self._close_port()
         if self._gap_open is not None:
             return
@@ -435,7 +435,7 @@ class Tap:
         answer, decoded = self._exchange("csi_ctrl")
         state = (decoded.values.get("lte"), decoded.values.get("nr5g"))
         if self._settings.enable_csi and state != (1, 1):
-            # the state of the first connection: after a replug the modem may have forgotten it
+            # keep the state of the first connection: the modem may have lost it after it was replugged
             if None not in state and self._csi_before is None:
                 self._csi_before = (int(state[0] or 0), int(state[1] or 0))
             answer, _ = self._exchange("csi_ctrl", csi_write(1, 1))
@@ -463,7 +463,7 @@ class Tap:
         query = QUERIES[name]
         text = command or query.text
         data = encode(text, allow_csi=self._settings.enable_csi)
-        # what came unasked must not be read as part of the answer
+        # unsolicited lines must not be read as part of the answer
         self._drain()
         sent_utc, sent = self._clock.utc_ns(), self._clock.mono_ns()
         timeout_ns = int((timeout_s or self._settings.answer_timeout_s) * 1e9)
@@ -486,10 +486,11 @@ class Tap:
             now = self._clock.mono_ns()
             if self._stop.count and not stopped_at:
                 stopped_at = now
-                # one second for the answer in flight, so that its record is complete; a second stop gives it none
+                # wait one second for the pending answer, so that its record is complete; after a second stop do not
+                # wait
                 deadline = min(deadline, now + 1_000_000_000)
             if now >= deadline or self._stop.count > 1:
-                # its answer may still come: until a bare AT is answered nothing else is asked
+                # its answer may still arrive: send no other query until a bare AT is answered
                 self._in_step = False
                 return self._framer.give_up(), now
             if self._select((deadline - now) / 1e9):
@@ -532,7 +533,7 @@ class Tap:
             "command": answer.command,
             "sent_utc_ns": sent_utc,
             "sent_mono_ns": sent,
-            "last_utc_ns": sent_utc + last - sent,  # a clock step inside an exchange is its own record
+            "last_utc_ns": sent_utc + last - sent,  # a clock step inside an exchange gets a separate record
             "last_mono_ns": last,
             "status": answer.status,
             "lines": lines,
@@ -573,7 +574,7 @@ class Tap:
             self._record({"kind": "late", "lines": lines, "status": event.status, "code": event.code, **self._now()})
         elif isinstance(event, Unsolicited):
             self._noise["lines"] += 1
-            # a port of another kind can fill the disk; lines of a modem are kept at any rate
+            # drop lines above this rate, because a wrong port could fill the disk; lines of a modem are always logged
             if self._noise["lines"] > _NOISE_LINES_PER_S and not is_unsolicited(event.text):
                 self._noise["bytes"] += len(event.text) + event.dropped
                 self._noise["not_kept"] += 1
@@ -704,7 +705,7 @@ class Tap:
     def _record(self, record: Record) -> None:
         if self._log_open:
             self._append(record)
-        # before the log is open: a port that talks without end must not fill the memory
+        # the log is not open yet: a port that sends without end must not fill the memory
         elif len(self._early) < 10_000:
             self._early.append(record)
 

@@ -32,7 +32,7 @@ from .feed import Feed
 
 DEFAULT = "127.0.0.1:8765"
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")
-# Bytes written to a browser's socket at once. Each piece has its time limit, so a slow connection is not taken for a
+# Bytes written to a browser's socket at once. Each piece has its time limit, so a slow connection is not closed as a
 # dead one.
 _PIECE = 16_384
 # Limit of connections, of all addresses, that wait for their request.
@@ -239,7 +239,7 @@ class _Server(ThreadingHTTPServer):
         """Let a connection wait for its request. If too many wait, close the oldest of the most frequent address."""
         try:
             request, address = self.socket.accept()
-        except OSError:  # closed already, or too many files are open
+        except OSError:  # the listening socket is closed, or too many files are open
             time.sleep(0.01)
             return
         request.setblocking(False)
@@ -258,18 +258,18 @@ class _Server(ThreadingHTTPServer):
     def _look_at(self, request: Any, ready: selectors.BaseSelector) -> None:
         """Answer a request in a thread of its own if it seems to have the token (the handler looks closely)."""
         if request not in self._waiting:
-            return  # closed in this round
+            return  # the request was closed earlier in this loop
         address, head = self._waiting[request][0], b""
         with contextlib.suppress(OSError):
             head = request.recv(_PIECE, socket.MSG_PEEK)
         known = any(secret in head for secret in self._secrets)
         more = len(head) + 1
-        # a browser may send its head in pieces, the token in the last of them
+        # a browser may send its header in pieces, with the token in the last piece
         if head and not known and b"\r\n\r\n" not in head and request.getsockopt(*_LOW_WATER) < more <= _PIECE:
-            request.setsockopt(*_LOW_WATER, more)  # readable again when more of it is there
+            request.setsockopt(*_LOW_WATER, more)  # report the socket as readable when more of the header has arrived
             return
         self._leave(request, ready)
-        with contextlib.suppress(OSError, RuntimeError):  # gone, or no further thread can be had
+        with contextlib.suppress(OSError, RuntimeError):  # the client has left, or no thread can be started
             if known:
                 request.setblocking(True)
                 self.process_request(request, address)
@@ -284,7 +284,7 @@ class _Server(ThreadingHTTPServer):
         """Check whether an address may have one more refusal."""
         limits, now = self.web.limits, time.monotonic()
         if len(self._allowances) > _MOST_WAITING:
-            # a table without end would fill the memory; forgetting gives each address one more burst at most
+            # limit the table's memory; after clearing it, each address has at most one more burst
             self._allowances.clear()
         left, counted = self._allowances.get(host, (limits.burst, now))
         left = min(limits.burst, left + (now - counted) * limits.per_second)
@@ -325,7 +325,7 @@ class _Handler(BaseHTTPRequestHandler):
     def setup(self) -> None:
         super().setup()
         self.connection.settimeout(self.server.web.limits.send_s)
-        # data in the kernel's buffer hides a browser that does not read: a small buffer detects it sooner
+        # a small kernel buffer shows sooner that a browser does not read
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 * _PIECE)
 
     def do_GET(self) -> None:
@@ -381,7 +381,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Check whether a request has the token in its address, or below the private path the cookie of a visit."""
         pairs = (item.strip().partition("=") for item in self.headers.get("Cookie", "").split(";"))
         cookie = next((value for name, _, value in pairs if private and name == self._cookie), "")
-        # compared in constant time: how long a refusal takes must not tell how much was right
+        # compare in constant time: the duration of a refusal must not show how much of the token was right
         given = (query.get("token", ""), self.server.web.token), (cookie, self.server.web.pass_word)
         return any(hmac.compare_digest(text.encode(), secret.encode()) for text, secret in given)
 
@@ -465,7 +465,7 @@ def _own_host(text: str, loopback: bool) -> bool:
         ipaddress.ip_address(host)
     except ValueError:
         return host in (own, f"{own.split('.')[0]}.local")
-    return True  # an address cannot be rebound: whoever uses it means this computer
+    return True  # a numeric address cannot be rebound by DNS, so it means this computer
 
 
 def _outward() -> list[str]:

@@ -72,7 +72,7 @@ _DBM, _DB = (-200.0, 30.0), (-60.0, 100.0)
 _FULL_SCALE = "dB re full scale"
 
 QUANTITIES: tuple[Quantity, ...] = (
-    # when; the surest first
+    # times, most reliable names first
     Quantity("time", "time", (
         r"^time (utc|unix|epoch)( s| ms| us| usec| ns)?$", r"^time (edt|est|cdt|cst|mdt|mst|pdt|pst|cest|cet|bst|gmt)$",
         r"^((measured|recorded|logged|sampled|seen|received|captured|created) at|recorded|logged)$",
@@ -95,7 +95,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("gps_seconds", "time", (
         r"^(gps ?)?(tow|i ?tow|seconds? of week|week seconds?|sow|gps seconds?)( s| ms)?$", r"^gms$",
     ), "s"),
-    # where; the places of a home, of a tower or of the one who flies are not the aircraft's
+    # positions; those of home, of a tower or of the pilot are not the aircraft's
     Quantity("elsewhere", "other", (
         r"\b(home|ref|reference|origin|tower|cell|site|station|bs|base|enb|gnb|target|waypoint|wp|pilot|operator|gcs|rc"
         r"|destination|take ?off|launch)\b.* (lat|latitude|lon|lng|long|longitude)\b",
@@ -117,7 +117,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"(^| )[hpg]dop$", r"(^| )eph$",
         r"^(gps |gnss |position |pos |location |horizontal |horiz )?((horizontal |horiz |h ?)?acc(uracy)?)( m)?$",
     )),
-    # how high, by the datum in the name; heights of home and of the terrain are not those of the aircraft
+    # heights, by the datum in the name; heights of home and of terrain are not the aircraft's
     Quantity("home", "other", (
         r"\b(home|take ?off|launch|terrain|ground|geoid|undulation|delta|target|max|min)\b.*" + _UP + r"(?!.*\babove)",
         _UP + r" (of )?(home|terrain|target)$", r"^geoid", r"accuracy|variance|\bvdop\b|precision",
@@ -144,7 +144,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^(height|hgt|hoehe|h he)( m| meters| metres| ft| feet)?$", r"^(baro(metric)?|pressure) " + _UP[2:],
         _UP + r" baro$",
     ), "m", can_be=(-1000.0, 20_000.0), datum="unknown"),
-    # how it lies; a gimbal's or camera's angles are not the aircraft's
+    # attitude; angles of a gimbal or camera are not the aircraft's
     Quantity("gimbal", "other", (
         r"\b(gimbal|camera|mount|payload|des|desired|target|setpoint|sp|cmd|command|ref|reference|error|err|delta|rate"
         r"|initial|home|antenna|tower)\b",
@@ -195,7 +195,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     )),
     Quantity("serving", "cell", (r"^(is ?)?(registered|serving|connected)( cell)?$",)),
     Quantity("neighbouring", "cell", (r"^(is ?)?neighbou?r(ing)?( cell)?$",)),
-    # how strong; 'PDSCH rank' before 'PDSCH throughput', 'RSSNR' before 'RSS'
+    # levels and ranks; 'PDSCH rank' before 'PDSCH throughput', 'RSSNR' before 'RSS'
     Quantity("power", "rss", (r"^link power$", r"^(power )?lw ?[1-5]( (power|level))?( dbm?)?$"), _FULL_SCALE),
     Quantity("quality", "rss", (r"^link quality$",), "dB"),
     Quantity("SNR", "rss", (r"^link snr$",), "dB"),
@@ -334,7 +334,8 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     """
     bare, unit = without_unit(name)
     texts = [plain(name) if words is None else words]
-    if not re.search("[a-z]", texts[0]):  # a number or a time: sniffers ask of every cell of the first lines
+    # return early for numbers and times, because sniffers test every cell of the first lines
+    if not re.search("[a-z]", texts[0]):
         return None
     if texts[0] == plain(name):
         # 'Time (+02:00)'; 'heightAboveGround'
@@ -344,11 +345,11 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     row, text = next(hits, (None, ""))
     if row is not None and row.role == "other":  # a tower, a target and an antenna have levels, too
         row, text = next((hit for hit in hits if hit[0].role in ("rss", "rank", "kpi", "cell")), (None, ""))
-    # 'rx [dBm]' is a level, and no name of a receiver
+    # 'rx [dBm]' is a level, not the name of a receiver
     if row is None or (row.role == "identity" and is_unit(unit)):
         return None
     if row.unit and unit in UNITS and (UNITS[unit][0] != row.unit) and row.role in ("position", "angle", "velocity"):
-        unit = ""  # 'Longitude (W)' counts no watts, 'vel_n_m_s' no metres
+        unit = ""  # the W of 'Longitude (W)' is not watts, and the m of 'vel_n_m_s' is not metres
     rat = "nr" if _NR.search(text) else "lte" if _LTE.search(text) else ""
     digits = _NUMBER.search(re.sub(r"\b[45] ?g\b", "", text))
     number = next((group for group in digits.groups() if group), "0") if digits else "0"
@@ -465,7 +466,7 @@ def in_brackets(name: str) -> tuple[str, str, str]:
 def rank_of(quantity: Quantity, words: str) -> tuple[int, int]:
     """Return the place of a plain name in the order of preference: first by row, then by pattern."""
     fits = [i for i, pattern in enumerate(quantity.names) if re.search(pattern, words)]
-    # a height above the ellipsoid only where no other is: it is 33 m off at Lake Wheeler
+    # use ellipsoid heights only if there is no other height: at Lake Wheeler they differ by 33 m from sea level
     last = len(QUANTITIES) * (quantity.datum == "ellipsoid")
     return QUANTITIES.index(quantity) + last, fits[0] if fits else len(quantity.names)
 
@@ -488,7 +489,7 @@ def angle_form(values: FloatArray, quantity: Quantity) -> str:
     # zeros are rows before the first fix
     known = np.abs(values[np.isfinite(values) & ~is_none(quantity, values) & (values != 0)])
     most = quantity.can_be[1]
-    # the median: a few damaged rows are no other unit
+    # use the median, because a few damaged rows do not show another unit
     if not len(known) or np.median(known) <= most:
         return ""
     if (known == np.round(known)).all() and np.median(known) > 1e5 and known.max() <= most * 1e7:
@@ -508,7 +509,7 @@ def _times(factor: float) -> Callable[[FloatArray], FloatArray]:
 
 def _milliwatts(per_unit: float) -> Callable[[FloatArray], FloatArray]:
     def convert(values: FloatArray) -> FloatArray:
-        # no power has no level in dB, and a negative one is no power
+        # zero power has no level in dB, and a negative value is not a power
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(values >= 0, 10 * np.log10(np.where(values > 0, values, np.nan) * per_unit), np.nan)
 
@@ -519,7 +520,7 @@ def _milliwatts(per_unit: float) -> Callable[[FloatArray], FloatArray]:
 ACROSS_50_OHM = ("dbuv", "db\u00b5v", "db\u03bcv")
 _DBUV_OF_0_DBM = 90 + 10 * float(np.log10(50.0))
 
-# Each unit that a name or a cell may have: the unit in which it is read, and how it becomes that.
+# Each unit that a name or a cell may have: the unit after conversion, and the function that converts it.
 UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     **{word: ("m", _times(factor)) for word, factor in (
         ("ft", 0.3048), ("feet", 0.3048), ("foot", 0.3048), ("kft", 304.8), ("m", 1.0), ("meter", 1.0),
@@ -569,7 +570,7 @@ def unit_of(written: str) -> str:
 def converted(values: FloatArray, written: str) -> FloatArray:
     """Return values of a written unit in the unit of the dictionary."""
     if written in _DDMM:
-        degrees = np.trunc(values / 100)  # as NMEA writes angles
+        degrees = np.trunc(values / 100)  # angles in the format of NMEA
         return np.asarray(degrees + (values - 100 * degrees) / 60)
     return UNITS[written][1](values) if written in UNITS else values
 
@@ -665,7 +666,8 @@ PROGRAMS: tuple[Program, ...] = (
 )  # fmt: skip
 
 
-# Names that a level of another program may have, and names that only look so: an altitude above sea level, a battery.
+# Names that a level of another program may have, and names that only look like levels, such as an altitude above sea
+# level or a battery.
 _LIKE_A_LEVEL = re.compile(
     r"^value$|power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs)?\b|\brss|strength|\bampl|magnitude|rsrp"
 )
@@ -725,7 +727,7 @@ def described(
     known = known or program([*present, *map(plain, of)])
     words, columns = dict(known.words) if known else {}, []
     if "rank" in present and not words and any((m := meaning(name)) and m.quantity.role == "rss" for name in present):
-        words = {"rank": "rank indicator"}  # without levels it may be the position in any list
+        words = {"rank": "rank indicator"}  # without levels, 'rank' may be the position in a list
     for name, bare in own:
         forms = (re.sub(form, word, bare) for form, word in words.items() if re.fullmatch(form, bare))
         common = next(forms, bare)

@@ -57,7 +57,7 @@ class _Gunzip:
     """One member of a gzip file, with the interface of the other two libraries."""
 
     def __init__(self) -> None:
-        # 16: with the header of gzip, which is checked
+        # 16 selects the gzip header and its checksum
         self._machine = zlib.decompressobj(zlib.MAX_WBITS | 16)
 
     def decompress(self, data: bytes, most: int) -> bytes:
@@ -80,7 +80,7 @@ def _machine(name: str, path: str | Path) -> Callable[[], Any]:
     if name == "gzip":
         return _Gunzip
     try:
-        # here: Python may lack these modules
+        # import them here, because a Python build may not have these modules
         if name == "bzip2":
             import bz2
 
@@ -128,10 +128,10 @@ def unpacked_pieces(content: Iterable[bytes], path: str | Path) -> Iterator[byte
             piece = machine.decompress(unread, _PIECE)
         except MemoryError:
             raise
-        except Exception as error:  # bz2 raises OSError and ValueError, lzma an exception of its own
+        except Exception as error:  # bz2 raises OSError and ValueError, and lzma raises LZMAError
             raise InputError(f"a damaged {name} file ({error})", cause="a cut download", path=path) from error
         bytes_out += len(piece)
-        # as it goes, so that a bomb is stopped at its first piece
+        # check while unpacking, so that a zip bomb is stopped at its first piece
         if bytes_out > _MOST_RATIO * bytes_in + _PIECE:
             raise InputError(f"the {name} file unpacks to more than {_MOST_RATIO} times its size", cause="no log",
                              path=path)  # fmt: skip

@@ -218,7 +218,7 @@ def _codes(part: AnyArray, number: dict[str | None, int]) -> AnyArray:
 def _write_json(group: Any, name: str, content: Any) -> None:
     import numpy as np
 
-    # escapes keep torn bytes (lone surrogates), which UTF-8 cannot hold
+    # escape invalid bytes (lone surrogates), which UTF-8 cannot encode
     text = json.dumps(content, ensure_ascii=True).encode("ascii")
     group.create_dataset(name, data=np.frombuffer(text, dtype=np.uint8))
 
@@ -284,7 +284,7 @@ def _read_column(items: Mapping[str, AnyArray], name: str, kind: str) -> Any:
         return values.astype("datetime64[ns]")
     if kind != "text":
         return values
-    # code -1 takes the last: no text
+    # code -1 selects the last entry, which means that there is no text
     words = np.array([*_read_json(items[f"{name}.words"]), None], dtype=object)
     return pd.Series(words[values], dtype=object)
 

@@ -165,7 +165,7 @@ def read(
     if chosen.columns:
         reader = reader or "generic_csv"  # as with --map
     files = Ingested()
-    # a path is a sequence of letters, too
+    # a str is also a sequence, so test it first
     single = isinstance(path, (str, os.PathLike)) or hasattr(path, "read")
     for source in cast("Iterable[Source]", [path] if single else path):
         if isinstance(source, (str, os.PathLike)):

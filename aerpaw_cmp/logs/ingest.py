@@ -27,13 +27,13 @@ from .records import ReadResult, RejectedLine, RejectedReason, Stream, by_reason
 if TYPE_CHECKING:
     import pandas as pd
 
-# Largest content of a packed file that is unpacked in memory.
+# Largest packed file that is unpacked in memory [bytes].
 MAX_BYTES = 2**32
 
-# A file with more records than this in a stream is a log of its own.
+# A file with more records per stream than this is a separate log.
 _PIECE_RECORDS = 50
 
-# Rejected lines of a file that a summary quotes.
+# Number of rejected lines that a summary quotes per file.
 _FIRST_REJECTED = 3
 
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
@@ -326,7 +326,7 @@ def read_log(
 def _refuse_other_kind(path: Path, reader: Reader) -> None:
     """Refuse a log that another reader recognises and the named one does not: it is the wrong file."""
     if reader.name == "generic_csv":
-        return  # its columns were named by the user
+        return  # the user named the columns of this file
     claimed_by = sniffers_of(path)
     if not claimed_by or reader.name in claimed_by:
         return
@@ -350,7 +350,7 @@ def _is_archive(place: Path) -> bool:
     try:
         return archives.is_archive(_beginning(place, 1024))
     except InputError:
-        return False  # reading it later reports why
+        return False  # the error is reported when the file is read
 
 
 def _archive(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> _Found:
@@ -386,7 +386,7 @@ def _member(
     unpacked = _unpacked(member.read(None), path)
     digest = hashlib.sha256(unpacked).hexdigest()
     data = as_utf8(unpacked)
-    # each level would multiply what may be unpacked
+    # do not nest archives: each level would multiply the limit of unpacked bytes
     if archives.is_archive(data[:HEAD_BYTES]):
         raise InputError("an archive inside an archive: unpack it", path=path)
 
@@ -467,7 +467,7 @@ def name_inside(path: str) -> str:
 def _source(flight_file: Path, name: str, held: Held | None = None) -> IngestedFile:
     """Return one of the logs in a flight file by its path or the end of it."""
     held = {} if held is None else held
-    # once for all logs of a flight.yaml that name it
+    # read it once for all logs in flight.yaml that refer to it
     files = held[flight_file] = held.get(flight_file) or read_flight(flight_file)
     named = [item for item in files if item.path == name or Path(item.path).as_posix().endswith(f"/{name}")]
     if len(named) != 1:

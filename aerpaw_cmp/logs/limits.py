@@ -33,22 +33,22 @@ FASTEST_MPS = 100.0
 FLAG, STALE = "position_jump", "position_stale"
 PLACE = ("latitude_deg", "longitude_deg", "altitude_m")
 
-# Further than this is no jitter of a receiver between two rows of (nearly) one time [m].
+# A distance above this between two rows of nearly one time is not jitter of a receiver [m].
 _JITTER_M = 15.0
 
-# Jumps are few; where more rows do not fit, the track is not one track, or its times are wrong.
+# Largest share of rows that are jumps. Above it, the rows are several tracks, or their times are wrong.
 _FEW_JUMPS_SHARE = 0.2
 
 # An aircraft gains less speed than this in a second [m/s^2].
 _GAIN_MPS2 = 10.0
 
-# Moves on either side of a step that show how fast the aircraft was.
+# Number of moves on either side of a step from which the speed is estimated.
 _AROUND = 3
 
 # Positions are stale from this duration [s] and this mean logged speed [m/s] on; a receiver reports once a second.
 _STALE_S, _STALE_MPS = 3.0, 1.0
 
-# A step back is shorter than this share of the steps there.
+# A step back in time is shorter than this share of the neighbouring steps.
 _STEP_BACK_SHARE = 0.2
 
 
@@ -184,7 +184,7 @@ def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
     if not runs.any():
         return none, ""
     for first, end in zip(begins[runs], last[runs], strict=True):
-        none[rows[first + 1 : end + 1]] = True  # the first of them is where the aircraft was
+        none[rows[first + 1 : end + 1]] = True  # the first row has the position of the aircraft
     longest = int(np.argmax(np.where(runs, lasts_s, 0.0)))
     line, speed_mps = int(frame["line"].iloc[rows[begins[longest]]]), moved_m[longest] / lasts_s[longest]
     return none, (
@@ -271,19 +271,20 @@ LIMITS: tuple[Limit, ...] = (
     Limit(("sinr_db",), ((-100.0, 100.0),), "sinr_out_of_range"),
 )
 
-# Levels by unit: thermal noise of 1 Hz is -174 dBm, no receiver in flight meets 30 dBm; a ratio to the noise is wider.
+# Levels by unit: thermal noise of 1 Hz is -174 dBm, no receiver in flight receives 30 dBm; a ratio to the noise is
+# wider.
 LEVEL_DB = {"dBm": (-200.0, 30.0), "dB": (-200.0, 200.0)}
 
-# Levels re full scale, gain taken off: real sounder logs reach 33 dB.
+# Levels re full scale minus the gain: real sounder logs reach 33 dB.
 _LEVEL_OTHER_DB = (-200.0, 100.0)
 
-# A few rows further than a day from all others have a damaged stamp: no log is silent for a day and goes on.
+# A few rows more than a day from all others have a damaged time stamp, because no log pauses for a day.
 _APART_S = 86_400.0
 
 _FEW_SHARE = 0.01
 
 # A computer without a battery of its clock begins in 1970 and is set by GNSS or network.
-# Some begin in 1980 or 2000; AERPAW is younger than all of these.
+# Some begin in 1980 or 2000; AERPAW began later.
 _CLOCK_SET_NS = int(np.datetime64("2010-01-01", "ns").astype(np.int64))
 
 # At most this share, or this many, are "a few".
@@ -315,19 +316,21 @@ def check(result: ReadResult) -> ReadResult:
     return replace(result, streams=streams, warnings=(*result.warnings, *warnings)) if warnings else result
 
 
-# AERPAW's sites, Lake Wheeler and Centennial Campus: latitude, longitude, and how far from them positions are theirs.
+# AERPAW's sites, Lake Wheeler and Centennial Campus: latitude, longitude, and the radius of a site, all in degrees.
 SITES_DEG, NEAR_DEG = ((35.727, -78.696), (35.773, -78.677)), 0.3
-# No receiver in flight meets such levels: reports of RSRP end at -31 dBm (3GPP TS 38.133, 10.1.6), those of RSRQ and
+# Highest level that is possible in flight: reports of RSRP end at -31 dBm (3GPP TS 38.133, 10.1.6), those of RSRQ and
 # SINR do not.
 _MOST_DBM = {"RSRP": -20.0}
-# A lost reading is this near 0 dB (or a placeholder) and this far from all others; at most this share is lost. No path
-# gains 20 dB from one reading to the next and loses it again.
+# A lost reading is within the first limit of 0 dB or of a placeholder, and farther than the second from all other
+# levels. The third is the largest share of lost readings. No path gains 20 dB from one reading to the next and loses it
+# again.
 _LOST_DB, _FAR_DB, _LOST_SHARE = 1.0, 20.0, 0.2
-# Ends of the scales of phones, modems and 8-bit integers, which programs write for a reading that is missing.
+# Lowest values of phones, modems and 8-bit integers, which programs write for a missing reading.
 _LEAST_DB = (-127.0, -128.0, -140.0, -141.0, -150.0, -156.0, -157.0)
-# Levels that alternate from record to record: further apart than fading, and back with the next.
+# Levels of two devices alternate from record to record: they differ by more than fading, and return with the next
+# record.
 _APART_DB, _BACK_SHARE, _FEW_ALTERNATE, _MOST_TURNS = 10.0, 0.2, 6, 5
-# Levels of one time that are of several sources: further apart than fading within a second of a coarse clock.
+# Levels at one time stamp come from several sources if they differ by more than fading within one second.
 _AT_ONCE_DB = 6.0
 
 
@@ -435,7 +438,7 @@ class _Check:
     def _lost_readings(self) -> None:
         """Flag a few placeholders far from all other levels: what a program writes for a reading that it lost."""
         level = self._values("rss_db")
-        # -1 is a common placeholder, too
+        # -1 is also a common placeholder
         for lost, sign, word in ((np.abs(level) <= _LOST_DB, 1, "above"), (np.isin(level, _LEAST_DB), -1, "below")):
             known = np.isfinite(level).sum()
             if not lost.any() or lost.sum() > max(1, _LOST_SHARE * known) or known < _FEW_ROWS:
@@ -449,14 +452,14 @@ class _Check:
 
     def _two_levels(self) -> None:
         """Report a series whose levels take turns or differ at one time: it has several devices, SIMs or networks."""
-        # the beginning: two devices alternate all along
+        # test only the beginning, because two devices alternate in the complete log
         level, time = self._values("rss_db")[:10_000], self.frame["time"].to_numpy("datetime64[ns]")[:10_000]
         level, time = level[np.isfinite(level)], time[np.isfinite(level)]
         if len(level) < _FEW_ALTERNATE:
             return
         lags = [lag for lag in range(1, _MOST_TURNS + 1) if len(level) >= 3 * lag]
         step, *back = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in lags)
-        # with one of the next records it is back: fading does not come back so closely
+        # the level returns within the next records; after fading it would not return so exactly
         turns = step > _APART_DB and min(back) < _BACK_SHARE * step
         # most series repeat few times, and grouping them is slow
         if not turns and 3 * len(np.unique(time)) > 2 * len(time):
@@ -486,9 +489,10 @@ class _Check:
         few = size <= max(_FEW_ROWS, _FEW_SHARE * len(order))
         # the largest group is the log
         few[int(np.argmax(size))] = False
-        few &= 2 * size.max() > len(order)  # without a main part: two flights in one file, not a few bad stamps
+        # if no group is dominant, the file contains two flights, not a few bad time stamps
+        few &= 2 * size.max() > len(order)
         last = stamp[order][np.append(np.flatnonzero(np.diff(group)), len(order) - 1)]
-        unset = last < _CLOCK_SET_NS  # rows before the clock was set, however many
+        unset = last < _CLOCK_SET_NS  # any number of rows before the clock was set
         few |= unset & ~unset.all()
         bad = np.zeros(len(stamp), dtype=np.bool_)
         bad[order[few[group]]] = True
@@ -503,7 +507,7 @@ def _marked(frame: pd.DataFrame, bad: BoolArray, flag: str, void: Sequence[str])
     for i in np.flatnonzero(bad):
         words = str(column[i]).split(";") if column[i] else []
         column[i] = ";".join([*words, flag] if flag not in words else words)
-    out: pd.DataFrame = frame.copy(deep=False)  # what is marked gets new columns
+    out: pd.DataFrame = frame.copy(deep=False)  # copy the columns that get flags
     out["flag"] = pd.Series(column, index=frame.index, dtype=object)
     for name in void:
         out[name] = np.where(bad, np.nan, frame[name].to_numpy(dtype=np.float64))

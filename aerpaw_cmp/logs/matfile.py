@@ -176,7 +176,7 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
     """Return the name and the array of a variable, None if it is not wanted or has another class."""
     parts = _elements(body, 0, order, padded=True)
     flags, dimensions, title = _head_of(parts)
-    # signed: a negative one is damage, and would wrap to a huge one
+    # signed, because a negative size means damage and would wrap to a huge size
     shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
     if min(shape) < 0:
         raise _damaged("a negative dimension")
@@ -198,7 +198,7 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
         raise _damaged(f"complex variable {title!r} without imaginary part")
     with np.errstate(all="ignore"):
         array = real.astype(np.complex128)
-        array.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf would be no number
+        array.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf would have a NaN real part
     return title, array
 
 

@@ -23,9 +23,9 @@ from ..common.errors import AerpawCmpError, InputError, UsageError, one_line
 from .records import Attribute, Kind, ReadResult, Stream
 
 ENTRY_POINT_GROUP = "aerpaw_cmp.readers"
-# Sniffers see this much of a file first.
+# Bytes of a file that sniffers see first.
 HEAD_BYTES = 65_536
-# And this much where no log reader knows those.
+# Bytes that they see if no log reader recognises the first ones.
 DEEP_BYTES = 4 << 20
 
 # A function that reads a log from pieces of complete lines, with a result that does not depend on their size.
@@ -202,7 +202,7 @@ def claims(data: bytes) -> list[Reader]:
     """
     data = _BLANK_LINES.sub(b"", data[:DEEP_BYTES])
     heads = (data[:HEAD_BYTES], data) if len(data) > HEAD_BYTES else (data,)
-    # log readers first, with little and then with more: a page of text may quote a log
+    # log readers first, with few bytes and then with more, because a text page may quote a log
     tried = [(head, True) for head in heads] + [(head, False) for head in reversed(heads)]
     accepting = ([r for r in catalogue() if bool(r.kinds) is of_logs and _accepts(r, head)] for head, of_logs in tried)
     return next((readers for readers in accepting if readers), [])
@@ -219,7 +219,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
     if not data.strip():
         raise InputError("the file is empty", expected="log lines", cause="an aborted run", path=path)
     head = data[:HEAD_BYTES]
-    # before any sniffer: it is a text, and would be called an unknown one
+    # before any sniffer, because it is a text that no reader would recognise
     if head.startswith(b"version https://git-lfs"):
         raise InputError(
             "a Git-LFS pointer instead of the data",
@@ -334,7 +334,7 @@ def named_tower(path: str, towers: Sequence[str]) -> str | None:
     places = {}
     for tower in towers:
         letters = "[-_ ]?".join(map(re.escape, re.findall(r"\d+|[^\W\d_]+", tower)))
-        # LW1 is not in LW12, nor CC in ACCESS
+        # match complete names: LW12 does not contain LW1, and ACCESS does not contain CC
         ends = r"(?!\d)" if tower[-1:].isdigit() else r"(?![^\W_])"
         for match in re.finditer(rf"(?<![^\W_]){letters}{ends}" if letters else r"(?!)", path, re.IGNORECASE):
             places[match.start()] = tower

@@ -87,7 +87,7 @@ def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFra
     with parsing(path, _EXPECTED):
         place = Path(path)
         if place.is_file() and place.stat().st_size > MOST_BYTES:
-            # the readers of logs take a large file in pieces
+            # log readers read a large file in pieces
             if not any(reader.kinds for reader in claims(read_head(place))):
                 raise InputError(
                     f"the file has {place.stat().st_size} bytes",
@@ -117,7 +117,7 @@ class _Route:
 
 def _route(data: bytes, path: str | Path) -> _Route:
     head = data[:HEAD_BYTES]
-    # before the log readers: a plan is a JSON that one of them may take for its own
+    # before the log readers, because one of them might accept the JSON of a plan
     if re.match(rb"\s*\{", head) and b'"fileType"' in data[: 1 << 20]:
         return _plan(data, path)
     if re.match(rb"\s*QGC WPL \d+", head):
@@ -164,7 +164,7 @@ def _log(path: str | Path) -> _Route:
     tracks = [stream for stream in file.result.streams if "latitude_deg" in stream.frame.columns]
     if not tracks:
         raise InputError(f"a log of {file.result.reader!r} without positions", expected=_EXPECTED)
-    # telemetry before the places of a radio
+    # prefer telemetry to positions in a radio log
     track = max(tracks, key=lambda stream: (stream.kind == "telemetry", len(stream.frame)))
     frame = track.frame[track.frame["latitude_deg"].notna()]
     route = _Route(remarks=[str(text) for text in file.result.warnings])
@@ -256,7 +256,7 @@ def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, name
             _turn(route, item)
         if item.command == _RETURN:
             route.remark("The return to the take-off at the end is left out.")
-        if not (latitude or longitude) or math.isnan(latitude):  # 0, 0 and null: where the aircraft is
+        if not (latitude or longitude) or math.isnan(latitude):  # 0, 0 and null mean the current position
             latitude, longitude = place
         if item.command not in (*_WAYPOINTS, *_TAKEOFFS, *_LANDINGS) or math.isnan(latitude):
             continue
@@ -280,7 +280,7 @@ def _height(route: _Route, item: _Item, height: float, home: tuple[float, ...]) 
     if item.command in _LANDINGS:
         return 0.0
     if item.frame in _SEA_LEVEL_FRAMES:
-        if len(home) < 3 or math.isnan(home[2]) or home[2] == 0.0:  # programs write 0 if it was not set
+        if len(home) < 3 or math.isnan(home[2]) or home[2] == 0.0:  # 0 means that the value was not set
             raise InputError(
                 f"a waypoint {height:g} m above sea level, and a home position without an altitude",
                 expected="heights above take-off, or the ground's height at the planned home position",

@@ -245,7 +245,7 @@ def built(
     column : mapping of str to array, shape (n,)
         Their cells as bytes or floats.
     options, reader, reason, skip, clock
-        As of :func:`matched`.
+        The same as of :func:`matched`.
     extra : iterable of RejectedLine
         Lines that were rejected before.
     markup : int array, optional
@@ -259,7 +259,7 @@ def built(
     """
     comment = np.zeros(len(rows), dtype=bool) if skip is None else skip(rows)
     before = list(extra)
-    # lines rejected before are accounted for already
+    # lines that were rejected earlier are already counted
     known = np.concatenate((rows, np.array([line.number - 1 for line in before], dtype=np.int64))).astype(np.int64)
     blank, rejected = _text.remainder(lines, known, reason, blank=markup)
     rejected += before
@@ -336,7 +336,7 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
     most = _FLIGHT_S if form == "relative" else _MOST_S
     valid = np.isfinite(value) & (np.abs(value) * unit_ns <= most * 1e9)
     safe = np.where(valid, value, 0.0)
-    integer = np.floor(safe)  # the fraction apart: a float64 epoch in ns has no room for it
+    integer = np.floor(safe)  # convert the fraction separately: a float64 epoch in ns has too few digits
     ns = integer.astype(np.int64) * int(unit_ns)
     ns += np.round((safe - integer) * unit_ns).astype(np.int64) + (origin or 0)
     if form == "epoch" and options.clock in ("local", "local_as_utc"):
@@ -385,7 +385,7 @@ def ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = None, mean
     float array, shape (m,)
     """
     absent = np.isnan(ri) | (np.zeros(len(ri), dtype=bool) if none is None else none)
-    # 3GPP specifies up to eight layers
+    # 3GPP specifies at most eight layers
     inside = (ri >= 1) & (ri <= 8) & ~absent
     integer = inside & (ri == np.round(ri))
     _text.add_flag(flag, absent, "no_csi")
@@ -454,7 +454,7 @@ def of_ues(
         (ue, mine, {"identity_from": "assumed"} if number is None else {"rnti": int(number)})
         for ue, mine, number in _divided(name, np.ones(len(rnti), dtype=bool), rnti, "rnti{:04x}")
     ]
-    if "pci" in values:  # two cells may give one RNTI at one time
+    if "pci" in values:  # two cells may assign the same RNTI at one time
         parts = [
             (cell, within, {**more, "pci": int(number)} if cell != ue and number is not None else more)
             for ue, mine, more in parts
@@ -510,7 +510,7 @@ def reader(
     Parameters
     ----------
     name, title, kinds, sample
-        As of :class:`aerpaw_cmp.logs.readers.Reader`.
+        The same as of :class:`aerpaw_cmp.logs.readers.Reader`.
     row : re.Pattern or callable
         See :func:`aerpaw_cmp.logs.rows.matched`. A callable makes it from the file, for instance from its header.
     streams : callable

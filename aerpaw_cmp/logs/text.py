@@ -102,7 +102,7 @@ class Lines:
             return np.empty((0, width), dtype=np.uint8)
         starts = self.starts[numbers]
         stride = int(starts[1] - starts[0]) if len(numbers) > 1 else width
-        if (np.diff(starts) == stride).all():  # one block of equal lines: no gather, a view is enough
+        if (np.diff(starts) == stride).all():  # equally spaced lines need only a view, not a copy
             return np.lib.stride_tricks.as_strided(
                 self.buffer[starts[0] :], (len(numbers), width), (stride, 1), writeable=False
             )
@@ -116,7 +116,7 @@ _SLICE = 1 << 17
 def _places(buffer: AnyArray, byte: int) -> IntArray:
     """Return the offsets of a byte, shape (n,)."""
     starts = range(0, len(buffer), _SLICE)
-    # slice by slice: a mask of a GiB would be a GiB
+    # slice by slice, because a mask is as large as the buffer
     parts = [np.flatnonzero(buffer[first : first + _SLICE] == byte) + first for first in starts]
     return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
 
@@ -139,7 +139,7 @@ def split(data: bytes) -> Lines:
     else:
         starts = starts[:-1]
     if len(ends) and b"\r" in data:
-        # an empty first line has nothing before it
+        # an empty first line has no byte before it
         before = buffer[np.maximum(ends - 1, 0)]
         ends = np.where((ends > starts) & (before == 13), ends - 1, ends)
     return Lines(data, starts, ends)
@@ -160,7 +160,7 @@ def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tupl
     groups : list of tuple of bytes, length n
         One tuple per line.
     """
-    if b"\r\r" in lines.data:  # the pattern has room for one carriage return, a line's own is left out
+    if b"\r\r" in lines.data:  # the pattern allows one carriage return, and raw() already removes one
         tried = ((i, pattern.match(lines.raw(i))) for i in range(len(lines)))
         hits = [(int(lines.starts[i]), hit.groups(b"")) for i, hit in tried if hit is not None]
     else:
@@ -172,7 +172,7 @@ class Rejects:
     """The rejected lines of a log that is read in pieces: the first ones verbatim, and the number per reason."""
 
     def __init__(self) -> None:
-        self.before = 0  # lines of the pieces in front of this one
+        self.before = 0  # number of lines in earlier pieces
         self._first_lines: list[RejectedLine] = []
         self._reasons: list[RejectedReason] = []
 
@@ -183,7 +183,7 @@ class Rejects:
         # numbers count from the first piece of the file
         low, high = int(min(numbers)) + self.before + 1, int(max(numbers)) + self.before + 1
         self._reasons.append(RejectedReason(reason, len(numbers), low, high))
-        # more come in the order of the file, but for the reasons of a piece
+        # enough lines: they arrive in file order, except for several reasons within a piece
         if len(self._first_lines) < 4 * KEPT_REJECTED:
             for i in sorted(numbers)[:KEPT_REJECTED]:
                 self._first_lines.append(RejectedLine(int(i) + self.before + 1, reason, lines.text(int(i))))
@@ -259,7 +259,7 @@ def numbers(column: AnyArray) -> AnyArray:
 def flags(count: int) -> AnyArray:
     """Return an empty flag column."""
     column = np.empty(count, dtype=object)
-    column.fill("")  # one object; np.full would make one per row
+    column.fill("")  # one object for all rows: np.full would create one per row
     return column
 
 
@@ -275,10 +275,10 @@ def add_flag(column: AnyArray, mask: BoolArray, reason: str) -> None:
 
 def first_lines(head: bytes, count: int = 40) -> list[bytes]:
     """Return complete, non-blank lines at the start of a file, which sniffers look at."""
-    # enough for any forty lines of a log
+    # enough for forty lines of any log
     pieces = head[:16_384].split(b"\n")
     if len(head) > 16_384 or (len(pieces) > 1 and not head.endswith(b"\n")):
-        pieces = pieces[:-1]  # a cut line proves nothing
+        pieces = pieces[:-1]  # a truncated line cannot confirm the format
     return [piece.rstrip(b"\r") for piece in pieces if piece.strip()][:count]
 
 
@@ -382,7 +382,7 @@ def zone(name: str | None, *, needed_by: str) -> tzinfo:
 def _offset_s(wall_s: int, where: tzinfo, fold: int) -> int:
     try:
         moment = datetime(1970, 1, 1) + timedelta(seconds=wall_s)
-        # fold 0 and 1 differ where the wall clock was twice, or never
+        # fold 0 and 1 differ if the wall time occurs twice or never
         offset = moment.replace(tzinfo=where, fold=fold).utcoffset()
     except (OverflowError, ValueError):
         return 0
@@ -549,7 +549,7 @@ def _minutes(cells: AnyArray) -> tuple[IntArray, BoolArray]:
     inside = np.clip(month, 1, 12)
     leap = (year % 4 == 0) & ((year % 100 != 0) | (year % 400 == 0))
     days = _MONTH_DAYS[inside] - ((inside == 2) & ~leap)
-    # datetime64[ns] spans 1678-2262; a clock outside 1970-2261 was never set
+    # datetime64[ns] spans 1678-2262; a clock outside 1970-2261 has not been set
     valid &= (year >= 1970) & (year <= 2261) & (month == inside) & (day >= 1) & (day <= days)
     valid &= (hour < 24) & (minute < 60)
     months = (year.astype(np.int64) - 1970) * 12 + inside - 1

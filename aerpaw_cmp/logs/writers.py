@@ -17,9 +17,9 @@ from ..common.units import AnyArray, unmasked
 if TYPE_CHECKING:
     import pandas as pd
 
-# 20 log10 of the smallest normal float32: what the sounder's logarithm gives without a signal.
+# 20 log10 of the smallest normal float32: the level of the sounder without a signal.
 _FLT_MIN_DB = -758.5956
-# Default gain that the sounder takes off its levels.
+# Default gain that the sounder subtracts from its levels.
 _RX_GAIN_DB = 30.0
 
 

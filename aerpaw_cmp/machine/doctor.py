@@ -147,7 +147,7 @@ def available_memory_bytes(root: Path = Path("/")) -> int | None:
     """Memory that can still be had: the kernel's estimate, or the control group's limit when that is lower."""
     try:
         lines = (root / "proc/meminfo").read_text().splitlines()
-        # not MemFree: what the kernel caches of files is given back when a program asks
+        # not MemFree, because the kernel frees its file cache on demand
         available = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
     except (OSError, StopIteration, ValueError, IndexError):
         return None

@@ -257,7 +257,7 @@ class IndexInterpolation(_Local):
     grid : Grid
         Determines the index of each sample and target. All must lie in distinct cells.
     neighbours, radius_m, selection, seed
-        As in :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`.
+        The same as in :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`.
     """
 
     kind: Literal["spline", "makima"]

@@ -139,7 +139,7 @@ def by_rule(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, skip: IntA
     ----------
     rule : Rule
     samples_m, targets_m, skip
-        As for :func:`nearest`.
+        The same as in :func:`nearest`.
 
     Returns
     -------
@@ -767,7 +767,7 @@ class TrendKriging:
     correlation : callable
         Phi(distance [m]) of the residual.
     neighbours, radius_m : int, float
-        As for :class:`OrdinaryKriging`; with fewer than three samples in the radius the nearest are used.
+        The same as in :class:`OrdinaryKriging`; with fewer than three samples in the radius the nearest are used.
     bounds : (low, high), optional
         Limits of the estimates, such as (1, 4) for ranks.
 

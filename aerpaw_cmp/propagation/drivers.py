@@ -52,7 +52,7 @@ def replay_in_parts(
     Parameters
     ----------
     site, link, poses, search, field, run
-        As for :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
+        The same as in :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
     size : int
         Most poses of a part; the parts are of about one size.
 
@@ -232,7 +232,7 @@ def replay_moving(
     sources_m : (poses, 3)
         Centre of the tower's array at each pose, east, north, up [m].
     search, field, run
-        As for :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
+        The same as in :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
 
     Returns
     -------

@@ -117,7 +117,7 @@ def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> 
     Parameters
     ----------
     phi_in, phi_out, exterior : (...)
-        As for :func:`wedge`.
+        The same as in :func:`wedge`.
 
     Returns
     -------

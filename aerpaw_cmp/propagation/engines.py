@@ -97,7 +97,7 @@ def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache
     Parameters
     ----------
     scene, link, poses, search
-        As for :func:`search_or_read`.
+        The same as in :func:`search_or_read`.
     cache : PathCache or None
 
     Returns
@@ -158,7 +158,7 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
     Parameters
     ----------
     scene, link, poses, search, run
-        As for :func:`search_or_read`.
+        The same as in :func:`search_or_read`.
 
     Returns
     -------

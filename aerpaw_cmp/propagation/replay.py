@@ -569,7 +569,7 @@ def passed(
     Parameters
     ----------
     site, scene, link, poses, search
-        As for :func:`replay`.
+        The same as in :func:`replay`.
     paths : PathSet
         Paths from the engine.
 
@@ -601,7 +601,7 @@ def further_paths(
     Parameters
     ----------
     site, scene, link, poses, search, field
-        As for :func:`replay`.
+        The same as in :func:`replay`.
 
     Returns
     -------

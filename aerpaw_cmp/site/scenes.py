@@ -135,7 +135,7 @@ def placed_scene(
     path : Path
         XML file.
     materials : mapping of str to str, optional
-        As in :func:`aerpaw_cmp.site.mitsuba.read_scene`.
+        The same as in :func:`aerpaw_cmp.site.mitsuba.read_scene`.
     sha256 : str, optional
         Required digest of the files of the scene.
     offset_m : (east, north, up)

@@ -50,7 +50,7 @@ def two_ray_dbm(
     Parameters
     ----------
     sources_m, targets_m, carrier_hz, transmit_power_dbm
-        As for :func:`free_space_dbm`.
+        The same as in :func:`free_space_dbm`.
     ground_material : str
         Half-space below ``ground_m``.
     ground_m : float or (towers,)

@@ -565,7 +565,7 @@ def over_stands(site: Site, source_m: FloatArray, vertices_m: FloatArray, target
     Parameters
     ----------
     site, source_m, vertices_m, target_m
-        As for :func:`stand_loss_db`.
+        The same as in :func:`stand_loss_db`.
 
     Returns
     -------

@@ -110,7 +110,7 @@ def fields_of(
     ----------
     paths : PathSet or Further
     faces, sources_m, poses, link, loss_db
-        As for :func:`channel_matrices`.
+        The same as in :func:`channel_matrices`.
 
     Returns
     -------
@@ -244,7 +244,7 @@ def of_one_depth(
     Parameters
     ----------
     g, elements, ends, wavelength, record
-        As for :func:`amplitudes`.
+        The same as in :func:`amplitudes`.
     slants : twice (cosine, sine)
         Slants of tower and UAV, broadcast with (paths, pairs). Additional leading axes are the first axes of the
         result. Parts that do not depend on them are evaluated once.

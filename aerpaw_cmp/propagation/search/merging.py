@@ -188,7 +188,7 @@ def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-de
     todo : (DEEPEST,) int
         Room for nodes that wait.
     hits
-        As of :func:`overlapping`.
+        The same as of :func:`overlapping`.
 
     Returns
     -------
@@ -252,7 +252,7 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     lower, upper, node
-        As for :func:`box_outside`.
+        The same as in :func:`box_outside`.
     segment : ((3,), (3,))
         Start [m], and one over each component of its vector [1/m]; 1e300 where that is 0.
 

@@ -625,7 +625,7 @@ def own_coefficients(
     Parameters
     ----------
     faces, links, rays, surfaces
-        As in :func:`find_paths`.
+        The same as in :func:`find_paths`.
     probe : Link
         Link with two elements of one pattern in each array's centre.
     turns : ((towers, 3, 3), (poses, 3, 3))

@@ -299,7 +299,7 @@ def _likeliest(
 
     def summed(kind: int) -> FloatArray:
         of = [c[kind * len(own) :][: len(own)] for own, (_, c, _) in zip(own_s, each, strict=True)]
-        return np.sum([np.interp(at_s, own, c, 0.0, 0.0) for own, c in zip(own_s, of, strict=True)], axis=0)
+        return np.asarray(sum(np.interp(at_s, own, c, 0.0, 0.0) for own, c in zip(own_s, of, strict=True)))
 
     chi2 = summed(0)
     slower = max(

@@ -356,20 +356,20 @@ def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
         return ()
     low_m += site.takeoff_ground_m
     near = sea_m is not None and low_m > _GROUND_M and abs(low_m - sea_m) < _NEAR_GROUND_M
-    if low_m > _FLOWN_M or (near and _takes_off(telemetry)):
+    high = low_m > _FLOWN_M
+    if high or (near and _takes_off(telemetry)):
+        # a UAV at rest is on the ground, independent of the datum of its heights
+        ground_m = low_m if sea_m is None or not high else sea_m
         ground = "the ground of the take-off above the sea [m]" if sea_m is None else f"the ground is {sea_m:g} m up"
-        line = f"'takeoff_ground_m: {-(low_m if sea_m is None else sea_m):.0f}' under 'origin:' of the site file"
-        too_high = low_m > _FLOWN_M
-        expected, otherwise = (
-            (f"samples below {_FLOWN_M:.0f} m, or a log that begins on the ground", "add the rows of the take-off")
-            if too_high
-            else ("a UAV at rest before its climb is on the ground, at 0 m", "remove its rows before the climb")
-        )
+        line = f"'takeoff_ground_m: {site.takeoff_ground_m - ground_m:.0f}' under 'origin:' of the site file"
         raise InputError(
-            f"the lowest height above take-off is {low_m:.0f} m" + ("" if too_high else ", at rest before a climb"),
-            expected=expected,
-            cause=f"heights above sea level that are read as above take-off: write {line} (minus {ground}); "
-            f"if the log begins in the air, {otherwise}",
+            f"the lowest height above take-off is {low_m:.0f} m" + ("" if high else ", at rest before a climb"),
+            expected=f"samples below {_FLOWN_M:.0f} m, or a log that begins on the ground"
+            if high
+            else "a UAV at rest before its climb is on the ground, at 0 m",
+            cause="heights above the sea or the ellipsoid that are read as above take-off: "
+            f"write {line} (minus {ground if high else 'the height at rest'}); if the log begins in the air, "
+            + ("add the rows of the take-off" if high else "remove its rows before the climb"),
             path=path,
         )
     if near:

@@ -228,7 +228,7 @@ def _failed(error: Exception, debug: bool, arguments: list[str]) -> int:
 
 
 def _code_of_output(code: int) -> int:
-    """The exit code, if standard output takes what was printed: seen here, not at the interpreter's exit."""
+    """Return the exit code after flushing standard output. A failure would otherwise be found at exit only."""
     fault = interrupts.output_fault()
     if fault is None or code:
         return code

@@ -1,9 +1,9 @@
-"""SHA-256 of the content of records, arrays and shapes: the name of what was made of them.
+"""SHA-256 of the content of records, arrays and shapes, used as cache key.
 
-The logs that a file was learned from, by SHA-256 and by marks: written into it, and read from any such file.
+The logs that a file was learned from, by SHA-256 and by marks: how a learned file lists them, and how they are read.
 
-Nothing learned is scored on a log that it was learned from. Names, folders and archives of a log may change: its
-SHA-256 says which one it is, and where its bytes changed too, its marks (:mod:`aerpaw_cmp.flight.training`).
+No learned model is scored on its training logs. Names, folders and archives of a log may change: its SHA-256 identifies
+it, and if its bytes were changed, its fingerprints do (:mod:`aerpaw_cmp.flight.training`).
 """
 
 from __future__ import annotations
@@ -82,5 +82,5 @@ def marks(text: str) -> tuple[str, ...]:
 
 
 def union(*lists: Iterable[str]) -> tuple[str, ...]:
-    """All of several lists, each log once, in order."""
+    """Return the entries of several lists without duplicates, in order."""
     return tuple(dict.fromkeys(digest for item in lists for digest in item))

@@ -1,4 +1,4 @@
-"""Exceptions, sorted by whose fault it is: one class per answer, each with its exit code.
+"""Exceptions for users: one class per cause, each with its exit code.
 
 ======================  =========  =====================================
 class                   exit code  meaning
@@ -45,9 +45,9 @@ def one_line(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    r"""Text that may have lines and holds nothing that a terminal takes for a command: a file's words may be in it.
+    r"""Return text with line breaks but without terminal control sequences, because it may quote a file.
 
-    All that is printed passes through here or through :func:`one_line`.
+    All printed text passes through this function or :func:`one_line`.
 
     Examples
     --------
@@ -58,11 +58,11 @@ def printable(text: str) -> str:
 
 
 def add_note(error: BaseException, text: str) -> None:
-    """Add a sentence to an exception that goes on: what is kept when a run is interrupted.
+    """Add a sentence to an exception that is raised again, for example about stored results.
 
     Notes
     -----
-    What ``BaseException.add_note`` of Python 3.11 does.
+    Equivalent to ``BaseException.add_note`` of Python 3.11.
     """
     error.__notes__ = [*getattr(error, "__notes__", ()), text]  # type: ignore[attr-defined]
 
@@ -133,7 +133,7 @@ class AerpawCmpError(Exception):
 
 @contextmanager
 def about_file(path: str | Path) -> Iterator[None]:
-    """Errors from inside that name no file are about this one."""
+    """Add this path to errors from inside the block that do not name a file."""
     try:
         yield
     except AerpawCmpError as error:
@@ -171,8 +171,8 @@ def parsing(
     expected, cause : str, optional
         Parts of the message for errors that the parser does not handle.
     any_shape : bool
-        Whether the block walks through JSON of an unchecked shape. A TypeError is then an error of the file, else a
-        bug.
+        Whether the block walks through JSON of an unchecked shape. If true, a TypeError is an error of the file,
+        otherwise a bug.
 
     Yields
     ------
@@ -210,7 +210,7 @@ def _is_raised_here(error: BaseException) -> bool:
 
 
 def parsed(expected: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
-    """Decorator of a function that reads the file which its first argument names: :func:`parsing` around it."""
+    """Decorate a function that reads the file named by its first argument: run it inside :func:`parsing`."""
 
     def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
         @wraps(function)
@@ -238,9 +238,10 @@ def _as_columns(options: re.Match[str]) -> str:
 
 
 def from_python(public: _T) -> _T:
-    """Decorator of a public function or class: errors name arguments (``timezone=``), not options (``--timezone``).
+    """Decorate a public function or class, so that errors name arguments (``timezone=``), not options (``--timezone``).
 
-    An argument that a record of options refuses is one of the public function; what only ``fit`` knows asks for it.
+    An argument that an options record refuses is reported for the public function. Attributes that only ``fit`` creates
+    are reported as missing ``fit()``.
     """
     if isinstance(public, type):
         for name, method in vars(public).items():
@@ -272,7 +273,7 @@ def from_python(public: _T) -> _T:
 
 
 class CheckError(AerpawCmpError):
-    """The job ran, but a check that the user asked for did not hold."""
+    """The job ran, but a check that the user requested failed."""
 
     exit_code = 1
 
@@ -292,7 +293,7 @@ class InputError(AerpawCmpError):
 
 
 class OutputError(AerpawCmpError):
-    """The disk does not take an output: it is full, fails, or may not be written."""
+    """An output cannot be written: the disk is full, fails, or is not writable."""
 
     exit_code = 3
 
@@ -365,7 +366,7 @@ def _exists(place: Path) -> bool:
 
 
 def _nearest(place: Path) -> str:
-    """A file with a name like it, or the nearest folder that exists."""
+    """Return a hint: a file with a similar name, or the nearest existing folder."""
     folder = place.parent
     while not _exists(folder) and folder != folder.parent:
         folder = folder.parent

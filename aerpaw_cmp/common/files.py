@@ -92,7 +92,7 @@ def clear_cache() -> tuple[int, int]:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """A folder for one process at a time: others wait. Without effect on systems and disks that have no locks."""
+    """Lock a folder for one process at a time. This has no effect on systems and disks without locks."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         # no fcntl on Windows, no locks on some network disks
@@ -107,17 +107,17 @@ def locked(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def atomic_path(target: Path) -> Iterator[Path]:
-    """A place to write to, which takes the name ``target`` when the block ends without an error.
+    """Yield a temporary path that is renamed to ``target`` when the block ends without an error.
 
     Parameters
     ----------
     target : Path
-        In a folder that exists. A reader sees the old file or the new one, never a part.
+        The output file. Its folder must exist. Other programs see the old file or the new one, never a part.
 
     Yields
     ------
     Path
-        An empty file in the same folder; it is removed if the block fails.
+        An empty file in the same folder. It is removed if the block fails.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
 
 
 def _clear_old_parts(folder: Path, prefix: str) -> None:
-    """Remove what a run killed more than an hour ago left of the same file."""
+    """Remove temporary files of the same target that a killed run left more than an hour ago."""
     for part in folder.glob(f"{glob.escape(prefix)}*.part"):
         with contextlib.suppress(OSError):
             if time.time() - part.stat().st_mtime > 3600:
@@ -147,7 +147,7 @@ def _clear_old_parts(folder: Path, prefix: str) -> None:
 
 
 def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
-    """Content of a file, or of a pipe, never more than ``most`` bytes: a device, or a log named by mistake, has no end.
+    """Return the content of a file or pipe of at most ``most`` bytes. A device could be endless.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
     Raises
     ------
     InputError
-        If it holds more.
+        If the file has more bytes.
     OSError
         If it cannot be read.
     """
@@ -193,18 +193,18 @@ _CHUNK = 1 << 20
 
 
 def seal(content: bytes, mark: bytes) -> bytes:
-    """Content with a mark and its SHA-256 behind it."""
+    """Return the content followed by a mark and its SHA-256."""
     return content + mark + hashlib.sha256(content).digest()
 
 
 def unseal(entry: bytes, mark: bytes) -> bytes:
-    """The content of what :func:`seal` made.
+    """Return the content of an entry that :func:`seal` created.
 
     Raises
     ------
     ValueError
-        If the entry is damaged, or another kind of file: seen before any of it is parsed, since damaged archives make
-        their readers fail in a dozen ways.
+        If the entry is damaged or another kind of file. This is checked before parsing, because readers of damaged
+        archives raise many kinds of exceptions.
     """
     content, end = entry[: -len(mark) - 32], entry[-len(mark) - 32 :]
     if end != mark + hashlib.sha256(content).digest():
@@ -256,7 +256,7 @@ def plain_mode() -> int:
 
 
 def sync(path: Path) -> None:
-    """Bring a file or folder to the disk."""
+    """Sync a file or folder to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

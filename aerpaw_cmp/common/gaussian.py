@@ -18,7 +18,7 @@ from .units import FloatArray, IntArray
 
 
 def gaussian_kernel(first: FloatArray, second: FloatArray, length: float) -> FloatArray:
-    """Gaussian kernel of unit variance between points (n, d) and (m, d): (n, m).
+    """Return the Gaussian kernel of unit variance between points (n, d) and (m, d), shape (n, m).
 
     Examples
     --------
@@ -78,13 +78,13 @@ class Factor:
         return np.asarray(solve_triangular(self.lower, values, lower=True, check_finite=False))
 
     def solve(self, values: FloatArray) -> FloatArray:
-        """``C^-1 y`` of values (n,) or (n, k)."""
+        """Return ``C^-1 y`` of values (n,) or (n, k)."""
         from scipy.linalg import cho_solve
 
         return np.asarray(cho_solve((self.lower, True), values, check_finite=False))
 
     def condition(self, across: FloatArray, white: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean and explained variance at targets, given the known values.
+        """Return mean and explained variance at targets, given the known values.
 
         Parameters
         ----------
@@ -98,18 +98,18 @@ class Factor:
         mean : (m,) or (m, k)
             ``K C^-1 y``.
         explained : (m,)
-            ``diag(K C^-1 K')``: what the known values take off the variance of each target.
+            ``diag(K C^-1 K')``: the reduction of each target's variance by the known values.
         """
         half = self.whiten(across.T)
         return half.T @ white, np.einsum("nm,nm->m", half, half)
 
     def log_likelihood(self, values: FloatArray) -> float:
-        """``-y' C^-1 y / 2 - log det(C) / 2`` of values (n,): their log likelihood but for a constant."""
+        """Return the log likelihood of values (n,) up to a constant: ``-y' C^-1 y / 2 - log det(C) / 2``."""
         white = self.whiten(values)
         return -0.5 * float(white @ white) - float(np.log(np.diag(self.lower)).sum())
 
     def inverse(self) -> FloatArray:
-        """``C^-1``, at a third of what solving for the unit matrix takes."""
+        """Return ``C^-1``, in a third of the time of solving for the unit matrix."""
         from scipy.linalg.lapack import dpotri
 
         # LAPACK fills one triangle and does not clear the other
@@ -120,7 +120,7 @@ class Factor:
 def determining(
     points: FloatArray, kernel: Callable[[FloatArray, FloatArray], FloatArray], share: float, most: int
 ) -> IntArray:
-    """Return numbers of those points that determine a process of unit variance at all of them.
+    """Return the indices of points whose values determine a process of unit variance at all points.
 
     Parameters
     ----------
@@ -128,19 +128,19 @@ def determining(
     kernel : callable
         Covariance (k, m) of points (k, d) and (m, d).
     share : float
-        Share of the variance that may be left at any point.
+        Largest share of the variance that remains at any point.
     most : int
-        Largest number of points taken; where they do not suffice, more than the share is left.
+        Largest number of points. If they are too few, more than the share remains.
 
     Returns
     -------
     (k,) int
-        In the order in which they were taken.
+        Indices in order of selection.
 
     Notes
     -----
-    Pivoted Cholesky decomposition of the kernel: the point of largest variance left is taken next (Harbrecht, Peters
-    and Schneider, Appl. Numer. Math. 62 (2012), doi:10.1016/j.apnum.2011.10.001).
+    Pivoted Cholesky decomposition of the kernel: the point with the largest remaining variance is selected next
+    (Harbrecht, Peters and Schneider, Appl. Numer. Math. 62 (2012), doi:10.1016/j.apnum.2011.10.001).
     """
     remaining, rows, chosen = np.ones(len(points)), np.empty((min(most, len(points)), len(points))), list[int]()
     while len(chosen) < len(rows) and remaining.max() > share:

@@ -2,17 +2,18 @@
 
 An interrupt is an exception that may occur anywhere, even where Python cannot raise it: in code around a fork, in a
 finaliser, in the callback of a weak reference ("Exception ignored in ..."). Before Python 3.12 an interrupt inside a
-class body becomes a RuntimeError. A command records that an interrupt came. It checks before each stage and before an
-output takes its name, and delays the interrupt while a half-done step would be reported wrongly.
+class body becomes a RuntimeError. A command records each interrupt, checks for it before each stage and before an
+output is renamed, and delays it during steps that must not be split.
 
 A call of compiled code (LLVM, linear algebra, Sionna) may last for minutes, during which Python handles no signals. A
 second thread then ends the process.
 
 scancel, systemd and docker send SIGTERM, and a closed terminal sends SIGHUP. Both end a command as Ctrl-C does.
 
-Standard streams that are closed, full or gone: none of that is a fault of the program.
+Standard streams that are closed, full or gone are not bugs of the program.
 
-The streams of a command note the first error of their descriptor and take no more; :func:`output_fault` says which.
+The streams of a command store the first error of their descriptor and then discard output; :func:`output_fault` returns
+it.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP"
 # The exit code is this plus the number of the signal.
 SIGNALLED = 128
 
-# Undone when :func:`noted` ends: hidden places whose owner an interrupt did not let finish its first step.
+# Functions to call when :func:`noted` ends: they remove hidden files whose creation was interrupted.
 AT_END: list[Callable[[], None]] = []
 
 # Time that compiled code may continue after a signal: half of the second within which a command should end.
@@ -94,7 +95,7 @@ def noted() -> Iterator[None]:
             raise
         raise KeyboardInterrupt from error
     finally:
-        # a second signal would break off the clearing
+        # a second signal would stop the clean-up
         _set(SIGNALS, signal.SIG_IGN, _note)
         _clear()
         _signalled = False
@@ -157,7 +158,7 @@ def _watch(signals: int, ended: threading.Event) -> None:
 
 
 def said(number: int) -> str:
-    """Return the message text for the end by a signal."""
+    """Return the message for a process that a signal ended."""
     return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
 
 
@@ -183,7 +184,7 @@ def held() -> Iterator[None]:
 
 
 class _Descriptor(io.FileIO):
-    """A standard descriptor whose errors are kept for the end."""
+    """A standard descriptor that stores its first error until the end of the command."""
 
     fault: OSError | None = None
 
@@ -198,10 +199,10 @@ class _Descriptor(io.FileIO):
 
 
 def guard() -> None:
-    """Put such streams in place of this process's own, not of those that a test or another program put there.
+    """Replace the standard streams of this process by such streams, but not streams of tests or other programs.
 
-    Descriptors that are closed are filled first: else the first files that a command opens would take their numbers,
-    and with them what is printed. Writing to them fails as it does without a descriptor.
+    Closed descriptors are opened first: otherwise the next files would get their numbers and receive the printed
+    output. Writing to them fails as before.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         closed = _is_closed(number)

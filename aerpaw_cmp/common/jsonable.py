@@ -13,7 +13,7 @@ from .units import AnyArray
 
 
 def number_key(number: float) -> str:
-    """A number as a key of JSON, or as part of a column's name.
+    """Return a number as text for a JSON key or a column name.
 
     Examples
     --------

@@ -1,9 +1,9 @@
-"""KML of others read, and KMZ files written: coordinates, marks, lines, legends and the archive.
+"""Reading of third-party KML and writing of KMZ: coordinates, marks, lines, legends and the archive.
 
-Logs in KML are read by pattern, line by line (:data:`DATA`, :data:`POINT`): each line has to be accounted for, also of
-a cut file. Maps and routes are read as XML.
+Logs in KML are read by pattern, line by line (:data:`DATA`, :data:`POINT`): each line has to be counted, even in a
+truncated file. Maps and routes are read as XML.
 
-XML files of others, refused where they could explode or read other files.
+Third-party XML files are refused if they could expand without limit or read other files.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ def xml_root(data: bytes, path: Path | None, expected: str) -> ElementTree.Eleme
 
 
 def plain_tag(tag: str) -> str:
-    """A tag without its namespace's prefix."""
+    """Return a tag without its namespace prefix."""
     return tag.rpartition(":")[2]
 
 
 def named(root: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:
-    """All elements of a name, in order."""
+    """Yield all elements with a name, in document order."""
     return (element for element in root.iter() if plain_tag(element.tag) == name)
 
 
@@ -72,7 +72,7 @@ def outermost(root: ElementTree.Element, names: set[str]) -> Iterator[ElementTre
             walk += reversed(element)
 
 
-# Of a legend.
+# Resolution of legends.
 _DPI = 110
 
 # --- reading -------------------------------------------------------------------------------------------------------
@@ -102,19 +102,19 @@ def data_of(parts: Iterator[ElementTree.Element]) -> dict[str, str]:
 
 
 def modes_of(shape: ElementTree.Element) -> set[str]:
-    """Altitude modes below an element: ``relativeToGround``, ``absolute``, ``clampToGround``."""
+    """Return the altitude modes below an element: ``relativeToGround``, ``absolute``, ``clampToGround``."""
     return {str(mode.text or "").strip() for mode in named(shape, "altitudeMode")}
 
 
 def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
-    """Longitude, latitude [deg] and, where it is written, height [m] of each place below an element.
+    """Return longitude, latitude [deg] and, if present, height [m] of each position below an element.
 
-    Numbers that commas alone join are taken in threes, as Google Earth does.
+    Numbers separated only by commas are read as triples, as in Google Earth.
 
     Raises
     ------
     InputError
-        A coordinate that is no number, or alone; joined numbers that are not the threes of one area.
+        If a coordinate is not a number or has no partner, or numbers separated by commas are not triples of one area.
     """
     if plain_tag(shape.tag) == "Track":
         cells = [str(place.text or "").split() for place in named(shape, "coord")]
@@ -136,7 +136,7 @@ _AREA_DEG = 5.0
 
 
 def _in_threes(numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
-    """Return places of numbers that no blank divides."""
+    """Return positions from numbers that are separated by commas only."""
     threes = [numbers[i : i + 3] for i in range(0, len(numbers), 3)]
     if len(numbers) % 3 or any(max(column) - min(column) > _AREA_DEG for column in list(zip(*threes, strict=True))[:2]):
         raise InputError(
@@ -155,7 +155,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def xml_text(text: str) -> str:
-    """Text for an XML element or attribute: characters that XML cannot hold as escapes."""
+    """Return text for an XML element or attribute. Characters that XML does not allow are escaped."""
     return escape(one_line(text), quote=False).replace('"', "&quot;")
 
 
@@ -180,7 +180,7 @@ def line(name: str, at: list[str], shape: str, *, style: str = "", head: str = "
     ----------
     name : str
     at : list of str
-        Places as :func:`coordinates` writes them.
+        Positions in the format of :func:`coordinates`.
     shape : str
         KML before the coordinates.
     style, head : str
@@ -231,7 +231,7 @@ def folder(name: str, legend: str, content: str, *, visible: bool) -> str:
 
 
 def write_archive(path: Path, title: str, description: str, body: str, pictures: Mapping[str, bytes]) -> Path:
-    """A KMZ file: the document and its pictures by name.
+    """Write a KMZ file: the document and its pictures by name.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ def write_archive(path: Path, title: str, description: str, body: str, pictures:
 
 
 def list_legend(title: str, colours: Mapping[str, str], width: float = 2.6) -> bytes:
-    """A list of colours by label as PNG, ``width`` inches wide."""
+    """Return a legend with colours by label as PNG, ``width`` inches wide."""
     sheet = _Sheet(title, width, 0.38 + 0.155 * len(colours))
     for number, (label, colour) in enumerate(colours.items()):
         top = round((0.28 + 0.155 * number) * _DPI)
@@ -291,7 +291,7 @@ def bar_legend(title: str, label: str, limits: tuple[float, float]) -> bytes:
 
 
 class _Sheet:
-    """A white picture with a title, of a size in inches: matplotlib takes a tenth of a second for each."""
+    """A white picture with a title and a size in inches, drawn without matplotlib (0.1 s per picture)."""
 
     def __init__(self, title: str, width: float, height: float) -> None:
         import matplotlib
@@ -308,7 +308,7 @@ class _Sheet:
         self.pen.text((x, y), text, fill="black", font=self._font, anchor=anchor)
 
     def png(self) -> bytes:
-        """The file."""
+        """Return the picture as PNG."""
         buffer = io.BytesIO()
         self.picture.save(buffer, "PNG")
         return buffer.getvalue()

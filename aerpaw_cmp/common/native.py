@@ -1,10 +1,10 @@
 """Reading of third-party files in native formats (HDF5, GeoTIFF), in a child process that cannot open anything.
 
-Libraries of these formats are C code that follows the file: to other files that it names (external storage and links,
-virtual data sets, VRT), into endless loops, and sometimes over the end of a buffer. The child gets the bytes of the
-file, loads its library, and then gives up its rights. It cannot create any further descriptor (RLIMIT_NOFILE 0: no
-file, socket or process pipe), use more than ``_MOST_MEMORY``, or more than ``SECONDS`` of processor time. Only then
-does it read the bytes. The result is a list of plain arrays.
+Libraries of these formats are C code that a file can lead to other files (external storage and links, virtual data
+sets, VRT), into endless loops, and sometimes beyond the end of a buffer. The child gets the bytes of the file, loads
+its library, and then gives up its rights. It cannot create any further descriptor (RLIMIT_NOFILE 0: no file, socket or
+process pipe), use more than ``_MOST_MEMORY``, or more than ``SECONDS`` of processor time. Only then does it read the
+bytes. The result is a list of plain arrays.
 
 Without a ``resource`` module (Windows) these limits do not apply, but the content of the file is still checked.
 """
@@ -38,7 +38,7 @@ _CHILD = "import sys; sys.path[:] = sys.argv[2:]; from aerpaw_cmp.common.native 
 
 
 def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
-    """Return arrays of a file, and what else is known of them.
+    """Return the arrays of a file, and notes about them.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
     Raises
     ------
     InputError
-        If it is damaged, declares too much, or holds something that lies in another file.
+        If the file is damaged, declares too much data, or contains data that are stored in another file.
     """
     code, out, err = _in_child(kind, data)
     if code == 0:
@@ -106,7 +106,7 @@ def main(kind: str) -> None:
 
 
 def answer(reader: Read, data: bytes) -> tuple[int, bytes, bytes]:
-    """Exit code, the arrays of a file for standard output, and why there are none for standard error."""
+    """Return the exit code, the arrays of a file for standard output, and the error for standard error."""
     try:
         arrays, notes = reader(data)
     except InputError as error:
@@ -116,7 +116,7 @@ def answer(reader: Read, data: bytes) -> tuple[int, bytes, bytes]:
         return 1, b"", f"{type(error).__name__}: {one_line(str(error))}".encode()
     head = json.dumps({"names": list(arrays), "notes": notes}).encode()
     out = io.BytesIO()
-    # pass names in a dictionary: 'file' and 'allow_pickle' are keywords of savez
+    # pass arrays by position, because names such as 'file' and 'allow_pickle' are keywords of savez
     np.savez(out, np.frombuffer(head, dtype=np.uint8), *arrays.values())
     return 0, out.getvalue(), b""
 
@@ -136,7 +136,7 @@ Read = Callable[[bytes], tuple[dict[str, AnyArray], dict[str, Any]]]
 
 
 def _hdf5(depth: int, netcdf: bool = False) -> Read:
-    """The reader of HDF5 files, with all loaded that it needs."""
+    """Return the reader of HDF5 files, after loading all modules that it needs."""
     import encodings.ascii
     import encodings.latin_1
     import encodings.utf_16  # noqa: F401  Python loads them when a text needs them
@@ -178,7 +178,7 @@ def _hdf5(depth: int, netcdf: bool = False) -> Read:
             book["x"].attrs[name] = book.attrs[name] = value
         book.flush()
         read(book.id.get_file_image())  # import what h5py and NumPy import late, because files cannot be opened later
-    # loads zipfile, which answer() needs when nothing can be opened any more
+    # load zipfile, because answer() needs it when files cannot be opened
     np.savez(io.BytesIO(), np.zeros(1))
     return read
 
@@ -209,7 +209,7 @@ def _text(value: Any) -> str | int:
 
 
 class _Items:
-    """Numeric data sets below a group by their path, none of which lies outside of the file."""
+    """Numeric data sets below a group by path. Data sets outside the file are refused."""
 
     def __init__(self, book: Any, depth: int, kinds: str = "fiub") -> None:
         import h5py
@@ -255,7 +255,7 @@ def _lies_elsewhere(reason: str) -> InputError:
 
 
 def _geotiff() -> Read:
-    """The reader of GeoTIFF files, with all loaded that it needs."""
+    """Return the reader of GeoTIFF files, after loading all modules that it needs."""
     import warnings
 
     import rasterio
@@ -264,7 +264,7 @@ def _geotiff() -> Read:
     warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # the caller reports the cause
 
     def read(data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
-        # by its driver: GDAL takes a text that begins with <VRTDataset> for a list of other files
+        # name the driver: GDAL treats a text that begins with <VRTDataset> as a list of other files
         with MemoryFile(data) as file, file.open(driver="GTiff") as image:
             if image.count != 1:
                 raise InputError(f"{image.count} bands", expected="one band of heights", cause="a picture, not heights")

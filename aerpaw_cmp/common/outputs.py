@@ -3,7 +3,7 @@
 Two kinds of result, one rule:
 
 =====================  =======================================================  ==================================
-kind                   is this tool's own, so that it may be replaced           how the new one takes the name
+kind                   proof that this tool wrote it                            how the new output gets the name
 =====================  =======================================================  ==================================
 :class:`OutputFile`    a seal inside: the SHA-256 of the rest of the file       written nearby, synced, renamed
 :class:`OutputFolder`  ``SHA256SUMS`` in it: the SHA-256 of every file of it    filled nearby, synced, swapped
@@ -50,7 +50,7 @@ _Identity = tuple[int, int]
 
 
 def sealed(text: str) -> bytes:
-    r"""Text whose first line, a comment, holds the SHA-256 of the rest.
+    r"""Return a text after a comment line that contains the SHA-256 of the text.
 
     Examples
     --------
@@ -62,7 +62,7 @@ def sealed(text: str) -> bytes:
 
 
 def unsealed(text: str) -> str:
-    """Text without the line that :func:`sealed` begins it with."""
+    """Return a text without the first line that :func:`sealed` added."""
     return text.partition("\n")[2] if text.startswith(_SEAL) else text
 
 
@@ -118,7 +118,7 @@ def changed_files(folder: Path) -> list[str]:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file."""
+    """Return the SHA-256 of a file."""
     with path.open("rb") as stream:
         return _digest(stream)
 
@@ -164,20 +164,21 @@ class OutputFile:
     Parameters
     ----------
     target : Path
-        What ``-o`` names. A link is followed: the file behind it is replaced, the link stays.
+        Value of ``-o``. A link is followed: its target is replaced, and the link remains.
     own : callable
-        Whether a file that exists is an earlier, unchanged output of the same kind.
+        Returns whether an existing file is an earlier, unchanged output of the same kind.
     inputs : iterable of Path
         Files and folders that the command reads.
     force : bool
-        Replace a file that is not this tool's; never an input.
+        Also replace a file that this tool did not write. An input is never replaced.
 
     Raises
     ------
     UsageError
-        On entry: the target is an input, is not this tool's, lies in no folder, or another run writes it.
+        On entry: if the target is an input, was not written by this tool, has no parent folder, or is in use by another
+        run.
     OutputError
-        If the disk does not take it.
+        If the output cannot be written to the disk.
     """
 
     def __init__(
@@ -221,9 +222,9 @@ class OutputFile:
             )
 
     def write(self, content: bytes | Callable[[BinaryIO], None]) -> None:
-        """Write, sync, and take the name: a reader sees the old file or the new one, also after a power cut.
+        """Write and sync the file, then rename it: even after a power cut, the target is the old or the new file.
 
-        ``content`` may be a function that fills a stream, which is open for reading, too.
+        ``content`` may be a function that writes to a stream. The stream can also be read.
         """
         place = self._place
         assert place is not None, "used as a context"
@@ -255,7 +256,7 @@ class OutputFile:
 
 
 def _say_kept(error: BaseException | None, named: Path) -> None:
-    """Add the state of the output's name to an interrupt."""
+    """Add a note about the state of the output file to an interrupt."""
     if isinstance(error, KeyboardInterrupt) or (error is not None and interrupted()):
         exists = os.path.lexists(named)
         add_note(error, f"{one_line(str(named))} {'is as it was before' if exists else 'was not written'}")
@@ -284,15 +285,15 @@ class OutputFolder:
     inputs : iterable of Path
         Files that the command reads. None of them may be in the folder.
     force : bool
-        Replace files that were changed after this tool wrote them; never files of others.
+        Also replace files that were changed after this tool wrote them. Files of other programs are never replaced.
 
     Raises
     ------
     UsageError
-        On entry: the folder holds an input or what is not this tool's, cannot be replaced as a whole, or another
-        run writes it.
+        On entry: if the folder contains an input or files that this tool did not write, cannot be replaced, or is in
+        use by another run.
     OutputError
-        If the disk does not take it.
+        If the output cannot be written to the disk.
 
     Examples
     --------
@@ -336,7 +337,7 @@ class OutputFolder:
                 _say_kept(error, self.named)
 
     def _refuse_shape(self) -> None:
-        """UsageError for a name that no folder of results can have."""
+        """Raise UsageError if the target cannot be a result folder."""
         if _taken(self.target) and not self.target.is_dir():
             raise UsageError("a file is in the way", expected="the name of a folder", path=self.named)
         if self.target.is_dir():
@@ -357,7 +358,7 @@ class OutputFolder:
                 )
 
     def _refuse_content(self) -> None:
-        """UsageError where the folder holds what this tool did not write, or what was changed since."""
+        """Raise UsageError if the folder contains files that this tool did not write or that were changed later."""
         if not self.target.is_dir():
             return
         own = read_sums(self.target)
@@ -395,7 +396,7 @@ class OutputFolder:
         self._made = []
 
     def placed(self, written: Iterable[Path]) -> tuple[Path, ...]:
-        """Final names of files that were written into the folder of :meth:`filling`."""
+        """Return the final paths of files that were written into the folder of :meth:`filling`."""
         assert self._place is not None, "used as a context"
         return tuple(self.named / path.relative_to(self._place.part) for path in written)
 
@@ -426,13 +427,13 @@ class OutputFolder:
 
 
 def foreign_entries(folder: Path, own: Iterable[str]) -> Iterator[str]:
-    """Entries of a folder besides files that are this tool's: files, links, folders, other file systems.
+    """Yield entries of a folder that are not files of this tool: files, links, folders, other file systems.
 
     Parameters
     ----------
     folder : Path
     own : iterable of str
-        The files that are this tool's, as names below the folder.
+        Relative names of the files that this tool wrote.
 
     Yields
     ------
@@ -560,7 +561,7 @@ class _Place:
         )
 
     def lock_too(self, folder: Path) -> None:
-        """Lock what is about to come to this place."""
+        """Also lock a folder that will get this path."""
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         self._further.append(descriptor)
         _lock(descriptor)
@@ -610,10 +611,10 @@ def _lock(descriptor: int) -> bool:
 
 
 def _clear(part: Path, *, keep: bool = False) -> None:
-    """Empty a place and, unless ``keep``, remove it. OSError if it contains files that are not this tool's.
+    """Empty a temporary folder and, unless ``keep``, remove it. OSError if it contains files that are not this tool's.
 
-    A place with ``.unfinished`` was being filled, so all its files are ours. Without it, it is the set that was
-    replaced, and only the files in its list are ours. Both markers are removed last, so that a killed run can be
+    A folder with ``.unfinished`` was being filled, so this tool wrote all its files. Otherwise it contains the replaced
+    results, and this tool wrote only the listed files. Both markers are removed last, so that a killed run can be
     continued.
     """
     # os.walk enters mounts, and unlink would empty the mounted disk
@@ -721,7 +722,7 @@ def _taken(path: Path) -> bool:
 
 @contextlib.contextmanager
 def explained_os_errors(path: str | Path) -> Iterator[None]:
-    """An OSError inside becomes one message that names the output and says what to do."""
+    """Convert an OSError inside the block into an error that names the output and the next step."""
     try:
         yield
     except OSError as error:
@@ -737,9 +738,9 @@ def explained_os_errors(path: str | Path) -> Iterator[None]:
 
 
 class Sink:
-    """A stream that never fails towards HDF5, which ends the process where a disk is full.
+    """A stream that never raises inside HDF5, because HDF5 ends the process if the disk is full.
 
-    The first failure, an interrupt included, is kept for :meth:`raise_spared`; what comes after it is lost.
+    The first exception or interrupt is stored for :meth:`raise_spared`. Later writes are ignored.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -747,7 +748,7 @@ class Sink:
         self._failure: BaseException | None = None
 
     def raise_spared(self) -> None:
-        """Raise what HDF5 was spared."""
+        """Raise the stored exception."""
         if self._failure is not None:
             raise self._failure
 
@@ -761,11 +762,11 @@ class Sink:
         return instead
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move to a place."""
+        """Move to a position."""
         return int(self._spared(self._stream.seek, offset, whence))
 
     def tell(self) -> int:
-        """Return the place in the stream."""
+        """Return the position in the stream."""
         return int(self._spared(self._stream.tell))
 
     def write(self, block: Any) -> int:
@@ -778,9 +779,9 @@ class Sink:
         return bytes(block.ljust(max(size, 0), b"\0"))
 
     def truncate(self, size: int | None = None) -> int:
-        """Cut or lengthen."""
+        """Change the length of the stream."""
         return int(self._spared(self._stream.truncate, size))
 
     def flush(self) -> None:
-        """Hand all to the system."""
+        """Flush the stream."""
         self._spared(self._stream.flush)

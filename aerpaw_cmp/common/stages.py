@@ -1,4 +1,4 @@
-"""Named stages of a job: how far it is, and how long each took."""
+"""Named stages of a job, with progress and durations."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from .interrupts import raise_interrupt
 
 
 class Progress(Protocol):
-    """Takes what is being done and, where it is known, the share of it that is done (0 to 1).
+    """A function that receives the current step and, if known, the share that is done (0 to 1).
 
-    The same text with a growing share is one bar; a text without a share is a line.
+    Calls with the same text and a growing share form one progress bar. A text without a share is a line.
     """
 
     def __call__(self, text: str, fraction: float | None = None, /) -> object: ...  # noqa: D102
@@ -87,7 +87,7 @@ class Plan:
     inputs : tuple of Path
         Files that would be read.
     output : Path
-        What would be written; its place was tried and would be taken.
+        The path that would be written. The check has confirmed that it can be written.
     stages : tuple of PlannedStage
     """
 
@@ -121,7 +121,7 @@ class Stages:
     Parameters
     ----------
     progress : Progress
-        Gets the name of each stage as it begins.
+        Receives the name of each stage when it begins.
     seconds : dict of str to float
         Time of each stage [s]. Stages with the same name are added.
     plan : Plan, optional
@@ -179,8 +179,8 @@ def peak_mib() -> float:
 def give_memory_back() -> None:
     """Return freed pages to the system, if the C library can (glibc: ``malloc_trim``).
 
-    A stage frees most of its memory, in pieces between others that stay. After a flight of ten hours a quarter of a GiB
-    of such free pieces would remain from stage to stage.
+    A stage frees most of its memory in small pieces between blocks that are still in use. After a flight of ten hours a
+    quarter of a GiB of such free pieces would remain from stage to stage.
     """
     trim = getattr(_library(), "malloc_trim", None)
     if trim is not None:

@@ -1,4 +1,4 @@
-"""Small texts: the commands and their help, counts in words, cells of CSV files, HTML tables.
+"""Short texts: the commands and their help, counts with nouns, cells of CSV files, HTML tables.
 
 The commands and their one-line help, for ``--help`` without loading anything and for the command line itself.
 
@@ -82,7 +82,7 @@ def guarded(table: Any) -> Any:
 
 
 def guarded_text(word: str) -> str:
-    """A cell that no spreadsheet takes for a formula.
+    """Return a cell that spreadsheets do not treat as a formula.
 
     Examples
     --------
@@ -104,7 +104,7 @@ def guarded_comment(line: str) -> str:
 
 
 def unguarded(word: str) -> str:
-    """The text of a cell that :func:`guarded` wrote.
+    """Return the original text of a cell that :func:`guarded` wrote.
 
     Examples
     --------

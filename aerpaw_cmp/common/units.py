@@ -38,7 +38,7 @@ THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0
 
 
 class Printed(float):
-    """A number in a sentence: its minus is printed as a minus sign, and hyphens of names next to it are kept.
+    """A number in a sentence. Its minus is printed as a minus sign; hyphens in names are not changed.
 
     Examples
     --------
@@ -51,9 +51,9 @@ class Printed(float):
 
 
 def unmasked(values: ArrayLike, dtype: Any = np.float64) -> AnyArray:
-    """An array of numbers in which what NumPy's mask hides is missing (NaN), as gaps of NetCDF and GeoTIFF come.
+    """Return an array of numbers with NaN instead of masked values, such as gaps of NetCDF and GeoTIFF.
 
-    Each function that takes arrays of callers begins with it: ``np.asarray`` would give what lies under the mask.
+    Each function that receives arrays from callers calls it first: ``np.asarray`` would give what lies under the mask.
 
     Examples
     --------

@@ -10,7 +10,7 @@ Values of some keys can be edited in a YAML file: every other line, its comments
 
 Files that a settings file names: inputs, which no output may replace.
 
-No list of keys: whatever text of the settings names a file is one, so that a new key cannot be forgotten.
+There is no list of keys: every text that names an existing file counts, so that a new key is not forgotten.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
     path : str or Path
         UTF-8 file.
     model : type of pydantic.BaseModel
-        With ``extra="forbid"`` (:class:`StrictModel`) unknown keys are errors.
+        Model of the settings. With ``extra="forbid"`` (:class:`StrictModel`), unknown keys are errors.
 
     Returns
     -------
@@ -122,8 +122,8 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
     InputError
         There is no such file, or it cannot be read.
     UsageError
-        With path and line: not text, not YAML, duplicate or unknown key (the nearest valid key
-        is named), wrong or missing values (all of them at once).
+        With path and line, if the file is not text or YAML, has duplicate or unknown keys (with the nearest valid key),
+        or wrong or missing values.
     """
     return parse_yaml(_read_text(Path(path)), model, path)
 
@@ -551,7 +551,7 @@ def _edited(text: str, path: KeyPath, value: Any) -> str:
 
 
 def _flow(value: Any) -> str:
-    """A value on one line."""
+    """Return a value as YAML on one line."""
     # a width that no line reaches, because wrapped lines would need an indent. PyYAML ends a plain scalar with "..."
     line: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6)
     return line.removesuffix("\n").removesuffix("\n...")
@@ -590,13 +590,13 @@ def _without(text: str, node: Any, at: int) -> str:
 
 
 def input_files(settings: BaseModel, path: Path, logs_root: Path | None = None) -> list[Path]:
-    """A settings file and every file that one of its values names, against its folder or ``logs_root``."""
+    """Return a settings file and every file that its values name, relative to its folder or ``logs_root``."""
     roots = [path.parent] if logs_root is None else [logs_root, path.parent]
     return [path, *(place for _, _, place in named_files(settings.model_dump(), roots))]
 
 
 def named_files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str, Path]]:
-    """Dotted key, text and place of every value that names a file."""
+    """Yield dotted key, text and path of every value that names a file."""
     for key, text in _texts(content, ""):
         for root in roots:
             # most names do not exist, and creating a Path is slow
@@ -606,7 +606,7 @@ def named_files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str,
 
 
 def _texts(value: Any, key: str) -> Iterator[tuple[str, str]]:
-    """Every text in nested settings with its dotted key."""
+    """Yield every text in nested settings with its dotted key."""
     if isinstance(value, (str, Path)):
         yield key, str(value)
     elif isinstance(value, dict):

@@ -74,7 +74,7 @@ def learned_health(flights: Sequence[HeldOut], differences_db: dict[str, list[fl
     Parameters
     ----------
     flights : sequence of HeldOut
-        At least one.
+        One or more flights.
     differences_db : dict of str to list of float
         By other channel of the tower: the offset of this channel minus that of the other channel, per flight.
     """

@@ -123,7 +123,7 @@ def distinct(rows: Sequence[LadderRow], keep: str) -> tuple[list[LadderRow], lis
     Parameters
     ----------
     rows : sequence of LadderRow
-        In the order of the models, with the same channels for each.
+        Rows in the order of the models, with the same channels for each.
     keep : str
         Model that always has a row, as the recommended model has.
 

@@ -456,7 +456,7 @@ def replay_poses(
         Positions of the only tower of the link, which moves [m].
     engine : {"image", "sionna"}, optional
     progress : Progress
-        Is called with the share that is done, for the sionna engine.
+        Called with the share that is done, for the sionna engine.
     job : Job, optional
         Job of which the poses are a part.
 

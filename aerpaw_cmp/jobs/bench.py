@@ -55,7 +55,7 @@ def run_bench(
     samples : tuple of int
         Rays per tower of the sionna engine.
     ratios : bool
-        Also compare with the peers.
+        Also measure the engines of other programs.
     report : Path, optional
         Folder of a report, whose model comparison becomes a table.
     progress : Progress

@@ -361,7 +361,7 @@ def calibrate(
     ----------
     settings : CalibrationFile
     flights : sequence of FlightData
-        As :func:`read_flights` returns them.
+        Flights, as returned by :func:`read_flights`.
     folder, logs_root : Path
         Folder for the paths of patterns, and folder for the logs of ``score`` (default: that of their flight file).
     campaigns : mapping of str to str, optional

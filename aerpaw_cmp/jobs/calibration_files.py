@@ -226,7 +226,7 @@ def _record_of(
     Returns
     -------
     CalibrationData
-        As :func:`aerpaw_cmp.report.calibration.write_calibration` takes it.
+        Input of :func:`aerpaw_cmp.report.calibration.write_calibration`.
     """
     mounts = {
         name: {k: v for k, v in dataclasses.asdict(m).items() if k not in ("grid_deg", "probability")}

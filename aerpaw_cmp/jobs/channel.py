@@ -186,7 +186,7 @@ def _chosen_towers(data: FlightData, chosen: ChannelOptions, remarks: list[str])
     if len(fixed) == len(towers) or (len(towers) == 1 and chosen.route is None):
         return towers
     if chosen.towers or not fixed:
-        raise UsageError("a moving tower with other towers or along a route", expected="it alone, along the track")
+        raise UsageError("a moving tower with other towers or along a route", expected="that tower alone, on its track")
     remarks.append("Moving towers are not exported: --tower NAME exports one of them.")
     return fixed
 

@@ -61,7 +61,7 @@ def tap_modems(
     Returns
     -------
     list of TapSummary
-        In the order of the ports.
+        One summary per port, in the order of the ports.
 
     Raises
     ------

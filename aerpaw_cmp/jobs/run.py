@@ -151,7 +151,7 @@ def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
     Raises
     ------
     UsageError, OutputError
-        As :meth:`aerpaw_cmp.flight.simulate.FlightSimulator.run`.
+        The same as in :meth:`aerpaw_cmp.flight.simulate.FlightSimulator.run`.
     """
     from ..flight.data import choose_site
     from ..flight.gains import load_with_learned
@@ -176,7 +176,7 @@ class ReportOptions:
     Parameters
     ----------
     audit : str, optional
-        In place of ``rt.audit_links`` ("full", "none" or a number).
+        Number of audited links ("full", "none" or a number), instead of ``rt.audit_links``.
     recommend : Path, optional
         Where the flight file with the settings of the recommended model is written.
     learned : path, optional

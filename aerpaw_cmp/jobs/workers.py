@@ -363,7 +363,7 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
     Raises
     ------
     UsageError
-        With the workers, their hosts and the faults.
+        If the workers differ. The message lists workers, hosts and differences.
     """
     answers = client.run(_worker_facts, [str(path.absolute()) for path in paths], on_error="return")
     ours = _worker_facts([])

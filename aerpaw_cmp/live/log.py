@@ -352,7 +352,7 @@ class LogWriter:
     Parameters
     ----------
     log : SegmentLog
-        Not yet open; its settings bound the queue.
+        A log that is not open yet. Its settings limit the queue.
     """
 
     def __init__(self, log: SegmentLog) -> None:

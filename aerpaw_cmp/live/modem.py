@@ -290,7 +290,7 @@ def _decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind:
     flags : list of str
         Receives flags for unusual content.
     command, kind : str
-        Such as ``+QRSRP``, and the key of its values in the result.
+        Name of the answer, such as ``+QRSRP``, and the key of its values in the result.
 
     Returns
     -------
@@ -475,7 +475,7 @@ class Answer:
     Parameters
     ----------
     command : str or None
-        None where a transcript does not show it.
+        The command. None if a transcript does not contain it.
     lines : tuple of str
         Information lines, without echo and final result.
     status : str
@@ -663,7 +663,7 @@ class Framer:
         Parameters
         ----------
         command : str
-            As written to the port, without its end.
+            Command as written to the port, without the line end.
         prefixes : tuple of str, or None
             Starts of its information lines, without blanks; ``()`` if it has none, None if any line may be one.
         """

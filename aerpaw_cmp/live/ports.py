@@ -60,7 +60,7 @@ class PortInfo:
     Parameters
     ----------
     path : Path
-        What to open; a stable name if there is one.
+        Path of the port: a stable name if there is one.
     device : Path
         The node it leads to now.
     how : str
@@ -442,11 +442,11 @@ class TapStatus:
     missed : int
         Poll slots that passed unused while connected.
     predicted_rank : int or None
-        By the replay at the present pose.
+        Rank that the replay predicts at the present pose.
     predicts : bool
         Whether predictions are made at all.
     alarm : bool
-        No CSI for longer than asked: ring the bell.
+        True if there was no CSI for longer than the limit: the bell rings.
     message : str
         Something to be read once (a loss, a fault, an advice); empty on regular calls.
     """

@@ -74,7 +74,7 @@ class RunningInterval:
     share : float
         Share of residuals that must lie inside.
     least : int
-        Fewest residuals for an interval.
+        Smallest number of residuals for an interval.
     keep : int
         Number of stored residuals.
 

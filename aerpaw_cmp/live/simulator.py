@@ -258,7 +258,7 @@ def run_modem_sim(
     ----------
     simulator : ModemSimulator
     on_ready : callable
-        Gets the port's name.
+        Function that receives the port's name.
     meanwhile : callable, optional
         Called several times a second, e.g. to write the telemetry of the same flight.
     """

@@ -322,7 +322,7 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     Parameters
     ----------
     name : str
-        As written, with its unit.
+        Name as written in the file, with its unit.
     words : str, optional
         Its plain form in common words, if the program uses its own words.
 
@@ -716,7 +716,7 @@ def described(
     Parameters
     ----------
     names : iterable of str
-        As written.
+        Names as written in the file.
     known : Program, optional
         The program, if it is known before.
     of : collection of str

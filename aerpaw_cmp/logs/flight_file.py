@@ -73,7 +73,7 @@ def write_flight(path: str | Path, files: Sequence[IngestedFile]) -> None:
     UsageError
         If the place is an input, another file, or in no folder; see :class:`~aerpaw_cmp.common.outputs.OutputFile`.
     OutputError
-        If the disk does not take it.
+        If the output cannot be written to the disk.
     """
     with OutputFile(Path(path), own=is_flight_file) as output:
         output.write(partial(fill, files=files))

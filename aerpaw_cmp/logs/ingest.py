@@ -287,7 +287,7 @@ def read_log(
     Returns
     -------
     IngestedFile
-        With at least one stream.
+        Content of the file, with at least one stream.
 
     Raises
     ------

@@ -137,7 +137,7 @@ class ReadResult:
     reader : str
         Name of the reader.
     streams : tuple of Stream
-        May be empty.
+        Streams of the file. May be empty.
     lines, accepted, blank : int
         ``blank`` counts blank lines, headers and comments.
     rejected : tuple of RejectedLine

@@ -245,7 +245,7 @@ def built(
     column : mapping of str to array, shape (n,)
         Their cells as bytes or floats.
     options, reader, reason, skip, clock
-        The same as of :func:`matched`.
+        The same as in :func:`matched`.
     extra : iterable of RejectedLine
         Lines that were rejected before.
     markup : int array, optional
@@ -373,7 +373,7 @@ def ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = None, mean
     Parameters
     ----------
     ri : float array, shape (m,)
-        As written, NaN where the log has no number.
+        Rank indicator as logged, NaN if the log has no number.
     flag : object array, shape (m,)
     none : bool array, shape (m,), optional
         True where the number means that nothing was reported.
@@ -510,7 +510,7 @@ def reader(
     Parameters
     ----------
     name, title, kinds, sample
-        The same as of :class:`aerpaw_cmp.logs.readers.Reader`.
+        The same as in :class:`aerpaw_cmp.logs.readers.Reader`.
     row : re.Pattern or callable
         See :func:`aerpaw_cmp.logs.rows.matched`. A callable makes it from the file, for instance from its header.
     streams : callable

@@ -564,7 +564,7 @@ def parse_texts(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolAr
     Returns
     -------
     wall_ns, valid : arrays, shape (n,)
-        As :func:`parse_digits`.
+        The same as in :func:`parse_digits`.
     offset_s : int array, shape (n,)
         Offset in the text, else 0.
     zoned : bool array, shape (n,)

@@ -38,7 +38,7 @@ class Check:
     Parameters
     ----------
     name : str
-        What was looked at.
+        Name of the check.
     status : {"ok", "warn", "fail"}
         ``warn``: a job that needs it will be slow or refused, the others run. ``fail``: no replay on this machine.
     found : str

@@ -497,7 +497,7 @@ def interpolation_study(
     values : (n, altitudes, K)
         Rank or RSS; NaN out of coverage. For RSS the last axis may hold towers.
     towers_m : (towers, 2+)
-        For the serving-tower mean.
+        Positions of the towers, for the mean per serving tower.
     neighbours, radius_m, selection, seed
         M, r0 and the choice of samples, the same for every local interpolator.
 

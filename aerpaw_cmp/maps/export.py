@@ -46,7 +46,7 @@ class MapLayers:
     ----------
     grid : Grid
     frame : SiteFrame
-        From local metres to latitude and longitude.
+        Frame that converts local metres to latitude and longitude.
     layers : sequence of Layer
         Values in index order, (positions,), NaN out of coverage.
     towers_m : mapping of str to (3,)
@@ -218,9 +218,9 @@ def maps_dataset(
     Parameters
     ----------
     maps : mapping of str to MapResult
-        By foliage mode; all of one grid, one list of towers, heights and K.
+        Results by foliage mode, with the same grid, towers, heights and K.
     frame : SiteFrame
-        From local metres to latitude and longitude.
+        Frame that converts local metres to latitude and longitude.
     about : mapping of str to str
         Attributes of the file (:func:`~aerpaw_cmp.common.cf.file_attributes`).
     further : sequence of Layer
@@ -336,7 +336,7 @@ def _stacked(
     ----------
     maps : mapping of str to MapResult
     values : sequence of ndarray
-        One array a mode.
+        One array per mode.
     between : tuple of str
         Dimensions of the values but the last; without ``"tower"`` they are those of the nearest tower.
     attributes : mapping

@@ -256,7 +256,7 @@ class Layer:
     name : str
         Identifier such as ``"rank_k10_h030m_joint"``: letters, digits, underscores.
     values : (n,)
-        In index order; NaN (classes: 0) is out of coverage.
+        Values in index order. NaN (0 for classes) means out of coverage.
     unit : str
         Unit, for example ``"dBm"``; ``"1"`` for classes and ratios.
     quantity : str
@@ -339,7 +339,7 @@ class MapResult:
     grid : Grid
         The positions.
     tower_names : tuple of str
-        In drawing order.
+        Names of the towers in drawing order.
     towers_m : (towers, 3)
         East, north, up [m].
     rss_altitudes_m, rank_altitudes_m, ks : tuple of float
@@ -353,7 +353,7 @@ class MapResult:
     serving : (n,) int
         Nearest tower.
     borders : tuple of Border
-        Between the serving areas.
+        Borders between the serving areas.
     """
 
     grid: Grid

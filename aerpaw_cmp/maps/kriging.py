@@ -87,7 +87,7 @@ def nearest(
     Parameters
     ----------
     samples_m : (samples, dims)
-        At distinct places, in a metric frame (anisotropy already applied).
+        Distinct positions in a metric frame (anisotropy already applied).
     targets_m : (targets, dims)
         The same frame.
     m : int

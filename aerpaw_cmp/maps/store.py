@@ -235,7 +235,7 @@ class TileStore:
         Created with the first tile. Files of others in it are neither read nor removed.
     tiling : Tiling
     job : mapping
-        All that the values depend on, as JSON takes it. Tiles of another job are not used.
+        All inputs of the values, as JSON values. Tiles of a different job are not used.
     empty : mapping of str to MapResult
         Maps of any tile, by foliage mode: their form.
 
@@ -346,7 +346,7 @@ class TileStore:
         Parameters
         ----------
         path : Path
-            Must not exist.
+            New file. It must not exist.
         frame : SiteFrame
         about : mapping of str to str
             Attributes of the store.

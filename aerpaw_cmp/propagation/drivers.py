@@ -54,7 +54,7 @@ def replay_in_parts(
     site, link, poses, search, field, run
         The same as in :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
     size : int
-        Most poses of a part; the parts are of about one size.
+        Largest number of poses per part. The parts have about the same size.
 
     Returns
     -------
@@ -227,7 +227,7 @@ def replay_moving(
     ----------
     site : Site
     link : Link
-        With one tower; its array keeps its orientation in the site.
+        Link with one tower. Its array keeps its orientation in the site.
     poses : Poses
     sources_m : (poses, 3)
         Centre of the tower's array at each pose, east, north, up [m].
@@ -400,7 +400,7 @@ def singular_values_of(
     Parameters
     ----------
     geometries : sequence of Geometry
-        In runs of one mount: each run costs one evaluation of the field, two with the ground.
+        Geometries, grouped by mount: each group needs one evaluation of the field, or two with the ground.
     tower : Array
         Positions, pattern and mount; its slants are those of the geometry.
     tower_m : (3,)

@@ -303,7 +303,7 @@ def over_edges(scene: Scene, poses: Poses, link: Link) -> EdgePaths:
     Raises
     ------
     UsageError
-        In a scene of triangles.
+        If the scene consists of triangles.
     """
     if scene.surfaces is not None:
         raise UsageError(

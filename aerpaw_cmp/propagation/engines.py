@@ -103,7 +103,7 @@ def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache
     Returns
     -------
     Choice or None
-        None where the number is given, or no rays are cast.
+        None if the number is given or no rays are cast.
     """
     if search.engine != "sionna" or search.samples != "auto":
         return None
@@ -130,7 +130,7 @@ def search_or_read(
     link : Link
     poses : Poses
     search : Search
-        With a number of samples, where rays are cast.
+        Search settings, with a number of samples if rays are cast.
     run : Run
     cache : PathCache or None
 

@@ -77,7 +77,7 @@ class Faces:
     material : tuple of str, length faces
         Names that :func:`aerpaw_cmp.site.materials.material` knows.
     label : tuple of str, length faces
-        For reports, e.g. ``"ground"``, ``"barn wall 3"``.
+        Name of each face for reports, for example ``"ground"``, ``"barn wall 3"``.
     along, across : (faces, 3)
         In-plane unit axes, ``along x across = normal``.
     lower, upper : (faces, 2)
@@ -178,9 +178,9 @@ class Surfaces:
     plane : (faces,) int
         Faces of one number lie in one plane.
     tree, face_tree : BoxTree
-        Over triangles and over faces.
+        Trees over triangles and over faces.
     notes : tuple of str
-        What was repaired.
+        Repairs of the scene.
     """
 
     faces: Faces
@@ -283,7 +283,7 @@ class PathSet(Rows):
         tower : int
         pose : (paths,) int
         faces : (paths, depth) int
-            From tower to UAV.
+            Index of each face from tower to UAV.
         vertices_m : (paths, depth, 3)
             Reflection points [m]; those without a face do not count.
         max_depth : int
@@ -291,7 +291,7 @@ class PathSet(Rows):
         Returns
         -------
         PathSet
-            In the order given.
+            Paths in the order of the arguments.
         """
         sequence = np.full((len(pose), max_depth), -1, dtype=np.int64)
         points = np.full((len(pose), max_depth, 3), np.nan)
@@ -629,7 +629,7 @@ class Array:
     Parameters
     ----------
     positions_m : (elements, 3)
-        In the device frame.
+        Positions of the elements in the device frame.
     slant_rad : (elements,)
         Slant of each element: 0 vertical, pi/2 horizontal.
     patterns : tuple of Pattern

@@ -115,7 +115,7 @@ class Run:
         Folder that stores paths, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for
         the ``sionna`` engine. The ``image`` engine is faster than a cache and only uses one that is named.
     job : Job, optional
-        What the poses are a part of.
+        Job that the poses are a part of.
     progress : callable, optional
         Called with the share done.
     """

@@ -269,7 +269,7 @@ def impulse_responses(
     Returns
     -------
     a : (rx, rx_ant, tx, tx_ant, paths, times) complex
-        With the phase of the carrier, as Sionna's baseband equivalents; zero where there is no path.
+        Coefficients with the phase of the carrier, like Sionna's baseband equivalents. Zero if there is no path.
     tau : (rx, tx, paths)
         Delay [s]; zero where there is no path.
     """
@@ -291,7 +291,7 @@ def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> 
     table : PathTable
     ends : Ends
     offsets_hz : (frequencies,)
-        From the carrier, such as those of :func:`subcarriers_hz`.
+        Offsets from the carrier, such as those of :func:`subcarriers_hz`.
 
     Returns
     -------
@@ -355,7 +355,7 @@ class Replay:
     rss_dbm : (poses, towers)
         Coherent: from ``|H|^2``, see :func:`aerpaw_cmp.propagation.field.sum.rss_dbm`. NaN without a path.
     rss_power_dbm : (poses, towers)
-        From the sum of the paths' powers.
+        Level from the sum of the paths' powers.
     h : (poses, towers, n_rx, n_tx) complex128
         Zero without a path.
     has_path : (poses, towers) bool
@@ -579,11 +579,11 @@ def passed(
         Scene with the terrain planes that a path meets.
     paths : PathSet
     notes : list of Omission
-        What was stopped or left out.
+        Searches that were stopped, and links that were skipped.
     """
     scene, level, shaped, notes = _shaped_ground(site, scene, link, poses, paths)
     clear = _clear_of_terrain(site, scene, poses, level)
-    # asked of level paths alone: those over shaped ground were asked when they were made
+    # only level paths are checked here: paths over shaped ground were checked when they were created
     lost = int((~clear).sum())
     notes += [Omission("paths end at the terrain of the elevation model", (lost, len(level)))]
     paths = level.select(clear) if lost else level

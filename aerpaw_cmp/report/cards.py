@@ -172,7 +172,7 @@ class Page:
     first, cards : sequence of Card
         Above the navigation and below it.
     charts : sequence of Chart
-        Those of the script, in the order of its data.
+        Charts in the order of the script's data.
     """
 
     kind: str

@@ -33,7 +33,7 @@ class Column:
     ----------
     name : str
     unit : str
-        As people write it; empty for text, codes and shares.
+        Unit in the usual notation. Empty for text, codes and shares.
     meaning : str
     values : callable, optional
         Returns the values (n,) of a series, or one value for all its rows. A family returns a mapping by model, K or

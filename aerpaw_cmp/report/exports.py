@@ -503,7 +503,7 @@ def chosen_formats(names: Iterable[str], known: Iterable[str] = FORMATS) -> tupl
     Raises
     ------
     UsageError
-        For an unknown name, or a format whose library is not installed.
+        If a name is unknown, or the library of a format is not installed.
 
     Examples
     --------
@@ -538,7 +538,7 @@ def write_exports(export: Export, folder: Path, formats: Iterable[str], progress
     formats : iterable of str
         Names of :data:`FORMATS`.
     progress : Progress
-        Is called for a format of ``all`` whose library is missing.
+        Called for a format of ``all`` whose library is missing.
 
     Returns
     -------

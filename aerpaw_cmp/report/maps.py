@@ -867,7 +867,7 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
 def result_card(data: MapsData) -> Card:
     """Return the card of the shares in coverage, and of the numbers of the paper next to ours."""
     paper = Table(
-        caption="What the paper (arXiv 2502.10324) states, and what this run gives.",
+        caption="What the paper (arXiv 2502.10324) states, and the results of this run.",
         columns={"Where": HEAD, "What": TEXT, "Paper": TEXT, "Here": TEXT, "Figure": TEXT},
         rows=[(p.where, p.what, p.paper, p.ours, p.figure) for p in data.paper],
     )  # fmt: skip

@@ -156,7 +156,7 @@ def write_figures(
     kind : str
         Style, as in :func:`render`.
     progress : Progress
-        Is called with the share of the figures that are drawn.
+        Called with the share of the figures that are drawn.
 
     Returns
     -------

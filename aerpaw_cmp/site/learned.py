@@ -352,7 +352,7 @@ def check_index(site: str | Path) -> None:
     Raises
     ------
     UsageError, InputError
-        As :func:`read_learned`.
+        The same as in :func:`read_learned`.
     """
     _read(folder_of(site), _Index)
 
@@ -387,7 +387,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
     UsageError
         If a file with the name of a table was not written by a calibration, or the index is damaged.
     InputError, OutputError
-        As :func:`read_learned`, or if the folder cannot be written.
+        The same as in :func:`read_learned`, or if the folder cannot be written.
     """
     folder = folder_of(site)
     # mtime=0, so that the same content has the same bytes and SHA-256

@@ -113,7 +113,7 @@ def result(
     reader : str
     options : ReadOptions
     flights : list of Flight
-        One per vehicle, at least one.
+        One or more flights, one per vehicle.
     messages : int
         Number of intact messages, without ``damaged``.
     damaged : list of RejectedLine

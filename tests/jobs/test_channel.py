@@ -365,7 +365,7 @@ def test_times_nodes_and_sizes_that_do_not_fit_are_refused(folder, capsys, tmp_p
         (flight, [*late, "csv"], "at most 10000000"),
         (flight, [*late, "npz", *wide], "only netcdf and csv."),
         (drawn, [*late, "csv", *wide], "only netcdf and csv with rt.engine: image"),
-        (moving, ["--tower", "N", "--format", "csv"], "it alone, along the track"),
+        (moving, ["--tower", "N", "--format", "csv"], "that tower alone, on its track"),
     ):
         assert main(["channel", str(path), "-o", str(tmp_path / "out"), *options]) == 2
         assert expected in capsys.readouterr().err

@@ -88,7 +88,7 @@ def report(
 
 
 def _print_cards(verdict: Mapping[str, Any]) -> None:
-    """Print the sentence and the small table of one prediction of another program."""
+    """Print the sentence and the table of a third-party prediction."""
     show(verdict["sentence"])
     columns = {
         "model": "model", "channels": "channels", "bias dB": "bias_db:.1f", "RMSE dB": "rmse_db:.1f",

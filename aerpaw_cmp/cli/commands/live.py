@@ -21,7 +21,7 @@ class WebCommand(TyperCommand):
     """A command whose ``--web`` may stand without an address."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the usual address behind a bare ``--web``: an address is what holds a colon and no slash."""
+        """Add the default address after a bare ``--web``: an address contains a colon and no slash."""
         words = []
         for index, word in enumerate(args):
             words.append(word)
@@ -98,7 +98,7 @@ def tap(
 
 
 class StatusLine:
-    """The status of one modem or more on standard error: on a terminal a line that is written over."""
+    """Show the status of one or more modems on standard error. On a terminal, each line overwrites the last one."""
 
     def __init__(self, enabled: bool) -> None:
         self._enabled, self._terminal = enabled, sys.stderr.isatty()

@@ -304,7 +304,7 @@ def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = 
     Returns
     -------
     list of Draft
-        At least one draft.
+        One or more drafts.
     """
     groups = flights_by_name(files)
     written = []
@@ -732,9 +732,7 @@ def _heights_and_floor(
     if any(lacks_height(s) for s in compared if s is track or _has_positions(s)):
         height = height_in_name(path)
         keys |= {} if height is None else {"height_m": height}
-        asked.append(
-            "no altitude in the log: which height_m?" if height is None else "height_m as the file's name says?"
-        )
+        asked.append("no altitude in the log: which height_m?" if height is None else "height_m from the file's name?")
     # RSRP is reported in whole decibels, so its lowest value repeats without a floor
     levels = [s for s in compared if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"]
     if (floor := receiver_floor_db(levels)) is not None:

@@ -712,11 +712,11 @@ def audit(
     Parameters
     ----------
     site, link, poses
-        As passed to the replay.
+        The same as for the replay.
     replay : Replay
         The result to check.
     search, field, run
-        As passed to the replay.
+        The same as for the replay.
     second : Second
         The other engine, how many links, and what the second implementation checks.
 

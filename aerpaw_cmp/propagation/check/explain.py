@@ -135,7 +135,7 @@ def further_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link:
     poses : Poses
         The pose.
     link : Link
-        With that tower alone.
+        Link with that tower only.
 
     Returns
     -------

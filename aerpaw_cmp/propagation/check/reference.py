@@ -99,7 +99,7 @@ class ExpectedLoss:
     ----------
     model : {"none", "p833", "weissberger", "opaque"}
     gamma_db_per_m, maximum_db : float or None
-        In place of P.833's.
+        Values used instead of those of P.833.
     in_leaf : bool
     reflection_db : float
         Per reflection.
@@ -505,7 +505,7 @@ class Reference:
         Parameters
         ----------
         sequence : sequence of Mirror
-            What the path meets, from the tower on.
+            Faces that the path meets, from the tower to the UAV.
         tx, rx : int
             Elements of tower and UAV.
         target : (3,)
@@ -516,7 +516,7 @@ class Reference:
         Returns
         -------
         complex
-            Such that its squared magnitude is received over sent power; 0 where the path does not exist.
+            Coefficient whose squared magnitude is received over sent power. 0 if the path does not exist.
         """
         tower, uav = self.link.towers[self.tower], self.link.uav
         start = _plus(self.source, _times(tower.mount, tower.positions_m[tx]))
@@ -630,7 +630,7 @@ def fresnel(cosine: float, eta: complex, thickness_m: float | None, wavelength: 
     thickness_m : float or None
         Thickness of the slab [m]. None means a half-space.
     wavelength : float
-        In vacuum [m].
+        Wavelength in vacuum [m].
 
     Returns
     -------

@@ -129,7 +129,7 @@ def reflection_coefficients(
     thickness_m : (...)
         Infinite for a half-space.
     wavelength : float
-        In air [m].
+        Wavelength in air [m].
 
     Returns
     -------

@@ -78,7 +78,7 @@ class Further(Rows):
         Parameters
         ----------
         faces, sources_m, poses, link, loss_db
-            As there.
+            The same as in :func:`channel_matrices`.
 
         Returns
         -------
@@ -137,7 +137,7 @@ def channel_matrices(
     ----------
     paths : PathSet
     faces : Faces
-        That the paths refer to.
+        Faces that the paths refer to.
     sources_m : (towers, 3) or (poses, towers, 3)
         Array centres, in the order of ``link.tower_arrays``; the latter for towers that move.
     poses : Poses

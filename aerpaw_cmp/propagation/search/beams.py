@@ -350,7 +350,7 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
     corners : (triangles, 3, 3)
         [m]
     tree : BoxTree
-        Over the triangles.
+        Tree over the triangles.
     a, b : (3,)
         Ends of the segment [m].
     before, after : ((3,), float)
@@ -857,7 +857,7 @@ def find_paths(
     Parameters
     ----------
     faces, links, max_depth, extent_m
-        As for that function.
+        The same as in that function.
     run : Run
 
     Returns

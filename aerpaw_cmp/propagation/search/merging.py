@@ -34,7 +34,7 @@ def box_tree(lower: FloatArray, upper: FloatArray, leaf: int = 4) -> BoxTree:
     ----------
     lower, upper : (n, 3)
     leaf : int
-        Most items of a leaf.
+        Largest number of items in a leaf.
     """
     lower, upper = np.ascontiguousarray(lower, np.float64), np.ascontiguousarray(upper, np.float64)
     return BoxTree(*_build(lower, upper, leaf))
@@ -114,12 +114,12 @@ def next_leaf(
     missed : function
         ``missed(lower, upper, node, region)``: :func:`box_missed`, or another of this file.
     region : tuple
-        As that takes it.
+        Last argument of ``missed``.
 
     Returns
     -------
     node, waiting : int
-        The leaf, -1 after the last; how many nodes still wait.
+        The leaf, or -1 after the last one, and the number of nodes in ``todo``.
     """
     while waiting > 0:
         waiting -= 1
@@ -162,7 +162,7 @@ def overlapping(tree, low, high, hits):  # type: ignore[no-untyped-def]
     low, high : (3,)
         Corners of the box [m].
     hits : (items,) int
-        Gets the items; has room for all of the tree.
+        Receives the items. Its length is the number of items in the tree.
 
     Returns
     -------
@@ -184,11 +184,11 @@ def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-de
     planes : (most, 4)
         Normals pointing inwards, and offsets [m].
     many : int
-        How many of them count.
+        Number of rows that are used.
     todo : (DEEPEST,) int
         Room for nodes that wait.
     hits
-        The same as of :func:`overlapping`.
+        The same as in :func:`overlapping`.
 
     Returns
     -------
@@ -217,11 +217,11 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
     lower, upper : (nodes, 3)
         Corners of the boxes of a tree [m].
     node : int
-        Which box.
+        Index of the box.
     planes : (most, 4)
         Normals pointing inwards, and offsets [m].
     many : int
-        How many of them count.
+        Number of rows that are used.
 
     Returns
     -------

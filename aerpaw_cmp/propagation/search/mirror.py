@@ -432,7 +432,7 @@ class _Bounds:
     Parameters
     ----------
     corners_m : (faces, 4, 3)
-        In order round the face; infinite ones are cut far away.
+        Corners in order around the face. Infinite faces are cut far away.
     centre_m : (faces, 3)
     reach_m : (faces, 2, 3)
         Half of each side.
@@ -480,7 +480,7 @@ class _Growth:
     tolerance_m : float
         A point this far behind a face still counts as before it [m].
     max_depth, budget : int
-        Most reflections; most sequences of one tower.
+        Largest numbers of reflections and of sequences per tower.
     """
 
     faces: Faces

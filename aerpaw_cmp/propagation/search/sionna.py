@@ -514,7 +514,7 @@ class Rays:
     Parameters
     ----------
     max_depth : int
-        Most interactions of a path, 0 to 3.
+        Largest number of interactions per path, 0 to 3.
     samples : int
         Rays per tower and batch.
     batch : int
@@ -545,7 +545,7 @@ def find_paths(
     carrier_hz : float
         Sionna shoots by reflection power, so materials matter to what it finds.
     surfaces : Surfaces, optional
-        What the faces are made of, where they are open surfaces.
+        Surfaces of the faces, if they are open surfaces.
     progress : callable, optional
 
     Returns
@@ -596,7 +596,7 @@ class Coefficients:
     Parameters
     ----------
     paths : PathSet
-        With Sionna's own reflection points.
+        Paths with Sionna's reflection points.
     gain : (paths, 2, 2) complex
         UAV elements by tower elements, carrier phase included.
     length_m : (paths,)

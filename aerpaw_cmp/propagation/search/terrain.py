@@ -40,11 +40,11 @@ class OnTerrain:
     Parameters
     ----------
     level : PathSet
-        Those of the engine that stay: without the ground, or over ground that is level or unknown.
+        Paths of the engine without a ground reflection, or over ground that is level or unknown.
     shaped : PathSet
-        Over tangent planes; neither buildings nor terrain stop them.
+        Paths over tangent planes. Buildings and terrain are not yet considered.
     faces : Faces
-        With the tangent planes behind those of the scene.
+        Faces of the scene, followed by the tangent planes.
     unknown : int
         Links over ground that the model does not know.
     """

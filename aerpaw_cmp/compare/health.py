@@ -183,7 +183,7 @@ def _decay(apart: Sequence[FloatArray], errors: Sequence[FloatArray], longest: f
 # Simulated healthy flights of 830 s: 95 % below 14 to 15, 99 % below 17 to 20.
 _STEP_CHI2, _FURTHER_CHI2 = 25.0, 4.0
 # A step must be this much better than a change over these times or over the flight, as twice a log likelihood.
-_BEFORE_SLOWER, _SLOW_S = 3.0, (100.0, 200.0)
+_BEFORE_SLOWER, _SLOW_S = 5.0, (100.0, 200.0)
 # The step must take this share of its own variance off that of the errors.
 _LEAST_TAKEN = 0.5
 # The mean square of the whitened error of healthy flights is at most 1.2 at LW1.

@@ -157,8 +157,8 @@ def test_an_interrupted_campaign_says_where_its_outcomes_are(
     file.write_text(f"campaign: c\nflights: [{SAMPLE / 'flight.yaml'}]\n")
     line = ["campaign", str(file), "-o", str(tmp_path / "out")]
     for more, said in (
-        (["--keep", str(tmp_path / "k")], f"finished tasks are kept in {tmp_path / 'k'}"),
-        (["--fresh"], "nothing is kept"),
+        (["--keep", str(tmp_path / "k")], f"finished tasks are stored in {tmp_path / 'k'}"),
+        (["--fresh"], "nothing is stored"),
     ):
         assert main([*line, *more]) == 130
         err = capsys.readouterr().err

@@ -370,7 +370,7 @@ def prepare_llvm() -> Path:
     trials = _trials()
     if not trials or not trials[-1].ok or trials[-1].library is None:
         line = INSTALL_AGAIN if sionna_fails(trials) else install_line()
-        raise SionnaMissingError(f"{explain(trials)}. Mend it with: {line}")
+        raise SionnaMissingError(f"{explain(trials)}. Repair it with: {line}")
     # Dr.Jit reads it once, when it is imported
     os.environ[LIBRARY_VARIABLE] = str(trials[-1].library.path)
     return trials[-1].library.path

@@ -71,7 +71,7 @@ def test_flight_is_replayed_where_sionna_rt_cannot_be_loaded(tmp_path, monkeypat
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     engine = audit_flight.audit_replays(data, replayed)
     assert engine.audit is None
-    assert engine.not_audited.endswith(f"Mend it with: {INSTALL_AGAIN}")
+    assert engine.not_audited.endswith(f"Repair it with: {INSTALL_AGAIN}")
     assert "mitsuba" in engine.not_audited
 
 

@@ -389,7 +389,7 @@ def test_reader_counts_bad_tails(tail):
     result = READER.read(sample() + tail, ReadOptions())
     assert len(result.rejected) == 1
     assert result.accepted == 5
-    assert any("torn" in w for w in result.warnings)
+    assert any("truncated" in w for w in result.warnings)
     middle = READER.read(sample() + tail + b"\n" + exchange(8, 10, "nr5g_csi", {"rank": 1, "ri_raw": 1}), ReadOptions())
     assert (len(middle.rejected), middle.accepted) == (1, 6)
 

@@ -96,7 +96,7 @@ def load_variant(prefer: str | None = None) -> str:
 
 
 def _missing(error: ImportError) -> SionnaMissingError:
-    return SionnaMissingError(f"Sionna RT cannot be loaded ({error}). Mend it with: {INSTALL_AGAIN}")
+    return SionnaMissingError(f"Sionna RT cannot be loaded ({error}). Repair it with: {INSTALL_AGAIN}")
 
 
 def _variant(kinds: Sequence[str]) -> str:

@@ -208,7 +208,7 @@ def unseal(entry: bytes, mark: bytes) -> bytes:
     """
     content, end = entry[: -len(mark) - 32], entry[-len(mark) - 32 :]
     if end != mark + hashlib.sha256(content).digest():
-        raise ValueError("the seal does not fit the content")
+        raise ValueError("the checksum does not match the content")
     return content
 
 

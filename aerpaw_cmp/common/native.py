@@ -249,7 +249,7 @@ class _Items:
 def _lies_elsewhere(reason: str) -> InputError:
     return InputError(
         reason,
-        expected="a file that holds its own data",
+        expected="a file that contains all its data",
         cause="a file made to read other files of this machine, or a set in several files: make it one (h5repack)",
     )
 

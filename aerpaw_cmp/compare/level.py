@@ -704,7 +704,7 @@ def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> Detectio
     def loss(c: FloatArray) -> tuple[float, FloatArray]:
         odds = c[0] + c[1] * unit
         over = DetectionForecast(level_db=0.0, per_db=1.0, share=0.0).probability(odds) - detected
-        # a small ridge: where a level parts the outcomes exactly, no slope is steep enough
+        # a small ridge limits the slope if a level separates the results perfectly
         value = (weight * (np.logaddexp(0.0, odds) - detected * odds)).sum() + 1e-3 * c[1] ** 2
         return float(value), np.array([(weight * over).sum(), (weight * over * unit).sum() + 2e-3 * c[1]])
 

@@ -211,7 +211,7 @@ def only_time(place_m: FloatArray | None) -> str:
         return f"{100.0 * missing:.0f} % of the samples have no position"
     away_m = place_m[known] - place_m[known].mean(axis=0)
     if np.square(away_m).sum(axis=1).mean() < _HOVER_M**2:
-        return "the UAV hardly left one place"
+        return "the UAV hardly moved"
     return ""
 
 

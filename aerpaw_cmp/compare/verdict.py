@@ -388,7 +388,7 @@ def _each_alone(values: FloatArray) -> Iterator[tuple[int, float, float, Interva
 
 def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interval]:
     """Return chance, difference of means (inside minus outside) and its 95 % interval, with pooled variance."""
-    from scipy.special import stdtr, stdtrit  # scipy.stats would load for 0.2 s what two functions need
+    from scipy.special import stdtr, stdtrit  # importing scipy.stats would take 0.2 s for two functions
 
     freedom, n = len(values) - 2, int(inside.sum())
     if len(values) < _FEWEST_TO_COMPARE or not 0 < n < len(values):
@@ -723,7 +723,7 @@ class _Segment:
 
     def step_to(self, nights: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
         """Return the step to the mean of some nights, half its 95 % interval, and the chance of one as large."""
-        from scipy.special import stdtr, stdtrit  # scipy.stats would load for 0.2 s what two functions need
+        from scipy.special import stdtr, stdtrit  # importing scipy.stats would take 0.2 s for two functions
 
         square, freedom = self.pooled()
         if freedom < _FEWEST_NIGHTS - 1:

@@ -349,7 +349,7 @@ def decode_record(line: bytes) -> Record:
     if not mark or len(tail) != 10 or not tail.endswith(b'"}'):
         raise ValueError("torn line: it does not end with a checksum")
     if b"%08x" % zlib.crc32(body) != tail[:8]:
-        raise ValueError("damaged line: its checksum does not fit")
+        raise ValueError("damaged line: its checksum does not match")
     try:
         record = json.loads(body + b"}")
     except RecursionError:

@@ -218,7 +218,7 @@ def holders(device: str) -> list[str]:
 def serial_checks() -> Iterator[Check]:
     """Check serial ports: whether this user may open them, and which processes use them. No port is opened."""
     if missing := [name for name in ("fcntl", "termios") if not _importable(name)]:
-        lacking = f"this system has no {' and no '.join(missing)}: 'tap' and 'modem-sim' need Linux, all else works"
+        lacking = f"this system has no {' and no '.join(missing)}: 'tap' and 'modem-sim' need Linux, the rest works"
         yield Check("Serial", "warn", lacking, "run the tap on Linux")
         return
     try:

@@ -142,7 +142,7 @@ def _not_a_knot_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
         right[..., end, :] = (
             (near + 2 * span)[..., None] * far[..., None] * slope[..., a, :] + near[..., None] ** 2 * slope[..., b, :]
         ) / span[..., None]
-    # dense, since NumPy solves a stack of small systems at once and SciPy's banded solver one at a time
+    # dense, because NumPy solves many small systems at once and SciPy's banded solver one at a time
     return np.asarray(np.linalg.solve(system, right))
 
 
@@ -157,7 +157,7 @@ def _hermite(x: FloatArray, y: FloatArray, tangent: FloatArray, at: FloatArray) 
     t0, t1 = np.take_along_axis(tangent, low, -2)[..., 0, :], np.take_along_axis(tangent, high, -2)[..., 0, :]
     h = right - left
     u = (at[..., None] - left) / h
-    # by differences from the left sample, so that equal samples come back to the last digit
+    # use differences from the left sample, so that equal samples are reproduced exactly
     rise = y1 - y0
     return np.asarray(y0 + u * (h * t0 + u * (3 * rise - h * (2 * t0 + t1) + u * (h * (t0 + t1) - 2 * rise))))
 
@@ -279,7 +279,7 @@ class InverseDistance(_Local):
 
     def _combine(self, near: _Near) -> FloatArray:
         at = near.distance_m < kriging.TIE_M
-        # relative to the nearest, so that nothing overflows
+        # relative to the nearest sample, to prevent overflow
         ratio = near.distance_m[:, :1] / np.where(at, 1.0, near.distance_m)
         weight = np.where(at.any(axis=1, keepdims=True), at.astype(np.float64), ratio**2)
         weight /= weight.sum(axis=1, keepdims=True)
@@ -374,7 +374,7 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
         raise UsageError(f"values of shape {truth.shape}, estimates of shape {guess.shape}")
     known = np.isfinite(truth)
     scored = known & np.isfinite(guess)
-    # NaN times zero is NaN: what does not count must leave the sums before they are made
+    # NaN times zero is NaN, so remove values without weight before summing
     error = np.where(scored, guess - np.where(known, truth, 0.0), 0.0)
     n = scored.sum(axis=0)
 
@@ -433,7 +433,7 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     estimate = np.full_like(flat, np.nan)
     for number in np.unique(block):
         test = block.ravel() == number
-        # one block that holds everything leaves nothing to learn from: it stays unscored
+        # if one block contains all samples, there are no training samples, and it is not scored
         if not test.all():
             estimate[test], _ = model.fit(points[~test], flat[~test]).predict(points[test])
     return score(data, estimate.reshape(data.shape))

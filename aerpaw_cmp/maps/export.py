@@ -181,7 +181,7 @@ def _colours(layer: Layer, low: float, high: float) -> AnyArray:
 
 
 def _class_palette(layer: Layer) -> list[str]:
-    # the first colour is the grey of Z: no class with a channel may have it
+    # the first colour is the grey of "no path", so no class with a channel may use it
     start = 0 if layer.classes[0] == "Z" else 1
     return [CLASS_COLOURS[start + i % (len(CLASS_COLOURS) - start)] for i in range(len(layer.classes))]
 
@@ -349,7 +349,7 @@ def _stacked(
     joint = "tower" not in between
     # the last axis, positions in index order, as y and x
     planes = np.stack([v.reshape(*v.shape[:-1], *m.grid.shape) for m, v in zip(maps.values(), values, strict=True)])
-    # levels as float32 hold 0.01 dB exactly enough and halve the file
+    # float32 resolves 0.01 dB and halves the file
     numbers = planes.astype(np.int8) if "flag_values" in attributes else np.round(planes, 2).astype(np.float32)
     described = {
         **attributes,

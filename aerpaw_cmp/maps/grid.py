@@ -34,7 +34,7 @@ from ..compare.rank import rank_from_singular_values
 # Horizontal interval d_rx of the UAV positions.
 PAPER_SPACING_M = 30.0
 
-# A digit too few in the spacing would ask for 1e8 positions and days of replays.
+# With a mistyped spacing, a map would have 1e8 positions and take days.
 _MAXIMUM_CELLS_A_SIDE = 10_000
 
 # How plots and tables name a position without any path.
@@ -99,7 +99,7 @@ class Grid:
                     expected=f"at most {_MAXIMUM_CELLS_A_SIDE}",
                     cause="a spacing with too few digits",
                 )
-            # what is left over is shared by both sides: the grid stays in the middle of the area
+            # divide the remainder between both sides, so that the grid is centred in the area
             axes.append((low + high) / 2 + spacing_m * (np.arange(cells) - (cells - 1) / 2))
         return cls(np.asarray(axes[0], dtype=np.float64), np.asarray(axes[1], dtype=np.float64), float(spacing_m))
 
@@ -228,7 +228,7 @@ def _bisector_segment(
             bounds.append(float(towers[c] @ towers[c] - towers[a] @ towers[a] - 2 * middle @ (towers[c] - towers[a])))
     low, high = -np.inf, np.inf
     for slope, bound in zip(slopes, bounds, strict=True):
-        # the bisector runs along this bound: all of it is inside, or none
+        # the bisector is parallel to this bound: it is completely inside or outside
         if abs(slope) < 1e-12:
             if bound < 0:
                 return None
@@ -236,7 +236,7 @@ def _bisector_segment(
             high = min(high, bound / slope)
         else:
             low = max(low, bound / slope)
-    # three areas that meet in a point: a corner, no border
+    # three areas that meet in a point have a corner, not a border
     if high - low < 1e-9:
         return None
     return np.stack([middle + low * along, middle + high * along])
@@ -438,12 +438,12 @@ def map_job(
     at = {"rss": tuple(map(float, rss_altitudes_m)), "rank": tuple(map(float, rank_altitudes_m))}
     t, n = len(names), len(grid)
     rss = np.full((3, len(at["rss"]), t, n), np.nan)
-    # zero is out of coverage, so what no engine fills in has no channel
+    # zero means out of coverage, so values that no engine writes have no channel
     rank = np.zeros((len(at["rank"]), len(ks), t, n), dtype=np.int8)
     ratio = np.full((2, len(at["rank"]), t, n), np.nan)
     heights = sorted({*at["rss"], *at["rank"]})
     for step, height in enumerate(heights):
-        # height by height: the engine's memory is that of one, however many there are
+        # height by height, so that the memory does not depend on the number of heights
         positions = grid.positions_m(height)
         for start in range(0, n, chunk):
             part = slice(start, min(start + chunk, n))
@@ -522,7 +522,7 @@ def foliage_difference(without: MapResult, foliage: MapResult) -> FoliageDiffere
     return FoliageDifference(
         clear - shaded,
         np.isfinite(clear) & ~np.isfinite(shaded),
-        # a link that foliage takes away is counted in ``lost``: as a fall to rank 0 it would count twice
+        # a link that foliage removes is counted in ``lost``: as a decrease to rank 0 it would count twice
         np.where((before > 0) & (after > 0), after - before, 0),
     )
 

@@ -571,7 +571,7 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
         for j in reversed(range(m)):
             weight[j] = known[j] - np.einsum("it,it->t", factor[j, j + 1 : m], weight[j + 1 :])
             weight[j] *= inverse_pivot[j]
-        # they add up to 1 by construction: this takes out rounding alone
+        # they add up to 1 by construction: this removes rounding errors only
         weight /= weight.sum(axis=0)
         sound = m * (inverse_pivot**2).sum(axis=0) < PLAINLY_SOUND
         if len(unclear := np.flatnonzero(~sound)):
@@ -592,7 +592,7 @@ def _solve_doubtful(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArra
     """Weights (t, m), normalised variance (t,), near-singular flag (t,) of systems (t, m, m) that may be singular."""
     weight, lagrange, fine = _solve_bordered(gamma, to_target)
     variance = (weight * to_target).sum(axis=1) + lagrange
-    # a covariance gives no negative variance; what lies below by more than rounding shows that it is none
+    # a covariance does not have negative variances: a value below zero by more than rounding shows an invalid one
     fine &= (variance >= -1e-9) & _is_definite(gamma)
     if not fine.all():
         weight[~fine] = _solve_reduced(gamma[~fine], to_target[~fine])
@@ -614,9 +614,9 @@ def _solve_bordered(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArra
     try:
         inverse = np.linalg.inv(system)
     except np.linalg.LinAlgError:
-        # one singular system fails the whole batch; the reduced form serves all of it
+        # one singular system makes the batch fail: solve all its systems in the reduced form
         return np.zeros((t, m)), np.zeros(t), np.zeros(t, dtype=bool)
-    with np.errstate(all="ignore"):  # what overflows here is not fine, and is solved again
+    with np.errstate(all="ignore"):  # systems that overflow here are solved again
         # in the 1-norm, the largest column sum, which costs no decomposition
         condition = np.abs(system).sum(axis=1).max(axis=1) * np.abs(inverse).sum(axis=1).max(axis=1)
         solution = inverse @ right
@@ -660,7 +660,7 @@ def _is_definite(gamma: FloatArray) -> BoolArray:
     covariance = _contrasts(gamma)
     try:
         np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:  # at least one is not; the slower method finds which
+    except np.linalg.LinAlgError:  # at least one matrix is not definite: find it by the slower method
         return np.asarray(np.linalg.eigvalsh(covariance)[:, 0] > 0)
     return np.ones(len(gamma), dtype=bool)
 
@@ -682,7 +682,8 @@ def _apply(rule: Weights, values: FloatArray) -> FloatArray:
     reference = _reference(values)
     estimate = reference + matrix @ (values - reference)
     target, column = np.nonzero(rule.weight == 1.0)
-    estimate[target] = values[rule.index[target, column]]  # at a sample, or with one only: its value to the last bit
+    # at a sample, or with a single sample, return its exact value
+    estimate[target] = values[rule.index[target, column]]
     estimate[~used.any(axis=1)] = np.nan
     return np.asarray(estimate)
 
@@ -708,7 +709,7 @@ def coverage_patterns(values: FloatArray) -> Iterator[tuple[BoolArray, IntArray]
 def _merge_places(points: FloatArray, fields: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     """Distinct places in order of appearance, mean of their values, and the place of each sample."""
     _, first, place = np.unique(np.round(points / TIE_M), axis=0, return_index=True, return_inverse=True)
-    # np.unique sorts by coordinate; places stay in the order in which their samples came
+    # np.unique sorts by coordinate; keep the positions in the order of their samples
     order = np.argsort(first)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))

@@ -183,7 +183,7 @@ class Reach:
         tile = np.array([[west, south], [east, south], [east, north], [west, north]])
         lines = [shapely.linestrings(np.vstack([at, tile])[None])]
         if self._depth:
-            # walls alone: seen from above, a path over ground or roof lies on the line between its ends
+            # only walls: seen from above, a path over ground or roof is on the line between its ends
             lit = self._mirrors.toward(tower.position_m, box_m)
             lit = lit[self._is_wall[lit]]
             lines += [self._way_in(at, lit), self._way_out(at, lit, tile)]
@@ -211,7 +211,7 @@ class Reach:
         reach = far / np.maximum(np.linalg.norm(ray, axis=2, keepdims=True), NEAR_M)
         beam = shapely.polygons(np.concatenate([image[:, None] + ray, (image[:, None] + ray * reach)[:, ::-1]], axis=1))
         area = shapely.polygons(tile)
-        wide = height < 0.05 * length  # a far end of the beam would come near the wall
+        wide = height < 0.05 * length  # the far end of the beam would be near the wall
         lit = np.where(wide, area, shapely.intersection(beam, area))
         return np.asarray(shapely.union(lit, shapely.linestrings(ends)))
 

@@ -31,7 +31,7 @@ from ..common.errors import UsageError, from_python
 from ..common.text import counted
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 
-# Below any sum of squares that data give: where all vanishes, a quotient is 0 and not NaN.
+# Smaller than any sum of squares of data, so that a quotient of zeros is 0 and not NaN.
 TINY = 1e-300
 
 
@@ -169,7 +169,7 @@ class _Projection:
         first, second = np.triu_indices(len(axis), 1)
         grid = np.column_stack([axis[second], axis[first]])
         cost = (self.amplitudes(grid)[1] ** 2).sum(axis=1)
-        # roughly from each start, to the last digit from the best alone
+        # fit roughly from each start, and exactly from the best start only
         refined = np.stack([self._search(grid[cell], 1e-5) for cell in np.argsort(cost)[:STARTS]])
         valley = refined[np.argmin((self.amplitudes(refined)[1] ** 2).sum(axis=1))]
         return np.sort(self._search(valley, 1e-15))[::-1]
@@ -267,7 +267,7 @@ def _candidate_amplitudes(basis: FloatArray, target: FloatArray) -> FloatArray:
     none, slope = np.zeros_like(p), _clipped(p - q + c - b, a - 2 * b + c)
     edges = [(none, _clipped(q, c)), (_clipped(p, a), none), (slope, 1.0 - slope)]
     determinant = a * c - b * b
-    # equal rates make both columns one: any split of the amplitude is as good
+    # with equal rates, both columns are equal and any split of the amplitude is correct
     regular = determinant > 1e-14 * a * c + TINY
     safe = np.where(regular, determinant, 1.0)
     first, second = (c * p - b * q) / safe, (a * q - b * p) / safe
@@ -579,7 +579,7 @@ def _bin_pairs(
     if not (width_m > 0 and maximum_m >= width_m and np.isfinite(maximum_m)):
         raise UsageError(f"bins of {width_m} m up to {maximum_m} m", expected="0 < width <= maximum, both finite")
     sums = _Sums(int(np.floor(maximum_m / width_m + 1e-9)) + 1, width_m)
-    # half a bin beyond the last one's middle; the micrometre lets in pairs at exactly that distance
+    # half a bin beyond the centre of the last bin; the micrometre includes pairs at exactly that distance
     reach = min(maximum_m, width_m * (len(sums.pairs) - 0.5)) + 1e-6
     for rows, columns in _blocks_within(points, reach):
         distance = np.hypot(

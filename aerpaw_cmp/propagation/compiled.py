@@ -37,7 +37,7 @@ from ..common.units import AnyArray
 ROOM = Path(__file__).parents[1]
 SWITCH = "AERPAW_CMP_COMPILED"
 BEAMS = "propagation.search.beams"
-# Files of compiled code, and those whose functions and constants it takes in.
+# Modules of compiled code, and modules whose functions and constants it includes.
 SOURCES = (
     "propagation/search/beams.py", "propagation/search/merging.py", "propagation/search/mirror.py",
     "propagation/geometry.py", "propagation/compiled.py", "propagation/numba_options.py",
@@ -45,7 +45,7 @@ SOURCES = (
 
 # CPU seconds of the first compilation on a machine.
 COMPILE_S = 25.0
-# CPU seconds of NumPy from which numba's import and reading what was compiled before pay off.
+# CPU seconds of NumPy above which importing numba and reading compiled code pays off.
 READ_S = 0.4
 # A job that NumPy finds in less time always uses NumPy, even if numba is loaded.
 LEAST_S = 0.25
@@ -69,7 +69,7 @@ def switch() -> str:
     Raises
     ------
     UsageError
-        If it is none of those known.
+        If the value is not known.
     """
     value = os.environ.get(SWITCH, "auto").strip().lower() or "auto"
     if value not in ("auto", "never", "always"):

@@ -103,7 +103,7 @@ def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
     columns = {name: [getattr(part, name) for part in parts] for name in PER_LINK}
     parts.clear()
     arrays: dict[str, Any] = {}
-    # one array at a time, whose parts are freed before the next: the peak is one array more
+    # join one array at a time and free its parts: the peak is then one array more
     for name in PER_LINK:
         values = columns.pop(name)
         arrays[name] = np.empty((count, *values[0].shape[1:]), dtype=values[0].dtype)
@@ -116,7 +116,7 @@ def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:
     """Return paths of all parts as one set: their poses are numbered as in the flight, and in order."""
     numbered = [replace(part, pose=at[part.pose]) for at, part in zip(rows, parts, strict=True)]  # type: ignore[type-var]
     paths = numbered[0].one_after_another(numbered)
-    # stable: within a pose the order by tower, depth and faces stays
+    # stable sort, so that within a pose the order by tower, depth and faces remains
     return paths.select(np.argsort(paths.pose, kind="stable")) if (np.diff(paths.pose) < 0).any() else paths
 
 
@@ -156,10 +156,10 @@ def added_up(omissions: Iterable[Omission]) -> list[Omission]:
     return list(added.values())
 
 
-# Places of a node in one block: H of a block has this many times the links that count.
+# Largest number of node positions per block. H of a block is this many times larger than needed.
 PLACES_AT_ONCE = 64
 
-# Links (poses times places) of a block: some 4 MB of H with 4 x 4 elements.
+# Largest number of links (poses times positions) per block: about 4 MB of H with 4 x 4 elements.
 LINKS_AT_ONCE = 16_384
 
 
@@ -199,7 +199,7 @@ def _blocks(sources_m: FloatArray) -> Iterator[_Block]:
 
 
 def site_with_tower_at(site: Site, tower: str, place_m: AnyArray) -> Site:
-    """The site with a tower's array at a place (3,) [m], above the ground that it had."""
+    """Return the site with a tower's array at a position (3,) [m] and with the same ground."""
     return replace(site, towers={**site.towers, tower: _moved(site, site.towers[tower], tower, place_m)})
 
 
@@ -221,7 +221,7 @@ def replay_moving(
     site: Site, link: Link, poses: Poses, sources_m: FloatArray,
     search: Search = Search(), field: Field = Field(), run: Run = Run(),
 ) -> Replay:  # fmt: skip
-    """Replay a flight against one tower that has a place of its own at every pose.
+    """Replay a flight with one tower that has a separate position at every pose.
 
     Parameters
     ----------
@@ -246,7 +246,8 @@ def replay_moving(
 
     Notes
     -----
-    Exact: each pose is traced from its own place. Paths and fields are those of a fixed tower there.
+    Exact: each pose is traced from the tower's position at that pose. Paths and fields are those of a fixed tower
+    there.
     """
     if len(link.tower_arrays) != 1:
         raise UsageError(
@@ -258,7 +259,7 @@ def replay_moving(
         raise UsageError(
             f"towers.{name} moves and the engine is {search.engine!r}",
             expected="rt.engine: image (or --engine image)",
-            cause="Sionna takes towers that stand still; each place of the node would be a scene of its own",
+            cause="Sionna requires fixed towers; each position of the node would need a separate scene",
         )
     progress, run = run.progress, replace(run, progress=None)
     blocks = list(_blocks(sources_m))
@@ -272,7 +273,7 @@ def replay_moving(
         moved_site, several, some, links = _scene_of(site, link, name, poses, block)
         return _of_one_tower(replay(moved_site, several, some, replace(search, links=links), field, run), name, block)
 
-    # lazily: a block is traced when it is put in, so one scene is alive at a time
+    # lazily: a block is traced when it is joined, so that only one scene is in memory
     result = in_turn([block.rows for block in blocks], map(of, blocks), progress)
     return replace(result, ends=Ends(link, poses, sources_m[:, None], field))
 
@@ -309,10 +310,10 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     )
 
 
-# How the ground ray is added to the direct one.
+# Ways to add the ground ray to the direct ray.
 Ground = Literal["coherent", "power_sum"]
 
-# The default ground of a site; its strength is what the search fits.
+# The default ground of a site. The search fits the strength of its reflection.
 _GROUND_MATERIAL = "itu_medium_dry_ground"
 
 
@@ -469,7 +470,7 @@ def basis_fields(
     slants = [(upright.reshape(shape), level.reshape(shape)) for shape in ((2, 1, 1), (2, 1, 1, 1))]
     fields = np.zeros((2, 2, 2, n, *ports), dtype=np.complex128)
     for depth in (0, 1) if with_ground else (0,):
-        # the reflection point is NaN: the field asks for images alone, never for points
+        # the reflection point is NaN: the field uses images only, not points
         path = PathSet(index, zero, zero + depth, np.full((n, 1), depth - 1), np.full((n, 1, 3), np.nan))
         columns = geometry(path, faces, table, np.asarray(tower_m)[None, :], poses, link)
         for start in range(0, n, step):

@@ -85,7 +85,7 @@ def wedge(
     upright, across = obliquity(phi_in, phi_out, exterior)
     # sine of the grazing angle, equal to the cosine from the normal in Fresnel's formulas
     sine = upright * np.sqrt(1.0 - cos_beta * cos_beta)
-    # from face n both the angles and the edge run the other way, which leaves the matrix as it is
+    # seen from face n, both the angles and the edge are reversed, so the matrix is the same
     te, tm = 0.0, 0.0
     for term, face in ((at_n, face_n), (at_0, face_0)):
         te_re, te_im, tm_re, tm_im = coefficients(sine, face)
@@ -107,7 +107,7 @@ def wedge(
 
 
 def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Sine and cosine of the angle under which the faces of a wedge are taken to be hit, in the plane across the edge.
+    """Return sine and cosine of the assumed angle of incidence on the faces of a wedge, in the plane across the edge.
 
     The angle of incidence is only defined at the reflection boundary. Elsewhere this function uses the angle on the
     mirror through the edge which would send the ray to the target, half of ``pi - less``, times a factor. The factor is
@@ -169,7 +169,7 @@ def transition(root: FloatArray) -> ComplexArray:
     return np.asarray(np.sqrt(np.pi) * np.exp(0.25j * np.pi) * wofz(np.exp(0.75j * np.pi) * root))
 
 
-# An end nearer than this to an edge has no path over it: there is no far field.
+# An end nearer than this to an edge has no path over it, because it is not in the far field.
 NEAREST_M = 0.01
 
 # Exterior angles nearer than this to 180 degrees [rad] are a plane.
@@ -198,7 +198,7 @@ class EdgePaths(Further):
     wedge : (paths, 2) int
         Faces 0 and n, which meet in the edge.
     ground : (paths, 2) int
-        Ground planes that reflect before and after the edge; -1 where none does.
+        Ground planes that reflect before and after the edge. -1 means no reflection.
     vertices_m : (paths, 3, 3)
         Reflection, edge, reflection point for array centres; NaN where unused.
     """
@@ -241,7 +241,7 @@ class EdgePaths(Further):
 
     def words(self, faces: Faces) -> list[str]:
         """Return corners of each path, from tower to UAV."""
-        label = (*faces.label, "")  # the last entry is for -1, which means no face
+        label = (*faces.label, "")  # index -1 (no face) selects the last entry
         edges = zip(self.wedge.tolist(), self.vertices_m[:, 1].tolist(), strict=True)
         middle = (f"edge of {label[f]} and {label[n]} at {', '.join(f'{x:.1f}' for x in at)} m" for (f, n), at in edges)
         steps = zip(self.ground.tolist(), middle, strict=True)
@@ -294,7 +294,7 @@ def over_edges(scene: Scene, poses: Poses, link: Link) -> EdgePaths:
     scene : Scene
     poses : Poses
     link : Link
-        Its carrier decides which buildings are too low to bend a wave.
+        Link. Its carrier decides which buildings are too low for diffraction.
 
     Returns
     -------
@@ -327,7 +327,7 @@ def over_edges(scene: Scene, poses: Poses, link: Link) -> EdgePaths:
     return paths.select(np.lexsort((after, before, last, first, paths.tower, paths.pose)))
 
 
-# Values of ``rt.diffraction``, and the further paths that each searches.
+# Values of ``rt.diffraction``, and the additional paths of each value.
 DIFFRACTION: dict[str, tuple[Callable[..., Further], ...]] = {"none": (), "edges": (over_edges,)}
 
 
@@ -367,7 +367,7 @@ class Edges(NamedTuple):
 
         Upright corners begin at the highest of the level grounds where their wall begins lower.
         """
-        # walls reach below the ground, where a corner bends nothing
+        # walls extend below the ground, where a corner does not diffract
         ground_m = max(0.0, float(faces.offset_m[faces.solid == -1].max(initial=0.0)))
         least_m = _LEAST_WAVELENGTHS * wavelength
         solids = np.unique(faces.solid[faces.solid >= 0])
@@ -394,7 +394,7 @@ def _of_solid(
     faces: Faces, solid: int, ground_m: float, least_m: float
 ) -> list[tuple[FloatArray, FloatArray, tuple[int, int]]]:
     """Start, end and faces of each edge, so that the outward normal of face 0 and the direction are as in Edges."""
-    # faces of one building alone: an edge between two buildings that touch is in neither's list
+    # only edges between faces of one building: an edge between two touching buildings is not listed
     members = np.flatnonzero(faces.solid == solid)
     walls = [int(i) for i in members if faces.normal[i, 2] == 0.0]
     roofs = {float(faces.offset_m[i]): int(i) for i in members if faces.normal[i, 2] == 1.0}
@@ -410,7 +410,7 @@ def _of_solid(
             # t lies in the wall, pointing down: t x normal points along the wall
             rows.append((far, near, (wall, roofs[top])))
         following = first.get(_corner(faces, wall, 1))
-        # the wall turns left: at an inner corner the air is on the hollow side, and nothing bends round it
+        # the wall turns left: at an inner corner the air is on the hollow side, and no wave is diffracted there
         if following is not None and np.cross(faces.along[wall], faces.along[following])[2] > np.sin(_SHARPEST):
             # t lies in the wall, away from the corner
             rows.append((_point(faces, wall, 1, low), _point(faces, wall, 1, top), (wall, following)))
@@ -443,12 +443,12 @@ class _Search:
         high = np.maximum(edges.start_m, edges.end_m) + 2.0 * _PROBE_M
         touch = (self.hiding.low[None] <= high[:, None]) & (self.hiding.high[None] >= low[:, None])
         near = np.asarray(touch.all(axis=2))
-        # an edge touches its own building always
+        # an edge always touches its building
         near[np.arange(len(edges)), solid] = False
         # another building may touch a face of these
         self.doubtful = np.asarray(near.any(axis=1))
         axis_n = np.cross(edges.along, edges.normal_n)
-        # along each face, and a tenth out of it: a probe in the plane itself would graze its own wall
+        # along each face and a tenth outside it, because a probe in the plane would graze the wall
         self.sides = np.stack([edges.face_axis + 0.1 * edges.normal, axis_n + 0.1 * edges.normal_n], axis=1)
 
     def of_tower(
@@ -496,7 +496,7 @@ class _Search:
         point, good = vertices_m[:, 1], np.ones(len(edge), np.bool_)
         for index, end in zip(ground, (source_m, target_m), strict=True):
             if index >= 0:
-                # an edge that lies in the ground has no reflection between it and the ground
+                # there is no reflection between the ground and an edge in the ground
                 good &= (self.faces.height_m(index, point) > NEAREST_M) & (self.faces.height_m(index, end) > 0.0)
         good[good] &= self._exposed(edge[good], point[good])
         for start, end in legs(source_m, vertices_m, target_m):
@@ -520,7 +520,7 @@ class _Search:
         start = (axes * edges.start_m).sum(axis=2)
         along, down, up, up_n = axes @ points_m.T - start[..., None]
         far = np.hypot(down, up)
-        # a point in front of neither face is inside the wedge, where no wave is
+        # a point in front of neither face is inside the wedge, where there is no wave
         return along, np.where((far >= NEAREST_M) & ((up >= 0.0) | (up_n >= 0.0)), far, -1.0)
 
     def _on_ground(self, ground: int, image_m: FloatArray, points_m: FloatArray) -> FloatArray:
@@ -577,7 +577,7 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
     wavelength = wavelength_m(link.carrier_hz)
     wave_number, table = 2.0 * np.pi / wavelength, FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
     face_0, face_n = paths.wedge.T
-    # axes of the edge as rows: places below become (along, down face 0, out of it)
+    # axes of the edge as rows: positions become (along the edge, along face 0, out of face 0)
     along, face_axis, exterior = wedge_axes(faces.normal[face_0], faces.normal[face_n])
     frame, point = np.stack([along, face_axis, faces.normal[face_0]], axis=1), paths.vertices_m[:, 1]
     ends = _ends(paths, faces, table, sources_m, poses, link)
@@ -602,7 +602,7 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
     p_mid = spread * (pp[:, None] * p_in - bp[:, None] * b_in)
     (u_s, v_s), (u_t, v_t) = (_element_places(end, point, frame) for end in ends)
     length = np.hypot(u_t[:, :, None] - u_s[:, None, :], v_t[:, :, None] + v_s[:, None, :])
-    # whole cycles go before the exponential: at 1 km they would take five digits of the phase
+    # remove full cycles before the exponential: at 1 km they would cost five digits of the phase
     cycles = length / wavelength
     carrier = np.exp(-2j * np.pi * (cycles - np.round(cycles))) / np.sqrt(length)
     return np.asarray((b_out[:, :, None] * b_mid[:, None, :] + p_out[:, :, None] * p_mid[:, None, :]) * carrier)
@@ -625,7 +625,7 @@ def _ends(
     for side, (centre, turned, place, slant) in enumerate(rows):
         ground = paths.ground[:, side]
         bounced = ground >= 0
-        # a normal of zero mirrors nothing, so all paths go through one formula
+        # a zero normal does not mirror, so that one formula serves all paths
         normal = np.where(bounced[:, None], faces.normal[ground], 0.0)
         offset = np.where(bounced, faces.offset_m[ground], 0.0)
         centre = centre - 2.0 * ((centre * normal).sum(axis=1) - offset)[:, None] * normal

@@ -82,7 +82,7 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
     while samples < MOST:
         samples *= _FACTOR
         paths = pilot(samples)
-        # the paths themselves, not their number: one may be lost while another is found
+        # compare the paths, not their number: one path may be lost while another is found
         if set(mirror.plane_keys(paths, plane)) == set(mirror.plane_keys(before, plane)):
             words = f"{samples // _FACTOR:,} and {samples:,} rays a tower found the same {counted(len(paths), 'path')}"
             return Choice(samples, f"{words} at {counted(poses, 'pose')}".replace(",", " "))
@@ -113,7 +113,7 @@ def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache
     few = poses[some]
 
     def pilot(samples: int) -> PathSet:
-        # through the cache, or each report would repeat the pilots
+        # use the cache, because otherwise each report would repeat the pilot searches
         return search_or_read(part, link, few, replace(search, samples=samples), Run(), cache)[0]
 
     return enough_samples(pilot, scene.faces, len(some))
@@ -168,7 +168,7 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
     links = scene.links_to(poses)
     extent, count = (None, scene.excluded.size) if run.job is None else (run.job.extent_m, run.job.links)
     if by_beams(scene, search, count):
-        from .search import beams as prisms  # compiled: loaded where there are many faces
+        from .search import beams as prisms  # compiled code, which is loaded only for many faces
         from .search import beams as search_beams
 
         if scene.surfaces is not None:
@@ -192,7 +192,7 @@ def by_beams(scene: Scene, search: Search, links: int = 0) -> bool:
         return True
     if search.max_depth < 2:
         return False
-    # few faces: worth it for a job of many links only
+    # with few faces, compiled code pays off only for many links
     if len(scene.faces) <= MANY_FACES:
         return links > 0 and beams_for(links, len(scene.faces))
     if find_spec("numba") is None:
@@ -242,11 +242,11 @@ class PathCache:
         Parameters
         ----------
         scene : Scene
-            Faces, sources and what hides them.
+            Faces, sources and obstacles.
         targets_m : (n, 3)
             Poses [m].
         carrier_hz : float
-            Counts for Sionna alone: an image path is the same at every frequency.
+            Used for Sionna only: paths of the image engine do not depend on the frequency.
         search : Search
             Engine, depth, samples and the rest.
 
@@ -262,7 +262,7 @@ class PathCache:
             decides += [[version(name) for name in ("sionna-rt", "mitsuba", "drjit")], carrier_hz, faces.material]
         columns = (faces.normal, faces.offset_m, faces.along, faces.lower, faces.upper, faces.solid)
         mesh = None if surfaces is None else (surfaces.corners_m, surfaces.first)
-        # which links and mirrors count changes what is found, not only where they are
+        # include which links and mirrors are used, because they also change the result
         links = (scene.sources_m, scene.usable, scene.excluded, targets_m)
         return content_digest(decides, faces.polygon, columns, mesh, links)
 

@@ -209,7 +209,7 @@ RowsT = TypeVar("RowsT", bound="Rows")
 
 
 class Rows:
-    """Columns of one length: the base of records that hold a path, or a path over edges, a row."""
+    """Columns of equal length: the base class of records with one path per row."""
 
     __slots__ = ()
     pose: IntArray
@@ -318,7 +318,7 @@ def legs(source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray) -> 
 
     A vertex (paths, vertices, 3) that is not used (NaN) is the point after it: a leg that begins there has no length.
     """
-    # backwards: a corner that is not used takes the place of the one after it
+    # backwards: an unused corner gets the position of the next corner
     points = [target_m]
     for step in reversed(range(vertices_m.shape[1])):
         vertex = vertices_m[:, step]
@@ -347,7 +347,7 @@ def path_lengths(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -
 # Walls start this far below the lower of their base and the site ground.
 _WALL_FOOT_M = 0.5
 
-# Sine of the angle between two edges below which they are one wall.
+# Two edges are one wall if the sine of the angle between them is below this.
 # A nanometre off over a metre; maps are drawn to the millimetre.
 _COLLINEAR = 1e-9
 
@@ -442,7 +442,7 @@ def _corners(ring: shapely.LinearRing) -> FloatArray:
         flat = np.abs(turn) <= _COLLINEAR * length
         if not flat.any():
             break
-        points = np.delete(points, np.flatnonzero(flat)[0], axis=0)  # one at a time: neighbours change
+        points = np.delete(points, np.flatnonzero(flat)[0], axis=0)  # one at a time, because the neighbours change
     return points
 
 
@@ -487,7 +487,7 @@ def _roof(building: Building, footprint: Polygon, solid: int) -> _Face:
     turned = shapely.transform(footprint, lambda p: p @ np.column_stack([along[:2], across[:2]]))
     # a rotated rectangle fills its bounds only along its axes
     low_a, low_b, high_a, high_b = turned.bounds
-    # most roofs: bounds alone then say what is inside, which costs no polygon
+    # most roofs are rectangles: the bounds decide what is inside, without a polygon
     fills = np.isclose(turned.area, (high_a - low_a) * (high_b - low_b), rtol=1e-12, atol=0.0)
     polygon = None if fills else turned
     if polygon is not None:
@@ -583,7 +583,7 @@ def triangles(faces: Faces, reach_m: float) -> tuple[FloatArray, IntArray, IntAr
         else:
             base = faces.normal[index] * faces.offset_m[index]
             axes = np.stack([faces.along[index], faces.across[index]])
-            # constrained: triangles of a plain one would cover the hollows
+            # a constrained triangulation, because a plain one would also cover the hollows
             pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
             parts = [base + np.asarray(orient(piece, 1.0).exterior.coords)[:3] @ axes for piece in pieces]
         vertices.extend(parts)
@@ -624,7 +624,7 @@ class Pattern(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """Elements (ports) of one device.
+    """The elements (ports) of one device.
 
     Parameters
     ----------
@@ -717,7 +717,7 @@ def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, rol
         unmasked(pitch_rad),
         unmasked(roll_rad),
     )
-    # written out: one pass over a whole flight, where a product of three turns makes three
+    # written out, because this needs one pass over a flight; a product of three rotations needs three
     ca, sa = np.cos(yaw), np.sin(yaw)
     cb, sb = np.cos(pitch), np.sin(pitch)
     cg, sg = np.cos(roll), np.sin(roll)
@@ -792,7 +792,7 @@ def _mounted(
     roll_deg: float = 0.0,
 ) -> Array:
     """Return elements of one pattern in a device that is turned and rolled."""
-    # no pitch: the arrays of the paper and of maps look level
+    # no pitch: the arrays of the paper and of maps point horizontally
     mount = rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, 0.0, roll_deg]))
     return Array(positions_m, np.radians(np.array(slant_deg)), (pattern or Isotropic(),), mount)
 
@@ -834,7 +834,7 @@ def uav_comparison_array(
         The array of four ports.
     """
     half = wavelength_m / 4
-    # the left column first, its upper port before its lower one
+    # left column first, and the upper port before the lower port
     positions = np.array([[0, half, half], [0, half, -half], [0, -half, half], [0, -half, -half]])
     return _mounted(positions, slant_deg, pattern, yaw_deg, roll_deg)
 

@@ -241,7 +241,7 @@ def _run_trial(
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 text=True,
-                # LLVM's own messages may hold any bytes
+                # LLVM's messages may contain any bytes
                 errors="replace",
                 timeout=timeout_s,
                 check=False,
@@ -448,7 +448,7 @@ def install_line() -> str:
         offered = apt_packages(known)
         if known and not offered:  # Ubuntu 22.04 ends at 15: packages of the LLVM project
             # a minimal image has none of these
-            needs = "wget gnupg lsb-release software-properties-common"  # what that script calls
+            needs = "wget gnupg lsb-release software-properties-common"  # programs that the script calls
             fetch = "wget https://apt.llvm.org/llvm.sh && sudo bash llvm.sh 19"
             first = f"sudo apt-get update && sudo apt-get install -y {needs} && {fetch}"
             return f"{first} && sudo apt-get install -y libllvm19 {APT_RUNTIME}"

@@ -629,7 +629,7 @@ def _shaped_ground(
         return scene, paths, paths.select(slice(0, 0)), []
     terrain = on_terrain(site.dem, scene.faces, scene.links_to(poses), paths, wavelength_m(link.carrier_hz))
     words = "links over ground that the elevation model does not know: level ground reflects there"
-    # tangent planes serve the one path that they were made for
+    # a tangent plane is valid only for the path for which it was computed
     more = np.zeros((len(scene.usable), len(terrain.faces) - len(scene.faces)), dtype=np.bool_)
     scene = replace(scene, faces=terrain.faces, usable=np.concatenate([scene.usable, more], axis=1))
     return scene, terrain.level, terrain.shaped, [Omission(words, (terrain.unknown,))]
@@ -644,7 +644,7 @@ def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) ->
     if site.dem is None or len(paths) == 0:
         return np.ones(len(paths), dtype=np.bool_)
     source, target = scene.sources_m[paths.tower], poses.position_m[paths.pose]
-    ground = np.append(scene.faces.solid < 0, False)  # the last entry stands for "no face"
+    ground = np.append(scene.faces.solid < 0, False)  # index -1 selects the last entry, which means "no face"
     over_ground = ground[paths.faces].any(axis=1)
     straight = (paths.depth == 0) | over_ground
     clear = np.ones(len(paths), dtype=np.bool_)
@@ -683,7 +683,7 @@ def _levels(fields: Fields, has_path: BoolArray, link: Link) -> tuple[FloatArray
         power_dbm[part] = rss_dbm(fields.power[part], sent, floor)
         above_floor = np.isfinite(level_dbm[part])
         if not above_floor.all():
-            # below the floor a receiver knows no channel, so no rank may be taken of it
+            # below the noise floor the channel is unknown, so there is no rank
             h[part][~above_floor] = 0.0
         has_path[part] &= above_floor
     return level_dbm, power_dbm
@@ -747,7 +747,7 @@ def trace(
     place = site if isinstance(site, Site) else load_site(site)
     search = Search(engine, max_depth=max_depth, samples=samples, further=diffracted(diffraction))
     if isinstance(poses, Poses):
-        # a masked value is a missing one: NaN, not the number under the mask
+        # a masked value is missing: NaN, not the number under the mask
         poses = Poses(unmasked(poses.position_m), unmasked(poses.rotation))
     else:
         poses = _level(poses)

@@ -80,7 +80,7 @@ def surfaces_of(site: Site) -> Surfaces | None:
         return None
     scene = site.scene
     for building in site.buildings:
-        # triangles hide and reflect by one formula: prisms would need the other formula
+        # scenes of triangles use one formula for hiding and reflecting, and prisms use another
         scene = added(scene, *building_mesh(building), building.name, material(building.material).name)
     return _merged(scene)
 
@@ -130,7 +130,7 @@ def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[Omission]]:
         # tower by tower: an array of all pairs would grow with both
         far = np.ones(len(poses), dtype=np.bool_)
         for place in towers:
-            # hypot does not overflow where squares of 1e200 would
+            # hypot does not overflow, unlike squares of 1e200
             far &= ~(np.hypot.reduce(poses.position_m - place, axis=1) <= REACH_M)
     far &= known
     bad = far | ~turned
@@ -142,7 +142,7 @@ def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[Omission]]:
     ]
     counted = [(int(mask.sum()), f"{what}: no path was searched for them") for mask, what in reasons]
     position = np.where(bad[:, None], np.nan, poses.position_m)
-    # any rotation: nothing is evaluated there, but NaN would warn in every product
+    # any rotation is valid, because it is not used; NaN would cause warnings in every product
     rotation = np.where(bad[:, None, None], np.eye(3), poses.rotation)
     return Poses(position, rotation), [Omission(what, (count,)) for count, what in counted]
 

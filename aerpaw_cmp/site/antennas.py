@@ -622,7 +622,7 @@ def _check_angles(elevation: FloatArray, azimuth: FloatArray, path: Path) -> Non
         ("elevation (theta2)", np.sort(elevation), wanted_elevation),
         ("azimuth (phi2)", np.sort(np.round(azimuth % 360.0, 6) % 360.0), wanted_azimuth),
     ):
-        if len(axis) >= 3 and np.abs(axis - grid).max() <= 0.05:  # false for NaN, too
+        if len(axis) >= 3 and np.abs(axis - grid).max() <= 0.05:  # also false for NaN
             continue
         causes = (
             (len(axis) >= 3 and 0 < np.abs(axis).max() < 7, "radians instead of degrees"),

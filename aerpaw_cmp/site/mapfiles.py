@@ -139,8 +139,8 @@ def reason(error: Exception) -> str:
     if isinstance(error, InputError):
         return error.found
     if isinstance(error, KeyError):
-        return f"it is not as it should be: no {error}"
-    return "it is not as it should be"
+        return f"it is not valid: no {error}"
+    return "it is not valid"
 
 
 def left_out(path: Path, line: int | None, what: str, error: Exception) -> str:
@@ -790,7 +790,7 @@ def _geometry(geometry: dict[str, Any], outline: Outline, result: MapFile, lines
             _geometry(part, outline, result, lines, path)
         return
     if kind not in _GEOMETRIES:
-        raise InputError(f"it is not as it should be: a geometry of type {geometry.get('type')!r}", path=path)
+        raise InputError(f"it is not valid: a geometry of type {geometry.get('type')!r}", path=path)
     several = geometry["coordinates"] if kind.startswith("Multi") else [geometry["coordinates"]]
     single = kind.removeprefix("Multi")
     if single == "Polygon":

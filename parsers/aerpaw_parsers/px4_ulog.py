@@ -62,7 +62,7 @@ def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int
     bodies: dict[tuple[str, int], list[bytes]] = {}
     numbers: dict[tuple[str, int], list[int]] = {}
     damaged: list[RejectedLine] = []
-    count, at = 0, 16  # behind the mark, the version and the time of the start
+    count, at = 0, 16  # after the magic bytes, the version and the start time
     while at + 3 <= len(data):
         size, kind = struct.unpack_from("<HB", data, at)
         if kind not in _KINDS or at + 3 + size > len(data):

@@ -107,7 +107,7 @@ def _reason(line: bytes) -> str | None:
     if line.strip() == b"OK":
         return None  # written by the start script, not by the modem
     if b"\0" in line:
-        return "NUL bytes in the line (the file system was not synced when power went)"
+        return "NUL bytes in the line (the file system was not synced when the power failed)"
     if line.startswith(b"[") and _TALK.match(line):
         return None  # commands and other answers of a console
     if not re.match(rb"\[?" + _text.TIME, line):

@@ -180,9 +180,9 @@ def _collect(rows: list[tuple[int, bytes, bytes, float]]) -> tuple[_Samples, lis
 
 def _reason(line: bytes) -> str:
     if b"\0" in line:
-        return "NUL bytes in the line (the file system was not synced when power went)"
+        return "NUL bytes in the line (the file system was not synced when the power failed)"
     if not line.startswith(b"["):
-        return "no '[time]' in front: not written through 'ts'"
+        return "the line does not begin with '[time]': it was not written through 'ts'"
     if not re.match(_HEAD, line):
         return "the time stamp is incomplete or of another form (torn line?)"
     return "neither 'offset value', nor '*': not an od line"

@@ -243,7 +243,7 @@ def test_white_errors_are_not_taken_for_shadowing() -> None:
 @pytest.mark.parametrize(
     ("place", "reason"),
     [
-        (np.random.default_rng(1).normal(0.0, 2.0, (200, 3)), "the UAV hardly left one place"),
+        (np.random.default_rng(1).normal(0.0, 2.0, (200, 3)), "the UAV hardly moved"),
         (np.where(np.arange(200)[:, None] % 2, np.nan, lawnmower(200)), "50 % of the samples have no position"),
         (np.where(np.arange(200)[:, None] % 8 == 0, np.nan, lawnmower(200)), "12 % of the samples have no position"),
         (np.full((200, 3), np.nan), "100 % of the samples have no position"),

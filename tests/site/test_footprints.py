@@ -262,7 +262,7 @@ def test_site_on_the_antimeridian_is_whole(tmp_path: Path) -> None:
         (b"version https://git-lfs.github.com/spec/v1\n", "Git-LFS"),
         (b"\x89PNG\r\n", "not a map file"),
         (b'{"type": "FeatureCollection", "features": [', "not JSON"),
-        (b'{"type": "FeatureCollection", "features": [3]}', "not as it should be"),
+        (b'{"type": "FeatureCollection", "features": [3]}', "not valid"),
         (b'{"a": 1}', "neither GeoJSON nor Overpass"),
         (b"<osm><node", "not XML"),
         (b"<gpx></gpx>", "XML of 'gpx'"),

@@ -171,7 +171,7 @@ def test_overpass_center_body_and_remark(tmp_path: Path) -> None:
     text = (tmp_path / "m.json").read_text().splitlines()
     line = text.index('   "id": 4,')  # the brace stands two lines above, and the index counts from 0
     assert said(footprints, f"m.json, line {line - 1}: way 4 was left out"), footprints.actions
-    assert any(action.endswith("element 5 was left out: it is not as it should be") for action in footprints.actions)
+    assert any(action.endswith("element 5 was left out: it is not valid") for action in footprints.actions)
     # 'out body; >; out skel;' lists nodes without tags, and ways twice
     nodes = [{"type": "node", "id": n, **point} for n, point in enumerate(points[:-1])]
     body = {"type": "way", "id": 5, "tags": BARN, "nodes": [0, 1, 2, 3, 0]}
@@ -198,9 +198,9 @@ def test_one_bad_feature_does_not_lose_the_others(tmp_path: Path) -> None:
     assert said(footprints, f"m.json, line {lines.index('  null,') + 1}: feature 1 was left out")
     assert said(footprints, f"m.json, line {lines.index('  3,') + 1}: feature 2 was left out")
     assert said(footprints, "feature 3 was left out: the position ['a', 1] is not longitude, latitude")
-    assert said(footprints, "feature 4 was left out: it is not as it should be: no 'geometries'")
-    assert said(footprints, "feature 5 was left out: it is not as it should be: a geometry of type 'Circle'")
-    assert said(footprints, "feature 6 was left out: it is not as it should be")
+    assert said(footprints, "feature 4 was left out: it is not valid: no 'geometries'")
+    assert said(footprints, "feature 5 was left out: it is not valid: a geometry of type 'Circle'")
+    assert said(footprints, "feature 6 was left out: it is not valid")
 
 
 def test_what_is_no_area_is_counted(tmp_path: Path) -> None:

@@ -162,12 +162,12 @@ def _explained(
     waves = [value for name, value in recorded if name == "wave"]
     spreading = next(value for name, value in recorded if name == "spreading") ** 2
     uav = next(value for name, value in recorded if name == "uav")
-    # spreading and the UAV's pattern multiply powers; what is left to the received power is polarisation
+    # spreading and the UAV's pattern multiply powers; the rest of the received power is polarisation
     powers = [*waves, waves[-1] * spreading, waves[-1] * spreading * uav, (field**2).sum(axis=1)]
     mean = np.array([1.0, *(float(power.mean()) for power in powers)])
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = db_from_power(mean[1:]) - db_from_power(mean[:-1])
-    # after a step to nothing the next ones change nothing, where 0 / 0 would be NaN
+    # after a step to zero power, later steps have no effect; 0 / 0 would be NaN
     steps = np.where(mean[1:] > 0.0, steps, np.where(mean[:-1] > 0.0, -np.inf, 0.0))
     depth = int(path.depth[0])
     names = [
@@ -317,7 +317,7 @@ def _outside_m(faces: Faces, face: int, point: FloatArray) -> float:
 
 def simple_paths(replay: Replay) -> list[tuple[str, IntArray]]:
     """The paths one looks for first: line of sight and the reflection at each ground of the scene."""
-    # endless planes: those of terrain are bounded, and made for one link
+    # infinite planes only: planes of terrain are bounded and valid for one link
     grounds = np.flatnonzero((replay.faces.solid < 0) & np.isinf(replay.faces.lower).all(axis=1))
     return [
         ("line of sight", np.zeros(0, dtype=np.int64)),

@@ -472,7 +472,7 @@ class Reference:
             with np.errstate(divide="ignore", invalid="ignore"):
                 at = image - (behind / through)[:, None] * (at - image)
             inside = (at >= planes.low_m[face] - _SLACK_M) & (at <= planes.high_m[face] + _SLACK_M)
-            # nearly in the plane the point is anywhere: such a sequence is left to the verdict
+            # nearly in the plane, the point is undefined: the verdict decides about such a sequence
             good &= (np.abs(through) < MARGIN_M) | (inside.all(axis=1) & (through > 0.0))
         return good
 
@@ -527,12 +527,12 @@ class Reference:
             image = mirror.mirrored(image)
         way = _plus(end, image, -1.0)
         length = math.sqrt(_dot(way, way))
-        # two elements at one place: no direction
+        # two elements at one position have no direction between them
         if length == 0:
             return 0j
         rays = [_unit(way)]
         for mirror in reversed(sequence):
-            # back from the UAV: the last ray is known, each earlier one is its mirror image
+            # trace back from the UAV: the last ray is known, and each earlier ray is its mirror image
             rays.insert(0, _plus(rays[0], mirror.normal, -2.0 * _dot(mirror.normal, rays[0])))
         wave = element_wave(tower, tx, tower.mount, rays[0])
         for mirror, ray, onward in zip(sequence, rays[:-1], rays[1:], strict=True):

@@ -29,7 +29,7 @@ def sine_cosine(turns: Number) -> tuple[Number, Number]:
     """Sine and cosine of an angle in turns, within 1 ulp of the angle's part of a turn (polynomials of fdlibm)."""
     # to half a turn either way, without a call that keeps a loop from vector instructions
     turns = turns - ((turns + _ROUND) - _ROUND)
-    # within an eighth of a turn the polynomials hold
+    # the polynomials are valid within an eighth of a turn
     quarter = (4.0 * turns + _ROUND) - _ROUND
     x = (turns - 0.25 * quarter) * (2.0 * np.pi)
     z = x * x
@@ -39,7 +39,7 @@ def sine_cosine(turns: Number) -> tuple[Number, Number]:
     tail = -2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11)
     tail = -1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + z * tail)
     cosine = 1.0 - (0.5 * z - z * z * (4.16666666666666019037e-02 + z * tail))
-    # in the quarters up and down, sine and cosine change places
+    # in the upper and lower quarters, swap sine and cosine
     odd = quarter * quarter == 1.0
     sine_there, cosine_there = np.where(odd, cosine, sine), np.where(odd, sine, cosine)
     return (
@@ -131,7 +131,7 @@ def field_vector(m: Rotation, toward: Vector, e_theta: Number, e_phi: Number) ->
     """
     x, y, z = turned(m, toward)
     across = np.sqrt(x * x + y * y)
-    # at a pole phi means nothing; 0 is what atan2(0, 0) gives a pattern
+    # at a pole phi is undefined: use 0, as atan2(0, 0)
     off_pole = across > 0.0
     scale = np.where(off_pole, 1.0 / np.maximum(across, 1e-300), 0.0)
     cosine, sine = np.where(off_pole, x * scale, 1.0), y * scale

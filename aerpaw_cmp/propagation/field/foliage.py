@@ -375,7 +375,7 @@ class CrownIndex:
         live = np.flatnonzero(last >= first)  # NaN compares false
         pieces = np.ceil((last - first)[live] * along[live] / _PIECE_M).clip(1).astype(np.int64)
         ends = np.cumsum(pieces)
-        # by the fullest cell, so that no batch outgrows its memory
+        # limit batches by the fullest cell, because of their memory
         at_once = max(_PAIRS_AT_ONCE // max(int(np.diff(self._row).max()), 1), 1)
         begin = 0
         while begin < len(live):
@@ -513,7 +513,7 @@ TRUNKS = 0.3
 # At 0.55 of the first Fresnel radius nu is -0.78, where the knife edge's loss begins.
 _CLEAR = 0.55
 
-# Seen from above an upright segment is a point, which crosses no area. Shifted by this distance it crosses one.
+# Seen from above, a vertical segment is a point and does not cross an area. Shifted by this distance it crosses one.
 _UPRIGHT_M = 1e-6
 # Pairs of a segment and a side of a forest stand; about 100 MB of temporary arrays.
 _SIDES_AT_ONCE = 1_000_000
@@ -673,7 +673,7 @@ def _pieces(start: FloatArray, end: FloatArray, corner: FloatArray, last: IntArr
     way = end - start
     # on which side of each line a corner lies
     left = way[:, :1] * (corner[:, 1] - start[:, 1:]) - way[:, 1:] * (corner[:, 0] - start[:, :1]) > 0
-    crosses = left[:, 1:] != left[:, :-1]  # a corner belongs to one of its sides alone
+    crosses = left[:, 1:] != left[:, :-1]  # a corner belongs to only one of its sides
     # from one ring to the next there is no side
     crosses[:, last] = False
     line, edge = np.divmod(np.flatnonzero(crosses), crosses.shape[1])  # nonzero of a table takes five times as long
@@ -709,9 +709,10 @@ def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wa
     depth_m = crossing.depth_m(np.where(outside, np.maximum((zone - intrusion).min(axis=0), 0.0), 0.0))
     through = model.loss_db(depth_m)
     if stand.evergreen_share:
-        # a mean of decibels, not of powers: the share is one of trees along each way, not of ways
+        # average decibels, not powers, because the share is that of trees along each path, not of paths
         through = through + stand.evergreen_share * (in_leaf.loss_db(depth_m) - through)
-    passed, some = np.zeros(count), np.flatnonzero(outside & (through > 0.0))  # what loses nothing needs no detour
+    # a path without loss does not need a detour
+    passed, some = np.zeros(count), np.flatnonzero(outside & (through > 0.0))
     over = Profile(length[some], share[:, some], intrusion[:, some])
     for way in (over, *_around(stand, source[some], target[some])):
         # add powers: the edge of a canopy is not known to a wavelength
@@ -767,7 +768,7 @@ def knife_edge_db(nu: FloatArray) -> FloatArray:
 
 def _parameter(height_m: FloatArray, before_m: FloatArray, after_m: FloatArray, wavelength_m: float) -> FloatArray:
     """Return the parameter nu of edges. It is -inf at the ends of a line and where the height is unknown."""
-    # an edge at an end has no distance to it, and nu would be infinite
+    # an edge at an end has distance zero, and nu would be infinite
     inner = (before_m > 0.0) & (after_m > 0.0) & np.isfinite(height_m)
     product = np.where(inner, before_m * after_m, 1.0)
     nu = np.where(inner, height_m, 0.0) * np.sqrt(2.0 * np.abs(before_m + after_m) / (wavelength_m * product))
@@ -791,7 +792,7 @@ def deygout_db(profile: Profile, wavelength_m: float) -> FloatArray:
     main, link = nu.argmax(axis=0), np.arange(len(length_m))
     total = first = knife_edge_db(nu[main, link])
     known = np.isfinite(nu[main, link])
-    # without an edge any place does: its loss is zero
+    # without an edge, any position is correct, because its loss is zero
     at, top = np.where(known, share[main, link], 0.5), np.where(known, intrusion_m[main, link], 0.0)
     for way, place in ((share, at), (1.0 - share, 1.0 - at)):
         # above the line from the end to the top of the main edge

@@ -107,7 +107,7 @@ def reflection(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
 def coefficients(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
     """TE and TM coefficients (re, im each) of faces: the Fresnel coefficients that NumPy's field takes."""
     eta_re, eta_im, thickness = material
-    # bare ground has no second face: its echo of zero need not be computed
+    # bare ground has no second face, so its echo is 0 and is not computed
     if np.any(np.isfinite(thickness)):
         return reflection(cosine, material)
     return half_space(cosine, eta_re, eta_im)[:4]

@@ -92,14 +92,14 @@ def geometry(
     frame = mounts[paths.tower]
     normals = np.where((sequence >= 0)[..., None], faces.normal[sequence], 0.0)
     for step in range(depth):
-        normal = normals[:, step]  # zero where there is no face: nothing is mirrored
+        normal = normals[:, step]  # a zero normal means no face: the point is not mirrored
         offset = np.where(sequence[:, step] >= 0, faces.offset_m[sequence[:, step]], 0.0)
         image = image - 2.0 * ((image * normal).sum(axis=1) - offset)[:, None] * normal
-        # earlier faces are mirrored too: seen from the last image they lie elsewhere
+        # mirror earlier faces, too, because the last image sees their mirror images
         for vectors in (frame, normals[:, :step]):
-            # in place: frame and normals are copies made above
+            # in place, because frame and normals are copies
             vectors -= 2.0 * np.einsum("nij,nj->ni", vectors, normal)[..., None] * normal[:, None, :]
-    # the poses between the first and the last of these paths: a part of a flight turns no other array
+    # rotate only arrays of poses between the first and last of these paths
     first, last = paths.pose.min(initial=len(poses)), paths.pose.max(initial=0)
     axes = np.einsum("nij,jk->nki", poses.rotation[first : last + 1], link.uav_array.mount)
     return Geometry(
@@ -154,7 +154,7 @@ def pattern_fields(array: Array, element: IntArray, m: dyads.Rotation, toward: d
     theta, phi = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)  # arccos would lose half of the digits at the poles
     fields = np.empty((len(theta), 4, theta.shape[1]))
     patterns = array.patterns if len(array.patterns) > 1 else array.patterns * len(array)
-    # elements often share one pattern object: it is asked once for all of them
+    # elements often share one pattern object: evaluate it once for all of them
     for pattern in {id(p): p for p in patterns}.values():
         pairs = np.flatnonzero([patterns[e] is pattern for e in element])
         e_theta, e_phi = pattern.field(theta[:, pairs], phi[:, pairs])

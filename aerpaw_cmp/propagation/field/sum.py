@@ -31,7 +31,7 @@ from .geometry import Elements, Ends, Geometry, directions, geometry, parts_of, 
 # Element pairs that NumPy evaluates at once: their columns stay in the cache of a core.
 PAIRS_PER_CHUNK = 8_000
 
-# Paths between whose ends threads change: some milliseconds of work.
+# Paths per thread: a few milliseconds of work.
 PATHS_PER_PART = 4096
 
 
@@ -116,7 +116,7 @@ def fields_of(
     -------
     Fields
     """
-    # reflections are no Further: they are the one kind that every engine finds
+    # reflections are not a Further kind, because every engine finds them
     evaluate = channel_matrices if isinstance(paths, PathSet) else type(paths).fields
     return evaluate(paths, faces, sources_m, poses, link, loss_db)
 
@@ -161,7 +161,7 @@ def channel_matrices(
     table = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
     # a link's paths side by side: reduceat adds runs
     order = _by_link(paths, len(arrays))
-    # mostly they are sorted, and a copy of a long flight is dear
+    # they are usually sorted, and copying a long flight is slow
     ordered = paths if order is None else paths.select(order)
     if paths.terrain_db.any():
         loss_db = paths.terrain_db if loss_db is None else loss_db + paths.terrain_db
@@ -178,7 +178,7 @@ def channel_matrices(
         power[part] = np.einsum("npc,npc->n", amplitude, amplitude) / (ports * uavs)
         key = some.pose * len(arrays) + some.tower
         first = np.flatnonzero(np.diff(key, prepend=-1))
-        # pairs of reals seen as complex numbers: no copy
+        # view pairs of real numbers as complex numbers, without a copy
         h[key[first]] = np.add.reduceat(amplitude.view(np.complex128)[..., 0], first, axis=0)
     if order is not None:
         # back to the order in which the caller has the paths
@@ -219,7 +219,7 @@ def amplitudes(
     pairs = elements.tower_m.shape[2]
     out = np.empty((len(g.depth), pairs, 2))
     step = max(1, PAIRS_PER_CHUNK // pairs)
-    # all of one depth at once: no step is evaluated for paths that have fewer
+    # all paths of one depth together, so that no step is evaluated for shorter paths
     for depth in np.unique(g.depth):
         rows = np.flatnonzero(g.depth == depth)
         for start in range(0, len(rows), step):

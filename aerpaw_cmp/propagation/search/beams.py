@@ -37,7 +37,7 @@ SIDE_M = 1e-6
 # A surface closer to an antenna than this [m] does not hide it: it is mounted there.
 _END_M = 1e-3
 
-# Outlines are this much larger in the cuts than they are [m], so that no cut loses a path to rounding.
+# Outlines are enlarged by this in the cuts [m], so that rounding does not remove a path.
 SLACK_M = 1e-5
 
 # How far outside its triangles a reflection point may lie [m]: the seams inside a face.
@@ -106,7 +106,7 @@ def grow_paths(
     beams : bool
         False follows every sequence of faces: the same paths, for tests.
     shadows : bool
-        False follows first faces that one convex face hides wholly, too.
+        If false, also follow first faces that are hidden by one convex face.
     solids : bool
         The faces are those of closed solids: they reflect in front only, and a segment is cut beyond doubt or not at
         all. What is found are candidates for :mod:`aerpaw_cmp.propagation.search.beams`, coincident ones among them.
@@ -144,7 +144,7 @@ def _rules(surfaces: Surfaces, max_depth: int, *, solids: bool, beams: bool = Tr
 
 def _searches(surfaces: Surfaces, links: Links, rules: Rules) -> Iterator[tuple[int, IntArray, _Search]]:
     """Tower, poses and search of every tower that has a pose to be searched for."""
-    # tower by tower: all have one scene and their own usable faces
+    # tower by tower: they share a scene but have different usable faces
     alive = searched_links(links)
     for tower in np.flatnonzero(alive.any(axis=1)).tolist():
         poses = np.flatnonzero(alive[tower])
@@ -197,12 +197,12 @@ class _Search:
         return pose, np.zeros((len(pose), 0), np.int64), np.zeros((len(pose), 0, 3))
 
     def first_faces(self) -> IntArray:
-        """First faces worth following, in an order whose beginning is a fair sample."""
+        """Return the first faces to follow, in an order whose beginning is a representative sample."""
         good = _first_faces(self.mirrors, self.solids.face_tree, self.source, self.rules)
         return np.random.default_rng(0).permutation(np.flatnonzero(good))
 
     def follow(self, some: IntArray) -> _Level:
-        """Paths whose first face is one of some."""
+        """Return the paths whose first face is one of ``firsts``."""
         return _follow(self.mirrors, self.solids, self.targets, self.source, some, self.rules)  # type: ignore[no-any-return]
 
     def run(self, first: IntArray, threads: int, share: Progress) -> list[_Level]:
@@ -279,7 +279,7 @@ def reflection_points(
     sequence : (paths, depth) int
     vertices_m : (paths, depth, 3)
     good : (paths,) bool
-        Every point in a face, and the ends of each reflection on one side.
+        True if each point is in its face and both ends of each reflection are on one side.
     """
     order = np.argsort(surfaces.plane, kind="stable")
     start = np.searchsorted(surfaces.plane[order], np.arange(len(surfaces) + 1))
@@ -310,7 +310,7 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
         for step in range(depth - 1, -1, -1):
             f = sequence[row, step]
             low, top = _height(normal, offset, f, images[step]), _height(normal, offset, f, point)
-            # on two sides of the mirror, or both in it: no reflection
+            # the ends are on two sides of the mirror or in it: no reflection
             if low * top < 0.0 or abs(low) + abs(top) <= SIDE_M:
                 good[row] = False
                 break
@@ -420,7 +420,7 @@ def _share_to(corners, a, way, length, margin):  # type: ignore[no-untyped-def]
     g0, g1, g2 = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2]
     p0, p1, p2 = d1 * g2 - d2 * g1, d2 * g0 - d0 * g2, d0 * g1 - d1 * g0
     det = e0 * p0 + e1 * p1 + e2 * p2
-    # along the triangle's plane: it has no thickness to cut with
+    # a segment in the triangle's plane does not cut it
     if abs(det) <= 1e-14 * length:
         return -1.0
     if margin > 0.0:  # so near to grazing that a tolerance might decide
@@ -453,7 +453,7 @@ def _direct(solids, source, targets, rules):  # type: ignore[no-untyped-def]
     free = np.zeros(len(targets), np.bool_)
     antenna = np.zeros(3), 0.0
     for r in range(len(targets)):
-        # one receiver after the other: a line of sight costs too little to be shared out
+        # serial, because a line of sight takes too little time for threads
         free[r] = not segment_cut(solids.corners, solids.tree, source, targets[r], antenna, antenna, rules)
     return free
 
@@ -501,7 +501,7 @@ def _wholly_hidden(mirrors, face_tree, source, f, before, sign, rules, stack):  
     while node >= 0:
         for k in range(start[node], start[node] + many[node]):
             g = items[k]
-            # what has hollows may let the beam through; what lies in one plane hides nothing of it
+            # a face with hollows may let the beam through, and a face in the same plane does not hide it
             if not convex[g] or plane[g] == plane[f] or g == before:
                 continue
             if _beyond(mirrors, before, sign, g, rules) and _hides(mirrors, source, f, g, rules):
@@ -592,7 +592,7 @@ def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
         offset = n0 * apex[0] + n1 * apex[1] + n2 * apex[2]
         reach = np.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
         planes[count, 0], planes[count, 1], planes[count, 2] = n0, n1, n2
-        # pushed outwards: a cut may keep too much, never too little
+        # move the plane outwards: a cut may keep too much but must not remove a path
         planes[count, 3] = -offset + SLACK_M * max(1.0, 1e3 / max(reach, 1e-3))
         count += 1
     return count
@@ -705,7 +705,7 @@ def _hidden(mirrors, solids, chain, source, points, target, rules):  # type: ign
 def _doubled(pose, faces, points):  # type: ignore[no-untyped-def]
     """Rows with room for as many more."""
     many, depth = faces.shape
-    # doubled: the number of paths is not known beforehand, and a list would need the interpreter
+    # double the size: the number of paths is unknown, and a list would need the interpreter
     pose2, points2 = np.empty(2 * many, np.int64), np.zeros((2 * many, depth, 3))
     faces2 = np.full((2 * many, depth), -1, np.int64)
     pose2[:many], faces2[:many], points2[:many] = pose, faces, points
@@ -764,7 +764,7 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
         image[0] = place[0] - 2.0 * height * n0
         image[1] = place[1] - 2.0 * height * n1
         image[2] = place[2] - 2.0 * height * n2
-        # planes of the beam: before this face, what earlier faces leave of it, mirrored; and its own sides
+        # planes of the beam: this face, the mirrored planes of earlier faces, and the sides of this face
         mine, number = planes[level], 1
         mine[0, 0], mine[0, 1], mine[0, 2] = sign * n0, sign * n1, sign * n2
         mine[0, 3] = -sign * offset[f] + side
@@ -837,7 +837,7 @@ def try_out() -> None:
         raise RuntimeError(f"compiled code sees {free.tolist()} where one of two points is hidden")
 
 
-# The ground is searched to this many times the largest coordinate: no reflection point lies further out.
+# The ground extends to this multiple of the largest coordinate, beyond all reflection points.
 REACH = 10.0
 
 # Boxes of faces are this much larger [m].
@@ -867,7 +867,7 @@ def find_paths(
     """
     sources_m, targets_m = links.sources_m, links.targets_m
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m if extent_m is None else extent_m)
-    # candidates: too many rather than too few
+    # select too many candidates rather than too few
     paths = grow_paths(solid_surfaces(faces, sources_m, targets_m), links, run, max_depth=max_depth, solids=True)
     hiding = Occlusion(faces, tolerance_m)
     pieces = []
@@ -899,7 +899,7 @@ def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -
     lower, upper = outline.min(axis=1) - OVERLAP_M, outline.max(axis=1) + OVERLAP_M
     obstacles = np.ascontiguousarray(points[hides])
     if not len(obstacles):
-        obstacles = np.full((1, 3, 3), 1e9)  # nothing hides: one needle far below everything
+        obstacles = np.full((1, 3, 3), 1e9)  # no obstacles: a single tiny triangle far below the scene
     return Surfaces(
         faces=faces,
         corners_m=obstacles,
@@ -907,7 +907,7 @@ def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -
         first=np.searchsorted(owner, np.arange(len(faces) + 1)),
         flat_m=np.ascontiguousarray(flat),
         window_m=np.ascontiguousarray(outline[:, np.minimum(np.arange(WINDOW), 3)]),
-        # the ground hides nothing, and what has a polygon does not fill its outline
+        # the ground does not hide, and faces with a polygon do not fill their outline
         convex=(faces.solid >= 0) & np.array([polygon is None for polygon in faces.polygon], dtype=np.bool_),
         plane=planes_of(faces),
         tree=box_tree(obstacles.min(axis=1), obstacles.max(axis=1)),

@@ -76,7 +76,7 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
             if most_ - least > widest:
                 longest, widest = axis, most_ - least
         mine = items[first : first + many].copy()
-        # a full sort, since numba has no partition of indices
+        # a full sort, because numba does not support a partition of indices
         order = np.argsort(middle[mine, longest])
         items[first : first + many] = mine[order]
         half = many // 2
@@ -261,7 +261,7 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
     bool
     """
     a, inverse = segment
-    # shares of the way, so nothing behind the start or beyond the end is met
+    # limit to shares from 0 to 1, so that boxes behind the start or beyond the end are not hit
     enter, leave = 0.0, 1.0
     for axis in range(3):
         at_lower = (lower[node, axis] - a[axis]) * inverse[axis]
@@ -274,16 +274,17 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
     return enter > leave
 
 
-# Triangles whose corners lie within this of one plane [m] are one face. The files hold float32: 0.1 mm at 1 km.
+# Triangles whose corners lie within this of one plane [m] are one face. Files contain float32 coordinates: 0.1 mm at 1
+# km.
 _MERGE_M = 1e-3
 
 # Corners of one shape closer than this are one corner [m].
 WELD_M = 1e-4
 
-# Most corners of the convex outline by which a face is searched; one with more is searched by a rectangle.
+# Largest number of corners of the convex outline of a face in the search. Larger outlines are replaced by a rectangle.
 WINDOW = 8
 
-# Triangles of less area have no plane; they are dropped.
+# Triangles with less area are removed, because their plane is undefined.
 _SMALLEST_M2 = 1e-10
 
 
@@ -321,7 +322,7 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
     face_area = np.add.reduceat(triangle_area, first[:-1])
     low = np.minimum.reduceat(corners.min(axis=1), first[:-1], axis=0)
     high = np.maximum.reduceat(corners.max(axis=1), first[:-1], axis=0)
-    # grown by the tolerance: neighbours of one plane must meet
+    # enlarge by the tolerance, so that neighbours in one plane touch
     face_tree = box_tree(low - merge_m, high + merge_m)
     plane = _shared_planes(face_tree, corners, first, (normal, offset), face_area, (low, high), merge_m)
     normal, offset = normal[plane], offset[plane]
@@ -397,7 +398,7 @@ def _faces_of_triangles(
     """Return the face of each triangle, and the triangle whose plane each face has: its largest."""
     # files repeat a corner for each triangle, in float32: equal means equal to a tenth of a millimetre
     grid = np.round(corners.reshape(-1, 3) / WELD_M).astype(np.int64)
-    # within one shape: walls of two houses that touch are two faces
+    # only within one shape: touching walls of two houses are two faces
     key = np.column_stack([np.repeat(shape, 3), grid])
     order = np.lexsort(key.T)
     new = np.ones(len(order), dtype=np.int64)
@@ -464,7 +465,7 @@ def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type
     (normal, offset), (low, high) = planes, bounds
     plane = np.arange(len(normal))
     near = np.empty(len(normal), np.int64)
-    # the largest first, so that a face is asked after all that it may join
+    # largest first, so that each face is tested after all faces that it may join
     for f in np.argsort(-area):
         many = overlapping(tree, low[f] - merge_m, high[f] + merge_m, near)
         best = -1

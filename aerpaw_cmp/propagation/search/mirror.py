@@ -49,7 +49,7 @@ _NEIGHBOURHOOD = 1e4
 # Share of its area by which a convex footprint may fall short of its hull.
 _ROUNDING = 1e-13
 
-_ROUND = np.pi / 8 * (np.arange(16) + 0.37)  # no direction of a map is favoured
+_ROUND = np.pi / 8 * (np.arange(16) + 0.37)  # offset so that no direction coincides with a map axis
 _AROUND = np.column_stack([np.cos(_ROUND), np.sin(_ROUND), np.zeros(16)])
 
 
@@ -76,9 +76,9 @@ class Occlusion:
         solid, footprint, planes = _prisms(faces, rows, starts)
         cuts = np.searchsorted(solid, np.arange(len(starts) + 1)).tolist()
         touched = _abutting(footprint, tolerance_m).tolist()
-        # per solid and convex piece: outward normals (planes, 3) and offsets (planes,); top and bottom come first
+        # for each convex piece of a solid: outward normals (planes, 3) and offsets (planes,); top and bottom come first
         self.pieces = [planes[start:stop] for start, stop in pairwise(cuts)]
-        # per solid and convex piece: whether another piece, of any solid, touches it
+        # for each convex piece of a solid: whether another piece, of any solid, touches it
         self.abutting = [touched[start:stop] for start, stop in pairwise(cuts)]
 
     def any_segment(self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> BoolArray:
@@ -108,7 +108,7 @@ class Occlusion:
         # most segments touch nothing, so seams are examined after all pieces
         seams: list[tuple[IntArray, FloatArray, FloatArray, int, int]] = []
         for column, solid in enumerate(solids.tolist()):
-            # one cut is enough
+            # one piece that cuts the segment is enough
             rows = np.flatnonzero(near[:, column] & ~result)
             for number, (normal, offset) in enumerate(self.pieces[solid]):
                 if not len(rows):
@@ -118,19 +118,19 @@ class Occlusion:
                 hit = enter < leave
                 result[rows[hit]] = True
                 if self.abutting[solid][number]:
-                    # now grown by the tolerance: what runs along the piece without entering it
+                    # grow the piece by the tolerance, to find segments that run along it without entering it
                     enter, leave = _within(before[~hit], after[~hit], self.tolerance_m)
                     along = enter < leave
                     seams.append((rows[~hit][along], enter[along], leave[along], solid, number))
                 rows = rows[~hit]
-        # one piece alone has no seam
+        # a single piece has no seam
         if len(seams) > 1:
             self._seams(result, start, end, seams)
         return result
 
     def _solids_near(self, start: FloatArray, end: FloatArray) -> IntArray:
         """Solids whose boxes meet the box of all segments, and from above also that turned to their mean direction."""
-        # links to one tower go one way: a box turned along them is thin
+        # links to one tower have similar directions, so a rotated box around them is thin
         east, north = np.nansum((end - start)[:, :2], axis=0)
         axes = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [east, north, 0], [-north, east, 0]])
         ends = np.concatenate([start, end]) @ axes.T
@@ -142,7 +142,7 @@ class Occlusion:
     def _boxes(self, start: FloatArray, end: FloatArray, solids: IntArray) -> BoolArray:
         """Check whether segments meet bounding boxes: slab test, (segments, solids)."""
         direction = end - start
-        # the quotients of a level segment become huge with the right sign, where 0 / 0 would be no number
+        # for a level segment the quotients become huge with the correct sign, whereas 0 / 0 would be NaN
         direction = np.where(direction == 0.0, 1e-300, direction)
         low, high = self.low[solids], self.high[solids]
         enter = np.zeros((len(start), len(solids)))
@@ -263,13 +263,14 @@ def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:
 def convex_pieces(footprint: Polygon) -> tuple[Polygon, ...]:
     """Convex polygons that together are a footprint that is not convex, with corners at its corners only.
 
-    Triangles are joined as long as what they make is convex (Hertel and Mehlhorn, 1983); kept, for each replay asks.
+    Triangles are joined as long as what they make is convex (Hertel and Mehlhorn, 1983); cached, because each replay
+    needs them.
     """
     pieces = list(shapely.get_parts(shapely.constrained_delaunay_triangles(footprint)))
     first = 0
     while first < len(pieces):
         for second in range(first + 1, len(pieces)):
-            # tried rather than computed: which joins stay convex depends on both outer angles
+            # try each join, because its convexity depends on both outer angles
             union = shapely.union(pieces[first], pieces[second])
             if union.geom_type == "Polygon" and _is_convex(union):
                 pieces[first] = union
@@ -294,12 +295,12 @@ def _planes(footprints: list[Polygon], foot: FloatArray, top: FloatArray) -> lis
     count = np.bincount(owner, minlength=len(ring))
     first = np.cumsum(count) - count
     turned = np.arange(len(point))
-    # outward normals need one sense round the ring
+    # outward normals require one orientation of the ring
     backwards = ~shapely.is_ccw(ring)[owner]
     turned[backwards] = (2 * first + count - 1)[owner[backwards]] - turned[backwards]
     point = point[turned]
     edge, start, side_of = np.diff(point, axis=0), point[:-1], owner[:-1]
-    # not from one ring's end to the next one's start, and no side without a length
+    # exclude sides from the end of one ring to the start of the next, and sides without length
     real = (owner[1:] == side_of) & (edge != 0.0).any(axis=1)
     edge, start, side_of = edge[real], start[real], side_of[real]
     outward = np.column_stack([edge[:, 1], -edge[:, 0]]) / np.hypot(edge[:, 0], edge[:, 1])[:, None]
@@ -326,16 +327,16 @@ def _abutting(footprints: list[Polygon], tolerance_m: float) -> BoolArray:
 # Relative to the largest coordinate: about a thousand times the rounding error of a plane equation.
 RELATIVE_TOLERANCE = 1e-12
 
-# A link shorter than this has no path: there is no far field, and no direction when it is zero.
+# A link shorter than this has no path: its ends are not in the far field, and a zero length has no direction.
 MINIMUM_LENGTH_M = 0.01
 
 # Face sequences per tower beyond which the ``image`` engine gives up.
 _SEQUENCE_BUDGET = 200_000
 
-# Bounds the memory of every dense step (8 MB per array).
+# Limits the memory of every dense step (8 MB per array).
 CELLS_PER_CHUNK = 1_000_000
 
-# Targets whose heights over all faces are held.
+# Number of targets whose heights over all faces are cached.
 TARGETS_AT_ONCE = 1024
 
 # Margin of :class:`Mirrors` [m]: far above the tolerance of any search that it thins out.
@@ -363,7 +364,7 @@ def find_paths(
     budget : int
         Largest number of sequences followed per tower.
     extent_m : (points, 3), optional
-        Points that set the tolerance in place of the targets: those of the whole, where the targets are a part.
+        Points that determine the tolerance instead of the targets, if the targets are a part of a job.
     progress : callable, optional
         Called with the share done.
 
@@ -388,7 +389,7 @@ def find_paths(
     growth = _Growth(
         faces=faces,
         bounds=box,
-        # pairs of faces are asked for from the second reflection on
+        # pairs of faces are needed from the second reflection on
         facing=_facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_),
         tolerance_m=tolerance_m,
         max_depth=max_depth,
@@ -640,12 +641,12 @@ def _paths_of_level(
                 )
             else:
                 row, column = np.zeros(len(some), np.int64), np.arange(len(some))
-            # taken: an index in brackets costs four times as much for rows of three
+            # use take, because an index in brackets needs four times as long for rows of three
             sequence, images, pose = level.faces[part].take(row, 0), level.images_m[part].take(row, 0), some[column]
             # after the cheap test of the last face, which few pairs pass
             vertices, good = trace_back(faces, sequence, images, targets.take(pose, 0), hiding.tolerance_m)
             sequence, pose, vertices = sequence[good], pose[good], vertices[good]
-            # last, since it is the dearest: on what geometry has left
+            # last, because it is the slowest test: only for paths that passed the geometric tests
             free = ~hiding.any_segment(np.broadcast_to(source, (len(pose), 3)), vertices, targets[pose])
             pieces.append(PathSet.from_tower(tower, pose[free], sequence[free], vertices[free], max_depth))
     return merge(pieces, max_depth, None)
@@ -700,10 +701,10 @@ def _meets_last_face(
     return row, column
 
 
-# Share of the targets from which on a sequence's first faces are tested for all of them at once.
+# Share of the targets above which the first faces of a sequence are tested for all targets at once.
 _OFTEN = 0.1
 
-# Heights over a plane that differ by less [m] give no sure place on it.
+# If the heights of both ends over a plane differ by less [m], the reflection point is uncertain.
 _SURE_M = 1e-4
 
 
@@ -730,7 +731,7 @@ def _passes_first_faces(faces: Faces, sequence: IntArray, image: FloatArray, tar
                 place = start + share * (end - start)
                 meets &= place >= faces.lower[face, which, None] - REACH_SLACK_M
                 meets &= place <= faces.upper[face, which, None] + REACH_SLACK_M
-        # where the place is not sure, the exact tracing decides
+        # exact tracing decides if the reflection point is uncertain
         good &= meets | (abs(below - height) < _SURE_M)
     return good
 
@@ -773,7 +774,7 @@ def trace_back(
         normal, offset = faces.normal.take(face, 0), faces.offset_m[face]
         ahead = np.einsum("ij,ij->i", normal, point) - offset
         behind = offset - np.einsum("ij,ij->i", normal, image)
-        # an end may lie on its face, the other reflection points lie before it
+        # an end may lie on its face; all other points must lie in front of it
         good &= ahead >= -tolerance_m if step == depth - 1 else ahead > tolerance_m
         good &= (behind >= -tolerance_m if step == 0 else behind > 0.0) & (ahead + behind > tolerance_m)
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -51,7 +51,7 @@ from .mirror import (
 
 SPECULAR_TABLE_SLOTS = 2**24
 _FEWEST_SLOTS = 2**20
-# Candidates per tower and batch that there is room for at first: their number is known afterwards.
+# Initial number of candidates per tower and batch: the actual number is known only afterwards.
 MAXIMUM_PATHS = 2**16
 
 # Room beyond which a batch is refused (some 100 bytes each).
@@ -64,7 +64,7 @@ _FULLEST_TABLE = 1 / 32
 _MOST_SLOTS = 2**28
 
 _LARGEST_BATCH = 100
-# Sionna knows slabs only; in this one no second echo returns. Its coefficients are not used for H.
+# Sionna supports slabs only: this thickness prevents a second echo. Its coefficients are not used for H.
 HALF_SPACE_THICKNESS_M = 10.0
 # A float32 reflection point may lie this far outside its face.
 _EDGE_TOLERANCE_M = 1e-3
@@ -132,7 +132,7 @@ def _variant(kinds: Sequence[str]) -> str:
     )
 
 
-# Modules of Sionna RT with a class that no search makes.
+# Modules of Sionna RT with a class that no search uses.
 _LATER = {
     "preview": "Previewer",
     "rcs.scattering_model_viewer": "ScatteringModelViewer",
@@ -207,12 +207,12 @@ class _Builder:
         except ImportError as error:
             raise _missing(error) from error
         if _ALIVE:
-            gc.collect()  # an exception may have kept one
+            gc.collect()  # an exception may still refer to a scene
         scene, faces = rt.load_scene(), self.faces
         _ALIVE.add(scene)
         scene.frequency = self.carrier_hz
         ends = np.concatenate([self.links.sources_m, self.links.targets_m])
-        # as far as reflections between the ends can lie, and no farther: float32 coordinates grow coarse
+        # extend only as far as reflections can lie, because float32 coordinates become coarse
         reach = 4.0 * float(max(np.nanmax(np.abs(ends)), 100.0))
         vertices, triangle, owner = triangles(faces, reach) if self.surfaces is None else self.surfaces.mesh()
         objects, owners = [], []
@@ -344,11 +344,11 @@ class _Finder:
         self.built, self.batch = built, batch
         scene = built.scene
         for name, kind in zip(("tx_array", "rx_array"), patterns, strict=True):
-            # both polarisations: slants are made of them afterwards, without another search
+            # both polarisations: slants are computed from them afterwards without another search
             pattern = rt.antenna_pattern.antenna_pattern_registry.get(kind)(polarization="VH")
             setattr(scene, name, rt.AntennaArray(pattern, _points(np.zeros((1, 3)))))
         for i in range(len(sources.centres_m)):
-            # places come later, as arrays; Sionna only counts these
+            # Sionna only counts these devices; their positions are set later as arrays
             scene.add(rt.Transmitter(name=f"tx{i}", position=[0.0, 0.0, 1.0]))
         for i in range(batch):
             scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
@@ -388,7 +388,7 @@ class _Finder:
 
         generator.fibonacci_lattice = lattice
         field = self.solver._field_calculator
-        # the number scales diffuse rays alone, and no search casts any
+        # the number affects diffuse rays only, which no search uses
         self.solver._field_calculator = lambda **named: field(**named | {"samples_per_src": 1})
 
     def _replace_endpoints(self, towers: int) -> None:
@@ -421,7 +421,7 @@ class _Finder:
         """Sionna's paths of one batch, padded, searched until there was room for all."""
         self.targets = targets.padded(self.batch).arguments()
         paths = self._solved(max_depth, samples)
-        # lines of sight alone need no table
+        # lines of sight do not need a table
         while max_depth and self._more_room():
             paths = self._solved(max_depth, samples)
         return paths
@@ -582,7 +582,7 @@ def _refined(
         raw = finder.searched(targets_m[some], rays.max_depth, rays.samples)
         _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
         receiver, tower, _, sequence = _sequences(raw, finder.built.face_of, rays.max_depth)
-        del raw  # may be memory of the device, which the next batch needs
+        del raw  # copy, because the next batch needs the device memory
         yield _refine(faces, sources_m, targets_m, some[receiver], towers[tower], sequence, tolerance_m, surfaces)
         traced += len(some)
         if progress:
@@ -780,13 +780,13 @@ def _relocate(
     everywhere = trace_back(faces, sequence, images_of(faces, sequence, sources_m), targets_m, tolerance_m, np.inf)[0]
     result = sequence.copy()
     for step in range(sequence.shape[1]):
-        # only where the face that Sionna named does not hold the point
+        # only if the face that Sionna named does not contain the point
         outside = np.flatnonzero(~inside(faces, sequence[:, step], everywhere[:, step], _EDGE_TOLERANCE_M))
         for row in outside:  # few: only scenes with disjoint coplanar faces
             twins = np.flatnonzero(plane == plane[sequence[row, step]])
             point = np.tile(everywhere[row, step], (len(twins), 1))
             holding = twins[inside(faces, twins, point, _EDGE_TOLERANCE_M)]
             if len(holding):
-                # any will do: where coplanar faces overlap merge() keeps one
+                # any face is correct: merge() keeps one of overlapping coplanar faces
                 result[row, step] = holding[-1]
     return np.asarray(result)

@@ -334,7 +334,7 @@ def _settled(
     rays = [end - place for end in (source, target)]
     between = sum(r / np.maximum(np.linalg.norm(r, axis=1, keepdims=True), 1e-12) for r in rays)
     smooth = ~crease & (np.abs(moved).max(axis=1, initial=0.0) < _STILL_M)
-    # on a crease no tangent plane is defined: the plane that sends one end to the other serves
+    # on a crease there is no tangent plane: use the plane that reflects one end to the other
     normal = np.where(smooth[:, None], tangent, between)
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     above = [(r * normal).sum(axis=1) > 0.0 for r in rays]

@@ -180,9 +180,9 @@ class GrowingNetcdf:
     ----------
     path : Path
     grows : sequence of str
-        Dimensions without a limit. Data sets follow each other along the first. Along the others the file is as long as
-        the longest data set, and contains ``_FillValue`` where another is shorter. A variable without the first
-        dimension is overwritten by each data set.
+        Dimensions without a limit. Data sets follow each other along the first dimension. Along the other dimensions,
+        shorter data sets are filled with ``_FillValue``. A variable without the first dimension is overwritten by each
+        data set.
 
     Notes
     -----

@@ -37,10 +37,10 @@ from .files import read_bounded
 # Larger files are refused unread; a site with 100 000 single trees has about 6 MB.
 MAX_BYTES = 32 * 1024 * 1024
 
-# Scalars, lists and mappings, aliases counted unfolded: an alias bomb stops here.
+# Largest number of scalars, lists and mappings, with aliases expanded, as a limit against alias bombs.
 _MAX_NODES = 4_000_000
 
-# Nesting of lists and mappings.
+# Largest nesting depth of lists and mappings.
 _MAX_DEPTH = 64
 
 _TAG = "tag:yaml.org,2002:"

@@ -637,7 +637,8 @@ def learning_curve(observed: Sequence[Observed], recipe: Recipe) -> tuple[CurveP
             for scored in filter(None, (score(o, learned.mean(o.samples)) for o in targets)):
                 key = scored.flight, f"{scored.tower}.{scored.channel}"
                 errors[size].setdefault(key, []).append((scored.rmse_db, scored.rmse_4s_db))
-    # use the same series at every number of flights: otherwise a curve could fall because a difficult flight is missing
+    # use the same series for every number of flights: otherwise a curve could fall because a difficult flight is
+    # missing
     common = set.intersection(*(set(each) for each in errors.values()))
     if not common:
         return ()

@@ -393,7 +393,7 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
 
 
 def _usual_db(shown: Sequence[_Models]) -> tuple[float, float] | None:
-    """Return the usual and the largest usual RMSE of held-out flights [dB]; None without learned antennas."""
+    """Return the usual and the largest usual RMSE of held-out flights [dB]. None without learned antennas."""
     learned = [table[_SOUND].evidence.learned for table in shown]
     usual = [(of.health.rmse_db, of.health.most_rmse_db) for of in learned if of is not None and of.health is not None]
     if len(usual) < len(shown):
@@ -552,7 +552,7 @@ _ANGLES = ("uav_azimuth_deg", "tower_azimuth_deg")
 
 
 def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
-    """Return means over :data:`BIN_S` and over hovers of the samples with both levels; None if they are too few."""
+    """Return means over :data:`BIN_S` and over hovers of the samples with both levels. None if they are too few."""
     finite = np.isfinite(evidence.measured_db) & np.isfinite(evidence.predicted_db)
     level = evidence.measured_db[finite]
     # two levels or few samples do not show the form of an error
@@ -1100,7 +1100,7 @@ _LEAST_BINS = 5
 
 
 def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
-    """Yield limits below (``side`` 1) or above (-1) which a receiver shows no level, hard ones and soft ones."""
+    """Yield hard and soft limits below (``side`` 1) or above (-1) which a receiver shows no level."""
     pile = _pile(e, side)
     if pile is not None:
         limit = float(e.measured_db[pile].mean())

@@ -500,7 +500,7 @@ class Known:
     series : sequence of LinkSamples
         Samples of the flown flights. If there are none, the antennas have their prior.
     model : GainModel
-        Terms and strengths of the antennas, error of a flight and channel, noise.
+        Gain model: terms and strengths of the antennas, error of a flight and channel, and noise.
     field : FieldModel, optional
         Model of the residual of the antennas. None adds no field.
     """

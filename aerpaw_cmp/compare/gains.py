@@ -168,7 +168,7 @@ class Term:
     Parameters
     ----------
     frame : {"body", "mast", "pair"}
-        Argument: direction of the tower in the body frame, of the UAV at the mast, or both.
+        Argument of the process: direction of the tower in the body frame, of the UAV at the mast, or both.
     per : {"all", "antenna"}
         One function for all, or one per tower and channel.
     length : float
@@ -981,7 +981,7 @@ class StatedSpread:
         return self.lock.quantile_db(0.5 - 0.5 * share), self.lock.quantile_db(0.5 + 0.5 * share)
 
     def crps_db(self, error_db: FloatArray) -> float:
-        """Return the mean continuous ranked probability score of errors (n,) [dB]; NaN is ignored.
+        """Return the mean continuous ranked probability score of errors (n,) [dB]. NaN is ignored.
 
         Notes
         -----

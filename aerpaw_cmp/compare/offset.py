@@ -250,8 +250,8 @@ def pooled_moments(
 
     Notes
     -----
-    The best shared offset is the mean difference over all pairs, rounded to the grid and kept within it: the mean of
-    the means, weighted by the pairs. RMSE^2(o) = variance + (mean - o)^2 of each sequence.
+    The best shared offset is the mean difference over all pairs, rounded to the grid and limited to its range.
+    RMSE^2(o) = variance + (mean - o)^2 of each sequence.
     """
     axes, grid = _GROUP[per], offset_grid(span_db=span_db)
     groups: dict[Hashable, list[tuple[str, str, str]]] = {}

@@ -615,7 +615,7 @@ def compare_rank(
     time_s : array_like, (n,), optional
         Times [s], for the hold time of stale RI. The default is the row number.
     sinr_db : array_like, (n,), optional
-        Reported SINR [dB], which a held report repeats.
+        Reported SINR [dB], used to detect repeated reports.
     place_m : (n, 3), optional
         East, north and up, NaN if unknown [m]: intervals then consider correlation over place, too.
     replicates : int

@@ -73,7 +73,7 @@ class LevelCard:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedLevel:
-    """Levels (n,) of one prediction at the samples of a series; NaN where nothing is predicted [dB].
+    """Levels (n,) of one prediction at the samples of a series. NaN where nothing is predicted [dB].
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def level_card(
 def _distribution(
     error_db: FloatArray, predicted: PredictedLevel, both: BoolArray
 ) -> tuple[float | None, float | None]:
-    """Return CRPS and coverage of the 90 % band as predicted; None for what is not stated."""
+    """Return CRPS and coverage of the 90 % band as predicted. None for what is not stated."""
     from scipy.special import ndtri
 
     crps = half_db = low_db = high_db = None

@@ -137,7 +137,7 @@ class RssFurther:
     snr: SnrScore | None = None
     """Error of a signal-to-noise ratio, for a receiver whose bandwidth is known."""
     rmse_bound: str | None = None
-    """Reason why the interval of the RMSE is only a lower bound; None for a complete interval."""
+    """Reason why the interval of the RMSE is only a lower bound. None for a complete interval."""
     interval_notes: tuple[str, ...] | None = None
     """Sentences about limits of the intervals: no correlation over place, an error that is not stationary."""
     simulated_sd_db: float | None = None
@@ -195,7 +195,7 @@ class RssResult:
     stated: StatedSpread | None = None
     """Stated standard deviations of the simulated level with learned antennas."""
     tower_m: FloatArray | None = None
-    """Position of a tower that moves, shape (n, 3) [m], NaN if unknown; None for a fixed tower."""
+    """Position of a tower that moves, shape (n, 3) [m], NaN if unknown. None for a fixed tower."""
 
     @property
     def name(self) -> str:
@@ -209,7 +209,7 @@ class RssResult:
 
     @property
     def clock_verdict(self) -> str:
-        """Verdict about the radio clock; empty if none was estimated."""
+        """Verdict about the radio clock. Empty if none was estimated."""
         return "" if self.further.clock is None else self.further.clock.verdict
 
     @property
@@ -229,7 +229,7 @@ class RssResult:
 
     @property
     def residual_db(self) -> FloatArray:
-        """Measurement plus offset minus simulation (n,); NaN if a side is missing or was learned on this flight."""
+        """Measurement plus offset minus simulation (n,). NaN if a side is missing or was learned on this flight."""
         if LEARNED_HERE in self.score.fitted_on_scored:
             # a series is not scored on its own training data
             return np.full(len(self.time), np.nan)
@@ -305,7 +305,7 @@ class RankResult:
     further: RankFurther
     probability: FloatArray | None = None
     tower_m: FloatArray | None = None
-    """Position of a tower that moves, shape (n, 3) [m]; None for a fixed tower."""
+    """Position of a tower that moves, shape (n, 3) [m]. None for a fixed tower."""
 
     @property
     def singular_ratio_db(self) -> FloatArray:
@@ -368,7 +368,7 @@ class FlightVerdict:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightResult:
-    """The results of one flight; empty for series that the flight does not have.
+    """The results of one flight. Empty for series that the flight does not have.
 
     ``models`` has one row per model over all channels, ``ladder`` one row per model, tower and channel. Both are empty
     if no models were compared.
@@ -382,15 +382,15 @@ class FlightResult:
     models: tuple[ModelRow, ...] = ()
     ladder: tuple[LadderRow, ...] = ()
     verdict: FlightVerdict | None = None
-    """The comparison with the best baseline over all channels; None if nothing could be scored."""
+    """The comparison with the best baseline over all channels. None if nothing could be scored."""
     likely_cause: Cause | None = None
-    """The systematic error that explains most of the RMSE; None if none is identified."""
+    """The systematic error that explains most of the RMSE. None if none is identified."""
     next_step: str | None = None
-    """The next step of the user, a clause; None if no known step changes the result."""
+    """The next step of the user, a clause. None if no known step changes the result."""
 
     @property
     def cause(self) -> str | None:
-        """The sentence of the likely cause; None if none is identified."""
+        """The sentence of the likely cause. None if none is identified."""
         return None if self.likely_cause is None else self.likely_cause.sentence
 
     @property

@@ -178,8 +178,8 @@ class TrackAccount:
         Rows of the telemetry frame.
     no_time, duplicate_time, backward_time, bad_position : int
         Rows that are not used for positions. They have no time stamp, the stamp of the row before, a stamp earlier than
-        one before it, or impossible coordinates (also NaN and -999). If that excludes fewer rows, a stamp later than
-        one after it counts as backward instead.
+        one before it, or impossible coordinates (also NaN and -999). If this excludes fewer rows, a stamp later than a
+        following stamp is excluded instead.
     steps_sorted : int
         Steps back in time of a shuffled file, whose rows were sorted because the path is then shorter.
     unknown_attitude : int

@@ -236,7 +236,7 @@ class CalibrationFile(StrictModel):
     flights: Annotated[list[str], Field(min_length=1)]
     """All flights, including those of ``campaigns``."""
     campaigns: dict[_Name, CampaignSettings] = Field(default_factory=dict)
-    """Several campaigns, from whose flights antennas are learned together. Each becomes an entry of a site."""
+    """Campaigns by name, if antennas are learned from several together. Each becomes an entry of a site."""
     patterns: PatternsSettings = PatternsSettings()
     source: Source = Source()
     """Title, DOI and licence of the flights' data, and their airframe, stored with the learned models of a site."""

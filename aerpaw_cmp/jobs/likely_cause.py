@@ -174,7 +174,7 @@ _AS_TOLD, _ALIKE, _LONG_STEP_S, _LEAST_PATH_M = 0.2, 0.5, 3.0, 10.0
 _SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")
 
 
-# No cause is looked for below this RMSE: receivers and positions are not more exact.
+# Below this RMSE no cause is searched for, because receivers and positions are not more accurate.
 _GOOD_DB = 1.0
 _Compared = tuple[RssSeries, Replayed, RssResult]
 

@@ -121,7 +121,7 @@ class Candidate:
 
     @property
     def row(self) -> dict[str, Any]:
-        """The entry of metrics.json."""
+        """Entry of this candidate in metrics.json."""
         length = {"length_m": self.route.length_m, "minutes": self.route.duration_s / 60.0}
         return {"name": self.route.name, "sd_db": self.sd_db, **length, "refused": self.refused}
 

@@ -116,7 +116,7 @@ def _entry(name: str, place: Path, role: str) -> InputFile:
     return InputFile(path=name, sha256=digest_of(place), role=role, learned_on=_learned_on(place, *stamp(place)))
 
 
-# Raised whenever the form of an entry changes.
+# Version of the entries. Increase it if their format changes.
 LAYOUT = 8
 
 _SEAL = b"aerpaw-cmp outcome"

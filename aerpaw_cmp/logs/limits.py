@@ -198,7 +198,7 @@ _SPEEDS = ("velocity_north_mps", "velocity_east_mps")
 
 
 def _comes_back(time_s: FloatArray, place_m: FloatArray) -> bool:
-    """Check whether fast steps lead back to where the track was a step or two before: it is of several vehicles."""
+    """Check whether fast steps return to an earlier position, which shows that the rows mix several vehicles."""
     begins, ends = _runs(time_s, place_m)
     apart_m = [
         float(np.median(np.linalg.norm(place_m[begins[lag:]] - place_m[ends[:-lag] - 1], axis=1)))
@@ -436,7 +436,7 @@ class _Check:
         self._flag(bad, "level_out_of_range", first, f"which is received nowhere ({known})", ["rss_db"])
 
     def _lost_readings(self) -> None:
-        """Flag a few placeholders far from all other levels: what a program writes for a reading that it lost."""
+        """Flag a few placeholders far from all other levels, which programs write for lost readings."""
         level = self._values("rss_db")
         # -1 is also a common placeholder
         for lost, sign, word in ((np.abs(level) <= _LOST_DB, 1, "above"), (np.isin(level, _LEAST_DB), -1, "below")):

@@ -235,7 +235,7 @@ def built(
     reason: Reason, skip: Callable[[IntArray], BoolArray] | None = None, clock: str = "wall",
     extra: Iterable[RejectedLine] = (), markup: IntArray | None = None, closed: bool = False,
 ) -> Rows:  # fmt: skip
-    """Return rows from their lines and their columns of text, one of them ``time``, as :func:`matched` does.
+    """Return rows from line numbers and text columns, one of which is ``time``, like :func:`matched`.
 
     Parameters
     ----------

@@ -34,10 +34,10 @@ TEXT_LIMIT = 500
 UNTERMINATED = "unterminated_line"
 
 
-# First bytes of a file of tags: no console or table.
+# First bytes of markup files, which are not consoles or tables.
 MARKUP = (b"<?xml", b"<kml", b"<gpx")
 
-# A decimal number of bounded length (bytes pattern, no group): what pandas' parser takes, see ``_table``.
+# A decimal number of bounded length (bytes pattern, no group), as the parser of pandas accepts, see ``_table``.
 NUMBER = rb"[-+]?\d{1,400}(?:\.\d{0,400})?(?:[eE][-+]?\d{1,400})?"
 
 
@@ -295,8 +295,8 @@ TIME = rb"\d{4}[-/]\d\d[-/]\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,9})?"
 # Optional offset behind :data:`TIME`.
 ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
 
-# Abbreviations of winter time that are also written in summer, and abbreviations of several countries: hours east of
-# UTC, and a zone with summer time.
+# Ambiguous abbreviations: winter time that is also written in summer, and names that several countries use. Each has
+# hours east of UTC and a zone with summer time.
 WINTER = {
     "EST": ((-5.0, "America/New_York"),), "CST": ((-6.0, "America/Chicago"),), "MST": ((-7.0, "America/Denver"),),
     "PST": ((-8.0, "America/Los_Angeles"),), "AKST": ((-9.0, "America/Anchorage"),), "CET": ((1.0, "Europe/Berlin"),),
@@ -307,7 +307,7 @@ WINTER = {
 
 
 class Count(NamedTuple):
-    """A unit of clocks: its nanoseconds, its pattern in the name of a column, and the least count that is an epoch."""
+    """A unit of clocks: its nanoseconds, its pattern in column names, and the smallest count that is an epoch."""
 
     ns: float
     said: re.Pattern[str]

@@ -213,7 +213,7 @@ class _Local:
         return self._estimate(unmasked(targets_m), leave_out=False)
 
     def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
-        """Return the estimate at each sample from the others, and NaN for the variance."""
+        """Return the estimate at each sample from all other samples, and NaN for the variance."""
         return self._estimate(self.points_m_, leave_out=True)
 
     def _estimate(self, targets: FloatArray, *, leave_out: bool) -> tuple[FloatArray, FloatArray]:

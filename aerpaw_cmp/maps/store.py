@@ -394,7 +394,7 @@ class TileStore:
         return self.folder / f"tile-{self._job}-{number}"
 
     def _content(self, number: int) -> bytes | None:
-        """Return paths and planes of one tile as bytes; None if there is no intact file."""
+        """Return paths and planes of one tile as bytes. None if there is no intact file."""
         values = sum(getattr(like, name)[..., 0].size for like in self._empty.values() for name in PLANES)
         size = 40 + 4 * values * len(self.tiling.grid_of(number))
         with suppress(FileNotFoundError, NotADirectoryError, InputError):

@@ -114,8 +114,8 @@ def fit_biexponential(distance_m: ArrayLike, correlation: ArrayLike) -> BiExpone
 
     Notes
     -----
-    Amplitudes of at least 0 keep the curve a valid covariance in any dimension. A correlation is at most 1: data that
-    begin beyond distance 0 would let a free fast exponential shoot up between 0 and the first point.
+    Amplitudes of at least 0 keep the curve a valid covariance in any dimension. A correlation is at most 1: without
+    this limit, an exponential with a fast rate could exceed 1 between distance 0 and the first point.
 
     References
     ----------

@@ -438,7 +438,7 @@ class _Search:
         self.hiding = Occlusion(faces, scene_tolerance_m(faces, sources_m, targets_m))
         numbers = np.unique(faces.solid[faces.solid >= 0])
         solid = np.searchsorted(numbers, faces.solid[edges.face[:, 0]])
-        # twice the probe, so that every building which a probe may enter is seen
+        # use twice the probe distance, to find every building that a probe may enter
         low = np.minimum(edges.start_m, edges.end_m) - 2.0 * _PROBE_M
         high = np.maximum(edges.start_m, edges.end_m) + 2.0 * _PROBE_M
         touch = (self.hiding.low[None] <= high[:, None]) & (self.hiding.high[None] >= low[:, None])

@@ -273,7 +273,7 @@ class PathCache:
             entry = read_sealed(place, _SEAL)
         except ValueError:
             self.warnings.append(
-                f"a damaged entry of the path cache was not used, the paths were searched anew: {place}"
+                f"a damaged entry of the path cache was ignored, and the paths were searched again: {place}"
             )
             return None
         if entry is None:

@@ -81,7 +81,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Properties of the whole replay that a part must know, so that it is the same as in one piece.
+    """Properties of the complete replay that a part needs to get the same result as one replay of all poses.
 
     Parameters
     ----------

@@ -761,6 +761,6 @@ def _level(position_m: ArrayLike) -> Poses:
         raise UsageError(
             f"poses of shape {np.shape(position_m)}",
             expected="Poses, or positions (poses, 3): metres east, north and up",
-            cause="latitude and longitude, or heights left out",
+            cause="latitude and longitude, or no heights",
         )
     return Poses(position, np.broadcast_to(np.eye(3), (len(position), 3, 3)).copy())

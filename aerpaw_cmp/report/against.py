@@ -28,7 +28,7 @@ class AgainstSeries(LevelSeries):
     high_db: FloatArray
     share_near: float
     start: np.datetime64 | None = None
-    """Time of ``time_s`` 0 (UTC); None for logs with relative times."""
+    """Time of ``time_s`` 0 (UTC). None for logs with relative times."""
     common_db: FloatArray | float = 0.0
     """The part of ``sd_db`` that all samples of the flight may share [dB]."""
 

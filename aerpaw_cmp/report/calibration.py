@@ -65,7 +65,7 @@ class CalibrationData(Made):
     curve: Sequence[Mapping[str, Any]]
     """Error by number of training flights, fewest first. Empty with fewer than three flights."""
     one_more_rmse_db: float
-    """Expected error with one more flight, extrapolated [dB]; NaN without a curve."""
+    """Expected error with one more flight, extrapolated [dB]. NaN without a curve."""
     antennas: Sequence[AntennaMap]
     rank: Mapping[str, Any] | None = None
     settings_text: str = ""

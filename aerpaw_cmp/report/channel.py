@@ -109,7 +109,7 @@ class Channel:
 
     @property
     def doppler_hz(self) -> FloatArray | None:
-        """Doppler shift (paths,) [Hz]; None without a velocity."""
+        """Doppler shift (paths,) [Hz]. None without a velocity."""
         own, other = self.along.velocity_mps, self.along.tower_mps
         return None if own is None else self.table.doppler_hz(self.carrier_hz, own, 0.0 if other is None else other)
 
@@ -119,7 +119,7 @@ class Channel:
         return [*self.along.remarks, *self.replay.left_out]
 
     def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
-        """Return values per path (paths, ...) as (most paths of a link, poses, towers, ...); None remains None."""
+        """Return values per path (paths, ...) as (most paths of a link, poses, towers, ...). None remains None."""
         return None if values is None else self.table.by_link(values, self.replay.ends, fill)
 
 

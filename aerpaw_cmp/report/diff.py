@@ -27,7 +27,7 @@ TOLERANCE_DB = 0.01
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """A named value of two reports; None if a report has no such entry."""
+    """A named value of two reports. None if a report has no such entry."""
 
     key: str
     first: Any

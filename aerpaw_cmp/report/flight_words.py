@@ -500,7 +500,7 @@ def _rss_cautions(panel: RssResult) -> list[str]:
 # Offsets of at least this size, or below zero, are explained [dB].
 _LARGE_OFFSET_DB = 20.0
 
-# Reasons of such an offset, by the unit of the log.
+# Explanation of a large or negative offset, by the unit of the log.
 OFFSETS = {
     "dB re full scale": "the log is relative to full scale, and the offset converts it to dBm",
     "dB": "the log is a signal-to-noise ratio, and the offset includes the noise level",

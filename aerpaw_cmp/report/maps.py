@@ -670,7 +670,7 @@ def _foliage_height(m: RssMap | RankMap) -> dict[str, str]:
 
 
 def layer_numbers(layer: MapLayer) -> dict[str, Any]:
-    """Return numbers of a layer: share in coverage, percentiles, shares of classes; None if missing."""
+    """Return numbers of a layer: share in coverage, percentiles, shares of classes. None if missing."""
     finite = layer.values[np.isfinite(layer.values)]
     result: dict[str, Any] = {
         "quantity": layer.quantity,

@@ -58,7 +58,7 @@ class PackedArrays:
         return self._known[key]
 
     def add_steps(self, values: FloatArray, step: float) -> int:
-        """Store values as 16-bit multiples of ``step`` and return their number; NaN and infinities are missing."""
+        """Store values as 16-bit multiples of ``step`` and return their number. NaN and infinities are missing."""
         return self.add(_steps_of(values, step), "i2")
 
     def content(self) -> dict[str, Any]:
@@ -68,7 +68,7 @@ class PackedArrays:
 
 
 def _steps_of(values: FloatArray, step: float) -> AnyArray:
-    """Return values as multiples of ``step``, clipped to 16 bits; NaN and infinities are missing.
+    """Return values as multiples of ``step``, clipped to 16 bits. NaN and infinities are missing.
 
     Examples
     --------

@@ -121,7 +121,7 @@ def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, st
 
 
 def _plain(name: str, value: Any) -> str | None:
-    """Return the text of one setting or number; None if it is not set or empty."""
+    """Return the text of one setting or number. None if it is not set or empty."""
     if "ci95" in name and isinstance(value, (list, tuple)) and None in value:
         return None if value[0] is None else f"≥ {short(value[0])}"
     if isinstance(value, (list, tuple)):
@@ -156,14 +156,14 @@ def more(rows: Sequence[Any], limit: int) -> str:
 
 
 def short(value: Any) -> str:
-    """Return a value as text with at most 6 digits; None is an en dash. metrics.json has all digits."""
+    """Return a value as text with at most 6 digits. None is an en dash. metrics.json has all digits."""
     if value is None:
         return "–"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def cut(text: str, most: int = 120) -> str:
-    """Return a text of at most ``most`` characters. A longer one ends in an ellipsis."""
+    """Return a text of at most ``most`` characters. A longer text ends in an ellipsis."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 

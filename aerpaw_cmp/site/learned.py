@@ -191,7 +191,7 @@ class LearnedHealth(StrictModel):
     channel_difference_sd_db: dict[str, float] = Field(default_factory=dict)
     """SD over flights of the difference of offsets to another channel of the tower, by channel."""
     below_lock_share: float | None = None
-    """Mean share of samples without lock; None for receivers that do not report their lock."""
+    """Mean share of samples without lock. None for receivers that do not report their lock."""
     run_s: float
     """Usual longest time in which all readings are equal."""
 
@@ -808,7 +808,7 @@ def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] =
     gain_dbi, sd_db : (thetas, phis)
         Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
     notes : tuple of str
-        Comments, a line each.
+        Comment lines.
     decimals : int
         Decimals of the gains.
 

@@ -197,7 +197,7 @@ def _marks(
     if key == "network" and unknown:
         names = ("RSRP", "RSSI", "SNR", "SINR", "power") if level is None else ()
         level = next((i for name in names if (i := sheet.find(name)) is not None), level)
-        # among the rows of one known key: a cell's number that goes with its PCI says nothing more
+        # compare rows of one known key, because a cell number that belongs to one PCI adds no information
         same = _of_one_key(table.drop(columns=["time", "levels"]))
         part, time = sheet.part(same), rows.time[same]
         if level is None:

@@ -128,7 +128,7 @@ _GROUPS = re.compile(
     r"(?:(?:gps|gnss|pos(?:ition)?|loc(?:ation)?|coord(?:inate)?s?|geo|data|meta(?:data)?|info|sample|record|measurement"
     r"|payload|fix|state|telemetry)\.)+"
 )
-# Objects within objects, and entries of a list, beyond which values are not columns.
+# Largest nesting depth of objects and number of list entries that become columns.
 _DEPTH, _ENTRIES = 4, 32
 
 

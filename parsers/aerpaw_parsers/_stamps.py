@@ -490,7 +490,7 @@ def _numbers(
         hours = step / scale * 1e9 / 3600
         odd = unit is None and bool(likely) and hours > 1 and hours % 1 > 0
         if middle >= 0.9 * scale and not odd and (unit is None or scale >= _text.COUNTS[unit].least_epoch):
-            if gps and middle < 1.58 * scale:  # as an epoch of 1970 before 2020, as one of 1980 before 2030
+            if gps and middle < 1.58 * scale:  # before 2020 if counted from 1970, before 2030 if counted from 1980
                 value, warnings = value + (GPS_S - LEAP_S) * scale / 1e9, [_GPS_COUNT]
             else:
                 warnings = ["the times are called GPS time and count from 1970: read as UTC"] if gps else []

@@ -152,7 +152,7 @@ def test_one_record_of_each_channel_and_rank(logs: Path) -> None:
     assert len(left) == 3
     assert any("the same bytes as LW1/USRP1_power_log.txt" in r or "the same bytes as LW1/copy" in r for r in left)
     assert any("has USRP1 of that tower and time already" in r for r in left)
-    assert any("z_vehicleOut.txt: the track is that of other telemetry" in r for r in left)
+    assert any("z_vehicleOut.txt: the track comes from other telemetry" in r for r in left)
     (logs / "flight.yaml").write_text(text)
     data = load_data(load_flight(logs / "flight.yaml"), logs)
     assert (len(data.rss), len(data.rank)) == (10, 1)

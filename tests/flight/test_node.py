@@ -76,7 +76,7 @@ def test_of_two_vehicles_the_levels_name_the_one_that_carried_the_radio(
     if asked:
         assert "pose.csv" in asked[0]
         assert f"m apart, and the levels fit {stream.name}: which" in asked[0]
-        assert "left out: other.csv: the track is that of other telemetry" in remarks
+        assert "left out: other.csv: the track comes from other telemetry" in remarks
 
 
 ROVER = (-120.0, 90.0, 1.5)

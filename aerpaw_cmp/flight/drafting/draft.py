@@ -882,7 +882,7 @@ def _reason(stream: Stream, span: Span, context: _Context, *, dated: bool) -> st
         if flown is None or stream is flown[0]:
             return None
         if meet(span, flown[1]) or (relative and has_wall_clock(flown[1][0])):
-            return "the track is that of other telemetry"
+            return "the track comes from other telemetry"
         return _late(span, flown[1])
     if flown is None and context.positioned and not _has_positions(stream):
         return "it has no positions, and there is no telemetry"

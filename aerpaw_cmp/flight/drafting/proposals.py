@@ -48,7 +48,7 @@ from ..track import Track
 from ..training import among, flight_logs, marks_of
 
 # Smallest log odds of a tower, and of a listed position. Of 20 real flights and thirds at LW1, 18 have more than -0.5
-# and all have more than -3. Six rovers have -11 and less. The listed positions of the rovers have -3 and more.
+# and all have more than -3. For six rovers, towers have -11 and less, and the listed positions have -3 and more.
 _TOWER_ODDS, _LISTED_ODDS = -0.5, -5.0
 
 # Log odds that learned antennas must add. Thirds of LW1 flights have 8 to 57 with antennas from one or two flights.
@@ -499,8 +499,9 @@ def propose(
 ) -> Proposal:
     """Return the learned antennas that the levels of a flight support, and the rank receiver of its tower.
 
-    Antennas of both ends are compared with the levels of each series; if none fits, the airframes alone with all
-    series together. The antenna of a node that other flights placed is compared at any node that is well placed.
+    Antennas of both ends are compared with the levels of each series; if no pair fits, airframes only are compared with
+    all series together. The antenna of a node that was located from other flights is compared at any node with a
+    well-known position.
 
     Parameters
     ----------

@@ -771,7 +771,7 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
     reference : Replay
         The replay of the chosen poses, by the other engine.
     chosen : (m,) int
-        Rows of ``replay`` that the reference has, in its order.
+        Rows of ``replay`` that correspond to the rows of ``reference``.
     ks : sequence of float
         Singular-value ratios at which ranks are compared.
 

@@ -75,7 +75,7 @@ class ExplainedPath:
 
     @property
     def words(self) -> str:
-        """The faces it meets, from tower to UAV."""
+        """Names of the faces that the path meets, from tower to UAV."""
         return ", ".join(bounce.face for bounce in self.bounces) or "line of sight"
 
     def as_dict(self) -> dict[str, Any]:

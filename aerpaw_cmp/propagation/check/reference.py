@@ -511,7 +511,7 @@ class Reference:
         target : (3,)
             Centre of the UAV's array [m].
         turn : (3, 3)
-            Body to site.
+            Rotation from body to site axes.
 
         Returns
         -------
@@ -677,7 +677,7 @@ def element_wave(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -
 
 
 def _bounces(sequence: Sequence[Mirror], source: Vector, target: Vector) -> list[Vector] | None:
-    """[source, reflection points, target] between array centres, or None."""
+    """Return source, reflection points and target of a path between array centres, or None if there is no path."""
     images = [source]
     for mirror in sequence:
         images.append(mirror.mirrored(images[-1]))

@@ -136,7 +136,7 @@ class P833:
         return cls(math.exp(gamma) * (1.0 if in_leaf else LEAFLESS_FACTOR), math.exp(maximum))
 
     def loss_db(self, depth_m: FloatArray) -> FloatArray:
-        """Loss [dB] of depth [m]."""
+        """Return the loss [dB] of a depth in foliage [m]."""
         depth = np.asarray(depth_m, dtype=np.float64)
         return np.asarray(-self.maximum_db * np.expm1(-self.gamma_db_per_m * depth / self.maximum_db))
 
@@ -158,7 +158,7 @@ class Weissberger:
             raise UsageError(f"Weissberger at {self.frequency_hz / 1e9:g} GHz", expected="0.23 to 95 GHz")
 
     def loss_db(self, depth_m: FloatArray) -> FloatArray:
-        """Loss [dB] of depth [m]."""
+        """Return the loss [dB] of a depth in foliage [m]."""
         depth = np.asarray(depth_m, dtype=np.float64)
         scale = (self.frequency_hz / 1e9) ** 0.284 * (1.0 if self.in_leaf else LEAFLESS_FACTOR)
         return np.asarray(scale * np.where(depth <= 14.0, 0.45 * depth, 1.33 * np.abs(depth) ** 0.588))
@@ -600,9 +600,9 @@ class _Crossing:
     piece : (n,) int
         Index into the ``k`` segments for each piece within the area.
     share : (n, 2)
-        Where each piece begins and ends, as shares of the segment.
+        Start and end of each piece as shares of the segment.
     ground_m : (n,)
-        Up of the ground below it.
+        Height of the ground below each piece.
     """
 
     stand: Forest

@@ -139,7 +139,7 @@ def channel_matrices(
     faces : Faces
         Faces that the paths refer to.
     sources_m : (towers, 3) or (poses, towers, 3)
-        Array centres, in the order of ``link.tower_arrays``; the latter for towers that move.
+        Array centres, in the order of ``link.tower_arrays``. The second shape is for towers that move.
     poses : Poses
     link : Link
     loss_db : (paths,), optional

@@ -857,7 +857,7 @@ def find_paths(
     Parameters
     ----------
     faces, links, max_depth, extent_m
-        The same as in that function.
+        The same as in :func:`aerpaw_cmp.propagation.search.mirror.find_paths`.
     run : Run
 
     Returns

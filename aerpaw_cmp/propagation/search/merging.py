@@ -396,7 +396,7 @@ def _faces_of_triangles(
     corners: FloatArray, normal: FloatArray, offset: FloatArray, area: FloatArray, shape: IntArray, merge_m: float
 ) -> tuple[IntArray, IntArray]:
     """Return the face of each triangle, and the triangle whose plane each face has: its largest."""
-    # files repeat a corner for each triangle, in float32: equal means equal to a tenth of a millimetre
+    # files repeat corners for each triangle in float32: corners within 0.1 mm are equal
     grid = np.round(corners.reshape(-1, 3) / WELD_M).astype(np.int64)
     # only within one shape: touching walls of two houses are two faces
     key = np.column_stack([np.repeat(shape, 3), grid])

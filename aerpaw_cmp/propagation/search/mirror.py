@@ -261,9 +261,9 @@ def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:
 
 @lru_cache(maxsize=4096)
 def convex_pieces(footprint: Polygon) -> tuple[Polygon, ...]:
-    """Convex polygons that together are a footprint that is not convex, with corners at its corners only.
+    """Split a footprint that is not convex into convex polygons without additional corners.
 
-    Triangles are joined as long as what they make is convex (Hertel and Mehlhorn, 1983); cached, because each replay
+    Triangles are joined while the result is convex (Hertel and Mehlhorn, 1983); cached, because each replay
     needs them.
     """
     pieces = list(shapely.get_parts(shapely.constrained_delaunay_triangles(footprint)))

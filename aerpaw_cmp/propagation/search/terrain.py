@@ -228,7 +228,7 @@ def specular_points(
 def _stationary(
     source: FloatArray, target: FloatArray, share: FloatArray, ground: FloatArray, wavelength_m: float
 ) -> tuple[IntArray, FloatArray, BoolArray, FloatArray]:
-    """Pair, place along the profile [m], whether it is a crease, and part of the Fresnel zone, of each mirror."""
+    """Return pair, position along the profile [m], crease flag, and part of the Fresnel zone, for each mirror."""
     length = np.hypot(*(target - source)[:, :2].T)
     along = share * length
     up = source[:, 2], target[:, 2]
@@ -258,7 +258,7 @@ def _stationary(
     d = np.where(crease, d, inner)
     z = np.where(crease, ground[piece + 1, column], z0 + m * (d - d0))
     way = np.hypot(d, z - up[0][column]) + np.hypot(d - total, z - up[1][column])
-    # seen from above by both ends
+    # both ends must be above the tangent plane
     good = crease | ((over[0] > 0.0) & (over[1] > 0.0))
     column, d, z, crease, way = column[good], d[good], z[good], crease[good], way[good]
     zone = np.cumsum((np.diff(column, prepend=-1) != 0) | (np.abs(np.diff(way, prepend=0.0)) >= wavelength_m / 2.0))

@@ -94,21 +94,23 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
 
 def _late_clock(evidence: Sequence[LevelEvidence], towers: Sequence[str]) -> Cause | None:
     """Return the radio clocks that are late, if correcting them lowers the error of their towers as printed."""
-    late: dict[str, str] = {}
+    late: dict[str, list[str]] = {}
     for tower in dict.fromkeys(towers):
         here = [e for e, at in zip(evidence, towers, strict=True) if at == tower]
         clock = here[0].clock
         if clock is not None and clock.shifted and fall_without_lag_db(here) >= SHOWN_DB:
-            late[tower] = f"The radio clock at {tower} is {clock.in_words}"
+            late.setdefault(clock.in_words, []).append(tower)
     if not late:
         return None
-    others = sorted(set(towers) - set(late))
+    found = {tower for each in late.values() for tower in each}
+    others = sorted(set(towers) - found)
+    lags = [f"The radio clock at {', '.join(each)} is {words}" for words, each in late.items()]
     only = f"; those at {', '.join(others)} are not" if others else ""
     return Cause(
         name="clock",
-        sentence=f"{'. '.join(late.values())}{only}.",
+        sentence=f"{'. '.join(lags)}{only}.",
         next_step="`rss: {lag: apply}`",
-        channels=tuple(e.name for e, at in zip(evidence, towers, strict=True) if at in late),
+        channels=tuple(e.name for e, at in zip(evidence, towers, strict=True) if at in found),
     )
 
 

@@ -73,6 +73,17 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
         assert (cause is not None and (cause.sentence, cause.next_step) == (said, "`rss: {lag: apply}`")) == bool(first)
 
 
+def test_late_clocks_of_one_computer_have_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(likely_cause, "fall_without_lag_db", lambda _: 0.4)
+    names = ("LW1", "LW2", "LW3")
+    lags: Any = [SimpleNamespace(name=f"{at} A", clock=SimpleNamespace(shifted=at != "LW3", in_words="0.40 s ahead"))
+                 for at in names]  # fmt: skip
+    cause = likely_cause._late_clock(lags, names)
+    assert cause is not None
+    assert cause.sentence == "The radio clock at LW1, LW2 is 0.40 s ahead; those at LW3 are not."
+    assert cause.channels == ("LW1 A", "LW2 A")
+
+
 FLOOR_DB = -758.6  # what the sounder writes without a signal
 
 

@@ -146,7 +146,7 @@ def about_file(path: str | Path) -> Iterator[None]:
 
 _IN_WORDS: dict[Any, str] = {
     RecursionError: "it is nested too deep",
-    MemoryError: "it does not fit into the memory",
+    MemoryError: "it does not fit in memory",
     UnicodeError: "it is not UTF-8 text",
 }
 

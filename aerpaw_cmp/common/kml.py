@@ -125,7 +125,9 @@ def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
     try:
         places = [tuple(float(cell) for cell in place) for place in cells]
     except ValueError as error:
-        raise InputError(f"a coordinate that is no number ({error})", expected="longitude,latitude,altitude") from error
+        raise InputError(
+            f"a coordinate that is not a number ({error})", expected="longitude,latitude,altitude"
+        ) from error
     if any(len(place) < 2 for place in places):
         raise InputError("a coordinate without latitude", expected="longitude,latitude,altitude")
     return [part for place in places for part in ([place] if len(place) <= 3 else _in_threes(place))]
@@ -140,7 +142,7 @@ def _in_threes(numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
     threes = [numbers[i : i + 3] for i in range(0, len(numbers), 3)]
     if len(numbers) % 3 or any(max(column) - min(column) > _AREA_DEG for column in list(zip(*threes, strict=True))[:2]):
         raise InputError(
-            f"{len(numbers)} numbers joined by commas alone, which are not longitude,latitude,altitude in turns",
+            f"{len(numbers)} numbers separated only by commas, which are not triples longitude,latitude,altitude",
             expected="a blank between places",
         )
     return threes

@@ -152,7 +152,7 @@ def _hdf5(depth: int, netcdf: bool = False) -> Read:
                 raise InputError(
                     f"the file of {len(data)} bytes declares {total} bytes of data",
                     expected=f"at most {most}",
-                    cause="a file made to fill the memory",
+                    cause="a file crafted to fill the memory",
                 )
             classes = {name: _text(item.attrs.get("MATLAB_class", b"")) for name, item in items.data_sets.items()}
             attributes = {name: _text(value) for name, value in book.attrs.items() if np.ndim(value) == 0}
@@ -241,7 +241,7 @@ class _Items:
 
     def _take(self, place: str, item: Any) -> None:
         if item.is_virtual or item.external:
-            raise _lies_elsewhere(f"the data of {place!r} lie in other files")
+            raise _lies_elsewhere(f"the data of {place!r} are in other files")
         if item.dtype.kind in self._kinds:
             self.data_sets[place] = item
 
@@ -250,7 +250,7 @@ def _lies_elsewhere(reason: str) -> InputError:
     return InputError(
         reason,
         expected="a file that contains all its data",
-        cause="a file made to read other files of this machine, or a set in several files: make it one (h5repack)",
+        cause="a file crafted to read other files of this machine, or a data set in several files: join it (h5repack)",
     )
 
 

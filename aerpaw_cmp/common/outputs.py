@@ -152,7 +152,7 @@ def _real(path: Path) -> Path:
     try:
         return Path(os.path.realpath(path))
     except (OSError, ValueError) as error:
-        raise UsageError(f"no possible name of an output ({error})", path=path) from None
+        raise UsageError(f"not a possible output name ({error})", path=path) from None
 
 
 # --- one file -------------------------------------------------------------------------------------
@@ -352,8 +352,8 @@ class OutputFolder:
         for path in self._inputs:
             if self.target in _real(path).parents or self.target == _real(path):
                 raise UsageError(
-                    f"the output folder holds an input, {one_line(str(path))}",
-                    expected="a folder of its own after -o: it is replaced as a whole",
+                    f"the output folder contains an input, {one_line(str(path))}",
+                    expected="a separate folder after -o, because all of its content is replaced",
                     path=self.named,
                 )
 
@@ -366,8 +366,8 @@ class OutputFolder:
         own = own or {}
         if foreign := next(foreign_entries(self.target, own), list_of_others):
             raise UsageError(
-                f"the folder holds what this tool did not write: {one_line(foreign)}",
-                expected="a new or empty folder after -o: a folder of results is replaced as a whole",
+                f"the folder contains files that this tool did not write: {one_line(foreign)}",
+                expected="a new or empty folder after -o, because all content of a result folder is replaced",
                 path=self.named,
             )
         inputs = {_identity(path) for path in self._inputs} - {None}
@@ -517,7 +517,7 @@ class _Place:
         if foreign := next(self.part.iterdir(), None):
             raise UsageError(
                 f"the hidden place {one_line(str(self.part))} holds what is not this tool's: {one_line(foreign.name)}",
-                expected="a hidden place of this tool's alone: move that away",
+                expected="no other files there: move them away",
                 path=self.named,
             )
 
@@ -543,8 +543,8 @@ class _Place:
                 os.close(descriptor)
                 raise UsageError(
                     f"the hidden place {one_line(str(self.part))} belongs to another user",
-                    expected="a hidden place of yours alone: remove that, or name another output",
-                    cause="a shared folder: whoever owns the place could replace the results before they are done",
+                    expected="your own temporary path: remove this one, or name another output",
+                    cause="a shared folder, whose other user could replace the results before they are complete",
                     path=self.named,
                 )
             if not _lock(descriptor):
@@ -629,7 +629,7 @@ def _clear(part: Path, *, keep: bool = False) -> None:
         for folder in (Path(parent, name) for name in folders):
             folder.unlink() if folder.is_symlink() and signs[0].exists() else folder.rmdir()
     if not set(part.iterdir()) <= set(signs):
-        raise OSError(errno.ENOTEMPTY, "files of others are there", str(part))
+        raise OSError(errno.ENOTEMPTY, "files of other programs are there", str(part))
     for sign in signs:
         sign.unlink(missing_ok=True)
     if not keep:
@@ -701,12 +701,12 @@ def _sync_folder(folder: Path) -> None:
 _REMEDIES = {
     errno.ENOSPC: "the disk is full: free some space, or name another place with -o",
     errno.EDQUOT: "your quota is used up: free some space, or name another place with -o",
-    errno.EFBIG: "a limit on the size of files (ulimit -f), or a file system that takes no larger ones",
+    errno.EFBIG: "a limit on file sizes (ulimit -f or the file system)",
     errno.EIO: "the disk fails: name another one with -o",
     errno.EROFS: "the disk is mounted read-only: name another place with -o",
     errno.EACCES: "no right to write here: name another place with -o",
     errno.EPERM: "no right to write here: name another place with -o",
-    errno.ENOENT: "a place that takes no files, or a folder that was removed while the run went on",
+    errno.ENOENT: "a folder that does not accept files, or was removed during the run",
 }
 _WRONG_NAMES = (errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
 

@@ -173,7 +173,7 @@ def parse_yaml(text: str, model: type[ModelT], path: str | Path | None = None) -
 def _checked(document: _Document, model: type[ModelT], path: str | Path | None) -> ModelT:
     if document.value is None:
         raise UsageError(
-            "the file holds no settings", expected=_KEYS.format(_listed(_field_names(model)[:4])), path=path
+            "the file contains no settings", expected=_KEYS.format(_listed(_field_names(model)[:4])), path=path
         )
     if not isinstance(document.value, dict):
         raise UsageError(

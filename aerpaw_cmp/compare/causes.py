@@ -1160,7 +1160,7 @@ _OVER_FLOOR_DB = 3.0
 
 _LIMITS = {
     1.0: ("floor", "the receiver shows no level below {level}", "`floor_db: {typed}` in this `logs:` line"),
-    -1.0: ("saturation", "the receiver shows no level above {level}", "lower the gain; trust lower levels alone"),
+    -1.0: ("saturation", "the receiver shows no level above {level}", "lower the gain; use only lower levels"),
 }
 
 

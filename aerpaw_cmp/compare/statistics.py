@@ -717,7 +717,7 @@ def error_intervals(
 def _notes(values: FloatArray, place_m: FloatArray | None) -> Iterator[str]:
     """Yield sentences on the limits of the intervals of a sequence (n,)."""
     if place_m is not None and (reason := only_time(place_m)):
-        yield f"The intervals consider correlation over time alone: {reason}."
+        yield f"The intervals consider correlation over time only: {reason}."
     share, ratio = loud_part(values)
     if share:
         yield (
@@ -884,7 +884,7 @@ class PairedDifference:
         size = f"{abs(self.difference_db):.1f} dB"
         if self.verdict == "no interval":
             more = "more" if self.difference_db > 0 else "less"
-            return f"{size} {more} error than {other_model}, too short a flight for an interval"
+            return f"{size} {more} error than {other_model}, the flight is too short for an interval"
         difference, low, high = map(Printed, (self.difference_db, *self.difference_ci95_db))
         if self.verdict == "not significant":
             return f"no significant difference from {other_model} ({difference:+.1f} dB [{low:+.1f}, {high:+.1f}])"

@@ -289,7 +289,7 @@ def _shown_without(
 
 
 _NO_OVERLAP = "too few samples at which the telemetry gives a position for every lag of the window"
-_FLAT_LEVEL = "the level stays flat where the model predicts that it varies"
+_FLAT_LEVEL = "the level is constant although the model predicts a change"
 _ONE_PLACE = "only one fifth of the flight supports a clock shift"
 _NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
 

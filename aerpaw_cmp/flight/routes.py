@@ -141,7 +141,7 @@ def allowed_area(fence: Any, avoid: Sequence[Any], towers_m: FloatArray, distanc
     if not parts:
         raise UsageError(
             "no route fits: no area remains inside the geofence",
-            expected="a geofence with room outside the no-fly areas and the circles around towers",
+            expected="a geofence with enough area outside no-fly areas and circles around towers",
             cause="a no-fly area that covers it, or too large a distance to towers",
         )
     return max(parts, key=lambda p: p.area)

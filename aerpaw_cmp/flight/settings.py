@@ -350,7 +350,7 @@ class GroundNode(StrictModel):
         if self.height == "logged" and self.track is None:
             raise ValueError("height: logged needs a track with heights")
         if self.height == "logged" and "antenna_height_m" in self.model_fields_set:
-            raise ValueError("height: logged takes the height from the track; remove antenna_height_m")
+            raise ValueError("height: logged uses the height of the track; remove antenna_height_m")
         return self
 
 

@@ -376,7 +376,7 @@ def _places(frame: pd.DataFrame, path: Path, site: Site) -> AnyArray:
         place = np.column_stack([*site.frame.to_local(latitude, longitude), height + site.takeoff_ground_m])
         swapped = np.hypot(*site.frame.to_local(np.clip(longitude, -90.0, 90.0), latitude))
         near = np.nanmin(swapped, initial=np.inf) <= _FAR_M
-        cause = "latitude and longitude are swapped" if near else "a prediction of another place"
+        cause = "latitude and longitude are swapped" if near else "a prediction of another area"
     else:
         return np.full((len(frame), 3), np.nan)
     away_m = float(np.nanmin(np.hypot(place[:, 0], place[:, 1]), initial=np.inf))
@@ -416,7 +416,7 @@ def _check_repeats(table: pd.DataFrame, path: Path) -> None:
         row = distinct[twice].iloc[0]
         where = row["time"] if "time" in key else tuple(round(float(row[name]), 1) for name in _PLACE)
         raise InputError(
-            f"{counted(int(twice.sum()), 'row')} with another level at the same place: tower {row['tower']}, {where}",
+            f"{counted(int(twice.sum()), 'row')} with several levels at one position: tower {row['tower']}, {where}",
             expected="one row per tower, channel and time or position",
             cause="two channels or two heights without their column",
             path=path,

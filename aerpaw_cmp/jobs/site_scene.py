@@ -29,7 +29,9 @@ from .options import JobOutcome
 # Thickness of ground in the export [m]: a slab without an echo from its second face.
 HALF_SPACE_THICKNESS_M = 1.0
 
-_LOCAL_NOTE = "this site has no georeference: latitude and longitude count from (0, 0), so flight logs do not fit it"
+_LOCAL_NOTE = (
+    "this site has no georeference: latitude and longitude are relative to (0, 0), so flight logs do not match it"
+)
 
 
 def is_scene(path: Path) -> bool:

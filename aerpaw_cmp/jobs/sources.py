@@ -316,7 +316,7 @@ def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
         raise InputError(
             f"the route comes no nearer than {away_m / 1000.0:.0f} km to any tower of site {site.name!r}",
             expected="latitude, longitude near the site",
-            cause="latitude and longitude are swapped" if exchanged else "a route of another place",
+            cause="latitude and longitude are swapped" if exchanged else "a route in another area",
             path=where,
         )
     takeoff_m = site.takeoff_ground_m

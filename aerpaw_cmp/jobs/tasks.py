@@ -157,7 +157,7 @@ class OutcomeStore:
             probe.unlink()
         except OSError as error:
             raise UsageError(
-                f"outcomes cannot be kept in {self.folder}: {error.strerror or error}",
+                f"task results cannot be stored in {self.folder}: {error.strerror or error}",
                 expected="a folder that may be written",
                 cause="a disk that is full or read-only, or a file in the way",
             ) from None

@@ -52,7 +52,7 @@ class Lost:
     message: str
 
 
-_ENDED = Lost("its worker process ended, time after time: out of memory, or killed")
+_ENDED = Lost("its worker process ended repeatedly: out of memory, or killed")
 
 
 class Workers(ABC):
@@ -242,13 +242,13 @@ class Cluster(Workers):
         if self._threads():
             self._staffed_s = now
         elif now - self._staffed_s > NO_WORKER_S:
-            self._progress(f"the scheduler has had no worker for {NO_WORKER_S:.0f} s; finished tasks are kept")
+            self._progress(f"the scheduler has had no worker for {NO_WORKER_S:.0f} s; finished tasks are stored")
             self._staffed_s = now
 
     def _gone(self) -> InputError:
         return InputError(
             "the scheduler of the workers went away",
-            cause="it was stopped; what was finished is kept, run the same command again",
+            cause="it was stopped; finished tasks are stored, run the same command again",
         )
 
 
@@ -311,7 +311,7 @@ def _scheduler(address: str, paths: Sequence[Path], progress: Progress) -> Itera
         ) from None
     if not address.startswith("tls://"):
         raise UsageError(
-            f"--scheduler {address!r} is not protected: whoever reaches it runs programs as you, here and there",
+            f"--scheduler {address!r} is not protected: anyone who reaches it can run programs as you, on both sides",
             expected="tls://HOST:PORT, with certificates in Dask's configuration (docs/campaign.md)",
         )
     try:
@@ -382,7 +382,7 @@ def _trouble(facts: Any, ours: WorkerFacts) -> str:
         return f"aerpaw-cmp cannot be loaded there ({type(facts).__name__}: {facts})"
     if facts.code != ours.code:
         what = f"aerpaw-cmp {facts.version}, here {ours.version}" if facts.version != ours.version else "another state"
-        return f"{facts.host} runs other code ({what} of the program or of NumPy, SciPy, Sionna RT)"
+        return f"{facts.host} runs different code ({what} of the program or of NumPy, SciPy, Sionna RT)"
     if facts.missing:
         more = f" and {len(facts.missing) - 1} more" if len(facts.missing) > 1 else ""
         return f"{facts.host} does not see {facts.missing[0]}{more}"

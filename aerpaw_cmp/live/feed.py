@@ -382,7 +382,7 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
         if modem.fix is not None and 0 <= modem.fix < 3:
             alarms["gps"] = "GPS lost: the telemetry states no 3-D fix"
         elif modem.age_s is None:
-            alarms["gps"] = "no position: the telemetry log holds no line so far"
+            alarms["gps"] = "no position: the telemetry log has no lines yet"
         else:
             alarms["gps"] = f"no position for more than {lost_s:g} s: the telemetry log does not reach the present"
     if modem.disk_fault:
@@ -405,5 +405,5 @@ def _rest_of_route(rest: Mapping[str, Any]) -> dict[str, Any]:
     level, (low, high) = float(rest["level_dbm"]), map(float, rest["interval_dbm"])
     points = [[float(v) for v in point[:5]] for point in rest["points"][:_POINTS_AHEAD]]
     if not all(map(math.isfinite, [level, low, high, *(v for point in points for v in point)])):
-        raise ValueError("a level that is no number")
+        raise ValueError("a level that is not a number")
     return {"trend": str(rest["trend"])[:20], "level": level, "interval": [low, high], "points": points}

@@ -260,7 +260,7 @@ class SegmentLog:
         self._number += 1
         self._write(encode_record(record))
         self.records += 1
-        self.on_fault(f"the disk takes records again; {fault.lost} were lost")
+        self.on_fault(f"the disk accepts records again; {fault.lost} were lost")
 
     def _write(self, line: bytes) -> None:
         """Write a line at once. A partial write is cut off, so that no truncated line stays inside the file."""
@@ -339,8 +339,8 @@ def _disk_cause(error: OSError) -> str:
         errno.EDQUOT: "the quota is used up: free space or give another folder with -o",
         errno.EFBIG: "a limit on file size: see 'ulimit -f'",
         errno.EROFS: "the disk is mounted read-only",
-        errno.EACCES: "the folder belongs to another user: choose one of your own with -o",
-        errno.EPERM: "the folder belongs to another user: choose one of your own with -o",
+        errno.EACCES: "the folder belongs to another user: choose your own folder with -o",
+        errno.EPERM: "the folder belongs to another user: choose your own folder with -o",
         errno.ENOTDIR: "part of the path is a file",
         errno.EEXIST: "part of the path is a file",
     }.get(error.errno or 0, "a failing disk or card")

@@ -225,7 +225,7 @@ def _busy(path: Path, others: list[Holder]) -> InputError:
         cause = f"another program or another tap reads it; to end it: 'kill {others[0].pid}'"
     else:
         cause = f"see 'sudo fuser -v {path}'"
-    return InputError(f"the port is in use by {who}", expected="a port for the tap alone", cause=cause, path=path)
+    return InputError(f"the port is in use by {who}", expected="a port that only the tap uses", cause=cause, path=path)
 
 
 def _denied(path: Path) -> InputError:

@@ -221,7 +221,7 @@ class Tap:
     def _poll_once(self) -> None:
         now = self._clock.mono_ns()
         if now - self._last_final_ns > self._settings.silent_s * 1e9:
-            raise PortGoneError(f"the modem answers nothing for {self._settings.silent_s:g} s")
+            raise PortGoneError(f"the modem has not answered for {self._settings.silent_s:g} s")
         if not self._in_step:
             self._probe()
             return
@@ -445,7 +445,7 @@ class Tap:
             elif self._csi_before is None:
                 self._say("CSI reporting was switched on; its old state is unknown and will not be restored")
         elif state[1] == 0:
-            self._say("CSI reporting is off, so no rank will come: run with --enable-csi")
+            self._say("CSI reporting is off, so no rank will be reported: run with --enable-csi")
 
     # one exchange -----------------------------------------------------------------------------------------
 

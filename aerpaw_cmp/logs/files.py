@@ -314,7 +314,7 @@ def _check(entries: list[Member], size: int, path: str | Path) -> None:
         raise InputError(
             f"the archive of {size} bytes unpacks to {total} bytes",
             expected=f"at most {MOST_RATIO} times its size and {_FREE_BYTES >> 20} MiB, and {_MOST_IN_ALL >> 30} GiB",
-            cause="no data set: an archive made to fill a disk or the memory",
+            cause="not a data set: an archive crafted to fill the disk or memory",
             path=path,
         )
 
@@ -347,7 +347,7 @@ def decode_record(line: bytes) -> Record:
     """
     body, mark, tail = line.strip().rpartition(_CRC)
     if not mark or len(tail) != 10 or not tail.endswith(b'"}'):
-        raise ValueError("torn line: it does not end with a checksum")
+        raise ValueError("truncated line: it does not end with a checksum")
     if b"%08x" % zlib.crc32(body) != tail[:8]:
         raise ValueError("damaged line: its checksum does not match")
     try:

@@ -401,7 +401,7 @@ def _samples_of(name: str, names: Collection[str]) -> str | None:
     """Return the description of a file of samples with a meta file in the same folder, else None."""
     meta = name.removesuffix(".sigmf-data") + ".sigmf-meta"
     if name.endswith(".sigmf-data") and meta in names:
-        return f"no log: the samples of {Path(meta).name}, read with it"
+        return f"not a log: the samples of {Path(meta).name}, read with it"
     return None
 
 
@@ -553,7 +553,7 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
         raise InputError(f"the folder cannot be searched ({error})", path=folder) from error
     for place in places:
         if not place.is_file():  # links to folders are not followed: they may go round in circles
-            what = "a link to a folder; name that folder, too" if place.is_dir() else "a link to nothing"
+            what = "a link to a folder; also name that folder" if place.is_dir() else "a link to nothing"
             skipped.append(Skipped(str(place), what))
             continue
         try:

@@ -446,7 +446,7 @@ class _Check:
             nearest = sign * float(np.nanmax(sign * level[~lost]))
             if np.min(sign * (level[lost] - nearest)) > _FAR_DB:
                 first = f"{level[int(np.argmax(lost))]:g} dB"
-                why = f"far {word} all others, which end at {nearest:.1f} dB (a reading that was lost?)"
+                why = f"far {word} all others, which end at {nearest:.1f} dB (a lost reading?)"
                 self._flag(lost, "level_lost", first, why, ["rss_db"])
                 level = self._values("rss_db")
 
@@ -468,7 +468,11 @@ class _Check:
         apart_db = (at_once["max"] - at_once["min"])[at_once["size"] > 1]
         if not turns and (2 * len(apart_db) < len(at_once) or apart_db.median() < _AT_ONCE_DB):
             return
-        how = f"{step:.0f} dB apart from record to record" if turns else f"{apart_db.median():.0f} dB apart at one time"
+        how = (
+            f"{step:.0f} dB apart from record to record"
+            if turns
+            else f"{apart_db.median():.0f} dB apart at the same time"
+        )
         self._said.append(
             f"{self._what}: its levels alternate, {how}: several devices, SIMs or networks in one series, without a "
             "known column that names them"

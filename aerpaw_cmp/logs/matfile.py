@@ -160,7 +160,7 @@ def _inflated(element: _Element, order: str, most: int) -> _Element:
         raise InputError(
             f"the variables of the MATLAB file unpack to more than {most} bytes more",
             expected=f"at most {MOST_BYTES >> 20} MiB each, in all {MOST_RATIO} times the file",
-            cause="a file made to fill the memory",
+            cause="a file crafted to fill the memory",
         )
     if not machine.eof:
         raise _damaged("a compressed variable is cut")

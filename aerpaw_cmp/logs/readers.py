@@ -242,7 +242,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
         )
     binary = b"\0" in head
     raise InputError(
-        "binary content that no reader knows" if binary else f"no reader knows this content: {_excerpt(head)}",
+        "binary content that no reader recognises" if binary else f"no reader knows this content: {_excerpt(head)}",
         expected="one of the formats of 'aerpaw-cmp formats'",
         cause="another kind of file, or a damaged one" if binary else _way_out(head),
         path=path,

@@ -146,11 +146,11 @@ def private(tmp_path: Path) -> Path:
 
 
 SAID = {
-    "external_0.mat": "the data of 'RSRP' lie in other files",
-    "virtual_0.mat": "the data of 'RSRP' lie in other files",
+    "external_0.mat": "the data of 'RSRP' are in other files",
+    "virtual_0.mat": "the data of 'RSRP' are in other files",
     "link_0.mat": "'RSRP' is a link, not data",
     "soft.mat": "is a link, not data",
-    "external_0.h5": "the data of 'files/00000/streams/00000/C00000' lie in other files",
+    "external_0.h5": "the data of 'files/00000/streams/00000/C00000' are in other files",
     "link_0.h5": "'files/00000/streams/00000/C00000' is a link, not data",
     "many_large.mat": "declares 42949672960 bytes of data",
     "vrt_0.tif": "an ASCII grid names no coordinate system",

@@ -334,7 +334,7 @@ def test_a_folder_removed_on_the_way(tmp_path: Path) -> None:
             with output.filling() as folder:
                 (folder / "a").write_text("1")
 
-    with pytest.raises(OutputError, match="was removed while the run"):
+    with pytest.raises(OutputError, match="was removed during the run"):
         remove_and_write()
     assert list(tmp_path.iterdir()) == []
 

@@ -20,7 +20,7 @@ ROOM = Path(aerpaw_cmp.__file__).parent
     [
         (RecursionError(), "it is nested too deep"),
         (ValueError("\x1b[2J" * 99), r"ValueError: \\x1b"),
-        (MemoryError(), "it does not fit into the memory"),
+        (MemoryError(), "it does not fit in memory"),
         (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "x"), "it is not UTF-8 text"),
         (KeyError("x"), "KeyError: 'x'"),
         (EOFError(), "EOFError"),

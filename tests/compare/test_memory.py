@@ -254,7 +254,7 @@ def test_a_hover_or_missing_positions_leave_correlation_over_time_and_say_so(pla
     assert statistics.only_time(place) == reason
     assert np.array_equal(mean_draws(values, place_m=place), mean_draws(values))
     (note,) = statistics.error_intervals(np.zeros(200), values, place).notes
-    assert note == f"The intervals consider correlation over time alone: {reason}."
+    assert note == f"The intervals consider correlation over time only: {reason}."
 
 
 def test_positions_that_repeat_or_miss_a_few_samples_serve() -> None:

@@ -204,7 +204,7 @@ def test_a_ratio_is_kept_where_nothing_else_is(logs: Path) -> None:
     files = ingest([logs / "LW1/x_quality_log.txt", *logs.glob("UAV/*vehicleOut.txt")], options=OPTIONS)
     text, remarks = draft(files, logs, DraftOptions(timezone=ZONE))
     assert "LW1/x_quality_log.txt" in text
-    assert any(r.endswith("a ratio to the noise as a level?") for r in remarks)
+    assert any(r.endswith("use a signal-to-noise ratio as a level?") for r in remarks)
 
 
 def test_sparse_telemetry_is_named_as_the_reason_why_nothing_is_compared(

@@ -204,8 +204,8 @@ def test_a_log_that_goes_with_no_flight_is_said_once_beside_the_first(tmp_path: 
     (tmp_path / "LW2_power_log.txt").write_bytes(format_power_log(times, np.linspace(-40, -60, 50), ZONE))
     made = drafts(ingest(tmp_path, options=OPTIONS), tmp_path, DraftOptions(timezone=ZONE))
     assert len({draft.name for draft in made}) == len(made) == 2
-    said = [[text for text in draft.remarks if "it goes with no flight here" in text] for draft in made]
-    assert said == [["left out: LW2_power_log.txt: it goes with no flight here"], []]
+    said = [[text for text in draft.remarks if "it does not belong to any flight here" in text] for draft in made]
+    assert said == [["left out: LW2_power_log.txt: it does not belong to any flight here"], []]
 
 
 @pytest.mark.parametrize(("aside_m", "agrees"), [(0.0, True), (13.2, True), (13.5, False)])

@@ -89,7 +89,7 @@ def test_a_draft_takes_the_height_of_the_files_name_and_asks(tmp_path: Path, nam
     text, remarks = draft(files, tmp_path, DraftOptions(timezone=ZONE))
     assert (f"height_m: {height}" in text) == (height is not None)
     (asked,) = (remark for remark in remarks if name in remark and remark.startswith("check: "))
-    assert ("height_m from the file's name?" if height else "which height_m?") in asked
+    assert ("height_m from the file's name?" if height else "what is height_m?") in asked
 
 
 def test_a_draft_of_a_log_with_altitudes_asks_for_no_height(tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def test_levels_of_no_tower_are_placed_and_asked_about(tmp_path: Path) -> None:
     node = settings.towers["NODE"]
     east, north = SITE.frame.to_local(np.array([node.latitude_deg or 0.0]), np.array([node.longitude_deg or 0.0]))
     assert np.hypot(east[0] - ROVER[0], north[0] - ROVER[1]) < 25.0
-    assert "the levels decide for no tower (LW1" in remarks  # it lies within the region, others may
+    assert "the levels do not determine the tower (LW1" in remarks  # it lies within the region, others may
     assert "where did the node stand?" in remarks
 
 

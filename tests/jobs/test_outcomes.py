@@ -128,7 +128,7 @@ def test_a_forged_entry_is_told_and_not_used(tmp_path: Path, forged: bytes | dic
 @pytest.mark.parametrize("place", ["a_file", "/proc/nowhere"])
 def test_a_place_that_takes_nothing_is_a_usage_error(tmp_path: Path, place: str) -> None:
     (tmp_path / "a_file").touch()
-    with pytest.raises(UsageError, match="outcomes cannot be kept in"):
+    with pytest.raises(UsageError, match="task results cannot be stored in"):
         OutcomeStore(tmp_path / place, Outcome).check()
     OutcomeStore(tmp_path / "new", Outcome).check()
     assert list((tmp_path / "new").iterdir()) == []

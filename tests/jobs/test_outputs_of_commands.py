@@ -87,7 +87,7 @@ def test_site_import_never_replaces_the_map(tmp_path: Path, capsys: pytest.Captu
 def test_simulate_replaces_its_own_folder_only(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Real logs stand in the flight's folder; a folder of simulated ones is a flight that a report takes."""
     out = logs.parent / "out"
-    assert "holds an input" in refused(capsys, logs, "simulate", logs / "flight.yaml", "-o", logs)
+    assert "contains an input" in refused(capsys, logs, "simulate", logs / "flight.yaml", "-o", logs)
     shutil.copytree(logs / "UAV", out / "UAV")
     said = refused(capsys, out, "simulate", logs / "flight.yaml", "-o", out, "--force")
     assert "did not write" in said

@@ -101,7 +101,7 @@ def test_workers_that_see_no_file_or_run_other_code_are_named(seen: dict[str, An
     assert cluster["unseen"].startswith("UsageError: 2 of 2 workers cannot do this campaign: ")
     assert "does not see" in cluster["unseen"]
     assert "nowhere" in cluster["unseen"]
-    assert "runs other code" in cluster["other"]
+    assert "runs different code" in cluster["other"]
 
 
 def test_a_scheduler_without_tls_is_refused(seen: dict[str, Any]) -> None:

@@ -227,11 +227,11 @@ def test_alarm_when_no_csi_comes(modem, tap, tools, tmp_path):
 def test_silent_modem_is_a_gap(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0, silent_after=25))
     session = tap(sim.port, silent_s=0.5, answer_timeout_s=0.1, probe_timeout_s=0.1, reconnect_min_s=0.05)
-    session.wait(lambda: any("answers nothing for 0.5 s" in text for text in session.said))
+    session.wait(lambda: any("has not answered for 0.5 s" in text for text in session.said))
     session.end()
     records, _ = tools.records_of(tmp_path / "log")
     (opened,) = [r for r in records if r["kind"] == "gap" and r["state"] == "open"]
-    assert "answers nothing" in opened["reason"]
+    assert "has not answered" in opened["reason"]
 
 
 @pytest.mark.usefixtures("web")

@@ -278,7 +278,7 @@ def test_files_that_are_no_logs_are_not_read_whole(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(Path, "read_bytes", watch)
     assert [skipped.reason for skipped in ingest(tmp_path, options=OPTIONS).skipped] == [
-        "binary content that no reader knows"
+        "binary content that no reader recognises"
     ]
 
 

@@ -315,7 +315,7 @@ def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = 
     homeless = [one_line(os.path.relpath(Path(f.path).resolve(), folder)) for f in files if f.path not in home]
     if homeless:
         first = written[0]
-        out = tuple(f"left out: {path}: it goes with no flight here" for path in homeless)
+        out = tuple(f"left out: {path}: it does not belong to any flight here" for path in homeless)
         written[0] = Draft(first.name, first.text, (*first.remarks, *out))
     return written
 
@@ -732,7 +732,9 @@ def _heights_and_floor(
     if any(lacks_height(s) for s in compared if s is track or _has_positions(s)):
         height = height_in_name(path)
         keys |= {} if height is None else {"height_m": height}
-        asked.append("no altitude in the log: which height_m?" if height is None else "height_m from the file's name?")
+        asked.append(
+            "no altitude in the log: what is height_m?" if height is None else "height_m from the file's name?"
+        )
     # RSRP is reported in whole decibels, so its lowest value repeats without a floor
     levels = [s for s in compared if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"]
     if (floor := receiver_floor_db(levels)) is not None:
@@ -742,7 +744,7 @@ def _heights_and_floor(
             f"floor of the receiver at {floor:.1f} dB?" if commented or asked else f"receiver floor {floor:.1f} dB?"
         )
     if any(is_ratio(s) for s in compared):
-        asked.append("a ratio to the noise as a level?")
+        asked.append("use a signal-to-noise ratio as a level?")
     return keys, asked
 
 
@@ -898,7 +900,7 @@ def _reason(stream: Stream, span: Span, context: _Context, *, dated: bool) -> st
     return _RATIO if context.has_level and is_ratio(stream) else None
 
 
-_RATIO = "a ratio to the noise, no level"
+_RATIO = "a signal-to-noise ratio, not a level"
 
 
 def _late(span: Span, flown: Span, timezone: str | None = None) -> str:

@@ -258,7 +258,11 @@ class Placer:
         latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
         apart = [float(np.hypot(*(np.asarray(t.position_m) - estimate.place_m)[:2])) for t in towers]
         near = [t.name for t, d in zip(towers, apart, strict=True) if d <= estimate.radius90_m]
-        decided = f"the levels decide for no tower ({', '.join(near)} possible)" if near else "no tower fits the levels"
+        decided = (
+            f"the levels do not determine the tower ({', '.join(near)} possible)"
+            if near
+            else "no tower fits the levels"
+        )
         about = (
             f"{decided}. They fit this place best, 90 % within {estimate.radius90_m:.0f} m, "
             f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where did the node stand?"
@@ -644,7 +648,7 @@ def _odds(odds: Evidence) -> str:
     Examples
     --------
     >>> _odds(Evidence(over_own=4.0, over_turned=20.0))
-    'odds 55:1 against a gain of its own, more than 1000:1 against rotated copies'
+    'odds 55:1 against a separate gain, more than 1000:1 against rotated copies'
     """
 
     def ratio(nat: float) -> str:
@@ -653,7 +657,7 @@ def _odds(odds: Evidence) -> str:
         return f"{math.exp(nat):.0f}:1" if nat > 0.0 else f"1:{math.exp(min(-nat, 20.0)):.0f}"
 
     turned = "" if math.isinf(odds.over_turned) else f", {ratio(odds.over_turned)} against rotated copies"
-    return f"odds {ratio(odds.over_own)} against a gain of its own{turned}"
+    return f"odds {ratio(odds.over_own)} against a separate gain{turned}"
 
 
 def searching_airframe(site: str | Path, towers: Collection[str], log: tuple[str, str]) -> SpherePattern | None:

@@ -1,4 +1,4 @@
-"""Names that a reader of a log format needs, in this repository or in a package of its own: docs/adding_a_reader.md.
+"""Names that a reader of a log format needs, in this repository or in a separate package: docs/adding_a_reader.md.
 
 A format of lines is a regular expression and the streams of its columns (:func:`text_reader`); any other is a pair of
 functions ``sniff(head)`` and ``read(data, options)`` in a :class:`Reader`. A reader lists itself under the entry-point

@@ -98,7 +98,7 @@ _WARNINGS = 10
 
 
 def warn_all(texts: Sequence[str]) -> None:
-    """Print the first warnings of a page, and the number of further ones."""
+    """Print the first warnings of a page, and the number of remaining warnings."""
     for text in texts[:_WARNINGS]:
         say.warn(f"warning: {one_line(text)}")
     if len(texts) > _WARNINGS:

@@ -234,7 +234,7 @@ def _parse(text: str, path: str | Path | None) -> _Document:
         cause = "tabs cannot indent in YAML; use blanks" if _tab_indents(text, mark) else None
         # PyYAML's term for control characters
         if "unacceptable" in problem:
-            cause = "a log, or another binary file, in place of the settings"
+            cause = "a log or another binary file instead of the settings"
         raise UsageError(
             f"not YAML: {problem}",
             expected="'key: value' lines",

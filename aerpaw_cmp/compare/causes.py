@@ -48,7 +48,8 @@ SHOWN_DB = 0.1
 # The nearest of all places explains a part of many errors, and learned antennas miss some decibels of each flight.
 _PLACE_SHARE = 0.3
 _OF_ANTENNA, _LEARNED_SHARE = ("heading", "pattern"), 0.25
-# Causes that must bring the error back to what is usual, and the least part of what all candidates take off together.
+# Causes that must bring the error back to a usual value, and the smallest share of the reduction by all candidates
+# together.
 _RESTORING = frozenset({"pattern", "heading", "height", "telemetry", "clock", "saturation", "place", "channels"})
 _LEAST_PART = 0.5
 # Another tower and another place imitate many errors of the position, and a step imitates other faults of a receiver.

@@ -184,13 +184,14 @@ def _decay(apart: Sequence[FloatArray], errors: Sequence[FloatArray], longest: f
 _STEP_CHI2, _FURTHER_CHI2 = 25.0, 4.0
 # A step must be this much better than a change over these times or over the flight, as twice a log likelihood.
 _BEFORE_SLOWER, _SLOW_S = 5.0, (100.0, 200.0)
-# The step must take this share of its own variance off that of the errors.
+# The step must reduce the variance of the errors by this share of its own variance.
 _LEAST_TAKEN = 0.5
 # The mean square of the whitened error of healthy flights is at most 1.2 at LW1.
 _MOST_SQUARE = 1.6
 # Least number of means before and after a step: a minute.
 _LEAST_EACH_SIDE = 15
-# What a step leaves may not show another step: twice the log likelihood that 99 % of simulated healthy flights have.
+# The residual after a step must not show another step: twice the log likelihood that 99 % of simulated healthy flights
+# have.
 _MOST_LEFT_CHI2 = 18.0
 
 

@@ -64,7 +64,7 @@ class RssComparison:
     intervals : ErrorIntervals
         95 % intervals, and the correlation of the residual.
     identifiable_db : (low, high)
-        Offsets within 0.1 dB of the least RMSE.
+        Offsets whose RMSE is within 0.1 dB of the smallest RMSE.
     baselines : mapping of str to OffsetFit
         Free space, two-ray and others, each with its own offset, over the same pairs.
     baseline_intervals : mapping of str to (low, high)
@@ -926,7 +926,7 @@ class ServingComparison:
 
     @property
     def majority_share(self) -> float:
-        """Share of the commonest serving cell, which a prediction must exceed."""
+        """Share of the most frequent serving cell, which a prediction must exceed."""
         return float(self.confusion.sum(axis=1).max() / self.n) if self.n else float("nan")
 
     def as_dict(self) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
     alive = (largest[..., 0] > 0) & np.isfinite(largest[..., 0])
     rank = above.sum(axis=-1)
     if k > 1:
-        # the margin may not take the largest from itself
+        # the margin must not exclude the largest value itself
         rank = np.maximum(rank, 1)
     return np.where(alive, rank, 0).astype(np.int64)
 

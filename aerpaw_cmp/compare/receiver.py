@@ -2,7 +2,7 @@
 
 A forecast is a probability for each rank. It is scored by the log score, a proper score, and compared with the constant
 forecast, which is the histogram of the training flights. Kappa and agreement score the rank that is decided from the
-probabilities, and are compared with the commonest rank.
+probabilities, and are compared with the most frequent rank.
 
 A receiver chooses the rank with the largest throughput at its noise. It uses a codebook and a channel estimate, which
 logs do not contain. The module learns how often each rank is reported for ratios of singular values and a level of the
@@ -89,7 +89,7 @@ class ForecastScore:
     kappa, agreement : float
         Scores of the decided rank.
     majority_agreement : float
-        Agreement of always saying the commonest rank of these samples (known only afterwards).
+        Agreement if the most frequent rank of these samples is always predicted (known only afterwards).
     log_score, constant_log_score : float
         Mean of :func:`log_losses` [nat], of the forecast and of the constant one.
     log_score_gain : float
@@ -518,10 +518,10 @@ def decision_weights(probability: FloatArray, rank: IntArray, groups: IntArray) 
 
 
 def _kappa_weights(probability: FloatArray, rank: IntArray) -> FloatArray:
-    """Return the weights (ranks,) with the largest kappa: one for ranks below the commonest rank, one for those above.
+    """Return the weights (ranks,) with the largest kappa, for ranks below and above the most frequent rank.
 
-    The most probable rank is the commonest one too often, and kappa rewards rare ranks. The two weights are searched on
-    a grid. At equal kappa the weights nearest to 1 are used.
+    The most probable rank is too often the most frequent rank, and kappa rewards rare ranks. The two weights are
+    searched on a grid. At equal kappa the weights nearest to 1 are used.
     """
     commonest = int(np.bincount(rank).argmax())
     # weights near 1 first: a farther weight must be better

@@ -510,7 +510,7 @@ def gather(
         placed += [(log.path, stream) for stream in ranked if "latitude_deg" in stream.frame]
         rank += [(log.path, _rank_series(log, stream, site, tower=tower, number=number)) for stream in ranked]
         if unnamed := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
-            warnings.append(f"{log.path}: {counted(len(unnamed), 'cell')} ignored that 'cells' does not name")
+            warnings.append(f"{log.path}: {counted(len(unnamed), 'cell')} ignored: not listed in 'cells'")
         names = [s.name for s in file.result.streams]
         keys = [*log.skip, *(key for key in log.cells if isinstance(key, str))]
         if unknown := [name for name in keys if name not in names]:

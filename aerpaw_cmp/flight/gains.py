@@ -225,7 +225,7 @@ def _roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | Non
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathLoss:
-    """A loss of a path besides its own field, declared once for replay, explain, model comparison and audit.
+    """A loss of a path besides its own field, which replay, explain, model comparison and audit use.
 
     Parameters
     ----------

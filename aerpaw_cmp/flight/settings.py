@@ -681,7 +681,7 @@ def _set(plain: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _add(plain: dict[str, Any], level: dict[str, Any], above: list[str], part: str, key: str) -> None:
-    """Create an entry of a mapping with free names. Refuse every other unknown key."""
+    """Create an entry of a mapping with free names. Refuse all other unknown keys."""
     if above == ["link", "channels"]:
         level[part] = deepcopy(plain["link"]["rss"])
         return

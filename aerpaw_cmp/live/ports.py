@@ -213,7 +213,7 @@ def modem_manager() -> Holder | None:
 
 
 def _busy(path: Path, others: list[Holder]) -> InputError:
-    who = ", ".join(f"{h.name} (process {h.pid})" for h in others[:4]) or "a process that we may not look at"
+    who = ", ".join(f"{h.name} (process {h.pid})" for h in others[:4]) or "a process of another user"
     if len(others) > 4:
         who += f" and {len(others) - 4} more"
     if any(h.name == "ModemManager" for h in others) or (not others and modem_manager()):

@@ -256,7 +256,7 @@ class _Server(ThreadingHTTPServer):
         return request
 
     def _look_at(self, request: Any, ready: selectors.BaseSelector) -> None:
-        """Answer a request in a thread of its own if it seems to have the token (the handler looks closely)."""
+        """Answer a request in a separate thread if it seems to have the token (the handler verifies it)."""
         if request not in self._waiting:
             return  # the request was closed earlier in this loop
         address, head = self._waiting[request][0], b""

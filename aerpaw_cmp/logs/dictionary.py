@@ -40,7 +40,7 @@ class Quantity:
     unit : str
         The unit of the values, and of numbers without a unit.
     none : tuple of float
-        Numbers that mean a missing value, besides those of :data:`UNAVAILABLE`.
+        Numbers that mean a missing value, in addition to those of :data:`UNAVAILABLE`.
     can_be : (low, high)
         Possible values in its unit: a value beyond them belongs to another column.
     datum : str
@@ -588,7 +588,7 @@ class Program:
     signs : collection of str
         Plain names: all of one of the sets.
     words : mapping of str to str
-        Patterns of its own names, matched against complete plain names, and the common words for them.
+        Patterns of the program's names, matched against complete plain names, and the dictionary's words for them.
     units : mapping of str to str
         Units of plain names that have none in brackets; ``time`` for that of the clock.
     datum : str

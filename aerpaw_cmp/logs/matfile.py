@@ -228,7 +228,7 @@ def _rows(values: _Element, shape: tuple[int, ...], order: str) -> AnyArray:
     """Return the rows of a character matrix as text, without trailing blanks."""
     encoding = _ENCODINGS.get(values.kind)
     if len(shape) > 2 and math.prod(shape) == shape[0] * shape[-1]:
-        shape = shape[0], shape[-1]  # SciPy writes a column of texts with a dimension more
+        shape = shape[0], shape[-1]  # SciPy writes a column of texts with an additional dimension
     if encoding is None or len(shape) != 2:
         raise _damaged("characters of an unknown kind")
     if encoding != "utf-8":

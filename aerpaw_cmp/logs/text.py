@@ -1,7 +1,7 @@
 """Lines of a text log, their clocks, and the frames of their records.
 
 Lines are byte ranges of a file, without a Python object per line. A line ends with LF, and a CR before it belongs to
-the line end. A last text without LF is a line, too; a file that ends with LF has no further, empty line.
+the line end. A last text without LF is a line, too; a file that ends with LF does not have an additional empty line.
 
 Wall clocks of all readers become UTC here. AERPAW nodes write naive America/New_York time almost everywhere, and some
 authors stored that wall clock as if it were UTC.
@@ -624,7 +624,7 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
     zones = np.unique(offset[zoned & valid])
     alike = (wall[naive] - zones[0] * 1_000_000_000).astype("datetime64[ns]") if len(zones) == 1 else None
     if alike is not None and _beside(alike, utc[zoned & valid]):
-        # one program wrote all rows: times without a zone have that of the others
+        # one program wrote all rows, so times without a zone have the zone of the other times
         where = f"UTC {zones[0] / 3600:+g} h"
         text = f"{counted(int(naive.sum()), 'time')} without a zone between times at {where}: read as at {where}, too"
         utc[naive] = alike

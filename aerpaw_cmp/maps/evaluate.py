@@ -558,7 +558,7 @@ def paper_scores(
 
 
 def kriging_wins(scores: Mapping[str, Score]) -> int:
-    """Return the number of fields (heights and K) at which Kriging has the least MAE of the paper's interpolators."""
+    """Count the fields (heights and K) for which Kriging has the smallest MAE of the paper's interpolators."""
     kriging, makima, spline = (scores[name].mae for name in ("Kriging", "makima", "spline"))
     return int(((kriging <= makima) & (kriging <= spline)).sum())
 

@@ -11,8 +11,8 @@ A file that exists is replaced; each function returns its path.
 
 Maps as one dataset after CF-1.11, in memory and as NetCDF: arrays over foliage, tower, K, height, y and x.
 
-Values are rounded to 0.01 dB, more than the site's data hold. The maps in which the nearest tower serves are
-variables of their own (``..._joint``): what ``serving_tower`` picks from the maps by tower.
+Values are rounded to 0.01 dB, more than the site's data hold. Maps in which the nearest tower serves are separate
+variables (``..._joint``). They contain the values that ``serving_tower`` selects from the maps per tower.
 
 Both need ``pip install aerpaw-cmp[geo]``.
 """
@@ -256,7 +256,7 @@ def maps_dataset(
 
 
 def _text(dimension: str, names: Mapping[str, Any] | Sequence[str], meaning: str) -> _Variable:
-    # objects become strings of variable length; an array of characters would need an axis of its own
+    # objects become strings of variable length; an array of characters would need an additional axis
     return (dimension,), np.array(list(names), dtype=object), {"long_name": meaning}
 
 

@@ -288,7 +288,7 @@ class Layer:
         return ", ".join(part for part in parts if part)
 
 
-# Section VII: ranks at 3 m as well, to highlight what blocks there; levels at three of the other heights.
+# Section VII: ranks also at 3 m, to show blockage; levels at three of the other heights.
 PAPER_RSS_ALTITUDES_M = (30.0, 70.0, 110.0)
 PAPER_RANK_ALTITUDES_M = (3.0, *(float(h) for h in range(30, 111, 10)))
 PAPER_KS = (10.0, 100.0, 1000.0)

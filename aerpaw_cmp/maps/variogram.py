@@ -8,7 +8,7 @@ Three correlations, all averaged over pairs of positions in bins of distance:
   and the mean product of two positions is taken.
 - :func:`vertical_correlation`: vertical only. Pearson correlation over the positions of two altitudes' maps.
 
-All three serve RSS as well as rank. NaN is out of coverage; whether a rank of 0 is a number or NaN is the caller's
+All three can be used for RSS and rank. NaN is out of coverage; whether a rank of 0 is a number or NaN is the caller's
 choice.
 
 The fitted curve, :func:`fit_biexponential`, is in :mod:`~aerpaw_cmp.maps.variogram`.

@@ -79,7 +79,7 @@ def switch() -> str:
 
 def _source_hash() -> str:
     """Return the hash of the sources, of numba's version and of Python's."""
-    # machine code of another numba or Python is another, and may not be loadable
+    # machine code depends on the versions of numba and Python
     digest = sha256(f"{version('numba')} {sys.version_info[:3]}".encode())
     for name in SOURCES:
         digest.update((ROOM / name).read_bytes())

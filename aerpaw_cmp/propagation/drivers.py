@@ -252,7 +252,7 @@ def replay_moving(
     if len(link.tower_arrays) != 1:
         raise UsageError(
             f"{counted(len(link.tower_arrays), 'tower')} in a link whose tower moves",
-            expected="one tower: links of their own",
+            expected="only one tower in the link",
         )
     (name,) = link.tower_arrays
     if search.engine != "image":
@@ -453,7 +453,7 @@ def basis_fields(
     poses : Poses
     carrier_hz : float
     with_ground : bool
-        Otherwise the second is all zeros.
+        If false, ``bounced`` contains zeros.
 
     Returns
     -------

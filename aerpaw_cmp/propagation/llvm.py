@@ -326,7 +326,7 @@ def _verdict_file(library: Library) -> Path:
         processor = platform.processor()
     stat = library.path.stat()
     versions = [version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
-    # the nodes of a cluster share home folders: hence the processor in the key
+    # include the processor in the key, because the nodes of a cluster share home folders
     key = repr((str(library.path), stat.st_size, stat.st_mtime_ns, versions, processor, sys.prefix))
     return cache_folder("llvm", sha256(key.encode()).hexdigest()[:24])
 

@@ -22,7 +22,7 @@ Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Options that decide the paths, besides the scene.
+    """Options that determine the paths, in addition to the scene.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class Search:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """Options that decide the field of the paths, besides arrays and materials.
+    """Options that determine the field of the paths, in addition to arrays and materials.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class Job:
     def of(cls, points_m: FloatArray, links: int) -> Job:
         """The box of the points (n, 3) that are known."""
         known = points_m[np.isfinite(points_m).all(axis=1)]
-        # two corners say as much of the tolerance as all points do
+        # two corners determine the same tolerance as all points
         return cls(np.stack([known.min(axis=0), known.max(axis=0)]) if len(known) else known, links)
 
 

@@ -80,7 +80,7 @@ class Ends:
 
     @property
     def moving(self) -> bool:
-        """True where the tower has a place of its own at every pose."""
+        """True if the tower has a separate position at every pose."""
         return self.sources_m.ndim == 3
 
 
@@ -240,7 +240,7 @@ def path_table(
 
 
 def _gains(item: Any, faces: Faces, ends: Ends, loss_db: FloatArray | None) -> ComplexArray:
-    """Return the gain (paths, n_rx, n_tx) of each path: H of a pose of its own, where it is the only path."""
+    """Return the gain (paths, n_rx, n_tx) of each path: H of a pose at which this is the only path."""
     pieces, order = [], []
     for tower, (name, array) in enumerate(ends.link.tower_arrays.items()):
         rows = np.flatnonzero(item.tower == tower)
@@ -505,7 +505,7 @@ def replay(
         Its ``tower_arrays`` name towers of the site.
     poses : Poses
     search : Search
-        Engine, depth and what else decides the paths.
+        Options that determine the paths, such as engine and depth.
     field : Field
         Further losses of the paths.
     run : Run

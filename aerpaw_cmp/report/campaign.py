@@ -707,7 +707,7 @@ def result_card(data: CampaignData) -> Card:
 
 def _ranking(data: CampaignData) -> Table:
     held_out = "held-out error over flights: each flight scored with the offset of the other flights"
-    kind = held_out if data.season.held_out else "error over flights, each with an offset of its own samples"
+    kind = held_out if data.season.held_out else "error over flights, each with its own offset"
     return Table(
         caption=f"Settings by their mean {kind}. Difference from the best setting: mean difference on the same "
         "flights, towers and channels, with a 95 % interval over flights; the first was chosen on these flights.",

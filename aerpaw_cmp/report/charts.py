@@ -135,7 +135,7 @@ def _errors(models: Sequence[ModelRow]) -> dict[str, Any]:
 
 
 def _costs(models: Sequence[ModelRow]) -> dict[str, Any]:
-    """Return a numbered dot for each model, and a mark of its own for the fastest sufficient one."""
+    """Return a numbered dot for each model, and a different mark for the fastest sufficient model."""
     marks = []
     for name, fastest in (("other models", False), ("fastest sufficient", True)):
         of = [(number, row) for number, row in enumerate(models, 1)

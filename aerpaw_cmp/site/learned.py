@@ -702,7 +702,7 @@ def read_pair(path: Path, length: float, prior_sd_db: float, written: Written | 
     lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
     table = np.loadtxt(lines[1:], delimiter=",", ndmin=2) if len(lines) > 1 else np.zeros((0, len(PAIR_COLUMNS)))
     if lines[:1] != [",".join(PAIR_COLUMNS)] or not len(table) or table.shape[1] != len(PAIR_COLUMNS):
-        raise InputError("not the columns, or no row", expected=", ".join(PAIR_COLUMNS), path=path)
+        raise InputError("wrong columns, or no rows", expected=", ".join(PAIR_COLUMNS), path=path)
     if not np.isfinite(table).all():
         raise InputError("values that are not finite", expected="angles [deg], gains and SDs [dB]", path=path)
     return PairGain(

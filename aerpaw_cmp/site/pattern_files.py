@@ -122,14 +122,14 @@ def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float, path: Path) -> dic
         raise InputError(
             f"values from {values.min():g} to {values.max():g} dB below the peak",
             expected="attenuations of one sign",
-            cause="gains in place of attenuations",
+            cause="gains instead of attenuations",
             path=path,
         )
     if (least := np.abs(values).min()) > _RIPPLE_DB:
         raise InputError(
             f"no direction of the cuts is less than {least:.1f} dB below the gain of {peak_dbi:g} dBi",
             expected="cuts through the peak",
-            cause="another gain, or gains in place of attenuations",
+            cause="another gain, or gains instead of attenuations",
             path=path,
         )
     return {name: peak_dbi - np.abs(cut) for name, cut in cuts.items()}

@@ -141,7 +141,7 @@ def result(
     rows.warnings += ["no message carries UTC: " + _rows.RELATIVE] if rows.relative else []
     if len(flights) > 1:
         systems = ", ".join(str(flight.system) for flight in flights)
-        rows.warnings.append(f"{len(flights)} vehicles (systems {systems}): a track of its own for each")
+        rows.warnings.append(f"{len(flights)} vehicles (systems {systems}): each has a separate track")
     of = owner[timed]
     tracks = [_track(rows.part(of == i), flight, timed[owner == i]) for i, flight in enumerate(flights)]
     return rows.result([*tracks, *_radio(rows.part(of == len(flights)), radio, timed[owner == len(flights)])])

@@ -198,7 +198,7 @@ class Sheet:
 
     @property
     def plain(self) -> list[str]:
-        """The names in plain form, in common words."""
+        """The column names as plain text, in the words of the dictionary."""
         return [words for *_, words in self._described[1]]
 
     @property

@@ -64,7 +64,7 @@ def test_cells_go_to_the_towers_that_the_flight_file_names(phone: Path) -> None:
     data = load_data(load_flight(flight(phone, "cells: {1: LW1, lte_pci2: LW2, cell 9: LW3}")), phone)
     assert any("no stream is named cell 9: its streams are " in text for text in data.warnings)
     assert [(series.tower, series.channel) for series in data.rss] == [("LW1", "lte_pci1"), ("LW2", "lte_pci2")]
-    assert any("1 cell ignored that 'cells' does not name" in text for text in data.warnings)
+    assert any("1 cell ignored: not listed in 'cells'" in text for text in data.warnings)
     first = data.rss[0].serving
     assert first is not None
     assert first.tolist() == [1.0] * 50 + [0.0] * 50

@@ -214,7 +214,7 @@ def test_modem_manager_is_named_to_a_user_who_may_not_see_its_files(modem):
         finally:
             process.kill()
             process.wait()
-    assert "a process that we may not look at" in said
+    assert "a process of another user" in said
     assert "systemctl stop ModemManager" in said
 
 

@@ -173,7 +173,7 @@ def channel(
     flight: Annotated[Path, Argument(help="flight.yaml with logs, with a plan, or with --route.")],
     out: Annotated[Path | None, output("Output folder  [default: reports/channel-<flight>]")] = None,
     route: Annotated[
-        Path | None, Option(metavar="FILE", help="Route in place of the track: .plan, KML, CSV or log.")
+        Path | None, Option(metavar="FILE", help="Route instead of the track: .plan, KML, CSV or log.")
     ] = None,
     link: Annotated[
         str | None, Option(help="rss, rank or a channel of the flight file  [default: its first channel, else rss]")

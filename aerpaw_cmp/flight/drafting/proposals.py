@@ -272,7 +272,7 @@ class Placer:
         return replace(_node(place, at_estimate, about, nodes), radius_m=estimate.radius90_m)
 
     def _supports(self, track: LevelTrack, tower: str, gains: Taught) -> bool:
-        """Check whether levels support the learned antennas of a tower against a gain of their own."""
+        """Check whether levels support the learned antennas of a tower against an unknown gain."""
         if gains.moments is None or track.rotation is None:
             return True
         place = self.site.towers[tower].position_m
@@ -405,7 +405,7 @@ class Remembered:
     def teaches(self) -> bool:
         """True if the airframe can be used at other towers.
 
-        A receiver that loses its lock, and flights that do not predict each other, do not predict other flights.
+        This requires a receiver that keeps its lock, and flights that predict each other.
         """
         return self.series.lock is None and self.series.shares_airframe
 

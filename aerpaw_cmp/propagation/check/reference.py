@@ -200,7 +200,7 @@ def turned(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix:
 
 
 def aircraft(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Matrix:
-    """Forward-left-up to east-north-up, by way of the textbook's forward-right-down to north-east-down."""
+    """Return the rotation from forward-left-up to east-north-up, by the textbook's forward-right-down axes."""
     # right turns about down, right and forward: heading, nose up and right wing down
     to_ned = turned(yaw_deg, pitch_deg, roll_deg)
     enu_of_ned: Matrix = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
@@ -654,7 +654,7 @@ def element_wave(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -
     number : int
         The element.
     turn : (3, 3)
-        Device to site.
+        Rotation from device to site axes.
     ray : (3,)
         Unit vector away from the device.
 
@@ -734,7 +734,7 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -
     a, b : (3,)
         Ends of the segment [m].
     trunks : bool
-        The cylinders below in place of the cones.
+        Cylinders below the cones replace them.
 
     Returns
     -------

@@ -70,7 +70,7 @@ def two_ray_dbm(
     wavelength = wavelength_m(carrier_hz)
     across = np.linalg.norm(targets_m[:, None, :2] - sources_m[..., :2], axis=2)
     ground = np.broadcast_to(np.asarray(ground_m, dtype=np.float64), (sources_m.shape[-2],))
-    # above the ground of that tower: each has a plane of its own
+    # above the ground of that tower: each has a separate plane
     low = np.atleast_2d(sources_m[..., 2]) - ground
     high = targets_m[:, None, 2] - ground[None, :]
     direct = np.hypot(across, high - low)

@@ -183,7 +183,7 @@ def foliage_model(
     in_leaf : bool
         Whether the trees are in leaf.
     gamma_db_per_m, maximum_db : float, optional
-        Specific attenuation [dB/m] and largest loss [dB] in place of P.833's table.
+        Specific attenuation [dB/m] and largest loss [dB] instead of P.833's table.
 
     Returns
     -------
@@ -540,7 +540,7 @@ def stand_loss_db(
     vertices_m : (paths, depth, 3)
         Points of reflection [m]; NaN where unused.
     model : FoliageModel
-        Depth in crowns to loss. Nothing gets through, over or around where it is opaque.
+        Model of loss by depth in crowns. An opaque model also blocks waves over and around the trees.
     wavelength_m : float
     in_leaf : FoliageModel, optional
         Model for the evergreen share of a forest stand. Default: ``model``.

@@ -465,7 +465,7 @@ def _height(normal, offset, f, p):  # type: ignore[no-untyped-def]
 
 @kernel
 def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-def]
-    """Faces (faces,) that may come first: none that one convex face hides wholly."""
+    """Return the faces (faces,) that may be first, without faces that one convex face hides completely."""
     normal, offset = mirrors.normal, mirrors.offset
     good = np.zeros(len(normal), np.bool_)
     stack = np.empty(DEEPEST, np.int64)
@@ -484,7 +484,8 @@ def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-
 def _wholly_hidden(mirrors, face_tree, source, f, before, sign, rules, stack):  # type: ignore[no-untyped-def]
     """Check whether one convex face lies between the source and every corner of the outline of face ``f``.
 
-    Where the source is an image, it lies as well wholly before the face ``before`` (-1: none), on the side ``sign``.
+    If the source is an image, the convex face must also be completely in front of the face ``before`` (-1: none), on
+    the side ``sign``.
     """
     _, _, _, _, window, convex, plane, _, _, _, _ = mirrors
     lower, upper, child, start, many, items = face_tree
@@ -512,7 +513,7 @@ def _wholly_hidden(mirrors, face_tree, source, f, before, sign, rules, stack):  
 
 @part
 def _beyond(mirrors, before, sign, g, rules):  # type: ignore[no-untyped-def]
-    """Check whether the outline of ``g`` lies wholly before the face ``before``, where there is one."""
+    """Check whether the outline of ``g`` is completely in front of the face ``before``, where there is one."""
     normal, offset = mirrors.normal, mirrors.offset
     for corner in range(WINDOW if before >= 0 else 0):
         if not sign * _height(normal, offset, before, mirrors.window[g, corner]) > 10.0 * rules.clearance:

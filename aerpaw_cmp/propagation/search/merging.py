@@ -210,7 +210,7 @@ def _apart(lower, upper, node, box):  # type: ignore[no-untyped-def]
 
 @kernel
 def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-def]
-    """Check whether a box lies wholly outside one of the planes.
+    """Check whether a box is completely outside one of the planes.
 
     Parameters
     ----------

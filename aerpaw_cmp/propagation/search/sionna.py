@@ -154,7 +154,7 @@ def _leave_for_later() -> None:
 
 
 def _loaded(later: ModuleType, kind: str, *arguments: Any, **named: Any) -> Any:
-    """Load a class in place of the module that stood for its own, and make an object of it."""
+    """Load a class instead of its placeholder module, and create an object of it."""
     if sys.modules.get(later.__name__) is later:
         del sys.modules[later.__name__]
     return getattr(import_module(later.__name__), kind)(*arguments, **named)

@@ -56,7 +56,7 @@ class OnTerrain:
 
 
 def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: float) -> OnTerrain:
-    """Return paths of an engine with the ground of an elevation model in place of level planes.
+    """Return paths of an engine with the ground of an elevation model instead of level planes.
 
     Parameters
     ----------

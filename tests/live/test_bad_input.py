@@ -170,7 +170,7 @@ def test_two_taps_in_one_process(modem, tap, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0))
     session = tap(sim.port)
     session.wait(lambda: len(sim.journal) > 5)
-    with pytest.raises(InputError, match="the port is held"):
+    with pytest.raises(InputError, match="the port is in use"):
         run_tap(TapSettings(tmp_path / "second", str(sim.port), duration_s=3.0))
     session.end()
 

@@ -511,7 +511,7 @@ class _Place:
                 raise
 
     def _empty(self) -> None:
-        """Clear the remains of a killed run. UsageError if there is anything else."""
+        """Clear the remains of a killed run. Raise UsageError if it contains other files."""
         with contextlib.suppress(OSError):
             _clear(self.part, keep=True)
         if foreign := next(self.part.iterdir(), None):

@@ -1224,7 +1224,7 @@ def _shadows(e: LevelEvidence, sectors: Sequence[tuple[float, float]]) -> FloatA
     return np.asarray(np.clip(0.5 + (0.5 * width - off) / _EDGE_DEG, 0.0, 1.0))
 
 
-_CHECK_GAIN = "check the receiver's gain; compare both parts apart"
+_CHECK_GAIN = "check the receiver's gain; compare both parts separately"
 
 
 def _gain_step(e: LevelEvidence) -> Iterator[Trial]:

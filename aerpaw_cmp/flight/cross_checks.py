@@ -453,7 +453,7 @@ _HEAD_BYTES = 2000
 def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
     """Return the smallest difference of a time from the start, as UTC and as local time (in any zone if unknown)."""
     if not exact:
-        # a date is its noon, plus or minus half a day
+        # a date means its noon, plus or minus half a day
         return abs(start - time - timedelta(hours=12))
     if zone is not None:
         # the offset of that day, because a zone has two in a year

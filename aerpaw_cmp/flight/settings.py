@@ -211,7 +211,7 @@ class LinksSettings(StrictModel):
 
     rss: LinkSettings = LinkSettings(carrier_hz=3.3e9)
     channels: dict[str, LinkSettings] = {}
-    """RSS link of channels that differ, by channel name (such as two antennas that point differently)."""
+    """RSS links of channels that differ from ``rss``, by channel name (for example two antennas)."""
     rank: LinkSettings = LinkSettings(
         carrier_hz=3.4e9,
         uav_transmits=False,

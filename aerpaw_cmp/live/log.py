@@ -197,7 +197,7 @@ class SegmentLog:
 
     def close(self) -> None:
         """Last attempt at what waits, sync, close."""
-        # the pause between attempts does not count any more
+        # reset the pause between attempts
         self._retry_ns = 0
         if self.fault is not None:
             self._drain()

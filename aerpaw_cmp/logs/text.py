@@ -507,7 +507,7 @@ def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
     count = len(cells)
     if count == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool)
-    # logs run forward: the date and the minute of a run of times are read once
+    # times increase, so the date and minute of consecutive equal times are parsed only once:
     # sixteen characters as two integers: two comparisons a row
     half = np.ascontiguousarray(cells[:, :16]).view(np.uint64)
     starts = np.flatnonzero(np.concatenate(([True], (half[1:, 0] != half[:-1, 0]) | (half[1:, 1] != half[:-1, 1]))))

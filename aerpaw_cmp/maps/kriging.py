@@ -412,7 +412,7 @@ class OrdinaryKriging:
     def _sill_of(self, values: FloatArray) -> FloatArray:
         finite = np.isfinite(values)
         count = finite.sum(axis=0)
-        # relative to a value of the field, so that a constant field has variance 0 and not 1e-32
+        # subtract a value of the field, so that a constant field has variance 0 and not 1e-32
         centred = np.where(finite, values - _reference(values), 0.0)
         mean = centred.sum(axis=0) / np.maximum(count, 1)
         squares = np.where(finite, centred - mean, 0.0) ** 2

@@ -91,9 +91,9 @@ def wedge(
         te_re, te_im, tm_re, tm_im = coefficients(sine, face)
         te, tm = te + term * (te_re + 1j * te_im), tm + term * (tm_re + 1j * tm_im)
     # angle between the edge-fixed basis and the plane of incidence, whose unit normal is sigma
-    askew = cos_beta * upright  # as across, times the sine of incidence: -(sigma . phi) and -(sigma . beta)
+    askew = cos_beta * upright  # like across, multiplied by the sine of incidence: -(sigma . phi) and -(sigma . beta)
     size = across * across + askew * askew
-    # along the edge itself both are zero: any plane of incidence will do
+    # along the edge both are zero, and any plane of incidence is valid
     weight = 1.0 / np.where(size == 0.0, 1.0, size)
     along, mixed, sideways = np.where(size == 0.0, 1.0, across * across * weight), across * askew * weight, askew**2
     sideways = sideways * weight
@@ -402,7 +402,7 @@ def _of_solid(
     first = {_corner(faces, wall, 0): wall for wall in walls}
     for wall in walls:
         top, low = faces.upper[wall, 1], max(float(faces.lower[wall, 1]), ground_m)
-        # neither its rim nor its corners are edges in the sense of an asymptotic formula
+        # its rim and corners are not edges for which the asymptotic formula is valid
         if top - low <= least_m:
             continue
         near, far = (_point(faces, wall, end, top) for end in (0, 1))
@@ -640,7 +640,7 @@ def _patterns(
 ) -> tuple[ComplexArray, ComplexArray]:
     """E_theta and E_phi (paths, elements) of one end's elements ``toward`` directions (paths, 3) of the centres."""
     count = len(arrays[0])
-    # one by one broadcasts against every path and element
+    # shape (1, 1), which broadcasts against every path and element
     if all(plain(array.patterns) for array in arrays):
         return np.ones((1, 1), complex), np.zeros((1, 1), complex)
     fields = np.empty((len(paths), 4, count))

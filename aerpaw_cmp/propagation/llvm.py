@@ -416,7 +416,7 @@ def os_families() -> set[str]:
         release = platform.freedesktop_os_release()
     except OSError:
         return {platform.system().lower()}
-    # Mint and Pop declare that they are like Ubuntu
+    # Mint and Pop state in os-release that they are like Ubuntu
     return {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
 
 

@@ -46,7 +46,7 @@ def write_locate(
     crosses = [np.array([[m["east_m"], m["north_m"]]]) + 8.0 * arm for m in numbers["modes"] for arm in _CROSS]
     shown = payload([places], site, lines=[track_m, *crosses])
     table = Table(
-        caption="Parts of the 90 % region; within that distance of the place lie nine tenths of a part",
+        caption="Parts of the 90 % region. Nine tenths of a part are within the stated distance of its place",
         columns={"Place": HEAD, "East [m]": 0, "North [m]": 0, "Share": SHARE, "Within [m]": 0},
         rows=[(f"{m['latitude_deg']:.7f}, {m['longitude_deg']:.7f}", m["east_m"], m["north_m"], m["share"],
                m["radius_m"])

@@ -277,9 +277,9 @@ def above_takeoff(
             "does not begin on the ground: read as above take-off"
         )
         return altitude, about
-    how = "that at rest on the ground" if climbs else "that of the first position"
+    how = "the altitude at rest on the ground" if climbs else "that of the first position"
     zero = "the ellipsoid" if datum == "ellipsoid" else "sea level"
-    rows.warnings.append(f"altitudes are above {zero}: {first:.1f} m, {how}, was taken off")
+    rows.warnings.append(f"altitudes are above {zero}: {first:.1f} m, {how}, was subtracted")
     about |= {"takeoff_from": "rest" if climbs else "first position", "height_taken_off_m": round(first, 3)}
     return altitude - first, about
 

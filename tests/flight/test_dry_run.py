@@ -13,7 +13,7 @@ TRACK = SimpleNamespace(pose_at=np.asarray, why_not=lambda _: "most are after te
 @pytest.mark.parametrize(
     ("counts", "track", "words"),
     [
-        ((0, 0, 0), TRACK, "no sample holds a value"),
+        ((0, 0, 0), TRACK, "no sample has a value"),
         ((10, 10, 10), TRACK, ""),
         ((10, 5, 1), TRACK, ""),
         ((10, 5, 0), TRACK, "all of 5 samples below minimum_height_m"),

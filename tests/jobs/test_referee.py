@@ -161,7 +161,7 @@ def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
         (lambda f: f.assign(level_dbm=10 ** (f["level_dbm"] / 10)), "watts or milliwatts"),
         (lambda f: f.assign(time_utc=f["time_utc"].str.replace("T14", "T18")), "another time zone, +4 h"),
         (lambda f: f.rename(columns={"time_utc": "time"}).assign(time="2025-06-01 14:00:00"), "times without a zone"),
-        (lambda f: pd.concat([f, f.assign(level_dbm=-50.0)]), "with another level at the same place"),
+        (lambda f: pd.concat([f, f.assign(level_dbm=-50.0)]), "with several levels at one position"),
         (lambda f: f.drop(columns="tower"), "no column tower"),
         (lambda f: f.drop(columns="time_utc"), "without a time and without a position"),
         (

@@ -140,7 +140,7 @@ def test_a_full_disk_is_told_at_once_and_nothing_is_lost_when_it_has_room_again(
     first, second, lost = done.stdout.splitlines()
     assert "the log cannot be written" in first
     assert "records wait in memory" in first
-    assert "takes records again; 0 were lost" in second
+    assert "accepts records again; 0 were lost" in second
     assert lost == "0"
     bad = []
     records = list(read_log(tmp_path, bad))

@@ -304,7 +304,7 @@ def test_a_disk_fault_does_not_stop_the_polling(modem, tap, tools, tmp_path):
     session.wait(lambda: len(sim.journal) > count + 10)
     assert any("disk is full" in text for text in session.said)
     os.dup2(duplicate, fd)  # and now there is room again
-    session.wait(lambda: any("takes records again; 0 were lost" in text for text in session.said))
+    session.wait(lambda: any("accepts records again; 0 were lost" in text for text in session.said))
     os.close(duplicate)
     os.close(full)
     summary = session.end()

@@ -167,12 +167,12 @@ def test_points_without_height_ask_for_one(tmp_path: Path) -> None:
         (
             "a.kml",
             kml("<LineString><coordinates>-78.7,35.7,-78.7,35.8</coordinates></LineString>"),
-            "4 numbers joined by commas",
+            "4 numbers separated only by commas",
         ),
         (
             "a.kml",
             kml("<LineString><coordinates>-78.7,35.7,-78.7,35.8,-78.6,35.8</coordinates></LineString>"),
-            "6 numbers joined",
+            "6 numbers separated",
         ),
         ("a.plan", b'{"fileType": "Plan", "mission": 3}', "damaged QGroundControl plan"),
         ("a.plan", b'{"fileType": "Plan", "mission": {"items": [', "damaged QGroundControl plan"),

@@ -85,7 +85,13 @@ def test_why_lines_are_rejected() -> None:
         "[2025-03-02 10:00] 0000014        -50.0000\n", line(8, "what the console said"),
         "[2025-02-30 10:00:07.000000] 0000014        -50.0000\n",
     ]  # fmt: skip
-    words = ["NUL bytes", "no '[time]' in front", "time stamp is incomplete", "neither 'offset value'", "not a date"]
+    words = [
+        "NUL bytes",
+        "does not begin with '[time]'",
+        "time stamp is incomplete",
+        "neither 'offset value'",
+        "not a date",
+    ]
     result = read(*GOOD, *bad)
     assert [word in reject.reason for word, reject in zip(words, result.rejected, strict=True)] == [True] * len(bad)
 

@@ -186,7 +186,7 @@ class TestWords:
         assert "worse than two-ray ground by 1.5 dB [1." in said(large, small)
         assert "better than two-ray ground by 1.5 dB [1." in said(small, large)
         assert "no significant difference from two-ray ground" in said(small, rng.permutation(small))
-        assert "too short a flight" in said(small[:5], large[:5])
+        assert "the flight is too short for an interval" in said(small[:5], large[:5])
 
     def test_without_a_pair_nothing_is_judged(self, report_data):
         text = words.rss_verdict(report_data.rss[0])

@@ -192,7 +192,7 @@ def foliage_model(
     Raises
     ------
     UsageError
-        An unknown name; gamma or A_m for a model that has neither.
+        If the name is unknown, or gamma or A_m is set for a model without it.
     """
     if name in ("attenuating", "p833"):
         table = P833.at(frequency_hz, in_leaf=in_leaf)
@@ -270,7 +270,7 @@ def foliage_depth_m(
     vertices = np.asarray(vertices_m, dtype=np.float64)
     index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
     depth = np.zeros(len(source))
-    # from the target back, as lengths were always added: another order moves their last digit
+    # add the legs from target to source: a different order would change the last digit
     for start, end in reversed([*legs(source, vertices, target)]):
         moved = (start != end).any(axis=1)
         depth[moved] += index.chords_m(start[moved], end[moved])
@@ -701,7 +701,7 @@ def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wa
     np.minimum.at(enter, crossing.piece, crossing.share[:, 0])
     np.maximum.at(leave, crossing.piece, crossing.share[:, 1])
     np.maximum.at(top, crossing.piece, crossing.height_m + crossing.ground_m)
-    # neither end in the canopy: only then are there ways over and around it
+    # there are paths over and around it only if neither end is in the canopy
     outside = ((enter > 1e-9) | (source[:, 2] > top)) & ((leave < 1.0 - 1e-9) | (target[:, 2] > top))
     length, share = np.linalg.norm(target - source, axis=1), np.stack([enter, leave])
     intrusion = top - source[:, 2] - share * (target - source)[:, 2]

@@ -780,7 +780,7 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
             number = _side_planes(mine, number, image, window[f])
         many[level] = number if beams else 0
         stack[0], pending, met = 0, 1, 0
-        while pending > 0:  # as within_planes, written out: a call counts every array of the tree in and out
+        while pending > 0:  # a copy of within_planes, because a call would count references to every array of the tree
             pending -= 1
             node = stack[pending]
             if beams and box_outside(t_lower, t_upper, node, mine, number):

@@ -23,7 +23,7 @@ from ...site.mitsuba import TriangleScene
 from ..geometry import BoxTree, Faces, Surfaces
 from ..numba_options import kernel, law, part
 
-# Nodes that wait while a tree is walked: twice its depth for 4e9 items.
+# Size of the stack of a tree search: twice the depth of a tree with 4e9 items.
 DEEPEST = 64
 
 

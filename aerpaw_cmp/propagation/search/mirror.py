@@ -339,7 +339,7 @@ CELLS_PER_CHUNK = 1_000_000
 # Number of targets whose heights over all faces are cached.
 TARGETS_AT_ONCE = 1024
 
-# Margin of :class:`Mirrors` [m]: far above the tolerance of any search that it thins out.
+# Margin of :class:`Mirrors` [m]: it is far above the tolerance of any search.
 REACH_SLACK_M = 1e-3
 
 
@@ -604,7 +604,7 @@ def _beam_meets(
     ray = np.ascontiguousarray((window - apex[:, None, :]).transpose(2, 1, 0))
     following = ray[:, _NEXT_CORNER]
     side = ray[_SECOND] * following[_THIRD] - ray[_THIRD] * following[_SECOND]
-    # the sense in which the window goes round decides which way the side planes point
+    # the orientation of the window determines the direction of the side planes
     sense = np.sign((side.sum(axis=1) * ray.sum(axis=1)).sum(axis=0))
     ahead = (side * (centre - apex).T[:, None]).sum(axis=0) * sense
     ahead += np.abs((side * reach.transpose(1, 2, 0)[:, :, None]).sum(axis=1)).sum(axis=0)

@@ -24,8 +24,8 @@ from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, Occlusion, images_of, 
 # ``solid`` of the tangent planes of the terrain; that of a tower's level ground is -1.
 TERRAIN = -2
 
-# A mirror over less of its Fresnel zone is left out.
-# That is 20 dB below the whole mirror.
+# A mirror over a smaller part of its Fresnel zone is ignored.
+# At this part, a reflection is 20 dB below that of a complete mirror.
 _SMALLEST_PART = 0.1
 
 # A point that still moves after this many steps gets the plane of a crease.
@@ -245,7 +245,7 @@ def _stationary(
         # at both ends of each piece of the profile: between them it changes its sign at most once
         ends = [growth(along[:-1], ground[:-1]), growth(along[1:], ground[1:])]
     turns = np.stack(ends, axis=1).reshape(-1, len(source))
-    # a change of sign within a piece is a mirror in it, between two pieces one in their crease
+    # a change of sign within a piece is a mirror in it; between two pieces it is a mirror in their crease
     falls, known = turns < 0.0, np.isfinite(turns)
     column, entry = np.nonzero(((falls[1:] != falls[:-1]) & known[1:] & known[:-1]).T)
     piece, crease = entry // 2, entry % 2 == 1

@@ -215,7 +215,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class _Model:
-    """Some faults on one channel, with the log likelihood that they gain together beyond their cost."""
+    """Faults of one channel, with their joint gain in log likelihood minus their cost."""
 
     evidence: LevelEvidence
     trials: tuple[Trial, ...]

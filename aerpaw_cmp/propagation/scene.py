@@ -92,7 +92,7 @@ def _merged(scene: TriangleScene) -> Surfaces:
         raise UsageError(
             f"the site is a scene of triangles, but {compiled.beams().reason}",
             expected="numba that works: pip install 'aerpaw-cmp[fast]'",
-            cause="its thousands of faces are searched by compiled code alone",
+            cause="only compiled code can search its thousands of faces",
         )
     from .search.merging import merged  # compiled, so loaded only for a scene of triangles
 

@@ -145,7 +145,7 @@ def sentences(
     Parameters
     ----------
     scores, controls : mapping of str to sequence of Score
-        Scores by what was held out, and by wrong or simpler model.
+        Scores by kind of held-out data, and by wrong or simpler models.
     ground_m : (float, float), optional
         Range of the roughness height that the data allow [m]; None if no ground was fitted.
     curve : sequence of CurvePoint

@@ -1,6 +1,6 @@
 """Trees: random placement in forests with a seed, sizes, and single trees.
 
-A tree is that of the paper (arXiv 2502.10324, section V): a trunk cylinder below a cone of vegetation, 20 m high and
+Trees are those of the paper (arXiv 2502.10324, section V): a trunk cylinder below a cone of vegetation, 20 m high and
 10 m wide. The paper does not print the height of the base of the crown, which is assumed to be a quarter of the height.
 """
 

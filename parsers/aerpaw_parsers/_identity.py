@@ -149,7 +149,7 @@ def _divides(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
     return max(values.values(), default=0) > 1
 
 
-# Words of another cell than that of the row's level, of what the aircraft does, and of the level itself in steps.
+# Words in column names that do not identify a series: other cells, states of the aircraft, levels in steps.
 _OTHERS = re.compile(
     r"\b(serving|best|target|source|dest|destination|strongest|prev|previous|next|handover|bars?|asu|quality|percent"
     r"|strength|signal|level|rate|wp|rank|layers)\b|(mode|state|status|event|step|waypoint)\b"

@@ -378,8 +378,8 @@ class Blocks:
 # Mirrors (sequences, depth) by number, and images (sequences, depth + 1, 3) of the source.
 _Chains = tuple[IntArray, FloatArray]
 
-# Rounding moves the point of a reflection by less, where its image and its other end are MARGIN_M or more apart along
-# the normal of its plane.
+# Rounding moves a reflection point by less than this if image and target are at least MARGIN_M apart along the normal
+# of its plane.
 _SLACK_M = 0.1
 
 

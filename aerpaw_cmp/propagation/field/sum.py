@@ -327,7 +327,7 @@ def _ports(arrays: Sequence[Array]) -> int:
 
 
 def _by_link(paths: PathSet, towers: int) -> IntArray | None:
-    """Return the order of the paths by pose and tower, None where they have it: a link is summed in one run."""
+    """Return the order that sorts paths by pose and tower, so that each link is one run, or None if they are sorted."""
     key = paths.pose * towers + paths.tower
     return None if (np.diff(key) >= 0).all() else np.argsort(key, kind="stable")
 

@@ -61,6 +61,7 @@ SMALLEST: dict[str, list[str]] = {
     "ingest": ["--scale", "2000", "--format", "sounder_log"],
     "interval_weights": ["mean", "--sequences", "4"],
     "kriging": ["--quick", "--pairs", "60"],
+    "located_nodes": ["--flights", "2", "--only", "circle"],
     "learned_map": ["--quick", "--only", "flights", "lte"],
     "left_out_reports": ["--only", "lte50"],
     "outside_causes": [],

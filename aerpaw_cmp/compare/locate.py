@@ -1,14 +1,15 @@
-"""Position estimate of a transmitter of unknown place, from the levels of one flight.
+"""Position estimate of a transmitter at an unknown place, from the levels of one flight.
 
-The model: a level falls with the logarithm of the distance, by a free slope; the airframe adds its gain where flights
-taught it, both antennas one over the elevation, shadowing is remembered for half a minute, and what lies below the
-receiver's floor says only that.
+The model of a level: it falls with the logarithm of the distance, by an unknown slope. Both antennas add a gain over
+elevation, azimuth and the directions of the airframe. Shadowing is correlated over place or time. A level below the
+floor of the receiver is known to be below it, and no more. Several strengths and lengths count by their evidence.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,43 +17,117 @@ from numpy.typing import ArrayLike
 from ..common.errors import InputError
 from ..common.geodesy import elevation_rad
 from ..common.text import counted
-from ..common.units import BoolArray, FloatArray, unmasked
+from ..common.units import BoolArray, FloatArray, spread_out, unmasked
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """One assumption on what scatters the levels about their mean over distance.
+
+    Parameters
+    ----------
+    shadow_db, length_m, time_s : float
+        Standard deviation of the shadowing [dB], and over which distance and time its correlation falls by a factor e.
+    scatter_db : float
+        Standard deviation of medians over some seconds [dB].
+    azimuth_db, airframe_db : float
+        Standard deviation of the node's gain over azimuth, and of the airframe's gain over its directions [dB].
+    learned : bool
+        The airframe has its learned gain, and ``airframe_db`` is a factor of the standard deviation of that gain.
+    log_weight : float
+        Logarithm of the weight before a level was measured.
+    """
+
+    shadow_db: float
+    scatter_db: float
+    length_m: float = np.inf
+    time_s: float = np.inf
+    azimuth_db: float = 0.0
+    airframe_db: float = 0.0
+    learned: bool = False
+    log_weight: float = 0.0
+
+    @property
+    def shadow(self) -> tuple[float, ...]:
+        """Everything but the gains."""
+        return self.shadow_db, self.scatter_db, self.length_m, self.time_s
+
+    def with_gains(self, azimuth_db: float, airframe_db: float, weight: float = 1.0) -> Case:
+        """Return the case with unknown gains over direction [dB], and its weight."""
+        return replace(self, azimuth_db=azimuth_db, airframe_db=airframe_db, log_weight=float(np.log(weight)))
+
+    def with_airframe(self) -> Case:
+        """Return the case with the learned gain of the airframe, uncertain by its standard deviation."""
+        return replace(self, airframe_db=_LEARNED_SD, learned=True, log_weight=self.log_weight + _KNOWN_ODDS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LevelModel:
-    """Standard deviations of a level about its distance law, before it was seen.
+    """Standard deviations of a level about its mean over distance, before a level was measured.
 
     Parameters
     ----------
     slope, slope_sd : float
         Exponent of the distance.
     elevation_sd_db : float
-        Gain that two antennas and the ground add over the elevation.
-    shadow_sd_db : float
-        Shadowing, remembered for half a minute.
-    scatter_sd_db : float
-        Of medians over some seconds.
+        Gain that both antennas and the ground add over the elevation.
+    cases : tuple of Case
+        The evidence is a mean over the cases, by their weights.
     """
 
     slope: float = 3.0
     slope_sd: float = 1.0
     elevation_sd_db: float = 5.0
-    shadow_sd_db: float = 8.0
-    scatter_sd_db: float = 4.0
+    cases: tuple[Case, ...] = ()
 
 
-# Of a node about which nothing is known: so the regions hold the surveyed rover on the six AFAR and sounder flights
-# that docs/formats.md names.
-UNKNOWN = LevelModel()
+# Standard deviation of a learned gain per degree of its harmonics, as a factor of that of its table.
+_LEARNED_SD = 0.25
 
-# How long shadowing is remembered.
-_SHADOW_S = 30.0
+# Log odds of a learned gain against an unknown one, before a level was measured.
+_KNOWN_ODDS = 3.0
 
-# Standard deviation per axis of what the model cannot see (a tilted antenna, a wall), of the same flights.
+# Gains over azimuth and over the directions of the airframe [dB]. Without the attitude, the axes of the airframe are
+# those of the site, and stronger gains count as well, by their weights. With the attitude they do not: the error of one
+# of six real flights rose from 41 to 67 m.
+_GAINS = (0.8, 1.5)
+_STRONG_GAINS = {_GAINS: 0.55, (3.0, 3.0): 0.28, (6.0, 6.0): 0.17}
+
+# Shadowing over the half minute of a hover, and over place. Strong shadowing over a short length and little scatter are
+# hard to distinguish from strong scatter, and are left out.
+_LENGTHS_M = (15.0, 45.0, 100.0)
+_SHADOWS = (
+    Case(shadow_db=8.0, scatter_db=4.0, time_s=30.0),
+    *(
+        Case(shadow_db=sd, scatter_db=2.0, length_m=length)
+        for sd, lengths in ((2.5, _LENGTHS_M), (4.5, _LENGTHS_M[1:]), (8.0, _LENGTHS_M[2:]), (12.0, _LENGTHS_M[2:]))
+        for length in lengths
+    ),
+    *(Case(shadow_db=sd, scatter_db=4.0, length_m=length) for sd, length in product((4.5, 8.0, 12.0), _LENGTHS_M)),
+)
+
+# A node about which nothing is known.
+UNKNOWN = LevelModel(cases=tuple(case.with_gains(*_GAINS) for case in _SHADOWS))
+
+
+def known_cases(shadow_db: float, scatter_db: float) -> tuple[Case, ...]:
+    """Return the cases of a level between two learned antennas, with the shadowing that their flights had."""
+    own = [Case(shadow_db=shadow_db, scatter_db=scatter_db, length_m=length) for length in _LENGTHS_M]
+    own.append(Case(shadow_db=shadow_db, scatter_db=scatter_db, time_s=30.0))
+    return tuple(replace(case, airframe_db=_LEARNED_SD, learned=True) for case in (*own, *_SHADOWS))
+
+
+# The same without the attitude of the UAV.
+_UNTURNED = tuple(case.with_gains(*gains, weight) for case, (gains, weight) in product(_SHADOWS, _STRONG_GAINS.items()))
+
+# Standard deviation per axis of what the model cannot see (a tilted antenna, a wall), chosen on six flights with a
+# surveyed rover (docs/formats.md).
 SYSTEMATIC_M = 20.0
 
-# Medians are taken over at least so many seconds, and there are at most so many.
+# The place is where the posterior, blurred by this [m], is largest: a rough posterior has its maximum at random.
+_SMOOTH_M = 45.0
+
+# Medians are taken over at least this time, and there are at most this many.
 WINDOW_S, _MOST_BINS = 4.0, 120
 
 # Heights of the antenna that are tried, and their prior: a rover, a tower.
@@ -64,31 +139,37 @@ FEWEST = 20
 # Places up to this far beyond the track are tried, at this spacing; likely ones again at a third of it.
 _REACH_M, _SPACING_M = 400.0, 40.0
 
-# Long tracks: the first grid has at most this many positions, at 2, 4, 8 ... times the spacing; then the likeliest
-# places are divided until the spacing is reached. A place costs 0.2 ms of processor time.
-_MOST_GRID, _MOST_DIVIDED = 3000, 500
+# The first grid has at most this many positions, at 2, 4, 8 ... times the spacing; then the likeliest
+# places are divided until the spacing is reached.
+_MOST_GRID, _MOST_DIVIDED = 500, 500
 
-# The level of a node so far away hardly changes along a flight; levels that fit it as well as the best place tell none.
-# Log odds of the best place: 4 to 76 on six real flights with a rover in reach, at most 0.3 of constants and hovers.
+# The level of a node this far away hardly changes along a flight; levels that fit it as well as the best place do not
+# determine a place. Log odds of the best place: 4 to 76 on six real flights with a rover in reach, at most 0.3 for
+# constant levels and hovers.
 _AFAR_M, _PLACED_ODDS = 30_000.0, 0.5
 
-# Places whose log evidence is lower by more take no part.
+# Places whose log evidence is lower by more are ignored.
 _POSSIBLE = 8.0
 
-# With more of them the region is wider than the spacing.
-_MOST_REFINED = 300
+# The likeliest places are divided by three to the east and to the north.
+_MOST_REFINED = 100
 
 # Standard deviation of a level about which nothing is known.
 _FREE_DB = 100.0
 
-# Of the shadowing; what they leave counts as scatter.
-_TERMS = 28
-
 # Newton steps of the Laplace approximation, and the change [dB] at which they end; there is one maximum.
-_STEPS, _SETTLED_DB = 12, 0.01
+_STEPS, _SETTLED_DB = 12, 0.03
 
-# Places whose matrices are held at a time.
-_AT_ONCE = 64
+# Places whose matrices are in memory at a time.
+_AT_ONCE = 128
+
+# A search uses at most this many cases, and none that is less likely than the best by more [nat]. They are compared at
+# this many of the places that are possible with a usual case.
+_MOST_CASES, _LIKELY, _JUDGED = 8, 4.0, 60
+
+# Levels below the floor that count: they are correlated, and their time grows with the cube.
+_MOST_BELOW = 20
+_USUAL = Case(shadow_db=8.0, scatter_db=4.0, length_m=45.0, azimuth_db=_GAINS[0], airframe_db=_GAINS[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +182,13 @@ class LevelTrack:
     position_m : (n, 3)
         East, north, up.
     level_db : (n,)
-        Medians; no lower than the floor.
+        Medians, at least the floor.
     floor_db : float
-        Level below which the receiver measures nothing; -inf where none shows.
+        Level below which the receiver measures nothing, or -inf.
     airframe_db : callable, optional
-        Gain (m, n) of the airframe at each of the levels towards unit vectors (m, n, 3) from the UAV, where known.
+        Returns the learned gain (m, n) and its standard deviation (m, n) towards two unit vectors (m, n, 3). The first
+        is at the UAV, in the frame of the aircraft. The second is at the node, in the frame of the site. None if no
+        antenna is known.
     rotation : (n, 3, 3), optional
         From the aircraft's frame to that of the site.
     """
@@ -114,42 +197,42 @@ class LevelTrack:
     position_m: FloatArray
     level_db: FloatArray
     floor_db: float = -np.inf
-    airframe_db: Callable[[FloatArray], FloatArray] | None = None
+    airframe_db: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]] | None = None
     rotation: FloatArray | None = None
 
     @property
     def below(self) -> BoolArray:
-        """Levels (n,) of which only the floor is known."""
+        """True (n,) for levels that are known to be below the floor."""
         return np.asarray(self.level_db <= self.floor_db)
 
 
 def level_track(
     time_s: ArrayLike, position_m: ArrayLike, level_db: ArrayLike, *, floor_db: float = -np.inf
 ) -> LevelTrack:
-    """Medians of levels over windows of :data:`WINDOW_S` or longer.
+    """Return medians of levels over windows of :data:`WINDOW_S` or longer.
 
-    A median commutes with the floor: it lies below it where more than half of its samples do.
+    A median is below the floor if more than half of its samples are.
 
     Parameters
     ----------
     time_s : (n,)
     position_m : (n, 3)
-        NaN where it is not known.
+        NaN if it is not known.
     level_db : (n,)
-        NaN does not count.
+        NaN is ignored.
     floor_db : float
 
     Returns
     -------
     LevelTrack
-        At most :data:`_MOST_BINS` of them.
+        At most :data:`_MOST_BINS` levels.
     """
     time, place, level = (np.asarray(v, dtype=np.float64) for v in (time_s, position_m, level_db))
     finite = np.isfinite(level) & np.isfinite(place).all(axis=1) & np.isfinite(time)
     time, place, level = time[finite], place[finite], np.maximum(level[finite], floor_db)
     if not len(time):
         return LevelTrack(time, place, level, floor_db)
-    # a little longer, or the last instant would have a bin of its own
+    # a little longer, or the last sample would have its own bin
     window = max(WINDOW_S, float(np.ptp(time)) / _MOST_BINS * 1.001)
     groups = np.unique(((time - time.min()) // window).astype(np.int64), return_inverse=True)[1]
     order = np.argsort(groups, kind="stable")
@@ -164,7 +247,7 @@ def level_track(
 
 @dataclass(frozen=True, slots=True)
 class Fits:
-    """Log evidence of places (m,), and slope and its standard deviation (m,) if the node is there."""
+    """The log evidence of places (m,), and the slope and its standard deviation (m,) if the node is there."""
 
     evidence: FloatArray
     slope: FloatArray
@@ -172,7 +255,7 @@ class Fits:
 
 
 def fit_places(track: LevelTrack, places_m: ArrayLike, model: LevelModel = UNKNOWN) -> Fits:
-    """Log evidence of the levels if the node stood at each of some places.
+    """Compute the log evidence of the levels if the node is at each of some places.
 
     Parameters
     ----------
@@ -184,85 +267,158 @@ def fit_places(track: LevelTrack, places_m: ArrayLike, model: LevelModel = UNKNO
 
     Notes
     -----
-    The level is mean + F c + noise, c ~ N(0, 1): level at 100 m, slope, two terms of the elevation, and the leading
-    terms of the shadowing's Karhunen-Loeve expansion, whose rest is noise. A level above the floor says what it is,
-    one below says P(level < floor). The evidence is Laplace's approximation at the maximum of the posterior
-    (Rasmussen and Williams, 2006, section 3.4): exact where no level lies below the floor.
+    The level is mean + F c + shadowing + scatter, c ~ N(0, 1). The terms of F are the level at 100 m, the slope, two
+    of the elevation, four of the azimuth at the node, and eight of the direction in the frame of the airframe. Levels
+    above the floor have a normal distribution. Those below have the probability to be there, given the others, by
+    Laplace's approximation at the maximum of the posterior (Rasmussen and Williams, 2006, section 3.4).
     """
     places = unmasked(places_m).reshape(-1, 3)
-    shadow, noise = _shadowing(track, model)
-    parts = [_fit(track, places[i : i + _AT_ONCE], shadow, noise, model) for i in range(0, len(places), _AT_ONCE)]
-    return Fits(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    shadows = {case.shadow: _Shadowing.of(track, case) for case in model.cases}
+    parts = [_fit(track, places[i : i + _AT_ONCE], model, shadows) for i in range(0, len(places), _AT_ONCE)]
+    return Fits(*np.concatenate(parts, axis=1))
 
 
-def _shadowing(track: LevelTrack, model: LevelModel) -> tuple[FloatArray, float]:
-    """Leading terms (n, k) of the shadowing's covariance, and the standard deviation of what else scatters."""
-    lag = np.abs(track.time_s[:, None] - track.time_s)
-    variance, vectors = np.linalg.eigh(model.shadow_sd_db**2 * np.exp(-lag / _SHADOW_S))
-    terms = vectors[:, -_TERMS:] * np.sqrt(np.maximum(variance[-_TERMS:], 0.0))
-    unresolved = max(float(variance[:-_TERMS].sum()), 0.0) / len(lag)
-    return terms, float(np.hypot(model.scatter_sd_db, np.sqrt(unresolved)))
+@dataclass(frozen=True, slots=True)
+class _Shadowing:
+    """Shadowing and scatter of the levels of a track.
+
+    ``root`` (k, k) is the inverse lower root of the covariance of the k levels above the floor. ``across`` (j, k) times
+    their whitened values predicts the shadowing of the j levels below the floor, with the covariance ``left`` (j, j).
+    """
+
+    root: FloatArray
+    across: FloatArray
+    left: FloatArray
+
+    @classmethod
+    def of(cls, track: LevelTrack, case: Case) -> _Shadowing:
+        apart = np.linalg.norm(track.position_m[:, None] - track.position_m, axis=-1) / case.length_m
+        lag = np.abs(track.time_s[:, None] - track.time_s) / case.time_s
+        shadow, seen = case.shadow_db**2 * np.exp(-apart - lag), ~track.below
+        root = np.linalg.inv(np.linalg.cholesky(shadow[seen][:, seen] + case.scatter_db**2 * np.eye(seen.sum())))
+        across = shadow[~seen][:, seen] @ root.T
+        return cls(root, across, shadow[~seen][:, ~seen] - across @ across.T)
 
 
-def _features(track: LevelTrack, places: FloatArray, model: LevelModel) -> tuple[FloatArray, FloatArray]:
-    """Mean (m, n) of the level before one was seen, and what coefficients of unit variance add (m, n, 4)."""
+def _features(track: LevelTrack, places: FloatArray, model: LevelModel, learned: bool) -> FloatArray:
+    """Return what coefficients of unit variance add to a level, and the level above its mean last (n, m, terms + 1)."""
     ray = track.position_m[None] - places[:, None]
     across = np.hypot(ray[..., 0], ray[..., 1])
-    # of 100 m; nearer than a metre no law of the distance holds
+    # relative to 100 m; below one metre the level does not follow the distance
     decades = np.log10(np.maximum(np.hypot(across, ray[..., 2]), 1.0) / 100.0)
-    elevation = elevation_rad(ray)
+    elevation, towards = elevation_rad(ray), ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9)
+    east, north, _ = np.moveaxis(towards, -1, 0)
     columns = [
         np.full(across.shape, _FREE_DB),
         -10.0 * model.slope_sd * decades,
         model.elevation_sd_db * np.sin(elevation) ** 2,
         0.5 * model.elevation_sd_db * np.cos(4.0 * elevation),
+        *(east, north, 0.7 * (east**2 - north**2), 1.4 * east * north),
     ]
-    mean = 0.5 * float(track.level_db.max() + track.level_db.min()) - 10.0 * model.slope * decades
-    if track.airframe_db is not None:
-        mean = mean + track.airframe_db(-ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9))
-    return mean, np.stack(columns, axis=-1)
+    at_uav = -towards if track.rotation is None else np.einsum("nji,mnj->mni", track.rotation, -towards)
+    x, y, z = np.moveaxis(at_uav, -1, 0)
+    second = [1.7 * x * y, 1.7 * x * z, 1.7 * y * z, 0.9 * (x**2 - y**2), 0.6 * (3.0 * z**2 - 1.0)]
+    gain_db, sd_db = (0.0, 1.0) if track.airframe_db is None or not learned else track.airframe_db(at_uav, towards)
+    columns += [sd_db * term for term in (x, y, z, *second)]
+    middle = 0.5 * float(track.level_db.max() + track.level_db.min())
+    columns.append(track.level_db - (middle - 10.0 * model.slope * decades + gain_db))
+    return np.ascontiguousarray(np.stack(columns, axis=-1).swapaxes(0, 1))
+
+
+# Numbers of terms: level, slope and elevation; azimuth; airframe.
+_TERMS = (4, 4, 8)
 
 
 def _fit(
-    track: LevelTrack, places: FloatArray, shadow: FloatArray, noise: float, model: LevelModel
-) -> tuple[FloatArray, ...]:
-    mean, features = _features(track, places, model)
-    terms = np.concatenate([features, np.broadcast_to(shadow, (len(places), *shadow.shape))], axis=2)
-    eye = np.eye(terms.shape[2])
-    latent = np.broadcast_to(track.level_db, mean.shape)
-    for _ in range(_STEPS):
-        _, gradient, weight = _likelihood(track, latent, noise)
-        precision = eye + terms.swapaxes(1, 2) @ (weight[:, :, None] * terms)
-        pull = terms.swapaxes(1, 2) @ (weight * (latent - mean) + gradient)[:, :, None]
-        coefficient = np.linalg.solve(precision, pull)[:, :, 0]
-        before, latent = latent, mean + np.einsum("mnq,mq->mn", terms, coefficient)
-        if not track.below.any() or np.abs(latent - before).max() < _SETTLED_DB:
-            break
-    value, _, weight = _likelihood(track, latent, noise)
-    if track.below.any():  # else the weight is that of the noise wherever the levels lie
-        precision = eye + terms.swapaxes(1, 2) @ (weight[:, :, None] * terms)
-    evidence = value - 0.5 * (coefficient**2).sum(axis=1) - 0.5 * np.linalg.slogdet(precision)[1]
-    slope_sd = model.slope_sd * np.sqrt(np.linalg.inv(precision)[:, 1, 1])
-    return evidence, model.slope + model.slope_sd * coefficient[:, 1], slope_sd
+    track: LevelTrack, places: FloatArray, model: LevelModel, shadows: dict[tuple[float, ...], _Shadowing]
+) -> FloatArray:
+    """Return log evidence, slope and its standard deviation (3, m), over all cases."""
+    from scipy.special import logsumexp
+
+    features = {learned: _features(track, places, model, learned) for learned in {c.learned for c in model.cases}}
+    evidence, slope, variance = fits = np.empty((3, len(model.cases), len(places)))
+    whitened: dict[tuple[object, ...], tuple[FloatArray, FloatArray]] = {}
+    for number, case in enumerate(model.cases):
+        key = (case.shadow, case.learned)
+        if key not in whitened:
+            whitened = {key: _whitened(features[case.learned], ~track.below, shadows[case.shadow])}
+        fits[:, number] = _fit_case(case, *whitened[key], shadows[case.shadow])
+    evidence += np.array([[case.log_weight] for case in model.cases])
+    total = logsumexp(evidence, axis=0)
+    share = np.exp(evidence - total)
+    mean = (share * slope).sum(axis=0)
+    spread = np.sqrt((share * (variance + (slope - mean) ** 2)).sum(axis=0))
+    return np.array([total, model.slope + model.slope_sd * mean, model.slope_sd * spread])
+
+
+def _whitened(features: FloatArray, seen: BoolArray, shadow: _Shadowing) -> tuple[FloatArray, FloatArray]:
+    """Return whitened features (m, k, terms + 1) above the floor, and what these leave of those below (m, j, ...)."""
+    flat = features.reshape(len(features), -1)
+    above = shadow.root @ flat[seen]
+    below = flat[~seen] - shadow.across @ above
+    apart = [part.reshape(len(part), *features.shape[1:]).swapaxes(0, 1) for part in (above, below)]
+    return apart[0], apart[1]
+
+
+def _fit_case(case: Case, above: FloatArray, below: FloatArray, shadow: _Shadowing) -> tuple[FloatArray, ...]:
+    """Return log evidence, standardised slope and its variance (m,) for one case."""
+    scale = np.repeat([1.0, case.azimuth_db, case.airframe_db], _TERMS)
+    gram = above.swapaxes(1, 2) @ above
+    root = np.linalg.cholesky(np.eye(len(scale)) + scale[:, None] * gram[:, :-1, :-1] * scale)
+    inverse = np.linalg.inv(root)
+    pull = (inverse @ (scale * gram[:, :-1, -1])[:, :, None])[:, :, 0]
+    size = np.log(np.diag(shadow.root)).sum() - above.shape[1] * _LOG_ROOT_TAU
+    size -= np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    evidence = 0.5 * ((pull**2).sum(axis=1) - gram[:, -1, -1]) + size
+    if below.shape[1]:
+        terms = (scale * below[:, :, :-1]) @ inverse.swapaxes(1, 2)
+        mean = (terms @ pull[:, :, None])[:, :, 0] - below[:, :, -1]
+        held, force = _below_floor(mean, shadow.left + terms @ terms.swapaxes(1, 2), case.scatter_db)
+        evidence, pull = evidence + held, pull + (terms.swapaxes(1, 2) @ force[:, :, None])[:, :, 0]
+    # the variance of the slope is that given the levels above the floor: the others hardly narrow it
+    return evidence, (inverse[:, :, 1] * pull).sum(axis=1), (inverse[:, :, 1] ** 2).sum(axis=1)
 
 
 _LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))
 
 
-def _likelihood(track: LevelTrack, latent: FloatArray, noise: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Log likelihood (m,) of the levels, its gradient (m, n), and minus its second derivative (m, n)."""
+def _below_floor(mean: FloatArray, covariance: FloatArray, scatter_db: float) -> tuple[FloatArray, FloatArray]:
+    """Return the log probability (m,) that levels are below the floor, and how the floor pulls them (m, j) [1 / dB].
+
+    Parameters
+    ----------
+    mean, covariance : (m, j) and (m, j, j)
+        Moments of the levels relative to the floor, given those above it, without scatter [dB, dB^2].
+    scatter_db : float
+    """
+    eye, latent = np.eye(mean.shape[1]), np.minimum(mean, 0.0)
+    for _ in range(_STEPS):
+        _, gradient, weight = _likelihood(latent, scatter_db)
+        root = np.sqrt(weight)
+        matrix = eye + root[:, :, None] * covariance * root[:, None, :]
+        target = weight * (latent - mean) + gradient
+        moved = root * (covariance @ target[:, :, None])[:, :, 0]
+        force = target - root * np.linalg.solve(matrix, moved[:, :, None])[:, :, 0]
+        before, latent = latent, mean + (covariance @ force[:, :, None])[:, :, 0]
+        if np.abs(latent - before).max() < _SETTLED_DB:
+            break
+    value, _, weight = _likelihood(latent, scatter_db)
+    root = np.sqrt(weight)
+    size = np.linalg.slogdet(eye + root[:, :, None] * covariance * root[:, None, :])[1]
+    return value.sum(axis=1) - 0.5 * (force * (latent - mean)).sum(axis=1) - 0.5 * size, force
+
+
+def _likelihood(latent: FloatArray, scatter_db: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the log probability of scattered levels to be below zero, its gradient, and minus its curvature (m, j)."""
     from scipy.special import log_ndtr
 
-    z = (track.level_db - latent) / noise  # a level below the floor stands at it
-    log_below = log_ndtr(z)
-    hazard = np.exp(-0.5 * z * z - _LOG_ROOT_TAU - log_below)
-    value = np.where(track.below, log_below, -0.5 * z * z - _LOG_ROOT_TAU - np.log(noise))
-    gradient = np.where(track.below, -hazard, z) / noise
-    weight = np.where(track.below, np.clip(hazard * (hazard + z), 1e-12, 1.0), 1.0) / noise**2
-    return value.sum(axis=1), gradient, weight
+    z = -latent / scatter_db
+    value = log_ndtr(z)
+    hazard = np.exp(-0.5 * z * z - _LOG_ROOT_TAU - value)
+    return value, -hazard / scatter_db, np.clip(hazard * (hazard + z), 1e-12, 1.0) / scatter_db**2
 
 
-# Cells of the regions [m] and their largest number; parts of a region that hold less are none.
+# Cells of the regions [m] and their largest number. Smaller parts of a region are ignored.
 _CELL_M, _MOST_CELLS, _LEAST_SHARE = 5.0, 1_000_000, 0.03
 
 
@@ -275,9 +431,9 @@ class Mode:
     place_m : (2,)
         Its likeliest place, east and north.
     share : float
-        Of the posterior that it holds.
+        Share of the posterior in this part.
     radius_m : float
-        About the place, that holds nine tenths of it.
+        Radius about the place within which nine tenths of this part are.
     """
 
     place_m: FloatArray
@@ -287,14 +443,14 @@ class Mode:
 
 @dataclass(frozen=True, slots=True)
 class Regions:
-    """Posterior of a node's place in cells.
+    """The posterior of a node's place in cells.
 
     Parameters
     ----------
     east_m, north_m : (columns,), (rows,)
         Middles of the cells.
     share : (columns, rows)
-        Of the posterior in each cell; 1 in all.
+        Share of the posterior in each cell. The sum is 1.
     """
 
     east_m: FloatArray
@@ -303,7 +459,7 @@ class Regions:
 
     @classmethod
     def of(cls, places: FloatArray, share: FloatArray, sd_m: float = SYSTEMATIC_M) -> Regions:
-        """Blur the shares (m,) of places (m, 2 or more) by a standard deviation per axis [m]."""
+        """Return the shares (m,) of places (m, 2 or more), blurred by a standard deviation per axis [m]."""
         reach = 4.0 * sd_m
         area = float(np.prod(np.ptp(places[:, :2], axis=0) + 2.0 * reach))
         cell = max(_CELL_M * sd_m / SYSTEMATIC_M, float(np.sqrt(area / _MOST_CELLS)))
@@ -311,18 +467,24 @@ class Regions:
         density = _blurred(places, share, axes, sd_m)
         return cls(axes[0], axes[1], density / density.sum())
 
+    def likeliest(self) -> FloatArray:
+        """Return the middle (2,) of the likeliest cell."""
+        # rounded: a place and its mirror image differ in the last digit alone
+        column, row = np.unravel_index(self.share.round(12).argmax(), self.share.shape)
+        return np.array([self.east_m[column], self.north_m[row]])
+
     def likelier(self) -> FloatArray:
-        """Part of the posterior in all cells that are likelier than each (columns, rows)."""
+        """Return the share of the posterior in all cells that are likelier than each cell (columns, rows)."""
         order = np.argsort(-self.share, axis=None)
         held = np.empty(self.share.size)
         held[order] = np.cumsum(self.share.ravel()[order]) - self.share.ravel()[order]
         return held.reshape(self.share.shape)
 
     def modes(self, part: float = 0.9) -> tuple[Mode, ...]:
-        """Connected parts of the region that holds a part of the posterior, the likeliest first."""
+        """Return the connected parts of the region that contains a share of the posterior, the likeliest first."""
         from scipy.ndimage import label
 
-        # cells that touch at a corner are of one region
+        # cells that touch at a corner are connected
         marks, count = label(self.likelier() < part, structure=np.ones((3, 3)))
         out = []
         for number in range(1, count + 1):
@@ -334,13 +496,16 @@ class Regions:
         return tuple(sorted((mode for mode in out if mode.share >= _LEAST_SHARE), key=lambda mode: -mode.share))
 
     def radius_m(self, place_m: FloatArray, part: float) -> float:
-        """Radius of the circle about a place that holds a part of the posterior."""
+        """Return the radius of the circle about a place that contains a share of the posterior."""
         east, north = np.meshgrid(self.east_m - place_m[0], self.north_m - place_m[1], indexing="ij")
         return _within(np.column_stack([east.ravel(), north.ravel()]), self.share.ravel(), part)
 
 
 def _blurred(places: FloatArray, share: FloatArray, axes: Sequence[FloatArray], sd_m: float) -> FloatArray:
-    """Return the blurred shares on a grid (columns, rows); places lie on a lattice, so each axis is blurred alone."""
+    """Return the blurred shares on a grid (columns, rows).
+
+    Places are on a lattice, so that each axis is blurred alone.
+    """
     (east, i), (north, j) = (np.unique(p.round(6), return_inverse=True) for p in places.T[:2])
     lattice = np.zeros((len(east), len(north)))
     np.add.at(lattice, (i, j), share)
@@ -351,7 +516,7 @@ def _blurred(places: FloatArray, share: FloatArray, axes: Sequence[FloatArray], 
 
 
 def _within(step_m: FloatArray, share: FloatArray, part: float) -> float:
-    """Length of steps (n, 2) within which lies a part of their shares (n,)."""
+    """Return the length of steps (n, 2) within which a part of their shares (n,) is."""
     away = np.hypot(*step_m.T)
     order = np.argsort(away)
     held = np.cumsum(share[order])
@@ -360,24 +525,24 @@ def _within(step_m: FloatArray, share: FloatArray, part: float) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeEstimate:
-    """Place of a node by the levels of a flight.
+    """The place of a node, estimated from the levels of a flight.
 
     Parameters
     ----------
     place_m : (3,)
         East, north and height above ground of the likeliest place.
     radius90_m : float
-        Circle about it that holds 90 % of the posterior.
+        Radius about the place that contains 90 % of the posterior.
     height_m : (low, high)
-        Heights that are not shown to be wrong.
+        Range of the heights that are possible.
     slope, slope_sd : float
         Exponent of the distance and its standard deviation.
     anywhere : float
         Log evidence of any place within reach.
     placed : bool
-        The levels fit a place within reach better than one so far away that they would not change.
+        The levels fit a place within reach better than a place 30 km away.
     at_edge : bool
-        More than a few percent lie at the edge of the search: the node may stand farther away.
+        More than a few percent of the posterior are at the edge of the search: the node may be farther away.
     regions : Regions
     """
 
@@ -393,7 +558,7 @@ class NodeEstimate:
 
 
 def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
-    """Place, height and slope that explain the levels of a flight best.
+    """Estimate the place, height and slope that explain the levels of a flight best.
 
     Parameters
     ----------
@@ -409,7 +574,8 @@ def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
 
     Notes
     -----
-    Evidence over a grid of places at :data:`_HEIGHTS_M`; the posterior is blurred by :data:`SYSTEMATIC_M`.
+    Evidence over a grid of places at :data:`_HEIGHTS_M`, and a prior by the distance from the track; the posterior is
+    blurred by :data:`SYSTEMATIC_M`.
     """
     from scipy.special import logsumexp
 
@@ -419,29 +585,32 @@ def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
             expected=f"{FEWEST}",
             cause="a short flight, or logs of two flights",
         )
-    grid, spacing = _grid(track)
+    track, (grid, spacing) = _thinned(track), _grid(track)
+    if model is UNKNOWN:
+        cases = model.cases if track.rotation is not None else _UNTURNED
+        known = () if track.airframe_db is None else tuple(case.with_airframe() for case in UNKNOWN.cases)
+        model = replace(model, cases=cases + known)
+    model = _likely_cases(track, grid, model)
     places, evidence, step, anywhere = _searched(track, grid, spacing, model)
     afar = fit_places(track, track.position_m[:1] + np.array([_AFAR_M, 0.0, 0.0]), model).evidence[0]
-    places = places[evidence > evidence.max() - _POSSIBLE]
-    if len(places) <= _MOST_REFINED:
-        places = _divided(places, (-step / 3.0, 0.0, step / 3.0))
+    order = np.argsort(-evidence, kind="stable")[: np.count_nonzero(evidence > evidence.max() - _POSSIBLE)]
+    fine = _divided(places[order[:_MOST_REFINED]], (-step / 3.0, 0.0, step / 3.0))
+    places = np.concatenate([fine, places[order[_MOST_REFINED:]]])
     fits = fit_places(track, places, model)
-    log_share = fits.evidence + _log_prior(places)
+    log_share = fits.evidence + _log_height(places) + _log_near(track, places)
+    log_share[: len(fine)] -= np.log(9.0)
     share = np.exp(log_share - logsumexp(log_share))
     # places that are far apart are blurred more: the region must not fall into spots
-    sd_m = SYSTEMATIC_M * step / _SPACING_M
-    (east, i), (north, j) = (np.unique(p.round(6), return_inverse=True) for p in places.T[:2])
-    density = _blurred(places, share, (east, north), sd_m)[i, j]
-    # rounded: a place and its mirror image differ in the last digit alone
-    best = int(np.lexsort((-share, -density.round(12)))[0])
-    regions = Regions.of(places, share, sd_m)
+    regions = Regions.of(places, share, SYSTEMATIC_M * step / _SPACING_M)
+    best = Regions.of(places, share, _SMOOTH_M * step / _SPACING_M).likeliest()
+    nearest = int(np.hypot(*(places[:, :2] - best).T).argmin())
     heights = [h for h in _HEIGHTS_M if share[places[:, 2] == h].sum() > 0.05]
     return NodeEstimate(
-        place_m=places[best],
-        radius90_m=regions.radius_m(places[best], 0.9),
+        place_m=np.array([*best, places[share.argmax(), 2]]),
+        radius90_m=regions.radius_m(best, 0.9),
         height_m=(min(heights), max(heights)),
-        slope=float(fits.slope[best]),
-        slope_sd=float(fits.slope_sd[best]),
+        slope=float(fits.slope[nearest]),
+        slope_sd=float(fits.slope_sd[nearest]),
         anywhere=anywhere,
         placed=bool(fits.evidence.max() - afar > _PLACED_ODDS),
         at_edge=bool(share[_on_edge(places, grid, spacing)].sum() > _LEAST_SHARE),
@@ -449,8 +618,47 @@ def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
     )
 
 
-def _log_prior(places: FloatArray) -> FloatArray:
-    """Of the height of places (m, 3)."""
+def _thinned(track: LevelTrack) -> LevelTrack:
+    """Return the track with at most :data:`_MOST_BELOW` of its levels below the floor."""
+    below = np.flatnonzero(track.below)
+    keep = ~track.below
+    keep[below[spread_out(len(below), _MOST_BELOW)]] = True
+    rotation = None if track.rotation is None else track.rotation[keep]
+    time, place, level = track.time_s[keep], track.position_m[keep], track.level_db[keep]
+    return replace(track, time_s=time, position_m=place, level_db=level, rotation=rotation)
+
+
+def _likely_cases(track: LevelTrack, grid: FloatArray, model: LevelModel) -> LevelModel:
+    """Return the model with its likely cases alone, by the places of a grid (n, 2) that fit one case best."""
+    from scipy.special import logsumexp
+
+    if len(model.cases) <= _MOST_CASES:
+        return model
+    places = _at_heights(grid)
+    usual = fit_places(track, places, replace(model, cases=(_USUAL,))).evidence + _log_near(track, places)
+    order = np.argsort(-usual, kind="stable")[: np.count_nonzero(usual > usual.max() - _POSSIBLE)]
+    places = places[order[spread_out(len(order), _JUDGED)]]
+    each = [fit_places(track, places, replace(model, cases=(case,))).evidence for case in model.cases]
+    odds = logsumexp(np.array(each) + _log_near(track, places), axis=1)
+    likely = [i for i in np.argsort(-odds, kind="stable")[:_MOST_CASES] if odds[i] > odds.max() - _LIKELY]
+    return replace(model, cases=tuple(model.cases[i] for i in sorted(likely)))
+
+
+# A radio is near the track that was flown for it: a Cauchy distribution in the plane. Its width is that of the track
+# (root mean square distance from its centre) times this factor, or that for towers [m].
+_NEAR, _NEAR_TOWERS_M = 1.5, 150.0
+
+
+def _log_near(track: LevelTrack, places: FloatArray, width_m: float | None = None) -> FloatArray:
+    """Return the log prior (m,) of places (m, 3) by their distance from the track."""
+    flat = track.position_m[:, :2]
+    width_m = width_m or max(_NEAR * float(np.sqrt(flat.var(axis=0).sum())), _SPACING_M)
+    away = [np.hypot(*(place[:2] - flat).T).min() for place in places]
+    return np.asarray(-1.5 * np.log1p((np.array(away) / width_m) ** 2))
+
+
+def _log_height(places: FloatArray) -> FloatArray:
+    """Return the log prior of the height of places (m, 3)."""
     return np.log([_HEIGHTS_M[height] for height in places[:, 2].tolist()])
 
 
@@ -482,13 +690,14 @@ def _searched(
 
     places, weight, others = _at_heights(grid), -float(np.log(len(grid))), list[FloatArray]()
     while True:
-        evidence = fit_places(track, places, model).evidence + _log_prior(places)
+        evidence = fit_places(track, places, model).evidence + _log_height(places)
         possible = np.count_nonzero(evidence > evidence.max() - _POSSIBLE)
         if spacing_m <= _SPACING_M or possible > _MOST_DIVIDED:
             break
         order = np.argsort(-evidence, kind="stable")
-        others.append(evidence[order[_MOST_DIVIDED:]] + weight)
-        places = _divided(places[order[:_MOST_DIVIDED]], (-spacing_m / 4.0, spacing_m / 4.0))
+        count = min(np.count_nonzero(evidence > evidence.max() - 2.0 * _POSSIBLE), _MOST_DIVIDED)
+        others.append(evidence[order[count:]] + weight)
+        places = _divided(places[order[:count]], (-spacing_m / 4.0, spacing_m / 4.0))
         spacing_m, weight = spacing_m / 2.0, weight - float(np.log(4.0))
     return places, evidence, spacing_m, float(logsumexp(np.concatenate([*others, evidence + weight])))
 
@@ -504,68 +713,37 @@ def _divided(places: FloatArray, steps_m: Sequence[float]) -> FloatArray:
     return np.asarray((places[:, None] + moved).reshape(-1, 3))
 
 
-# Of a known place against any: nearly free space, with antennas of which nothing is known; chosen on made flights.
-_RIVAL = LevelModel(slope=2.1, slope_sd=0.3, elevation_sd_db=4.0, scatter_sd_db=1.5)
-# What azimuth adds at the node, and the directions of an airframe at the UAV (spherical harmonics of degrees 1 and 2).
-_AZIMUTH_SD_DB, _AIRFRAME_SD_DB = 0.8, 1.5
-# Shadowing [dB] and its length [m] that are tried: the levels weigh them.
-_SHADOWS = ((2.5, 15.0), (2.5, 45.0), (4.5, 15.0), (4.5, 45.0))
-# A radio stands near the track that was flown for it: a Cauchy distribution in the plane, of this width.
-_NEAR_M = 150.0
-_RIVAL_SPACING_M = 60.0
+# A known place against any other: nearly free space, and antennas about which nothing is known. Chosen on simulated
+# flights.
+_TOWERS = LevelModel(
+    slope=2.1,
+    slope_sd=0.3,
+    elevation_sd_db=4.0,
+    cases=tuple(
+        Case(shadow_db=sd, length_m=length, scatter_db=1.5).with_gains(*_GAINS)
+        for sd, length in product((2.5, 4.5), (15.0, 45.0))
+    ),
+)
+_TOWER_SPACING_M = 60.0
 
 
 def place_odds(track: LevelTrack, known_m: ArrayLike) -> FloatArray:
-    """Log odds (k,) of known places, such as towers, against any place about the track, where no antenna is known.
+    """Return the log odds (k,) of known places, such as towers, against any place about the track.
 
     Place, gain, slope and antennas are integrated over: a place wins only by more than its freedom gives.
 
     Parameters
     ----------
     track : LevelTrack
-        Levels below the floor count as at it.
+        Its antennas count as unknown, and levels below the floor as levels at the floor.
     known_m : (k, 3)
     """
     from scipy.special import logsumexp
 
-    known, (grid, _) = unmasked(known_m).reshape(-1, 3), _grid(track, _RIVAL_SPACING_M)
+    known, (grid, _) = unmasked(known_m).reshape(-1, 3), _grid(track, _TOWER_SPACING_M)
     free = _at_heights(grid)
     places = np.concatenate([known, free])
-    away = np.hypot(*(places[:, None, :2] - track.position_m[:, :2]).transpose(2, 0, 1)).min(axis=1)
-    shadows = [_inverse_root(track, *shadow) for shadow in _SHADOWS]
-    parts = [_rival_evidence(track, places[i : i + _AT_ONCE], shadows) for i in range(0, len(places), _AT_ONCE)]
-    share = np.concatenate(parts) - 1.5 * np.log1p((away / _NEAR_M) ** 2)
-    return np.asarray(share[: len(known)] + np.log(len(grid)) - logsumexp(share[len(known) :] + _log_prior(free)))
-
-
-def _inverse_root(track: LevelTrack, sd_db: float, length_m: float) -> FloatArray:
-    """Inverse (n, n) of the lower root of the covariance of shadowing and scatter."""
-    apart = np.linalg.norm(track.position_m[:, None] - track.position_m, axis=-1)
-    covariance = sd_db**2 * np.exp(-apart / length_m) + _RIVAL.scatter_sd_db**2 * np.eye(len(apart))
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
-
-
-def _rival_evidence(track: LevelTrack, places: FloatArray, shadows: Sequence[FloatArray]) -> FloatArray:
-    """Log evidence (m,) of the levels at places, over the shadows that are tried."""
-    from scipy.special import logsumexp
-
-    mean, features = _features(track, places, _RIVAL)
-    ray = track.position_m[None] - places[:, None]
-    towards = ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9)
-    east, north, _ = np.moveaxis(towards, -1, 0)
-    more = _AZIMUTH_SD_DB * np.stack([east, north, 0.7 * (east**2 - north**2), 1.4 * east * north], axis=-1)
-    terms = [features, more]
-    if track.rotation is not None:
-        x, y, z = np.moveaxis(np.einsum("nji,mnj->mni", track.rotation, -towards), -1, 0)
-        second = [1.7 * x * y, 1.7 * x * z, 1.7 * y * z, 0.9 * (x**2 - y**2), 0.6 * (3.0 * z**2 - 1.0)]
-        terms.append(_AIRFRAME_SD_DB * np.stack([x, y, z, *second], axis=-1))
-    columns = np.concatenate(terms, axis=-1)
-    evidence = []
-    for root in shadows:
-        left, white = (track.level_db - mean) @ root.T, root @ columns
-        precision = np.eye(white.shape[2]) + white.swapaxes(1, 2) @ white
-        pull = (white.swapaxes(1, 2) @ left[:, :, None])[:, :, 0]
-        gain = (pull * np.linalg.solve(precision, pull[:, :, None])[:, :, 0]).sum(axis=1)
-        size = np.log(np.diag(root)).sum() - 0.5 * np.linalg.slogdet(precision)[1]
-        evidence.append(0.5 * (gain - (left**2).sum(axis=1)) + size)
-    return np.asarray(logsumexp(evidence, axis=0))
+    share = fit_places(replace(track, floor_db=-np.inf), places, _TOWERS).evidence + _log_near(
+        track, places, _NEAR_TOWERS_M
+    )
+    return np.asarray(share[: len(known)] + np.log(len(grid)) - logsumexp(share[len(known) :] + _log_height(free)))

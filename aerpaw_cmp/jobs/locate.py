@@ -1,4 +1,4 @@
-"""The ``locate`` job: where the ground end of a link stands, by the levels that a flight measured."""
+"""The ``locate`` job: estimate the position of the ground end of a link from the levels of a flight."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ..common.errors import InputError, UsageError
 from ..common.jsonable import json_object
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
-from ..compare.locate import UNKNOWN, LevelModel, LevelTrack, NodeEstimate, locate
+from ..compare.locate import LevelTrack, NodeEstimate, locate
 from ..flight.data import check_place, choose_site, is_ratio, read_logs, site_place
 from ..flight.drafting.draft import receiver_floor_db
-from ..flight.drafting.proposals import Placer, taught
-from ..flight.gains import load_with_learned, spread_of
+from ..flight.drafting.proposals import Placer, searching_airframe
+from ..flight.gains import load_with_learned
 from ..flight.rows import LOCK_FLOOR_DB, is_sounder_power
 from ..flight.settings import FlightFile
 from ..flight.training import mark_of
@@ -32,16 +32,16 @@ from .tasks import inputs_of_flight
 
 
 def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None = None) -> JobOutcome:
-    """Place of the unknown node and its regions, as a page and numbers.
+    """Estimate the position of an unknown node, and write its regions as a page and numbers.
 
     Parameters
     ----------
     flight : Path
-        flight.yaml with telemetry and a log of levels; where its node stands is not asked.
+        flight.yaml with telemetry and a log of levels. The position of its node is not used.
     options : RunOptions
         ``out`` is ``reports/locate-NAME`` by default.
     channel : str, optional
-        By default the first of the logs.
+        Channel of the levels, by default the first one in the logs.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
     Raises
     ------
     UsageError, InputError
-        No telemetry, no such channel, too few levels.
+        There is no telemetry or no such channel, there are too few levels, or they do not determine a place.
     """
     settings, stages = load_with_learned(flight), Stages(options.progress)
     inputs = inputs_of_flight(settings, flight, options.logs_root)
@@ -65,15 +65,15 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
         with stages("locate"):
             floor = LOCK_FLOOR_DB if is_sounder_power(level) else receiver_floor_db([level])
             track = Placer(site, vehicle).levels(level, -np.inf if floor is None else floor, uav, node)
-            estimate = locate(track, model=UNKNOWN if node is None else _model_of(node))
+            estimate = locate(track)
         if not estimate.placed:
             raise InputError(
-                "the levels tell no place: they fit a node 30 km away as well",
+                "the levels do not determine a place: they fit a node 30 km away as well",
                 expected="levels that fall with the distance",
                 cause="a receiver that logs one value, a hover, or a node far beyond the flight",
                 path=flight,
             )
-        assumed = "unknown, one gain over the elevation" if node is None else f"{node.name}, learned on other flights"
+        assumed = "unknown" if node is None else f"{node.name}, learned on other flights"
         ends = f"Antenna of the UAV: {'unknown' if uav is None else uav.name}. Antenna of the node: {assumed}."
         numbers = {"flight": settings.flight.name, "channel": level.channel, **_numbers(site, track, estimate, ends)}
         numbers["warnings"] = (*cautions, *numbers["warnings"])
@@ -86,7 +86,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
 def _streams(
     settings: FlightFile, flight: Path, logs_root: Path | None, channel: str | None
 ) -> tuple[Stream, IngestedFile, Stream]:
-    """Telemetry with most rows; the chosen levels and their file."""
+    """Return the telemetry with most rows, the file of the chosen levels, and these levels."""
     streams = [(f, stream) for f in read_logs(settings, flight.parent, logs_root) for stream in f.result.streams]
     vehicles = [s for _, s in streams if s.kind == "telemetry"]
     levels = {s.channel: (f, s) for f, s in reversed(streams) if s.kind == "rss" and not is_ratio(s)}
@@ -101,19 +101,20 @@ def _streams(
 def _antennas(
     settings: FlightFile, flight: Path, logs_root: Path | None, site: Site, log: tuple[IngestedFile, Stream]
 ) -> tuple[MeasuredPattern | None, MeasuredPattern | None]:
-    """Antennas of node and airframe that the flight file or else the site knows; none that this very log taught."""
+    """Return the antennas of node and airframe in the flight file, else the airframe that the site has learned.
+
+    An airframe that was learned from this log is not used.
+    """
     file, level = log
-    # by no tower's name: its antennas are those of link.rss.tower
+    # not by the name of a tower: antennas of the node are those of link.rss.tower
     known = settings.link.of(level.channel).build(["node"], logs_root or flight.parent)
     node, uav = (array.patterns[0] for array in (known.tower_arrays["node"], known.uav_array))
     if isinstance(uav, MeasuredPattern) and file.sha256 not in uav.trained_on:
         return node if isinstance(node, SpherePattern) else None, uav
-    mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
     if not is_sounder_power(level):
         return None, None
-    every = taught(site_place(settings.site.file, flight.parent), (file.sha256, mark), loses_lock=True)
-    both = (ends for name, each in every.items() if name not in site.towers for ends in each)
-    return next(((ends.tower, ends.uav) for ends in both), (None, None))
+    mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
+    return None, searching_airframe(site_place(settings.site.file, flight.parent), site.towers, (file.sha256, mark))
 
 
 def _cautions(settings: FlightFile, channel: str, uav: MeasuredPattern | None) -> list[str]:
@@ -130,46 +131,44 @@ def _cautions(settings: FlightFile, channel: str, uav: MeasuredPattern | None) -
     return list(dict.fromkeys(texts))
 
 
-def _model_of(node: Any) -> LevelModel:
-    """Levels about antennas that are known at both ends, near free space."""
-    spread = spread_of(node.spread)
-    scatter_db = spread.noise_sd_db or UNKNOWN.scatter_sd_db
-    return LevelModel(slope=2.0, slope_sd=0.2, elevation_sd_db=spread.own_sd_db, scatter_sd_db=scatter_db)
-
-
 def _numbers(site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -> dict[str, Any]:
-    """Numbers and sentences on the node for metrics.json and the page; ``ends`` is one on the antennas."""
+    """Return numbers and sentences on the node for metrics.json and the page. ``ends`` is the one on the antennas."""
     parts, names = estimate.regions.modes(), ("latitude_deg", "longitude_deg", "east_m", "north_m")
     angles = site.frame.to_geographic(*np.array([mode.place_m for mode in parts]).T)
     modes = [
         dict(zip(names, (*at, *mode.place_m), strict=True)) | {"share": mode.share, "radius_m": mode.radius_m}
         for *at, mode in zip(*angles, parts, strict=True)
     ]
-    region50_m, region90_m = (estimate.regions.radius_m(parts[0].place_m, part) for part in (0.5, 0.9))
+    place = estimate.place_m[:2]
+    position = dict(zip(names[:2], (float(v[0]) for v in site.frame.to_geographic(place[:1], place[1:])), strict=True))
+    region50_m, region90_m = (estimate.regions.radius_m(place, part) for part in (0.5, 0.9))
     low, high = estimate.height_m
-    floor = "none shows" if not np.isfinite(track.floor_db) else f"{track.floor_db:.1f} dB, no level below it is known"
-    edge = "The region reaches the edge of the search, 400 m beyond the flight: the node may stand farther away."
+    floor = "not known" if not np.isfinite(track.floor_db) else f"{track.floor_db:.1f} dB; levels below are not known"
+    edge = "The region reaches the edge of the search, 400 m beyond the flight: the node may be farther away."
     return {
-        "sentence": _sentence(modes, region90_m),
-        "position": {key: modes[0][key] for key in names[:2]},
+        "sentence": _sentence(position, modes, region90_m),
+        "position": position,
         "region50_m": region50_m,
         "region90_m": region90_m,
         "modes": modes,
         "assumed": (
             f"Path-loss exponent {estimate.slope:.1f} ± {2.0 * estimate.slope_sd:.1f} (fitted, 95 %).",
             ends,
-            f"Height of the node: {low:g} m" + ("." if low == high else f" or {high:g} m; the levels do not decide."),
-            f"Floor of the receiver: {floor}. Shadowing is remembered for 30 s; nothing is ray-traced.",
+            f"Height of the node: {low:g} m"
+            + ("." if low == high else f" or {high:g} m, which the levels do not decide."),
+            f"Floor of the receiver: {floor}. Strength and length of the shadowing are weighed by the levels. "
+            "No path is ray-traced.",
         ),
         "warnings": (edge,) if estimate.at_edge else (),
     }
 
 
-def _sentence(modes: Sequence[dict[str, Any]], radius_m: float) -> str:
+def _sentence(position: dict[str, float], modes: Sequence[dict[str, Any]], radius_m: float) -> str:
+    if len(modes) == 1:
+        at = f"{position['latitude_deg']:.6f}, {position['longitude_deg']:.6f}"
+        return f"The node is most likely at {at}, 90 % within {radius_m:.0f} m."
     places = [
         f"{m['latitude_deg']:.6f}, {m['longitude_deg']:.6f} (within {m['radius_m']:.0f} m, {100.0 * m['share']:.0f} %)"
         for m in modes
     ]
-    if len(places) == 1:
-        return f"The node most likely stands at {places[0].partition(' (')[0]}, 90 % within {radius_m:.0f} m."
-    return f"{len(places)} places fit the levels: {'; '.join(places)}."
+    return f"{len(modes)} places fit the levels: {'; '.join(places)}."

@@ -10,7 +10,7 @@ import pytest
 
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.common.yamlfile import parse_yaml
-from aerpaw_cmp.compare.locate import LevelModel, LevelTrack, NodeEstimate, Regions, level_track
+from aerpaw_cmp.compare.locate import LevelModel, LevelTrack, NodeEstimate, Regions, known_cases, level_track
 from aerpaw_cmp.flight.drafting import proposals as node
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft
 from aerpaw_cmp.flight.drafting.proposals import listed_places
@@ -88,7 +88,7 @@ def test_levels_of_no_tower_are_placed_and_asked_about(tmp_path: Path) -> None:
     node = settings.towers["NODE"]
     east, north = SITE.frame.to_local(np.array([node.latitude_deg or 0.0]), np.array([node.longitude_deg or 0.0]))
     assert np.hypot(east[0] - ROVER[0], north[0] - ROVER[1]) < 25.0
-    assert "the levels do not determine the tower (LW1" in remarks  # it lies within the region, others may
+    assert "no tower fits the levels" in remarks  # LW1 is outside the region
     assert "where did the node stand?" in remarks
 
 
@@ -243,7 +243,7 @@ def _taught() -> node.Taught:
     _, _, v = sphere_grid()
     tower, uav = (unit_mean_gain(5.0 * v[..., a] - 3.0 * v[..., b]) for a, b in ((0, 1), (1, 0)))
     sd = np.zeros(v.shape[:2])
-    model = LevelModel(slope=2.0, slope_sd=0.2, elevation_sd_db=1.0, shadow_sd_db=1.6, scatter_sd_db=1.4)
+    model = LevelModel(slope=2.0, slope_sd=0.2, elevation_sd_db=1.0, cases=known_cases(1.6, 1.4))
     return node.Taught(SpherePattern("tower", tower, sd), SpherePattern("uav", uav, sd), model)
 
 

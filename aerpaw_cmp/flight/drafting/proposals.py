@@ -32,7 +32,17 @@ from ...compare.gains import (
     Term,
     link_directions,
 )
-from ...compare.locate import FEWEST, LevelModel, LevelTrack, fit_places, level_track, locate, place_odds
+from ...compare.locate import (
+    FEWEST,
+    Case,
+    LevelModel,
+    LevelTrack,
+    fit_places,
+    known_cases,
+    level_track,
+    locate,
+    place_odds,
+)
 from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
 from ...site import learned
@@ -60,7 +70,9 @@ CONTRADICTED = 8.0
 
 # Fewest bins of a level that show which of two vehicles carried the radio, and the model of the level.
 _FEWEST_OF_VEHICLE = 8
-_NEAR_FREE_SPACE = LevelModel(slope=2.0, slope_sd=0.3, elevation_sd_db=2.0, shadow_sd_db=2.0, scatter_sd_db=1.5)
+_NEAR_FREE_SPACE = LevelModel(
+    slope=2.0, slope_sd=0.3, elevation_sd_db=2.0, cases=(Case(shadow_db=2.0, scatter_db=1.5, time_s=30.0),)
+)
 
 # Name all listed positions and towers whose log odds differ by less.
 _UNDECIDED = 3.0
@@ -199,7 +211,7 @@ class Placer:
         if not len(track.time_s):
             return track
         track = replace(track, rotation=self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation)
-        return track if airframe is None else replace(track, airframe_db=self._gain_db(track, airframe, node))
+        return track if airframe is None else replace(track, airframe_db=_gain_of(airframe, node))
 
     def propose(
         self,
@@ -288,20 +300,8 @@ class Placer:
 
     def _taught_odds(self, track: LevelTrack, tower: str, gains: Taught) -> float:
         """Return the log evidence of a tower with learned antennas at both ends."""
-        place, gain_db = self.site.towers[tower].position_m[None, :], self._gain_db(track, gains.uav, gains.tower)
-        return float(fit_places(replace(track, airframe_db=gain_db), place, gains.model).evidence[0])
-
-    def _gain_db(
-        self, track: LevelTrack, airframe: MeasuredPattern, node: MeasuredPattern | None = None
-    ) -> Callable[[FloatArray], FloatArray]:
-        """Return a function: the gain of an airframe and a node at each level towards unit vectors (m, n, 3) [dB]."""
-
-        def gain_db(towards: FloatArray) -> FloatArray:
-            assert track.rotation is not None
-            uav_db = airframe.gain_dbi(*sphere_angles(np.einsum("nji,mnj->mni", track.rotation, towards)))
-            return uav_db if node is None else uav_db + node.gain_dbi(*sphere_angles(-towards))
-
-        return gain_db
+        known = replace(track, airframe_db=_gain_of(gains.uav, gains.tower))
+        return float(fit_places(known, self.site.towers[tower].position_m[None, :], gains.model).evidence[0])
 
     def evidence(self, stream: Stream) -> float:
         """Return the log evidence per bin of levels along this track at the best tower, or -inf for too few levels."""
@@ -360,6 +360,23 @@ def _node(
     tower = dict(zip(("latitude_deg", "longitude_deg", "antenna_height_m"), at, strict=True))
     name = "NODE" + (str(len(nodes) + 1) if nodes else "")
     return Placement(name, tower, question, position_m=position_m)
+
+
+def _gain_of(
+    airframe: MeasuredPattern, node: MeasuredPattern | None
+) -> Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    """Return the gain of an airframe and of a node with its standard deviation, as ``LevelTrack.airframe_db``."""
+
+    def gain_db(at_uav: FloatArray, at_node: FloatArray) -> tuple[FloatArray, FloatArray]:
+        gain, square = np.zeros((2, *at_uav.shape[:-1]))
+        for pattern, direction in ((airframe, at_uav), (node, at_node)):
+            if pattern is not None:
+                gain += pattern.gain_dbi(*sphere_angles(direction))
+            if isinstance(pattern, SpherePattern):
+                square += pattern.gain_sd_db(*sphere_angles(direction)) ** 2
+        return gain, np.sqrt(square)
+
+    return gain_db
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -689,8 +706,6 @@ def taught(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[
     loses_lock : bool
         True for receivers that lose their lock, False for all others.
     """
-    from ...compare.locate import LevelModel  # only drafts need it, and reports load this module
-
     out: dict[str, list[Taught]] = {}
     with suppress(InputError, UsageError):
         for known in every_antenna(site):
@@ -703,8 +718,9 @@ def taught(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[
                 slope=2.0,
                 slope_sd=_TAUGHT_SLOPE_SD,
                 elevation_sd_db=known.spread.own_sd_db,
-                shadow_sd_db=float(np.hypot(known.spread.own_sd_db, known.series.sd_db)),
-                scatter_sd_db=known.spread.noise_sd_db,
+                cases=known_cases(
+                    float(np.hypot(known.spread.own_sd_db, known.series.sd_db)), known.spread.noise_sd_db
+                ),
             )
             each.append(Taught(tower=known.tower, uav=known.uav, model=model, moments=known.moments))
         return out

@@ -51,6 +51,13 @@ _STALE_S, _STALE_MPS = 3.0, 1.0
 # A step back in time is shorter than this share of the neighbouring steps.
 _STEP_BACK_SHARE = 0.2
 
+# Units of times that were read as another one, and how much slower the track then is.
+_OTHER_UNITS = {
+    "minutes, read as seconds": 60.0,
+    "seconds, read as milliseconds": 1e3,
+    "hours, read as seconds": 3600.0,
+}
+
 
 def jumps_of(frame: pd.DataFrame, what: str = "") -> tuple[BoolArray, str]:
     """Return the rows (n,) of a stream whose position is a jump, and a sentence about them or about the track.
@@ -70,9 +77,11 @@ def jumps_of(frame: pd.DataFrame, what: str = "") -> tuple[BoolArray, str]:
         return none, ""
     speed_mps = _speed_mps(time_s, place_m)
     if speed_mps > FASTEST_MPS and not _comes_back(time_s, place_m):
+        slower = {unit: speed_mps / factor for unit, factor in _OTHER_UNITS.items()}
+        units = "; ".join(f"{unit}: {mps:.1f} m/s" for unit, mps in slower.items() if 0.5 < mps <= FASTEST_MPS)
         return none, (
-            f"{what}: its positions imply {speed_mps:.0f} m/s throughout: are its times in another unit, "
-            "such as milliseconds?"
+            f"{what}: its positions imply {speed_mps:.0f} m/s throughout: are its times in another unit"
+            f"{units and f' ({units})'}, which the name of their column should contain, such as 'time [min]'?"
         )
     astray, at_rest, fast_mps, at = _astray(time_s, place_m)
     if not astray.any() and speed_mps <= FASTEST_MPS:

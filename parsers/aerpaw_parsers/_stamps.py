@@ -453,7 +453,18 @@ def refuse_spreadsheets(texts: Sequence[str]) -> None:
 # unit that they may have. Steps of 10 may be 10 ms, steps of 5 are 5 s.
 _FLIGHT_S, _LONGEST_STEP_S = 10_800.0, 60.0
 _LEAST_STEPS = {"s": 0.0, "ms": 10.0, "us": 2e3, "ns": 2e6}
-_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+_NAMES = {
+    "s": "seconds",
+    "ms": "milliseconds",
+    "us": "microseconds",
+    "ns": "nanoseconds",
+    "min": "minutes",
+    "h": "hours",
+}
+# Counts that last less as seconds may be minutes or hours [s].
+_SHORT_S = 60.0
+# Steps of loggers at rest: quarters of an hour, but no number of milliseconds that programs use [s].
+_QUARTERS = (900.0, 1800.0, 3600.0)
 # No program of a radio or an autopilot writes rows in such steps [ns].
 _LEAST_NS = 1e6
 
@@ -471,6 +482,15 @@ def _likely_units(value: FloatArray) -> list[str]:
         unit for unit, least in _LEAST_STEPS.items()
         if least <= step <= _LONGEST_STEP_S * 1e9 / _text.COUNTS[unit].ns
         and span <= _FLIGHT_S * 1e9 / _text.COUNTS[unit].ns
+    ]  # fmt: skip
+
+
+def _longer_units(value: FloatArray) -> list[str]:
+    """Return the units above seconds in which a log of less than a minute has the steps and the length of a flight."""
+    step, span = _step(value), float(np.nanmax(value, initial=-np.inf) - np.nanmin(value, initial=np.inf))
+    return [
+        unit for unit, factor in (("min", 60.0), ("h", 3600.0))
+        if span < _SHORT_S and factor * step <= _LONGEST_STEP_S and factor * span <= _FLIGHT_S
     ]  # fmt: skip
 
 
@@ -504,15 +524,21 @@ def _numbers(
     whole, of_day = not (value % 1 > 0).any(), 86_400 < middle < 86_400_000
     late = whole and middle > 86_400  # beyond a day of seconds
     unit = next((unit for unit in likely if unit != "s" or not late), "ms" if late and of_day and not likely else "s")
-    others = dict.fromkeys(f"as {_NAMES[other]} {_lasting(value, other)}" for other in ("s", *likely) if other != unit)
-    if unit == "s" and (not whole or not others):
+    unit = "s" if step in _QUARTERS and not (value % step).any() else unit
+    known = likely if whole else _longer_units(value)
+    others = [other for other in dict.fromkeys(("s", *known)) if other != unit]
+    if unit == "s" and not others:
         return "relative_s", value, []
-    lasting = "; ".join([f"the log lasts {_lasting(value, unit)}", *others])
-    text = f"the times are numbers without a unit: read as {_NAMES[unit]}, a guess ({lasting})"
-    advice = "to avoid it, write the unit in the column's name, such as 'time [ms]'"
-    # a log that begins within the first hour counts from its start, a later one from midnight
+    lasting = "; ".join(f"as {_NAMES[other]} {_lasting(value, other)}" for other in others)
+    text = f"the times are numbers without a unit: read as {_NAMES[unit]}, a guess"
+    text = f"{text} (the log lasts {_lasting(value, unit)}; {lasting})"
+    advice = f"if it is wrong, write the unit in the column's name, such as 'time [{others[0]}]'"
+    # A log that begins within the first hour counts from its start. A later one counts from midnight, unless the user
+    # knows the time of zero.
     if unit == "ms" and of_day and whole and np.nanmin(value) >= 3_600_000:
-        return _on_a_date(value / 1e3, options, [f"{text}, of the day; {advice}"])
+        if len(options.time_origin or "") <= len("2025-03-02"):
+            return _on_a_date(value / 1e3, options, [f"{text}, of the day; {advice}"])
+        text += f", counted from {options.time_origin}"
     return f"relative_{unit}", value, [f"{text}; {advice}"]
 
 

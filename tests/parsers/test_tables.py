@@ -360,3 +360,40 @@ def test_mapped_columns_count_as_read_and_rows_without_a_fix_have_no_position() 
     assert np.isnan(track.frame["latitude_deg"]).tolist() == [True, False]
     (left,) = [text for text in result.warnings if "not read" in text]
     assert left.endswith(": 'signal_B'")
+
+
+@pytest.mark.parametrize("first", [3_700_000, 4_000_000, 54_000_000, 80_000_000])
+def test_milliseconds_count_from_a_complete_origin_and_else_are_a_time_of_the_day(first: int) -> None:
+    rows = "".join(f"{first + 100 * i},35.72,-78.69,30,-80\n" for i in range(100))
+    for origin, zone, zero in (
+        ("2025-03-02T15:00:00Z", None, "2025-03-02T15:00:00"), ("2025-03-02", "America/New_York", "2025-03-02T05:00:00"),
+    ):  # fmt: skip
+        options = replace(OPTIONS, time_origin=origin, timezone=zone, file_name="x.csv")
+        result = by_name("drive_test").read((SIX_COLUMNS + rows).encode(), options)
+        expected = np.datetime64(zero, "ms") + np.timedelta64(first, "ms")
+        assert result.streams[0].frame["time"].iloc[0] == expected
+        assert any("read as milliseconds, a guess" in text and "'time [s]'" in text for text in result.warnings)
+
+
+@pytest.mark.parametrize(("step", "unit_s", "named", "remedy"), [
+    (900, 1.0, "read as seconds", "'time [ms]'"), (3600, 1.0, "read as seconds", "'time [ms]'"),
+    (300, 1e-3, "read as milliseconds", "'time [s]'"), (1 / 60, 1.0, "as minutes", "'time [min]'"),
+    (0.25, 1.0, "as minutes", "'time [min]'"), (1 / 3600, 1.0, "as hours", "'time [min]'"),
+    (0.01, 1.0, "as hours", "'time [min]'"),
+])  # fmt: skip
+def test_a_guessed_unit_is_reported_with_the_other_units_and_the_remedy(
+    step: float, unit_s: float, named: str, remedy: str
+) -> None:
+    rows = "".join(f"{round(step * i, 5):g},35.72,-78.69,30,-80\n" for i in range(60))
+    result = drive_test((SIX_COLUMNS + rows).encode(), time_origin="2025-03-02T15:00:00Z")
+    steps = result.streams[0].frame["time"].diff().iloc[1:].dt.total_seconds()
+    np.testing.assert_allclose(steps, step * unit_s, atol=2e-5)
+    (text,) = (text for text in result.warnings if "without a unit" in text)
+    assert named in text
+    assert remedy in text
+
+
+def test_seconds_of_a_whole_minute_are_read_without_a_question() -> None:
+    rows = "".join(f"{0.5 * i},35.72,-78.69,30,-80\n" for i in range(200))
+    result = drive_test((SIX_COLUMNS + rows).encode(), time_origin="2025-03-02T15:00:00Z")
+    assert not any("without a unit" in text for text in result.warnings)

@@ -669,7 +669,7 @@ PROGRAMS: tuple[Program, ...] = (
 # Names that a level of another program may have, and names that only look like levels, such as an altitude above sea
 # level or a battery.
 _LIKE_A_LEVEL = re.compile(
-    r"^value$|power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs)?\b|\brss|strength|\bampl|magnitude|rsrp"
+    r"^value$|power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs|w)?\b|\bd ?bu ?v\b|\brss|strength|\bampl|magnitude|rsrp"
 )
 UNLIKE_A_LEVEL = re.compile(
     r"batt|volt|current|throttle|gps|water|fuel|noise|gain|loss|\btx|alt|height|elev|\bsea\b|type|quality|source|bars"

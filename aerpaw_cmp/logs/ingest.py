@@ -10,7 +10,7 @@ import hashlib
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from datetime import timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -529,12 +529,24 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
 
 # GPS receivers count weeks modulo 1 024 (IS-GPS-200): after a rollover their dates are earlier by this number of days.
 ROLLOVER_DAYS = 7 * 1024
+# The first LTE networks. Earlier dates of logs are wrong.
+_PLAUSIBLE_FROM = datetime(2009, 12, 1)
 
 
 def _later(result: ReadResult, rollovers: int) -> ReadResult:
-    """Return a result with 1 024 weeks added to its times for each rollover of the receiver's week number."""
+    """Return a result with 1 024 weeks added to its times for each rollover of the receiver's week number.
+
+    Without rollovers, dates before the first LTE networks (2009) are reported if one rollover makes them plausible.
+    """
     if not rollovers:
-        return result
+        first = min((s.frame["time"].min() for s in result.streams if len(s.frame)), default=None)
+        if first is None or not _PLAUSIBLE_FROM - timedelta(days=ROLLOVER_DAYS) < first < _PLAUSIBLE_FROM:
+            return result
+        text = (
+            f"the dates begin on {first:%Y-%m-%d}: if the week number of the GPS receiver rolled over, "
+            "'gps_rollovers: 1' next to the log in flight.yaml adds 1 024 weeks"
+        )
+        return replace(result, warnings=(*result.warnings, text))
     days = rollovers * ROLLOVER_DAYS
     shift = timedelta(days=days)
     streams = [replace(s, frame=s.frame.assign(time=s.frame["time"] + shift)) for s in result.streams]

@@ -364,6 +364,7 @@ class _Check:
             self._within_ports()
         self._near_in_time()
         if kind == "rss":
+            self._all_silent()
             self._lost_readings()
             self._two_levels()
         self._at_a_site_if_otherwise()
@@ -443,6 +444,13 @@ class _Check:
         known = "another unit, an RSRQ, or an index?" if quantity in _MOST_DBM else "another unit, or an index?"
         first = f"{level[int(np.argmax(bad))]:g} dBm"
         self._flag(bad, "level_out_of_range", first, f"which is received nowhere ({known})", ["rss_db"])
+
+    def _all_silent(self) -> None:
+        """Report a series without any level, because another unit can put all levels below the floor of the reader."""
+        silent = int(self.frame["flag"].str.contains("out_of_coverage").sum())
+        if silent and silent == len(self.frame) and not np.isfinite(self._values("rss_db")).any():
+            levels = "the only level is" if silent == 1 else f"all {silent} levels are"
+            self._said.append(f"{self._what}: {levels} below the floor of the reader (no signal, or another unit?)")
 
     def _lost_readings(self) -> None:
         """Flag a few placeholders far from all other levels, which programs write for lost readings."""

@@ -340,3 +340,19 @@ def test_links_in_a_folder_are_told(tmp_path: Path) -> None:
     reasons = {Path(s.path).name: s.reason for s in ingested.skipped}
     assert reasons.keys() == {"far", "gone.txt", "round"}
     assert "link to a folder" in reasons["far"]
+
+
+@pytest.mark.parametrize(
+    ("column", "level", "said"),
+    [
+        ("rssi_0.1dBm", "-724", "rssi_0_1dbm': all 5 levels are below the floor of the reader"),
+        ("E (dBuV/m)", "60.3", "not read, though they look like levels, identities, positions or times: 'E (dBuV/m)'"),
+        ("rsrp_dbm", "-80", "the dates begin on 2004-09-17: if the week number of the GPS receiver rolled over"),
+    ],
+)
+def test_a_level_or_date_that_cannot_be_right_is_reported(tmp_path: Path, column: str, level: str, said: str) -> None:
+    path = tmp_path / "log.csv"
+    rows = [f"2004-09-17T14:00:0{i}.000Z,35.72{i},-78.69,{level}" for i in range(5)]
+    path.write_text("\n".join([f"utc,lat,lon,{column}", *rows]) + "\n")
+    (file,) = ingest([path])
+    assert any(said in text for text in file.result.warnings), file.result.warnings

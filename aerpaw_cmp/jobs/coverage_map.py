@@ -830,7 +830,7 @@ def _notes(outcome: MapOutcome) -> tuple[str, ...]:
         each, all_ = outcome.tiles["shown_every"], outcome.tiles["positions"]
         notes.append(
             f"The map of {counted(all_, 'position')} is in {Path(outcome.tiles['store']).name}. "
-            f"This page and its files have every {each}th position along each axis."
+            f"This page and its files have one in {each} positions along each axis."
         )
     return tuple(notes)
 

@@ -55,7 +55,7 @@ def test_a_correction_that_was_asked_for_and_not_made_is_said() -> None:
     assert "2.50 s ahead of the telemetry clock" in text
     assert "it was corrected" in text
     (text,) = clock_warnings({"LW1": _clock_of(SERIES, estimate("shifted"), apply=False).result})
-    assert "rss.lag: apply would" in text
+    assert "Set rss.lag: apply" in text
     (text,) = clock_warnings({"LW1": _clock_of(SERIES, estimate("cannot tell"), apply=False).result})
     assert "could not be checked: flat level" in text
     assert clock_warnings({"LW1": _clock_of(SERIES, estimate("ok", ci95_s=(-0.3, 0.2)), apply=True).result}) == ()

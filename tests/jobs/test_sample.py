@@ -49,5 +49,5 @@ def test_without_samples_the_message_says_where_they_were_looked_for(
 ) -> None:
     monkeypatch.setattr(sample, "PACKAGED", tmp_path / "a")
     monkeypatch.setattr(sample, "CHECKOUT", tmp_path / "b")
-    with pytest.raises(UsageError, match="not here"):
+    with pytest.raises(UsageError, match="is missing"):
         sample.sample_folder()

@@ -196,7 +196,7 @@ def test_a_geofence_is_read_and_what_is_none_is_one_message(tmp_path: Path):
     fence.write_text(body.format("-78.7,35.72,0 -78.69,35.72,0 -78.69,35.73,0 -78.7,35.72,0"))
     assert read_areas(fence) == [[(35.72, -78.7), (35.72, -78.69), (35.73, -78.69), (35.72, -78.7)]]
     for bad, said in (
-        ("nan,x,0", "no number"),
+        ("nan,x,0", "a coordinate that is not a number"),
         ("-78.7,95,0 -78.69,95,0 -78.69,96,0", "not a position on Earth"),
         ("", "without an area"),
     ):

@@ -30,8 +30,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from left_out_reports import TIMEZONE, recipe_of_campaign, site_without
-from numpy.typing import NDArray
-from outside_causes import KINDS
+from outside_causes import KINDS, LEVELS, Array, Table, levels, seconds
 from planted_causes import TOWER, fading, flown, unmodelled
 from scipy.io import loadmat, savemat
 
@@ -45,24 +44,15 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.compare_flight import compare_flight
 from aerpaw_cmp.site.siteyaml import load_site
 
-Array = NDArray[np.float64]
-Table = dict[str, Array]
 Fault = Callable[[Table, np.random.Generator], None]
-LEVELS = ("mpower1", "mpower2", "RSRP")
 NONE = "none"
 # A fault that costs less [dB] changes no decision.
 LEAST_DB = 0.3
 
 
-def seconds(t: Table) -> Array:
-    """Time since the first row [s]."""
-    time = t["timestamp_power" if "timestamp_power" in t else "timestamp_meas"].astype(np.float64)
-    return np.asarray(time - time[0])
-
-
 def channels(t: Table, draw: np.random.Generator) -> list[str]:
     """All level columns, or one of them."""
-    names = [name for name in LEVELS if name in t]
+    names = levels(t)
     return names if draw.random() < 0.5 else [str(draw.choice(names))]
 
 
@@ -83,7 +73,7 @@ def levels_by(change: Callable[[Array, Table, np.random.Generator], Array], *, e
     """Levels of all or one channel after a change; all of one fault have the same draws."""
 
     def fault(t: Table, draw: np.random.Generator) -> None:
-        names = [n for n in LEVELS if n in t] if every else channels(t, draw)
+        names = levels(t) if every else channels(t, draw)
         seed = int(draw.integers(1 << 30))
         for name in names:
             t[name] = change(t[name].astype(np.float64), t, np.random.default_rng(seed))

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from aerpaw_cmp.common.units import wrap_degrees
 from aerpaw_cmp.compare import causes
 from aerpaw_cmp.compare.causes import LevelEvidence, Trial, flight_cause
 from aerpaw_cmp.flight.clock import Along, ClockChannel, judge_clock
@@ -200,7 +201,7 @@ def drawn(troubles: tuple[str, ...], draw: np.random.Generator) -> tuple[LevelEv
             measured, clean = measured + step, clean + step
         elif trouble == "blocked":
             seen = np.degrees(np.arctan2(*(at - true)[:, :2].T))
-            off = np.abs((seen - draw.choice(seen) + 180.0) % 360.0 - 180.0)
+            off = np.abs(wrap_degrees(seen - draw.choice(seen)))
             edge = draw.uniform(8, 25)
             loss = draw.uniform(8, 22) / (1.0 + np.exp((off - edge) / 1.0))
             measured, clean = measured - loss, clean - loss

@@ -29,11 +29,13 @@ VACUUM_PERMITTIVITY_F_PER_M = 8.854_187_8128e-12
 # Poses below this height above ground are raised to it (arXiv 2502.10324, section V).
 MINIMUM_HEIGHT_M = 0.5
 
+# International foot [m] (exact).
+FOOT_M = 0.3048
 
-# Thermal noise at 290 K [dBm in 1 Hz]: -173.98 (Boltzmann's constant: SI, exact).
 # Radio carriers [Hz] that a setting can mean: a smaller number is in MHz or GHz; a larger number was converted twice.
 LOWEST_CARRIER_HZ, HIGHEST_CARRIER_HZ = 1e6, 1e12
 
+# Thermal noise at 290 K [dBm in 1 Hz]: -173.98 (Boltzmann's constant: SI, exact).
 THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0
 
 

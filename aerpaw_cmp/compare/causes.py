@@ -23,7 +23,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, wrap_degrees
 from ..site.learned import LearnedSeries
 from .health import Judged, Step, level_of, step_of
 from .noise import LEAST_VARIANCE, START, Memories, MemoryFit, fit_with_memories
@@ -1220,7 +1220,7 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
 def _shadows(e: LevelEvidence, sectors: Sequence[tuple[float, float]]) -> FloatArray:
     """Return the share (m, n) of the loss of each sector (middle and width [deg]) that each sample has."""
     middle, width = (np.array(column)[:, None] for column in zip(*sectors, strict=True))
-    off = np.abs((e.tower_azimuth_deg - middle + 180.0) % 360.0 - 180.0)
+    off = np.abs(wrap_degrees(e.tower_azimuth_deg - middle))
     return np.asarray(np.clip(0.5 + (0.5 * width - off) / _EDGE_DEG, 0.0, 1.0))
 
 

@@ -78,10 +78,11 @@ def learned_health(flights: Sequence[HeldOut], differences_db: dict[str, list[fl
     differences_db : dict of str to list of float
         By other channel of the tower: the offset of this channel minus that of the other channel, per flight.
     """
-    series = [binned(f.time_s, f.error_db) for f in flights]
-    seconds = [float(binned(f.time_s, f.error_db, 1.0)[1].std()) for f in flights]
+    errors_db = [f.error_db for f in flights]
+    series = [binned(f.time_s, error_db) for f, error_db in zip(flights, errors_db, strict=True)]
+    seconds = [float(binned(f.time_s, e, 1.0)[1].std()) for f, e in zip(flights, errors_db, strict=True)]
     numbers = _noise(series)
-    places = [_places(f) for f in flights]
+    places = [_interpolated(at, f) for f, (at, _) in zip(flights, series, strict=True)]
     apart = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in places]
     locked = [f.locked for f in flights if f.locked is not None and np.isfinite(f.locked).any()]
     judged = [step_chi2(*each, noise=_noise([s for s in series if s is not each] or [each])) for each in series]
@@ -147,8 +148,8 @@ def binned(time_s: FloatArray, error_db: FloatArray, width_s: float = BIN_S) -> 
     return np.bincount(place, time_s) / count, mean_db - mean_db.mean()
 
 
-def _places(flight: HeldOut) -> FloatArray:
-    at, _ = binned(flight.time_s, flight.error_db)
+def _interpolated(at: FloatArray, flight: HeldOut) -> FloatArray:
+    """Return the positions (m, 3) of the UAV at instants (m,)."""
     return np.column_stack([np.interp(at, flight.time_s, axis) for axis in flight.place_m.T])
 
 

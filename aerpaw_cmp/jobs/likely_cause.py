@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from ..common.errors import InputError, UsageError
-from ..common.units import FloatArray
+from ..common.units import FOOT_M, FloatArray
 from ..compare import level as rss
 from ..compare.causes import (
     OF_DIRECTION,
@@ -169,8 +169,7 @@ def heights_meant(telemetry: Stream) -> str | None:
 
 
 # Factor to metres by meaning of the heights.
-_FOOT_M = 0.3048
-_HEIGHTS = {"the logged heights are in feet": _FOOT_M, "the logged heights were divided by 3.28": 1.0 / _FOOT_M}
+_HEIGHTS = {"the logged heights are in feet": FOOT_M, "the logged heights were divided by 3.28": 1.0 / FOOT_M}
 # Four field logs climb at .90 to 1.00 of their speeds. Rows further apart [s] do not determine the path between them.
 _AS_TOLD, _ALIKE, _LONG_STEP_S, _LEAST_PATH_M = 0.2, 0.5, 3.0, 10.0
 _SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")

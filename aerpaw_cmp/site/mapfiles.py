@@ -31,6 +31,7 @@ from ..common.errors import InputError, parsed
 from ..common.files import read_input
 from ..common.kml import named, outermost, plain_tag, xml_root
 from ..common.text import counted
+from ..common.units import FOOT_M
 from ..logs import files
 from .materials import MATERIALS
 
@@ -166,13 +167,11 @@ def left_out(path: Path, line: int | None, what: str, error: Exception) -> str:
     return f"warning: {place}: {what} was left out: {why}"
 
 
-_FOOT_M = 0.3048
-
 Kind = Literal["building", "forest", "geofence"]
 
 _FOREST_TAGS = (("landuse", "forest"), ("natural", "wood"), ("landcover", "trees"))
 _NOT = ("no", "", "none", "false", "0")
-_UNITS_M = {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": _FOOT_M}
+_UNITS_M = {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT_M}
 _UNIT_WORDS = {"metre": "m", "meter": "m", "foot": "ft", "feet": "ft"}
 # Words of OpenStreetMap for materials that P.2040 has under another or a similar name.
 _MATERIAL_WORDS = {
@@ -274,7 +273,7 @@ def metres(text: str) -> float | None:
         unit = match.group(2) or "m"
         return float(match.group(1)) * _UNITS_M[_UNIT_WORDS.get(unit, unit)]
     if match := re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:'|ft)\s*(?:(\d+(?:\.\d+)?)\s*(?:\"|in))?", text):
-        return (float(match.group(1)) + float(match.group(2) or 0) / 12) * _FOOT_M
+        return (float(match.group(1)) + float(match.group(2) or 0) / 12) * FOOT_M
     return None
 
 

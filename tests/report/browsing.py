@@ -126,10 +126,10 @@ def serious_findings(driver) -> dict[str, list[str]]:
     return found
 
 
-def set_width(driver, width: int, height: int = 1000) -> None:
+def set_width(driver, width: int, height: int = 1000, *, mobile: bool = False) -> None:
     driver.execute_cdp_cmd(
         "Emulation.setDeviceMetricsOverride",
-        {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False},
+        {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": mobile},
     )
     frame(driver)
 

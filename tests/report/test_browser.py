@@ -228,10 +228,8 @@ def test_only_rank(small_report, tmp_path, driver, page):
 @pytest.mark.parametrize("width", [1440, 390])
 def test_names_of_towers_stay_clear_of_the_key_of_the_edges_and_of_each_other(driver, width):
     """Towers put all over the map, some of them side by side: below the lowest of them begins the key."""
-    size = {"width": width, "height": 1200, "deviceScaleFactor": 1, "mobile": False}
-    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    set_width(driver, width, 1200)
     try:
-        frame(driver)
         towers = driver.execute_script(
             "const site = explorer.data.site, kept = site.towers, at = kept[0].at;"
             "site.towers = [kept[0], { ...kept[0], name: 'beside', at: [at[0] + 4, at[1], at[2]] }, ...kept.slice(1)];"
@@ -251,7 +249,7 @@ def test_names_of_towers_stay_clear_of_the_key_of_the_edges_and_of_each_other(dr
         assert min(c, g) <= max(a, e) or min(d, h) <= max(b, f)
         driver.execute_script("explorer.data.site.towers = arguments[0]; explorer.span(null)", towers)
     finally:
-        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        usual_width(driver)
 
 
 def test_no_error_of_a_model_is_shown_on_the_flight_it_was_learned_from(small_report, tmp_path):

@@ -32,15 +32,18 @@ def driver() -> Iterator[Any]:
     browser.quit()
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_the_first_words_need_no_scrolling(
-    page: str, driver: Any, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+@pytest.fixture
+def path(page: str, tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """Return the written file of a page."""
     path = tmp_path / f"{page}.html"
     path.write_text(PAGES[page](request.getfixturevalue), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_first_words_need_no_scrolling(page: str, path: Path, driver: Any) -> None:
     for width, height in ((1440, 900), (1024, 800), (390, 844)):
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
-        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        set_width(driver, width, height, mobile=width < 500)
         driver.get(path.as_uri())
         text, bottom, wide = driver.execute_script(
             "const v = document.querySelector('.verdict');"
@@ -54,22 +57,14 @@ def test_the_first_words_need_no_scrolling(
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_no_page_has_a_serious_finding_of_accessibility(
-    page: str, driver: Any, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    path = tmp_path / f"{page}.html"
-    path.write_text(PAGES[page](request.getfixturevalue), encoding="utf-8")
+def test_no_page_has_a_serious_finding_of_accessibility(page: str, path: Path, driver: Any) -> None:
     driver.get(path.as_uri())
     assert serious_findings(driver) == {}
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_no_page_is_wider_than_its_window_or_light_in_the_dark(
-    page: str, driver: Any, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_no_page_is_wider_than_its_window_or_light_in_the_dark(page: str, path: Path, driver: Any) -> None:
     """Every fold open: what is wide scrolls in its own box, and a drawn figure is dark on a dark page."""
-    path = tmp_path / f"{page}.html"
-    path.write_text(PAGES[page](request.getfixturevalue), encoding="utf-8")
     if page == "report":  # the charts of its folds are drawn by a script
         open_page(driver, path, "window.explorer")
     else:

@@ -353,7 +353,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
         )
     remarks = [f"moves {reach_m:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
     # the attitude of a node is not used
-    remarks += [text for text in track.account.warnings if "attitude" not in text]
+    remarks += dataclasses.replace(track.account, unknown_attitude=0, heading_alone=0).warnings
     return dataclasses.replace(stands, track=track, remarks=tuple(remarks))
 
 
@@ -607,18 +607,20 @@ def _unknown(key: str, kind: str, name: str, valid: Sequence[str]) -> NoReturn:
 
 def _learned_cautions(settings: FlightFile, channels: Sequence[str]) -> tuple[str, ...]:
     """Return a sentence per caution about learned antennas, which names channels if only some are affected."""
-    touched: dict[str, list[str]] = {}
+    touched: dict[tuple[str, str], list[str]] = {}
     for caution in settings.cautions:
         # None is the link of all channels without an entry
         links = settings.link.channels if caution.channel is None else {*channels} - {caution.channel}
         concerned = [channel for channel in channels if channel not in links]
         if concerned or caution.key == "rank.receiver":
-            touched.setdefault(f"{caution.key}: {caution.text}", []).extend(concerned)
+            touched.setdefault((caution.key, caution.text), []).extend(concerned)
     if settings.antennas and not channels:
-        touched["antennas: the logs have no levels, so no antenna is used"] = []
-    part = {text for text, on in touched.items() if text.startswith("antennas.uav") and {*on} != {*channels}}
-    where = {text: f" (channel {', '.join(touched[text])})" for text in part}
-    return tuple(f"{text}{where.get(text, '')}." for text in touched)
+        touched["antennas", "the logs have no levels, so no antenna is used"] = []
+    texts = []
+    for (key, text), on in touched.items():
+        partial = key == "antennas.uav" and {*on} != {*channels}
+        texts.append(f"{key}: {text} (channel {', '.join(on)})." if partial else f"{key}: {text}.")
+    return tuple(texts)
 
 
 def _idle_channels(settings: FlightFile, channels: Sequence[str]) -> tuple[str, ...]:

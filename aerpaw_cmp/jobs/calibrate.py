@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -385,6 +386,7 @@ def calibrate(
     stages = stages or Stages()
     campaigns = campaigns or dict.fromkeys((f.settings.flight.name for f in flights), settings.calibration)
     observed, warnings = observe(flights)
+    warnings += _unscored(observed)
     observed = in_campaigns(settings, observed, flights, campaigns)
     recipe = recipe_of(settings, observed, logs_root or folder)
     with stages("read"):
@@ -548,11 +550,18 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
             expected="at least one tower and channel that two flights have",
             cause="different 'node' or 'channel' of the logs in the flight files",
         )
-    if len(calibration.flights_of(observed)) < 2:
-        warnings.append("only one flight: no flight can be held out, so nothing is scored, and mounts are unstable")
-    elif lonely:
-        warnings.append(f"only one flight has {', '.join(lonely)}: learned, but not scored")
     return observed, warnings
+
+
+def _unscored(observed: Sequence[Observed]) -> list[str]:
+    """Return a remark on the tower channels that cannot be scored, because only one flight has them."""
+    flights = calibration.flights_of(observed)
+    if len(flights) < 2:
+        return ["only one flight: no flight can be held out, so nothing is scored, and mounts are unstable"]
+    heard = {(o.samples.antenna, o.samples.flight) for o in observed}
+    count = Counter(antenna for antenna, _ in heard)
+    lonely = [antenna for antenna in dict.fromkeys(o.samples.antenna for o in observed) if count[antenna] == 1]
+    return [f"only one flight has {', '.join(lonely)}: learned, but not scored"] if lonely else []
 
 
 def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | None, list[str]]:

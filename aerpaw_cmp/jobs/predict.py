@@ -173,9 +173,9 @@ def predict(
                 remarks.append(f"Not used: the antennas learned for {', '.join(learned)} have no level.")
             sources = {name: s for name, s in every.items() if s.tower in asked} or every
         else:
-            observed, warnings = observe(known)
+            observed, about_logs = observe(known)
             sources = sources_of(known, observed)
-            remarks += [text for text in warnings if "scored" not in text]
+            remarks += about_logs
         _check_shared(where, sources, site, "the flights heard" if known else "the site remembers")
         targets = find_targets(where, site, options, logs_root)
     work = f"{counted(len(targets.position_m), 'point')}: {', '.join(sources)}"

@@ -279,7 +279,7 @@ def warnings(data: MapsData) -> list[str]:
         if fit["degenerate"]:
             out.append(f"Correlation fit ({key.replace('z_', 'Z ')}): {fit['message']}")
     spacing = data.settings.get("spacing_m", 0.0)
-    if spacing > PAPER_SPACING_M:
+    if data.paper and data.correlation and spacing > PAPER_SPACING_M:
         out.append(
             f"A spacing of {spacing:g} m is coarser than the paper's {PAPER_SPACING_M:g} m: errors of interpolation "
             "and correlation are not comparable with it."

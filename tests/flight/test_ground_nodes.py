@@ -54,6 +54,17 @@ def test_a_track_that_stays_is_a_place_and_one_that_moves_a_track(tmp_path):
         ground_nodes(site, flight(track="gone.csv"), tmp_path)
 
 
+def test_the_attitude_of_a_node_gets_no_warning(tmp_path):
+    path = rover(tmp_path, 1e-5)
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([f"{head},heading", *(f"{row},90.0" for row in rows)]) + "\n")
+    warnings: list[str] = []
+    _, nodes = ground_nodes(load_site("lake_wheeler"), flight(track="rover.csv"), tmp_path, warnings)
+    assert nodes["ROVER"].account.heading_alone == 30
+    assert len(warnings) == 1
+    assert "moves 16 m" in warnings[0]
+
+
 def test_a_node_is_one_thing_and_has_its_own_name(tmp_path):
     for node in ({}, {"latitude_deg": 35.0}, {"latitude_deg": 35.0, "longitude_deg": -78.0, "track": "rover.csv"}):
         with pytest.raises(ValidationError, match="or a track"):

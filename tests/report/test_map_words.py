@@ -57,5 +57,8 @@ def test_warnings_stand_only_under_their_condition(maps_data: MapsData) -> None:
     )
     said = warnings(coarse)
     assert any("spacing of 90 m is coarser" in text for text in said)
+    for nothing_to_compare in ({"paper": ()}, {"correlation": ()}):
+        said_here = warnings(dataclasses.replace(coarse, **nothing_to_compare))
+        assert not any("coarser than" in text for text in said_here)
     assert "Corrected: Expect 3 dB." in said
     assert "Correlation fit (Z zero): one length alone" in said

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.errors import InputError, UsageError, about_file, one_line, parsed
+from ..common.errors import InputError, UsageError, one_line, parsed
 from ..common.files import LARGEST_TABLE, read_input
 from ..common.text import counted
 from ..common.units import (
@@ -41,6 +41,9 @@ _HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
 
 # A mean gain below -20 dB is a field in other units, or normalised. Measured antennas are near 0.5.
 _MINIMUM_EFFICIENCY = 0.01
+
+# Likely cause of a mean gain that no antenna has, unless the values are linear.
+NOT_GAIN = "the values are not gain over isotropic"
 
 # No element has more gain. A file with more has other units.
 HIGHEST_DBI = 60.0
@@ -267,8 +270,8 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
     """
     path = Path(path)
     rows = _read_rows(path)
-    _check_units(rows, path)
-    folded, table = _as_grid(rows, path)
+    _check_units(rows)
+    folded, table = _as_grid(rows)
     amplitude_db, phase = table[..., [4, 3]], table[..., [6, 5]]
     fields = np.moveaxis(amplitude_from_db(amplitude_db) * np.exp(1j * phase), -1, 0)
     e_theta, e_phi = _unfold(fields) if folded else fields
@@ -277,7 +280,7 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
     if not along:
         e_theta, e_phi = _mirrored(e_theta), _mirrored(e_phi)
     pattern = MeasuredPattern(path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
-    check_power(pattern, path)
+    check_power(pattern)
     return pattern
 
 
@@ -324,25 +327,24 @@ def _read_rows(path: Path) -> _Rows:
             rows.frequency_hz = float(frequency.group(1)) * scale
             continue
         if line.lower().lstrip().startswith("phi"):
-            _check_header(line, path, number)
+            _check_header(line, number)
             started = True
         elif started and line.strip():
-            values.append(_numbers(line, path, number))
+            values.append(_numbers(line, number))
             rows.lines.append(number)
-    _check_last_line(text, rows, path)
+    _check_last_line(text, rows)
     if not values:
         first = next((line.strip() for line in text.splitlines() if line.strip()), "")
         raise InputError(
             f"no antenna pattern of a known format; the file begins with '{one_line(first)[:60]}'",
             expected=READABLE,
             cause=_foreign_format(text),
-            path=path,
         )
     rows.values = np.array(values)
     return rows
 
 
-def _check_last_line(text: str, rows: _Rows, path: Path) -> None:
+def _check_last_line(text: str, rows: _Rows) -> None:
     """Refuse a truncated file, whose last line has no line end and a shorter last number than all others."""
     if not rows.lines or text.endswith(("\n", "\r")):
         return
@@ -353,22 +355,21 @@ def _check_last_line(text: str, rows: _Rows, path: Path) -> None:
         raise InputError(
             f"the last number, '{lines[rows.lines[-1] - 1].split()[-1]}', has fewer digits than those above it",
             cause="the line was cut off",
-            path=path,
             line=rows.lines[-1],
         )
 
 
-def _check_header(line: str, path: Path, number: int) -> None:
+def _check_header(line: str, number: int) -> None:
     # headers differ in blanks and points between files
     columns = [re.sub(r"[\s.]", "", cell.lower()) for cell in line.split("\t")]
     if len(columns) != 7 or not all(cell.startswith(column) for cell, column in zip(columns, _COLUMNS, strict=True)):
         cause = "the columns are not separated by tabs" if len(columns) == 1 else None
         raise InputError(
-            f"the columns are {', '.join(columns)}", expected=", ".join(_COLUMNS), cause=cause, path=path, line=number
+            f"the columns are {', '.join(columns)}", expected=", ".join(_COLUMNS), cause=cause, line=number
         )
 
 
-def _numbers(line: str, path: Path, number: int) -> list[float]:
+def _numbers(line: str, number: int) -> list[float]:
     cells = line.split()
     try:
         row = [float(cell) for cell in cells]
@@ -380,13 +381,12 @@ def _numbers(line: str, path: Path, number: int) -> list[float]:
             f"{counted(len(cells), 'field')}: '{line.strip()[:60]}'",
             expected="7 numbers",
             cause="decimal commas in place of points" if re.search(r"\d,\d", line) else cause,
-            path=path,
             line=number,
         )
     return row
 
 
-def _check_units(rows: _Rows, path: Path) -> None:
+def _check_units(rows: _Rows) -> None:
     values = rows.values
     for columns, what in (((0, 1), "angles"), ((5, 6), "phases")):
         largest = np.abs(values[:, columns]).max(axis=1)
@@ -397,16 +397,12 @@ def _check_units(rows: _Rows, path: Path) -> None:
                 f"{what} reach {largest[worst]:g}",
                 expected=f"{what} in radians",
                 cause="they are in degrees",
-                path=path,
                 line=rows.lines[worst],
             )
     if values[:, 2:5].max() > HIGHEST_DBI:
         worst = int(values[:, 2:5].max(axis=1).argmax())
         raise InputError(
-            f"a gain of {values[worst, 2:5].max():g}",
-            expected=f"dBi, at most {HIGHEST_DBI:g}",
-            path=path,
-            line=rows.lines[worst],
+            f"a gain of {values[worst, 2:5].max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", line=rows.lines[worst]
         )
     # the file also contains the sum, which checks the units
     total = db_from_power(power_from_db(values[:, 3]) + power_from_db(values[:, 4]))
@@ -417,12 +413,11 @@ def _check_units(rows: _Rows, path: Path) -> None:
             f"a total of {row[2]:g} with components {row[3]:g} and {row[4]:g}",
             expected=f"the total of the components, {total[wrong[0]]:.2f} dBi",
             cause="linear amplitudes instead of dBi" if len(wrong) > len(values) / 2 else "the line was cut off",
-            path=path,
             line=rows.lines[wrong[0]],
         )
 
 
-def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
+def _as_grid(rows: _Rows) -> tuple[bool, FloatArray]:
     """Return whether theta is a full circle, and rows as (phis, thetas, 7) with complete and equally spaced angles."""
     # five digits, because float32 angles of one grid line differ in the seventh
     key = np.round(rows.values[:, :2], 5)
@@ -435,7 +430,6 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
             f"{len(key)} rows with {len(phi)} values of phi and {len(theta)} of theta",
             expected="a grid over the sphere: every phi with every theta",
             cause="angles with other digits in each row, or a file that was cut off",
-            path=path,
         )
     seen = np.zeros((len(phi), len(theta)), dtype=np.int64)
     np.add.at(seen, (at_phi, at_theta), 1)
@@ -447,7 +441,6 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
             f"{math.degrees(phi[i]):.1f} deg, theta {math.degrees(theta[j]):.1f} deg ({what})",
             expected=f"each of {len(phi)} x {len(theta)} directions once",
             cause="the file was cut off, or a line is lost" if what == "missing" else "a line was copied",
-            path=path,
             line=None if what == "missing" else rows.lines[np.flatnonzero((at_phi == i) & (at_theta == j))[1]],
         )
     # theta begins at -pi, so phi covers half a circle only
@@ -463,7 +456,6 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
                 "values",
                 expected=f"{math.degrees(grid[0]):.0f} to {math.degrees(grid[-1]):.1f} deg in steps of {step:.2f}",
                 cause="angles are missing",
-                path=path,
             )
     # rows may have any order
     order = np.empty((len(phi), len(theta)), dtype=np.int64)
@@ -516,16 +508,12 @@ def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
     return scores[0] > 1.05 * scores[1] + 1e-6
 
 
-def check_power(
-    pattern: MeasuredPattern, path: Path, *, most_db: float = 0.5, cause: str = "the values are not gain over isotropic"
-) -> None:
+def check_power(pattern: MeasuredPattern, *, most_db: float = 0.5, cause: str = NOT_GAIN) -> None:
     """Refuse a pattern that radiates more than it is fed, almost nothing, or has linear numbers.
 
     Parameters
     ----------
     pattern : MeasuredPattern
-    path : Path
-        File, for the message.
     most_db : float
         Largest mean gain over the sphere. An antenna without loss has 0 dB, and the rest is measurement error.
     cause : str
@@ -540,13 +528,13 @@ def check_power(
             f"(peak {pattern.peak_gain_dbi:.1f} dBi)",
             expected=f"a mean of {float(db_from_power(_MINIMUM_EFFICIENCY)):g} to 0 dB",
             cause="linear values in place of dBi" if linear else cause,
-            path=path,
         )
 
 
 # ---------------------------------------------------------------- gain grids
 
 
+@parsed("a file of gain grids (rad_pat.mat)")
 def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
     """Read a gain grid of ``rad_pat.mat``: dBi over elevation x azimuth, without polarisation.
 
@@ -570,32 +558,30 @@ def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
         If there is no such grid.
     """
     path = Path(path)
-    with about_file(path):
-        content = read_arrays(read_input(path, LARGEST_TABLE, "a file of gain grids"), None)
+    content = read_arrays(read_input(path, LARGEST_TABLE, "a file of gain grids"), None)
     if not {"theta2", "phi2"} <= set(content):
-        raise InputError("no variables 'theta2' and 'phi2'", expected="a file of gain grids (rad_pat.mat)", path=path)
+        raise InputError("no variables 'theta2' and 'phi2'", expected="a file of gain grids (rad_pat.mat)")
     elevation, azimuth = np.ravel(content["theta2"]).astype(float), np.ravel(content["phi2"]).astype(float)
-    gain = _grid_of(content, variable, (len(elevation), len(azimuth)), path)
-    _check_angles(elevation, azimuth, path)
+    gain = _grid_of(content, variable, (len(elevation), len(azimuth)))
+    _check_angles(elevation, azimuth)
     if not np.isfinite(gain).all():
         row, column = np.argwhere(~np.isfinite(gain))[0]
         raise InputError(
             f"'{variable}': {counted(int((~np.isfinite(gain)).sum()), 'value')} without a number, first at elevation "
             f"{elevation[row]:g} deg, azimuth {azimuth[column]:g} deg",
             expected="dBi in every direction",
-            path=path,
         )
     if gain.max() > HIGHEST_DBI:
-        raise InputError(f"'{variable}' reaches {gain.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", path=path)
+        raise InputError(f"'{variable}' reaches {gain.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}")
     # the second modulo is needed because 359.9999999 rounds to 360, which is 0
     by_azimuth = np.argsort(np.round(azimuth % 360.0, 6) % 360.0)
     gain = gain[np.argsort(-elevation)][:, by_azimuth]
     pattern = MeasuredPattern(variable, np.sqrt(power_from_db(gain)).astype(np.complex128), None)
-    check_power(pattern, path)
+    check_power(pattern)
     return pattern
 
 
-def _grid_of(content: Mapping[str, Any], variable: str, shape: tuple[int, int], path: Path) -> FloatArray:
+def _grid_of(content: Mapping[str, Any], variable: str, shape: tuple[int, int]) -> FloatArray:
     """Return the grid of that name if it has a row per elevation and a column per azimuth."""
     sizes = {key: value.shape for key, value in content.items() if isinstance(value, np.ndarray)}
     grids = sorted(key for key, size in sizes.items() if size == shape)
@@ -603,19 +589,16 @@ def _grid_of(content: Mapping[str, Any], variable: str, shape: tuple[int, int], 
         return np.asarray(content[variable], dtype=float)
     rows = f"{shape[0]} elevations x {shape[1]} azimuths"
     if variable not in sizes:
-        raise UsageError(
-            f"no gain grid '{variable}'", expected=f"one of {', '.join(grids) or 'none'} ({rows})", path=path
-        )
+        raise UsageError(f"no gain grid '{variable}'", expected=f"one of {', '.join(grids) or 'none'} ({rows})")
     size = sizes[variable]
     raise UsageError(
         f"'{variable}' has {' x '.join(map(str, size))} values",
         expected=rows,
         cause="rows and columns are swapped" if size == shape[::-1] else "rows or columns are missing",
-        path=path,
     )
 
 
-def _check_angles(elevation: FloatArray, azimuth: FloatArray, path: Path) -> None:
+def _check_angles(elevation: FloatArray, azimuth: FloatArray) -> None:
     wanted_elevation = np.linspace(-90, 90, len(elevation))
     wanted_azimuth = np.arange(len(azimuth)) * (360.0 / len(azimuth))
     for what, axis, grid in (
@@ -635,5 +618,4 @@ def _check_angles(elevation: FloatArray, azimuth: FloatArray, path: Path) -> Non
             f"{what} runs from {ends} in {counted(len(axis), 'value')}",
             expected=f"{grid[0]:g} to {grid[-1]:g} deg, equally spaced" if len(axis) >= 3 else "a whole sphere",
             cause=next(cause for holds, cause in causes if holds),
-            path=path,
         )

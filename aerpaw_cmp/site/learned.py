@@ -876,7 +876,7 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
     notes = "\n".join(line for line in text.splitlines() if line.startswith("#"))
     # reports use the name of the file for the antenna
     pattern = SpherePattern(path.stem, gain, sd, notes=notes)
-    check_power(pattern, path)
+    check_power(pattern)
     return pattern
 
 

@@ -1,7 +1,7 @@
 """Outlines, single trees and tree rows of map files: GeoJSON, OSM XML, Overpass JSON, KML, KMZ.
 
 Elements are returned unchanged, and :mod:`.footprints` cleans them. An element that cannot be used is skipped and
-listed with its line. Only a file that is not a map file is an error.
+listed by its number, id or name. Only a file that is not a map file is an error.
 
 The file also reads the tags of OpenStreetMap (kind of an object, height, material), and converts its model of nodes,
 ways and relations to outlines, for OSM XML and Overpass JSON.
@@ -13,14 +13,12 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from math import isfinite
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
-from xml.parsers import expat
 
 import numpy as np
 import shapely
@@ -124,14 +122,14 @@ def is_tangled(ring: Polygon) -> bool:
     return False
 
 
-def lonlat(point: Any, where: str, path: Path) -> Position:
+def lonlat(point: Any, where: str) -> Position:
     """Return a position that is written longitude first. Raise InputError if it is not valid."""
     try:
         longitude, latitude = float(point[0]), float(point[1])
     except (TypeError, ValueError, IndexError, KeyError, OverflowError):
-        raise InputError(f"{where}: the position {str(point)[:40]} is not longitude, latitude", path=path) from None
+        raise InputError(f"{where}: the position {str(point)[:40]} is not longitude, latitude") from None
     if not (math.isfinite(latitude) and math.isfinite(longitude)):
-        raise InputError(f"{where}: a coordinate is not a number", path=path)
+        raise InputError(f"{where}: a coordinate is not a number")
     return latitude, longitude
 
 
@@ -144,27 +142,10 @@ def reason(error: Exception) -> str:
     return "it is not valid"
 
 
-def left_out(path: Path, line: int | None, what: str, error: Exception) -> str:
-    """Return the line of the list about an element that cannot be used.
-
-    Parameters
-    ----------
-    path : Path
-        Map file.
-    line : int or None
-        Line of the element.
-    what : str
-        Name of the element.
-    error : Exception
-        Reason why it cannot be used.
-
-    Returns
-    -------
-    str
-    """
-    place = path.name if line is None else f"{path.name}, line {line}"
+def left_out(path: Path, what: str, error: Exception) -> str:
+    """Return the note about the element ``what`` of a map file, which cannot be used because of an error."""
     why = reason(error).removeprefix(f"{path.name}: ").removeprefix(f"{what}: ")
-    return f"warning: {place}: {what} was left out: {why}"
+    return f"warning: {path.name}: {what} was left out: {why}"
 
 
 Kind = Literal["building", "forest", "geofence"]
@@ -362,7 +343,6 @@ def _number(text: str) -> float | None:
 
 
 Element = dict[str, Any]
-LineOf = Callable[[int], "int | None"]
 
 
 @dataclass(slots=True)
@@ -377,7 +357,7 @@ class _Data:
     relations: dict[str, Element] = field(default_factory=dict)
 
 
-def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: LineOf) -> MapFile:
+def read_elements(kind: str, elements: Iterable[Element], path: Path) -> MapFile:
     """Return outlines and trees of OpenStreetMap elements in the form of Overpass.
 
     Parameters
@@ -388,8 +368,6 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: L
         ``type``, ``id``, ``tags``, and ``lat lon``, ``nodes`` or ``geometry``, ``members``.
     path : Path
         File, for messages.
-    line_of : callable
-        Returns the line of an element by its index, for elements that cannot be used.
 
     Returns
     -------
@@ -397,37 +375,37 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: L
         Outlines, trees, and a note for each skipped element.
     """
     result, data = MapFile(kind, OSM_CREDIT), _Data(path)
-    for index, element in enumerate(elements):
+    for number, element in enumerate(elements, start=1):
         try:
-            _sort(element, index, data)
+            _sort(element, number, data)
         except BROKEN_ELEMENT as error:
-            result.notes.append(left_out(path, line_of(index), f"element {index + 1}", error))
+            result.notes.append(left_out(path, f"element {number}", error))
     for identity, tags in data.trees.items():
         result.trees.append(TreeLine(f"{path.name}: node {identity}", tags, (data.nodes[identity],)))
     result.ground += [(data.nodes[identity], height_m) for identity, height_m in data.ground.items()]
     lines: Counter[str] = Counter()
-    used_ways = _relations(data, result, lines, line_of)
+    used_ways = _relations(data, result, lines)
     for identity, way in data.ways.items():
         # a way without tags is part of a relation, or not used
         if way.get("tags") and identity not in used_ways:
             try:
                 _way_outline(identity, way, data, result, lines)
             except BROKEN_ELEMENT as error:
-                result.notes.append(left_out(path, line_of(way["index"]), f"way {identity}", error))
+                result.notes.append(left_out(path, f"way {identity}", error))
     result.note_no_areas(path.name, lines)
     return result
 
 
-def _sort(element: Element, index: int, data: _Data) -> None:
+def _sort(element: Element, number: int, data: _Data) -> None:
     """Store an element under its id. An element that occurs twice has the tags and points of both."""
     if element.get("visible") == "false" or element.get("action") == "delete":
         return
-    identity = str(element.get("id", f"without id, element {index + 1}"))
+    identity = str(element.get("id", f"without id, element {number}"))
     if element["type"] == "node":
         if element.get("lat") is None and element.get("lon") is None:
             return  # "out ids" and "out tags" contain no positions
         # ids are text in OSM XML and numbers in Overpass
-        data.nodes[identity] = lonlat((element.get("lon"), element.get("lat")), f"node {identity}", data.path)
+        data.nodes[identity] = lonlat((element.get("lon"), element.get("lat")), f"node {identity}")
         tags = element.get("tags") or {}
         if tags.get("natural") == "tree":
             data.trees[identity] = _osm_words(element)
@@ -435,7 +413,7 @@ def _sort(element: Element, index: int, data: _Data) -> None:
             data.ground[identity] = height_m
     elif element["type"] in ("way", "relation"):
         store = data.ways if element["type"] == "way" else data.relations
-        given = {key: value for key, value in {**element, "index": index}.items() if value is not None and value != {}}
+        given = {key: value for key, value in element.items() if value is not None and value != {}}
         # "out body; >; out skel;" contains a way with tags, and again without tags
         store[identity] = {**store.get(identity, {}), **given}
 
@@ -479,7 +457,7 @@ def _points(way: Element, data: _Data, outline: Outline) -> list[Position]:
             outline.broken.append(
                 f"{lost} of {counted(len(way['geometry']), 'point')} unknown: cut off at the query's box"
             )
-        return [lonlat((point.get("lon"), point.get("lat")), outline.source, data.path) for point in points]
+        return [lonlat((point.get("lon"), point.get("lat")), outline.source) for point in points]
     references = [str(reference) for reference in way.get("nodes") or []]
     known = [data.nodes[reference] for reference in references if reference in data.nodes]
     if not known:
@@ -492,7 +470,7 @@ def _points(way: Element, data: _Data, outline: Outline) -> list[Position]:
 # ---------------------------------------------------------------- relations
 
 
-def _relations(data: _Data, result: MapFile, lines: Counter[str], line_of: LineOf) -> set[str]:
+def _relations(data: _Data, result: MapFile, lines: Counter[str]) -> set[str]:
     """Add multipolygons and return the ways that are part of them and must not be added again."""
     used_ways: set[str] = set()
     for identity, relation in data.relations.items():
@@ -520,7 +498,7 @@ def _relations(data: _Data, result: MapFile, lines: Counter[str], line_of: LineO
         try:
             _multipolygon(relation, data, outline)
         except BROKEN_ELEMENT as error:
-            result.notes.append(left_out(data.path, line_of(relation["index"]), f"relation {identity}", error))
+            result.notes.append(left_out(data.path, f"relation {identity}", error))
             continue
         if outline.parts:
             used_ways |= {ref for ref in own if kind_of(_osm_words(data.ways[ref])) == kind}
@@ -637,9 +615,9 @@ def read_map_file(path: str | Path) -> MapFile:
     # skip a byte-order mark and blank lines
     start = data[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
     if not data.strip():
-        raise InputError("the file is empty", expected=FORMATS, path=path)
+        raise InputError("the file is empty", expected=FORMATS)
     if start.startswith(b"version https://git-lfs"):
-        raise InputError("a Git-LFS pointer in place of the data", cause="'git lfs pull' was not run", path=path)
+        raise InputError("a Git-LFS pointer in place of the data", cause="'git lfs pull' was not run")
     if start[:1] in (b"{", b"[", b"<"):
         content = _from_xml(data, path) if start[:1] == b"<" else _from_json(data, path)
         if _OF_OSM.search(data):
@@ -647,12 +625,10 @@ def read_map_file(path: str | Path) -> MapFile:
         return content
     for magic, what, remedy in _OTHER_KINDS:
         if data.startswith(magic):
-            raise InputError(f"{what}, not a map file of text", expected=FORMATS, cause=remedy, path=path)
+            raise InputError(f"{what}, not a map file of text", expected=FORMATS, cause=remedy)
     if b"OSMHeader" in data[:64]:
-        raise InputError(
-            "OSM data in PBF", expected=FORMATS, cause="'osmium cat in.pbf -o out.osm' unpacks it", path=path
-        )
-    raise InputError("not a map file", expected=FORMATS, path=path)
+        raise InputError("OSM data in PBF", expected=FORMATS, cause="'osmium cat in.pbf -o out.osm' unpacks it")
+    raise InputError("not a map file", expected=FORMATS)
 
 
 def _unzipped(data: bytes, path: Path) -> bytes:
@@ -660,14 +636,14 @@ def _unzipped(data: bytes, path: Path) -> bytes:
     try:
         members = files.archive_members(data, path)
     except InputError as error:
-        raise InputError(f"not a KMZ archive ({error.found})", cause="the file was cut off", path=path) from None
+        raise InputError(f"not a KMZ archive ({error.found})", cause="the file was cut off") from None
     maps = {name.lower(): member for name, member in members.items() if name.lower().endswith(".kml")}
     if not maps:
-        raise InputError("an archive without a .kml file", expected="KMZ", path=path)
+        raise InputError("an archive without a .kml file", expected="KMZ")
     # Google Earth opens doc.kml, or otherwise the first file
     main = maps.get("doc.kml") or next(iter(maps.values()))
     if main.size > MAX_BYTES:
-        raise InputError(f"{main.name} has {main.size} bytes", expected=f"at most {MAX_BYTES}", path=path)
+        raise InputError(f"{main.name} has {main.size} bytes", expected=f"at most {MAX_BYTES}")
     return main.read(MAX_BYTES)
 
 
@@ -678,43 +654,19 @@ def _from_json(data: bytes, path: Path) -> MapFile:
     except json.JSONDecodeError as error:
         # an error at the end means that the text is truncated
         cause = "the file was cut off" if error.pos >= len(text.rstrip()) - 1 else None
-        raise InputError(f"not JSON: {error.msg}", cause=cause, path=path, line=error.lineno) from None
+        raise InputError(f"not JSON: {error.msg}", cause=cause, line=error.lineno) from None
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise InputError(
-            "not JSON text: a byte that is not UTF-8", cause="save it as UTF-8", path=path, line=line
-        ) from None
+        raise InputError("not JSON text: a byte that is not UTF-8", cause="save it as UTF-8", line=line) from None
     if isinstance(content, dict) and isinstance(content.get("elements"), list):
-        result = read_elements("Overpass JSON", content["elements"], path, _lines_of(text, "elements"))
+        result = read_elements("Overpass JSON", content["elements"], path)
         # Overpass answers with status 200 and a remark if it ran out of time
         if remark := content.get("remark"):
             result.notes.append(f"warning: {path.name}: the Overpass server says: {str(remark)[:200]}")
         return result
     if isinstance(content, dict) and "type" in content:
-        return _geojson(content, path, _lines_of(text, "features"))
-    raise InputError("JSON, but neither GeoJSON nor Overpass", expected="a 'type' or 'elements' member", path=path)
-
-
-def _lines_of(text: str, member: str) -> Callable[[int], int | None]:
-    """Return a function for the line of the n-th element of a list in JSON, which reads the text again once."""
-    decoder, gap = json.JSONDecoder(), re.compile(r"[\s,]*")
-
-    @cache
-    def lines() -> list[int]:
-        start = re.search(rf'"{member}"\s*:\s*\[', text)
-        numbers: list[int] = []
-        at, counted, number = (start.end() if start else len(text)), 0, 1
-        while True:
-            at = gap.match(text, at).end()  # type: ignore[union-attr]
-            number += text.count("\n", counted, at)
-            counted = at
-            try:
-                _, at = decoder.raw_decode(text, at)
-            except (json.JSONDecodeError, RecursionError):
-                return numbers
-            numbers.append(number)
-
-    return lambda index: lines()[index] if index < len(lines()) else None
+        return _geojson(content, path)
+    raise InputError("JSON, but neither GeoJSON nor Overpass", expected="a 'type' or 'elements' member")
 
 
 # ---------------------------------------------------------------- GeoJSON (RFC 7946)
@@ -724,28 +676,28 @@ _GEOMETRIES = (
 )  # fmt: skip
 
 
-def _geojson(content: dict[str, Any], path: Path, line_of: Callable[[int], int | None]) -> MapFile:
-    _check_crs(content.get("crs"), path)
+def _geojson(content: dict[str, Any], path: Path) -> MapFile:
+    _check_crs(content.get("crs"))
     result, lines = MapFile("GeoJSON"), Counter[str]()
     kind = content["type"]
     if kind not in (*_GEOMETRIES, "Feature", "FeatureCollection"):
-        raise InputError(f"JSON of type '{kind}'", expected="GeoJSON: a FeatureCollection of areas", path=path)
+        raise InputError(f"JSON of type '{kind}'", expected="GeoJSON: a FeatureCollection of areas")
     features = content.get("features") if kind == "FeatureCollection" else [content]
     if not isinstance(features, list):
-        raise InputError("a FeatureCollection without a list of features", expected="'features': [...]", path=path)
+        raise InputError("a FeatureCollection without a list of features", expected="'features': [...]")
     for number, feature in enumerate(features, start=1):
         part = MapFile("GeoJSON")
         try:
             _feature(feature, number, part, lines, path)
         except BROKEN_ELEMENT as error:
-            result.notes.append(left_out(path, line_of(number - 1), f"feature {number}", error))
+            result.notes.append(left_out(path, f"feature {number}", error))
         else:
             result.take(part)
     result.note_no_areas(path.name, lines)
     return result
 
 
-def _check_crs(crs: Any, path: Path) -> None:
+def _check_crs(crs: Any) -> None:
     """Refuse coordinate systems other than WGS84, which GeoJSON of before RFC 7946 may name."""
     named = crs.get("properties") if isinstance(crs, dict) else crs
     name = str(named.get("name", "CRS84") if isinstance(named, dict) else named or "CRS84")
@@ -755,7 +707,6 @@ def _check_crs(crs: Any, path: Path) -> None:
             f"coordinates in {name}",
             expected="WGS84 longitude and latitude (RFC 7946)",
             cause="exported in projected coordinates; ogr2ogr -t_srs EPSG:4326 converts them",
-            path=path,
         )
 
 
@@ -789,25 +740,25 @@ def _geometry(geometry: dict[str, Any], outline: Outline, result: MapFile, lines
             _geometry(part, outline, result, lines, path)
         return
     if kind not in _GEOMETRIES:
-        raise InputError(f"it is not valid: a geometry of type {geometry.get('type')!r}", path=path)
+        raise InputError(f"it is not valid: a geometry of type {geometry.get('type')!r}")
     several = geometry["coordinates"] if kind.startswith("Multi") else [geometry["coordinates"]]
     single = kind.removeprefix("Multi")
     if single == "Polygon":
         for rings in several:
-            _polygon(rings, outline, path)
+            _polygon(rings, outline)
     # points and lines are trees only if their tags say so
     elif (single, natural) in (("Point", "tree"), ("LineString", "tree_row")):
         rows = [[points] if single == "Point" else points for points in several]
         source = outline.source
-        result.trees += [TreeLine(source, outline.tags, tuple(lonlat(p, source, path) for p in row)) for row in rows]
+        result.trees += [TreeLine(source, outline.tags, tuple(lonlat(p, source) for p in row)) for row in rows]
     elif single == "Point" and (height_m := metres(outline.tags.get("ele", ""))) is not None:
-        result.ground += [(lonlat(point, outline.source, path), height_m) for point in several]
+        result.ground += [(lonlat(point, outline.source), height_m) for point in several]
     else:
         lines[kind] += 1
 
 
-def _polygon(rings: list[Any], outline: Outline, path: Path) -> None:
-    outer, *holes = [[lonlat(point, outline.source, path) for point in ring] for ring in rings] or [[]]
+def _polygon(rings: list[Any], outline: Outline) -> None:
+    outer, *holes = [[lonlat(point, outline.source) for point in ring] for ring in rings] or [[]]
     if any(ring and ring[0] != ring[-1] for ring in (outer, *holes)):
         outline.broken.append("a ring is not closed; its ends were joined by a straight line")
     outline.parts.append((outer, holes))
@@ -818,44 +769,21 @@ def _polygon(rings: list[Any], outline: Outline, path: Path) -> None:
 
 def _from_xml(data: bytes, path: Path) -> MapFile:
     if b"<html" in data[:4096].lower():
-        raise InputError("a web page", expected=FORMATS, cause="the server's message was saved, not the map", path=path)
+        raise InputError("a web page", expected=FORMATS, cause="the server's message was saved, not the map")
     # count before parsing, because a parser would fill the memory
     if (tags := data.count(b"<")) > MAX_TAGS:
         raise InputError(
             f"the XML has {tags} tags",
             expected=f"at most {MAX_TAGS}",
             cause="a map of a whole country: cut out the site ('osmium extract')",
-            path=path,
         )
     root = xml_root(data, path, "plain OSM or KML")
     tag = plain_tag(root.tag)
     if tag == "kml":
-        return _kml(root, path, data)
+        return _kml(root, path)
     if tag == "osm":
-        return read_elements("OSM XML", _osm_elements(root), path, _xml_lines(data, None))
-    raise InputError(f"XML of '{tag}'", expected="OSM ('osm') or KML ('kml')", path=path)
-
-
-def _xml_lines(data: bytes, name: str | None) -> Callable[[int], int | None]:
-    """Return a function for the line of the n-th element of a name, or child of the root, which reads again once."""
-
-    @cache
-    def lines() -> list[int]:
-        numbers: list[int] = []
-        inside: list[bool] = []
-        parser = expat.ParserCreate()
-
-        def start(tag: str, _: Any) -> None:
-            wanted = len(inside) == 1 if name is None else tag.rpartition(":")[2] == name and not any(inside[-1:])
-            if wanted:
-                numbers.append(parser.CurrentLineNumber)
-            inside.append(name is not None and (wanted or any(inside[-1:])))
-
-        parser.StartElementHandler, parser.EndElementHandler = start, lambda _: inside.pop()
-        parser.Parse(data, True)
-        return numbers
-
-    return lambda index: lines()[index] if index < len(lines()) else None
+        return read_elements("OSM XML", _osm_elements(root), path)
+    raise InputError(f"XML of '{tag}'", expected="OSM ('osm') or KML ('kml')")
 
 
 def _osm_elements(root: ElementTree.Element) -> Iterator[dict[str, Any]]:
@@ -879,8 +807,8 @@ _ATTRIBUTES = {"id", "lat", "lon", "visible", "action"}
 # ---------------------------------------------------------------- KML
 
 
-def _kml(root: ElementTree.Element, path: Path, data: bytes) -> MapFile:
-    result, lines, line_of = MapFile("KML"), Counter[str](), _xml_lines(data, "Placemark")
+def _kml(root: ElementTree.Element, path: Path) -> MapFile:
+    result, lines = MapFile("KML"), Counter[str]()
     for number, placemark in enumerate(outermost(root, {"Placemark"}), start=1):
         name = next((str(n.text or "").strip() for n in placemark if plain_tag(n.tag) == "name"), "")
         identity = name or f"placemark {number}"
@@ -891,11 +819,11 @@ def _kml(root: ElementTree.Element, path: Path, data: bytes) -> MapFile:
             _kml_height(polygons, outline)
             for polygon in polygons:
                 bounds = list(outermost(polygon, {"outerBoundaryIs", "innerBoundaryIs"}))
-                outer = [_kml_ring(b, outline, path) for b in bounds if plain_tag(b.tag) == "outerBoundaryIs"]
-                holes = [_kml_ring(b, outline, path) for b in bounds if plain_tag(b.tag) == "innerBoundaryIs"]
+                outer = [_kml_ring(b, outline) for b in bounds if plain_tag(b.tag) == "outerBoundaryIs"]
+                holes = [_kml_ring(b, outline) for b in bounds if plain_tag(b.tag) == "innerBoundaryIs"]
                 outline.parts += [(ring, holes) for ring in outer]
         except BROKEN_ELEMENT as error:
-            result.notes.append(left_out(path, line_of(number - 1), f"placemark '{identity}'", error))
+            result.notes.append(left_out(path, f"placemark '{identity}'", error))
             continue
         if outline.parts:
             result.outlines.append(outline)
@@ -919,5 +847,5 @@ def _kml_height(polygons: list[ElementTree.Element], outline: Outline) -> None:
         outline.tags = {"height": f"{highest:g}", **outline.tags}
 
 
-def _kml_ring(boundary: ElementTree.Element, outline: Outline, path: Path) -> list[Position]:
-    return [lonlat(place, outline.source, path) for place in kml.places_of(boundary)]
+def _kml_ring(boundary: ElementTree.Element, outline: Outline) -> list[Position]:
+    return [lonlat(place, outline.source) for place in kml.places_of(boundary)]

@@ -74,10 +74,10 @@ def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
     """
     data = read_input(path, _LARGEST_FILE, "a mesh")
     with parsing(path, "a mesh"):
-        return check(read_ply(data, path), path), data
+        return check(read_ply(data)), data
 
 
-def check(mesh: RawMesh, path: Path) -> RawMesh:
+def check(mesh: RawMesh) -> RawMesh:
     """Return the mesh if every index names a vertex and every used vertex is finite."""
     if len(mesh.triangles):
         low, high = int(mesh.triangles.min()), int(mesh.triangles.max())
@@ -86,40 +86,37 @@ def check(mesh: RawMesh, path: Path) -> RawMesh:
                 f"a face names vertex {low if low < 0 else high}",
                 expected=f"0 to {len(mesh.vertices) - 1}",
                 cause="the file is damaged",
-                path=path,
             )
         if not np.isfinite(mesh.vertices[mesh.triangles.ravel()]).all():
-            raise InputError("a vertex is not a finite number", expected="coordinates in metres", path=path)
+            raise InputError("a vertex is not a finite number", expected="coordinates in metres")
     return mesh
 
 
-def read_ply(data: bytes, path: Path) -> RawMesh:
+def read_ply(data: bytes) -> RawMesh:
     """Read a PLY file."""
-    kind, elements, start = _header(data, path)
-    body = _Body(data, ">" if kind == "binary_big_endian" else "<", start, path)
+    kind, elements, start = _header(data)
+    body = _Body(data, ">" if kind == "binary_big_endian" else "<", start)
     if kind == "ascii":  # convert words to numbers of one type, so that the rest is the same as for a binary file
-        body = _Body(_numbers(data[start:].split(), path).tobytes(), "=", 0, path)
+        body = _Body(_numbers(data[start:].split()).tobytes(), "=", 0)
         elements = [replace(e, properties=tuple((n, "f8", k and "f8") for n, _, k in e.properties)) for e in elements]
     vertices: FloatArray = np.zeros((0, 3))
     triangles, bent = np.zeros((0, 3), dtype=np.int64), 0
     for element in elements:
         columns = body.read(element)
         if element.name == "vertex":
-            vertices = _vertices(element, columns, path)
+            vertices = _vertices(element, columns)
         elif element.name == "face":
-            triangles, bent = _fans(_polygons(element, columns, path), vertices, path)
+            triangles, bent = _fans(_polygons(element, columns), vertices)
     return RawMesh(vertices, triangles, bent)
 
 
-def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
+def _header(data: bytes) -> tuple[str, list[_Element], int]:
     if not data.startswith(b"ply"):
-        raise InputError("it does not begin with 'ply'", expected="a PLY mesh", path=path)
+        raise InputError("it does not begin with 'ply'", expected="a PLY mesh")
     end = data.find(b"end_header", 0, _LARGEST_HEADER)
     if end < 0:
-        raise InputError(
-            f"no 'end_header' in its first {_LARGEST_HEADER} bytes", expected="a PLY mesh", cause="a damaged file",
-            path=path,
-        )  # fmt: skip
+        found = f"no 'end_header' in its first {_LARGEST_HEADER} bytes"
+        raise InputError(found, expected="a PLY mesh", cause="a damaged file")
     start = data.find(b"\n", end) + 1
     kind = ""
     elements: list[_Element] = []
@@ -129,12 +126,10 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
             kind = words[1] if words[:1] == ["format"] else kind
             _declare(words, elements)
         except (IndexError, KeyError, ValueError):
-            raise InputError(
-                f"the header says '{line.strip()[:60]}'", expected="a PLY header", path=path, line=number
-            ) from None
+            raise InputError(f"the header says '{line.strip()[:60]}'", expected="a PLY header", line=number) from None
     # a negative count would read backwards
     if kind not in ("ascii", "binary_little_endian", "binary_big_endian") or any(e.count < 0 for e in elements):
-        raise InputError(f"a PLY of format '{kind}'", expected="ascii or binary", path=path)
+        raise InputError(f"a PLY of format '{kind}'", expected="ascii or binary")
     return kind, elements, start
 
 
@@ -149,11 +144,11 @@ def _declare(words: list[str], elements: list[_Element]) -> None:
         elements[-1] = _Element(last.name, last.count, (*last.properties, item))
 
 
-def _numbers(words: list[bytes], path: Path) -> FloatArray:
+def _numbers(words: list[bytes]) -> FloatArray:
     try:
         return np.array(words, dtype=np.bytes_).astype(np.float64) if words else np.zeros(0)
     except ValueError as error:
-        raise InputError(f"not a number: {error}", path=path) from None
+        raise InputError(f"not a number: {error}") from None
 
 
 @dataclass(slots=True)
@@ -163,7 +158,6 @@ class _Body:
     data: bytes
     order: str
     place: int
-    path: Path
 
     def take(self, kind: Any, count: int, element: _Element) -> AnyArray:
         """Return the next ``count`` items of a type."""
@@ -173,7 +167,6 @@ class _Body:
             raise InputError(
                 f"the file ends before the {element.count} entries of '{element.name}' that its header promises",
                 cause="it was cut off, or the header is damaged",
-                path=self.path,
             )
         values = np.frombuffer(self.data, what, count, self.place)
         self.place += count * what.itemsize
@@ -210,18 +203,18 @@ class _Body:
         ]
 
 
-def _vertices(element: _Element, columns: dict[str, Any], path: Path) -> FloatArray:
+def _vertices(element: _Element, columns: dict[str, Any]) -> FloatArray:
     if not {"x", "y", "z"} <= set(columns) or any(length for *_, length in element.properties):
-        raise InputError("its vertices have no x, y and z", expected="a PLY mesh", path=path)
+        raise InputError("its vertices have no x, y and z", expected="a PLY mesh")
     return np.column_stack([columns[axis][:, 0].astype(np.float64) for axis in "xyz"])
 
 
-def _polygons(element: _Element, columns: dict[str, Any], path: Path) -> list[IntArray]:
+def _polygons(element: _Element, columns: dict[str, Any]) -> list[IntArray]:
     """Return the corners of the polygons, grouped by size."""
     lists = [name for name, _, length in element.properties if length]
     which = next((name for name in lists if name in ("vertex_indices", "vertex_index")), None)
     if which is None:
-        raise InputError("its faces list no vertices", expected="'vertex_indices' or 'vertex_index'", path=path)
+        raise InputError("its faces list no vertices", expected="'vertex_indices' or 'vertex_index'")
     corners, by_size = columns[which], dict[int, list[AnyArray]]()
     for row in [corners] if isinstance(corners, np.ndarray) else corners:
         by_size.setdefault(row.shape[-1], []).append(row.reshape(-1, row.shape[-1]))
@@ -230,14 +223,14 @@ def _polygons(element: _Element, columns: dict[str, Any], path: Path) -> list[In
     return [np.where(np.abs(rows) < 2**53, rows, -1).astype(np.int64) for rows in polygons.values()]
 
 
-def _fans(polygons: list[IntArray], vertices: FloatArray, path: Path) -> tuple[IntArray, int]:
+def _fans(polygons: list[IntArray], vertices: FloatArray) -> tuple[IntArray, int]:
     """Return the triangles of polygons (n, 3), and the number of polygons that are not flat."""
     triangles: list[IntArray] = []
     bent = 0
     for group in polygons:
         corners = group.shape[1]
         if corners > 3:
-            check(RawMesh(vertices, group), path)
+            check(RawMesh(vertices, group))
             points = vertices[group]
             normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
             size = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -340,13 +333,13 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
     parameters = dict(materials or {})
     for name in parameters.values():
         material(name)  # raises an error for an unknown material
-    radio, unknown, notes = _materials(root, parameters, path)
+    radio, unknown, notes = _materials(root, parameters)
     reading = _Reading(path, path.parent.resolve(), radio)
     reading.digest.update(data)
     for shape in root.findall("./shape"):
         _add(reading, shape, unknown)
     if not reading.triangles:
-        raise InputError("the scene has no triangle", expected="shapes of type ply", path=path)
+        raise InputError("the scene has no triangle", expected="shapes of type ply")
     return _gathered(reading, notes)
 
 
@@ -372,9 +365,9 @@ def _root(path: Path) -> tuple[ElementTree.Element, bytes]:
     data = read_input(path, _LARGEST_XML, "a scene")
     root = xml_root(data, path, "a plain Mitsuba scene")
     if root.tag != "scene":
-        raise InputError(f"XML of '{root.tag}'", expected="a Mitsuba scene ('scene')", path=path)
+        raise InputError(f"XML of '{root.tag}'", expected="a Mitsuba scene ('scene')")
     if root.find(".//include") is not None:
-        raise InputError("the scene includes another XML file", expected="one file: paste it in", path=path)
+        raise InputError("the scene includes another XML file", expected="one file: paste it in")
     return root, data
 
 
@@ -382,7 +375,7 @@ def _root(path: Path) -> tuple[ElementTree.Element, bytes]:
 
 
 def _materials(
-    root: ElementTree.Element, parameters: Mapping[str, str], path: Path
+    root: ElementTree.Element, parameters: Mapping[str, str]
 ) -> tuple[dict[str, str], dict[str, str], list[str]]:
     """Return radio materials by id, the types of other materials by id, and notes."""
     radio: dict[str, str] = {}
@@ -395,28 +388,26 @@ def _materials(
         if name in parameters:
             radio[name] = parameters[name]
             continue
-        material = _radio_material(bsdf, name, path)
+        material = _radio_material(bsdf, name)
         if material is None:
             unknown[name] = bsdf.get("type", "?")
         else:
             radio[name] = material
-            if _float(bsdf, "scattering_coefficient", 0.0, path) > 0.0 and not _VEGETATION.search(name.lower()):
+            if _float(bsdf, "scattering_coefficient", 0.0) > 0.0 and not _VEGETATION.search(name.lower()):
                 rough.append(name)
     stray = sorted(set(parameters) - set(radio))
     if stray:
-        raise UsageError(
-            f"the scene has no material '{stray[0]}'", expected="one of " + ", ".join([*radio, *unknown]), path=path
-        )
+        raise UsageError(f"the scene has no material '{stray[0]}'", expected="one of " + ", ".join([*radio, *unknown]))
     notes = []
     if rough:
         notes.append(f"diffuse scattering of {', '.join(rough)} is not modelled: they reflect as smooth surfaces")
     return radio, unknown, notes
 
 
-def _radio_material(bsdf: ElementTree.Element, name: str, path: Path) -> str | None:
+def _radio_material(bsdf: ElementTree.Element, name: str) -> str | None:
     """Return the name of the radio material of a bsdf, or None if it has no radio properties."""
     kind, plain = bsdf.get("type", ""), name.removeprefix("mat-")
-    thickness = _float(bsdf, "thickness", _DEFAULT_THICKNESS_M, path)
+    thickness = _float(bsdf, "thickness", _DEFAULT_THICKNESS_M)
     stated = bsdf.find("string[@name='type']")
     if kind == "itu-radio-material" or plain.startswith(("itu_", "itu-")):
         # the exporter of Blender uses such names, from which Sionna RT derives the type
@@ -424,26 +415,25 @@ def _radio_material(bsdf: ElementTree.Element, name: str, path: Path) -> str | N
         if stated is not None:
             itu = stated.get("value", "")
         elif kind == "itu-radio-material" and itu == plain:
-            raise InputError(f"the material '{name}' has no type", expected='<string name="type" .../>', path=path)
+            raise InputError(f"the material '{name}' has no type", expected='<string name="type" .../>')
         try:
             return material(f"{itu} with thickness={thickness:.9g}").name
         except UsageError as error:
-            raise InputError(f"material '{name}': {error.found}", expected=error.expected, path=path) from None
+            raise InputError(f"material '{name}': {error.found}", expected=error.expected) from None
     if kind == "radio-material":
-        permittivity = _float(bsdf, "relative_permittivity", 1.0, path)
-        conductivity = _float(bsdf, "conductivity", 0.0, path)
+        permittivity = _float(bsdf, "relative_permittivity", 1.0)
+        conductivity = _float(bsdf, "conductivity", 0.0)
         if permittivity < 1.0 or conductivity < 0.0 or thickness < 0.0:
             raise InputError(
                 f"material '{name}': permittivity {permittivity:g}, conductivity {conductivity:g} S/m, "
                 f"thickness {thickness:g} m",
                 expected="a permittivity of at least 1 and no negative number",
-                path=path,
             )
         return stated_name(permittivity, conductivity, thickness)
     return "vacuum" if kind == "absorber-radio-material" else None
 
 
-def _float(parent: ElementTree.Element, name: str, default: float, path: Path) -> float:
+def _float(parent: ElementTree.Element, name: str, default: float) -> float:
     item = parent.find(f"float[@name='{name}']")
     text = str(default) if item is None else item.get("value", "")
     try:
@@ -451,7 +441,7 @@ def _float(parent: ElementTree.Element, name: str, default: float, path: Path) -
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"'{text[:60]}'", expected="a finite number", path=path)
+        raise InputError(f"'{text[:60]}'", expected="a finite number")
     return value
 
 
@@ -470,7 +460,6 @@ def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, st
             f"the shape '{name}' is moved by a to_world",
             expected="meshes in the coordinates of the scene, as Sionna RT's own",
             cause="apply the transform where the scene was made (Blender: Object, Apply), and export it again",
-            path=reading.path,
         )
     mesh = _mesh(reading, shape, name)
     reading.total += len(mesh.triangles)
@@ -479,7 +468,6 @@ def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, st
             f"more than {_MOST_TRIANGLES} triangles",
             expected="a scene that fits into memory",
             cause="a terrain or scan that is finer than a wavelength asks for: simplify it first",
-            path=reading.path,
         )
     reading.vertices.append(mesh.vertices)
     reading.triangles.append(mesh.triangles)
@@ -500,21 +488,17 @@ def _of_shape(reading: _Reading, shape: ElementTree.Element, name: str, unknown:
     if which in reading.radio:
         return reading.radio[which]
     if not which:
-        raise InputError(
-            f"the shape '{name}' has no material", expected='<ref id="..." name="bsdf"/>', path=reading.path
-        )
+        raise InputError(f"the shape '{name}' has no material", expected='<ref id="..." name="bsdf"/>')
     if which in unknown:
         others = "" if len(unknown) == 1 else f" and {len(unknown) - 1} more ({', '.join(list(unknown)[:6])})"
         raise UsageError(
             f"the material '{which}'{others} is of type '{unknown[which]}', which says nothing about radio",
             expected="itu-radio-material, radio-material, or an id such as 'mat-itu_concrete'",
             cause=f"say what it is: --material '{which}=concrete'",
-            path=reading.path,
         )
     raise InputError(
         f"the shape '{name}' names the material '{which}', which the scene has not",
         expected="one of " + ", ".join([*reading.radio, *unknown][:20]),
-        path=reading.path,
     )
 
 
@@ -522,16 +506,13 @@ def _mesh(reading: _Reading, shape: ElementTree.Element, name: str) -> RawMesh:
     item = shape.find("string[@name='filename']")
     wanted = "" if item is None else item.get("value", "")
     if not wanted:
-        raise InputError(
-            f"the shape '{name}' names no file", expected='<string name="filename" .../>', path=reading.path
-        )
+        raise InputError(f"the shape '{name}' names no file", expected='<string name="filename" .../>')
     place = inside(reading.folder, wanted, reading.path)
     if not place.is_file():
         raise InputError(
             f"the shape '{name}' names '{wanted}', which is not there",
             expected=f"a mesh below {reading.folder}",
             cause="the XML file was copied without its folder 'meshes'",
-            path=reading.path,
         )
     mesh, data = read_mesh(place)
     # digests of digests, so that bytes cannot move from one file to the next

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from ..common.content import marks, trained_on
-from ..common.errors import InputError, UsageError, parsed
+from ..common.errors import InputError, UsageError, about_file, parsed
 from ..common.files import LARGEST_TABLE, read_input
 from ..common.text import counted
 from ..common.units import FloatArray, power_from_db
-from .antennas import HIGHEST_DBI, MeasuredPattern, check_power, read_pattern_text
+from .antennas import HIGHEST_DBI, NOT_GAIN, MeasuredPattern, check_power, read_pattern_text
 from .learned import BAND, SPHERE_COLUMNS, SpherePattern, planning_cuts, read_sphere_csv, sphere_csv, sphere_grid
 
 # Gain of a half-wave dipole over an isotropic antenna.
@@ -64,14 +64,13 @@ def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> M
     if any(line.replace(" ", "").startswith(",".join(SPHERE_COLUMNS[:3])) for line in text.splitlines()[:100]):
         return read_sphere_csv(path)
     if _PLANET.search(text):
-        pattern = _planet(text, path)
+        pattern = _planet(text, path.stem)
     elif _PHI_CUT.search(text):
-        pattern = _great_circle(text, path.stem, path, carrier_hz)
+        pattern = _great_circle(text, path.stem, carrier_hz)
     elif _GAIN_TABLE.search(text):
         raise InputError(
             "peak gain over frequency, without directions",
             expected="a pattern of the same antenna, such as SA-1400-5900_F3300.txt",
-            path=path,
         )
     else:
         pattern = read_pattern_text(path)
@@ -79,7 +78,7 @@ def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> M
     return pattern
 
 
-def _planet(text: str, path: Path) -> MeasuredPattern:
+def _planet(text: str, name: str) -> MeasuredPattern:
     """Return the pattern of an MSI Planet file.
 
     Cuts run clockwise from the front, and from the front downwards.
@@ -91,22 +90,21 @@ def _planet(text: str, path: Path) -> MeasuredPattern:
     """
     gain = _GAIN.search(text)
     if gain is None:
-        raise InputError("no line 'GAIN value dBi'", expected="GAIN in dBi or dBd", path=path)
+        raise InputError("no line 'GAIN value dBi'", expected="GAIN in dBi or dBd")
     # dBd is the default of MSI Planet
     peak_dbi = float(gain[1]) + (0.0 if (gain[2] or "dBd").lower() == "dbi" else _DBI_OF_DBD)
     cuts: dict[str, FloatArray] = {}
     for cut in _PLANET.finditer(text):
         # the header has the number of lines, and later lines belong to the next cut
-        rows = _pairs(text[cut.end() :].split("\n"), int(cut[2]), path)
-        cuts[cut[1].upper()] = _each_degree(rows, cut[1], path)
+        rows = _pairs(text[cut.end() :].split("\n"), int(cut[2]))
+        cuts[cut[1].upper()] = _each_degree(rows, cut[1])
     carrier, learned = _FREQUENCY.search(text), bool(trained_on(text))
     cause = "the gain is too high for beams as wide as these cuts"
     if gain[2] is None:
         cause = f"'GAIN {gain[1]}' has no unit and is read as dBd; if it is a gain over isotropic: 'GAIN {gain[1]} dBi'"
     return _from_cuts(
-        _about_peak(cuts, peak_dbi, path),
-        path.stem,
-        path,
+        _about_peak(cuts, peak_dbi),
+        name,
         float(carrier[1]) * 1e6 if carrier else None,
         stated_dbi=None if learned else peak_dbi,
         most_db=_MOST_OF_LEARNED_CUTS_DB if learned else _MOST_OF_CUTS_DB,
@@ -114,7 +112,7 @@ def _planet(text: str, path: Path) -> MeasuredPattern:
     )
 
 
-def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float, path: Path) -> dict[str, FloatArray]:
+def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float) -> dict[str, FloatArray]:
     """Return the gain of cuts with attenuations below the peak, of either sign [dBi]."""
     values = np.concatenate(list(cuts.values()))
     # attenuations have one sign; values of both signs are gains relative to a level
@@ -123,19 +121,17 @@ def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float, path: Path) -> dic
             f"values from {values.min():g} to {values.max():g} dB below the peak",
             expected="attenuations of one sign",
             cause="gains instead of attenuations",
-            path=path,
         )
     if (least := np.abs(values).min()) > _RIPPLE_DB:
         raise InputError(
             f"no direction of the cuts is less than {least:.1f} dB below the gain of {peak_dbi:g} dBi",
             expected="cuts through the peak",
             cause="another gain, or gains instead of attenuations",
-            path=path,
         )
     return {name: peak_dbi - np.abs(cut) for name, cut in cuts.items()}
 
 
-def _pairs(lines: list[str], count: int, path: Path) -> FloatArray:
+def _pairs(lines: list[str], count: int) -> FloatArray:
     """Return angle and value of the first lines with numbers."""
     rows = []
     for line in [line for line in lines if line.strip()][:count]:
@@ -143,45 +139,42 @@ def _pairs(lines: list[str], count: int, path: Path) -> FloatArray:
         try:
             rows.append((float(cells[0]), float(cells[1])))
         except (ValueError, IndexError):
-            raise InputError(f"'{line.strip()[:60]}'", expected="an angle and a value", path=path) from None
+            raise InputError(f"'{line.strip()[:60]}'", expected="an angle and a value") from None
     if len(rows) < count or count < 4:
-        raise InputError(
-            f"a cut of {counted(len(rows), 'line')}", expected=f"{max(count, 4)}", cause="a cut file", path=path
-        )
+        raise InputError(f"a cut of {counted(len(rows), 'line')}", expected=f"{max(count, 4)}", cause="a cut file")
     return np.array(rows, dtype=np.float64)
 
 
-def _each_degree(rows: FloatArray, cut: str, path: Path) -> FloatArray:
+def _each_degree(rows: FloatArray, cut: str) -> FloatArray:
     """Return values at 0 to 359 degrees of a cut over a full circle.
 
     Half of a vertical circle is used for both halves.
     """
     angle, value = rows[:, 0] % 360.0, rows[:, 1]
     if not np.isfinite(rows).all() or np.abs(value).max() > 10 * HIGHEST_DBI:
-        raise InputError(f"cut {cut} reaches {np.abs(value).max():g} dB", expected="attenuation in dB", path=path)
+        raise InputError(f"cut {cut} reaches {np.abs(value).max():g} dB", expected="attenuation in dB")
     if np.ptp(rows[:, 0]) <= 180.0 and np.abs(rows[:, 0]).max() <= 90.0:  # a front half is used for the back, too
         angle, value = np.concatenate((angle, (180.0 - rows[:, 0]) % 360.0)), np.concatenate((value, value))
     order = np.argsort(angle, kind="stable")
     # the gap across the front counts, too
     if np.diff(np.append(angle[order], angle[order][0] + 360.0)).max() > 15.0:
-        raise InputError(f"cut {cut} has gaps above 15 deg", expected="a full circle", path=path)
+        raise InputError(f"cut {cut} has gaps above 15 deg", expected="a full circle")
     return np.asarray(np.interp(np.arange(360.0), angle[order], value[order], period=360.0))
 
 
 def _from_cuts(
     cuts: dict[str, FloatArray],
     name: str,
-    path: Path,
     frequency_hz: float | None,
     *,
     stated_dbi: float | None = None,
     most_db: float = _MOST_OF_CUTS_DB,
-    cause: str = "the values are not gain over isotropic",
+    cause: str = NOT_GAIN,
 ) -> MeasuredPattern:
     """Return the sphere of two cuts [dBi at each degree]. The module describes the method."""
     for cut in ("HORIZONTAL", "VERTICAL"):
         if cut not in cuts:
-            raise InputError(f"no cut {cut}", expected="a horizontal and a vertical cut", path=path)
+            raise InputError(f"no cut {cut}", expected="a horizontal and a vertical cut")
     horizontal, vertical = cuts["HORIZONTAL"], cuts["VERTICAL"]
     theta, phi = _grid()
     below = np.degrees(theta) - 90.0
@@ -201,9 +194,8 @@ def _from_cuts(
             f"are {down} below it",
             expected="two cuts with the same value at 0 deg",
             cause="a beam turned to the side, and each cut relative to its own peak",
-            path=path,
         )
-    return _pattern(level, name, path, frequency_hz, most_db, cause)
+    return _pattern(level, name, frequency_hz, most_db, cause)
 
 
 def _at(cut: FloatArray, degrees: FloatArray) -> FloatArray:
@@ -215,40 +207,40 @@ def _grid() -> tuple[FloatArray, FloatArray]:
 
 
 def _pattern(
-    level_dbi: FloatArray, name: str, path: Path, frequency_hz: float | None, most_db: float, cause: str
+    level_dbi: FloatArray, name: str, frequency_hz: float | None, most_db: float, cause: str = NOT_GAIN
 ) -> MeasuredPattern:
     if level_dbi.max() > HIGHEST_DBI:
-        raise InputError(f"a gain of {level_dbi.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", path=path)
+        raise InputError(f"a gain of {level_dbi.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}")
     pattern = MeasuredPattern(name, np.sqrt(power_from_db(level_dbi)).astype(np.complex128), None, frequency_hz)
-    check_power(pattern, path, most_db=most_db, cause=cause)
+    check_power(pattern, most_db=most_db, cause=cause)
     return pattern
 
 
-def _great_circle(text: str, name: str, path: Path, carrier_hz: float | None) -> MeasuredPattern:
+def _great_circle(text: str, name: str, carrier_hz: float | None) -> MeasuredPattern:
     """Return total gain of AERPAW along one great circle at several frequencies, with both halves blended."""
     rows = [line.split() for line in text.splitlines() if re.match(r"\s*\d{6,}(?:\.\d+)?\s", line)]
     table = np.array([[float(cell) for cell in row[:3]] for row in rows if len(row) >= 3])
     if not len(table):
-        raise InputError("no rows", expected="frequency [Hz], theta [rad], total gain [dBi], ...", path=path)
+        raise InputError("no rows", expected="frequency [Hz], theta [rad], total gain [dBi], ...")
     frequencies = np.unique(table[:, 0])
     frequency = float(frequencies[0])
     if len(frequencies) > 1:
         if carrier_hz is None:
-            raise InputError(f"{len(frequencies)} frequencies", expected="a carrier that says which", path=path)
+            raise InputError(f"{len(frequencies)} frequencies", expected="a carrier that says which")
         frequency = float(frequencies[np.argmin(np.abs(frequencies - carrier_hz))])
     cut = table[table[:, 0] == frequency]
     # -pi and pi, or a repeated row: interpolation needs ascending angles
     _, once = np.unique(np.round(cut[:, 1], 6), return_index=True)
     angle, gain = cut[once, 1], cut[once, 2]
     if len(angle) < 8 or angle[0] > -3.1 or angle[-1] < 3.1 or np.diff(angle).max() > 0.3:
-        raise InputError(f"{len(angle)} angles at {frequency / 1e6:g} MHz", expected="theta from -pi to pi", path=path)
+        raise InputError(f"{len(angle)} angles at {frequency / 1e6:g} MHz", expected="theta from -pi to pi")
     theta, phi = _grid()
     share = np.minimum(np.degrees(phi), 360.0 - np.degrees(phi)) / 180.0
     # blend the two halves of the circle around the axis, because there are no values between them
     front, back = np.interp(theta, angle, gain), np.interp(-theta, angle, gain)
     level = (1.0 - share) * front[:, None] + share * back[:, None]
     # one circle leaves more of the sphere to the interpolation than two cuts
-    return _pattern(level, name, path, frequency, _MOST_OF_LEARNED_CUTS_DB, "the values are not gain over isotropic")
+    return _pattern(level, name, frequency, _MOST_OF_LEARNED_CUTS_DB)
 
 
 # Columns of a cut by the first letters of the angle: degrees clockwise from the front, or below the horizon.
@@ -285,9 +277,10 @@ def read_cut_files(azimuth: Path, elevation: Path) -> MeasuredPattern:
             cause="one of them is relative to its own peak, or the files are exchanged",
             path=elevation,
         )
-    return _from_cuts(cuts, azimuth.stem, azimuth, None)
+    return _from_cuts(cuts, azimuth.stem, None)
 
 
+@parsed("a cut of an antenna pattern")
 def _cut_file(path: Path, angles: tuple[str, ...]) -> FloatArray:
     """Return the gain at each degree of a CSV file with a header, as :func:`_planet` does [dBi]."""
     text = read_input(path, LARGEST_TABLE, "a cut of an antenna pattern").decode("utf-8-sig", errors="replace")
@@ -298,11 +291,10 @@ def _cut_file(path: Path, angles: tuple[str, ...]) -> FloatArray:
         raise InputError(
             f"the columns are {', '.join(names)}",
             expected=f"an angle ({' or '.join(angles)}..., degrees) and a gain [dBi], named in the first line",
-            path=path,
         )
-    rows = _pairs([line.replace(",", " ") for line in lines], len(lines), path)
+    rows = _pairs([line.replace(",", " ") for line in lines], len(lines))
     rows[:, 0] = _CUT_ANGLES[begin] * rows[:, 0] - (90.0 if begin in ("th", "zen") else 0.0)
-    return _each_degree(rows, path.name, path)
+    return _each_degree(rows, path.name)
 
 
 def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: float | None = None) -> str:
@@ -337,9 +329,8 @@ def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: floa
         return planning_cuts(pattern, name, frequency, lines)
     theta, phi, _ = sphere_grid(STEP_DEG)
     if target.suffix == ".csv":
-        check_power(
-            pattern, target
-        )  # the reader of spheres requires it, because two cuts may radiate more power than is fed
+        with about_file(target):  # the reader of spheres requires it: two cuts may radiate more power than is fed
+            check_power(pattern)
         at = np.meshgrid(np.radians(theta), np.radians(phi), indexing="ij")
         sd = pattern.gain_sd_db(*at) if isinstance(pattern, SpherePattern) else np.zeros(at[0].shape)
         return sphere_csv(pattern.gain_dbi(*at), sd, lines)

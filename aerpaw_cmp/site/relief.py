@@ -295,26 +295,25 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> D
         if crs is None:
             where = "crs in site.yaml, or --dem-crs of 'site import', such as EPSG:4326"
             raise UsageError("an ASCII grid names no coordinate system", expected=where)
-        return _read_ascii(data, path, frame, crs)
+        return _read_ascii(data, frame, crs)
 
 
-def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str) -> Dem:
+def _read_ascii(data: bytes, frame: SiteFrame, crs: str) -> Dem:
     lines = data.decode("utf-8-sig").splitlines()
-    header, begin = _ascii_header(lines, path)
+    header, begin = _ascii_header(lines)
     rows, columns, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
     # default of ESRI
     gap = header.get("nodata_value", -9999.0)
     values: list[FloatArray] = []
     for number, line in enumerate(lines[begin:], start=begin + 1):
         if line.strip():
-            values.append(_ascii_cells(line, gap, path, number))
+            values.append(_ascii_cells(line, gap, number))
     flat = np.concatenate(values) if values else np.zeros(0)
     if flat.size != rows * columns:
         raise InputError(
             f"{flat.size} cells",
             expected=f"{rows} x {columns}",
             cause="the file was cut off" if flat.size < rows * columns else "nrows or ncols is wrong",
-            path=path,
             line=len(lines),
         )
     # heights belong to cell centres, half a cell from a corner
@@ -326,7 +325,7 @@ def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str) -> Dem:
     )  # fmt: skip
 
 
-def _ascii_header(lines: list[str], path: Path) -> tuple[dict[str, float], int]:
+def _ascii_header(lines: list[str]) -> tuple[dict[str, float], int]:
     """Return the values of the header, and its number of lines."""
     header: dict[str, float] = {}
     begin = 0
@@ -335,30 +334,28 @@ def _ascii_header(lines: list[str], path: Path) -> tuple[dict[str, float], int]:
         try:
             header[word[0].lower()] = float(word[1])
         except (IndexError, ValueError):
-            raise InputError(f"'{lines[begin - 1][:40]}' is no header", path=path, line=begin) from None
+            raise InputError(f"'{lines[begin - 1][:40]}' is no header", line=begin) from None
     missing = {"ncols", "nrows", "cellsize"} - set(header)
     if missing or not ({"xllcorner", "xllcenter"} & set(header) and {"yllcorner", "yllcenter"} & set(header)):
-        raise InputError(
-            "not an ESRI ASCII grid", expected="ncols, nrows, xllcorner, yllcorner, cellsize", path=path, line=1
-        )
+        raise InputError("not an ESRI ASCII grid", expected="ncols, nrows, xllcorner, yllcorner, cellsize", line=1)
     for name in ("ncols", "nrows"):
         if not (2 <= header[name] <= 1e6 and header[name] == int(header[name])):
-            raise InputError(f"{name} is {header[name]:g}", expected="a whole number from 2 on", path=path)
+            raise InputError(f"{name} is {header[name]:g}", expected="a whole number from 2 on")
     if not (0 < header["cellsize"] < np.inf):
-        raise InputError(f"cellsize is {header['cellsize']:g}", expected="a positive number", path=path)
+        raise InputError(f"cellsize is {header['cellsize']:g}", expected="a positive number")
     return header, begin
 
 
-def _ascii_cells(line: str, gap: float, path: Path, number: int) -> FloatArray:
+def _ascii_cells(line: str, gap: float, number: int) -> FloatArray:
     try:
         row = np.array(line.split(), dtype=np.float64)
     except ValueError:
         cause = "decimal commas in place of points" if "," in line else None
-        raise InputError("a cell is not a number", cause=cause, path=path, line=number) from None
-    return _plausible(np.where(row == gap, np.nan, row), path, number)
+        raise InputError("a cell is not a number", cause=cause, line=number) from None
+    return _plausible(np.where(row == gap, np.nan, row), number)
 
 
-def _plausible(height_m: FloatArray, path: Path | None = None, line: int | None = None) -> FloatArray:
+def _plausible(height_m: FloatArray, line: int | None = None) -> FloatArray:
     """Return the heights if each is a gap or possible on Earth."""
     wrong = height_m[(height_m < LOWEST_M) | (height_m > HIGHEST_M)]
     if wrong.size:
@@ -366,7 +363,6 @@ def _plausible(height_m: FloatArray, path: Path | None = None, line: int | None 
             f"a height of {wrong[0]:g} m",
             expected=f"{LOWEST_M:g} to {HIGHEST_M:g} m",
             cause="a gap that the file's NODATA value does not declare, or feet or centimetres",
-            path=path,
             line=line,
         )
     return height_m

@@ -42,7 +42,7 @@ COMMANDS: dict[str, list[str]] = {
 }
 
 # What runs before all of them and is not counted: it compiles the kernels that replays and maps keep on disk.
-WARM = ["-c", "from aerpaw_cmp.propagation.compiled import COMPILE_S, load\nfor name in COMPILE_S: load(name)"]
+WARM = ["-c", "from aerpaw_cmp.propagation.compiled import why_missing\nwhy_missing()"]
 
 # How each file of this folder is run by ``--check``; ``{folder}`` is one that is removed afterwards.
 SMALLEST: dict[str, list[str]] = {

@@ -34,7 +34,7 @@ import aerpaw_cmp
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.jobs.bench import random_scene
-from aerpaw_cmp.propagation import compiled
+from aerpaw_cmp.propagation import engines
 from aerpaw_cmp.propagation.geometry import Poses, single_element
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Building
@@ -145,12 +145,13 @@ def tables(listed: dict[str, tuple[list[str], tuple[str, ...]]]) -> dict[str, An
 def record(flights: list[Path], logs: Path | None, quick: bool) -> dict[str, Any]:
     """Every case, in NumPy and, if numba is installed, compiled, and the tables of the commands."""
     held: dict[str, Any] = {}
+    many = engines.MANY_FACES
     for mode in ("never", "always") if find_spec("numba") and not quick else ("never",):
-        os.environ[compiled.SWITCH] = mode
+        engines.MANY_FACES = 0 if mode == "always" else many
         for name, case in islice(scenes(), 2 if quick else SCENES):
             held |= columns(f"{name}, {mode}", replay(*case))
             print(name, mode, flush=True)
-    del os.environ[compiled.SWITCH]
+    engines.MANY_FACES = many
     case = None if quick else street()
     if case is not None:
         held |= columns("street", replay(*case))

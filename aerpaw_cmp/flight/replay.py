@@ -24,7 +24,7 @@ from ..propagation.edges import diffracted
 from ..propagation.field.baselines import free_space_dbm
 from ..propagation.field.sum import channel_matrices, mean_pair_power, rss_dbm
 from ..propagation.geometry import Link, Poses, RowsT, rotation_from_aircraft
-from ..propagation.options import Engine, Field, Job, Run, Search
+from ..propagation.options import Engine, Field, Run, Search
 from ..propagation.replay import PER_LINK, Replay, replay
 from ..site.site import Site
 from .clock import Along, ClockChannel, ClockEstimate, judge_clock
@@ -440,7 +440,7 @@ def replay_poses(
     towers_m: FloatArray | None = None,
     engine: Engine | None = None,
     progress: Progress = logged,
-    job: Job | None = None,
+    extent_m: FloatArray | None = None,
 ) -> Replay:
     """Replay poses with the settings ``rt`` and foliage.
 
@@ -457,8 +457,8 @@ def replay_poses(
     engine : {"image", "sionna"}, optional
     progress : Progress
         Called with the share that is done, for the sionna engine.
-    job : Job, optional
-        Job of which the poses are a part.
+    extent_m : (points, 3), optional
+        Points that span all poses of the job, if the poses are a part of it [m].
 
     Returns
     -------
@@ -485,7 +485,7 @@ def replay_poses(
     run = Run(
         # the image engine finishes before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" or long or towers_m is not None else None,
-        job=job,
+        extent_m=extent_m,
     )
     field = Field(path_loss(site, rt, link.carrier_hz))
     if towers_m is not None:

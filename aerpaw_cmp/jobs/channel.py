@@ -24,7 +24,7 @@ from ..flight.settings import FlightFile, LinkSettings
 from ..flight.track import interpolated, velocities_mps
 from ..flight.training import flight_logs
 from ..propagation.geometry import Link, Poses, rotation_from_aircraft
-from ..propagation.options import Job
+from ..propagation.options import extent_of
 from ..propagation.replay import check_band, subcarriers_hz
 from ..report.channel import FORMATS, STREAMED, Along, Channel, write_channel
 from ..report.exports import chosen_formats
@@ -128,12 +128,12 @@ def channel_parts(
         at_once, room, size = count, MOST_BYTES, size + _PATH_BYTES * links * _PATHS
         further = ", or only netcdf and csv" + (" with rt.engine: image" if drawn else "")
     _refuse(size, f"{counted(count, 'pose')}, {counted(len(towers), 'tower')}", room, further)
-    job = None if at_once >= count else Job.of(along.poses.position_m, links)
-    progress = stages.progress if job is None else lambda *_: None  # no progress for single parts
+    extent_m = None if at_once >= count else extent_of(along.poses.position_m)
+    progress = stages.progress if extent_m is None else lambda *_: None  # no progress for single parts
     names = {"": 0}  # the line of sight
     for start in range(0, count, at_once):
         part = along.part(slice(start, start + at_once))
-        run: dict[str, Any] = {"towers_m": part.towers_m, "progress": progress, "job": job}
+        run: dict[str, Any] = {"towers_m": part.towers_m, "progress": progress, "extent_m": extent_m}
         with stages("replay"):
             replayed = replay_poses(data.site, settings.rt, link, part.poses, **run)
         with stages("paths"):

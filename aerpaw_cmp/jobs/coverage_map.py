@@ -55,7 +55,7 @@ from ..maps.variogram import BinnedCorrelation, field_correlation, vertical_corr
 from ..propagation.field.foliage import crown_index, foliage_loss_db, foliage_model, stand_loss_db
 from ..propagation.field.sum import channel_matrices, rss_dbm
 from ..propagation.geometry import Link, PathSet, Poses, linear_array, single_element
-from ..propagation.options import Job, Run, Search
+from ..propagation.options import Run, Search
 from ..propagation.replay import Replay, replay
 from ..report import maps as page
 from ..report.flight_data import ReportData
@@ -281,9 +281,7 @@ class SiteChannels:
             return dict.fromkeys(s.foliage, self._for_all_towers(nothing))
         poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (n, 3, 3)))
         search = Search(max_depth=s.max_depth)
-        links = n * len(self.site.towers)
-        run = Run(job=Job(self.reach.extent_m, links))
-        replayed = replay(self.site, self.siso, poses, search, run=run)
+        replayed = replay(self.site, self.siso, poses, search, run=Run(extent_m=self.reach.extent_m))
         self.paths += len(replayed.paths)
         siso, mimo = replayed.h, channel_matrices(replayed.paths, replayed.faces, self.sources_m, poses, self.mimo).h
         result = {}

@@ -1,9 +1,9 @@
-"""Use of the compiled path search: whether it runs, the folder for its code, and threads.
+"""Compiled code of the path search among thousands of faces: options of its kernels, its folder, and threads.
 
-numba is optional (extra ``fast``). Importing numba and reading compiled code takes about a second. Compiling takes ten
-to thirty seconds, once per machine. A job is therefore compiled only if NumPy would take longer: the sum of the
-estimated seconds of all jobs of a process decides, and a first report never waits for a compiler.
-``AERPAW_CMP_COMPILED`` overrides the choice: ``auto``, ``never`` or ``always``.
+numba is optional (extra ``fast``). Importing numba and reading compiled code takes about a second, and compiling takes
+ten to thirty seconds, once per machine. NumPy finds the same paths among few faces in about the same time, so compiled
+code is used only for more faces (:func:`aerpaw_cmp.propagation.engines.by_beams`).
+``AERPAW_CMP_COMPILED=never`` switches it off.
 
 numba's cache on disk notices only changes in the file of a kernel. Formulas and constants that a kernel imports from
 another file would stay as they were compiled. The folder name therefore contains a hash of every source of compiled
@@ -13,58 +13,38 @@ code.
 from __future__ import annotations
 
 import os
+import pickle
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import sha256
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-import numpy as np
-
 from ..common.errors import UsageError
-from ..common.files import cache_folder
-from ..common.units import AnyArray
+from ..common.files import cache_folder, read_sealed, write_sealed
 
 ROOM = Path(__file__).parents[1]
 SWITCH = "AERPAW_CMP_COMPILED"
-BEAMS = "propagation.search.beams"
 # Modules of compiled code, and modules whose functions and constants it includes.
 SOURCES = (
     "propagation/search/beams.py", "propagation/search/merging.py", "propagation/search/mirror.py",
-    "propagation/geometry.py", "propagation/compiled.py", "propagation/numba_options.py",
+    "propagation/geometry.py", "propagation/compiled.py",
 )  # fmt: skip
 
-# CPU seconds of the first compilation on a machine.
-COMPILE_S = 25.0
-# CPU seconds of NumPy above which importing numba and reading compiled code pays off.
-READ_S = 0.4
-# A job that NumPy finds in less time always uses NumPy, even if numba is loaded.
-LEAST_S = 0.25
-
-# CPU seconds of NumPy per link and face, sequences of two reflections: 2.2 s in a map of 12 780 links, 245 faces and
-# ten heights, which with numba took 1.6 s and 110 MiB more.
-MIRRORS_S = 7e-8
+_MARK = b"aerpaw-cmp kernel 1\n"
+# As NumPy: 1 / 0 is infinite, not an exception; and no sum is reordered, or bits would differ.
+_MATHS: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
 
 
-@dataclass(frozen=True, slots=True)
-class State:
-    """The compiled code, or the reason why it is not available."""
-
-    kernels: ModuleType | None
-    reason: str
-
-
-def switch() -> str:
-    """The value of ``AERPAW_CMP_COMPILED``.
+def is_allowed() -> bool:
+    """Return False if ``AERPAW_CMP_COMPILED`` is ``never``.
 
     Raises
     ------
@@ -72,9 +52,9 @@ def switch() -> str:
         If the value is not known.
     """
     value = os.environ.get(SWITCH, "auto").strip().lower() or "auto"
-    if value not in ("auto", "never", "always"):
-        raise UsageError(f"{SWITCH}={value}", expected="auto, never or always")
-    return value
+    if value not in ("auto", "never"):
+        raise UsageError(f"{SWITCH}={value}", expected="auto or never")
+    return value == "auto"
 
 
 def _source_hash() -> str:
@@ -113,73 +93,41 @@ def _is_private(status: os.stat_result) -> bool:
     return not hasattr(os, "geteuid") or (status.st_uid == os.geteuid() and not status.st_mode & 0o022)
 
 
-class _Spent:
-    """The estimated CPU seconds of NumPy that this process spent on searches: many small jobs count as a large one."""
-
-    seconds = 0.0
-
-
-def beams_for(links: int, faces: int) -> bool:
-    """Check whether compiled beams are worth their start where mirror images in NumPy would find the same paths."""
-    chosen, numpy_s = switch(), links * faces * MIRRORS_S
-    _Spent.seconds += numpy_s
-    if chosen == "never" or (chosen == "auto" and (numpy_s < LEAST_S or _Spent.seconds < _cost_s())):
-        return False
-    state = load()
-    if state.kernels is None and (chosen == "always" or find_spec("numba") is not None):
-        warn_once(state.reason)
-    return state.kernels is not None
-
-
-def beams() -> State:
-    """The search among thousands of faces (:mod:`aerpaw_cmp.propagation.search.beams`), or why it cannot run."""
-    if switch() == "never":
-        return State(None, f"{SWITCH}=never")
-    return load()
-
-
-def _cost_s() -> float:
-    """Return the CPU seconds until compiled code runs: it is loaded, kept on disk, or has to be compiled."""
-    # loaded already: nothing left to pay
-    if f"aerpaw_cmp.{BEAMS}" in sys.modules:
-        return LEAST_S
-    folder = code_folder() if find_spec("numba") else None
-    return READ_S if folder is not None and (folder / f"{BEAMS}.compiled").exists() else COMPILE_S
+def why_missing() -> str:
+    """Return the reason why compiled code cannot run, or an empty text if it can."""
+    return _failure() if is_allowed() else f"{SWITCH}=never"
 
 
 @lru_cache(maxsize=1)
-def load() -> State:
-    """Import the kernels and try them. Any failure is a reason to use NumPy, not an error.
+def _failure() -> str:
+    """Import the kernels and try them. Any exception is a reason to use NumPy, not an error.
 
     A broken installation has many symptoms (no LLVM for this processor, a NumPy that is too new, a truncated cache),
     and NumPy returns the same result.
     """
     if find_spec("numba") is None:
-        return State(None, "numba is not installed (pip install 'aerpaw-cmp[fast]')")
+        return "numba is not installed (pip install 'aerpaw-cmp[fast]')"
     if os.path.lexists(".numba_config.yaml"):  # it names files that numba then writes, and may come from a third party
-        return State(None, "the working folder holds a .numba_config.yaml, which numba would obey")
+        return "the working folder holds a .numba_config.yaml, which numba would obey"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numba's own, about its cache
-            kernels = import_module(f"aerpaw_cmp.{BEAMS}")
             # a broken LLVM fails only when something is compiled, not on import
-            kernels.try_out()
-            if (folder := code_folder()) is not None:
-                (folder / f"{BEAMS}.compiled").touch()
+            import_module("aerpaw_cmp.propagation.search.beams").try_out()
     except Exception as error:
         line = (str(error).splitlines() or [""])[0]
-        return State(None, f"compiled code cannot run ({type(error).__name__}: {line})")
-    return State(kernels, "")
+        return f"compiled code cannot run ({type(error).__name__}: {line})"
+    return ""
 
 
 @lru_cache(maxsize=1)
 def warn_once(reason: str) -> None:
-    """Say why compiled code is not there."""
+    """Warn that compiled code cannot run, and why."""
     warnings.warn(f"{reason}: the job runs in NumPy, up to ten times slower", RuntimeWarning, stacklevel=4)
 
 
 def thread_count() -> int:
-    """Threads to use: the cores that this process may use."""
+    """Return the number of cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS and Windows
@@ -195,17 +143,70 @@ def in_threads(call: Callable[[Any], Any], parts: Iterable[Any], threads: int) -
     count = min(threads, len(parts))
     if count < 2:
         return [call(part) for part in parts]
-    # threads suffice: kernels let go of the interpreter's lock
     with ThreadPoolExecutor(count) as pool:
-        waiting = [pool.submit(call, part) for part in parts]
+        return list(pool.map(call, parts))
+
+
+def kernel(function: Callable[..., Any], **options: Any) -> Any:
+    """Compile a kernel at its first call, and cache it in :func:`code_folder` if that can be written."""
+    import numba
+    from numba.core import config
+
+    options = options or {"_nrt": True}  # set explicitly, or the option of the first caller would be used
+    compiled = numba.njit(nogil=True, **_MATHS, **options)(function)
+    if (folder := code_folder()) is not None:
+        before = config.CACHE_DIR
+        config.CACHE_DIR = str(folder)  # numba requires a private folder here, but does not store anything in it
         try:
-            return [each.result() for each in waiting]
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+            compiled.enable_caching()
+        finally:
+            config.CACHE_DIR = before
+        # after numba has created its cache, which would unpickle any file in the folder
+        compiled._cache._cache_file = _Sealed(function, folder)
+    return compiled
 
 
-def column(values: AnyArray, kind: Any = np.float64) -> AnyArray:
-    """Return an array with the layout that kernels require: one type, contiguous and writable."""
-    # numba compiles separately for every layout and for read-only arrays
-    return np.require(values, kind, ["C", "W"])
+class _Sealed:
+    """The compiled code of one kernel on disk, instead of numba's files, whose damage raises any exception or crashes.
+
+    An entry is followed by its SHA-256. A damaged entry is ignored, and the kernel is compiled again. Only this user
+    can write to the folder (:func:`code_folder`), since an entry contains machine code.
+    """
+
+    def __init__(self, function: Callable[..., Any], folder: Path) -> None:
+        self._folder = folder
+        self._name = f"{function.__module__}.{function.__qualname__}"
+
+    def _place(self, key: Any) -> Path:
+        # hashed: a signature of records is longer than a file name may be
+        return self._folder / f"{self._name}-{sha256(repr(key).encode()).hexdigest()[:32]}.kernel"
+
+    def load(self, key: Any) -> Any:
+        """Return the compiled code of a signature. None if it is not stored."""
+        try:
+            content = read_sealed(self._place(key), _MARK)
+        except ValueError:
+            return None
+        return None if content is None else pickle.loads(content)
+
+    def save(self, key: Any, data: Any) -> None:
+        """Store the compiled code of a signature."""
+        from numba.core.serialize import dumps
+
+        write_sealed(self._place(key), dumps(data), _MARK)
+
+
+def part(function: Callable[..., Any]) -> Any:
+    """Compile a part of kernels that creates no array.
+
+    A call would hand over each array of its records, hundreds of words, and count its users up and down: four fifths of
+    the time of a search went there. The caller holds the arrays, so nothing is counted in a part (numba's ``_nrt``).
+    """
+    return kernel(function, forceinline=True, _nrt=False)
+
+
+def inlined(function: Callable[..., Any]) -> None:
+    """Let kernels use a formula in plain Python, which NumPy also evaluates. Its body is inserted where it is used."""
+    from numba.extending import register_jitable
+
+    register_jitable(**_MATHS, forceinline=True)(function)

@@ -39,7 +39,7 @@ from .field.fresnel import FaceMaterials
 from .field.geometry import Elements, geometry
 from .field.sum import PAIRS_PER_CHUNK, of_one_depth, pattern_ends
 from .geometry import Array, Faces, Link, PathSet, Poses, RowsT, joined, rotation_from_yaw_pitch_roll
-from .options import Field, Job, Progress, Run, Search
+from .options import Field, Progress, Run, Search, extent_of
 from .replay import PER_LINK, Ends, Replay, replay
 from .scene import Omission
 
@@ -64,9 +64,8 @@ def replay_in_parts(
     rows = np.array_split(np.arange(len(poses)), max(1, -(-len(poses) // size)))
     if len(rows) == 1:
         return replay(site, link, poses, search, field, run)
-    links = len(poses) * len(link.tower_arrays)
     # each part would report its progress from 0 to 1
-    progress, run = run.progress, replace(run, progress=None, job=Job.of(poses.position_m, links))
+    progress, run = run.progress, replace(run, progress=None, extent_m=extent_of(poses.position_m))
 
     def of(at: IntArray) -> Replay:
         return replay(site, link, poses[at], search, field, run)
@@ -266,8 +265,8 @@ def replay_moving(
     if not blocks:
         return replay(site, link, poses, search, field, run)
     if len(blocks) > 1:
-        # all blocks share one tolerance; each place has few faces in reach, so that mirror images suffice
-        run = replace(run, job=Job.of(np.concatenate([poses.position_m, sources_m]), 0))
+        # all blocks share one tolerance
+        run = replace(run, extent_m=extent_of(np.concatenate([poses.position_m, sources_m])))
 
     def of(block: _Block) -> Replay:
         moved_site, several, some, links = _scene_of(site, link, name, poses, block)

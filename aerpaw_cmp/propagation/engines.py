@@ -21,7 +21,7 @@ from ..common.files import cache_folder, read_sealed, write_sealed
 from ..common.text import counted
 from ..common.units import FloatArray, spread_out
 from ..common.versions import version
-from .compiled import beams, beams_for, switch, warn_once
+from .compiled import is_allowed, warn_once, why_missing
 from .geometry import Faces, Link, PathSet, Poses
 from .options import Run, Search
 from .scene import Scene
@@ -166,16 +166,14 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
     """
     depth = search.max_depth
     links = scene.links_to(poses)
-    extent, count = (None, scene.excluded.size) if run.job is None else (run.job.extent_m, run.job.links)
-    if by_beams(scene, search, count):
-        from .search import beams as prisms  # compiled code, which is loaded only for many faces
-        from .search import beams as search_beams
+    if by_beams(scene, search):
+        from .search import beams  # compiled code, which is loaded only for many faces
 
         if scene.surfaces is not None:
-            return search_beams.grow_paths(scene.surfaces, links, run, max_depth=depth)
-        return prisms.find_paths(scene.faces, links, run, max_depth=depth, extent_m=extent)
+            return beams.grow_paths(scene.surfaces, links, run, max_depth=depth)
+        return beams.find_paths(scene.faces, links, run, max_depth=depth, extent_m=run.extent_m)
     if search.engine == "image":
-        return mirror.find_paths(scene.faces, links, max_depth=depth, extent_m=extent, progress=run.progress)
+        return mirror.find_paths(scene.faces, links, max_depth=depth, extent_m=run.extent_m, progress=run.progress)
     from .search import sionna
 
     return sionna.find_paths(
@@ -184,23 +182,18 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
     )  # fmt: skip
 
 
-def by_beams(scene: Scene, search: Search, links: int = 0) -> bool:
-    """Check whether the image engine searches by compiled beams: a scene of triangles, many faces, or a large job."""
+def by_beams(scene: Scene, search: Search) -> bool:
+    """Check whether the image engine searches by compiled beams: in a scene of triangles, or among many faces."""
     if search.engine != "image":
         return False
     if scene.surfaces is not None:
         return True
-    if search.max_depth < 2:
+    if search.max_depth < 2 or len(scene.faces) <= MANY_FACES or not is_allowed() or find_spec("numba") is None:
         return False
-    # with few faces, compiled code pays off only for many links
-    if len(scene.faces) <= MANY_FACES:
-        return links > 0 and beams_for(links, len(scene.faces))
-    if find_spec("numba") is None:
-        return False
-    state = beams()
-    if state.kernels is None and switch() != "never":
-        warn_once(state.reason)
-    return state.kernels is not None
+    reason = why_missing()
+    if reason:
+        warn_once(reason)
+    return not reason
 
 
 # ------------------------------------------------------------------------------------------------------- the cache

@@ -79,27 +79,11 @@ class Field:
         return None if self.loss is None else self.loss(paths, sources_m, targets_m)
 
 
-@dataclass(frozen=True, slots=True)
-class Job:
-    """Properties of the complete replay that a part needs to get the same result as one replay of all poses.
-
-    Parameters
-    ----------
-    extent_m : (points, 3)
-        Points that span all poses: they set the tolerance of the path search.
-    links : int
-        All links: they decide whether compiled code is worth loading.
-    """
-
-    extent_m: FloatArray
-    links: int
-
-    @classmethod
-    def of(cls, points_m: FloatArray, links: int) -> Job:
-        """The box of the points (n, 3) that are known."""
-        known = points_m[np.isfinite(points_m).all(axis=1)]
-        # two corners determine the same tolerance as all points
-        return cls(np.stack([known.min(axis=0), known.max(axis=0)]) if len(known) else known, links)
+def extent_of(points_m: FloatArray) -> FloatArray:
+    """Return two corners (2, 3) of the box of the known points (n, 3), for :class:`Run`."""
+    known = points_m[np.isfinite(points_m).all(axis=1)]
+    # two corners determine the same tolerance as all points
+    return np.stack([known.min(axis=0), known.max(axis=0)]) if len(known) else known
 
 
 Progress = Callable[[float], None]
@@ -114,12 +98,13 @@ class Run:
     cache_dir : path, optional
         Folder that stores paths, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for
         the ``sionna`` engine. The ``image`` engine is faster than a cache and only uses one that is named.
-    job : Job, optional
-        Job that the poses are a part of.
+    extent_m : (points, 3), optional
+        Points that span all poses of a job, if the poses are a part of it. They set the tolerance of the path search,
+        so that a part has the same paths as in one replay of all poses.
     progress : callable, optional
         Called with the share done.
     """
 
     cache_dir: str | Path | None = None
-    job: Job | None = None
+    extent_m: FloatArray | None = None
     progress: Progress | None = None

@@ -13,7 +13,7 @@ from ..site.materials import material
 from ..site.mitsuba import TriangleScene
 from ..site.scenes import added, building_mesh
 from ..site.site import Site
-from . import compiled
+from .compiled import why_missing
 from .geometry import Faces, Link, Links, Poses, Surfaces, inside_solids, site_faces
 
 
@@ -88,9 +88,9 @@ def surfaces_of(site: Site) -> Surfaces | None:
 @lru_cache(maxsize=2)
 def _merged(scene: TriangleScene) -> Surfaces:
     """Return the faces of a scene. The same scene is merged once."""
-    if compiled.beams().kernels is None:
+    if reason := why_missing():
         raise UsageError(
-            f"the site is a scene of triangles, but {compiled.beams().reason}",
+            f"the site is a scene of triangles, but {reason}",
             expected="numba that works: pip install 'aerpaw-cmp[fast]'",
             cause="only compiled code can search its thousands of faces",
         )

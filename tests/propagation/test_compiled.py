@@ -50,9 +50,7 @@ def test_no_file_of_the_working_folder_tells_numba_what_to_write(tmp_path, monke
     """``chrome_trace: thesis.tex`` there made numba replace the thesis at the end of the command."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / ".numba_config.yaml").write_text("chrome_trace: thesis.tex\n")
-    state = compiled.load.__wrapped__()
-    assert state.kernels is None
-    assert "the working folder holds a .numba_config.yaml" in state.reason
+    assert "the working folder holds a .numba_config.yaml" in compiled._failure.__wrapped__()
 
 
 def test_no_pose_is_shared_by_two_threads(case):
@@ -169,11 +167,10 @@ def test_a_replay_on_three_threads_is_that_on_one_bit_by_bit(monkeypatch, case):
 @pytest.fixture
 def fresh():
     """Nothing remembered, before and after."""
-    compiled.load.cache_clear()
+    compiled._failure.cache_clear()
     compiled.warn_once.cache_clear()
-    compiled._Spent.seconds = 0.0
     yield
-    compiled.load.cache_clear()
+    compiled._failure.cache_clear()
     compiled.warn_once.cache_clear()
 
 
@@ -214,9 +211,9 @@ from aerpaw_cmp.propagation.search import merging as boxtree
 from aerpaw_cmp.propagation.search import beams as growth
 from aerpaw_cmp.propagation.search import merging
 from aerpaw_cmp.propagation.search import beams as prisms
-from aerpaw_cmp.propagation.numba_options import FOLDER
+from aerpaw_cmp.propagation.compiled import code_folder
 height = growth._height(np.array([[0.0, 0.0, 1.0]]), np.array([2.0]), 0, np.array([5.0, 5.0, 7.0]))
-print(json.dumps([FOLDER, height]))
+print(json.dumps([code_folder(), height]))
 """
 
 
@@ -256,37 +253,14 @@ def test_many_faces_without_compiled_code(monkeypatch, fresh, case, way):
         Scene.of(dataclasses.replace(site, scene=mesh), link, poses)
 
 
-LINKS, FACES = 10_000, 1_000  # 0.7 s of NumPy
-
-
-def test_a_missing_numba_is_no_error(monkeypatch, fresh):
-    monkeypatch.setattr(compiled, "find_spec", lambda _: None)
-    monkeypatch.delenv(compiled.SWITCH, raising=False)
+def test_a_missing_numba_is_no_error(monkeypatch, fresh, case):
+    monkeypatch.setattr(engines, "MANY_FACES", 5)
+    for module in (compiled, engines):
+        monkeypatch.setattr(module, "find_spec", lambda _: None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert not compiled.beams_for(10**9, FACES)  # nobody asked for it
-    monkeypatch.setenv(compiled.SWITCH, "always")
-    with pytest.warns(RuntimeWarning, match=r"aerpaw-cmp\[fast\]"):
-        assert not compiled.beams_for(1, 1)
-
-
-def test_compiled_code_has_to_be_quicker_than_numpy_its_compilation_included(fresh, monkeypatch, tmp_path):
-    monkeypatch.delenv(compiled.SWITCH, raising=False)
-    monkeypatch.setattr(compiled, "load", lambda: compiled.State(types.ModuleType("kernels"), ""))
-    monkeypatch.setattr(compiled, "code_folder", lambda: tmp_path)
-    monkeypatch.setattr(compiled, "find_spec", lambda _: True)
-    monkeypatch.delitem(sys.modules, f"aerpaw_cmp.{compiled.BEAMS}", raising=False)
-    # many jobs of one process together pay for a compiler
-    seconds = LINKS * FACES * compiled.MIRRORS_S
-    before = [compiled.beams_for(LINKS, FACES) for _ in range(60)]
-    assert before == sorted(before)
-    assert before.index(True) * seconds == pytest.approx(compiled.COMPILE_S, abs=seconds)
-    (tmp_path / f"{compiled.BEAMS}.compiled").touch()
-    compiled._Spent.seconds = 0.0
-    assert compiled.beams_for(LINKS, FACES)  # kept on disk: read in less time than NumPy takes
-    assert not compiled.beams_for(100, 100)
-    monkeypatch.setenv(compiled.SWITCH, "never")
-    assert not compiled.beams_for(10**9, FACES)
+        same_paths(replay(*case[:3]).paths, case[3])
+    assert "aerpaw-cmp[fast]" in compiled.why_missing()
 
 
 DAMAGED = {
@@ -305,16 +279,16 @@ class _Ends:
         return sys.exit, (9,)
 
 
+@needs_numba
 @pytest.mark.parametrize("kind", DAMAGED)
 def test_a_damaged_entry_of_compiled_code_is_compiled_again(kind, tmp_path, monkeypatch):
-    numba_options = pytest.importorskip("aerpaw_cmp.propagation.numba_options")
-    monkeypatch.setattr(numba_options, "FOLDER", tmp_path)
+    monkeypatch.setattr(compiled, "code_folder", lambda: tmp_path)
 
     def run():
         def doubled(x):
             return 2.0 * x
 
-        kernel = numba_options.kernel(doubled)
+        kernel = compiled.kernel(doubled)
         assert kernel(4.0) == 8.0
         return sum(kernel.stats.cache_hits.values())
 
@@ -342,4 +316,4 @@ def test_compiled_code_is_kept_where_nobody_else_can_write(tmp_path, monkeypatch
 def test_wrong_settings_are_named(monkeypatch):
     monkeypatch.setenv(compiled.SWITCH, "sometimes")
     with pytest.raises(UsageError, match="AERPAW_CMP_COMPILED=sometimes"):
-        compiled.beams_for(1, 1)
+        compiled.why_missing()

@@ -9,7 +9,6 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation import engines
 from aerpaw_cmp.propagation.check.audit import Second, audit
-from aerpaw_cmp.propagation.compiled import State
 from aerpaw_cmp.propagation.edges import over_edges
 from aerpaw_cmp.propagation.engines import PathCache
 from aerpaw_cmp.propagation.geometry import Link, single_element
@@ -117,23 +116,19 @@ def test_the_cache_is_where_it_was_asked_for(monkeypatch, tmp_path, engine, give
 
 
 @pytest.mark.parametrize(
-    ("search", "faces", "worth", "here", "expected"),
+    ("search", "faces", "here", "expected"),
     [
-        ({}, 401, False, True, True), ({}, 400, False, True, False), ({}, 400, True, True, True),
-        ({"max_depth": 1}, 401, True, True, False), ({"engine": "sionna"}, 401, True, True, False),
-        ({}, 401, True, False, False),
+        ({}, 401, True, True), ({}, 400, True, False), ({"max_depth": 1}, 401, True, False),
+        ({"engine": "sionna"}, 401, True, False), ({}, 401, False, False),
     ],
 )  # fmt: skip
-def test_beams_serve_many_faces_two_deep_and_jobs_that_are_worth_them(
-    monkeypatch, case, search, faces, worth, here, expected
-):
+def test_beams_search_among_many_faces_two_deep(monkeypatch, case, search, faces, here, expected):
     scene = Scene.of(*case)
     few = replace(scene, faces=scene.faces.select(np.resize(np.arange(len(scene.faces)), faces)))
-    monkeypatch.setattr(engines, "beams_for", lambda links, many: worth and (links, many) == (7, faces))
-    monkeypatch.setattr(engines, "beams", lambda: State(object() if here else None, "no reason"))
+    monkeypatch.setattr(engines, "find_spec", lambda _: True)
+    monkeypatch.setattr(engines, "why_missing", lambda: "" if here else "no reason")
     monkeypatch.setattr(engines, "warn_once", lambda _: None)
-    assert engines.by_beams(few, Search(**search), 7) is expected
-    assert engines.by_beams(few, Search(**search)) is (expected and faces > 400)
+    assert engines.by_beams(few, Search(**search)) is expected
     assert engines.by_beams(replace(few, surfaces=object()), Search(**search)) is (search.get("engine") != "sionna")
 
 

@@ -25,8 +25,8 @@ import numpy as np
 from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
 from .. import compiled
+from ..compiled import kernel, part
 from ..geometry import BoxTree, Faces, Links, PathSet, Surfaces, corners, triangles
-from ..numba_options import kernel, part
 from ..options import Progress, Run
 from .merging import DEEPEST, WINDOW, box_missed, box_outside, box_tree, next_leaf, within_planes
 from .mirror import Occlusion, images_of, merge, planes_of, scene_tolerance_m, searched_links, trace_back

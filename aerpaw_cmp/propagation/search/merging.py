@@ -20,8 +20,8 @@ from ...common.errors import InputError
 from ...common.text import counted
 from ...common.units import BoolArray, FloatArray, IntArray
 from ...site.mitsuba import TriangleScene
+from ..compiled import inlined, kernel, part
 from ..geometry import BoxTree, Faces, Surfaces
-from ..numba_options import kernel, law, part
 
 # Size of the stack of a tree search: twice the depth of a tree with 4e9 items.
 DEEPEST = 64
@@ -133,7 +133,7 @@ def next_leaf(
     return -1, waiting
 
 
-law(next_leaf)
+inlined(next_leaf)
 
 
 def _collected(tree: BoxTree, missed: Any, region: Any, todo: IntArray, hits: IntArray) -> int:
@@ -149,7 +149,7 @@ def _collected(tree: BoxTree, missed: Any, region: Any, todo: IntArray, hits: In
     return total
 
 
-law(_collected)
+inlined(_collected)
 
 
 @kernel

@@ -37,6 +37,7 @@ from ..maps import grid as cells
 from ..maps import grid as job
 from ..maps.evaluate import (
     LOWEST_M,
+    TREATMENTS,
     InverseDistance,
     Predictor,
     Score,
@@ -784,10 +785,10 @@ def _correlation_panels(outcome: MapOutcome) -> Iterator[page.Correlation]:
     if not outcome.studies:
         return
     distance = np.linspace(0.0, 500.0, 251)
-    for key, title in (("zero", "Rank vectors, Z as rank 0"), ("missing", "Rank vectors, Z left out")):
+    for key, treatment in TREATMENTS.items():
         fit, words = outcome.studies[key].fit, f"bi-exponential, RMSE {outcome.studies[key].fit.rmse:.4f}"
         modelled = {"fit_distance_m": distance, "fit": fit(distance), "fit_label": words}
-        yield _correlation(title, outcome.studies[key].correlation, **modelled)
+        yield _correlation(f"Rank vectors, {treatment}", outcome.studies[key].correlation, **modelled)
     titles = {"horizontal": "Rank, one height", "vertical": "Rank, across heights", "RSS": "RSS, one height"}
     for key, binned in outcome.correlations.items():
         yield _correlation(titles[key], binned)
@@ -803,11 +804,11 @@ def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
     if not outcome.studies:
         return
     heights, _ = rank_fields(outcome.shown)
-    chosen = outcome.studies["random"].scores
+    chosen, zero = outcome.studies["random"].scores, TREATMENTS["zero"]
     tables: dict[str, dict[str, Score]] = {
         "leave one out": dict(outcome.studies["missing"].scores),
-        "leave one out, Z as rank 0": dict(outcome.studies["zero"].scores),
-        "leave one out, Z as rank 0, random samples": {name: chosen[name] for name in INTERPOLATORS if name in chosen},
+        f"leave one out, {zero}": dict(outcome.studies["zero"].scores),
+        f"leave one out, {zero}, random samples": {name: chosen[name] for name in INTERPOLATORS if name in chosen},
         f"blocks of {outcome.settings.block_m:g} m left out": outcome.blocks,
     }
     fields = list(itertools.product(enumerate(heights), enumerate(outcome.shown.ks)))

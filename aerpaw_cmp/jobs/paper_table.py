@@ -14,7 +14,7 @@ import yaml
 
 from ..common.text import counted
 from ..common.units import finite_mean, power_from_db
-from ..maps.evaluate import kriging_wins, rank_fields
+from ..maps.evaluate import TREATMENTS, kriging_wins, rank_fields
 from ..maps.grid import PAPER_BUDGET, Antennas
 from ..report.maps import PaperRow
 from ..report.texts import k_key
@@ -22,8 +22,6 @@ from .coverage_map import INTERPOLATORS, MapOutcome
 
 # Horizontal distance of "near the tower" in the rows about rank 2.
 NEAR_M = 150.0
-
-WORDS = {"zero": "Z as rank 0", "missing": "Z left out"}
 
 
 def paper_rows(outcome: MapOutcome) -> Iterator[PaperRow]:
@@ -147,7 +145,7 @@ def _correlation(outcome: MapOutcome) -> dict[str, str]:
     at = np.array([30.0, 150.0, 500.0])
 
     def each(text: Any) -> str:
-        return "; ".join(f"{text(outcome.studies[key].fit)} ({words})" for key, words in WORDS.items())
+        return "; ".join(f"{text(outcome.studies[key].fit)} ({words})" for key, words in TREATMENTS.items())
 
     digits = {"c1": 4, "c2": 5, "c3": 4, "c4": 5, "rmse": 4}
     ours = {name: each(lambda fit, name=name, d=d: f"{getattr(fit, name):.{d}f}") for name, d in digits.items()}

@@ -463,6 +463,10 @@ class Study:
     scores: Mapping[str, Score]
 
 
+# Treatments of positions out of coverage, as in :func:`rank_fields`.
+TREATMENTS = {"zero": "out of coverage as rank 0", "missing": "out of coverage excluded"}
+
+
 def rank_fields(
     result: MapResult, out_of_coverage: Literal["missing", "zero"] = "missing"
 ) -> tuple[tuple[float, ...], FloatArray]:

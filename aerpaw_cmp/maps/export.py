@@ -200,7 +200,7 @@ def _picture(grid: Grid, layer: Layer, low: float, high: float) -> bytes:
 
 def _legend(layer: Layer, low: float, high: float) -> bytes:
     if layer.classes:
-        names = ["Z (out of coverage)" if name == "Z" else name for name in layer.classes]
+        names = ["out of coverage" if name == "Z" else name for name in layer.classes]
         return kml.list_legend(layer.title, dict(zip(names, _class_palette(layer), strict=True)), 4.2)
     return kml.bar_legend(layer.title, f"{layer.unit}; grey: out of coverage", (low, high))
 

@@ -124,7 +124,7 @@ def fit_biexponential(distance_m: ArrayLike, correlation: ArrayLike) -> BiExpone
     problem = _Projection.of(distance_m, correlation)
     if len(problem.d) < 4:
         single = problem.single()
-        return problem.result(single, f"{counted(len(problem.d), 'point')} for four coefficients")
+        return problem.result(single, f"{counted(len(problem.d), 'point')} cannot determine four coefficients")
     best = problem.double()
     return problem.judge(best)
 
@@ -238,16 +238,16 @@ class _Projection:
         gain = n * np.log((cost_single + scale) / (cost + scale)) - 2 * np.log(n)
         reasons = []
         if gain <= 0:
-            reasons.append("one exponential describes the data as well (BIC)")
+            reasons.append("one exponential fits as well")
         if min(abs(c1), abs(c3)) < 1e-3 * max(abs(c1), abs(c3), 1e-300):
-            reasons.append("one of the two amplitudes vanishes")
+            reasons.append("one of the two exponentials has no amplitude")
         # rates within 5 %: one exponential in two parts
         if log_rates[0] - log_rates[1] < 0.05:
-            reasons.append("the two rates coincide")
+            reasons.append("both exponentials decay at the same rate")
         if log_rates[0] > self.log_rates[1] - 1e-3:
-            reasons.append("the fast rate lies at its bound: the first bins hold a jump, not a decay")
+            reasons.append("the faster decay ends before the first distance, so its rate cannot be determined")
         if -c4 * self.d.max() < 1e-3 or log_rates[1] < self.log_rates[0] + 1e-3:
-            reasons.append("the slow rate is too small to tell from 0: the tail is flat over the data")
+            reasons.append("the slower decay does not show within the largest distance")
         rmse = float(np.sqrt(cost / n))
         return BiExponential(
             c1=c1, c2=c2, c3=c3, c4=c4, rmse=rmse, degenerate=bool(reasons), message="; ".join(reasons)

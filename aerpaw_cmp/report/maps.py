@@ -22,6 +22,7 @@ from ..common.text import counted
 from ..common.units import FloatArray, IntArray, spread_out
 from ..compare.statistics import Interval
 from ..compare.verdict import Coverage, coverage_verdict
+from ..maps.evaluate import TREATMENTS
 from ..maps.grid import PAPER_SPACING_M
 from ..site.scenes import drawn_buildings
 from ..site.site import Site
@@ -277,7 +278,10 @@ def warnings(data: MapsData) -> list[str]:
         out.append(f"Corrected: {data.corrected_words}")
     for key, fit in data.metrics.get("correlation", {}).items():
         if fit["degenerate"]:
-            out.append(f"Correlation fit ({key.replace('z_', 'Z ')}): {fit['message']}")
+            out.append(
+                f"Correlation of ranks over distance, {TREATMENTS[key.removeprefix('z_')]}: the four coefficients of "
+                f"the fitted curve are not reliable ({fit['message']}). Kriging uses the curve, not its coefficients."
+            )
     spacing = data.settings.get("spacing_m", 0.0)
     if data.paper and data.correlation and spacing > PAPER_SPACING_M:
         out.append(
@@ -566,7 +570,7 @@ def plates(data: MapsData) -> Iterator[Plate]:
         yield Plate(
             name="correlation", section="kriging", title="Spatial correlation",
             caption="Pearson correlation between positions against their distance, and the fitted model. "
-            + " ".join(f"{c.title}: {c.excluded} constant positions left out." for c in data.correlation),
+            + " ".join(f"{c.title}: {c.excluded} constant positions or maps excluded." for c in data.correlation),
             panels={curve.title: correlation(curve) for curve in data.correlation},
         )  # fmt: skip
     for evaluation, errors in grouped(data.errors, lambda error: error.evaluation).items():

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -21,15 +20,12 @@ from ..compare.offset import Moments, difference_moments
 from ..compare.statistics import Interval
 from ..compare.verdict import NodeOffset, Step, Verdict, campaign_verdict, pooled_db
 from ..site.site import Site
-from .canvas import FigureSpec, Picture, beyond, colour_bar, draw_tower, frame_around, plan_axes, subplots
-from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Table, bold, estimate, settings_card
-from .charts import COLOURS
+from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, settings_card
+from .charts import Chart
 from .flight_words import first_sentence, judge, pretty, ranking_sentence, said_of
-from .page import Made, about, json_text, write_figures, write_file
+from .page import Made, about, json_text, write_file
+from .places import RESIDUAL, Places, payload
 from .texts import interval, k_key, minute, more, number
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -417,13 +413,13 @@ def step_words(data: CampaignData) -> list[str]:
     last = max(node.night[-1] for node in judged)
     steps = sorted(((step.night, node.node, step) for node in judged for step in node.steps), key=lambda s: s[:2])
     out = [
-        f"On {night} the offset of {name} steps by {step.step_db:+.1f} dB "
+        f"On {minute(night)} the offset of {name} steps by {step.step_db:+.1f} dB "
         f"(95 %: {step.step_ci95_db[0]:+.1f} to {step.step_ci95_db[1]:+.1f} dB)"
-        + (f" and is back on {step.back}." if step.back else ".")
+        + (f" and is back on {minute(step.back)}." if step.back else ".")
         for night, name, step in reversed(steps)
     ]
     if not any(step.shown == last for _, _, step in steps):
-        out.append(f"No offset steps on {last}, the last date.")
+        out.append(f"No offset steps on {minute(last)}, the last date.")
     smallest = max(judged, key=lambda node: node.smallest_db)
     return [
         *out,
@@ -439,7 +435,7 @@ def _ranked_words(data: CampaignData) -> list[str]:
         return []
     first = (
         f"With the offset of the other flights, {ranking[0].setting} has the smallest error "
-        f"({ranking[0].mean_db:.2f} dB over {counted(ranking[0].n_flights, 'flight')}). "
+        f"({ranking[0].mean_db:.1f} dB over {counted(ranking[0].n_flights, 'flight')}). "
     )
     return [first + ranking_sentence({entry.setting: entry.verdict for entry in ranking[1:]}, _FEW_SETTINGS)]
 
@@ -538,75 +534,43 @@ def against_baselines(row: RssRow) -> str:
     return "; ".join(parts) or ("not significant" if row.verdicts else "\u2013")
 
 
-# Number of nodes in a figure: those with steps first, then those that vary most.
+# Number of nodes in the chart: those with steps first, then those that vary most.
 _NODES_SHOWN = 12
 
 
-def season_nodes(data: CampaignData) -> Figure:
-    """Draw the offsets of nodes over the dates, minus their common part, with steps as bars of their intervals."""
-    fig, ax = subplots((9.2, 3.6))
-    order = sorted(data.season.nodes, key=lambda node: (not node.steps, -np.ptp(node.offset_db or (0.0,))))
-    dates = sorted({night for node in data.season.nodes for night in node.night})
-    for place, node in enumerate(order[:_NODES_SHOWN]):
-        colour = COLOURS[place % len(COLOURS)]
-        at = [dates.index(night) for night in node.night]
-        ax.plot(at, node.offset_db, marker=".", linewidth=0.6, color=colour, alpha=0.7, label=node.node)
-        for step in node.steps:
-            middle, where = node.offset_db[node.night.index(step.shown)], dates.index(step.shown)
-            reach = (step.step_ci95_db[1] - step.step_ci95_db[0]) / 2.0
-            ax.errorbar(where, middle, yerr=reach, color=colour, capsize=4, linewidth=1.6)
-    shown = np.unique(np.linspace(0, len(dates) - 1, 8).round().astype(int))
-    ax.set_xticks(shown, [dates[i] for i in shown], rotation=20)
-    ax.tick_params(axis="x", labelsize=8)
-    ax.set_ylabel("Offset against its median [dB]")
-    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    return fig
+def charts_of(data: CampaignData) -> list[Chart]:
+    """Return the chart of the offsets of nodes over the dates, if a node has more than one date."""
+    nodes = data.season.nodes
+    if not any(len(node.night) > 1 for node in nodes):
+        return []
+    dates = sorted({night for node in nodes for night in node.night})
+    number = {night: float(i) for i, night in enumerate(dates)}
+    shown = sorted(nodes, key=lambda node: (not node.steps, -np.ptp(node.offset_db or (0.0,))))[:_NODES_SHOWN]
+    marks = [
+        {"kind": "line", "name": node.node, "x": np.array([number[night] for night in node.night]),
+         "y": np.array(node.offset_db)}
+        for node in shown
+    ]  # fmt: skip
+    for name, step, level in ((n.node, s, n.offset_db[n.night.index(s.shown)]) for n in shown for s in n.steps):
+        ends = level + np.array(step.step_ci95_db) - step.step_db
+        marks.append({"kind": "line", "name": f"step of {name}", "x": np.full(2, number[step.shown]), "y": ends})
+    return [Chart(
+        section="season", title="Offsets over the campaign",
+        caption="Offset of each node over the dates, minus the part that all nodes share (weather, a transmitter). "
+        f"Vertical lines: 95 % intervals of steps. At most {_NODES_SHOWN} nodes are shown: nodes with steps, then "
+        "those that vary most.",
+        content={"x": {"label": "Date", "names": [minute(date).removesuffix(" UTC") for date in dates]},
+                 "y": {"label": "Offset against its median [dB]"}, "marks": marks},
+    )]  # fmt: skip
 
 
-def season_places(data: CampaignData) -> Figure:
-    """Draw the mean residual of each cell of the plan over flights, towers and channels."""
-    shown = data.season.places
-    assert shown is not None
-    cells = shown.cells
-    # a few outlying cells would leave one colour to all others
-    reach = max(float(np.percentile(np.abs(shown.mean_db), 98)), 0.1)
-    first, last = cells.min(axis=0), cells.max(axis=0) + 1
-    image = np.full(tuple(last - first)[::-1], np.nan)
-    image[cells[:, 1] - first[1], cells[:, 0] - first[0]] = shown.mean_db
-    extent = np.array([first[0], last[0], first[1], last[1]]) * data.cell_m
-    fig, ax = subplots((7.0, 5.0))
-    ax.set_facecolor("#F4F4F4")
-    # the palette has no grey, because a grey middle would be dark on a dark page, between two light neighbours
-    mesh = ax.imshow(
-        image, origin="lower", extent=tuple(extent), cmap="Spectral_r", vmin=-reach, vmax=reach, interpolation="none",
-        zorder=2,
-    )  # fmt: skip
-    known = {} if data.site is None else data.site.towers
-    names = dict.fromkeys(row.tower for row in data.reference_rows if row.tower in known)
-    for tower in names:
-        draw_tower(ax, known[tower])
-    plan_axes(ax)
-    at = [known[name].position_m[None, :2] for name in names]
-    frame_around(ax, *np.concatenate([(cells + 0.5) * data.cell_m, *at]).T)
-    colour_bar(fig, mesh, [ax], "Mean of measured − simulated [dB]", beyond(shown.mean_db, -reach, reach))
-    return fig
-
-
-def figure_specs(data: CampaignData) -> Iterator[FigureSpec]:
-    """Yield the figures of the campaign for which there are numbers."""
-    if any(len(node.night) > 1 for node in data.season.nodes):
-        yield FigureSpec(
-            "season_nodes", partial(season_nodes, data), "Offsets over the campaign",
-            "Offset of each node over the dates, minus the part that all nodes share (weather, a transmitter). Bars: "
-            f"95 % intervals of steps. At most {_NODES_SHOWN} nodes are shown: nodes with steps, then those that vary "
-            "most.",
-        )  # fmt: skip
-    if data.season.places is not None:
-        yield FigureSpec(
-            "season_places", partial(season_places, data), "Where the simulation is wrong, over all flights",
-            f"Mean over flights of the mean residual in cells of {data.cell_m:g} m, “{data.reference}”, all towers and "
-            "channels.",
-        )  # fmt: skip
+def _places(data: CampaignData) -> list[Places]:
+    """Return the mean residual of each cell of the plan over flights, towers and channels."""
+    if (shown := data.season.places) is None:
+        return []
+    at = np.pad((shown.cells + 0.5) * data.cell_m, ((0, 0), (0, 1)))
+    name = f"all flights, {data.reference}"
+    return [Places(name=name, at=at, values={f"{RESIDUAL} [dB]": shown.mean_db}, cell_m=data.cell_m)]
 
 
 # Largest number of warnings on the page.
@@ -711,11 +675,12 @@ def _ranking(data: CampaignData) -> Table:
     return Table(
         caption=f"Settings by their mean {kind}. Difference from the best setting: mean difference on the same "
         "flights, towers and channels, with a 95 % interval over flights; the first was chosen on these flights.",
-        columns={"Place": 0, "Setting": HEAD, "Flights": 0, "Mean error [dB]": RIGHT, "Median [dB]": 2,
-                 "10 % to 90 % [dB]": RIGHT, "Difference from the best setting [dB]": 2, "95 %": 2, "Shown": TEXT},
+        columns={"Rank": 0, "Setting": HEAD, "Flights": 0, "Mean error [dB]": RIGHT, "Median [dB]": 1,
+                 "10 % to 90 % [dB]": RIGHT, "Difference from the best setting [dB]": 2, "95 %": 2,
+                 "Against the best": TEXT},
         rows=[
-            (place, r.setting, r.n_flights, bold(number(r.mean_db, 2)), r.quantiles_db[3],
-             f"{number(r.quantiles_db[1], 2)} to {number(r.quantiles_db[5], 2)}", r.difference_db,
+            (place, r.setting, r.n_flights, bold(number(r.mean_db)), r.quantiles_db[3],
+             f"{number(r.quantiles_db[1])} to {number(r.quantiles_db[5])}", r.difference_db,
              r.difference_ci95_db or "", r.verdict)
             for place, r in enumerate(data.season.over_all(), 1)
         ],
@@ -729,9 +694,12 @@ def _worst(data: CampaignData) -> Table:
     link, first = Markup('<a href="{}">{}</a>'), next((r.setting for r in season.over_all()), "")
     return Table(
         caption=f"Flights with the largest error under “{first}”{few}.",
-        columns={"Flight": HEAD, "Start (UTC)": "when", "Error [dB]": 2, "Worst link": TEXT},
-        rows=[(link.format(reports[name], name) if name in reports else name, season.started.get(name, ""), error, at)
-              for name, error, at in worst[:_FEW_FLIGHTS]],
+        columns={"Flight": HEAD, "Start": "when", "Error [dB]": 1, "Worst link": TEXT},
+        rows=[
+            (link.format(reports[name], name) if name in reports else name, minute(season.started.get(name, "")),
+             error, at)
+            for name, error, at in worst[:_FEW_FLIGHTS]
+        ],
     )  # fmt: skip
 
 
@@ -740,7 +708,7 @@ def _mean_errors(data: CampaignData) -> Table:
     shown = (data.rss or not data.rank) and 0 < len(flights) <= _FEW_FLIGHTS
     return Table(
         caption="Mean RMSE over towers and channels [dB], each with an offset fitted on its own samples.",
-        columns={"Setting": HEAD, **dict.fromkeys(flights, 2)},
+        columns={"Setting": HEAD, **dict.fromkeys(flights, 1)},
         rows=[(setting, *(by[f] for f in flights)) for setting, by in mean_rmse(data).items()] if shown else [],
     )  # fmt: skip
 
@@ -756,23 +724,21 @@ def _transfers(data: CampaignData) -> Table:
     )  # fmt: skip
 
 
-def season_card(data: CampaignData, pictures: Sequence[Picture]) -> Card:
-    """Return the card of the campaign over time: its figures, and steps of offsets."""
-    steps = any(picture.spec.name == "season_nodes" for picture in pictures)
+def season_card(data: CampaignData) -> Card:
+    """Return the card of the campaign over time: offsets of nodes over the dates, and their steps."""
     table = Table(
         caption="Steps of offsets: date, size with 95 % interval, and date of the return to the old level. “Detects”: "
         "step that is detected on its first date with a probability of 90 %. campaign.json has every date.",
-        columns={"Node": HEAD, "Dates": 0, "Std. dev. [dB]": 2, "Detects [dB]": 1, "Steps": TEXT},
+        columns={"Node": HEAD, "Dates": 0, "Std. dev. [dB]": 1, "Detects [dB]": 1, "Steps": TEXT},
         rows=[(n.node, len(n.night), n.sd_db, n.smallest_db, "; ".join(map(_step, n.steps)) or "none")
-              for n in data.season.nodes] if steps else [],
+              for n in data.season.nodes],
     )  # fmt: skip
-    parts = [Card(tables=[table])]
-    return Card(title="Over the campaign", id="season", chart=pictures, parts=parts) if pictures else Card()
+    return Card(title="Over the campaign", id="season", link="Over time", chart="season", parts=[Card(tables=[table])])
 
 
 def _step(step: Step) -> str:
-    back = f", back on {step.back}" if step.back else ""
-    return f"{step.night}: {step.step_db:+.1f} dB ({interval(step.step_ci95_db)}){back}"
+    back = f", back on {minute(step.back)}" if step.back else ""
+    return f"{minute(step.night)}: {step.step_db:+.1f} dB ({interval(step.step_ci95_db)}){back}"
 
 
 def failures_card(data: CampaignData) -> Card:
@@ -797,7 +763,7 @@ def _pooled(data: CampaignData) -> Table:
         caption=f"Offsets shared per {data.calibration} (added to the measurement), the offsets of the members, "
         f"and the mean RMSE with each{more(data.pooled, ROWS_SHOWN)}.",
         columns={"Setting": TEXT, "Group": HEAD, "Members": 0, "Shared offset [dB]": RIGHT, "Own offsets [dB]": 1,
-                 "Std. dev. [dB]": 2, "RMSE, own offsets [dB]": 2, "RMSE, shared [dB]": 2},
+                 "Std. dev. [dB]": 1, "RMSE, own offsets [dB]": 1, "RMSE, shared [dB]": 1},
         rows=[(g.setting, g.group, len(g.members), number(g.offset_db) + (" (edge)" if g.at_search_edge else ""),
                g.range_db, g.spread_db, g.own_rmse_db, g.pooled_rmse_db) for g in data.pooled[:ROWS_SHOWN]],
     )  # fmt: skip
@@ -838,13 +804,13 @@ def _levels(data: CampaignData) -> Table:
     return Table(
         caption=f"RSS. Offset and RMSE are fitted on the row's own samples; baselines have an offset of their "
         f"own{few}.",
-        columns={"Flight": HEAD, "Setting": TEXT, "Link": TEXT, "Offset [dB]": RIGHT, "RMSE [dB]": RIGHT, "95 %": 2,
-                 "Held-out RMSE [dB]": 2, **{f"{pretty(name)} [dB]": 2 for name in models},
-                 "Against baselines (95 %)": TEXT, "RMSE, shared offset [dB]": 2, "Corr.": 2, "Samples": 0,
+        columns={"Flight": HEAD, "Setting": TEXT, "Link": TEXT, "Offset [dB]": RIGHT, "RMSE [dB]": RIGHT, "95 %": 1,
+                 "Held-out RMSE [dB]": 1, **{f"{pretty(name)} [dB]": 1 for name in models},
+                 "Against baselines (95 %)": TEXT, "RMSE, shared offset [dB]": 1, "Corr.": 2, "Samples": 0,
                  "Out of coverage": 0, "Clock": TEXT, "Fitted here": TEXT},
         rows=[
             (r.flight, r.setting, r.link, number(r.offset_db) + (" (edge)" if r.at_search_edge else ""),
-             bold(number(r.rmse_db, 2)), r.rmse_ci95_db or "", r.held_out_rmse_db,
+             bold(number(r.rmse_db)), r.rmse_ci95_db or "", r.held_out_rmse_db,
              *(r.baselines.get(name) for name in models), against_baselines(r), r.pooled_rmse_db, r.correlation, r.n,
              r.n_out_of_coverage, _clock(r),
              ", ".join(r.fitted))
@@ -887,8 +853,12 @@ def settings_of(data: CampaignData, files: Sequence[str]) -> Card:
 CARDS = (failures_card, offsets_card, rows_card)
 
 
-def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
+def campaign_page(data: CampaignData, files: Sequence[str]) -> str:
     """Return the page."""
+    charts = charts_of(data)
+    places = _places(data)
+    linked = payload(places, data.site, charts=charts) if charts or places else None
+    shown = Positions(view="places", data=linked) if linked else None
     known, failed = warnings(data), len({failure.flight for failure in data.failures})
     beyond = [f"{len(known) - MANY} more are in campaign.json."] if len(known) > MANY else []
     lead = "Soundings between towers."
@@ -899,13 +869,15 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
     return Page(
         kind="campaign", title=data.title, tag="synthetic" if data.synthetic else "", verdict=" ".join(verdict(data)),
         cautions=[*known[:MANY], *beyond], about=[f"{lead} Made {minute(data.generated)}"],
-        cards=[result_card(data), season_card(data, pictures), *(card(data) for card in CARDS),
-               settings_of(data, files)],
+        charts=charts,
+        cards=[result_card(data), *([season_card(data)] if charts else []),
+               Card(title="Where the simulation is wrong: mean residual, measured minus simulated", positions=shown),
+               *(card(data) for card in CARDS), settings_of(data, files)],
     ).html()  # fmt: skip
 
 
 def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
-    """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``. Return the files, the page first.
+    """Write ``campaign.html``, ``campaign.json`` and the tables. Return the files, the page first.
 
     ``pairs.csv`` contains all pairs of flights at the same positions; campaign.json those with the most cells.
     """
@@ -921,11 +893,7 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     for name, table in tables.items():
         if name == "campaign.csv" or len(table):
             written.append(write_file(folder / name, guarded(table).to_csv(index=False, lineterminator="\n")))
-    specs = list(figure_specs(data))
-    drawn, pictures = write_figures(specs, folder / "figures", ("svg", "png"))
-    files = [*(path.name for path in written), *["figures/"] * bool(pictures)]
-    page = write_file(folder / "campaign.html", campaign_page(data, drawn, files))
-    return [page, *written, *pictures]
+    return [write_file(folder / "campaign.html", campaign_page(data, [path.name for path in written])), *written]
 
 
 # --- pairs of flights at the same places -----------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -51,26 +51,14 @@ _RASTER_DPI = 130
 
 @dataclass(frozen=True, slots=True)
 class FigureSpec:
-    """A figure to draw: file name, the function that draws it, and its text on a page."""
+    """A figure to draw: its file name, and the function that draws it."""
 
     name: str
     draw: Callable[[], Figure]
-    title: str = ""
-    caption: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A drawn figure: the picture by format ("png", "svg", "pdf"), and the smaller PNG inside a page."""
-
-    spec: FigureSpec
-    formats: Mapping[str, bytes]
-    inline: bytes = b""
 
 
 STYLES = ("screen", "paper")
 FORMATS = ("png", "svg", "pdf")
-INLINE = "png of few colours"
 
 # Width of two columns of an IEEE page.
 _IEEE_WIDTH_IN = 7.16
@@ -172,20 +160,14 @@ def placed(
 
 
 def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
-    """Return the figure in some of :data:`FORMATS`.
-
-    In the style ``paper`` it is as wide as two columns of an IEEE page. The result also contains :data:`INLINE`, the
-    same picture with at most 256 colours, which has a third of the bytes and no visible difference.
-    """
+    """Return the figure in some of :data:`FORMATS`, in the style ``paper`` as wide as two columns of an IEEE page."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.ticker import AutoLocator
-    from PIL import Image
 
     if kind == "paper":
         width, height = fig.get_size_inches()
         fig.set_size_inches(_IEEE_WIDTH_IN, height * _IEEE_WIDTH_IN / width)
-    dots_per_inch = 300.0 if kind == "paper" else _RASTER_DPI
-    fig.set_dpi(dots_per_inch)
+    fig.set_dpi(300.0 if kind == "paper" else _RASTER_DPI)
     for axis in (axis for ax in fig.axes for axis in (ax.xaxis, ax.yaxis)):
         locator = axis.get_major_locator()
         if isinstance(locator, AutoLocator):
@@ -194,13 +176,11 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
     # use the canvases, because Figure.savefig draws an additional, hidden figure before each file
     agg = FigureCanvasAgg(fig)
     agg.draw()  # the layout is made here
-    picture = Image.fromarray(np.asarray(agg.buffer_rgba())).convert("RGB")
     if "png" in images:
-        picture.save(images["png"], "PNG", compress_level=2, dpi=(dots_per_inch, dots_per_inch))
-    if INLINE in images:
-        # an octree needs a tenth of the time of a median cut, and fewer pixels differ much; level 9 saves a further 5 %
-        few = picture.quantize(256, method=Image.Quantize.FASTOCTREE)
-        few.save(images[INLINE], "PNG", compress_level=6)
+        from PIL import Image
+
+        picture = Image.fromarray(np.asarray(agg.buffer_rgba())).convert("RGB")
+        picture.save(images["png"], "PNG", compress_level=2, dpi=(fig.dpi, fig.dpi))
     fig.set_layout_engine("none")  # a second layout would cost as much as a drawing
     if "svg" in images:
         from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -213,11 +193,10 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
     return {name: file.getvalue() for name, file in images.items()}
 
 
-def render(spec: FigureSpec, formats: Sequence[str] = ("png",), kind: str = "screen") -> Picture:
-    """Draw a figure and return its pictures."""
+def render(spec: FigureSpec, formats: Sequence[str] = ("png",), kind: str = "screen") -> dict[str, bytes]:
+    """Draw a figure and return it by format."""
     with style(kind):
-        files = save_as(spec.draw(), (*formats, INLINE) if "png" in formats else formats, kind)
-    return Picture(spec, {name: files[name] for name in formats}, files.get(INLINE, b""))
+        return save_as(spec.draw(), formats, kind)
 
 
 # --- parts --------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from typing import Any
 from markupsafe import Markup
 
 from ..compare.statistics import Interval
-from .canvas import Picture
 from .page import json_text, rendered, write_file
 from .texts import flat, interval, number, percent, short
 
@@ -120,8 +119,8 @@ class Card:
     text : sequence
         A string is a paragraph with commands between backquotes, a list is a list, and Markup is unchanged.
     tables : sequence of Table
-    chart : str or sequence of Picture
-        Section of the charts of this card (:class:`~aerpaw_cmp.report.charts.Chart`), or drawn figures.
+    chart : str
+        Section of the charts of this card (:class:`~aerpaw_cmp.report.charts.Chart`).
     positions : Positions, optional
     id, link : str
         Anchor of a section, and its name in the navigation.
@@ -137,7 +136,7 @@ class Card:
     title: str = ""
     text: Sequence[Any] = ()
     tables: Sequence[Table] = ()
-    chart: str | Sequence[Picture] = ""
+    chart: str = ""
     positions: Positions | None = None
     id: str = ""
     link: str = ""

@@ -646,7 +646,7 @@ def write_report(
         for name, text in (("rss.csv", csv_text(RSS, data.rss)), ("rank.csv", csv_text(RANK, data.rank))):
             # write it without rows, too, so that every report has the same files
             written.append(write_file(folder / name, text))
-        _, pictures = write_figures(specs, folder / "figures", formats, style, stages.progress)
+        pictures = write_figures(specs, folder / "figures", formats, style, stages.progress)
     written += pictures
     if exports:
         from .exports import of_report, write_exports

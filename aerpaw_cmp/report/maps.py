@@ -989,6 +989,6 @@ def write_maps(data: MapsData, folder: str | Path, drawn: str = "none") -> list[
     written = [write_file(folder / "metrics.json", json_text(maps_metrics(data)))]
     specs = [] if drawn == "none" else figure_specs(data)
     formats = canvas.FORMATS if drawn == "all" else (drawn,)
-    _, files = write_figures(specs, folder / "figures", formats)
+    files = write_figures(specs, folder / "figures", formats)
     page = write_file(folder / "map.html", maps_page(data, ["metrics.json"]))
     return [page, *written, *files]

@@ -21,7 +21,7 @@ from markupsafe import Markup
 from ..common.stages import Progress, logged
 from ..common.text import counted
 from ..common.versions import commit, utc_now, versions
-from .canvas import FigureSpec, Picture, render
+from .canvas import FigureSpec, render
 from .texts import coded
 
 
@@ -87,12 +87,6 @@ def digest(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
 
 
-def picture_uri(picture: Picture) -> str:
-    """Return a picture as a data URI: its small PNG if there is one, otherwise its SVG."""
-    kind, content = ("png", picture.inline) if picture.inline else ("svg+xml", picture.formats["svg"])
-    return f"data:image/{kind};base64," + base64.b64encode(content).decode("ascii")
-
-
 @cache
 def environment() -> Any:
     """Return the template engine, which escapes all text and fails on undefined names."""
@@ -105,7 +99,7 @@ def environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(coded=coded, counted=counted, embedded=embedded, picture_uri=picture_uri, zip=zip)
+    environment.filters.update(coded=coded, counted=counted, embedded=embedded, zip=zip)
     return environment
 
 
@@ -143,8 +137,8 @@ def write_figures(
     formats: Sequence[str] = ("png",),
     kind: str = "screen",
     progress: Progress = logged,
-) -> tuple[list[Picture], list[Path]]:
-    """Draw figures, write each in its formats, and return the pictures and the files.
+) -> list[Path]:
+    """Draw figures, write each in its formats, and return the files.
 
     Parameters
     ----------
@@ -160,16 +154,13 @@ def write_figures(
 
     Returns
     -------
-    pictures : list of Picture
-    files : list of Path
+    list of Path
     """
-    drawn: list[Picture] = []
     written: list[Path] = []
-    for spec in specs:
-        progress("figures", len(drawn) / len(specs))
-        picture = render(spec, formats, kind)
-        drawn.append(picture)
-        written += [write_file(folder / f"{spec.name}.{form}", content) for form, content in picture.formats.items()]
+    for number, spec in enumerate(specs):
+        progress("figures", number / len(specs))
+        pictures = render(spec, formats, kind)
+        written += [write_file(folder / f"{spec.name}.{form}", content) for form, content in pictures.items()]
     if specs:
         progress("figures", 1.0)
-    return drawn, written
+    return written

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from ..common.kml import CLASS_COLOURS
 from ..common.units import FloatArray, spread_out
 from ..site.site import Site
+from .charts import Chart
 from .flight_data import RANKS
-from .packed import PackedArrays, ends_of_scale, listed, plan_of, step_for
+from .packed import PackedArrays, ends_of_scale, listed, packed, plan_of, step_for
 
 # Largest number of values on a page; larger groups are thinned.
 MOST_VALUES = 1_500_000
@@ -21,6 +22,9 @@ MOST_VALUES = 1_500_000
 # Name of a layer of ranks, and names of the ends of its interval.
 LIKELIEST = "likeliest rank"
 BAND = ("low", "high")
+
+# First word of a layer whose colours are centred on zero.
+RESIDUAL = "residual"
 
 # Names of azimuths 0, 90, 180 and 270 degrees, counter-clockwise.
 COMPASS = ("E", "N", "W", "S")
@@ -62,6 +66,7 @@ def payload(
     site: Site | None = None,
     lines: Iterable[FloatArray] = (),
     rings: Iterable[FloatArray] = (),
+    charts: Sequence[Chart] = (),
 ) -> dict[str, Any]:
     """Return all data of the script as plain values.
 
@@ -73,6 +78,7 @@ def payload(
         East, north of flown or proposed routes [m].
     rings : iterable of (k, 2)
         Outlines of the area in which a route may run [m].
+    charts : sequence of Chart
 
     Returns
     -------
@@ -85,13 +91,14 @@ def payload(
         for name, column in group.values.items():
             alike.setdefault(_scale(group.name, name), []).append(np.asarray(column, dtype=np.float64))
     every = {key: np.concatenate(columns) for key, columns in alike.items()}
-    ranges = {key: ends_of_scale(values[np.isfinite(values)], 99.0) for key, values in every.items()}
+    ranges = {key: _range(key[1], values[np.isfinite(values)]) for key, values in every.items()}
     return {
         "site": None if site is None else plan_of(site),
         "lines": [listed(np.round(np.asarray(line)[spread_out(len(line), 2000), :2], 1)) for line in lines],
         "rings": [listed(np.round(ring[:, :2], 1)) for ring in rings],
         "groups": [_group(group, arrays, total, ranges) for group in groups],
         "ranks": {str(rank): CLASS_COLOURS[rank] for rank in RANKS},
+        "plots": [packed(chart.content, arrays) for chart in charts],
         "packed": arrays.content(),
     }
 
@@ -99,6 +106,13 @@ def payload(
 def _scale(group: str, layer: str) -> tuple[str, str]:
     """Return the key of a colour scale, which a quantity shares at all heights, and before and after a flight."""
     return group.partition(", ")[0], layer.partition(" ")[0]
+
+
+def _range(layer: str, values: FloatArray) -> list[float]:
+    """Return the colour scale of a quantity, symmetric for residuals."""
+    low, high = ends_of_scale(values, 99.0)
+    reach = max(-low, high)
+    return [-reach, reach] if layer == RESIDUAL else [low, high]
 
 
 def _group(
@@ -112,8 +126,8 @@ def _group(
         values = np.asarray(column, dtype=np.float64)[pick]
         # probabilities lie between 0 and 1, where steps of 0.01 would be visible
         step = step_for(values, 1e-4 if "probability" in name else 0.01)
-        packed = {"step": step, "values": arrays.add_steps(values, step)}
-        layers.append({"name": name, "range": ranges[_scale(group.name, name)], **packed})
+        scale = {"range": ranges[_scale(group.name, name)], "step": step}
+        layers.append({"name": name, **scale, "values": arrays.add_steps(values, step)})
     return {
         "name": group.name,
         "of": n,

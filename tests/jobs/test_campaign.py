@@ -29,8 +29,6 @@ from tests.jobs.campaign_rows import rss_row
 from tests.json_page import unlisted
 from tests.simulated import planned, simulate, write_yaml
 
-pytestmark = pytest.mark.usefixtures("few_pictures")
-
 CASES = Path(__file__).parents[1] / "parsers" / "cases" / "logs"
 YAW_DEG = 110.0
 OFFSETS_DB = {"first": 12.3, "second": 9.1}
@@ -142,7 +140,7 @@ def test_broken_flights_are_rows_with_their_message(summary: dict[str, Any], fol
     }
     page = (folder / "whole_out" / "campaign.html").read_text(encoding="utf-8")
     assert "gone/&lt;b&gt;USRP1.txt" in page
-    assert "<script" not in page
+    assert page.count("<script") == 2  # the data of the charts, and the script that draws them
     assert page.rstrip().endswith("</html>")
 
 
@@ -152,12 +150,6 @@ def test_a_campaign_of_soundings_alone_needs_no_flight_and_one_of_nothing_is_ref
     assert main(["campaign", str(campaign), "-o", str(tmp_path / "out")]) == 0
     (tmp_path / "n.yaml").write_text("campaign: n\n")
     assert main(["campaign", str(tmp_path / "n.yaml")]) == 2
-
-
-def test_every_figure_is_there(summary: dict[str, Any], folder: Path) -> None:
-    figures = folder / "whole_out" / "figures"
-    expected = {"season_nodes", "season_places"}
-    assert {p.stem for p in figures.glob("*.png")} == expected
 
 
 def test_a_lag_estimated_on_the_scored_samples_is_told(folder: Path) -> None:
@@ -342,7 +334,6 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
     for transfer in campaign["rank_transfers"]:
         assert transfer["k"] == 10  # the simulated modem's
         assert transfer["total_variation"] < 0.05
-    assert not list((folder / "ranks_out").glob("figures/*"))
     page = (folder / "ranks_out" / "campaign.html").read_text(encoding="utf-8")
     assert "Mean RMSE over towers" not in page
     assert "with the K of the other flights" in page

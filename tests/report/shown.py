@@ -59,7 +59,7 @@ def site_map(fixture: Fixture) -> str:
 
 
 def campaign(_: Fixture) -> str:
-    return campaign_html.campaign_page(fabricated.season(30, 6, 2, 2), [], ["campaign.json"])
+    return campaign_html.campaign_page(fabricated.season(30, 6, 2, 2), ["campaign.json"])
 
 
 def calibration(_: Fixture) -> str:

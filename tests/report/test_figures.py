@@ -88,8 +88,8 @@ def test_svg_stays_small_however_long_the_flight(report_data):
 def test_svg_has_no_reference_to_elsewhere_and_is_the_same_twice(small_report):
     spec = next(p for p in figures.figure_specs(small_report) if p.name == "altitude")
     first, redrawn = canvas.render(spec, ("svg",)), canvas.render(spec, ("svg",))
-    assert first.formats["svg"] == redrawn.formats["svg"]
-    fetched = re.findall(rb'(?:href|src)="([^"]*)"', first.formats["svg"])
+    assert first["svg"] == redrawn["svg"]
+    fetched = re.findall(rb'(?:href|src)="([^"]*)"', first["svg"])
     assert all(f.startswith((b"#", b"data:")) for f in fetched)
 
 

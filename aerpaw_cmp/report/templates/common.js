@@ -96,7 +96,7 @@ const common = (() => {
     pen.strokeStyle = css("--line"); pen.fillStyle = css("--ink"); pen.lineWidth = 1; pen.font = FONT;
     const dx = digits(xs), dy = digits(ys);
     pen.textAlign = "center";
-    for (const v of xs) { pen.beginPath(); pen.moveTo(X(v), top); pen.lineTo(X(v), bottom); pen.stroke(); pen.fillText(x.words ? x.words(v) : number(v, dx), X(v), bottom + 14); }
+    for (const v of xs) { pen.beginPath(); pen.moveTo(X(v), top); pen.lineTo(X(v), bottom); pen.stroke(); const words = x.words ? x.words(v) : number(v, dx), half = pen.measureText(words).width / 2; pen.fillText(words, Math.max(half, Math.min(w - half, X(v))), bottom + 14); }
     pen.textAlign = "right";
     for (const v of ys) { pen.beginPath(); pen.moveTo(left, Y(v)); pen.lineTo(right, Y(v)); pen.stroke(); pen.fillText(y.words ? y.words(v) : number(v, dy), left - 5, Y(v) + 4); }
     pen.textAlign = "center"; pen.fillText(x.label, (left + right) / 2, h - 6);
@@ -285,6 +285,7 @@ const common = (() => {
       const [west, east] = spec.x.ends || reach(marks.flatMap(m => n ? [m.x, m.low, m.high] : [m.x])), [south, north] = n ? [n - 0.4, -0.9] : spec.y.ends || reach(marks.flatMap(m => [m.y, m.low, m.high]));
       const [p, w, h] = frame(place), room = marks.some(m => m.labels) ? 0.06 : 0, wide = east - west, tall = room * (north - south), x = { low: west - (n ? 0.02 : room) * wide, high: east + room * wide, label: spec.x.label }, y = { low: south - tall, high: north + 2 * tall, label: n ? "" : spec.y.label };
       if (spec.x.start) { const begun = Date.parse(spec.x.start + "Z") / 1000; x.marks = clockTicks(west, east, w / 110, begun); x.words = v => clockText(v + begun); }
+      if (spec.x.names) { const step = Math.max(1, Math.ceil(spec.x.names.length * 150 / w)); x.marks = spec.x.names.flatMap((_, i) => i % step ? [] : [i]); x.words = v => spec.x.names[v]; }
       if (n) y.marks = [];
       const g = axes(p, w, h, x, y, n ? 14 : 50);
       if (n) spec.rows.forEach((name, i) => { p.fillStyle = css(i === spec.chosen ? "--accent" : "--soft"); p.fillText(name + (i === spec.chosen ? " (recommended)" : ""), g.left + 4, g.Y(i - 0.35)); });

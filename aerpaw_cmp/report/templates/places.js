@@ -3,7 +3,10 @@
 (async () => {
   const { at, css, number, cells, fill, frame, axes, later, polyline } = common;
   const data = JSON.parse(at("explorer-data").textContent), arrays = await common.unpack(data.packed);
-  const ramps = { level: common.ramp("viridis"), spread: common.ramp("plasma") };
+  const ramps = { level: common.ramp("viridis"), spread: common.ramp("plasma"), residual: common.ramp("RdBu_r") };
+  document.documentElement.classList.add("live");
+  common.plots(data.plots, i => i === undefined ? null : arrays[i]);
+  if (!data.groups.length) return; // a page with charts only
   const canvas = at("map"), legend = at("legend"), chart = at("profile");
   const state = { group: 0, layer: 0, point: null, zoom: 1, east: 0, north: 0, turn: -Math.PI / 2, tilt: 0.6 };
   const group = () => data.groups[state.group], layer = () => group().layers[state.layer], sphere = () => group().around.length > 0;
@@ -11,7 +14,7 @@
   const values = l => { if (!taken.has(l)) taken.set(l, common.values(arrays[l.values], l.step)); return taken.get(l); };
   const unit = l => (l.name.match(/\[(.*)\]/) || [])[1] || "", ranked = l => l.name.includes("rank") && !l.name.includes("probability");
   const words = (l, v) => !Number.isFinite(v) ? "–" : ranked(l) ? String(v) : number(v, unit(l) || Math.abs(v) > 2 ? 1 : 2, unit(l));
-  const ramped = l => ramps[l.name.includes("deviation") ? "spread" : "level"];
+  const ramped = l => ramps[l.name.includes("deviation") ? "spread" : l.name.startsWith("residual") ? "residual" : "level"];
   function colour(l, v) {
     if (!Number.isFinite(v)) return css("--line");
     if (ranked(l)) return data.ranks[v] || css("--line");
@@ -168,7 +171,6 @@
   });
   common.whenResized(at("explorer"), () => { drawMap(); drawLegend(); drawAlong(); });
 
-  document.documentElement.classList.add("live");
   choose(0);
   window.places = { state, data, values, choose, point, drawn: () => drawn, labels: () => labels, ready: true };
 })().catch(error => { // an old browser without the means

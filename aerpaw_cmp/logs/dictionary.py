@@ -266,7 +266,10 @@ _INDIRECT = re.compile(
 
 
 # Levels in addition to the measured one: averages over time, and those of single ports.
-_MEAN = re.compile(r"\b(mean|avg|average|averaged|filtered|filt|smooth(ed)?|median|ema|rolling|moving)\d*\b")
+_MEAN = re.compile(
+    r"\b(mean|avg|average|averaged|filtered|filt|smooth(ed)?|median|ema|rolling|moving|kalman|low ?pass|lpf|savgol"
+    r"|denoised|interp(olated)?|fitted)\d*\b"
+)
 _PORT = re.compile(r"\b(rx|ant(enna)?|port|branch|chain|path) ?\d\b")
 
 
@@ -531,9 +534,9 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
         ("kts", 0.514444), ("kt", 0.514444), ("kn", 0.514444), ("knots", 0.514444), ("cm/s", 0.01), ("ft/s", 0.3048))},
     **{word: ("deg", _times(factor)) for word, factor in (
         ("deg", 1.0), ("degree", 1.0), ("degrees", 1.0), ("\u00b0", 1.0), ("rad", 180 / np.pi),
-        ("radians", 180 / np.pi), ("1e-7 deg", 1e-7), ("1e-7deg", 1e-7), ("dege7", 1e-7), ("deg e7", 1e-7),
+        ("radians", 180 / np.pi), ("dege7", 1e-7), ("deg e7", 1e-7),
         ("semicircles", 180 / 2**31),
-        ("degrees e7", 1e-7), ("e7", 1e-7), ("deg*1e7", 1e-7), ("1e7", 1e-7), ("e6", 1e-6), ("1e-6 deg", 1e-6),
+        ("degrees e7", 1e-7), ("e7", 1e-7), ("deg*1e7", 1e-7), ("1e7", 1e-7), ("e6", 1e-6),
         ("microdegrees", 1e-6), ("cdeg", 0.01), ("centidegrees", 0.01), ("mrad", 0.18 / np.pi))},
     **{word: ("bit/s", _times(factor)) for word, factor in (
         ("bps", 1.0), ("bit/s", 1.0), ("kbps", 1e3), ("kbit/s", 1e3), ("mbps", 1e6), ("mbit/s", 1e6), ("gbps", 1e9),
@@ -556,13 +559,27 @@ _SUFFIXES = ("ft", "kft", "feet", "m", "meters", "metres", "cm", "mm", "km", "de
              "dbm", "dbfs", "dbw", "mw", "uw", "nw", "e6", "e7", "cdeg", "kbps", "mbps", "db", "linear")  # fmt: skip
 
 
+# A factor before a unit: '0.1 dBm', '1e-7 deg'.
+_SCALED = re.compile(r"(0\.0{0,8}1|1?e-\d{1,2}) ?\*? ?([a-z\u00b0\u00b5\u03bc].{0,20})")
+
+
 def is_unit(text: str) -> bool:
     """Check whether a text is a unit that values are converted from."""
-    return text.lower() in UNITS or text.lower() in _DDMM
+    unit = _scale(text.lower())[1]
+    return unit in UNITS or unit in _DDMM
+
+
+def _scale(written: str) -> tuple[float, str]:
+    """Return the factor before a unit, 1 if there is none, and the unit."""
+    scaled = _SCALED.fullmatch(written)
+    return (
+        (1.0, written) if scaled is None else (float(scaled[1] if scaled[1][0] != "e" else f"1{scaled[1]}"), scaled[2])
+    )
 
 
 def unit_of(written: str) -> str:
     """Return the unit into which a written unit is converted, an unknown unit as written, empty for other words."""
+    written = _scale(written)[1]
     known = UNITS.get(written)
     return known[0] if known else "deg" if written in _DDMM else written if _A_UNIT.fullmatch(written) else ""
 
@@ -572,7 +589,8 @@ def converted(values: FloatArray, written: str) -> FloatArray:
     if written in _DDMM:
         degrees = np.trunc(values / 100)  # angles in the format of NMEA
         return np.asarray(degrees + (values - 100 * degrees) / 60)
-    return UNITS[written][1](values) if written in UNITS else values
+    factor, unit = _scale(written)
+    return UNITS[unit][1](values * factor if factor != 1 else values) if unit in UNITS else values
 
 
 # --- programs ---------------------------------------------------------------------------------------------------------
@@ -672,7 +690,7 @@ _LIKE_A_LEVEL = re.compile(
     r"^value$|power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs|w)?\b|\bd ?bu ?v\b|\brss|strength|\bampl|magnitude|rsrp"
 )
 UNLIKE_A_LEVEL = re.compile(
-    r"batt|volt|current|throttle|gps|water|fuel|noise|gain|loss|\btx|alt|height|elev|\bsea\b|type|quality|source|bars"
+    r"batt|volt|current|throttle|gps|water|fuel|noise|gain|loss|\btx|transmit|\be?irp\b|\berp\b|interfer|alt|height|elev|\bsea\b|type|quality|source|bars"
     r"|\basu|mode|state|status|charge|energy|consum|\b(avg|mean|min|max|std|log|audio|sound|light|id)\b|threshold|count"
     r"|\b([xyz]|down|home|gyro|mag)\b|\b(lat|lon|lng|acc|vel|speed|temp|yaw|roll|pitch|heading|offset)"
 )

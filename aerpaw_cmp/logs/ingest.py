@@ -531,6 +531,8 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
 ROLLOVER_DAYS = 7 * 1024
 # The first LTE networks. Earlier dates of logs are wrong.
 _PLAUSIBLE_FROM = datetime(2009, 12, 1)
+# Later dates are wrong: counts of LabVIEW (from 1904) and NTP (from 1900), read as Unix time, are after 2080.
+_FUTURE = datetime(2050, 1, 1)
 
 
 def _later(result: ReadResult, rollovers: int) -> ReadResult:
@@ -540,6 +542,11 @@ def _later(result: ReadResult, rollovers: int) -> ReadResult:
     """
     if not rollovers:
         first = min((s.frame["time"].min() for s in result.streams if len(s.frame)), default=None)
+        if first is not None and first >= _FUTURE:
+            text = (
+                f"the dates begin on {first:%Y-%m-%d}, in the future: do the times count from 1904 or 1900, not 1970?"
+            )
+            return replace(result, warnings=(*result.warnings, text))
         if first is None or not _PLAUSIBLE_FROM - timedelta(days=ROLLOVER_DAYS) < first < _PLAUSIBLE_FROM:
             return result
         text = (

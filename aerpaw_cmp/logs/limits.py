@@ -420,6 +420,7 @@ class _Check:
             ("latitude and longitude swapped", place[::-1]),
             ("western longitudes without their sign", place * [1, -1]),
             ("they radians", np.degrees(place)),
+            ("they 1e-6 deg, read as 1e-7 deg", place * 10),
         ):
             if (np.abs(np.array(SITES_DEG) - other) < NEAR_DEG).all(axis=1).any():
                 self._said.append(

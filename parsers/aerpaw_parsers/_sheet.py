@@ -140,6 +140,8 @@ def _angle(text: str) -> tuple[float, str]:
 # 'Longitude (W)', 'lon_deg_W'; columns of such letters: 'lat_dir', 'lonRef', 'E/W'.
 _HEMISPHERE = re.compile(r"[^A-Za-z]([NSEW])[\])]?\s*$")
 _OF_SIDES = re.compile(r"dir|ref|hemi|lat|lon|\b[ns]\W*[ns]\b|\b[ew]\W*[ew]\b", re.IGNORECASE)
+# The radio access of a cell as programs write it.
+_RAT = re.compile(r"(?i)(lte|nr|[2345]g|gsm|umts|wcdma|e-?utran?)([ _-]?(a|nr|nsa|sa|lte|fdd|tdd|e-?utran?))?")
 _VALUE = re.compile(r"\s*[-+\[\"]?\d")
 # Units of cells that need no conversion.
 _HARMLESS = ("%", "ms", "s", "Hz", "MHz", "kHz")
@@ -211,6 +213,14 @@ class Sheet:
         """The meaning of each column."""
         said = {i: dictionary.Meaning(row, dictionary.without_unit(self.names[i])[1]) for i, row in self.said.items()}
         known = [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
+        if not any(what and what.quantity.name == "technology" for what in known):
+            # any column whose cells name radio accesses, such as 'mode'
+            rats = ({cells[i].strip() for cells in self.cells[:200]} - {""} for i in range(len(known)))
+            named = [
+                what is None and bool(cells) and all(map(_RAT.fullmatch, cells))
+                for what, cells in zip(known, rats, strict=True)
+            ]
+            known = [dictionary.meaning("technology") if it else what for what, it in zip(known, named, strict=True)]
         return dictionary.of_pairs(zip(self.plain, known, strict=True))
 
     def find(self, *quantities: str) -> int | None:
@@ -374,25 +384,40 @@ class Sheet:
         left = [i for i in range(len(self.names)) if i not in self.used and self._is_of_interest(i)]
         shown = ", ".join(repr(self.names[i]) for i in left[:_MOST_NAMED])
         more = f" and {len(left) - _MOST_NAMED} more" if left[_MOST_NAMED:] else ""
-        said = (
-            [f"not read, though they look like levels, identities, positions or times: {shown}{more}"] if left else []
-        )
-        return [self.notes[column] for column in sorted(self.notes)] + said
+        said = [self.notes[column] for column in sorted(self.notes)]
+        if left:
+            said.append(f"not read, though they look like levels, identities, positions or times: {shown}{more}")
+        gains = [i for i in left if _GAIN.search(self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
+        if gains:
+            text = "changes, and levels are read as written: do they contain it?"
+            said.append(f"column {self.names[gains[0]]!r} {text}")
+        equal = len(self) - len({*map(tuple, self.cells)})
+        if equal > _MOST_EQUAL * len(self):
+            said.append(f"{counted(equal, 'row')} equal to another row in every cell: was one log joined twice?")
+        return said
 
     def _is_of_interest(self, column: int) -> bool:
         """Check whether a column with values is a level, an identity, a position or a time, as far as names show it."""
         meaning, words = self.meanings[column], self.plain[column]
         like = bool(dictionary.like_levels([self.names[column]])) or dictionary.names_a_cell(words)
-        role = "" if meaning is None else meaning.quantity.role
-        like |= role in _OF_INTEREST or (meaning is None and _WHERE_OR_WHEN.search(words) is not None)
+        if meaning is not None:
+            like |= meaning.quantity.role in _OF_INTEREST
+        elif not like:
+            like = _WHERE_OR_WHEN.search(words) is not None or self.unit_read(column) in _OF_LEVELS[1:]
+            # angles in columns of other names, such as x and y
+            like |= self.find("latitude_deg") is None and _is_angle(self.numbers(column))
         return like and any(text.lower() not in NO_VALUE for text in self.texts(column))
 
 
-_OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank")
+_OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank", "kpi")
 _WHERE_OR_WHEN = re.compile(
     r"\b(lat|latitude|lon|lng|long|longitude|alt|altitude|height|date|(date|wall|up)? ?(time|clock)( ?stamp)?|utc"
     r"|epoch)\b"
 )
+# Gains of a receiver, not those of an antenna or a transmitter.
+_GAIN = re.compile(r"^(?!.*\b(tx|transmit\w*|ant|antenna)\b).*\b(gain|agc|atten(uation|uator)?)\b")
+# Largest share of rows that are equal to another row, as at the same second.
+_MOST_EQUAL = 0.3
 # Names of columns in one sentence.
 _MOST_NAMED = 20
 _DECIMAL_POINT = re.compile(r"[-+]?\d{1,20}\.\d{1,40}")
@@ -550,7 +575,7 @@ class _Table:
         """Add the next line that is not blank."""
         width = len(self._place)
         words = [text.strip() for text in fields]
-        if not any(_VALUE.match(text) for text in words) and (self._is_units(words) or self._is_header(words)):
+        if self._is_units(words) or (not any(_VALUE.match(text) for text in words) and self._is_header(words)):
             self.comments.append(i)  # units below the names, or files joined by hand
         elif len(fields) == width:
             self._row.append(i)
@@ -563,10 +588,12 @@ class _Table:
 
     def _is_units(self, texts: list[str]) -> bool:
         """Check whether the line below the names contains their units, and add the units to the names."""
+        if self._row or len(texts) != len(self.names):
+            return False
         texts = [text.strip("[]()") for text in texts]
         filled = [text for text in texts if text]
         units = sum(dictionary.is_unit(text) or text in _HARMLESS for text in filled)
-        if self._row or len(texts) != len(self.names) or len(filled) < 2 or 2 * units <= len(filled):
+        if len(filled) < 2 or 2 * units <= len(filled):
             return False
         self.names[:] = [f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, texts, strict=True)]
         return True
@@ -786,6 +813,10 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     if day is not None and day != column and not _stamps.is_dated(next(filter(None, texts), "")):
         pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
         texts = [f"{date} {time}".strip() for date, time in pairs]
+    half = [i for i, cell in enumerate(sheet.cells[0] if sheet.cells else ()) if _HALF.fullmatch(cell.strip())]
+    if half:
+        sheet.used.add(half[0])
+        texts = [" ".join(pair) for pair in zip(texts, sheet.texts(half[0]), strict=True)]
     name, unit = dictionary.plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", sheet.names[column])), sheet.unit(column)
     count = next((short for short, c in _text.COUNTS.items() if c.said.search(unit) or c.said.search(name)), None)
     # plain names have no letter for micro: 'Time [\u00b5s]' becomes 'time s'
@@ -840,6 +871,8 @@ def _zone_beside(sheet: Sheet, column: int, zone: str, texts: list[str], options
 # Epochs, and times with an offset.
 _DATED = re.compile(r"\d{9,}[.,]?\d*|.*\d(?:Z|[+-]\d\d:?\d\d)")
 _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
+# A cell of a column that only has the half of the day.
+_HALF = re.compile(r"[AaPp]\.?[Mm]\.?")
 # The order in a name: 'date (dd/mm/yyyy)'.
 _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 

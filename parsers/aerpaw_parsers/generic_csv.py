@@ -8,7 +8,9 @@ of the column, or the steps between the rows, require another unit.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -96,6 +98,9 @@ def _is_of(quantity: dictionary.Quantity, name: str, unit: str | None) -> bool:
     return name not in COLUMNS["telemetry"] or quantity.name in (name, *_NO_POSE) or of_axes
 
 
+_UNIT = re.compile(r" \[[^\[\]]*\]$")
+
+
 def _odd(sheet: _sheet.Sheet, column: int) -> BoolArray:
     """Return the mask of cells that are words or infinities, except -inf dB, which means no signal."""
     values = sheet.numbers(column)
@@ -119,6 +124,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     # the header is the line with the columns that the user named, else the first line
     known = (item for item in _tables(lines, first) if {*options.columns.values()} <= {*item[2]})
     first, separator, header = next(known, next(_tables(lines, first)))
+    # proposed options name columns with the unit of the line below the header
+    bare = {key: name if name in header else _UNIT.sub("", name) for key, name in options.columns.items()}
+    options = replace(options, columns=bare) if {*bare.values()} <= {*header} else options
     kind, where = _checked(options, header)
     sheet = _sheet.cut(lines, first, separator, header)
     sheet.used |= {*where.values()}

@@ -356,3 +356,19 @@ def test_a_level_or_date_that_cannot_be_right_is_reported(tmp_path: Path, column
     path.write_text("\n".join([f"utc,lat,lon,{column}", *rows]) + "\n")
     (file,) = ingest([path])
     assert any(said in text for text in file.result.warnings), file.result.warnings
+
+
+def test_counts_from_1904_are_reported_as_dates_in_the_future(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("timestamp,rsrp\n3823772400.5,-80\n3823772401.5,-81\n")
+    (file,) = ingest([path])
+    assert any("the dates begin on 2091-03-03, in the future" in text for text in file.result.warnings)
+
+
+def test_the_proposed_map_of_a_table_with_a_row_of_units_works(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("time,lat,lon,level\nUTC,deg,deg,0.1 dBm\n2025-03-02T15:00:00Z,35.73,-78.7001,-801\n")
+    columns = {"time": "time [UTC]", "rss_db": "level [0.1 dBm]"}
+    options = ReadOptions(columns=columns, kind="rss", unit="dBm")
+    (file,) = ingest([path], options=options, reader="generic_csv")
+    assert file.result.streams[0].frame["rss_db"].tolist() == pytest.approx([-80.1])

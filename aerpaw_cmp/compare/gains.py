@@ -71,7 +71,7 @@ def link_directions(tower_m: FloatArray, position_m: FloatArray, rotation: Float
 
 
 def rotated(direction: FloatArray, turn_deg: float) -> FloatArray:
-    """Return directions (n, 3) in the body frame, rotated counter-clockwise about its vertical axis."""
+    """Return directions (..., 3) in the body frame, rotated counter-clockwise about its vertical axis."""
     c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
     return np.asarray(direction @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
 
@@ -1185,7 +1185,7 @@ class FlightEvidence:
             mean, covariance = known(_rotated(rows, turn_deg))
             return _log_likelihood(left + covariance, _centred(rows) - mean)
 
-        return _judged(own, of)
+        return judged(own, of)
 
     def of_airframe(self, known: KnownProcess) -> Evidence:
         """Return the evidence for a learned airframe in all series together, with an unknown gain of each tower."""
@@ -1200,7 +1200,7 @@ class FlightEvidence:
             return _log_likelihood(self._without_airframe + covariance, levels - mean)
 
         own = self._without_airframe + gain_covariance([BODY], rows, rows)
-        return _judged(_log_likelihood(own, levels), of)
+        return judged(_log_likelihood(own, levels), of)
 
     @cached_property
     def _without_airframe(self) -> FloatArray:
@@ -1214,7 +1214,8 @@ class FlightEvidence:
         return covariance
 
 
-def _judged(own: float, of: Callable[[float], float]) -> Evidence:
+def judged(own: float, of: Callable[[float], float]) -> Evidence:
+    """Return the evidence from the log likelihood of an unknown gain, and of a learned gain by its rotation [deg]."""
     learned = of(0.0)
     # copies cost three times as much, so a gain that is clearly worse is not compared with them
     turned = max(map(of, _TURNS_DEG)) if learned > own - _HOPELESS else math.inf

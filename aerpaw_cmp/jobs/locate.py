@@ -15,7 +15,7 @@ from ..common.stages import Stages
 from ..compare.locate import LevelTrack, NodeEstimate, locate
 from ..flight.data import check_place, choose_site, is_ratio, read_logs, site_place
 from ..flight.drafting.draft import receiver_floor_db
-from ..flight.drafting.proposals import Placer, searching_airframe
+from ..flight.drafting.proposals import Placer, searching_airframe, with_antennas
 from ..flight.gains import load_with_learned
 from ..flight.rows import LOCK_FLOOR_DB, is_sounder_power
 from ..flight.settings import FlightFile
@@ -60,12 +60,12 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
             site = choose_site(settings.site, flight.parent)
             vehicle, file, level = _streams(settings, flight, options.logs_root, channel)
             check_place(site, str(flight), vehicle)
-            node, uav = _antennas(settings, flight, options.logs_root, site, (file, level))
-            cautions = _cautions(settings, level.channel, uav)
-        with stages("locate"):
             floor = LOCK_FLOOR_DB if is_sounder_power(level) else receiver_floor_db([level])
-            track = Placer(site, vehicle).levels(level, -np.inf if floor is None else floor, uav, node)
-            estimate = locate(track)
+            track = Placer(site, vehicle).levels(level, -np.inf if floor is None else floor)
+        with stages("locate"):
+            node, uav = _antennas(settings, flight, options.logs_root, track, (file, level))
+            cautions = _cautions(settings, level.channel, uav)
+            estimate = locate(with_antennas(track, uav, node))
         if not estimate.placed:
             raise InputError(
                 "the levels do not determine a place: they fit a node 30 km away as well",
@@ -99,9 +99,9 @@ def _streams(
 
 
 def _antennas(
-    settings: FlightFile, flight: Path, logs_root: Path | None, site: Site, log: tuple[IngestedFile, Stream]
+    settings: FlightFile, flight: Path, logs_root: Path | None, track: LevelTrack, log: tuple[IngestedFile, Stream]
 ) -> tuple[MeasuredPattern | None, MeasuredPattern | None]:
-    """Return the antennas of node and airframe in the flight file, else the airframe that the site has learned.
+    """Return the antennas of node and airframe in the flight file, else the learned airframe that the levels support.
 
     An airframe that was learned from this log is not used.
     """
@@ -111,10 +111,10 @@ def _antennas(
     node, uav = (array.patterns[0] for array in (known.tower_arrays["node"], known.uav_array))
     if isinstance(uav, MeasuredPattern) and file.sha256 not in uav.trained_on:
         return node if isinstance(node, SpherePattern) else None, uav
-    if not is_sounder_power(level):
-        return None, None
     mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
-    return None, searching_airframe(site_place(settings.site.file, flight.parent), site.towers, (file.sha256, mark))
+    carrier_hz = settings.link.of(level.channel).carrier_hz
+    place = site_place(settings.site.file, flight.parent)
+    return None, searching_airframe(place, (file.sha256, mark), track, carrier_hz)
 
 
 def _cautions(settings: FlightFile, channel: str, uav: MeasuredPattern | None) -> list[str]:

@@ -13,7 +13,10 @@ from scipy.signal import lfilter
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.gains import ANTENNA_TERMS, link_directions, term_kernel
+from aerpaw_cmp.flight.drafting.proposals import Placer, searching_airframe
 from aerpaw_cmp.flight.gains import sphere_angles
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.writers import format_power_log
 from aerpaw_cmp.propagation.geometry import rotation_from_aircraft
 from aerpaw_cmp.site.learned import (
@@ -209,3 +212,25 @@ def test_a_rotated_airframe_is_refused(turn_deg, tmp_path, capsys) -> None:
     _, content = drafted(raw_logs, tmp_path, known_site(tmp_path, turn_deg))
     assert "antennas" not in content
     capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "sha256", "carrier_hz", "found"),
+    [
+        (0, "b" * 64, 3.51e9, True),  # another year's carrier, 6 % away
+        (90, "b" * 64, 3.3e9, False),
+        (180, "b" * 64, 3.3e9, False),
+        (270, "b" * 64, 3.3e9, False),
+        (0, "a" * 64, 3.3e9, False),  # learned from this very log
+        (0, "b" * 64, 2.4e9, False),
+    ],
+)
+def test_levels_choose_the_airframe_for_a_node_at_an_unknown_place(turn_deg, sha256, carrier_hz, found, tmp_path):
+    level_tables(tmp_path)
+    options = ReadOptions(timezone=ZONE)
+    pose, level = (ingest([tmp_path / name], options=options)[0] for name in ("track.csv", "meter a.csv"))
+    (vehicle,), (power,) = pose.result.streams, level.result.streams
+    assert power.attributes["unit"] == "dBm"
+    track = Placer(SITE, vehicle).levels(power)
+    airframe = searching_airframe(known_site(tmp_path, turn_deg), (sha256, ""), track, carrier_hz)
+    assert (airframe is not None) is found

@@ -16,7 +16,7 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.outputs import file_digest
-from aerpaw_cmp.flight.drafting.proposals import every_antenna, searching_airframe, taught
+from aerpaw_cmp.flight.drafting.proposals import every_antenna, taught
 from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.training import mark_of
@@ -73,24 +73,20 @@ def flight(folder: Path, antennas: dict[str, str], carrier_hz: float = CARRIER_H
 
 
 @pytest.mark.parametrize(
-    ("site", "towers", "loses_lock", "log", "fits"),
+    ("site", "loses_lock", "log", "towers"),
     [
-        ("mine.yaml", [], True, "b" * 64, True),
-        ("mine.yaml", ["LW1"], True, "b" * 64, False),  # learned with a tower that needs no search
-        ("mine.yaml", [], True, "a" * 64, False),  # learned from this very log
-        ("mine.yaml", [], False, "b" * 64, False),  # of another receiver
-        ("none.yaml", [], True, "b" * 64, False),
-        ("mine.yaml", [], True, "copy", False),  # learned from these readings in another log
+        ("mine.yaml", True, "b" * 64, {"LW1"}),
+        ("mine.yaml", True, "a" * 64, set()),  # learned from this very log
+        ("mine.yaml", False, "b" * 64, set()),  # of another receiver
+        ("none.yaml", True, "b" * 64, set()),
+        ("mine.yaml", True, "copy", set()),  # learned from these readings in another log
     ],
 )
-def test_a_search_takes_the_antennas_of_other_flights_alone(folder, site, towers, loses_lock, log, fits) -> None:
+def test_levels_are_compared_with_antennas_of_other_flights_alone(folder, site, loses_lock, log, towers) -> None:
     if loses_lock:
         remember(folder / "mine.yaml", "d12", entry("A", lock=LOCK), learned_tables("A", (f"marks: {MARK}",)))
     log = log, MARK if log == "copy" else ""
-    airframe = searching_airframe(folder / site, towers, log)
-    assert (airframe is not None) == fits
-    known = {tower for tower, gains in taught(folder / site, log, loses_lock=True).items() if gains}
-    assert known == ({"LW1"} if fits or towers else set())
+    assert {tower for tower, gains in taught(folder / site, log, loses_lock=True).items() if gains} == towers
 
 
 def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:

@@ -46,6 +46,7 @@ from .proposals import (
     propose,
     searching_airframe,
     taught,
+    with_antennas,
 )
 
 
@@ -801,9 +802,9 @@ def _placement(
     """Return the tower or position that a level fits. None if the level has too few samples."""
     site = site_place(context.options.site, context.folder)
     log = file.sha256, mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
-    airframe = searching_airframe(site, placer.site.towers, log) if is_sounder_power(level) else None
-    track = placer.levels(level, context.floor_db(level), airframe)
-    return placer.propose(track, taught(site, log, loses_lock=False), nodes)
+    track = placer.levels(level, context.floor_db(level))
+    airframe = searching_airframe(site, log, track) if is_sounder_power(level) else None
+    return placer.propose(with_antennas(track, airframe), taught(site, log, loses_lock=False), nodes)
 
 
 def _doubt(entry: Mapping[str, Any], levels: Sequence[Stream], placer: Placer, context: _Context) -> str:

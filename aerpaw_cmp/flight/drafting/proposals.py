@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -30,7 +30,9 @@ from ...compare.gains import (
     Moments,
     Spread,
     Term,
+    judged,
     link_directions,
+    rotated,
 )
 from ...compare.locate import (
     FEWEST,
@@ -179,26 +181,8 @@ class Placer:
         # on the ground every sight line is blocked
         return place[place[:, 2] > self.track.ground_m + _LOW_M]
 
-    def levels(
-        self,
-        stream: Stream,
-        floor_db: float = -np.inf,
-        airframe: MeasuredPattern | None = None,
-        node: MeasuredPattern | None = None,
-    ) -> LevelTrack:
-        """Return the levels of a log along the flight, with the gains of airframe and node if they are known.
-
-        Parameters
-        ----------
-        stream : Stream
-        floor_db : float
-            Floor of the receiver, -inf if it is unknown.
-        airframe, node : MeasuredPattern, optional
-
-        Returns
-        -------
-        LevelTrack
-        """
+    def levels(self, stream: Stream, floor_db: float = -np.inf) -> LevelTrack:
+        """Return the levels of a log along the flight. ``floor_db`` is the floor of the receiver, -inf if unknown."""
         frame = stream.frame[~unscored(stream.frame)]
         poses = self.track.pose_at(frame["time"])
         place = np.where((poses.position_m[:, 2] > self.track.ground_m + _LOW_M)[:, None], poses.position_m, np.nan)
@@ -210,8 +194,7 @@ class Placer:
         track = level_track(time, place, level, floor_db=floor_db)
         if not len(track.time_s):
             return track
-        track = replace(track, rotation=self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation)
-        return track if airframe is None else replace(track, airframe_db=_gain_of(airframe, node))
+        return replace(track, rotation=self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation)
 
     def propose(
         self,
@@ -362,6 +345,13 @@ def _node(
     return Placement(name, tower, question, position_m=position_m)
 
 
+def with_antennas(
+    track: LevelTrack, airframe: MeasuredPattern | None, node: MeasuredPattern | None = None
+) -> LevelTrack:
+    """Return levels with the gains of airframe and node. They are unchanged if the airframe is not known."""
+    return track if airframe is None else replace(track, airframe_db=_gain_of(airframe, node))
+
+
 def _gain_of(
     airframe: MeasuredPattern, node: MeasuredPattern | None
 ) -> Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
@@ -425,6 +415,10 @@ class Remembered:
         This requires a receiver that keeps its lock, and flights that predict each other.
         """
         return self.series.lock is None and self.series.shares_airframe
+
+    def learned_from(self, sha256: str, mark: str) -> bool:
+        """Check whether a log, by its SHA-256 or its fingerprint, is one of the training flights."""
+        return sha256 in self.entry.trained_on or among(mark, self.uav.marks)
 
     def gain_db(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
         """Return the gain of both ends (n,) and its standard deviation (n,) [dB]."""
@@ -677,22 +671,72 @@ def _odds(odds: Evidence) -> str:
     return f"odds {ratio(odds.over_own)} against a separate gain{turned}"
 
 
-def searching_airframe(site: str | Path, towers: Collection[str], log: tuple[str, str]) -> SpherePattern | None:
-    """Return the airframe that was learned with nodes at many positions, to search for a node. None if there is none.
+# Assumptions about the scatter of the levels of a node at an unknown place, with an unknown gain of the airframe.
+_SCATTERS = tuple(
+    Case(shadow_db=shadow, scatter_db=scatter, length_m=45.0, azimuth_db=0.8, airframe_db=1.5)
+    for shadow, scatter in ((8.0, 4.0), (2.5, 2.0))
+)
 
-    Use it for levels of the channel sounder only: it was learned with a receiver that loses its lock.
+# The places at which airframes are compared: the likeliest of a grid that reaches this far beyond the track [m], each
+# divided by three to the east and to the north.
+_BEYOND_M, _PER_SIDE, _LIKELIEST = 400.0, 24, 20
+
+
+def searching_airframe(
+    site: str | Path, log: tuple[str, str], track: LevelTrack, carrier_hz: float | None = None
+) -> SpherePattern | None:
+    """Return the learned airframe that levels of a node at an unknown place support, or None.
+
+    The levels, in any unit, must be more likely with its gain than with an unknown gain and than with each rotated
+    copy. Each likelihood is a mean over the likely places of the node.
 
     Parameters
     ----------
     site : str or Path
         Name or path, as for :func:`.read_learned`.
-    towers : collection of str
-        Towers of the site. Airframes learned with one of them are not used.
     log : (SHA-256, fingerprint)
         The log of the levels. Airframes learned from it are not used.
+    track : LevelTrack
+        The levels, without antennas.
+    carrier_hz : float, optional
+        Carrier of the levels [Hz]. Airframes of other bands are then not used.
     """
-    nodes = (ends for tower, each in taught(site, log, loses_lock=True).items() if tower not in towers for ends in each)
-    return next((ends.uav for ends in nodes if isinstance(ends.uav, SpherePattern)), None)
+    if len(track.level_db) < FEWEST or track.rotation is None:
+        return None
+    known: dict[str, SpherePattern] = {}
+    with suppress(InputError, UsageError):
+        for item in every_antenna(site):
+            near = carrier_hz is None or abs(carrier_hz / item.series.carrier_hz - 1.0) <= learned.AIRFRAME_BAND
+            if item.series.shares_airframe and near and not item.learned_from(*log):
+                known.setdefault(item.series.uav_file, item.uav)
+    if not known:
+        return None
+    places = _likely_places(track)
+
+    def likelihood(airframe: SpherePattern | None, turn_deg: float = 0.0) -> float:
+        levels, cases = track, _SCATTERS
+        if airframe is not None:
+            gain, cases = _gain_of(airframe, None), tuple(replace(c.with_airframe(), log_weight=0.0) for c in cases)
+            levels = replace(track, airframe_db=lambda at_uav, node: gain(rotated(at_uav, turn_deg), node))
+        evidence = fit_places(levels, places, LevelModel(cases=cases)).evidence
+        return float(evidence.max() + np.log(np.exp(evidence - evidence.max()).mean()))
+
+    best = max(known.values(), key=likelihood)
+    # the copies of the best airframe only, because they take most of the time
+    return best if judged(likelihood(None), lambda turn_deg: likelihood(best, turn_deg)).fits else None
+
+
+def _likely_places(track: LevelTrack) -> FloatArray:
+    """Return the places (n, 3) of a node that its levels fit best with unknown antennas [m]."""
+    flat = track.position_m[:, :2]
+    low, high = flat.min(axis=0) - _BEYOND_M, flat.max(axis=0) + _BEYOND_M
+    step = (high - low) / (_PER_SIDE - 1)
+    grid = low + step * np.indices((_PER_SIDE, _PER_SIDE)).reshape(2, -1).T
+    places = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in (1.5, 10.0)])
+    evidence = fit_places(track, places, LevelModel(cases=_SCATTERS[:1])).evidence
+    near = places[np.argsort(-evidence)[:_LIKELIEST]]
+    thirds = np.array([(east, north, 0.0) for east in (-1, 0, 1) for north in (-1, 0, 1)]) / 3.0
+    return np.asarray((near[:, None] + thirds * np.append(step, 0.0)).reshape(-1, 3))
 
 
 def taught(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[str, list[Taught]]:
@@ -712,7 +756,7 @@ def taught(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[
             if (known.series.lock is not None) != loses_lock:
                 continue
             each = out.setdefault(known.series.tower, [])
-            if log[0] in known.entry.trained_on or among(log[1], known.uav.marks):
+            if known.learned_from(*log):
                 continue
             model = LevelModel(
                 slope=2.0,

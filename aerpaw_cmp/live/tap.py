@@ -1,7 +1,7 @@
 """The tap: it polls the modem, records every answer, and survives field conditions.
 
 There is one polling thread and one command in flight. A record is in the kernel before the next command is sent, unless
-the disk stalls (:class:`~aerpaw_cmp.live.log.LogWriter`). The port may vanish and come back under another
+the disk stalls (:class:`~aerpaw_cmp.live.log.TapLog`). The port may vanish and come back under another
 number, the disk may fill, the clock may step, signals may come. Each event is recorded, and the polling continues.
 """
 
@@ -20,7 +20,7 @@ from typing import Any
 from ..common.errors import InputError
 from ..common.versions import tool_version
 from ..logs.files import SCHEMA, Record
-from .log import Clock, LogWriter, SegmentLog, boot_id, clock_synchronised
+from .log import Clock, TapLog, boot_id, clock_synchronised
 from .modem import (
     OTHER_QUERIES,
     QUERIES,
@@ -125,7 +125,7 @@ class Tap:
         self._session = uuid.uuid4().hex
         self._framer = Framer()
         self._redactor = Redactor()
-        self._log = LogWriter(SegmentLog(settings.folder, self._header, settings.log, self._clock))
+        self._log = TapLog(settings.folder, self._header, settings.log, self._clock)
         periods = {RI_QUERY: int(1e9 / settings.ri_hz)}
         if settings.other_hz > 0:
             periods |= {name: int(1e9 / settings.other_hz) for name in OTHER_QUERIES}
@@ -270,8 +270,8 @@ class Tap:
         return TapSummary(
             **said,
             exit_code=1 if self._log.lost else 0,
-            segments=tuple(self._log.log.paths),
-            records=self._log.log.records,
+            segments=tuple(self._log.paths),
+            records=self._log.records,
             lost_records=self._log.lost,
             alarms=self._alarms,
         )
@@ -687,8 +687,8 @@ class Tap:
             sinr_db=self._last["sinr_db"],
             ri_rate_hz=len(self._ri_times) / window_s,
             gaps=self._gaps,
-            records=self._log.log.records,
-            bytes_written=self._log.log.bytes_written,
+            records=self._log.records,
+            bytes_written=self._log.bytes_written,
             disk_free_bytes=self._log.free_bytes,
             disk_fault=self._log.fault,
             missed=sum(self._schedule.missed.values()),

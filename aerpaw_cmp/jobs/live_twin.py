@@ -76,11 +76,8 @@ class LiveTwin:
     def predictor(self) -> Predict:
         """Return the prediction function for one modem, which reads the telemetry log."""
         log = _telemetry_log(self.settings)
-        follower = TelemetryFollower(
-            self.telemetry,
-            options=log.options(self.settings.timezone),
-            reader=by_name(log.reader or "vehicle_out"),
-        )
+        reader = by_name(log.reader or "vehicle_out")
+        follower = TelemetryFollower(self.telemetry, reader, log.options(self.settings.timezone))
         return predict_along(follower, partial(self.at, ahead=self.route_ahead()))
 
     def route_ahead(self) -> RouteAhead | None:

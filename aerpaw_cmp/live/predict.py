@@ -2,8 +2,6 @@
 
 The tap passes a time and gets records back. The caller determines how a time becomes a pose and a pose a rank.
 :class:`~aerpaw_cmp.live.predict.TelemetryFollower` returns the pose from a telemetry log that is still being written.
-
-The follower only reads the lines that were appended since its last call.
 """
 
 from __future__ import annotations
@@ -19,10 +17,10 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from ..common.errors import InputError
-from ..logs.readers import Reader, ReadOptions, identify
+from ..logs.readers import Reader, ReadOptions
 
 RANKS = (1, 4)
 
@@ -227,8 +225,8 @@ def _rounded(value: float | None) -> float | None:
 
 
 _MAX_AGE_S = 2.0
-# Only the end of a log that is already long is read.
-_TAIL_BYTES = 65_536
+# Only the end of the telemetry log is read: more than a hundred lines of vehicleOut.
+_TAIL_BYTES = 16_384
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,43 +249,32 @@ _DELAYS = 20
 
 
 class TelemetryFollower:
-    """A reader of the lines that were appended to a telemetry log since the last call.
+    """A reader of the last lines of a telemetry log that is still being written.
 
-    It supports formats with independent lines (``vehicleOut``). A truncated last line waits for its rest. A file that
-    was replaced or cut is read from scratch.
+    It supports formats with independent lines (``vehicleOut``).
 
     Parameters
     ----------
     path : Path
         Telemetry log, which may not exist yet.
+    reader : Reader
+        Reader of the log.
     options : ReadOptions
         Options such as the time zone of the log's clock.
-    reader : Reader, optional
-        Reader of the log. None: identified from the content.
-    keep_s : float
-        Length of the history in memory [s].
+
+    Attributes
+    ----------
+    samples : list of TelemetrySample
+        The samples of the last lines.
     """
 
-    def __init__(
-        self, path: Path, *, options: ReadOptions | None = None, reader: Reader | None = None, keep_s: float = 120.0
-    ) -> None:
-        self.path = path
-        self.rejected = 0
-        self._options = options or ReadOptions()
-        self._reader = reader
-        self._keep_ns = int(keep_s * 1e9)
-        self._samples: deque[TelemetrySample] = deque()
+    def __init__(self, path: Path, reader: Reader, options: ReadOptions) -> None:
+        self.path, self._reader, self._options = path, reader, options
+        self.samples: list[TelemetrySample] = []
         self._delays: deque[float] = deque(maxlen=_DELAYS)
-        self._position = 0
-        self._identity: tuple[int, int] | None = None
 
-    def poll(self) -> int:
-        """Take in what is new.
-
-        Returns
-        -------
-        int
-            Number of new samples.
+    def poll(self) -> None:
+        """Read the end of the log.
 
         Raises
         ------
@@ -296,81 +283,51 @@ class TelemetryFollower:
         """
         from ..logs import limits  # loads pandas, as any reader does
 
-        data = self._new_lines()
-        if not data.strip():
-            return 0
-        reader = self._reader = self._reader or identify(data, path=str(self.path))
-        result = limits.check(reader.read(data, self._options))
-        self.rejected += result.rejected_count
+        result = limits.check(self._reader.read(self._last_lines(), self._options))
         streams = [stream for stream in result.streams if stream.kind == "telemetry"]
-        if not streams:
-            if result.streams:
-                raise InputError(
-                    f"the log holds {result.streams[0].kind} records",
-                    expected="telemetry",
-                    cause="another log was named to be followed",
-                    path=self.path,
-                )
-            return 0
-        frame = streams[0].frame
-        times = frame["time"].to_numpy().astype("datetime64[ns]").astype("int64")
-        columns = [frame[name].to_numpy(dtype="float64") for name in _COLUMNS]
-        self._samples.extend(
-            TelemetrySample(int(row[0]), *(float(v) for v in row[1:])) for row in zip(times, *columns, strict=True)
-        )
-        while self._samples[-1].utc_ns - self._samples[0].utc_ns > self._keep_ns:
-            self._samples.popleft()
-        self._delays.append((time.time_ns() - self._samples[-1].utc_ns) / 1e9)
-        return len(frame)
+        if result.streams and not streams:
+            raise InputError(
+                f"the log holds {result.streams[0].kind} records",
+                expected="telemetry",
+                cause="another log was named to be followed",
+                path=self.path,
+            )
+        newest_ns = self.samples[-1].utc_ns if self.samples else None
+        self.samples = []
+        for stream in streams:
+            times = stream.frame["time"].to_numpy().astype("datetime64[ns]").astype("int64").tolist()
+            rows = stream.frame[list(_COLUMNS)].to_numpy(dtype="float64").tolist()
+            self.samples += [TelemetrySample(time_ns, *row) for time_ns, row in zip(times, rows, strict=True)]
+        if self.samples and self.samples[-1].utc_ns != newest_ns:
+            self._delays.append((time.time_ns() - self.samples[-1].utc_ns) / 1e9)
 
     @property
     def delay_s(self) -> float | None:
         """The smallest recent delay from the time in a line to its arrival. Negative if the log's clock is ahead."""
-        return min(self._delays) if self._delays else None
-
-    def latest(self) -> TelemetrySample | None:
-        """Return the last sample."""
-        return self._samples[-1] if self._samples else None
+        return min(self._delays, default=None)
 
     def at(self, utc_ns: int) -> TelemetrySample | None:
         """Return the sample nearest in time. None if it is farther away than :data:`_MAX_AGE_S`."""
-        if not self._samples:
-            return None
-        samples = list(self._samples)
-        index = bisect_left(samples, utc_ns, key=lambda sample: sample.utc_ns)
-        near = min(samples[max(0, index - 1) : index + 1], key=lambda sample: abs(sample.utc_ns - utc_ns))
-        return near if abs(near.utc_ns - utc_ns) <= _MAX_AGE_S * 1e9 else None
+        near = min(self.samples, key=lambda sample: abs(sample.utc_ns - utc_ns), default=None)
+        return None if near is None or abs(near.utc_ns - utc_ns) > _MAX_AGE_S * 1e9 else near
 
-    def _new_lines(self) -> bytes:
-        """Complete lines since the last call."""
+    def _last_lines(self) -> bytes:
+        """Return the last complete lines."""
         try:
             with self.path.open("rb") as file:
-                self._find_place(file)
-                file.seek(self._position)
-                data = file.read(16 * 2**20)
+                start = max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES)
+                file.seek(start)
+                data = file.read()
         except FileNotFoundError:
             return b""
         except OSError as error:
             raise InputError(f"cannot be read ({error.strerror})", expected="a telemetry log", path=self.path) from None
-        # the last line may be incomplete: keep it until the rest is written
-        end = data.rfind(b"\n") + 1
-        self._position += end
-        return data[:end]
-
-    def _find_place(self, file: BinaryIO) -> None:
-        """Start from scratch in a file that was replaced or cut."""
-        state = os.fstat(file.fileno())
-        identity = (state.st_dev, state.st_ino)
-        if identity == self._identity and state.st_size >= self._position:
-            return
-        self._identity, self._position = identity, max(0, state.st_size - _TAIL_BYTES)
-        if self._position:
-            file.seek(self._position)
-            self._position += len(file.readline())
+        # the first and the last line may be incomplete
+        return data[data.find(b"\n") + 1 if start else 0 : data.rfind(b"\n") + 1]
 
 
 def predict_along(follower: TelemetryFollower, replay_at: Callable[[TelemetrySample], Prediction]) -> Predict:
-    """``predict`` for :func:`~aerpaw_cmp.live.tap.Tap`: the prediction at the pose of the followed log.
+    """Return the function ``predict`` of a tap: the prediction at the pose of the followed log.
 
     Parameters
     ----------
@@ -381,14 +338,13 @@ def predict_along(follower: TelemetryFollower, replay_at: Callable[[TelemetrySam
 
     def predict(utc_ns: int) -> Prediction | None:
         follower.poll()
-        latest, sample = follower.latest(), follower.at(utc_ns)
-        if latest is None:
+        if not follower.samples:
             return None
-        now = Prediction() if sample is None else replay_at(sample)
+        sample = follower.at(utc_ns)
         return dataclasses.replace(
-            now,
+            Prediction() if sample is None else replay_at(sample),
             fix=None if sample is None else sample.fix,
-            telemetry_age_s=(utc_ns - latest.utc_ns) / 1e9,
+            telemetry_age_s=(utc_ns - follower.samples[-1].utc_ns) / 1e9,
             telemetry_delay_s=follower.delay_s,
         )
 

@@ -96,7 +96,7 @@ def read_lines(data, options):
         "flag": "",
     }
     for name in RECORD_COLUMNS["telemetry"]:
-        content[name] = np.zeros(len(rows))
+        content[name] = np.full(len(rows), np.nan if name == "fix" else 0.0)
     content["altitude_m"] = [float(row[1]) for row in rows]
     return ReadResult("t", (Stream("telemetry", "t", pd.DataFrame(content)),), len(rows), len(rows), 0)
 
@@ -110,26 +110,25 @@ def second(i):
 
 def test_growing_telemetry(tmp_path):
     path = tmp_path / "t.log"
-    follower = TelemetryFollower(path, reader=LINES, keep_s=5)
-    assert follower.poll() == 0
+    follower = TelemetryFollower(path, LINES, ReadOptions())
+
+    def heights():
+        follower.poll()
+        return [sample.altitude_m for sample in follower.samples]
+
+    assert heights() == []
     path.write_text("2026-01-01T00:00:00,1\n2026-01-01T00:00:01,2\n2026-01-01T00:0")
-    assert follower.poll() == 2
-    assert follower.latest().altitude_m == 2.0
-    assert follower.poll() == 0
+    assert heights() == [1.0, 2.0]
+    assert heights() == [1.0, 2.0]
     with path.open("a") as file:
         file.write("0:02,3\n")
-    assert follower.poll() == 1
+    assert heights() == [1.0, 2.0, 3.0]
     assert follower.at(second(1) + 400_000_000).altitude_m == 2.0
     assert follower.at(second(1) + 600_000_000).altitude_m == 3.0
     assert follower.at(second(5)) is None
     assert follower.at(second(4)).altitude_m == 3.0
-    with path.open("a") as file:
-        file.write("2026-01-01T00:00:20,9\n")
-    follower.poll()
-    assert follower.at(second(2)) is None  # forgotten
     path.write_text("2026-01-01T00:00:30,4\n")  # a new flight under the old name
-    assert follower.poll() == 1
-    assert follower.latest().altitude_m == 4.0
+    assert heights() == [4.0]
     predict = predict_along(follower, lambda sample: Prediction(rank=round(sample.altitude_m)))
     now = predict(second(30))
     assert (now.rank, now.telemetry_age_s) == (4, 0.0)
@@ -137,9 +136,20 @@ def test_growing_telemetry(tmp_path):
     assert (late.rank, late.telemetry_age_s) == (None, 10.0)
 
 
-def test_long_telemetry_is_read_from_its_end(tmp_path):
+def test_only_the_end_of_long_telemetry_is_read(tmp_path):
     path = tmp_path / "t.log"
     path.write_text("".join(f"2026-01-01T00:00:{i % 60:02d},{i}\n" for i in range(6000)))
-    follower = TelemetryFollower(path, reader=LINES, keep_s=1e6)
-    assert 2000 < follower.poll() < 3000
-    assert follower.latest().altitude_m == 5999.0
+    follower = TelemetryFollower(path, LINES, ReadOptions())
+    follower.poll()
+    assert 500 < len(follower.samples) < 1000
+    assert follower.samples[-1].altitude_m == 5999.0
+
+
+def test_the_delay_of_telemetry_counts_new_lines_only(tmp_path):
+    """A log that stopped is old; its lines were not late."""
+    path = tmp_path / "t.log"
+    path.write_text("2026-01-01T00:00:00,1\n")
+    follower = TelemetryFollower(path, LINES, ReadOptions())
+    for _ in range(3):
+        follower.poll()
+    assert len(follower._delays) == 1

@@ -33,27 +33,8 @@ _HOME = {
     "trace": "propagation.replay",
 }
 
-__all__ = [
-    "Array",
-    "BiExponential",
-    "Comparison",
-    "Flight",
-    "Link",
-    "Logs",
-    "OrdinaryKriging",
-    "Poses",
-    "Replay",
-    "ReplayedFlight",
-    "Site",
-    "Variogram",
-    "__version__",
-    "channel_rank",
-    "grid_offset",
-    "load_site",
-    "open_flight",
-    "read",
-    "trace",
-]
+# The types are in __init__.pyi.
+__all__ = [*_HOME, "__version__"]
 
 
 def __getattr__(name: str) -> Any:

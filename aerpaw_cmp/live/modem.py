@@ -66,9 +66,6 @@ class Decoded:
 
 _FIELD = re.compile(r'\s*("[^"]*"?|[^,]*)\s*(?:,|$)')
 
-# Quectel's "no value", and the same after a division by ten.
-_INVALID = (-32768, -3276)
-
 
 def _split_fields(payload: str) -> list[str | None]:
     """Split comma-separated fields and remove quotes. ``-`` and empty fields are None.
@@ -100,37 +97,32 @@ def _payload_of(line: str, prefix: str) -> str | None:
     return line[len(prefix) :].lstrip(": ")
 
 
-@dataclass(frozen=True, slots=True)
-class Range:
-    """Physical range of a field, and the values that mean "no value"."""
-
-    low: float
-    high: float
-    missing: tuple[int, ...] = _INVALID
-
-
-# TS 38.214 table 5.1.3.1 (mcs), TS 38.133 10.1.6-10.1.16 (rsrp, rsrq, sinr), TS 38.104 5.4.2.1 (arfcn).
-RANGES: Mapping[str, Range] = {
-    "mcs": Range(0, 31),
-    "ri_raw": Range(0, 8),
-    "cqi": Range(0, 15, (255, *_INVALID)),
-    "pmi": Range(0, 65_535),
-    "mcc": Range(1, 999),
-    "mnc": Range(0, 999),
-    "pcid": Range(0, 1007, (65_535, *_INVALID)),
-    "arfcn": Range(0, 3_279_165),
-    "band": Range(1, 1024),
-    "rsrp_dbm": Range(-156, -31),
-    "rsrq_db": Range(-43, 20),
-    "sinr_db": Range(-23, 40),
-    "sinr_raw": Range(-200, 250),
-    "rssi_dbm": Range(-120, 0),
-    "srxlev_db": Range(-200, 200),
-    "scs_code": Range(0, 4),
-    "bandwidth_code": Range(0, 16),
-    "uplink_bandwidth_code": Range(0, 16),
-    "tx_power_tenth_dbm": Range(-600, 300),
+# Physical range of each field: TS 38.214 table 5.1.3.1 (mcs), TS 38.133 10.1.6-10.1.16 (rsrp, rsrq, sinr),
+# TS 38.104 5.4.2.1 (arfcn).
+_RANGES: Mapping[str, tuple[int, int]] = {
+    "mcs": (0, 31),
+    "ri_raw": (0, 8),
+    "cqi": (0, 15),
+    "pmi": (0, 65_535),
+    "mcc": (1, 999),
+    "mnc": (0, 999),
+    "pcid": (0, 1007),
+    "arfcn": (0, 3_279_165),
+    "band": (1, 1024),
+    "rsrp_dbm": (-156, -31),
+    "rsrq_db": (-43, 20),
+    "sinr_db": (-23, 40),
+    "sinr_raw": (-200, 250),
+    "rssi_dbm": (-120, 0),
+    "srxlev_db": (-200, 200),
+    "scs_code": (0, 4),
+    "bandwidth_code": (0, 16),
+    "uplink_bandwidth_code": (0, 16),
+    "tx_power_tenth_dbm": (-600, 300),
 }
+# Quectel's "no value", the same after a division by ten, and the values that mean it in single fields.
+_MISSING = (-32768, -3276)
+_MISSING_OF = {"cqi": 255, "pcid": 65_535}
 
 _NR_BANDWIDTH_MHZ = (5, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 200, 400, 35, 45)
 _LTE_BANDWIDTH_MHZ = (1.4, 3, 5, 10, 15, 20)
@@ -142,7 +134,7 @@ def number(name: str, text: str | None, flags: list[str], *, prefix: str = "") -
     Parameters
     ----------
     name : str
-        Field, a key of ``RANGES``.
+        Field, a key of ``_RANGES``.
     text : str or None
         Text from the modem.
     flags : list of str
@@ -162,14 +154,13 @@ def number(name: str, text: str | None, flags: list[str], *, prefix: str = "") -
     """
     if text is None:
         return None
-    limits = RANGES[name]
     if re.fullmatch(r"[+-]?\d{1,9}", text) is None:
         flags.append(f"{prefix}{name}:not_a_number")
         return None
     value = int(text)
-    if value in limits.missing:
+    if value in _MISSING or value == _MISSING_OF.get(name):
         return None
-    if not limits.low <= value <= limits.high:
+    if not _RANGES[name][0] <= value <= _RANGES[name][1]:
         flags.append(f"{prefix}{name}:out_of_range({value})")
         return None
     return value
@@ -461,14 +452,6 @@ Status = Literal["ok", "error", "cme", "cms", "timeout", "lost", "cut"]
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
-    """A line without its end. ``dropped`` is the number of bytes that were not stored."""
-
-    text: str
-    dropped: int = 0
-
-
-@dataclass(frozen=True, slots=True)
 class Answer:
     """The response to one command.
 
@@ -499,7 +482,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Unsolicited:
-    """A line that belongs to no command."""
+    """A line that belongs to no command. ``dropped`` is the number of its bytes that were not stored."""
 
     text: str
     dropped: int = 0
@@ -575,43 +558,6 @@ def unglue(text: str) -> tuple[str, ...]:
     return tuple(piece.strip() for piece in pieces)
 
 
-class LineBuffer:
-    """A bounded buffer that splits bytes into lines. :attr:`Line.dropped` counts the rest of a longer line."""
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self._dropped = 0
-
-    def feed(self, data: bytes) -> Iterator[Line]:
-        """Yield complete lines except blank ones."""
-        start = 0
-        for match in _LINE_END.finditer(data):
-            self._keep(data, start, match.start())
-            start = match.end()
-            yield from self.flush()
-        self._keep(data, start, len(data))
-
-    def _keep(self, data: bytes, start: int, stop: int) -> None:
-        room = max(0, _MAX_LINE_BYTES - len(self._buffer))
-        self._buffer += data[start : min(stop, start + room)]
-        self._dropped += max(0, stop - start - room)
-
-    def peek(self) -> str:
-        """The unfinished line."""
-        return self._buffer.decode("latin-1")
-
-    def flush(self) -> list[Line]:
-        """Return the unfinished line, if it is not blank, and empty the buffer."""
-        text = self._buffer.decode("latin-1").strip(" \t")
-        line = Line(text, self._dropped)
-        self._buffer.clear()
-        self._dropped = 0
-        return [line] if text or line.dropped else []
-
-
-_LINE_END = re.compile(rb"[\r\n]+")
-
-
 @dataclass(slots=True)
 class _Open:
     """The command in flight, and what came for it."""
@@ -650,7 +596,7 @@ class Framer:
     """
 
     def __init__(self, *, max_lines: int = _MAX_LINES) -> None:
-        self._buffer = LineBuffer()
+        self._partial, self._dropped = bytearray(), 0
         self._max_lines = max_lines
         self._open: _Open | None = None
         self._owed: list[_Open] = []
@@ -672,13 +618,32 @@ class Framer:
     def feed(self, data: bytes) -> list[Event]:
         """Return events that these bytes complete, in their order."""
         events: list[Event] = []
-        for line in self._buffer.feed(data):
-            pieces = unglue(line.text) if not line.dropped else (line.text,)
-            if len(pieces) > 1 and self._open is not None:
+        *ends, rest = re.split(rb"[\r\n]", data)
+        for end in ends:
+            self._keep(end)
+            text, dropped = self._take_partial().strip(" \t"), self._dropped
+            self._dropped = 0
+            if not text and not dropped:
+                continue
+            pieces = (text,) if dropped else unglue(text)
+            if len(pieces) > 1:
                 self._flag("glued")
             for piece in pieces:
-                self._line(Line(piece, line.dropped), events)
+                self._line(piece, dropped, events)
+        self._keep(rest)
         return events
+
+    def _keep(self, part: bytes) -> None:
+        """Append to the unfinished line, and count the bytes beyond its limit."""
+        room = _MAX_LINE_BYTES - len(self._partial)
+        self._partial += part[:room]
+        self._dropped += max(0, len(part) - room)
+
+    def _take_partial(self) -> str:
+        """Return the unfinished line and remove it."""
+        text = self._partial.decode("latin-1")
+        self._partial.clear()
+        return text
 
     def give_up(self, status: Literal["timeout", "lost"] = "timeout") -> Answer:
         """End the command in flight without a final result.
@@ -693,11 +658,12 @@ class Framer:
             status=status,
             code=None,
             flags=tuple(now.flags),
-            partial=self._buffer.peek(),
+            partial=self._partial.decode("latin-1"),
         )
         self._echo_seen = now.echoed  # a reset modem may have stopped echoing
         if status == "lost":
-            self._buffer.flush()
+            self._partial.clear()
+            self._dropped = 0
             self._owed.clear()
         else:
             self._owed.append(now)
@@ -708,10 +674,9 @@ class Framer:
     def leave(self) -> tuple[tuple[str, ...], str]:
         """Return and forget what is held and belongs to nothing: lines of owed answers, and the unfinished line."""
         lines, self._stray = tuple(self._stray), []
-        partial = self._buffer.peek()
-        self._buffer.flush()
         self._owed.clear()
-        return lines, partial
+        self._dropped = 0
+        return lines, self._take_partial()
 
     def settle(self) -> list[Event]:
         """Forget what is owed (a probe was answered, so the modem is in step again)."""
@@ -723,11 +688,10 @@ class Framer:
 
     # one line ---------------------------------------------------------------------------------------------
 
-    def _line(self, line: Line, events: list[Event]) -> None:
-        text = line.text
+    def _line(self, text: str, dropped: int, events: list[Event]) -> None:
         final = _final_result(text)
         if final is not None:
-            self._final(final[0], final[1], events)
+            self._final(*final, events)
             return
         now = self._open
         if now is not None and self._is_echo(text, now):
@@ -735,20 +699,16 @@ class Framer:
         if any(text == owed.command for owed in self._owed):
             return
         if now is not None and _matches(text, now.prefixes):
-            self._own(line, now)
+            if dropped:
+                self._flag(f"overlong:{dropped}")
+            if len(now.lines) < self._max_lines:
+                now.lines.append(text)
+            else:
+                now.too_many += 1
         elif any(_matches(text, owed.prefixes) for owed in self._owed) and len(self._stray) < self._max_lines:
             self._stray.append(text)
         else:
-            events.append(Unsolicited(text, line.dropped))
-
-    def _own(self, line: Line, now: _Open) -> None:
-        """Take a line of the answer in flight."""
-        if line.dropped:
-            self._flag(f"overlong:{line.dropped}")
-        if len(now.lines) < self._max_lines:
-            now.lines.append(line.text)
-        else:
-            now.too_many += 1
+            events.append(Unsolicited(text, dropped))
 
     def _is_echo(self, text: str, now: _Open) -> bool:
         # rubbish from before may come before the echo on the same line

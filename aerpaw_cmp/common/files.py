@@ -6,7 +6,6 @@ import contextlib
 import glob
 import hashlib
 import os
-import re
 import tempfile
 import time
 from collections.abc import Iterator
@@ -65,29 +64,6 @@ def cache_folder(*parts: str) -> Path:
     chosen = os.environ.get("AERPAW_CMP_CACHE")
     folder = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "aerpaw-cmp")
     return folder.expanduser().joinpath(*parts)
-
-
-# Match cache entries by their path: the name alone could also be a Git object in a user's folder.
-_ENTRY = re.compile(
-    r"[0-9a-f]{64}\.npz|llvm/[0-9a-f]{24}|(outcomes|audits)/[0-9a-f]{64}\.(npz|json)"
-    r"|compiled/kernels-[0-9a-f]{16}/[^\n]+\.(kernel|compiled)"
-)
-
-
-def clear_cache() -> tuple[int, int]:
-    """Remove the entries of the cache, but no other files in its folder. Return the number of files and bytes."""
-    folder, files, size = cache_folder(), 0, 0
-    for place, below, names in os.walk(folder):  # os.walk does not follow links
-        if Path(place) == folder:
-            # AERPAW_CMP_CACHE may name a folder with other contents: enter only our subfolders
-            below[:] = sorted({"llvm", "outcomes", "audits", "compiled"}.intersection(below))
-        for path in (Path(place, name) for name in names):
-            if _ENTRY.fullmatch(path.relative_to(folder).as_posix()) and not path.is_symlink():
-                size, files = size + path.stat().st_size, files + 1
-                path.unlink()
-                with contextlib.suppress(OSError):  # the last link also removes the folder
-                    path.parent.rmdir()
-    return files, size
 
 
 @contextlib.contextmanager

@@ -274,24 +274,6 @@ def list_legend(title: str, colours: Mapping[str, str], width: float = 2.6) -> b
     return sheet.png()
 
 
-def bar_legend(title: str, label: str, limits: tuple[float, float]) -> bytes:
-    """Return a colour bar as PNG. Both ends include the values beyond the limits."""
-    from matplotlib import colormaps
-
-    sheet, (low, high) = _Sheet(title, 4.2, 0.9), limits
-    left, wide = 30, sheet.picture.width - 60
-    for column, colour in enumerate(colormaps["viridis"](np.linspace(0.0, 1.0, wide), bytes=True)):
-        sheet.pen.line((left + column, 26, left + column, 46), fill=tuple(colour))
-    # enough decimals to show a tenth of the range
-    digits = max(0, int(np.ceil(1.0 - np.log10(high - low))))
-    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
-        at, sign = left + share * (wide - 1), {0.0: "≤ ", 1.0: "≥ "}.get(share, "")
-        sheet.pen.line((at, 46, at, 50), fill="black")
-        sheet.write(at, 51, f"{sign}{low + share * (high - low):.{digits}f}", "ma")
-    sheet.write(sheet.picture.width / 2, 70, label, "ma")
-    return sheet.png()
-
-
 class _Sheet:
     """A white picture with a title and a size in inches, drawn without matplotlib (0.1 s per picture)."""
 

@@ -64,7 +64,7 @@ class PortInfo:
     device : Path
         The node it leads to now.
     how : str
-        ``given``, ``by-id``, ``usb``, ``node``.
+        ``given``, ``by-id`` or ``usb``.
     interface : str or None
         USB interface number, two hex digits.
     product : str or None
@@ -122,7 +122,7 @@ def _entries(folder: Path, pattern: str) -> list[Path]:
 
 
 def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
-    """Return AT ports of Quectel modems, the likeliest first: by-id names, USB interface numbers, then PCIe nodes."""
+    """Return AT ports of Quectel modems, the likeliest first: by-id names, then USB interface numbers."""
     roots = roots or Roots()
     ports: list[PortInfo] = []
     by_name = roots.usb()
@@ -137,9 +137,6 @@ def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
             node = roots.dev / name
             if usb[0].startswith(_QUECTEL_VENDOR) and usb[1] == interface and node.resolve() not in known:
                 ports.append(PortInfo(node, node.resolve(), "usb", interface, usb[0]))
-    for name in ("mhi_DUN", "smd11"):
-        if (roots.dev / name).exists():
-            ports.append(PortInfo(roots.dev / name, roots.dev / name, "node"))
     return ports
 
 
@@ -382,8 +379,6 @@ class TapSettings:
         Interval of the status calls [s].
     duration_s : float, optional
         End the session after this time [s].
-    wait_for_port_s : float
-        Longest wait for the port at the start [s].
     reconnect_min_s, reconnect_max_s : float
         Back-off after a loss of the port [s].
     log : LogSettings
@@ -404,7 +399,6 @@ class TapSettings:
     no_csi_alarm_s: float | None = None
     status_s: float = 1.0
     duration_s: float | None = None
-    wait_for_port_s: float = 0.0
     reconnect_min_s: float = 0.1
     reconnect_max_s: float = 2.0
     log: LogSettings = field(default_factory=LogSettings)
@@ -415,7 +409,7 @@ class TapSettings:
         for name in ("ri_hz", "answer_timeout_s", "probe_timeout_s", "silent_s", "status_s", "reconnect_min_s"):
             if not 0 < getattr(self, name) < 1e6:
                 raise UsageError(f"{name} is {getattr(self, name)}", expected="a positive number")
-        for name in ("other_hz", "pause_s", "wait_for_port_s"):
+        for name in ("other_hz", "pause_s"):
             if not 0 <= getattr(self, name) < 1e6:
                 raise UsageError(f"{name} is {getattr(self, name)}", expected="zero or a positive number")
         if self.no_csi_alarm_s is not None and not self.no_csi_alarm_s > 0:

@@ -22,7 +22,7 @@ from pathlib import Path
 from ..common.errors import AerpawCmpError, UsageError
 from ..logs.readers import ReadOptions, identify
 from .modem import QUERIES
-from .ports import Stop, make_raw
+from .ports import make_raw
 
 # Delay of each answer.
 _LATENCY_S = 0.02
@@ -244,26 +244,3 @@ class ModemSimulator:
 def framed(lines: Iterable[str]) -> bytes:
     """Return lines of an answer as a modem writes them."""
     return b"".join(b"\r\n" + line.encode("latin-1") + b"\r\n" for line in lines)
-
-
-def run_modem_sim(
-    simulator: ModemSimulator,
-    *,
-    on_ready: Callable[[Path], None],
-    meanwhile: Callable[[], None] | None = None,
-) -> None:
-    """Serve a simulated modem until a signal comes.
-
-    Parameters
-    ----------
-    simulator : ModemSimulator
-    on_ready : callable
-        Function that receives the port's name.
-    meanwhile : callable, optional
-        Called several times a second, e.g. to write the telemetry of the same flight.
-    """
-    with Stop() as stop, simulator:
-        on_ready(simulator.port)
-        while not stop.wait(0.1 if meanwhile else 1.0):
-            if meanwhile is not None:
-                meanwhile()

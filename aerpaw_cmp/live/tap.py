@@ -14,56 +14,27 @@ import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from ..common.errors import InputError
 from ..common.versions import tool_version
 from ..logs.files import SCHEMA, Record
+from . import modem, ports
 from .log import Clock, TapLog, boot_id, clock_synchronised
-from .modem import (
-    OTHER_QUERIES,
-    QUERIES,
-    RI_QUERY,
-    Answer,
-    Decoded,
-    Event,
-    Framer,
-    Late,
-    Redactor,
-    Unsolicited,
-    csi_write,
-    decode,
-    encode,
-    is_unsolicited,
-)
-from .ports import (
-    PortGoneError,
-    PortInfo,
-    Schedule,
-    SerialPort,
-    StatusNotifier,
-    Stop,
-    TapSettings,
-    TapStatus,
-    TapSummary,
-    find_candidates,
-    find_port,
-    format_status,
-    modem_manager,
-)
 from .predict import Asked, Predict, PredictionWorker
-
-__all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status"]
 
 # A jump of the wall clock against the monotonic one beyond this is recorded.
 _CLOCK_STEP_NS = 50_000_000
 # Readings of the two clocks farther apart than this are not compared, because the process was paused between them.
 _PAUSE_NS = 5_000_000
 # A function that receives each logged record and each status in the polling thread. It must neither wait nor raise.
-Watch = Callable[["Record | TapStatus"], None]
+Watch = Callable[["Record | ports.TapStatus"], None]
 
 RATE_WINDOW_S = 10.0
+# Settings that the header of the log contains.
+_IN_HEADER = ("ri_hz", "other_hz", "pause_s", "answer_timeout_s", "enable_csi")
 _NOISE_LINES_PER_S = 50
 
 
@@ -81,7 +52,7 @@ def _not_a_modem(path: Path, received: bytes) -> InputError:
             "interface 00 was given, or the numbers moved",
         )
     elif received:
-        excerpt = ascii(Redactor().clean(received[:40].decode("latin-1"), cut=True))
+        excerpt = ascii(modem.Redactor().clean(received[:40].decode("latin-1"), cut=True))
         sign, cause = f"the port sends {excerpt} but no answer", "another device, or a wrong baud rate"
     else:
         sign, cause = "nothing answers on the port", "the modem is off, still starts, or this is not its AT port"
@@ -108,41 +79,41 @@ class Tap:
 
     def __init__(
         self,
-        settings: TapSettings,
-        stop: Stop,
+        settings: ports.TapSettings,
+        stop: ports.Stop,
         *,
-        on_status: Callable[[TapStatus], None] | None = None,
+        on_status: Callable[[ports.TapStatus], None] | None = None,
         watch: Watch | None = None,
         predict: Predict | None = None,
         clock: Clock | None = None,
     ) -> None:
         self._settings = settings
         self._watch = watch
-        self._notifier = None if on_status is None else StatusNotifier(on_status)
+        self._notifier = None if on_status is None else ports.StatusNotifier(on_status)
         self._stop = stop
         self._clock = clock or Clock()
         self._worker = None if predict is None else PredictionWorker(predict)
         self._session = uuid.uuid4().hex
-        self._framer = Framer()
-        self._redactor = Redactor()
+        self._framer = modem.Framer()
+        self._redactor = modem.Redactor()
         self._log = TapLog(settings.folder, self._header, settings.log, self._clock)
-        periods = {RI_QUERY: int(1e9 / settings.ri_hz)}
+        periods = {modem.RI_QUERY: int(1e9 / settings.ri_hz)}
         if settings.other_hz > 0:
-            periods |= {name: int(1e9 / settings.other_hz) for name in OTHER_QUERIES}
-        self._schedule = Schedule(periods)
-        self._port: SerialPort | None = None
-        self._info: PortInfo | None = None
+            periods |= {name: int(1e9 / settings.other_hz) for name in modem.OTHER_QUERIES}
+        self._schedule = ports.Schedule(periods)
+        self._port: ports.SerialPort | None = None
+        self._info: ports.PortInfo | None = None
         self._first_bytes: bytearray | None = None
-        self._early: list[Record] = []
+        # records from before the log is open, then None
+        self._early: list[Record] | None = []
         self._received = 0
-        self._log_open = False
         self._in_step = True
         self._initialise_again = False
         self._csi_before: tuple[int, int] | None = None
         self._csi_changed = False
         self._answers: dict[str, Counter[str]] = {}
         self._ri_times: deque[int] = deque()
-        self._last: dict[str, Any] = {"rank": None, "rsrp_dbm": None, "sinr_db": None, "predicted": None}
+        self._last: dict[str, Any] = dict.fromkeys(("rank", "rsrp_dbm", "sinr_db", "predicted_rank"))
         self._gap_open: tuple[int, int, str] | None = None
         self._gaps, self._gap_ns, self._alarms, self._alarm = 0, 0, 0, False
         self._noise = Counter[str]()
@@ -154,7 +125,7 @@ class Tap:
 
     # the session ------------------------------------------------------------------------------------------
 
-    def run(self) -> TapSummary:
+    def run(self) -> ports.TapSummary:
         """Connect, poll until asked to stop, end cleanly.
 
         Returns
@@ -168,42 +139,29 @@ class Tap:
             If the port cannot be used or the folder cannot be written to, at the start.
         """
         try:
-            self._first_connection()
+            try:
+                self._connect()
+            except ports.PortGoneError as error:
+                raise InputError(
+                    str(error),
+                    expected="the modem's AT port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
+                    cause="the modem is not plugged in or still starts; see 'aerpaw-cmp doctor'",
+                ) from None
             if not self._stop.count:
                 self._log.open()
-                self._log_open = True
                 if self._watch is not None:
                     self._watch(self._header())
-                for record in self._early:
+                early, self._early = self._early or [], None
+                for record in early:
                     self._append(record)
-                self._early.clear()
                 if clock_synchronised() is False:
                     self._say("the clock is not synchronised (NTP or GPS): times may not fit the telemetry")
-                if modem_manager() and self._info is not None and self._info.how != "given":
+                if ports.modem_manager() and self._info is not None and self._info.how != "given":
                     self._say("ModemManager runs and may take the port when the modem comes back; see docs/tap.md")
                 self._poll_until_stopped()
         finally:
             summary = self._finish()
         return summary
-
-    def _first_connection(self) -> None:
-        deadline = self._clock.mono_ns() + int(self._settings.wait_for_port_s * 1e9)
-        while not self._stop.count:
-            last = self._clock.mono_ns() >= deadline
-            try:
-                self._connect()
-                return
-            except PortGoneError as error:
-                if last:
-                    raise InputError(
-                        str(error),
-                        expected="the modem's AT port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
-                        cause="the modem is not plugged in or still starts; see 'aerpaw-cmp doctor'",
-                    ) from None
-            except InputError:
-                if last:
-                    raise
-            self._wait(0.2)
 
     def _poll_until_stopped(self) -> None:
         while not self._stop.count:
@@ -215,13 +173,13 @@ class Tap:
                     self._schedule.reset(self._clock.mono_ns())
                 while not self._stop.count:
                     self._poll_once()
-            except PortGoneError as gone:
+            except ports.PortGoneError as gone:
                 self._lost(str(gone))
 
     def _poll_once(self) -> None:
         now = self._clock.mono_ns()
         if now - self._last_final_ns > self._settings.silent_s * 1e9:
-            raise PortGoneError(f"the modem has not answered for {self._settings.silent_s:g} s")
+            raise ports.PortGoneError(f"the modem has not answered for {self._settings.silent_s:g} s")
         if not self._in_step:
             self._probe()
             return
@@ -234,11 +192,11 @@ class Tap:
             return
         self._schedule.started(name, now)
         decoded = self._exchange(name)[1]
-        if name == RI_QUERY and decoded.values.get("rank") is not None:
+        if name == modem.RI_QUERY and decoded.values.get("rank") is not None:
             self._last_csi_ns = self._clock.mono_ns()
             self._alarm = False
 
-    def _finish(self) -> TapSummary:
+    def _finish(self) -> ports.TapSummary:
         restored = self._restore_csi()
         self._close_port()
         if self._gap_open is not None:
@@ -259,7 +217,7 @@ class Tap:
             "duration_s": duration_s,
             "redacted": self._redactor.count,
         }
-        if self._log_open:
+        if self._early is None:
             received = {"received_bytes": self._received, "csi_restored": restored}
             self._append({"kind": "end", **said, **received, **self._now()})
             self._log.close()
@@ -267,7 +225,7 @@ class Tap:
                 self._say(text)
         if self._notifier is not None:
             self._notifier.close()
-        return TapSummary(
+        return ports.TapSummary(
             **said,
             exit_code=1 if self._log.lost else 0,
             segments=tuple(self._log.paths),
@@ -282,8 +240,8 @@ class Tap:
             return None
         answer = None
         if self._port is not None and self._csi_before is not None and self._stop.count < 2:
-            with contextlib.suppress(PortGoneError):
-                answer, _ = self._exchange("csi_ctrl", csi_write(*self._csi_before))
+            with contextlib.suppress(ports.PortGoneError):
+                answer, _ = self._exchange("csi_ctrl", modem.csi_write(*self._csi_before))
         if answer is not None and answer.status == "ok":
             return True
         self._say("CSI reporting stays on: the modem could not be asked to switch it back")
@@ -293,41 +251,40 @@ class Tap:
 
     def _connect(self) -> None:
         """Open and probe the first port that answers."""
-        first_error: PortGoneError | InputError | None = None
+        first_error: ports.PortGoneError | InputError | None = None
         for info in self._ports_to_try():
             try:
                 self._open_and_probe(info)
                 return
-            except (PortGoneError, InputError) as error:
+            except (ports.PortGoneError, InputError) as error:
                 self._close_port()
                 first_error = first_error or error
         assert first_error is not None
         raise first_error
 
-    def _ports_to_try(self) -> list[PortInfo]:
+    def _ports_to_try(self) -> list[ports.PortInfo]:
         """Return the named port or every AT port at the start, and the same interface after a loss."""
         roots, last = self._settings.roots, self._info
         if last is None:
             named = self._settings.port
-            ports = find_candidates(roots) if named is None else []
-            return ports or [find_port(named, roots)]
-        ports = []
-        with contextlib.suppress(PortGoneError):
-            now = find_port(last.path, roots)
+            return (ports.find_candidates(roots) if named is None else []) or [ports.find_port(named, roots)]
+        found = []
+        with contextlib.suppress(ports.PortGoneError):
+            now = ports.find_port(last.path, roots)
             if now.interface == last.interface:  # otherwise this number now belongs to another port of the modem
-                ports.append(now)
+                found.append(now)
         if last.product is not None:
-            known = {port.device for port in ports}
-            others = [p for p in find_candidates(roots) if p.product == last.product and p.device not in known]
-            ports += sorted(others, key=lambda port: port.interface != last.interface)
-        if not ports:
-            raise PortGoneError(f"{last.path} is not there")
-        return ports
+            known = {port.device for port in found}
+            others = [p for p in ports.find_candidates(roots) if p.product == last.product and p.device not in known]
+            found += sorted(others, key=lambda port: port.interface != last.interface)
+        if not found:
+            raise ports.PortGoneError(f"{last.path} is not there")
+        return found
 
-    def _open_and_probe(self, info: PortInfo) -> None:
+    def _open_and_probe(self, info: ports.PortInfo) -> None:
         self._leave_framer()
-        self._framer = Framer()
-        self._port = SerialPort.open(info.path)
+        self._framer = modem.Framer()
+        self._port = ports.SerialPort.open(info.path)
         self._first_bytes = bytearray()
         try:
             # probe again only if the first probe gets no answer
@@ -357,14 +314,14 @@ class Tap:
         """Record what came and was finished by nothing, before it is forgotten."""
         lines, partial = self._left()
         if lines or partial:
-            self._record({"kind": "unsolicited", "lines": lines, "partial": partial, "dropped_bytes": 0, **self._now()})
+            self._event("unsolicited", lines=lines, partial=partial, dropped_bytes=0)
 
     def _left(self) -> tuple[list[str], str]:
         lines, partial = self._framer.leave()
         return [self._redactor.clean(line) for line in lines], self._redactor.clean(partial, cut=True)
 
     def _lost(self, reason: str) -> None:
-        with contextlib.suppress(PortGoneError):
+        with contextlib.suppress(ports.PortGoneError):
             self._drain()  # read what is still in the port before it is closed
         self._close_port()
         if self._gap_open is not None:
@@ -372,17 +329,8 @@ class Tap:
         lines, partial = self._left()
         self._gaps += 1
         self._gap_open = (self._clock.utc_ns(), self._clock.mono_ns(), reason)
-        self._record(
-            {
-                "kind": "gap",
-                "state": "open",
-                "reason": self._redactor.clean(reason),
-                "lines": lines,
-                "partial": partial,
-                "received_bytes": self._received,
-                **self._now(),
-            }
-        )
+        received = {"lines": lines, "partial": partial, "received_bytes": self._received}
+        self._event("gap", state="open", reason=self._redactor.clean(reason), **received)
         self._log.sync()
         self._say(f"lost: {reason}; looking for it")
 
@@ -395,7 +343,7 @@ class Tap:
             try:
                 self._connect()
                 break
-            except (PortGoneError, InputError) as error:
+            except (ports.PortGoneError, InputError) as error:
                 if isinstance(error, InputError) and str(error) != last_message:
                     last_message = str(error)
                     self._say(last_message)
@@ -409,19 +357,18 @@ class Tap:
         if self._gap_open is None:
             return
         (from_utc, from_mono, reason), self._gap_open = self._gap_open, None
-        now = self._now()
-        self._gap_ns += now["mono_ns"] - from_mono
-        record = {
-            "kind": "gap",
-            "state": "closed",
-            "reason": self._redactor.clean(reason),
-            "from_utc_ns": from_utc,
-            "to_utc_ns": now["utc_ns"],
-            "duration_ns": now["mono_ns"] - from_mono,
-            "missed": self._schedule.slots(now["mono_ns"] - from_mono),
-            "port": self._port_record(),
-        }
-        self._record({**record, **now})
+        to_utc, duration_ns = self._clock.utc_ns(), self._clock.mono_ns() - from_mono
+        self._gap_ns += duration_ns
+        self._event(
+            "gap",
+            state="closed",
+            reason=self._redactor.clean(reason),
+            from_utc_ns=from_utc,
+            to_utc_ns=to_utc,
+            duration_ns=duration_ns,
+            missed=self._schedule.slots(duration_ns),
+            port=self._port_record(),
+        )
         self._log.sync()
         self._say(text)
 
@@ -438,7 +385,7 @@ class Tap:
             # keep the state of the first connection: the modem may have lost it after it was replugged
             if None not in state and self._csi_before is None:
                 self._csi_before = (int(state[0] or 0), int(state[1] or 0))
-            answer, _ = self._exchange("csi_ctrl", csi_write(1, 1))
+            answer, _ = self._exchange("csi_ctrl", modem.csi_write(1, 1))
             self._csi_changed = answer.status == "ok"
             if not self._csi_changed:
                 self._say("the modem refused to switch CSI reporting on")
@@ -451,7 +398,7 @@ class Tap:
 
     def _exchange(
         self, name: str, command: str | None = None, *, timeout_s: float | None = None
-    ) -> tuple[Answer, Decoded]:
+    ) -> tuple[modem.Answer, modem.Decoded]:
         """Send one command and wait for its end. The record is written before this returns.
 
         Raises
@@ -460,26 +407,26 @@ class Tap:
             After recording the bytes that had come.
         """
         assert self._port is not None
-        query = QUERIES[name]
+        query = modem.QUERIES[name]
         text = command or query.text
-        data = encode(text, allow_csi=self._settings.enable_csi)
+        data = modem.encode(text, allow_csi=self._settings.enable_csi)
         # unsolicited lines must not be read as part of the answer
         self._drain()
         sent_utc, sent = self._clock.utc_ns(), self._clock.mono_ns()
         timeout_ns = int((timeout_s or self._settings.answer_timeout_s) * 1e9)
         self._framer.send(text, query.prefixes if command is None else ())
-        loss: PortGoneError | None = None
+        loss: ports.PortGoneError | None = None
         try:
             self._port.write(data)
             answer, last = self._await(sent + timeout_ns)
-        except PortGoneError as error:
+        except ports.PortGoneError as error:
             loss, answer, last = error, self._framer.give_up("lost"), self._clock.mono_ns()
         decoded = self._record_exchange(name, command is None, answer, sent_utc, sent, last)
         if loss is not None:
             raise loss
         return answer, decoded
 
-    def _await(self, deadline: int) -> tuple[Answer, int]:
+    def _await(self, deadline: int) -> tuple[modem.Answer, int]:
         """The answer in flight, and the monotonic time of its last byte."""
         stopped_at = 0
         while True:
@@ -501,7 +448,7 @@ class Tap:
                     return answer, last
             self._tick()
 
-    def _read(self) -> Answer | None:
+    def _read(self) -> modem.Answer | None:
         """Read the available bytes. Record everything except the answer in flight."""
         assert self._port is not None
         data = self._port.read()
@@ -511,7 +458,7 @@ class Tap:
             self._first_bytes += data[: 4096 - len(self._first_bytes)]
         answer = None
         for event in self._framer.feed(data):
-            if isinstance(event, Answer):
+            if isinstance(event, modem.Answer):
                 answer = event
             else:
                 self._other(event)
@@ -522,9 +469,11 @@ class Tap:
         while self._select(0.0) and self._port is not None:
             self._read()
 
-    def _record_exchange(self, name: str, query: bool, answer: Answer, sent_utc: int, sent: int, last: int) -> Decoded:
+    def _record_exchange(
+        self, name: str, query: bool, answer: modem.Answer, sent_utc: int, sent: int, last: int
+    ) -> modem.Decoded:
         lines = [self._redactor.clean(line) for line in answer.lines]
-        decoded = decode(name, lines) if query and lines else Decoded()
+        decoded = modem.decode(name, lines) if query and lines else modem.Decoded()
         pause = int(self._settings.pause_s * 1e9)
         self._rest_until_ns = last + pause
         record: Record = {
@@ -549,9 +498,9 @@ class Tap:
         self._note(name, answer, decoded, record)
         return decoded
 
-    def _note(self, name: str, answer: Answer, decoded: Decoded, record: Record) -> None:
+    def _note(self, name: str, answer: modem.Answer, decoded: modem.Decoded, record: Record) -> None:
         """Keep what the status line shows, and ask for a prediction."""
-        if name == RI_QUERY:
+        if name == modem.RI_QUERY:
             self._last["rank"] = decoded.values.get("rank")
             if answer.status == "ok":
                 self._ri_times.append(record["last_mono_ns"])
@@ -567,20 +516,20 @@ class Tap:
             nr = decoded.values.get("nr") or {}
             self._last["rsrp_dbm"], self._last["sinr_db"] = nr.get("rsrp_dbm"), nr.get("sinr_db")
 
-    def _other(self, event: Event) -> None:
+    def _other(self, event: modem.Event) -> None:
         """Record a line or an answer that belongs to no command in flight."""
-        if isinstance(event, Late):
+        if isinstance(event, modem.Late):
             lines = [self._redactor.clean(line) for line in event.lines]
-            self._record({"kind": "late", "lines": lines, "status": event.status, "code": event.code, **self._now()})
-        elif isinstance(event, Unsolicited):
+            self._event("late", lines=lines, status=event.status, code=event.code)
+        elif isinstance(event, modem.Unsolicited):
             self._noise["lines"] += 1
             # drop lines above this rate, because a wrong port could fill the disk; lines of a modem are always logged
-            if self._noise["lines"] > _NOISE_LINES_PER_S and not is_unsolicited(event.text):
+            if self._noise["lines"] > _NOISE_LINES_PER_S and not modem.is_unsolicited(event.text):
                 self._noise["bytes"] += len(event.text) + event.dropped
                 self._noise["not_kept"] += 1
                 return
             text = self._redactor.clean(event.text, cut=event.dropped > 0)
-            self._record({"kind": "unsolicited", "lines": [text], "dropped_bytes": event.dropped, **self._now()})
+            self._event("unsolicited", lines=[text], dropped_bytes=event.dropped)
             # the modem restarted behind the same port: its CSI switch is as after power-on
             if event.text in ("RDY", "APP RDY"):
                 self._initialise_again = True
@@ -612,7 +561,7 @@ class Tap:
     def _tick(self) -> None:
         """Regular duties: clock, disk, alarm, status, end of the set time."""
         now = self._clock.mono_ns()
-        if self._log_open:
+        if self._early is None:
             for text in self._log.messages():
                 self._say(text)
             self._log_predictions()
@@ -634,7 +583,7 @@ class Tap:
             return
         step, self._offset_ns = utc - before - (self._offset_ns or utc - before), utc - before
         if abs(step) > _CLOCK_STEP_NS:
-            self._record({"kind": "clock", "step_ns": step, **self._now()})
+            self._event("clock", step_ns=step)
 
     def _check_alarm(self, now: int) -> None:
         limit = self._settings.no_csi_alarm_s
@@ -643,21 +592,19 @@ class Tap:
         if not self._alarm:
             self._alarm = True
             self._alarms += 1
-            self._record({"kind": "alarm", "reason": f"no CSI for {limit:g} s", **self._now()})
+            self._event("alarm", reason=f"no CSI for {limit:g} s")
             self._say(f"no CSI for {limit:g} s: is data flowing, and CSI reporting on (--enable-csi)?")
 
     def _flush_noise(self) -> None:
         if self._noise["not_kept"]:
-            self._record(
-                {"kind": "noise", "count": self._noise["not_kept"], "bytes": self._noise["bytes"], **self._now()}
-            )
+            self._event("noise", count=self._noise["not_kept"], bytes=self._noise["bytes"])
         self._noise.clear()
 
     def _log_predictions(self) -> None:
         if self._worker is None:
             return
         for result in self._worker.results():
-            self._last["predicted"] = result.get("predicted")
+            self._last["predicted_rank"] = result.get("predicted")
             if result.get("error"):
                 self._say_once(f"the prediction failed: {result['error']}")
             self._record({"kind": "prediction", **result})
@@ -680,11 +627,9 @@ class Tap:
         while self._ri_times and now - self._ri_times[0] > RATE_WINDOW_S * 1e9:
             self._ri_times.popleft()
         window_s = min(RATE_WINDOW_S, max(1.0, (now - self._start_ns) / 1e9))
-        status = TapStatus(
+        status = ports.TapStatus(
             connected=self._port is not None,
-            rank=self._last["rank"],
-            rsrp_dbm=self._last["rsrp_dbm"],
-            sinr_db=self._last["sinr_db"],
+            **self._last,
             ri_rate_hz=len(self._ri_times) / window_s,
             gaps=self._gaps,
             records=self._log.records,
@@ -692,7 +637,6 @@ class Tap:
             disk_free_bytes=self._log.free_bytes,
             disk_fault=self._log.fault,
             missed=sum(self._schedule.missed.values()),
-            predicted_rank=self._last["predicted"],
             predicts=self._worker is not None,
             alarm=self._alarm,
             message=message,
@@ -702,10 +646,14 @@ class Tap:
         if self._watch is not None:
             self._watch(status)
 
+    def _event(self, kind: str, **fields: Any) -> None:
+        """Record an event of this moment."""
+        self._record({"kind": kind, **fields, **self._now()})
+
     def _record(self, record: Record) -> None:
-        if self._log_open:
+        if self._early is None:
             self._append(record)
-        # the log is not open yet: a port that sends without end must not fill the memory
+        # a port that sends without end must not fill the memory
         elif len(self._early) < 10_000:
             self._early.append(record)
 
@@ -720,13 +668,9 @@ class Tap:
     def _port_record(self) -> Record:
         if self._info is None:
             return {}
-        clean = self._redactor.clean
-        return {
-            "path": clean(str(self._info.path)),
+        return asdict(self._info) | {
+            "path": self._redactor.clean(str(self._info.path)),
             "device": str(self._info.device),
-            "how": self._info.how,
-            "interface": self._info.interface,
-            "product": self._info.product,
         }
 
     def _header(self) -> Record:
@@ -742,13 +686,9 @@ class Tap:
             "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self._clock.utc_ns() / 1e9)),
             "port": self._port_record(),
             "settings": {
-                "ri_hz": settings.ri_hz,
-                "other_hz": settings.other_hz,
-                "queries": list(OTHER_QUERIES),
-                "pause_s": settings.pause_s,
-                "answer_timeout_s": settings.answer_timeout_s,
+                **{name: getattr(settings, name) for name in _IN_HEADER},
+                "queries": list(modem.OTHER_QUERIES),
                 "sync_interval_s": settings.log.sync_interval_s,
-                "enable_csi": settings.enable_csi,
             },
             **self._now(),
         }

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from importlib import import_module, metadata
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
@@ -217,15 +217,18 @@ def holders(device: str) -> list[str]:
 
 def serial_checks() -> Iterator[Check]:
     """Check serial ports: whether this user may open them, and which processes use them. No port is opened."""
-    if missing := [name for name in ("fcntl", "termios") if not _importable(name)]:
-        lacking = f"this system has no {' and no '.join(missing)}: 'tap' and 'modem-sim' need Linux, the rest works"
-        yield Check("Serial", "warn", lacking, "run the tap on Linux")
-        return
     try:
+        import fcntl  # noqa: F401
+        import termios  # noqa: F401
+
         from serial.tools import list_ports
     except ImportError as error:
-        what = "pyserial is not installed" if not _importable("serial") else f"pyserial cannot be loaded ({error})"
-        yield Check("Serial", "fail", what, "make setup")
+        if error.name in ("fcntl", "termios"):
+            found = f"this system has no {error.name}: 'tap' and 'modem-sim' need Linux, the rest works"
+            yield Check("Serial", "warn", found, "run the tap on Linux")
+        else:
+            found = "is not installed" if isinstance(error, ModuleNotFoundError) else f"cannot be loaded ({error})"
+            yield Check("Serial", "fail", f"pyserial {found}", "make setup")
         return
     # ttyS* are sockets of the main board, listed whether or not anything is plugged in
     ports = sorted(port for port in list_ports.comports() if port.vid is not None or "ttyS" not in port.device)
@@ -233,14 +236,6 @@ def serial_checks() -> Iterator[Check]:
         yield Check("Serial", "ok", "no USB serial port: plug the modem in to use 'aerpaw-cmp tap'")
     for port in ports:
         yield serial_check(port.device, port.description or "")
-
-
-def _importable(name: str) -> bool:
-    try:
-        import_module(name)
-    except ImportError:
-        return False
-    return True
 
 
 def serial_check(device: str, description: str = "") -> Check:

@@ -202,7 +202,16 @@ def _legend(layer: Layer, low: float, high: float) -> bytes:
     if layer.classes:
         names = ["out of coverage" if name == "Z" else name for name in layer.classes]
         return kml.list_legend(layer.title, dict(zip(names, _class_palette(layer), strict=True)), 4.2)
-    return kml.bar_legend(layer.title, f"{layer.unit}; grey: out of coverage", (low, high))
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    digits = max(0, int(np.ceil(1.0 - np.log10(high - low))))  # enough to show a tenth of the range
+    labels = [f"{level:.{digits}f} {layer.unit}" for level in np.linspace(high, low, 5)]
+    # both ends include the values beyond the limits
+    labels[0], labels[-1] = f"≥ {labels[0]}", f"≤ {labels[-1]}"
+    colours = [to_hex(colour) for colour in colormaps["viridis"](np.linspace(1.0, 0.0, 5))]
+    legend = dict(zip(labels, colours, strict=True)) | {"out of coverage": CLASS_COLOURS[0]}
+    return kml.list_legend(layer.title, legend, 4.2)
 
 
 _PLANE = ("y", "x")

@@ -10,7 +10,8 @@ import pytest
 
 from aerpaw_cmp.live.feed import Feed
 from aerpaw_cmp.live.modem import QUERIES
-from aerpaw_cmp.live.tap import Stop, Tap, TapSettings
+from aerpaw_cmp.live.ports import Stop, TapSettings
+from aerpaw_cmp.live.tap import Tap
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
 from benchmarks.simulated_modem import BadLine, FaultyModem, read_log
 from tests.long.tap_common import free_port, start_tap

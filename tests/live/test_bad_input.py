@@ -15,7 +15,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.live.ports import PortGoneError, Roots, SerialPort, TapSettings, find_candidates, find_port, holders
-from benchmarks.simulated_modem import Faults, FaultyModem
+from benchmarks.simulated_modem import Faults
 from tests.live.terminals import held, until
 from tests.long.tap_common import run_tap
 
@@ -47,15 +47,6 @@ def test_no_port(tmp_path):
     roots = Roots(tmp_path, list)
     with pytest.raises(InputError, match="no AT port of a Quectel modem"):
         run_tap(TapSettings(tmp_path / "log", roots=roots))
-
-
-def test_a_port_that_comes_later(tap, tmp_path):
-    link = tmp_path / "modem"
-    session = tap(link, wait_for_port_s=10.0)
-    time.sleep(0.3)
-    with FaultyModem(link=link, faults=Faults(latency_s=0.0)) as sim:
-        session.wait(lambda: len(sim.journal) > 5)
-        assert session.end().exit_code == 0
 
 
 @pytest.mark.parametrize("content", ["a file", "a folder", "/dev/null", "/dev/zero"])

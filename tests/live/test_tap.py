@@ -14,9 +14,8 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.live.log import Clock, LogSettings
 from aerpaw_cmp.live.modem import OTHER_QUERIES
-from aerpaw_cmp.live.ports import Schedule
+from aerpaw_cmp.live.ports import Schedule, TapSettings, TapStatus, format_status
 from aerpaw_cmp.live.predict import Prediction
-from aerpaw_cmp.live.tap import TapSettings, TapStatus, format_status
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER
 from benchmarks.simulated_modem import Faults
@@ -164,13 +163,6 @@ def test_the_end_inside_a_gap(modem, tap, tools, tmp_path):
     assert records[-2]["state"] == "closed"
     assert summary.gap_s > 0
     assert not session.statuses[-1].connected
-
-
-def test_the_end_before_a_port_came(tap, tmp_path):
-    session = tap(tmp_path / "nothing", wait_for_port_s=60.0)
-    time.sleep(0.3)
-    summary = session.end()
-    assert (summary.exit_code, summary.segments, summary.records) == (0, (), 0)
 
 
 def test_a_reset_modem_is_set_up_again(modem, tap, tools, tmp_path):

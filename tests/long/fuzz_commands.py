@@ -120,7 +120,7 @@ def drawn(draw: random.Random, root: Path) -> Call:
         lambda: ["explain", path(), "--time", draw.choice(["now", "2025-06-01T14:00:10Z", ""])],
         lambda: ["site", draw.choice(["import", "show", "export"]), path(), "-o", path()],
         lambda: [draw.choice(["sample", "modem-sim"]), path(), draw.choice(["-q", "--json", "-x"])],
-        lambda: ["tap", "--port", path(), "-o", path(), "--duration", "0.2", "--wait", "0.1"],
+        lambda: ["tap", "--port", path(), "-o", path(), "--duration", "0.2"],
     ]
     words = draw.choices(lines, [60, 8, 6, 4, 3, 5, 5, 4])[0]()
     descriptors = tuple(draw.choices(["open", "closed", "full", "gone"], [8, 1, 1, 1])[0] for _ in range(3))

@@ -20,7 +20,7 @@ import json, sys
 from pathlib import Path
 from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.live.log import LogSettings
-from aerpaw_cmp.live.tap import TapSettings
+from aerpaw_cmp.live.ports import TapSettings
 from tests.long.tap_common import run_tap
 values = json.loads(sys.argv[1])
 log = LogSettings(**values.pop("log", {}))
@@ -64,7 +64,8 @@ sys.exit(summary.exit_code)
 
 def run_tap(settings: Any, **options: Any) -> Any:
     """A tap in this process, until its set time or a signal ends it."""
-    from aerpaw_cmp.live.tap import Stop, Tap
+    from aerpaw_cmp.live.ports import Stop
+    from aerpaw_cmp.live.tap import Tap
 
     with Stop() as stop:
         return Tap(settings, stop, **options).run()

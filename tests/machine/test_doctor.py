@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from aerpaw_cmp.common.files import cache_folder, clear_cache
+from aerpaw_cmp.common.files import cache_folder
 from aerpaw_cmp.machine import doctor
 from aerpaw_cmp.propagation import llvm
 
@@ -106,23 +106,6 @@ def test_cache_folder_that_cannot_be(tmp_path: Path) -> None:
     assert doctor.cache_check(tmp_path / "new/deep").status == "ok"
     (tmp_path / "file").touch()
     assert doctor.cache_check(tmp_path / "file/cache").status == "warn"
-
-
-def test_clearing_the_cache_leaves_what_is_not_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("AERPAW_CMP_CACHE", str(tmp_path))
-    ours = [f"{64 * 'a'}.npz", f"llvm/{24 * '0'}", f"outcomes/{64 * 'b'}.json", f"compiled/kernels-{16 * 'c'}/m.kernel"]
-    theirs = ["thesis.tex", "outcomes/notes.txt", "llvm/readme", f"objects/ab/{38 * 'a'}", f"{40 * 'e'}/thesis.tex"]
-    theirs += [f"sub/{64 * 'a'}.npz", f"{64 * 'a'}.txt", f"llvm/{64 * 'a'}.npz"]
-    for name in ours + theirs:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text("12345")
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "elsewhere" / f"{64 * 'd'}.npz").symlink_to(tmp_path / "thesis.tex")
-    assert clear_cache() == (len(ours), 5 * len(ours))
-    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file() and not p.is_symlink()) == (
-        sorted(theirs)
-    )
-    assert not (tmp_path / "compiled").exists() or not any((tmp_path / "compiled").iterdir())
 
 
 @pytest.mark.parametrize(

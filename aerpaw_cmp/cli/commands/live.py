@@ -53,7 +53,6 @@ def tap(
     ri_hz: Annotated[float, Option(help="Rate of the rank indicator.")] = 2.0,
     no_csi_alarm: Annotated[float | None, Option(help="Seconds without CSI until the bell rings.")] = None,
     duration: Annotated[float | None, Option(help="Stop after this many seconds.")] = None,
-    wait: Annotated[float, Option(help="Seconds to wait for the port.")] = 0.0,
     web: Annotated[
         str | None,
         Option(help=f"Also show the flight as a page, opened with a token, at HOST:PORT [default: {WEB}]."),
@@ -77,7 +76,6 @@ def tap(
         enable_csi=enable_csi,
         no_csi_alarm_s=no_csi_alarm,
         duration_s=duration,
-        wait_for_port_s=wait,
     )
     line = StatusLine(status and not say.quiet)
     summaries = tap_modems(settings, port or [None], shown, on_status=line)
@@ -160,7 +158,8 @@ def modem_sim(
 ) -> int:
     """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""
     _needs_posix("modem-sim")
-    from ...live.simulator import FlightModem, ModemSimulator, run_modem_sim
+    from ...live.ports import Stop
+    from ...live.simulator import FlightModem, ModemSimulator
 
     if (flight is None) != (telemetry is None):
         raise UsageError(
@@ -172,10 +171,10 @@ def modem_sim(
 
         flown = FlownAgain(flight, telemetry)
     modem = FlightModem() if flown is None else FlightModem(flown.rank, rsrp=flown.rsrp)
-
-    def ready(port: object) -> None:
-        if not answered({"port": str(port)}):
-            show(port)
-
-    run_modem_sim(ModemSimulator(modem, link=link), on_ready=ready, meanwhile=flown)
+    with Stop() as stop, ModemSimulator(modem, link=link) as simulator:
+        if not answered({"port": str(simulator.port)}):
+            show(simulator.port)
+        while not stop.wait(0.1):
+            if flown is not None:
+                flown()
     return 0

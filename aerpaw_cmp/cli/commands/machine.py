@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 from typer import Option
 
-from ...common import files as cached
 from ...common.text import counted
 from ..app import command
 from ..shown import answered, records, say, show
@@ -66,17 +65,10 @@ def _conditions(at: Mapping[str, Any]) -> str:
     examples=[
         "aerpaw-cmp doctor",
         "aerpaw-cmp doctor --json",
-        "aerpaw-cmp doctor --clear-cache",
     ],
 )
-def doctor(
-    clear_cache: Annotated[bool, Option("--clear-cache", help="First empty the cache of this program.")] = False,
-) -> int:
+def doctor() -> int:
     """Check this machine."""
-    if clear_cache:
-        files, size = cached.clear_cache()
-        # matplotlib's folder is every program's: only its fonts are listed there
-        say(f"cache: {counted(files, 'file')} removed, {size / 1e6:.1f} MB; matplotlib's list of fonts stays")
     from ...machine import doctor as doctor_room
 
     checks = doctor_room.checks()

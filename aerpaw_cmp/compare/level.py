@@ -22,7 +22,7 @@ from scipy.special import ndtr, ndtri  # every report loads this module, and sci
 
 from ..common.geodesy import azimuth_rad, bearing_deg, elevation_rad
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
-from .offset import SPAN_DB, OffsetFit, grid_offset, identifiable_range, offset_curve, offset_grid
+from .offset import SPAN_DB, OffsetFit, difference_moments, grid_offset, identifiable_range, offset_grid
 from .receiver import brier_losses, log_losses, out_of_group
 from .statistics import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals, rmse_interval
 
@@ -140,7 +140,6 @@ def compare_rss(
     m, s = measured[order], simulated[order]
     place = None if position_m is None else position_m[order]
     fit = grid_offset(m, s, span_db=span_db)
-    offsets, curve = offset_curve(m, s, span_db=span_db)
     simple = {name: _levels(levels)[order] for name, levels in (baselines or {}).items()}
     fits = {name: grid_offset(m, level, span_db=span_db) for name, level in simple.items()}
     return RssComparison(
@@ -154,7 +153,7 @@ def compare_rss(
         n_no_pose=int((~has_pose).sum()),
         correlation=correlation(m, s),
         intervals=replace(error_intervals(m, s, place), rmse_db=_rmse_interval(m - s, fit, place)),
-        identifiable_db=identifiable_range(offsets, curve),
+        identifiable_db=identifiable_range(difference_moments(m, s), span_db=span_db),
         baselines=fits,
         baseline_intervals={name: _rmse_interval(m - level, fits[name], place) for name, level in simple.items()},
         residual_db=np.where(use, measured + fit.offset_db - simulated, np.nan),
@@ -248,32 +247,17 @@ def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> Fl
     top = x.max()
     # powers relative to the strongest level stay in range for any gain
     power = power_from_db(x - top)
-    first = np.searchsorted(t, t - 0.5 * window_s, side="left")
-    last = np.searchsorted(t, t + 0.5 * window_s, side="right")
-    result[rows] = db_from_power(_window_sums(power, first, last) / (last - first)) + top
+    result[rows] = db_from_power(_window_means(t, power, window_s)) + top
     return result
 
 
-def _window_sums(values: FloatArray, first: Any, last: Any) -> FloatArray:
-    """Return the sums of values[first:last] for windows that move forward.
-
-    A running sum would lose weak windows after strong ones (1e-16 of the total). Therefore each window is the sum of
-    aligned pieces of 2^j values, which are summed separately (a sparse table with log2(n) passes).
-    """
-    total = np.zeros(len(first))
-    at, remaining = first.copy(), last - first
-    table = values
-    width = 1
-    tables = [table]
-    while width * 2 <= int(remaining.max(initial=1)):
-        table = table[: len(table) - width] + table[width:]
-        tables.append(table)
-        width *= 2
-    for j in range(len(tables) - 1, -1, -1):
-        take = (remaining >> j) & 1 == 1
-        total[take] += tables[j][at[take]]
-        at = at + np.where(take, 1 << j, 0)
-    return total
+def _window_means(time: FloatArray, values: FloatArray, window_s: float) -> FloatArray:
+    """Return the means of values (n,) over windows about their times (n,), which ascend [s]."""
+    first = np.searchsorted(time, time - 0.5 * window_s, side="left")
+    last = np.searchsorted(time, time + 0.5 * window_s, side="right")
+    # differences of a running sum would lose weak windows after strong ones: add up each window
+    ends = np.column_stack([first, last]).ravel()
+    return np.asarray(np.add.reduceat(np.append(values, 0.0), ends)[::2] / (last - first))
 
 
 def averaged_fits(
@@ -440,9 +424,7 @@ def error_spans(
     if not len(ok):
         return []
     t, r = time[ok], residual[ok]
-    first = np.searchsorted(t, t - 0.5 * window_s, side="left")
-    last = np.searchsorted(t, t + 0.5 * window_s, side="right")
-    smooth = _window_sums(r, first, last) / (last - first)
+    smooth = _window_means(t, r, window_s)
     limit = 1.5 * float(np.sqrt(np.mean(r**2))) if threshold_db is None else threshold_db
     sign = np.where(smooth > limit, 1, np.where(smooth < -limit, -1, 0))
     # a gap longer than the window separates segments, because the error in the gap is unknown

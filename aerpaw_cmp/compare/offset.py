@@ -25,6 +25,9 @@ STEP_DB = 0.1
 # A longer grid results from a wrong step or range, and would not fit in memory.
 MAXIMUM_OFFSETS = 10_000_000
 
+# Larger levels [dB] count as this one.
+_LARGEST_DB = 1e150
+
 # Distances that differ by less than this share of a step are ties (0.15 lies between 0.1 and 0.2).
 _TIE = 1e-9
 
@@ -91,24 +94,43 @@ def nearest_offset(grid_db: FloatArray, target_db: float, step_db: float = STEP_
     return int(near[np.argmin(np.abs(grid_db[near]))])
 
 
-def _difference(measured_db: ArrayLike, simulated_db: ArrayLike) -> FloatArray:
-    """Return simulated minus measured over the pairs with both sides finite [dB], flattened."""
-    measured = unmasked(measured_db)
-    simulated = unmasked(simulated_db)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Moments:
+    """The number of pairs of a sequence, and mean [dB] and variance [dB^2] of simulated minus measured."""
+
+    n: int
+    mean_db: float
+    variance_db2: float
+
+    def rmse_db(self, offset_db: FloatArray) -> FloatArray:
+        """Return the RMSE at offsets [dB], of their shape: RMSE^2(o) = variance + (mean - o)^2."""
+        # without squaring a difference of 1e200
+        return np.asarray(np.hypot(np.sqrt(self.variance_db2), self.mean_db - offset_db))
+
+    def fit_at(self, grid_db: FloatArray, best: int) -> OffsetFit:
+        """Return the fit of the offset with the index ``best`` in a grid."""
+        rmse = float(self.rmse_db(grid_db[best]))
+        return OffsetFit(float(grid_db[best]), rmse, self.n, best in (0, len(grid_db) - 1))
+
+
+def difference_moments(measured_db: ArrayLike, simulated_db: ArrayLike) -> Moments:
+    """Return the moments of the pairs with both sides finite, NaN if there are no pairs.
+
+    Examples
+    --------
+    >>> difference_moments([-60.0, -70.0, float("nan")], [-57.0, -66.0, -1.0])
+    Moments(n=2, mean_db=3.5, variance_db2=0.25)
+    """
+    measured, simulated = unmasked(measured_db), unmasked(simulated_db)
     if measured.shape != simulated.shape:
         raise ValueError(f"measured has shape {measured.shape}, simulated {simulated.shape}: they must be pairs")
-    ok = np.isfinite(measured) & np.isfinite(simulated)
-    # a difference of +-1e308 would overflow: no level is near it
-    limit = 1e300
-    return np.asarray(np.clip(simulated[ok], -limit, limit) - np.clip(measured[ok], -limit, limit))
-
-
-def _mean_and_variance(values: FloatArray) -> tuple[float, float]:
-    largest = float(np.abs(values).max())
-    if largest > 1e150:  # sums and squares would overflow
-        return float((values / largest).mean()) * largest, float("inf")
-    mean = float(values.mean())
-    return mean, float(np.mean((values - mean) ** 2))
+    finite = np.isfinite(measured) & np.isfinite(simulated)
+    if not finite.any():
+        return Moments(n=0, mean_db=float("nan"), variance_db2=float("nan"))
+    # sums and squares of +-1e308 would overflow: no level is near it
+    first, second = (np.clip(side[finite], -_LARGEST_DB, _LARGEST_DB) for side in (measured, simulated))
+    values = second - first
+    return Moments(n=len(values), mean_db=float(values.mean()), variance_db2=float(values.var()))
 
 
 def grid_offset(
@@ -141,89 +163,35 @@ def grid_offset(
 
     Notes
     -----
-    RMSE^2(o) = variance + (mean difference - o)^2, evaluated in that form on the whole grid: sums of squares of
-    offset levels would lose the digits that decide a tie. Source: arXiv 2502.10324, section V.
+    The best offset is the mean difference, rounded to the grid (:meth:`Moments.rmse_db`). Sums of squares of offset
+    levels would lose the digits that decide a tie. Source: arXiv 2502.10324, section V.
 
     Examples
     --------
     >>> grid_offset([-60.0, -70.0, float("nan")], [-57.0, -66.9, -1.0])
     OffsetFit(offset_db=3.0, rmse_db=0.0707..., n=2, at_edge=False)
     """
-    grid = offset_grid(step_db, span_db)
-    difference = _difference(measured_db, simulated_db)
-    if not len(difference):
+    grid, moments = offset_grid(step_db, span_db), difference_moments(measured_db, simulated_db)
+    if not moments.n:
         return _NO_FIT
-    mean, variance = _mean_and_variance(difference)
-    best = nearest_offset(grid, mean, step_db)
-    # without squaring a difference of 1e200
-    rmse = float(np.hypot(np.sqrt(variance), mean - grid[best]))
-    return OffsetFit(float(grid[best]), rmse, len(difference), best in (0, len(grid) - 1))
+    return moments.fit_at(grid, nearest_offset(grid, moments.mean_db, step_db))
 
 
-def offset_curve(
-    measured_db: ArrayLike,
-    simulated_db: ArrayLike,
-    *,
-    step_db: float = STEP_DB,
-    span_db: tuple[float, float] = SPAN_DB,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the RMSE [dB] at every offset [dB] of the grid: how sharply the data determine the offset.
-
-    Parameters
-    ----------
-    measured_db, simulated_db : array_like, (n,)
-        Levels [dB]; pairs with a NaN do not count.
-    step_db, span_db : float, (float, float)
-        Step and range of the candidate offsets, as in :func:`offset_grid` [dB].
-
-    Returns
-    -------
-    (offsets_db, rmse_db), each (offsets,)
-        The RMSE is NaN everywhere if there are no pairs.
-    """
-    grid = offset_grid(step_db, span_db)
-    difference = _difference(measured_db, simulated_db)
-    if not len(difference):
-        return grid, np.full(len(grid), np.nan)
-    mean, variance = _mean_and_variance(difference)
-    return grid, np.hypot(np.sqrt(variance), mean - grid)
-
-
-def identifiable_range(offsets_db: FloatArray, rmse_db: FloatArray, *, excess_db: float = 0.1) -> tuple[float, float]:
-    """Return the lowest and highest offset whose RMSE is within ``excess_db`` of the best one [dB]."""
-    if not np.isfinite(rmse_db).any():
+def identifiable_range(
+    moments: Moments, *, excess_db: float = 0.1, step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB
+) -> tuple[float, float]:
+    """Return the lowest and highest offset whose RMSE is within ``excess_db`` of the best one [dB], NaN if no pairs."""
+    if not moments.n:
         return float("nan"), float("nan")
-    near = offsets_db[rmse_db <= np.nanmin(rmse_db) + excess_db]
-    return float(near.min()), float(near.max())
+    grid = offset_grid(step_db, span_db)
+    rmse = moments.rmse_db(grid)
+    near = grid[rmse <= rmse.min() + excess_db]
+    return float(near[0]), float(near[-1])
 
 
 Pooling = Literal["link", "tower", "channel", "flight", "all"]
 
 _GROUP: dict[str, tuple[int, ...]] = {"link": (0, 1, 2), "tower": (1,), "channel": (2,), "flight": (0,), "all": ()}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Moments:
-    """The number of pairs of a sequence, and mean [dB] and variance [dB^2] of simulated minus measured."""
-
-    n: int
-    mean_db: float
-    variance_db2: float
-
-
-def difference_moments(measured_db: ArrayLike, simulated_db: ArrayLike) -> Moments:
-    """Return the moments of the pairs with both sides finite, NaN if there are no pairs.
-
-    Examples
-    --------
-    >>> difference_moments([-60.0, -70.0, float("nan")], [-57.0, -66.0, -1.0])
-    Moments(n=2, mean_db=3.5, variance_db2=0.25)
-    """
-    difference = _difference(measured_db, simulated_db)
-    if not len(difference):
-        return Moments(n=0, mean_db=float("nan"), variance_db2=float("nan"))
-    mean, variance = _mean_and_variance(difference)
-    return Moments(n=len(difference), mean_db=mean, variance_db2=variance)
 
 
 def pooled_moments(
@@ -267,9 +235,5 @@ def pooled_moments(
         # sum about the first mean: sums of levels near -90 dB would lose the digits that decide a tie
         mean = filled[0].mean_db + sum((item.mean_db - filled[0].mean_db) * (item.n / total) for item in filled)
         best = nearest_offset(grid, mean)
-        offset, at_edge = float(grid[best]), best in (0, len(grid) - 1)
-        for key in members:
-            sequence = moments[key]
-            rmse = float(np.hypot(np.sqrt(sequence.variance_db2), sequence.mean_db - offset))
-            fits[key] = OffsetFit(offset, rmse, sequence.n, at_edge)
+        fits |= {key: moments[key].fit_at(grid, best) for key in members}
     return {key: fits[key] for key in moments}

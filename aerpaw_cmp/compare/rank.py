@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, unmasked
 from .statistics import (
     FEWEST,
-    LANES,
-    LARGEST,
     NO_INTERVAL,
     REPLICATES,
     SAME_PLACE_M,
@@ -25,7 +23,6 @@ from .statistics import (
     Visit,
     autocorrelation,
     bootstrap_means,
-    certain_rank,
     influence_interval,
     same_places,
     share_interval,
@@ -145,21 +142,7 @@ def channel_rank(h: ArrayLike, k: float) -> IntArray:
     >>> channel_rank(h, 10), channel_rank(1e-150 * h, 1000), channel_rank(0 * h, 10)
     (array(2), array(4), array(0))
     """
-    matrix = unmasked(h, np.complex128)
-    if matrix.ndim < 2 or not 1 <= min(matrix.shape[-2:]) <= LARGEST or not k >= 1:
-        return rank_from_singular_values(singular_values(matrix), k)
-    flat = matrix.reshape(-1, *matrix.shape[-2:])
-    rank = np.zeros(len(flat), dtype=np.int64)
-    for start in range(0, len(flat), LANES):
-        part = flat[start : start + LANES]
-        counted, certain = certain_rank(part, k)
-        doubtful = np.flatnonzero(~certain)
-        if len(doubtful):
-            has_path = part[doubtful].any(axis=(1, 2))  # most matrices in doubt have no path at all
-            counted[doubtful] = 0
-            counted[doubtful[has_path]] = rank_from_singular_values(singular_values(part[doubtful[has_path]]), k)
-        rank[start : start + LANES] = counted
-    return rank.reshape(matrix.shape[:-2])
+    return rank_from_singular_values(singular_values(h), k)
 
 
 def _ranks(rank: ArrayLike) -> FloatArray:

@@ -114,7 +114,7 @@ def rss_result(
     measured, simulated = levels["measured"], levels["simulated"]
     score = compare_rss(time, measured, simulated, baselines=baselines)
     further = RssFurther(
-        n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out, block_length=1,
+        n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out,
         identifiable_db=score.identifiable_db,
         n_too_low=0, n_no_pose=0, n_outliers=0, rmse_without_outliers_db=score.rmse_db, n_flagged={}, clock=None,
         baseline_rmse_ci95_db=score.baseline_intervals, compared_with={}, averaged={},

@@ -844,6 +844,16 @@ def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: flo
     return OffsetFit(float(grid[best]), float(np.sqrt(mse[best])), n, best in (0, len(grid) - 1))
 
 
+def error_above_floor(measured_db: FloatArray, simulated_db: FloatArray, floor_db: float) -> FloatArray:
+    """Return measured minus simulated (n,) [dB], of levels that are only known to be below the floor if they are lower.
+
+    Such a level is inside an interval if the interval extends below the floor: its error is 0 if the simulated level is
+    lower as well, else the distance of the simulated level from the floor.
+    """
+    below = measured_db <= floor_db
+    return np.where(below, np.minimum(floor_db - simulated_db, 0.0), measured_db - simulated_db)
+
+
 def _reliability(stated: FloatArray, detected: BoolArray) -> tuple[tuple[float, float, int], ...]:
     fifth = np.minimum((stated * 5.0).astype(np.int64), 4)
     groups = [fifth == i for i in range(5)]

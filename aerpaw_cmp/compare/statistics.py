@@ -452,9 +452,6 @@ SEED = 20_250_210
 # Blocks have twice the length of Politis and White, which minimises the error of the variance, not of the coverage.
 _LONGER = 2.0
 
-# Number of consecutive insignificant lags: max(5, sqrt(log10 n)) of Politis and White is 5 for any flight.
-_RUN = 5
-
 # Width of an interval relative to its value above which only its lower end is reported.
 _BOUND = 2.0
 
@@ -501,35 +498,13 @@ def autocovariance(values: ArrayLike, lags: int) -> FloatArray:
     return np.asarray(np.fft.irfft(np.abs(spectrum) ** 2, size)[: lags + 1] / n)
 
 
-def _significant(n: int) -> float:
-    """Return the autocorrelation above which a lag is significant (Politis and White's rule)."""
-    return 2.0 * float(np.sqrt(np.log10(n) / n))
-
-
-def _cutoff(correlation: FloatArray, n: int) -> int:
-    """Return the last lag before :data:`_RUN` consecutive insignificant lags (Politis and White's rule)."""
-    small = np.abs(correlation[1:]) < _significant(n)
-    small_so_far = np.concatenate([[0], np.cumsum(small)])
-    runs = small_so_far[_RUN:] - small_so_far[:-_RUN] == _RUN
-    return int(np.argmax(runs)) if runs.any() else len(small)
-
-
-def _flat_top(covariance: FloatArray, n: int) -> tuple[float, float, float]:
-    """Return long-run variance, sum of the lag window, and sum of lag times covariance, by the flat-top window."""
-    lags = min(2 * max(1, _cutoff(covariance / covariance[0], n)), len(covariance) - 1)
-    lag = np.arange(1, lags + 1)
-    window = np.clip(2.0 * (1.0 - lag / lags), 0.0, 1.0)
-    weighted = window * covariance[1 : lags + 1]
-    return float(covariance[0] + 2.0 * weighted.sum()), float(1.0 + 2.0 * window.sum()), float((lag * weighted).sum())
-
-
 def _exponential_decay(covariance: FloatArray, n: int) -> tuple[float, float]:
     """Return long-run variance and sum of lag times covariance for white noise plus an exponential correlation.
 
     The decay is fitted to consecutive lags down to a correlation of one half, which the removed mean changes least.
     """
     correlation = covariance / covariance[0]
-    if correlation[1] < _significant(n):
+    if correlation[1] < 2.0 * np.sqrt(np.log10(n) / n):  # not significant, by the rule of Politis and White
         return float(covariance[0]), 0.0
     below = np.flatnonzero(correlation[1:] <= 0.5)
     last = min(max(2, int(below[0]) + 1 if len(below) else len(correlation)), len(correlation) - 1)
@@ -559,11 +534,9 @@ def autocorrelation(values: ArrayLike) -> Autocorrelation:
     autocovariances). On a flight of a few correlation times, this hides most of the correlation. V and the corrected
     covariances are therefore solved together. If there is no V below n times the variance, the effective size is one.
 
-    V is the larger of two estimates. One is the flat-top lag window of Politis and White (2004),
-    doi:10.1081/ETC-120028836. The other is white noise plus an exponential correlation (Gudmundson 1991,
-    doi:10.1049/el:19911328). The block length is that of Patton, Politis and White (2009),
-    doi:10.1080/07474930802459016, for the circular block bootstrap. Lags are searched up to n / 2 instead of sqrt n,
-    because there are many radio samples per correlation length. Blocks are at most n / 5.
+    The correlation is white noise plus an exponential (Gudmundson 1991, doi:10.1049/el:19911328). The block length is
+    that of Patton, Politis and White (2009), doi:10.1080/07474930802459016, for the circular block bootstrap. Lags are
+    searched up to n / 2, because there are many radio samples per correlation length. Blocks are at most n / 5.
 
     Examples
     --------
@@ -578,22 +551,13 @@ def autocorrelation(values: ArrayLike) -> Autocorrelation:
     unbiased = autocovariance(x, lags) * n / (n - np.arange(lags + 1))
     hidden, long_run, reach = 0.0, float(unbiased[0]), 0.0
     for _ in range(12):
-        covariance = unbiased + hidden
-        by_window, width, window_reach = _flat_top(covariance, n)
-        by_decay, decay_reach = _exponential_decay(covariance, n)
-        # The sum of the window contains the hidden part width / n times. A window nearly as long as the flight means an
-        # effective size of one.
-        by_window = (by_window - width * hidden) / (1.0 - width / n) if width < 0.8 * n else np.inf
-        long_run, reach = max(by_window, by_decay), max(window_reach, decay_reach)
-        if long_run >= n * covariance[0]:
+        long_run, reach = _exponential_decay(unbiased + hidden, n)
+        if long_run >= n * (unbiased[0] + hidden):
             return Autocorrelation(n, max(1, n // 5), 1.0)
-        if long_run <= 0.0:  # an oscillation determines the mean at least as well as independent samples
-            long_run = float(unbiased[0])
         if abs(long_run / n - hidden) < 1e-3 * unbiased[0]:
             break
         hidden = long_run / n
-    slope = max(0.0, 2.0 * reach / long_run)
-    length = _LONGER * (1.5 * slope**2 * n) ** (1.0 / 3.0)
+    length = _LONGER * (1.5 * (2.0 * reach / long_run) ** 2 * n) ** (1.0 / 3.0)
     # at least five blocks, because resamples of fewer repeat each other
     block = int(np.clip(np.ceil(length), 1, max(1, n // 5)))
     effective = float(np.clip(n * (unbiased[0] + hidden) / long_run, 1.0, n))
@@ -626,27 +590,20 @@ def bootstrap_means(
 
     Notes
     -----
-    The start of a block determines its sum, so a resample is a set of starts. A few long blocks are gathered. Many
-    short ones are counted and multiplied, which is one matrix product for all replicates.
+    The start of a block determines its sum, so a resample is a set of starts. They are counted and multiplied, which is
+    one matrix product for all replicates.
     """
     n, width = columns.shape
     rng = np.random.default_rng(seed)
     blocks = -(-n // block_length)
-    sums = _block_sums(columns, block_length)
-    last = _block_sums(columns, n - (blocks - 1) * block_length)
+    sums, last = _block_sums(columns, block_length), _block_sums(columns, n - (blocks - 1) * block_length)
     result = np.empty((replicates, width))
-    few = 2 * (blocks - 1) * width < n * (3.0 + 0.2 * width)
-    chunk = max(1, _HELD // max(1, (blocks - 1) * width if few else n))
+    chunk = max(1, _HELD // n)
     for start in range(0, replicates, chunk):
-        count = min(chunk, replicates - start)
-        begin = rng.integers(0, n, (count, blocks))
-        full_blocks = begin[:, :-1]
-        if few:
-            total = sums[full_blocks].sum(axis=1)
-        else:
-            cell = np.arange(count)[:, None] * n + full_blocks
-            total = np.bincount(cell.ravel(), minlength=count * n).reshape(count, n).astype(np.float64) @ sums
-        result[start : start + count] = (total + last[begin[:, -1]]) / n
+        begin = rng.integers(0, n, (min(chunk, replicates - start), blocks))
+        cell = np.arange(len(begin))[:, None] * n + begin[:, :-1]
+        count = np.bincount(cell.ravel(), minlength=len(begin) * n).reshape(-1, n).astype(np.float64)
+        result[start : start + chunk] = (count @ sums + last[begin[:, -1]]) / n
     return result
 
 

@@ -21,11 +21,15 @@ import numpy as np
 import yaml
 
 from aerpaw_cmp.common.yamlfile import dump_yaml
+from aerpaw_cmp.compare.referee import PredictedLevel, level_card
+from aerpaw_cmp.compare.statistics import FEWEST
 from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import FlightSimulator
-from aerpaw_cmp.jobs.options import RunOptions
-from aerpaw_cmp.jobs.predict import run_predict, score_against
+from aerpaw_cmp.jobs.calibrate import observe
+from aerpaw_cmp.jobs.options import AGAINST_DISTANCE_M, RunOptions
+from aerpaw_cmp.jobs.predict import run_predict
+from aerpaw_cmp.jobs.referee import predicted_at, read_foreign, split_by_series
 from aerpaw_cmp.jobs.sources import NamedFlight, TargetOptions
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -104,12 +108,23 @@ def predicted(
     """Predict a flight from others and return the numbers of each of its series."""
     out = folder / f"prediction_{third.parent.name}_{third.stem}"
     run_predict(third, files, TargetOptions(), RunOptions(out=out, logs_root=logs_root))
-    against = score_against(NamedFlight(third, load_with_learned(third)).load(logs_root), out)
-    return [
-        dict(zip(NAMES, (scores["coverage_90"], scores["rmse_db"], float(np.std(s.measured_db - s.level_db)),
-                         float(np.sqrt(np.mean(s.sd_db**2))), scores["crps_db"]), strict=True))
-        for s, scores in zip(against.series, against.scores.values(), strict=True)
-    ]  # fmt: skip
+    data, rows = NamedFlight(third, load_with_learned(third)).load(logs_root), []
+    given = read_foreign(out, data)
+    for flown in observe([data])[0]:
+        samples = flown.samples
+        part = split_by_series(given.table, samples.tower, samples.channel)
+        said, near = predicted_at(
+            given, part, samples.time_s, samples.position_m, flown.heading_deg, AGAINST_DISTANCE_M
+        )
+        predicted = PredictedLevel(
+            level_db=said["level"], sd_db=said.get("sd_db"), low_db=said.get("q05_db"), high_db=said.get("q95_db")
+        )
+        if near.sum() >= FEWEST:
+            card = level_card(samples.time_s, samples.residual_db + flown.free_space_db, predicted, ())
+            sd_db = float(np.sqrt(np.nanmean(np.square(said["sd_db"]))))
+            numbers = card.coverage_90, card.rmse_db, card.rmse_offset_db, sd_db, card.crps_db
+            rows.append(dict(zip(NAMES, numbers, strict=True)))
+    return rows
 
 
 def show(name: str, rows: Sequence[dict[str, float]]) -> None:

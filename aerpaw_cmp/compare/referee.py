@@ -186,7 +186,7 @@ def nearest_points(
     heading_deg: FloatArray | None,
     points_m: FloatArray,
     yaw_deg: FloatArray | None,
-    reach_m: float | tuple[float, float, float],
+    reach_m: float,
 ) -> tuple[IntArray, BoolArray]:
     """Return the nearest predicted point (n,) of each sample, and whether it is near (n,).
 
@@ -199,7 +199,7 @@ def nearest_points(
     points_m : (points, 3)
     yaw_deg : (points,), optional
         Headings that were predicted. Unless all points and any sample have one, headings do not count.
-    reach_m : float or (east, north, up)
+    reach_m : float
         Largest distance of a near point.
 
     Returns
@@ -209,7 +209,7 @@ def nearest_points(
     """
     from scipy.spatial import cKDTree
 
-    samples, points = position_m / np.asarray(reach_m), points_m / np.asarray(reach_m)
+    samples, points = position_m / reach_m, points_m / reach_m
     if (
         yaw_deg is not None
         and heading_deg is not None

@@ -1,13 +1,11 @@
 """The ``predict`` job: levels with intervals, serving tower and ranks at positions without a flight.
 
-The file also scores a flight with an earlier prediction (``report flight.yaml --against prediction/``), and corrects
-maps by flights: raw replay, prediction, its standard deviation, and the ranks of a learned receiver. Levels of a map
-are in dBm, without the mean offset between the logs and the raw replay.
+The file also corrects maps by flights: raw replay, prediction, its standard deviation, and the ranks of a learned
+receiver. Levels of a map are in dBm, without the mean offset between the logs and the raw replay.
 """
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -19,31 +17,25 @@ import numpy as np
 import pandas as pd
 
 from ..common.content import KEY, MARKS, union
-from ..common.errors import InputError, UsageError, parsing
-from ..common.files import LARGEST_TABLE, read_bounded
-from ..common.geodesy import bearing_deg
+from ..common.errors import InputError, UsageError
 from ..common.outputs import OutputFolder
 from ..common.stages import PlannedStage, Progress, Stages
 from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
-from ..compare.calibration import OFF, STATED_FIELDS, Base, Observed, by_degree, choose, fixed_base
-from ..compare.gains import BAND, LinkSamples, LostLock
-from ..compare.receiver import ForecastScore, score_forecast
-from ..compare.referee import nearest_points
+from ..compare.calibration import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base
+from ..compare.gains import BAND, LinkSamples
 from ..flight.data import FlightData, site_place, unread
 from ..flight.drafting.proposals import remembered
 from ..flight.gains import flight_of
 from ..flight.settings import FlightFile, LinkSettings, LinksSettings
-from ..flight.training import among, common, counted_once, flight_logs, knows, learned_patterns, marks_of
+from ..flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
 from ..maps.grid import Grid, Layer, class_names
 from ..propagation.geometry import Poses, rotation_from_aircraft
 from ..report import maps as page
-from ..report.against import Against, AgainstSeries
 from ..report.prediction import (
     FLAGS,
     TITLES,
     PredictionPage,
-    against_words,
     cautions,
     first_words,
     heading_words,
@@ -60,8 +52,8 @@ from ..site.learned import folder_of, read_learned
 from ..site.site import Site
 from ..site.siteyaml import load_site, site_model
 from .calibrate import learned_antennas, observe
-from .calibrate_rank import FittedReceiver, RankSamples, rank_samples, read_receiver
-from .options import DEFAULT, JobOutcome, RunOptions
+from .calibrate_rank import FittedReceiver, RankSamples, read_receiver
+from .options import DEFAULT, RANKS, JobOutcome, RunOptions
 from .sources import (
     PRIOR_ANTENNA_DB,
     PRIOR_FADING_DB,
@@ -90,8 +82,6 @@ HEADINGS = 8
 
 # Targets per block, which limits memory.
 AT_ONCE = 50_000
-
-RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
 
 # Column of the probability of lock, for receivers that can lose it.
 P_LOCK = "p_lock"
@@ -670,119 +660,6 @@ def run_predict(
         for text in remarks:
             options.progress(text)
         return JobOutcome(folder=folder, metrics=prediction_metrics(prediction.page), files=output.placed(written))
-
-
-# A sample is scored by the nearest predicted point within these distances.
-NEAR_M, _NEAR_UP_M = 30.0, 15.0
-
-FEWEST = 20
-
-
-def score_against(data: FlightData, folder: Path) -> Against:
-    """Score a flight with the prediction of an earlier run of ``predict``.
-
-    Raises
-    ------
-    UsageError
-        If the prediction was learned from the flight's own log, or no sample was predicted.
-    InputError
-        If the folder does not contain a prediction.
-    """
-    with parsing(folder, "the output folder of 'aerpaw-cmp predict'", any_shape=True):
-        about = json.loads(read_bounded(folder / "metrics.json", LARGEST_TABLE))
-        table = pd.read_csv(folder / "prediction.csv", low_memory=False)
-        learned, marked, sentence = list(about[KEY]), tuple(map(str, about.get(MARKS, ()))), str(about["sentence"])
-        groups = dict(iter(table[table["level_db"].notna()].groupby(["tower", "channel"])))
-        forecasts = dict(iter(table[table["channel"] == "rank"].groupby("tower")))
-    own = common(flight_logs(data), [learned])
-    if own or any(among(mark, marked) for mark in marks_of([data])):
-        raise UsageError(
-            f"the prediction learned from this flight's own {f'log (SHA-256 {own[0][:12]}...)' if own else 'readings'}",
-            expected="a prediction made before the flight, or from other flights",
-            path=folder,
-        )
-    series = [
-        scored
-        for o in (observe([data])[0] if data.rss else ())
-        if (part := groups.get((o.samples.tower, o.samples.channel))) is not None
-        and (scored := _matched(o, part)) is not None
-    ]
-    ranks = {
-        s.tower: score
-        for s in data.rank
-        if s.tower in forecasts and (score := _rank_score(rank_samples(data, s), forecasts[s.tower])) is not None
-    }
-    if not series and not ranks:
-        raise UsageError(
-            f"no tower and channel of the flight has {FEWEST} samples within {NEAR_M:g} m of predicted points",
-            expected="a prediction of this route: " + ", ".join(" ".join(map(str, key)) for key in groups),
-            path=folder,
-        )
-    return Against(
-        folder=folder.name,
-        sentence=sentence,
-        generated=str(about.get("generated", "")),
-        flights=tuple(map(str, about.get("flights", ()))),
-        series=tuple(series),
-        ranks=ranks,
-        words=against_words(series, ranks),
-    )
-
-
-def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
-    """Return the samples near predicted points, each with the level that was predicted there."""
-    good = np.isfinite(o.samples.residual_db)
-    finite = o.part(good)
-    index, near = _nearest(finite.samples.position_m, finite.heading_deg, part)
-    if near.sum() < FEWEST:
-        return None
-    predicted, s = part.iloc[index[near]], finite.samples.part(near)
-
-    def column(name: str) -> FloatArray:
-        return np.asarray(predicted[name], dtype=np.float64)
-
-    level_db, lock = column("level_db"), None
-    if P_LOCK in predicted and predicted[P_LOCK].notna().all():
-        lock = LostLock(
-            probability=column(P_LOCK),
-            locked_db=column("locked_db") - level_db,
-            lost_db=column("lost_db") - level_db,
-            locked_sd_db=float(column("locked_sd_db")[0]),
-            lost_sd_db=float(column("lost_sd_db")[0]),
-        )
-    return AgainstSeries(
-        name=f"{s.tower} {s.channel}",
-        time_s=s.time_s,
-        position_m=s.position_m,
-        measured_db=s.residual_db + finite.free_space_db[near],
-        level_db=level_db,
-        lock=lock,
-        sd_db=column("sd_db"),
-        low_db=column("q05_db"),
-        high_db=column("q95_db"),
-        share_near=float(near.mean()),
-        common_db=column("slow_sd_db") if "slow_sd_db" in predicted else 0.0,
-        start=finite.start,
-    )
-
-
-def _rank_score(samples: RankSamples, part: pd.DataFrame) -> ForecastScore | None:
-    """Score predicted probabilities. The constant forecast is their mean over the predicted points."""
-    heading_deg = bearing_deg(samples.poses.rotation[:, :, 0])
-    index, near = _nearest(samples.poses.position_m, heading_deg, part)
-    if near.sum() < FEWEST:
-        return None
-    every = part[list(RANKS)].to_numpy(np.float64)
-    forecast = every[index[near]]
-    return score_forecast(samples.rank[near], forecast, forecast.argmax(axis=1) + 1, every.mean(axis=0))
-
-
-def _nearest(position_m: FloatArray, heading_deg: FloatArray, part: pd.DataFrame) -> tuple[IntArray, BoolArray]:
-    """Return the predicted point (n,) of each sample, and which samples are near theirs (n,)."""
-    points = part[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
-    return nearest_points(
-        position_m, heading_deg, points, part["yaw_deg"].to_numpy(np.float64), (NEAR_M, NEAR_M, _NEAR_UP_M)
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,16 +1,17 @@
-"""Predictions of other programs, scored on one flight together with ours and the baselines.
+"""Predictions of any program, scored on one flight together with ray tracing and the baselines.
 
-``report flight.yaml --against FILE``. A prediction of any program is read as one table: CSV, NetCDF, a radio map in
-.npz, or the logs of an emulated flight. Samples are matched to predictions by time where the file has times, else by
-position. Every model is scored on the samples that the file predicts, so that the cards can be compared.
-docs/referee.md lists the columns and has examples.
+``report flight.yaml --against FILE``. A prediction is read as one table: CSV, NetCDF, a radio map in .npz, the output
+folder of ``predict``, or the logs of an emulated flight. Samples are matched to predictions by time if the file has
+times, else by position. Every model is scored on the samples that the prediction covers, so that the cards can be
+compared. docs/referee.md lists the columns and has examples.
 """
 
 from __future__ import annotations
 
 import io
+import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..common.errors import InputError, parsing
-from ..common.files import LARGEST_TABLE, read_input
+from ..common.content import KEY, MARKS
+from ..common.errors import InputError, UsageError, parsing
+from ..common.files import LARGEST_TABLE, read_bounded, read_input
 from ..common.jsonable import json_safe
 from ..common.native import read as read_native
 from ..common.outputs import file_digest
 from ..common.text import counted
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..common.units import AnyArray, BoolArray, FloatArray
+from ..common.yamlfile import parse_yaml
 from ..compare.level import nearest_in_time
 from ..compare.rank import agreement, cohen_kappa, histogram, total_variation
 from ..compare.receiver import score_forecast
@@ -37,25 +40,25 @@ from ..compare.referee import (
     nearest_points,
 )
 from ..compare.result import BASELINE_TITLE, FlightResult, RankResult, RssResult
-from ..compare.statistics import PairedDifference, paired_difference
+from ..compare.statistics import FEWEST, PairedDifference, paired_difference
 from ..flight.data import FlightData, load_data
 from ..flight.drafting.draft import DraftOptions, drafts
+from ..flight.gains import load_with_learned
 from ..flight.settings import FlightFile
-from ..flight.training import flight_logs
+from ..flight.training import among, common, flight_logs, marks_of
 from ..logs.ingest import ingest
 from ..logs.readers import ReadOptions
 from ..propagation.field.sum import mean_pair_power, rss_dbm
 from ..site.site import Site
 from .calibrate import observe
-from .options import AGAINST_DISTANCE_M
+from .options import AGAINST_DISTANCE_M, RANKS
 
 QUANTITIES = ("level_dbm", "level_db", "path_loss_db")
-RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
 _PLACE = ("east_m", "north_m", "height_m")
 _GEOGRAPHIC = ("latitude_deg", "longitude_deg", "height_m")
 _OPTIONAL = ("sd_db", "q05_db", "q95_db", "rank", "yaw_deg", *RANKS)
 
-_WANTED = (
+_EXPECTED = (
     "time_utc, or east_m, north_m, height_m, or latitude_deg, longitude_deg, height_m; tower; level_dbm, level_db or "
     "path_loss_db (docs/referee.md has an example)"
 )
@@ -63,13 +66,18 @@ _WANTED = (
 # A file of more bytes, or with more rows (towers times positions), is refused: a row needs 200 bytes of memory.
 _MOST_BYTES, _MOST_ROWS = 4 * LARGEST_TABLE, 5_000_000
 
-# A prediction whose positions lie farther from the site is one of another place [m].
+# A prediction is refused as one of another area if all its positions are farther from the site's origin [m].
 _FAR_M = 50_000.0
+
+# A sample is scored by the nearest predicted time within this [s], or within half of the prediction's step.
+_NEAR_S = 0.5
+
+OURS = "ray tracing (this report)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForeignPrediction:
-    """A prediction of another program.
+    """A prediction that was read.
 
     Parameters
     ----------
@@ -78,21 +86,24 @@ class ForeignPrediction:
     program : str
         Program that wrote the file, if it is known.
     quantity : str
-        One of :data:`QUANTITIES`; empty if only ranks are predicted.
+        One of :data:`QUANTITIES`. Empty if only ranks are predicted.
     table : DataFrame
         One row per prediction: ``time`` (datetime64[ns], NaT if unknown), ``east_m north_m height_m`` in the site
         frame (NaN if unknown), ``tower``, ``channel`` (empty: every channel of the tower), ``level`` [dB or dBm], and
         those of ``sd_db q05_db q95_db rank yaw_deg p_rank1..4`` that the file has.
+    sha256 : str
+        Digest of the file. Empty for a folder of logs.
     remarks : tuple of str
         Sentences on how the file was read.
     unit : str
-        Unit of ``level_db``; empty for the unit of the log.
+        Unit of ``level_db``. Empty for the unit of the log.
     """
 
     path: Path
     program: str
     quantity: str
     table: pd.DataFrame
+    sha256: str = ""
     remarks: tuple[str, ...] = ()
     unit: str = ""
 
@@ -114,9 +125,9 @@ def read_foreign(path: Path, data: FlightData) -> ForeignPrediction:
     Parameters
     ----------
     path : Path
-        CSV, NetCDF, .npz, or a folder with the logs of an emulated flight.
+        CSV, NetCDF, .npz, the output folder of ``predict``, or a folder with the logs of an emulated flight.
     data : FlightData
-        The flight that is scored: its site, time zone and towers.
+        The flight that is scored: its site, time zone, towers and logs.
 
     Returns
     -------
@@ -126,74 +137,95 @@ def read_foreign(path: Path, data: FlightData) -> ForeignPrediction:
     ------
     InputError
         If the file is damaged, or has no position, no tower, or no level with its unit.
+    UsageError
+        If ``predict`` learned the prediction from the logs of the flight.
     """
-    if (path / "prediction.csv").is_file():  # a folder of 'predict'
-        path = path / "prediction.csv"
-    if path.is_dir():
-        return _emulated(path, data)
-    content = read_input(path, _MOST_BYTES, "a prediction: CSV, NetCDF, .npz, or a folder")
-    if content[:8] == b"\x89HDF\r\n\x1a\n":
-        frame, program, remarks = _netcdf(content, path)
-    elif content[:4] == b"PK\x03\x04":
-        frame, program, remarks = _radio_map(content, path)
-    elif content[:3] == b"CDF":
-        raise InputError("a NetCDF file of version 3", expected="NetCDF 4 ('nccopy -k nc4 IN OUT')", path=path)
+    file = path / "prediction.csv" if (path / "prediction.csv").is_file() else path
+    if file.is_dir():
+        digest, frame = "", _emulated(path, data)
     else:
-        frame, program, remarks = _csv(content, path)
+        content = read_input(file, _MOST_BYTES, "a prediction: CSV, NetCDF, .npz, or a folder")
+        if content[:3] == b"CDF":
+            raise InputError("a NetCDF file of version 3", expected="NetCDF 4 ('nccopy -k nc4 IN OUT')", path=path)
+        formats = {b"\x89HDF\r\n\x1a\n": _netcdf, b"PK\x03\x04": _radio_map}
+        read = next((reader for start, reader in formats.items() if content.startswith(start)), _csv)
+        digest, frame = file_digest(file), read(content, file)
+    if file.name.startswith("prediction.") and (file.parent / "metrics.json").is_file():
+        frame.attrs["unit"] = _predicted_unit(file.parent / "metrics.json", data)
     quantity, table = _checked(frame, path, data.site)
-    _check_towers(table, data, path)
-    return ForeignPrediction(path=path, program=program, quantity=quantity, table=table, remarks=tuple(remarks))
+    _check_names(table, data, path)
+    return ForeignPrediction(
+        path=path, program=frame.attrs["program"], quantity=quantity, table=table, sha256=digest,
+        remarks=frame.attrs.get("remarks", ()), unit=frame.attrs.get("unit", ""),
+    )  # fmt: skip
+
+
+def _predicted_unit(path: Path, data: FlightData) -> str:
+    """Return the unit of the levels of ``predict`` from its metrics.json. Empty if the channels have several.
+
+    Raises
+    ------
+    UsageError
+        If the prediction was learned from logs of the flight, or from changed copies of them.
+    """
+    with parsing(path, "metrics.json of 'aerpaw-cmp predict'", any_shape=True):
+        about = json.loads(read_bounded(path, LARGEST_TABLE))
+        learned, marked = list(about[KEY]), tuple(map(str, about[MARKS]))
+        units = {str(series["unit"]) for series in about["series"].values()}
+    own = common(flight_logs(data), [learned])
+    if own or any(among(mark, marked) for mark in marks_of([data])):
+        what = f"log (SHA-256 {own[0][:12]}...)" if own else "readings"
+        raise UsageError(
+            f"the prediction learned from this flight's own {what}",
+            expected="a prediction made before the flight, or from other flights",
+            path=path.parent,
+        )
+    return units.pop() if len(units) == 1 else ""
 
 
 # --- formats -------------------------------------------------------------------------------------------------------
+# Each returns a table under the names of the file, and its attributes ``program``, ``remarks`` and ``unit``.
 
 
-def _csv(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
-    with parsing(path, "a CSV with a header: " + _WANTED, cause="another format"):
+def _csv(content: bytes, path: Path) -> pd.DataFrame:
+    with parsing(path, "a CSV with a header: " + _EXPECTED, cause="another format"):
         frame = pd.read_csv(
             io.BytesIO(content), comment="#", skipinitialspace=True, low_memory=False, nrows=_MOST_ROWS + 1
         )
     _check_rows(len(frame), path)
     frame.columns = [str(name).strip().lower() for name in frame.columns]
-    return frame, "CSV", []
+    frame.attrs = {"program": "CSV"}
+    return frame
 
 
 def _check_rows(rows: int, path: Path) -> None:
-    """Refuse a prediction with more than :data:`_MOST_ROWS` rows before its table is made.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a prediction with more than :data:`_MOST_ROWS` rows before its table is made."""
     if rows > _MOST_ROWS:
         raise InputError(
             f"the prediction has more than {_MOST_ROWS} rows",
             expected=f"at most {_MOST_ROWS} rows (towers times positions or times)",
-            cause="a map of a larger area, or finer than the flight needs; leave out what lies far from its route",
+            cause="a map of a larger area, or finer than needed; remove positions far from the route",
             path=path,
         )
 
 
-def _netcdf(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
+def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
     """Read variables along the dimensions of the level, one row per element."""
     with parsing(path, "a NetCDF file"):
-        arrays, notes = read_native("netcdf", content)
-    program = str(notes["attributes"].get("source", "NetCDF"))
-    dims = {name: notes["dims"][name][: values.ndim] for name, values in arrays.items()}
-    arrays = {name.lower(): values for name, values in arrays.items()}
-    dims = {name.lower(): names for name, names in dims.items()}
+        values, notes = read_native("netcdf", content)
+    dims = {name.lower(): notes["dims"][name][: array.ndim] for name, array in values.items()}
+    arrays = {name.lower(): array for name, array in values.items()}
+    remarks: tuple[str, ...] = ()
     if "height_m" not in arrays and "up_m" in arrays:
         arrays["height_m"], dims["height_m"] = arrays["up_m"], dims["up_m"]
-    remarks: list[str] = []
     if "h_real" in arrays and not set(arrays) & set(QUANTITIES):
-        h = arrays["h_real"] + 1j * arrays["h_imag"]
         power_dbm = float(notes["attributes"].get("transmit_power_dbm", 0.0))
-        arrays["level_dbm"] = rss_dbm(mean_pair_power(h), power_dbm)
+        arrays["level_dbm"] = rss_dbm(mean_pair_power(arrays["h_real"] + 1j * arrays["h_imag"]), power_dbm)
         dims["level_dbm"] = dims["h_real"][:-2]
-        remarks.append(f"The levels of {path.name} are those of H, with {power_dbm:g} dBm transmitted.")
+        remarks = (f"The levels of {path.name} are those of H, with {power_dbm:g} dBm transmitted.",)
     main = next((name for name in (*QUANTITIES, "rank", RANKS[0]) if name in arrays), None)
     if main is None:
-        raise InputError("no variable with a level", expected=_WANTED, path=path)
+        raise InputError("no variable with a level", expected=_EXPECTED, path=path)
     shape = dict(zip(dims[main], arrays[main].shape, strict=True))
     _check_rows(math.prod(shape.values()), path)
     columns = {}
@@ -204,29 +236,31 @@ def _netcdf(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
         columns[name] = np.broadcast_to(arrays[name].transpose(order).reshape(place), tuple(shape.values())).ravel()
     unit = str(notes["units"].get("time", ""))
     if "time" in columns and columns["time"].dtype.kind in "fiu":
-        columns.pop("time") if " since " not in unit else columns.update(time=_since(columns["time"], unit, path))
-    return pd.DataFrame(columns), program, remarks
+        elapsed = columns.pop("time")  # seconds after an unknown start cannot be matched
+        if " since " in unit:
+            columns["time"] = _since(elapsed, unit, path)
+    frame = pd.DataFrame(columns)
+    frame.attrs = {"program": str(notes["attributes"].get("source", "NetCDF")), "remarks": remarks}
+    return frame
 
 
-def _since(values: AnyArray, unit: str, path: Path) -> AnyArray:
+def _since(elapsed: AnyArray, unit: str, path: Path) -> AnyArray:
     """Return times of a CF unit such as ``seconds since 2025-06-10T14:00:00Z``."""
     size, _, start = unit.partition(" since ")
     with parsing(path, "a time unit such as 'seconds since 2025-06-10T14:00:00Z'"):
-        elapsed = pd.to_timedelta(np.asarray(values, dtype=np.float64), unit=size.strip().lower())  # type: ignore[call-overload]
-        return np.asarray(pd.to_datetime(start, utc=True) + elapsed)
+        after = pd.to_timedelta(np.asarray(elapsed, dtype=np.float64), unit=size.strip().lower())  # type: ignore[call-overload]
+        return np.asarray(pd.to_datetime(start, utc=True) + after)
 
 
-def _radio_map(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
+def _radio_map(content: bytes, path: Path) -> pd.DataFrame:
     """Read a radio map of Sionna RT, saved with ``np.savez(path_gain=..., cell_centers=..., tx_names=...)``."""
-    with parsing(path, "an .npz with path_gain, cell_centers, tx_names"), np.load(io.BytesIO(content)) as book:
-        missing = {"path_gain", "cell_centers", "tx_names"} - set(book.files)
-        if missing:
-            raise InputError(
-                f"no array {', '.join(sorted(missing))}", expected="path_gain, cell_centers, tx_names", path=path
-            )
+    needed = ("path_gain", "cell_centers", "tx_names")
+    with parsing(path, f"an .npz with {', '.join(needed)}"), np.load(io.BytesIO(content)) as book:
+        if missing := set(needed) - set(book.files):
+            raise InputError(f"no array {', '.join(sorted(missing))}", expected=", ".join(needed), path=path)
         if sum(info.file_size for info in book.zip.infolist()) > _MOST_BYTES:
             raise InputError("the arrays are too large", expected=f"at most {_MOST_BYTES >> 20} MiB", path=path)
-        gain, centre, names = (np.asarray(book[name]) for name in ("path_gain", "cell_centers", "tx_names"))
+        gain, centre, names = (np.asarray(book[name]) for name in needed)
     if gain.ndim != 3 or centre.shape != (*gain.shape[1:], 3) or names.shape != gain.shape[:1]:
         raise InputError(
             f"shapes {gain.shape}, {centre.shape}, {names.shape}",
@@ -235,25 +269,20 @@ def _radio_map(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]
         )
     _check_rows(gain.size, path)
     with np.errstate(divide="ignore", invalid="ignore"):
-        loss = -10.0 * np.log10(gain.astype(np.float64).reshape(len(names), -1))
-    loss[~np.isfinite(loss)] = np.nan
-    columns = dict(zip(_PLACE, np.tile(centre.reshape(-1, 3), (len(names), 1)).T.astype(np.float64), strict=True))
-    table = pd.DataFrame(
-        {**columns, "tower": np.repeat(names.astype(str), loss.shape[1]), "path_loss_db": loss.ravel()}
+        loss_db = -10.0 * np.log10(gain.astype(np.float64).ravel())
+    places = np.tile(centre.reshape(-1, 3), (len(names), 1)).astype(np.float64)
+    frame = pd.DataFrame(places, columns=list(_PLACE)).assign(
+        tower=np.repeat(names.astype(str), gain[0].size), path_loss_db=np.where(np.isfinite(loss_db), loss_db, np.nan)
     )
     remark = "The cell centres of the radio map are taken as east, north and up of the site [m]."
-    return table, "radio map (.npz)", [remark]
+    frame.attrs = {"program": "radio map (.npz)", "remarks": (remark,)}
+    return frame
 
 
-def _emulated(folder: Path, data: FlightData) -> ForeignPrediction:
+def _emulated(folder: Path, data: FlightData) -> pd.DataFrame:
     """Read levels and positions from the logs of an emulated flight, which are matched by position."""
-    if (folder / "flight.yaml").is_file():
-        from ..flight.gains import load_with_learned
-
-        settings = load_with_learned(folder / "flight.yaml")
-    else:
-        settings = _drafted(folder, data)
-    twin = load_data(settings, folder)
+    own = folder / "flight.yaml"
+    twin = load_data(load_with_learned(own) if own.is_file() else _drafted(folder, data), folder)
     if set(flight_logs(twin)) & set(flight_logs(data)):
         raise InputError(
             "logs of the scored flight itself",
@@ -261,45 +290,32 @@ def _emulated(folder: Path, data: FlightData) -> ForeignPrediction:
             cause="the folder of the real flight was named",
             path=folder,
         )
-    observed, _ = observe([twin])
-    parts = []
-    for o in observed:
-        samples = o.samples
-        level = samples.residual_db + o.free_space_db
-        place = dict(zip(_PLACE, samples.position_m.T, strict=True))
-        parts.append(pd.DataFrame({**place, "tower": samples.tower, "channel": samples.channel, "level_db": level}))
-    if not parts:
-        raise InputError("no level with a position", expected="levels and telemetry of an emulated flight", path=folder)
-    table = pd.concat(parts, ignore_index=True)
-    heard = {(s.tower, s.channel) for s in data.rss}
-    if not heard & set(zip(table["tower"], table["channel"], strict=True)):
-        table["channel"] = ""  # the emulator names its channels in another way
+    samples = [(o.samples, o.samples.residual_db + o.free_space_db) for o in observe([twin])[0]]
+    every = pd.concat(
+        [
+            pd.DataFrame(s.position_m, columns=list(_PLACE)).assign(tower=s.tower, channel=s.channel, level_db=level)
+            for s, level in samples
+        ]
+    )
     # a hover has many levels at one position: their mean is what the emulator predicts there
-    table = table.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False)["level_db"].mean()
-    quantity, table = _checked(table, folder, data.site)
-    _check_towers(table, data, folder)
+    frame = every.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False)["level_db"].mean()
     units, ours = (sorted({s.unit for s in of.rss}) for of in (twin, data))
-    remarks = [f"{folder.name} is an emulated flight: {counted(len(table), 'level')} with a position."]
+    remarks = [f"{folder.name} is an emulated flight: {counted(len(frame), 'level')} with a position."]
     if units != ours:
         remarks.append(f"Its levels are in {', '.join(units)}, those of the flight in {', '.join(ours)}: no bias.")
-    return ForeignPrediction(
-        path=folder, program="emulated flight", quantity=quantity, table=table, remarks=tuple(remarks),
-        unit=units[0] if len(units) == 1 else "several units",
-    )  # fmt: skip
+    unit = units[0] if len(units) == 1 else "several units"
+    frame.attrs = {"program": "emulated flight", "remarks": tuple(remarks), "unit": unit}
+    return frame
 
 
 def _drafted(folder: Path, data: FlightData) -> FlightFile:
     """Return the flight file that a draft of the folder proposes for the site of the scored flight."""
-    from ..common.yamlfile import parse_yaml
-
     site = str(data.site_place) if not Path(data.site_place).is_file() else str(Path(data.site_place).resolve())
     timezone = data.settings.timezone
-    options = DraftOptions(timezone=timezone, site=site)
     files = ingest([folder], options=ReadOptions(timezone=timezone))
     if not files:
         raise InputError("no log", expected="power logs and telemetry of an emulated flight", path=folder)
-    text = drafts(files, folder, options)[0].text
-    return parse_yaml(text, FlightFile)
+    return parse_yaml(drafts(files, folder, DraftOptions(timezone=timezone, site=site))[0].text, FlightFile)
 
 
 # --- checks --------------------------------------------------------------------------------------------------------
@@ -307,33 +323,30 @@ def _drafted(folder: Path, data: FlightData) -> FlightFile:
 
 def _checked(frame: pd.DataFrame, path: Path, site: Site) -> tuple[str, pd.DataFrame]:
     """Return the quantity and the table under the names of :class:`ForeignPrediction`."""
+    columns = f"(columns: {', '.join(map(str, frame))})"
     quantities = [name for name in QUANTITIES if name in frame]
     if len(quantities) > 1:
         raise InputError(f"columns {', '.join(quantities)}", expected="one of them", path=path)
     if not quantities and not {"rank", *RANKS} & set(frame):
-        near = [
-            str(name) for name in frame if str(name).lower() in ("level", "rss", "rsrp", "rssi", "power", "path_gain")
-        ]
+        near = [str(name) for name in frame if name in ("level", "rss", "rsrp", "rssi", "power", "path_gain")]
         raise InputError(
-            f"no column of a level with its unit (columns: {', '.join(map(str, frame))})",
+            f"no column of a level with its unit {columns}",
             expected="level_dbm, level_db (the unit of the log) or path_loss_db",
             cause=f"the unit of {near[0]!r} is not in its name" if near else None,
             path=path,
         )
     if "tower" not in frame:
-        raise InputError(f"no column tower (columns: {', '.join(map(str, frame))})", expected=_WANTED, path=path)
+        raise InputError(f"no column tower {columns}", expected=_EXPECTED, path=path)
     quantity = quantities[0] if quantities else ""
     table = pd.DataFrame({"tower": frame["tower"].astype(str).str.strip()})
     table["channel"] = frame["channel"].astype(str).str.strip().replace({"nan": ""}) if "channel" in frame else ""
     table["time"] = _times(frame, path)
     table[list(_PLACE)] = _places(frame, path, site)
     if table["time"].isna().all() and table["east_m"].isna().all():
-        raise InputError("rows without a time and without a position", expected=_WANTED, path=path)
-    for name in (quantity, *_OPTIONAL):
-        if name in frame:
-            table["level" if name == quantity else name] = _numbers(frame[name])
-    if "level" not in table:
-        table["level"] = np.nan
+        raise InputError("rows without a time and without a position", expected=_EXPECTED, path=path)
+    table["level"] = _numbers(frame[quantity]) if quantity else np.nan
+    for name in (name for name in _OPTIONAL if name in frame):
+        table[name] = _numbers(frame[name])
     _check_levels(table["level"].to_numpy(np.float64), quantity, path)
     _check_repeats(table, path)
     return quantity, table
@@ -349,20 +362,16 @@ def _times(frame: pd.DataFrame, path: Path) -> Any:
     if name is None:
         return pd.Series(pd.NaT, index=frame.index, dtype="datetime64[ns]")
     column = frame[name]
-    numeric = pd.api.types.is_numeric_dtype(column)
-    text = not numeric and not pd.api.types.is_datetime64_any_dtype(column)
-    if name == "time" and text and not column.astype(str).str.contains(r"Z$|[+-]\d\d:?\d\d$").all():
-        raise InputError(
-            f"times without a zone, such as {column.iloc[0]!r}", expected="a column time_utc, or times that end in Z",
-            path=path,
-        )  # fmt: skip
-    if numeric:
-        raise InputError(
-            f"times as numbers ({column.iloc[0]})", expected="ISO 8601, such as 2025-06-10T14:00:00Z", path=path
-        )
+    form = "ISO 8601 in UTC, such as 2025-06-10T14:00:00Z"
+    if pd.api.types.is_numeric_dtype(column):
+        raise InputError(f"times as numbers ({column.iloc[0]})", expected=form, path=path)
+    dated = pd.api.types.is_datetime64_any_dtype(column)
+    if name == "time" and not dated and not column.astype(str).str.contains(r"Z$|[+-]\d\d:?\d\d$").all():
+        expected = "a column time_utc, or times that end in Z"
+        raise InputError(f"times without a zone, such as {column.iloc[0]!r}", expected=expected, path=path)
     stamps = pd.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
     if stamps.isna().all():
-        raise InputError(f"no time that can be read ({column.iloc[0]!r})", expected="ISO 8601 in UTC", path=path)
+        raise InputError(f"no time that can be read ({column.iloc[0]!r})", expected=form, path=path)
     return stamps.dt.tz_localize(None).astype("datetime64[ns]")
 
 
@@ -391,7 +400,7 @@ def _places(frame: pd.DataFrame, path: Path, site: Site) -> AnyArray:
 def _check_levels(level: FloatArray, quantity: str, path: Path) -> None:
     """Refuse levels that cannot have the unit of their column."""
     known = level[np.isfinite(level)]
-    if not len(known) or not quantity:
+    if not len(known):
         return
     middle, cause = float(np.median(known)), None
     if known.min() > 0.0 and known.max() < 1.0:
@@ -406,48 +415,38 @@ def _check_levels(level: FloatArray, quantity: str, path: Path) -> None:
 
 
 def _check_repeats(table: pd.DataFrame, path: Path) -> None:
-    """Refuse two rows of one tower, channel and time (or position) with different levels."""
-    place = [*_PLACE, *({"yaw_deg"} & set(table))]
-    key = ["tower", "channel", *(["time"] if table["time"].notna().any() else place)]
-    repeated = table.duplicated([*key, "level"], keep="first")
-    distinct = table[~repeated]
-    twice = distinct.duplicated(key, keep=False) & distinct["level"].notna()
-    if twice.any():
-        row = distinct[twice].iloc[0]
-        where = row["time"] if "time" in key else tuple(round(float(row[name]), 1) for name in _PLACE)
+    """Refuse two rows of one tower, channel and time (or position and heading) with different levels."""
+    key = ["time"] if table["time"].notna().any() else [*_PLACE, *({"yaw_deg"} & set(table))]
+    distinct = table.dropna(subset="level").drop_duplicates(["tower", "channel", *key, "level"])
+    twice = distinct[distinct.duplicated(["tower", "channel", *key], keep=False)]
+    if len(twice):
+        where = ", ".join(f"{name} {twice[name].iloc[0]}" for name in ("tower", *key))
         raise InputError(
-            f"{counted(int(twice.sum()), 'row')} with several levels at one position: tower {row['tower']}, {where}",
+            f"{counted(len(twice), 'row')} with several levels at one position: {where}",
             expected="one row per tower, channel and time or position",
             cause="two channels or two heights without their column",
             path=path,
         )
 
 
-def _check_towers(table: pd.DataFrame, data: FlightData, path: Path) -> None:
-    """Refuse a prediction without any tower of the flight."""
-    ours, theirs = {s.tower for _, s in data.series}, set(table["tower"])
-    if not ours & theirs:
-        shown: Sequence[str] = sorted(theirs)[:8]
+def _check_names(table: pd.DataFrame, data: FlightData, path: Path) -> None:
+    """Refuse a prediction without any tower of the flight, and use levels of an unknown channel for all channels.
+
+    A program that predicts one channel per tower may have another name for it.
+    """
+    ours, theirs = {s.tower for _, s in data.series}, sorted(set(table["tower"]))
+    if ours.isdisjoint(theirs):
         raise InputError(
-            f"towers {', '.join(shown)}", expected=f"towers of the flight: {', '.join(sorted(ours))}",
+            f"towers {', '.join(theirs[:8])}", expected=f"towers of the flight: {', '.join(sorted(ours))}",
             cause="other names for the same towers; rename them in the file", path=path,
         )  # fmt: skip
+    channels = table[table["level"].notna()].groupby("tower")["channel"].unique()
+    named = {channel for of_tower in channels for channel in of_tower}
+    if channels.str.len().max() == 1 and named.isdisjoint(s.channel for s in data.rss):
+        table["channel"] = table["channel"].replace(dict.fromkeys(named, ""))
 
 
-def split_by_series(table: pd.DataFrame, tower: str, channel: str) -> pd.DataFrame:
-    """Return the rows of a tower that count for one of its channels."""
-    part: pd.DataFrame = table[(table["tower"] == tower) & table["channel"].isin(["", channel])]
-    own: pd.DataFrame = part[part["channel"] == channel]
-    return part if own.empty else own
-
-
-# A sample is scored by the nearest predicted time within this [s], and at least half of the prediction's step.
-_NEAR_S = 0.5
-
-# Fewer matched samples get no card.
-FEWEST = 20
-
-OURS = "ray tracing (this report)"
+# --- scores --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -462,9 +461,10 @@ class SeriesVerdict:
     floor_db : float or None
         Detection floor that the predicted levels show (an emulated receiver).
     cards : mapping of str to LevelCard
-        The prediction first, then ours and the baselines, on the same samples. A model with too few levels has none.
+        The prediction first, then ray tracing and the baselines, on the same samples. A model with too few levels has
+        no card.
     differences : mapping of str to PairedDifference
-        RMSE of the prediction minus that of ours and of each baseline, each after one offset, with its interval.
+        RMSE of the prediction minus that of each other model, each after one offset, with its interval.
     """
 
     tower: str
@@ -479,9 +479,9 @@ class SeriesVerdict:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankVerdict:
-    """Predicted ranks of one tower and ours, on the same samples.
+    """Predicted ranks of one tower and those of ray tracing, on the same samples.
 
-    ``scores`` has kappa, total variation and agreement by model; ``log_score`` and ``constant_log_score`` are those of
+    ``scores`` has kappa, total variation and agreement by model. ``log_score`` and ``constant_log_score`` are those of
     probabilities, if the prediction has them.
     """
 
@@ -502,14 +502,14 @@ _HEADS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """One prediction against one flight."""
+    """The scores of one prediction on one flight."""
 
     name: str
     sha256: str
     program: str
     series: tuple[SeriesVerdict, ...]
-    ranks: tuple[RankVerdict, ...] = ()
-    remarks: tuple[str, ...] = ()
+    ranks: tuple[RankVerdict, ...]
+    remarks: tuple[str, ...]
 
     def metrics(self) -> dict[str, Any]:
         """Return the entry of ``referee`` in metrics.json and of card.json."""
@@ -536,11 +536,9 @@ class Verdict:
         rows = []
         for model in dict.fromkeys(name for item in self.series for name in item.cards):
             cards = [item.cards[model] for item in self.series if model in item.cards]
-            row: dict[str, Any] = {"model": model, "channels": len(cards)}
-            for key in _HEADS:
-                values = [getattr(card, key) for card in cards]
-                row[key] = None if None in values else float(np.mean(values))
-            rows.append(row)
+            values = {key: [getattr(card, key) for card in cards] for key in _HEADS}
+            means = {key: None if None in of else float(np.mean(of)) for key, of in values.items()}
+            rows.append({"model": model, "channels": len(cards), **means})
         return rows
 
     def _rows(self) -> Iterator[tuple[Any, ...]]:
@@ -552,42 +550,44 @@ class Verdict:
                 yield f"{item.tower} {item.channel}", name, card.n, *(getattr(card, key) for key in _HEADS), *apart
 
     def sentence(self) -> str:
-        """Return the result in two sentences: both errors, and whether the difference is significant."""
+        """Return both errors, whether the difference is significant, and the errors as predicted."""
         if not self.series:
             return f"{self.name}: ranks only."
-        lost = sum(s.unmatched for s in self.series)
-        matched = counted(sum(s.matched for s in self.series), "sample")
-        extent = f"All {matched} have a prediction."
-        if lost:
-            extent = f"{matched} have a prediction, {counted(lost, 'sample')} have none."
         both = [s for s in self.series if OURS in s.differences]
-        if not both:
-            rmse_db = np.mean([s.cards[self.name].rmse_offset_db for s in self.series])
-            return (
-                f"{self.name}: RMSE {rmse_db:.1f} dB after one offset per channel. Ray tracing has no level there. "
-                f"{extent}"
-            )
-        theirs, mine = (np.mean([s.cards[name].rmse_offset_db for s in both]) for name in (self.name, OURS))
-        words = {kind: sum(s.differences[OURS].verdict == kind for s in both) for kind in ("better", "worse")}
-        decided = " and ".join(f"significantly {kind} on {n}" for kind, n in words.items() if n)
-        return (
-            f"{self.name}: RMSE {theirs:.1f} dB after one offset per channel, ray tracing {mine:.1f} dB on the same "
-            f"samples ({counted(len(both), 'channel')}). It is "
-            f"{decided or 'on no channel significantly different from ray tracing'} (95 %). {extent}"
+        theirs, mine = (
+            float(np.mean([s.cards[name].rmse_offset_db for s in both or self.series if name in s.cards] or [np.nan]))
+            for name in (self.name, OURS)
         )
+        texts = [f"{self.name}: RMSE {theirs:.1f} dB after one offset per channel. Ray tracing has no level there."]
+        if both:
+            words = {kind: sum(s.differences[OURS].verdict == kind for s in both) for kind in ("better", "worse")}
+            decided = " and ".join(f"significantly {kind} on {n}" for kind, n in words.items() if n)
+            texts = [
+                f"{self.name}: RMSE {theirs:.1f} dB after one offset per channel, ray tracing {mine:.1f} dB on the "
+                f"same samples ({counted(len(both), 'channel')}). It is "
+                f"{decided or 'on no channel significantly different from ray tracing'} (95 %)."
+            ]
+        stated = self.means()[0]
+        if stated["rmse_db"] is not None:
+            band = stated["coverage_90"]
+            inside = "" if band is None else f"; the 90 % band contains {100 * band:.0f} % of the samples"
+            texts.append(f"As predicted, without an offset: RMSE {stated['rmse_db']:.1f} dB{inside}.")
+        lost, matched = sum(s.unmatched for s in self.series), sum(s.matched for s in self.series)
+        without = f"{counted(matched, 'sample')} have a prediction, {counted(lost, 'sample')} have none."
+        return " ".join([*texts, without if lost else f"All {counted(matched, 'sample')} have a prediction."])
 
 
 def judge(
     given: ForeignPrediction, data: FlightData, result: FlightResult, near_m: float = AGAINST_DISTANCE_M
 ) -> Verdict:
-    """Score a prediction of another program on a flight.
+    """Score a prediction on a flight.
 
     Parameters
     ----------
     given : ForeignPrediction
     data : FlightData
     result : FlightResult
-        Ours: levels, baselines and ranks at the same samples.
+        Levels and ranks by ray tracing, and baselines, at the same samples.
     near_m : float
         Largest distance between a sample and its predicted position.
 
@@ -600,9 +600,8 @@ def judge(
     InputError
         If none of the predictions is near a sample.
     """
-    name = given.path.name
     series = [s for item in result.rss if given.quantity and (s := _series(given, item, data, near_m)) is not None]
-    ranks = [r for tower in result.rank if (r := _ranks(given, tower, near_m)) is not None]
+    ranks = [r for tower in result.rank if (r := _ranks(given, tower, data, near_m)) is not None]
     if not series and not ranks:
         raise InputError(
             f"fewer than {FEWEST} samples of the flight have a prediction nearby",
@@ -610,18 +609,13 @@ def judge(
             cause=_why_none(given, result),
             path=given.path,
         )
-    remarks = list(given.remarks)
-    lost = sum(s.unmatched for s in series)
+    name, remarks, lost = given.path.name, given.remarks, sum(s.unmatched for s in series)
     if series and lost > 0.1 * sum(s.matched + s.unmatched for s in series):
-        where = "times" if given.timed else "positions"
-        remarks.append(
-            f"{name}: {counted(lost, 'sample')} lie outside the {where} of the prediction and are not scored."
-        )
-    digest = "" if given.path.is_dir() else file_digest(given.path)
+        where = "times of the prediction" if given.timed else f"predicted positions (within {near_m:g} m)"
+        remarks += (f"{name}: {counted(lost, 'sample')} lie outside the {where} and are not scored.",)
     return Verdict(
-        name=name, sha256=digest, program=given.program, series=tuple(series), ranks=tuple(ranks),
-        remarks=tuple(remarks),
-    )  # fmt: skip
+        name=name, sha256=given.sha256, program=given.program, series=tuple(series), ranks=tuple(ranks), remarks=remarks
+    )
 
 
 def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m: float) -> SeriesVerdict | None:
@@ -629,34 +623,32 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
     heading_deg = item.geometry.get("heading_deg")
     predicted, near = predicted_at(given, part, item.time, item.position_m, heading_deg, near_m)
     near &= item.posed
-    name, absolute = given.path.name, given.absolute(item.unit)
-    level = predicted["level"]
+    level, heard, absolute = predicted["level"], np.isfinite(item.measured_db), given.absolute(item.unit)
     if given.quantity == "path_loss_db":
         link = next(s.link for s in data.rss if (s.tower, s.channel) == (item.tower, item.channel))
         level = link.transmit_power_dbm - level
-    scored = near & np.isfinite(level) & np.isfinite(item.measured_db)
+    scored = near & heard & np.isfinite(level)
     if scored.sum() < FEWEST:
         return None
+    # the offset of a prediction without a reference is fitted, so that its outages cannot be compared
+    rows = near if absolute else scored
+    same = rows & (np.isfinite(level) | ~heard)
+    band = {key: predicted.get(name) for key, name in (("sd_db", "sd_db"), ("low_db", "q05_db"), ("high_db", "q95_db"))}
+    name = given.path.name
     models = {
-        name: PredictedLevel(
-            level_db=level, sd_db=predicted.get("sd_db"), low_db=predicted.get("q05_db"),
-            high_db=predicted.get("q95_db"), absolute=absolute,
-        ),
-        OURS: PredictedLevel(level_db=item.simulated_dbm, absolute=item.unit == "dBm"),
-    }  # fmt: skip
-    models |= {
-        BASELINE_TITLE[key]: PredictedLevel(level_db=model.level_dbm, absolute=False)
-        for key, model in item.baselines.items()
+        name: (PredictedLevel(level_db=level, absolute=absolute, **band), rows),
+        OURS: (PredictedLevel(level_db=item.simulated_dbm, absolute=item.unit == "dBm"), same),
     }
+    for key, baseline in item.baselines.items():
+        models[BASELINE_TITLE[key]] = PredictedLevel(level_db=baseline.level_dbm, absolute=False), same
     seconds = (item.time - item.time[0]) / np.timedelta64(1, "s")
     thresholds = measured_thresholds(item.measured_db[near], ratio=item.unit == "dB")
-    rows = near if absolute else scored
-    cards, errors = {}, {}
-    for key, model in models.items():
-        same = rows if key == name else rows & (np.isfinite(level) | ~np.isfinite(item.measured_db))
-        if (np.isfinite(model.level_db) & np.isfinite(item.measured_db) & same).sum() >= FEWEST:
-            cards[key] = level_card(seconds, item.measured_db, model, thresholds, same)
-            errors[key] = np.where(scored, item.measured_db - model.level_db, np.nan)
+    cards = {
+        key: level_card(seconds, item.measured_db, model, thresholds, on)
+        for key, (model, on) in models.items()
+        if (np.isfinite(model.level_db) & heard & on).sum() >= FEWEST
+    }
+    errors = {key: np.where(scored, item.measured_db - models[key][0].level_db, np.nan) for key in cards}
     return SeriesVerdict(
         tower=item.tower, channel=item.channel, unit=item.unit, matched=int(near.sum()),
         unmatched=int((item.posed & ~near).sum()), floor_db=detection_floor_db(part["level"].to_numpy(np.float64)),
@@ -666,6 +658,13 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
             for key, error in errors.items() if key != name
         },
     )  # fmt: skip
+
+
+def split_by_series(table: pd.DataFrame, tower: str, channel: str) -> pd.DataFrame:
+    """Return the rows of a tower that count for one of its channels."""
+    part: pd.DataFrame = table[(table["tower"] == tower) & table["channel"].isin(["", channel])]
+    own: pd.DataFrame = part[part["channel"] == channel]
+    return part if own.empty else own
 
 
 def predicted_at(
@@ -697,7 +696,11 @@ def predicted_at(
         near: BoolArray = np.zeros(len(time), dtype=np.bool_)
         return {"level": np.full(len(time), np.nan)}, near
     if given.timed:
-        index, near = _nearest_times(time, part["time"].to_numpy("datetime64[ns]"))
+        known = part["time"].to_numpy("datetime64[ns]")
+        index, apart = nearest_in_time(time, known)
+        steps_s = np.diff(np.unique(known)) / np.timedelta64(1, "s")
+        most_s = max(_NEAR_S, 0.51 * float(np.median(steps_s)) if len(steps_s) else 0.0)
+        near = np.asarray(apart / np.timedelta64(1, "s") <= most_s)
     else:
         yaw_deg = part["yaw_deg"].to_numpy(np.float64) if "yaw_deg" in part else None
         points = part[list(_PLACE)].to_numpy(np.float64)
@@ -706,17 +709,11 @@ def predicted_at(
     return {name: np.where(near, part[name].to_numpy(np.float64)[index], np.nan) for name in names}, near
 
 
-def _nearest_times(time: Any, known: Any) -> tuple[IntArray, BoolArray]:
-    """Return the nearest predicted time (n,) of each sample, and whether it is near (n,)."""
-    index, apart = nearest_in_time(time, known)
-    steps = np.diff(np.unique(known)) / np.timedelta64(1, "s")
-    most_s = max(_NEAR_S, 0.51 * float(np.median(steps)) if len(steps) else 0.0)
-    return index, np.asarray(apart / np.timedelta64(1, "s") <= most_s)
-
-
-def _ranks(given: ForeignPrediction, item: RankResult, near_m: float) -> RankVerdict | None:
-    part = given.table[given.table["tower"] == item.tower]
-    predicted, near = predicted_at(given, part, item.time, item.position_m, None, near_m)
+def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData, near_m: float) -> RankVerdict | None:
+    ranked = [name for name in ("rank", *RANKS) if name in given.table]
+    part = given.table[(given.table["tower"] == item.tower) & given.table[ranked].notna().any(axis=1)]
+    heading_deg = data.poses_at(item.time).heading_deg if data.track is not None else None
+    predicted, near = predicted_at(given, part, item.time, item.position_m, heading_deg, near_m)
     p = np.column_stack([predicted[name] for name in RANKS]) if set(RANKS) <= set(predicted) else None
     if "rank" in predicted:
         rank = predicted["rank"]
@@ -750,28 +747,35 @@ def _ranks(given: ForeignPrediction, item: RankResult, near_m: float) -> RankVer
 
 
 def _why_none(given: ForeignPrediction, result: FlightResult) -> str | None:
-    """Return the likely cause if no sample is near a prediction: another time zone, day, route or height datum."""
+    """Return the likely cause if no sample is near a prediction: other channels, time zone, day, route or datum."""
     if not result.series:
         return None
-    if not given.timed:
-        flown, points = (
-            place[np.isfinite(place).all(axis=1)]
-            for place in (np.vstack([s.position_m for s in result.series]), given.table[list(_PLACE)].to_numpy())
+    ours, theirs = ({s.channel for s in result.rss}, set(given.table["channel"]) - {""})
+    if theirs and ours.isdisjoint(theirs):
+        return f"other names for the channels: {', '.join(sorted(theirs))}; the flight has {', '.join(sorted(ours))}"
+    if given.timed:
+        return _other_time(given, result)
+    flown, points = (
+        place[np.isfinite(place).all(axis=1)]
+        for place in (np.vstack([s.position_m for s in result.series]), given.table[list(_PLACE)].to_numpy())
+    )
+    index, near = nearest_points(flown * [1, 1, 0], None, points * [1, 1, 0], None, 50.0)
+    apart_m = float(np.median((points[index] - flown)[near, 2])) if near.mean() > 0.5 else 0.0
+    if abs(apart_m) > 10.0:
+        return (
+            f"another height datum: the predicted positions are {abs(apart_m):.0f} m "
+            f"{'above' if apart_m > 0 else 'below'} the flight, whose heights count from the ground at the origin "
+            "(up) or from take-off (with latitude and longitude)"
         )
-        index, near = nearest_points(flown * [1, 1, 0], None, points * [1, 1, 0], None, 50.0)
-        apart_m = float(np.median((points[index] - flown)[near, 2])) if near.mean() > 0.5 else 0.0
-        if abs(apart_m) > 10.0:
-            return (
-                f"another height datum: the predicted positions are {abs(apart_m):.0f} m "
-                f"{'above' if apart_m > 0 else 'below'} the flight, whose heights count from the ground at the origin "
-                "(up) or from take-off (with latitude and longitude)"
-            )
-        return "a prediction of another route; --against-distance allows larger distances"
+    return "a prediction of another route; --against-distance allows larger distances"
+
+
+def _other_time(given: ForeignPrediction, result: FlightResult) -> str:
+    """Return the likely cause if no sample is near a predicted time."""
     flown = np.concatenate([item.time for item in result.series])
     theirs = given.table["time"].dropna().to_numpy("datetime64[ns]")
     apart_h = float((np.median(theirs.astype(np.int64)) - np.median(flown.astype(np.int64))) / 3.6e12)
     spans = f"predicted {theirs.min()} to {theirs.max()}, flown {flown.min()} to {flown.max()} (UTC)"
     hours = round(apart_h * 2) / 2
-    if 0.5 <= abs(hours) <= 14.0 and abs(apart_h - hours) < 0.25:
-        return f"another time zone, {hours:+g} h: {spans}"
-    return f"another flight: {spans}"
+    zone = 0.5 <= abs(hours) <= 14.0 and abs(apart_h - hours) < 0.25
+    return f"another time zone, {hours:+g} h: {spans}" if zone else f"another flight: {spans}"

@@ -238,11 +238,6 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             target = outputs.enter_context(file)
         with stages("read"):
             data = load_data(settings, flight.parent, options.logs_root)
-            before = None
-            if own := [path for path in chosen.against if (path / "prediction.csv").is_file()]:
-                from .predict import score_against  # loads what calibration and prediction need
-
-                before = score_against(data, own[0])
             given = []
             if chosen.against:
                 from .referee import read_foreign
@@ -261,9 +256,6 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             other_inputs=other_inputs(settings, flight, options.logs_root, learned),
             paths=pose_paths(data, replays),
         )
-        if before is not None:
-            extra = {**record.extra_metrics, "against": before.metrics()}
-            record = replace(record, against=before, extra_metrics=extra)
         cards: list[dict[str, Any]] = []
         if given:
             from .referee import judge

@@ -25,8 +25,6 @@ from .flight_words import AS_SET, learned_on
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from .against import AgainstSeries
-
 
 # Number of means of a forecast along the flight, about one per pixel.
 _FORECAST_COLUMNS = 600
@@ -110,14 +108,6 @@ def charts_of(data: ReportData) -> list[Chart]:
         )
         for rank in data.rank if rank.probability is not None
     ]  # fmt: skip
-    charts += [
-        Chart(
-            section="against", title=f"{series.name}: predicted before this flight",
-            caption="Band: 90 % interval of one sample as it was predicted. Nothing of this flight was used.",
-            content=_predicted(series),
-        )
-        for series in (data.against.series if data.against is not None else ())
-    ]  # fmt: skip
     return charts
 
 
@@ -146,19 +136,6 @@ def _costs(models: Sequence[ModelRow]) -> dict[str, Any]:
         })  # fmt: skip
     marks = [mark for mark in marks if mark["labels"]]
     return {"x": {"label": "Computing time [s]"}, "y": {"label": "RMSE on held-out areas [dB]"}, "marks": marks}
-
-
-def _predicted(series: AgainstSeries) -> dict[str, Any]:
-    """Return levels over time with the predicted band."""
-    return {
-        "x": _time_axis(series.start),
-        "y": {"label": "Level [dB]"},
-        "marks": [
-            {"kind": "band", "name": "90 %", "x": series.time_s, "low": series.low_db, "high": series.high_db},
-            {"kind": "dots", "name": "measured", "x": series.time_s, "y": series.measured_db},
-            {"kind": "line", "name": "predicted", "x": series.time_s, "y": series.level_db},
-        ],
-    }
 
 
 def _time_axis(start: np.datetime64 | None) -> dict[str, str]:

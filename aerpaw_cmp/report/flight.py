@@ -32,7 +32,7 @@ from .explorer import payload
 from .exports import FOLDER
 from .flight_data import RANKS, InputFile, ReportData, start_of
 from .page import about, json_text, merge, rendered, write_figures, write_file
-from .texts import clock, coded, cut, duration, interval, k_key, minute, number, percent
+from .texts import clock, cut, duration, interval, k_key, minute, number, percent
 
 # Rejected lines shown per file; the flight file contains all.
 _REJECTED_SHOWN = 20
@@ -273,28 +273,6 @@ def _spans(data: ReportData, time: AnyArray, spans: Sequence[ErrorSpan], caption
         "Mean [dB]": 1,
     }
     return Table(caption=caption, columns=heads, rows=rows)
-
-
-def against_card(data: ReportData) -> Card:
-    """Return the card of the prediction that was made before the flight."""
-    before = data.against
-    if before is None:
-        return Card()
-    made = f"Prediction {before.folder}, made {minute(before.generated)} from {', '.join(before.flights)}."
-    table = Table(
-        caption="Levels as predicted, offset included; the last error column is after the flight's own offset. Samples "
-        "further than 30 m from a predicted point do not count.",
-        columns={"Tower, channel": HEAD, "RMSE [dB]": 2, "over 4 s": 2, "own offset": 2, "Measured above predicted": 1,
-                 "CRPS [dB]": 2, "Log score [nat]": 2, "In 50 %": SHARE, "In 90 %": SHARE, "In 95 %": SHARE,
-                 "Mean SD [dB]": 1, "Samples": 0, "Predicted share": SHARE},
-        rows=[(name, *(s[key] for key in _AGAINST)) for name, s in before.scores.items()], look="dense",
-    )  # fmt: skip
-    text = [paragraph(bold(coded(before.words)), made)]
-    return Card(title="Predicted before this flight", id="against", text=text, tables=[table], chart="against")
-
-
-_AGAINST = ("rmse_db", "rmse_4s_db", "own_offset_rmse_db", "bias_db", "crps_db", "log_score", "coverage_50",
-            "coverage_90", "coverage_95", "mean_sd_db", "n", "share_near")  # fmt: skip
 
 
 def referee_card(data: ReportData) -> Card:
@@ -563,7 +541,7 @@ def method_card(data: ReportData, files: Sequence[str]) -> Card:
 
 # Cards in the order of the page. A new card is a further function.
 CARDS = (
-    result_card, channels_card, against_card, referee_card, models_card, serving_card, ranks_card, engine_card,
+    result_card, channels_card, referee_card, models_card, serving_card, ranks_card, engine_card,
     inputs_card,
 )  # fmt: skip
 

@@ -27,7 +27,6 @@ if TYPE_CHECKING:  # the logs and the replay load pandas; a prediction loads how
     from ..flight.replay import FlightReplay, Replayed
     from ..flight.settings import LogSettings
     from ..logs.ingest import IngestedFile
-    from .against import Against
 
 
 # Ranks of a 4 x 4 channel, the bars of every histogram.
@@ -175,8 +174,6 @@ class ReportData(FlightResult):
     stages_s: Mapping[str, float] = field(default_factory=dict)
     extra_metrics: Mapping[str, Any] = field(default_factory=dict)
     paths: tuple[PosePaths, ...] = ()
-    against: Against | None = None
-    """The prediction made before the flight, if a prediction is named."""
 
     @property
     def moments(self) -> list[tuple[str, np.datetime64]]:

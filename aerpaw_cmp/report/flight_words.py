@@ -555,8 +555,6 @@ def paragraph(data: ReportData) -> str:
     if learned := _training(data):
         other = error if panels or not data.rss else _baseline_sentence(data.rss)
         parts = [learned, other, expected_sentence(data.rss), advice]
-    elif error and data.against is not None and data.against.scores:
-        parts = [error, before_flight(data.against.scores), advice]
     elif error:
         none = _without_cause(data.verdict, panels) if panels else ""
         # the next step of such a flight is always a wider search range
@@ -802,12 +800,3 @@ def points(share: float) -> str:
     ('1 percentage point', '18 percentage points')
     """
     return counted(round(100 * share), "percentage point")
-
-
-def before_flight(scores: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the sentence about the prediction made before the flight. Empty without levels."""
-    if not scores:
-        return ""
-    error, inside = (float(np.mean([row[key] for row in scores.values()])) for key in ("rmse_db", "coverage_90"))
-    within = f"{100 * inside:.0f} % of the samples"
-    return f"Predicted before this flight: RMSE {error:.1f} dB; the 90 % band contains {within}."

@@ -18,15 +18,13 @@ from ..common.jsonable import json_object
 from ..common.text import guarded
 from ..common.units import FloatArray
 from ..compare.calibration import OFF, Correction, crps_difference
-from ..compare.receiver import ForecastScore
 from ..compare.statistics import paired_difference
 from ..compare.verdict import Verdict, by_flight, stated_errors
 from ..site.learned import Entry, LearnedSeries
 from ..site.site import Site
-from .against import AgainstSeries
 from .cards import HEAD, SHARE, TEXT, Card, Page, Positions, Table, bold, paragraph, write_page
 from .flight_data import RANKS
-from .flight_words import before_flight, filled, said_of
+from .flight_words import filled, said_of
 from .page import Made, about, write_file
 from .places import BAND, LIKELIEST, Places, payload
 from .texts import minute, number
@@ -99,27 +97,6 @@ STATED: dict[str, tuple[str, str]] = {
         HELD_OUT
         + " The measured level is {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) above the predicted one.",
         "check the gain of the training flights",
-    ),
-}
-
-# Sentences about the stated standard deviations on the flight after the prediction.
-FLOWN: dict[str, tuple[str, str]] = {
-    "none": ("", "`aerpaw-cmp predict` with this flight for the next route"),
-    "no interval": ("There are too few samples to test the intervals.", ""),
-    "narrow": (
-        "Intervals of {where} are too narrow: errors are {effect:.1f} times as large as stated "
-        "(95 %: {low:.1f} to {high:.1f}).",
-        "add this flight to the training flights",
-    ),
-    "wide": (
-        "Intervals of {where} are too wide: errors are {effect:.1f} times as large as stated "
-        "(95 %: {low:.1f} to {high:.1f}).",
-        "add this flight to the training flights",
-    ),
-    "biased": (
-        "Likely cause at {where}: another offset; the measured level is {effect:+.1f} dB "
-        "(95 %: {low:+.1f} to {high:+.1f} dB) above the predicted one.",
-        "check transmit power and receiver gain of this flight",
     ),
 }
 
@@ -284,43 +261,6 @@ def field(correction: Correction) -> Verdict:
     difference, ends = crps_difference(correction.held_out, (base, title), correction.held_out_place_m)
     cause = "better" if correction.on else "worse" if ends[0] > 0.0 else "off"
     return Verdict(cause=cause, effect=difference, interval=ends, where=title)
-
-
-def against_words(series: Sequence[AgainstSeries], ranks: Mapping[str, ForecastScore]) -> str:
-    """Return sentences that compare a prediction with a later flight: levels, then ranks by tower."""
-    levels = [after_flight({s.name: s.scores for s in series}, [s.stated for s in series])] if series else []
-    return " ".join([*levels, *(rank_after_flight(tower, score) for tower, score in ranks.items())])
-
-
-def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Verdict]) -> str:
-    """Return sentences that compare predicted levels with a later flight.
-
-    Parameters
-    ----------
-    scores : mapping of str to mapping
-        Scores by tower and channel.
-    stated : sequence of Verdict
-        Verdict of :func:`~aerpaw_cmp.compare.verdict.stated_errors` for each of them.
-
-    Returns
-    -------
-    str
-    """
-    rows = list(scores.values())
-    mean = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
-    worst = max(stated, key=lambda verdict: list(FLOWN).index(verdict.cause))
-    return (
-        f"{before_flight(scores)} Over 4 s {mean['rmse_4s_db']:.1f} dB, after the flight's own offset "
-        f"{mean['own_offset_rmse_db']:.1f} dB. {said_of(worst, FLOWN).strip()}"
-    )
-
-
-def rank_after_flight(tower: str, score: ForecastScore) -> str:
-    """Return the sentence that compares predicted ranks with a later flight."""
-    return (
-        f"Rank at {tower}, predicted before this flight: kappa {score.kappa:.2f} (0 is chance), log score "
-        f"{score.log_score:.2f}; the mean of the prediction, without positions: {score.constant_log_score:.2f}."
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

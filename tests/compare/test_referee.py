@@ -103,12 +103,12 @@ def test_a_point_of_another_heading_is_not_near() -> None:
     """Four headings are predicted at one position; a sample takes the one within 45 degrees of its nose."""
     points, yaw = np.zeros((4, 3)), np.array([0.0, 90.0, 180.0, 270.0])
     samples, heading = np.full((4, 3), 1.0), np.array([100.0, 350.0, 44.0, np.nan])
-    index, near = nearest_points(samples, heading, points, yaw, (30.0, 30.0, 15.0))
+    index, near = nearest_points(samples, heading, points, yaw, 15.0)
     assert index[:3].tolist() == [1, 0, 0]
     assert near.tolist() == [True, True, True, False]
-    _, near = nearest_points(samples, heading, points[:1], yaw[:1], (30.0, 30.0, 15.0))
+    _, near = nearest_points(samples, heading, points[:1], yaw[:1], 15.0)
     assert near.tolist() == [False, True, True, False]
-    _, near = nearest_points(np.array([[0.0, 0.0, 14.9], [0.0, 0.0, 15.1]]), None, points, yaw, (30.0, 30.0, 15.0))
+    _, near = nearest_points(np.array([[0.0, 0.0, 14.9], [0.0, 0.0, 15.1]]), None, points, yaw, 15.0)
     assert near.tolist() == [True, False]
 
 

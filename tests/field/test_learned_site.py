@@ -119,7 +119,9 @@ def test_an_unseen_flight_of_the_sounder_is_told_its_lock_by_other_flights(tmp_p
     assert "The receiver is in lock for " in json.loads((before / "metrics.json").read_text())["sentence"]
     flown = ["report", str(tmp_path / "known.yaml"), "--logs-root", str(REAL), "--against", str(before)]
     assert main([*flown, "--audit", "none", "--figures", "none", "-o", str(tmp_path / "flown")]) == 0
-    (score,) = json.loads((tmp_path / "flown" / "metrics.json").read_text())["against"]["scores"].values()
+    (verdict,) = json.loads((tmp_path / "flown" / "card.json").read_text())
+    ((entry,),) = (channels.values() for channels in verdict["levels"].values())
+    score = entry["cards"]["before"]
     assert 0.85 < score["coverage_90"] < 0.95
     assert score["crps_db"] < 6.7  # 7.0 in level flight
     drafted = yaml.safe_load((tmp_path / "flight.yaml").read_text(encoding="utf-8"))["towers"]["NODE"]

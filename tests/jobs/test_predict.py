@@ -15,13 +15,13 @@ from scipy.stats import t as student
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.common.jsonable import json_safe
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs import predict, sources
 from aerpaw_cmp.jobs.calibrate import observe
 from aerpaw_cmp.jobs.calibrate_rank import rank_samples
-from aerpaw_cmp.jobs.predict import score_against
+from aerpaw_cmp.jobs.flight_run import run_flight
+from aerpaw_cmp.jobs.referee import judge, read_foreign
 from aerpaw_cmp.jobs.sources import TargetOptions, Targets, find_targets, named_flights
 from aerpaw_cmp.propagation.geometry import Link, rotation_from_aircraft, single_element
 from aerpaw_cmp.propagation.replay import trace
@@ -199,39 +199,53 @@ def test_files_agree_with_each_other(tmp_path, prediction, cf_faults):
     assert cf_faults(tmp_path / "prediction.nc") == []
 
 
-@pytest.fixture
-def said(small, tmp_path):
-    """A prediction that is 2 dB above each level of LW1 USRP1 and states 3 dB, at the very poses of the flight."""
+@pytest.fixture(scope="module")
+def flown(small):
+    """The flight with its comparison, by which predictions are scored."""
     data = load_data(load_flight(small / "a.yaml"), small)
-    flown = next(o for o in observe([data])[0] if o.samples.antenna == "LW1.USRP1")
-    level = flown.samples.residual_db + flown.free_space_db + 2.0
-    place = dict(zip(("east_m", "north_m", "height_m"), flown.samples.position_m.T, strict=True))
-    frame = pd.DataFrame({**place, "yaw_deg": flown.heading_deg, "tower": "LW1", "channel": "USRP1", "level_db": level,
+    return data, run_flight(data, audit=False).result
+
+
+@pytest.fixture
+def said(flown, tmp_path):
+    """A prediction that is 2 dB above each level of LW1 USRP1 and states 3 dB, at the poses of the flight."""
+    data, result = flown
+    levels = next(o for o in observe([data])[0] if o.samples.antenna == "LW1.USRP1")
+    level = levels.samples.residual_db + levels.free_space_db + 2.0
+    place = dict(zip(("east_m", "north_m", "height_m"), levels.samples.position_m.T, strict=True))
+    frame = pd.DataFrame({**place, "yaw_deg": levels.heading_deg, "tower": "LW1", "channel": "USRP1", "level_db": level,
                           "sd_db": 3.0, "q05_db": level - 4.935, "q95_db": level + 4.935})  # fmt: skip
+    frame = frame.drop_duplicates([*place, "yaw_deg"])
     frame.to_csv(tmp_path / "prediction.csv", index=False)
-    (tmp_path / "metrics.json").write_text(json.dumps({"trained_on": ["0" * 64], "sentence": "s", "flights": ["x"]}))
-    return data, tmp_path
+    about = {"trained_on": ["0" * 64], "marks": [], "series": {"LW1 USRP1": {"unit": "dB re full scale"}}}
+    (tmp_path / "metrics.json").write_text(json.dumps(about))
+    return data, tmp_path, lambda: judge(read_foreign(tmp_path, data), data, result)
 
 
 def test_a_flown_route_is_scored_by_what_was_said(said):
-    against = score_against(*said)
-    (scores,) = against.scores.values()
+    _, folder, scored = said
+    verdict = scored()
+    (series,) = verdict.series
+    card = series.cards[folder.name]
     # the flight waits at its waypoints: there a sample is scored by a neighbour's level
-    assert scores["bias_db"] == pytest.approx(-2.0, abs=0.3)
-    assert scores["n"] == len(against.series[0].time_s)
-    assert scores["share_near"] == 1.0
-    error = against.series[0].measured_db - against.series[0].level_db
-    assert scores["rmse_db"] == pytest.approx(np.sqrt(np.mean(error**2)))
-    assert scores["coverage_90"] == np.mean(np.abs(error) <= 4.935)
-    assert against.metrics()["sentence"].startswith("Predicted before this flight: RMSE")
-    sure = against.series[0].scores
-    frame = pd.read_csv(said[1] / "prediction.csv")
-    away = {"p_lock": 0.999, "locked_db": frame["level_db"] + 20, "lost_db": frame["level_db"] - 20}
-    frame.assign(**away, locked_sd_db=1.0, lost_sd_db=1.0).to_csv(said[1] / "prediction.csv", index=False)
-    (scores,) = score_against(*said).scores.values()  # nearly always 20 dB above what was measured
-    assert scores["coverage_50"] == scores["coverage_95"] == 0.0
-    assert scores["log_score"] > 100.0 > sure["log_score"]
-    assert scores["crps_db"] > 5.0 > sure["crps_db"]
+    assert card.bias_db == pytest.approx(-2.0, abs=0.3)
+    assert series.unmatched == 0
+    assert card.rmse_db == pytest.approx(np.hypot(card.bias_db, card.rmse_offset_db), abs=0.1)
+    assert 0.9 < card.coverage_90 < 1.0
+    assert f"As predicted, without an offset: RMSE {card.rmse_db:.1f} dB; the 90 % band contains" in verdict.sentence()
+
+
+def test_levels_of_a_first_prediction_count_for_every_channel_after_an_offset(said):
+    """Ray tracing before any flight predicts dBm, and calls its channel ``level``."""
+    _, folder, scored = said
+    frame = pd.read_csv(folder / "prediction.csv").assign(channel="level")
+    pd.concat([frame, frame.assign(channel="rank", level_db=np.nan)]).to_csv(folder / "prediction.csv", index=False)
+    about = json.loads((folder / "metrics.json").read_text()) | {"series": {"LW1 level": {"unit": "dBm"}}}
+    (folder / "metrics.json").write_text(json.dumps(about))
+    series = scored().series
+    assert [(s.tower, s.channel) for s in series] == [("LW1", "USRP1"), ("LW1", "USRP2")]
+    assert all(s.cards[folder.name].bias_db is None for s in series)
+    assert series[0].cards[folder.name].offset_db == pytest.approx(2.0, abs=0.3)
 
 
 def test_a_neighbour_stands_for_the_rank_of_a_point(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -271,7 +285,7 @@ def test_headings_are_ranked_alike_one_at_a_time(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("levels", [True, False])
 def test_predicted_ranks_are_scored_where_they_were_flown(said, levels):
-    data, folder = said
+    data, folder, scored = said
     ranked = rank_samples(data, data.rank[0])
     keep = np.isfinite(ranked.rank) & (ranked.rank >= 1)
     place = dict(zip(("east_m", "north_m", "height_m"), ranked.poses.position_m[keep].T, strict=True))
@@ -282,28 +296,28 @@ def test_predicted_ranks_are_scored_where_they_were_flown(said, levels):
                                **dict(zip(predict.RANKS, p.T, strict=True))})  # fmt: skip
     table = pd.read_csv(folder / "prediction.csv")
     pd.concat([table if levels else table[:0], said_ranks]).to_csv(folder / "prediction.csv", index=False)
-    against = score_against(data, folder)
-    score = against.ranks[ranked.tower]
-    assert score.kappa > 0.9  # where the flight waits, a neighbour's rank stands for its own
-    assert score.log_score == pytest.approx(-np.log(0.7), abs=0.1)
-    assert score.constant_log_score > score.log_score
-    assert len(against.series) == int(levels)
-    assert f"Rank at {ranked.tower}, predicted before this flight: kappa" in against.metrics()["sentence"]
-    assert json_safe(against.metrics())["rank"][ranked.tower]["kappa"] == score.kappa
+    verdict = scored()
+    (ranks,) = verdict.ranks
+    assert ranks.tower == ranked.tower
+    assert ranks.scores[folder.name]["kappa"] > 0.9  # where the flight waits, a neighbour's rank stands for its own
+    assert ranks.log_score == pytest.approx(-np.log(0.7), abs=0.1)
+    assert ranks.constant_log_score > ranks.log_score
+    assert len(verdict.series) == int(levels)
 
 
 def test_a_prediction_that_learned_from_the_flight_is_refused(said):
-    data, folder = said
+    data, folder, _ = said
     about = json.loads((folder / "metrics.json").read_text())
     (digest,) = (f.sha256 for f in data.files if f.path.endswith("LW1/USRP1_power_log.txt"))
     (folder / "metrics.json").write_text(json.dumps({**about, "trained_on": [digest]}))
-    with pytest.raises(UsageError, match="this flight's own log"):
-        score_against(data, folder)
+    for place in (folder, folder / "prediction.csv"):
+        with pytest.raises(UsageError, match="this flight's own log"):
+            read_foreign(place, data)
 
 
 def test_a_prediction_that_learned_from_the_flight_refuses_half_of_it(said, prediction):
     """The half has another digest; its readings are those that the prediction keeps marks of."""
-    data, folder = said
+    data, folder, _ = said
     halves = [
         dataclasses.replace(s, time=s.time[: len(s.time) // 2], measured_db=s.measured_db[: len(s.time) // 2])
         for s in data.rss
@@ -313,21 +327,24 @@ def test_a_prediction_that_learned_from_the_flight_refuses_half_of_it(said, pred
     marks = prediction_metrics(prediction.page)["marks"]
     (folder / "metrics.json").write_text(json.dumps({**about, "marks": marks}))
     with pytest.raises(UsageError, match="this flight's own readings"):
-        score_against(data, folder)
+        read_foreign(folder, data)
 
 
 def test_a_prediction_of_another_place_is_no_score(said):
-    data, folder = said
+    data, folder, scored = said
     table = pd.read_csv(folder / "prediction.csv")
-    table["north_m"] += 5000.0
-    table.to_csv(folder / "prediction.csv", index=False)
-    with pytest.raises(UsageError, match="within 30 m"):
-        score_against(data, folder)
+    table.assign(north_m=table["north_m"] + 5000.0).to_csv(folder / "prediction.csv", index=False)
+    with pytest.raises(InputError, match="a prediction of another route") as refused:
+        scored()
+    assert "within 5 m" in str(refused.value)
+    table.assign(channel=np.arange(len(table)) % 2).to_csv(folder / "prediction.csv", index=False)
+    with pytest.raises(InputError, match="other names for the channels: 0, 1; the flight has USRP1, USRP2"):
+        scored()
     about = json.loads((folder / "metrics.json").read_text())
     for damaged in ({}, {**about, "marks": None}):
         (folder / "metrics.json").write_text(json.dumps(damaged))
         with pytest.raises(InputError, match="cannot be read"):
-            score_against(data, folder)
+            read_foreign(folder, data)
 
 
 def test_a_grid_has_its_heights_one_after_the_other():

@@ -9,7 +9,6 @@ import pytest
 from aerpaw_cmp.compare.ladder import LadderRow, ModelRow
 from aerpaw_cmp.compare.level import DetectionScore, compare_serving
 from aerpaw_cmp.report import flight as html
-from aerpaw_cmp.report.against import Against, AgainstSeries
 from aerpaw_cmp.report.charts import charts_of, shown_confusion
 from aerpaw_cmp.report.flight import models_card
 from benchmarks.fabricated import with_numbers
@@ -101,19 +100,3 @@ def test_the_reliability_of_a_detection_is_drawn_where_it_was_scored(report_data
     assert "(learned on other flights)" in chart.caption
     dots = chart.content["marks"][0]
     np.testing.assert_allclose([dots["x"], dots["y"]], [[10, 50, 90], [12, 45, 93]])
-
-
-def test_a_prediction_is_drawn_with_the_band_that_was_given(report_data):
-    time_s = np.arange(5.0)
-    series = AgainstSeries(
-        name="LW1 A", time_s=time_s, measured_db=-60 - time_s, level_db=-61 - time_s, sd_db=np.ones(5),
-        low_db=-65 - time_s, high_db=-58 - time_s, share_near=1.0, start=np.datetime64("2025-06-01T14:00:00"),
-    )  # fmt: skip
-    against = Against(folder="p", sentence="", generated="", flights=(), series=(series,), words="")
-    (chart,) = charts_of(dataclasses.replace(report_data, against=against))
-    band, dots, line = chart.content["marks"]
-    assert band["low"] is series.low_db
-    assert band["high"] is series.high_db
-    assert dots["y"] is series.measured_db
-    assert line["y"] is series.level_db
-    assert chart.content["x"]["start"].startswith("2025-06-01T14:00:00")

@@ -8,9 +8,8 @@ import pytest
 
 from aerpaw_cmp.compare.calibration import OFF, Correction
 from aerpaw_cmp.compare.field_gp import FieldModel
-from aerpaw_cmp.compare.verdict import Verdict
 from aerpaw_cmp.report.flight_words import MOST_WORDS
-from aerpaw_cmp.report.prediction import FIELD, FLOWN, after_flight, cautions, first_words
+from aerpaw_cmp.report.prediction import FIELD, cautions, first_words
 
 FREE, LEARNED, WITH_FIELD = ("free space", OFF), ("learned", OFF), ("learned", "field of 2 dB, 30 m")
 
@@ -101,13 +100,3 @@ def test_a_first_paragraph_has_one_error_one_step_and_sixty_words_at_most(
         assert len(words.split()) <= MOST_WORDS
         assert words.count("RMSE") == 1
         assert words.count("Next: ") <= 1
-
-
-@pytest.mark.parametrize("cause", FLOWN)
-def test_the_flight_that_followed_is_said_by_the_gravest_cause(cause: str) -> None:
-    scores = {"rmse_db": 4.0, "rmse_4s_db": 3.0, "own_offset_rmse_db": 3.5, "coverage_90": 0.7}
-    stated = [Verdict(), Verdict(cause=cause, effect=2.0, interval=(1.5, 2.5), where="LW1 USRP1")]
-    words = after_flight({"LW1 USRP1": scores}, stated)
-    assert "the 90 % band contains 70 % of the samples" in words
-    assert FLOWN[cause][0].split("{")[0] in words
-    assert ("LW1 USRP1" in words) == (cause in ("narrow", "wide", "biased"))

@@ -52,7 +52,7 @@ from ..maps.export import maps_dataset
 from ..maps.grid import PAPER_BUDGET, Grid, LinkBudget
 from ..maps.kriging import OrdinaryKriging
 from ..maps.store import Budget, Reach, TileStore, Tiling
-from ..maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
+from ..maps.variogram import BiExponential, BinnedCorrelation, field_correlation, vertical_correlation
 from ..propagation.field.foliage import crown_index, foliage_loss_db, foliage_model, stand_loss_db
 from ..propagation.field.sum import channel_matrices, rss_dbm
 from ..propagation.geometry import Link, PathSet, Poses, linear_array, single_element
@@ -653,7 +653,7 @@ def maps_record(
             *(() if flown is None else flown.page_layers(result.grid)),
             *_linked_layers(outcome),
         ),
-        correlation=tuple(_correlation_panels(outcome)),
+        correlation=_correlations(outcome),
         errors=tuple(_errors(outcome)),
         paper=tuple(paper),
         warnings=() if flown is None else tuple(flown.prediction.warnings),
@@ -673,8 +673,8 @@ def _rss_maps(result: job.MapResult, mode: str, budget: LinkBudget) -> Iterator[
                 yield page.RssMap(
                     tower=tower or page.JOINT,
                     antennas=antennas.upper(),
-                    altitude_m=height,
-                    rss_dbm=result.grid.raster(values),
+                    height_m=height,
+                    values=result.grid.raster(values),
                     coverage=float(budget.covered(values).mean()),
                     foliage=mode,
                 )
@@ -686,11 +686,11 @@ def _rank_maps(result: job.MapResult, mode: str, tower: str | None = None) -> It
     for (column, k), (row, height) in itertools.product(enumerate(result.ks), enumerate(result.rank_altitudes_m)):
         yield page.RankMap(
             k=k,
-            altitude_m=height,
-            rank=result.grid.raster(ranks[row, column]).astype(np.int64),
+            height_m=height,
+            values=result.grid.raster(np.where(ranks[row, column] > 0, ranks[row, column], np.nan)),
             share=shares[row, column],
             foliage=mode,
-            **({} if tower is None else {"tower": tower}),
+            tower=tower or page.JOINT,
         )
 
 
@@ -709,23 +709,21 @@ def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
     for mode, result in outcome.ordered():
         raster = result.grid.raster
         for antennas in kinds:
-            axes = {"Antennas": antennas.upper(), "Foliage": mode}
+            layer = partial(page.MapLayer, antennas=antennas.upper(), foliage=mode)
             each = budget.covered(result.rss_mimo_dbm if antennas == "mimo" else result.rss_siso_dbm)
             for row, height in enumerate(result.rss_altitudes_m):
-                yield page.MapLayer(
-                    quantity="Towers in coverage", unit="towers", axes={**axes, **page.at_height(height)},
-                    values=raster(each[row].sum(axis=0)),
-                )  # fmt: skip
+                covering = raster(each[row].sum(axis=0))
+                yield layer(quantity="Towers in coverage", unit="towers", height_m=height, values=covering)
             for tower in (None, *result.tower_names) if len(result.rss_altitudes_m) > 1 else ():
                 covered = budget.covered(result.rss(antennas, tower)).mean(axis=0)
-                yield page.MapLayer(
-                    quantity="Probability of coverage over heights", unit="%",
-                    axes={"Tower": tower or page.JOINT, **axes}, values=raster(100.0 * covered),
+                yield layer(
+                    quantity="Probability of coverage over heights", unit="%", tower=tower or page.JOINT,
+                    values=raster(100.0 * covered),
                 )  # fmt: skip
     shown = outcome.shown
     if len(shown.tower_names) > 1:
         yield page.MapLayer(
-            quantity="Serving tower", unit="", axes={}, values=shown.grid.raster(shown.serving.astype(np.float64)),
+            quantity="Serving tower", unit="", values=shown.grid.raster(shown.serving.astype(np.float64)),
             classes=shown.tower_names,
         )  # fmt: skip
 
@@ -749,26 +747,26 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
     result, s = outcome.shown, outcome.settings
     raster = result.grid.raster
     for layer in _budget_layers(outcome):
-        axes = {"Foliage": layer.foliage, **page.at_height(layer.height_m)}
-        yield page.MapLayer(quantity=layer.quantity, unit="dB", axes=axes, values=raster(layer.values))
+        yield page.MapLayer(
+            quantity=layer.quantity, unit="dB", values=raster(layer.values), foliage=layer.foliage,
+            height_m=layer.height_m,
+        )  # fmt: skip
     for name, values in (("Singular-value spread", result.spread_db), ("Condition number", result.condition_db)):
         joint = values[..., result.serving, np.arange(len(result.grid))]
         for row, height in enumerate(result.rank_altitudes_m):
             shown = raster(np.minimum(joint[row], job.RATIO_LIMIT_DB))
-            yield page.MapLayer(
-                quantity=f"{name}, foliage {s.shown}", unit="dB", axes=page.at_height(height), values=shown
-            )
+            yield page.MapLayer(quantity=name, unit="dB", foliage=s.shown, height_m=height, values=shown)
     for mode, maps, change in _foliage_changes(outcome):
         for row, height in enumerate(maps.rss_altitudes_m):
             yield page.MapLayer(
-                quantity=f"RSS lost by foliage, {mode}", unit="dB", axes=page.at_height(height),
+                quantity="RSS lost by foliage", unit="dB", foliage=mode, height_m=height,
                 values=raster(change.rss_loss_db[row]), difference=True,
             )  # fmt: skip
         for column, k in enumerate(maps.ks if mode == s.shown else ()):
             for row, height in enumerate(maps.rank_altitudes_m):
                 covered = maps.ranks()[row, column] > 0
                 yield page.MapLayer(
-                    quantity=f"Rank change by foliage, {mode}, K = {k:g}", unit="", axes=page.at_height(height),
+                    quantity="Rank change by foliage", unit="", foliage=mode, k=k, height_m=height,
                     values=raster(np.where(covered, change.rank_change[row, column], np.nan)), difference=True,
                 )  # fmt: skip
 
@@ -781,23 +779,12 @@ def _foliage_changes(outcome: MapOutcome) -> Iterator[tuple[str, job.MapResult, 
         )
 
 
-def _correlation_panels(outcome: MapOutcome) -> Iterator[page.Correlation]:
-    if not outcome.studies:
-        return
-    distance = np.linspace(0.0, 500.0, 251)
-    for key, treatment in TREATMENTS.items():
-        fit, words = outcome.studies[key].fit, f"bi-exponential, RMSE {outcome.studies[key].fit.rmse:.4f}"
-        modelled = {"fit_distance_m": distance, "fit": fit(distance), "fit_label": words}
-        yield _correlation(f"Rank vectors, {treatment}", outcome.studies[key].correlation, **modelled)
+def _correlations(outcome: MapOutcome) -> dict[str, tuple[BinnedCorrelation, BiExponential | None]]:
+    """Return each correlation against distance, with its fitted curve if it has one, by title."""
     titles = {"horizontal": "Rank, one height", "vertical": "Rank, across heights", "RSS": "RSS, one height"}
-    for key, binned in outcome.correlations.items():
-        yield _correlation(titles[key], binned)
-
-
-def _correlation(title: str, binned: BinnedCorrelation, **modelled: Any) -> page.Correlation:
-    excluded = binned.excluded_constant
-    distance_m, correlation = binned.distance_m, binned.correlation
-    return page.Correlation(title=title, distance_m=distance_m, correlation=correlation, excluded=excluded, **modelled)
+    studies = {key: outcome.studies[key] for key in TREATMENTS if key in outcome.studies}
+    fitted = {f"Rank vectors, {TREATMENTS[key]}": (study.correlation, study.fit) for key, study in studies.items()}
+    return fitted | {titles[key]: (binned, None) for key, binned in outcome.correlations.items()}
 
 
 def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -704,13 +705,11 @@ class CorrectedMaps:
     def page_layers(self, grid: Grid) -> Iterator[page.MapLayer]:
         """Yield the layers of the linked map: raw and corrected level, and standard deviation."""
         for item in self.levels:
-            axes = {"Link": item.link, **page.at_height(item.height_m)}
+            layer = partial(page.MapLayer, link=item.link, height_m=item.height_m)
             for version, values in (("corrected", item.corrected_dbm), ("raw", item.raw_dbm)):
-                yield page.MapLayer(quantity="RSS, raw and corrected", unit="dBm", axes={"Version": version, **axes},
-                                    values=grid.raster(values))  # fmt: skip
-            yield page.MapLayer(
-                quantity="SD of the corrected RSS", unit="dB", axes=axes, values=grid.raster(item.sd_db)
-            )
+                shown = grid.raster(values)
+                yield layer(quantity="RSS, raw and corrected", unit="dBm", version=version, values=shown)
+            yield layer(quantity="SD of the corrected RSS", unit="dB", values=grid.raster(item.sd_db))
 
     def rss_maps(self, grid: Grid) -> Iterator[page.RssMap]:
         """Yield the maps and distributions of both versions for figures."""
@@ -720,8 +719,8 @@ class CorrectedMaps:
                 yield page.RssMap(
                     tower=item.link,
                     antennas=version,
-                    altitude_m=item.height_m,
-                    rss_dbm=grid.raster(values),
+                    height_m=item.height_m,
+                    values=grid.raster(values),
                     coverage=float(np.isfinite(values).mean()),
                 )
 
@@ -729,8 +728,9 @@ class CorrectedMaps:
         """Yield the most probable rank for figures and the linked map, with mean probabilities as shares."""
         for (tower, height), p in self.ranks.items():
             share = np.concatenate([[np.isnan(p[:, 0]).mean()], np.nan_to_num(p).mean(axis=0)])
-            rank = grid.raster(likeliest(p)).astype(np.int64)
-            yield page.RankMap(k=None, altitude_m=height, rank=rank, share=share, tower=tower)
+            rank = likeliest(p)
+            values = grid.raster(np.where(rank > 0, rank, np.nan))
+            yield page.RankMap(height_m=height, values=values, share=share, tower=tower)
 
 
 def likeliest(p: FloatArray) -> FloatArray:

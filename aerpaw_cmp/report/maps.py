@@ -7,6 +7,8 @@ from integers with a step. :func:`layer_numbers` returns the same numbers for me
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -19,11 +21,11 @@ from ..common.geodesy import SiteFrame
 from ..common.jsonable import json_object, json_safe
 from ..common.kml import CLASS_COLOURS
 from ..common.text import counted
-from ..common.units import FloatArray, IntArray, spread_out
-from ..compare.statistics import Interval
+from ..common.units import FloatArray, spread_out
 from ..compare.verdict import Coverage, coverage_verdict
 from ..maps.evaluate import TREATMENTS
 from ..maps.grid import PAPER_SPACING_M
+from ..maps.variogram import BiExponential, BinnedCorrelation
 from ..site.scenes import drawn_buildings
 from ..site.site import Site
 from . import canvas
@@ -46,85 +48,85 @@ if TYPE_CHECKING:
 JOINT = "joint"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RssMap:
-    """The RSS of one tower, or of the nearest tower (``tower="joint"``), at one height.
-
-    ``rss_dbm`` (rows, columns) is NaN out of coverage [dBm]; ``coverage`` is the share of positions with a path.
-    """
-
-    tower: str
-    antennas: str
-    altitude_m: float
-    rss_dbm: FloatArray
-    coverage: float
-    foliage: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RankMap:
-    """The rank for one K at one height, shape (rows, columns).
-
-    Rank 0 is out of coverage; ``share`` (5,) contains the shares of ranks 0 to 4.
-
-    Without K, the rank is the most probable rank of a learned receiver, and ``share`` its mean probabilities.
-    """
-
-    k: float | None
-    altitude_m: float
-    rank: IntArray
-    share: FloatArray
-    foliage: str = ""
-    tower: str = JOINT
-
-    @property
-    def source(self) -> str:
-        """K, or the name of the learned receiver."""
-        return "learned receiver" if self.k is None else f"K = {k_key(self.k)}"
+# Names of the values of a map of ranks. Positions out of coverage have the value 0 in files, and NaN here.
+_RANK_CLASSES = ("Z", *map(str, RANKS))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapLayer:
-    """A layer of the page.
+    """A map of one quantity.
 
     Parameters
     ----------
     quantity, unit : str
         Layers of one quantity share a colour scale and can be subtracted.
-    axes : mapping of str to str
-        Values that distinguish layers of a quantity, by "Tower", "Antennas", "Foliage", "K", "Height".
     values : (rows, columns)
         Values from the south-west; NaN out of coverage.
     classes : tuple of str
         Names of the values 0, 1, ... of a layer of classes.
     difference : bool
         True for a colour scale centred on zero.
+    version, link, tower, antennas, foliage : str
+        What distinguishes layers of a quantity, as far as it applies. The tower "joint" is the nearest one.
+    k : float, optional
+        Singular-value ratio of a rank.
+    height_m : float
+        Height above ground [m]; NaN for a layer without a height.
     """
 
     quantity: str
     unit: str
-    axes: Mapping[str, str]
     values: FloatArray = field(repr=False, compare=False)
     classes: tuple[str, ...] = ()
     difference: bool = False
+    version: str = ""
+    link: str = ""
+    tower: str = ""
+    antennas: str = ""
+    k: float | None = None
+    foliage: str = ""
+    height_m: float = math.nan
 
+    @property
+    def axes(self) -> dict[str, str]:
+        """What distinguishes this layer from others of its quantity, by the label of its choice on the page."""
+        k = "" if self.k is None else k_key(self.k)
+        height = "" if math.isnan(self.height_m) else f"{self.height_m:g} m"
+        axes = {"Version": self.version, "Link": self.link, "Tower": self.tower, "Antennas": self.antennas, "K": k,
+                "Foliage": self.foliage, "Height": height}  # fmt: skip
+        return {name: value for name, value in axes.items() if value}
 
-def at_height(altitude_m: float) -> dict[str, str]:
-    """Return the axis of a height, for :class:`MapLayer`."""
-    return {"Height": f"{altitude_m:g} m"}
+    def place(self, axis: str) -> float:
+        """Return the order among values of an axis: all towers together first, K and heights rising, else as given."""
+        return {"Tower": float(self.tower != JOINT), "K": self.k, "Height": self.height_m}.get(axis) or 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Correlation:
-    """Correlation against distance, each (bins,), and a fitted model on its own distances."""
+class RssMap(MapLayer):
+    """The RSS of one tower, or of the nearest tower; ``coverage`` is the share of covered positions."""
 
-    title: str
-    distance_m: FloatArray
-    correlation: FloatArray
-    fit_distance_m: FloatArray | None = None
-    fit: FloatArray | None = None
-    fit_label: str = ""
-    excluded: int = 0
+    quantity: str = "RSS"
+    unit: str = "dBm"
+    coverage: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankMap(MapLayer):
+    """The rank for one K; ``share`` (5,) contains the shares of positions out of coverage and of ranks 1 to 4.
+
+    Without K, the rank is the most probable rank of a learned receiver, and ``share`` its mean probabilities.
+    """
+
+    quantity: str = "Rank"
+    unit: str = ""
+    classes: tuple[str, ...] = _RANK_CLASSES
+    tower: str = JOINT
+    share: FloatArray
+
+    @property
+    def source(self) -> str:
+        """K, or the name of the learned receiver."""
+        return "learned receiver" if self.k is None else f"K = {k_key(self.k)}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,7 +142,6 @@ class MapError:
     altitude_m: float
     mae: float
     n: int
-    mae_ci95: Interval | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -185,6 +186,8 @@ class MapsData(Made):
         Flights of ``--with``, replayed and compared.
     layers : tuple of MapLayer
         Layers other than RSS and rank.
+    correlation : mapping of str to (BinnedCorrelation, BiExponential)
+        Correlation against distance and its fitted curve, if any, by title.
     metrics : mapping
         Content of ``metrics.json`` that follows the tables of this page.
     """
@@ -206,7 +209,7 @@ class MapsData(Made):
     rank: tuple[RankMap, ...] = ()
     rank_by_tower: tuple[RankMap, ...] = ()
     layers: tuple[MapLayer, ...] = ()
-    correlation: tuple[Correlation, ...] = ()
+    correlation: Mapping[str, tuple[BinnedCorrelation, BiExponential | None]] = field(default_factory=dict)
     errors: tuple[MapError, ...] = ()
     paper: tuple[PaperRow, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -258,12 +261,12 @@ def coverage(data: MapsData) -> list[Coverage]:
         return []
     first = shown[0]
     same_link = [item for item in shown if (item.tower, item.antennas) == (first.tower, first.antennas)]
-    clear = {item.altitude_m: item.coverage for item in same_link if item.foliage == "none" != first.foliage}
+    clear = {item.height_m: item.coverage for item in same_link if item.foliage == "none" != first.foliage}
     return [
         Coverage(
-            height_m=item.altitude_m,
+            height_m=item.height_m,
             covered=item.coverage,
-            clear=clear.get(item.altitude_m, np.nan),
+            clear=clear.get(item.height_m, np.nan),
             outside=data.outside_flown,
         )
         for item in same_link
@@ -441,9 +444,9 @@ def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]
     image = None
     for ax, shown in zip(axes, maps, strict=True):
         alone = None if shown.tower == JOINT else shown.tower
-        image = draw_map(ax, data, shown.rss_dbm, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
+        image = draw_map(ax, data, shown.values, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
         ax.set_title(f"{shown.tower}: {100 * shown.coverage:.0f} %", fontsize=9)
-    levels = np.concatenate([entry.rss_dbm.ravel() for entry in maps])
+    levels = np.concatenate([entry.values.ravel() for entry in maps])
     low, high = axes[-1].get_position().y0, axes[0].get_position().y1
     bar = fig.add_axes((0.91, low + 0.1 * (high - low), 0.016, 0.8 * (high - low)))
     colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits), bar)
@@ -461,8 +464,8 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
     colours = ListedColormap([CLASS_COLOURS[r] for r in RANKS])
     norm = BoundaryNorm([0.5, 1.5, 2.5, 3.5, 4.5], 4)
     for ax, shown in zip(axes, maps, strict=True):
-        draw_map(ax, data, np.where(shown.rank > 0, shown.rank, np.nan), cmap=colours, norm=norm)
-        ax.set_title(f"{shown.altitude_m:g} m", fontsize=9)
+        draw_map(ax, data, shown.values, cmap=colours, norm=norm)
+        ax.set_title(f"{shown.height_m:g} m", fontsize=9)
     entries = [Patch(facecolor=CLASS_COLOURS[r], edgecolor="black", label=f"rank {r}") for r in RANKS]
     fig.legend(handles=[*entries, *overlay_legend(data, borders=True)], loc="lower center", ncols=5)
     return fig
@@ -475,8 +478,8 @@ def distribution(members: Sequence[RssMap]) -> dict[str, Any]:
     """
     marks = []
     for shown in members:
-        level = np.sort(shown.rss_dbm[np.isfinite(shown.rss_dbm)])
-        share = (shown.rss_dbm.size - len(level) + np.arange(1, len(level) + 1)) / shown.rss_dbm.size
+        level = np.sort(shown.values[np.isfinite(shown.values)])
+        share = (shown.values.size - len(level) + np.arange(1, len(level) + 1)) / shown.values.size
         some = spread_out(len(level), 400)  # steps of 1/400 are not visible
         marks.append({"kind": "line", "name": shown.tower, "x": level[some], "y": 100.0 * share[some]})
     return {"x": {"label": "RSS [dBm]"}, "y": {"label": "Positions below [%]", "ends": [0, 100]}, "marks": marks}
@@ -484,8 +487,8 @@ def distribution(members: Sequence[RssMap]) -> dict[str, Any]:
 
 def rank_shares(members: Sequence[RankMap]) -> dict[str, Any]:
     """Return stacked shares of ranks and of positions out of coverage at each height."""
-    members = sorted(members, key=lambda member: member.altitude_m)
-    at = np.array([member.altitude_m for member in members])
+    members = sorted(members, key=lambda member: member.height_m)
+    at = np.array([member.height_m for member in members])
     half = np.diff(at) / 2.0 if len(at) > 1 else np.array([5.0])
     sides = np.repeat([max(at[0] - half[0], 0.0), *(at[:-1] + half[: len(at) - 1]), at[-1] + half[-1]], 2)[1:-1]
     share = 100.0 * np.array([member.share for member in members])
@@ -498,12 +501,12 @@ def rank_shares(members: Sequence[RankMap]) -> dict[str, Any]:
     return {"x": {"label": "Height [m]"}, "y": {"label": "Positions [%]", "ends": [0, 100]}, "marks": marks}
 
 
-def correlation(curve: Correlation) -> dict[str, Any]:
-    """Return the correlation against distance, and its model."""
-    marks: list[Any] = [{"kind": "dots", "name": "data", "x": curve.distance_m, "y": curve.correlation}]
-    if curve.fit is not None:
-        name = curve.fit_label or "model"
-        marks.append({"kind": "line", "name": name, "x": curve.fit_distance_m, "y": curve.fit})
+def correlation(binned: BinnedCorrelation, fit: BiExponential | None) -> dict[str, Any]:
+    """Return the correlation against distance, and its fitted curve."""
+    marks: list[Any] = [{"kind": "dots", "name": "data", "x": binned.distance_m, "y": binned.correlation}]
+    if fit is not None:
+        at = np.linspace(0.0, binned.distance_m[-1], 251)
+        marks.append({"kind": "line", "name": f"bi-exponential, RMSE {fit.rmse:.4f}", "x": at, "y": fit(at)})
     return {"x": {"label": "Distance [m]"}, "y": {"label": "Correlation"}, "marks": marks}
 
 
@@ -550,7 +553,7 @@ def plates(data: MapsData) -> Iterator[Plate]:
             name=f"rss_cdf_{safe_name(words)}", section="rss", title=f"Distribution of RSS, {words}",
             caption="Share of positions with an RSS below the value. A curve starts at the share of positions out of "
             "coverage.",
-            panels={f"{at:g} m": distribution(some) for at, some in grouped(maps, lambda m: m.altitude_m).items()},
+            panels={f"{at:g} m": distribution(some) for at, some in grouped(maps, lambda m: m.height_m).items()},
         )  # fmt: skip
     for words, ranks in grouped(data.rank, lambda m: _under(m.foliage)).items():
         yield Plate(
@@ -570,8 +573,9 @@ def plates(data: MapsData) -> Iterator[Plate]:
         yield Plate(
             name="correlation", section="kriging", title="Spatial correlation",
             caption="Pearson correlation between positions against their distance, and the fitted model. "
-            + " ".join(f"{c.title}: {c.excluded} constant positions or maps excluded." for c in data.correlation),
-            panels={curve.title: correlation(curve) for curve in data.correlation},
+            + " ".join(f"{title}: {binned.excluded_constant} constant positions or maps excluded."
+                       for title, (binned, _) in data.correlation.items()),
+            panels={title: correlation(*curve) for title, curve in data.correlation.items()},
         )  # fmt: skip
     for evaluation, errors in grouped(data.errors, lambda error: error.evaluation).items():
         worst = max((error.mae for error in errors if np.isfinite(error.mae)), default=1.0)
@@ -587,7 +591,7 @@ def plates(data: MapsData) -> Iterator[Plate]:
 
 def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
     """Return one colour scale for all maps: the 1 to 99.5 % range, rounded to 5 dB [dBm]."""
-    parts = [entry.rss_dbm[np.isfinite(entry.rss_dbm)] for entry in maps]
+    parts = [entry.values[np.isfinite(entry.values)] for entry in maps]
     finite = np.concatenate(parts) if parts else np.zeros(0)
     if not len(finite):
         return -100.0, -50.0
@@ -612,7 +616,7 @@ def _under(foliage: str) -> str:
 def _rss_specs(data: MapsData) -> Iterator[FigureSpec]:
     levels = (*data.rss, *data.corrected)
     limits = _level_limits(levels)
-    by_height = grouped(levels, lambda m: (f"{m.antennas}{_under(m.foliage)}", m.altitude_m))
+    by_height = grouped(levels, lambda m: (f"{m.antennas}{_under(m.foliage)}", m.height_m))
     for (antennas, height), maps in by_height.items():
         name = f"rss_map_{safe_name(f'{antennas}, {height:g} m')}"
         yield FigureSpec(name, partial(rss_maps, data, maps, limits))
@@ -634,7 +638,6 @@ _DEGREE = 4
 _FINEST_DB = 0.01
 
 LEVEL, _CLASSES, DIFFERENCE = "level", "classes", "difference"
-_RANK_CLASSES = ("Z", *map(str, RANKS))
 
 
 # --- layers ---------------------------------------------------------------------------------------------------------
@@ -642,35 +645,12 @@ _RANK_CLASSES = ("Z", *map(str, RANKS))
 
 def page_layers(data: MapsData) -> list[MapLayer]:
     """Return every layer of the page, sorted by quantity."""
-    rss = [
-        MapLayer(
-            quantity="RSS", unit="dBm", axes={"Tower": m.tower, "Antennas": m.antennas, **_foliage_height(m)},
-            values=m.rss_dbm,
-        )
-        for m in data.rss
-    ]  # fmt: skip
-    traced = [
-        _rank_layer(m, "Rank", {"Tower": m.tower, "K": k_key(m.k or 0.0), **_foliage_height(m)})
-        for m in (*data.rank, *data.rank_by_tower)
-    ]
-    corrected = [
-        _rank_layer(
-            m, "Rank, raw and corrected",
-            {"Version": f"{'corrected' if m.k is None else 'raw'}, {m.source}", "Tower": m.tower,
-             **at_height(m.altitude_m)},
-        )
+    versions = [
+        replace(m, quantity="Rank, raw and corrected", version=f"{'corrected' if m.k is None else 'raw'}, {m.source}",
+                k=None)
         for m in data.corrected_rank
     ]  # fmt: skip
-    return [*rss, *traced, *corrected, *data.layers]
-
-
-def _rank_layer(m: RankMap, quantity: str, axes: dict[str, str]) -> MapLayer:
-    values = np.where(m.rank > 0, m.rank, np.nan)
-    return MapLayer(quantity=quantity, unit="", axes=axes, values=values, classes=_RANK_CLASSES)
-
-
-def _foliage_height(m: RssMap | RankMap) -> dict[str, str]:
-    return {**({"Foliage": m.foliage} if m.foliage else {}), **at_height(m.altitude_m)}
+    return [*data.rss, *data.rank, *data.rank_by_tower, *versions, *data.layers]
 
 
 def layer_numbers(layer: MapLayer) -> dict[str, Any]:
@@ -707,25 +687,17 @@ def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST
         Then every second (third, ...) cell of each row and column is retained. ``left_out`` names the missing layers.
     """
     layers = page_layers(data)
-    tries: list[tuple[str, Sequence[MapLayer], int]] = [("", layers, 1)]
-    joint = [item for item in layers if _is_joint(item)]
-    levels = [item for item in layers if _is_joint(item) or item.quantity == "RSS"]
-    tries.append(("layers of single towers but RSS", levels, 1))
-    tries.append(("layers of single towers", joint, 1))
-    stride = 1
-    while True:
-        for words, chosen, every in tries:
-            content = _packed(data, charts, chosen, every)
-            # measure after packing, because the compressed size depends on the maps
-            if len(content["packed"]["data"]) <= most_bytes:
-                return content | {"left_out": words, "stride": every}
-        stride += 1
-        words = f"layers of single towers, and all but every {stride}. cell of each row and column"
-        tries = [(words, joint, stride)]
-
-
-def _is_joint(layer: MapLayer) -> bool:
-    return layer.axes.get("Tower", JOINT) == JOINT
+    joint = [item for item in layers if item.tower in ("", JOINT)]
+    levels = [item for item in layers if item.tower in ("", JOINT) or item.quantity == "RSS"]
+    single = "layers of single towers"
+    tries = [("", layers, 1), (f"{single} but RSS", levels, 1), (single, joint, 1)]
+    thinned = ((f"{single}, and all but every {n}. cell of each row and column", joint, n) for n in itertools.count(2))
+    return next(
+        content | {"left_out": left_out, "stride": stride}
+        for left_out, chosen, stride in itertools.chain(tries, thinned)
+        # measure after packing, because the compressed size depends on the maps
+        if len((content := _packed(data, charts, chosen, stride))["packed"]["data"]) <= most_bytes
+    )
 
 
 def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer], stride: int) -> dict[str, Any]:
@@ -750,13 +722,11 @@ def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer],
 
 def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, stride: int) -> dict[str, Any]:
     """Return one quantity: its axes, and the number of its array for each combination of their values."""
-    axes: dict[str, list[str]] = {}
+    places: dict[str, dict[str, float]] = {}
     for layer in layers:
         for axis, value in layer.axes.items():
-            if value not in axes.setdefault(axis, []):
-                axes[axis].append(value)
-    for axis, values in axes.items():
-        values.sort(key=lambda value: _place(axis, value))
+            places.setdefault(axis, {})[value] = layer.place(axis)
+    axes = {axis: sorted(values, key=values.__getitem__) for axis, values in places.items()}
     kind = _CLASSES if layers[0].classes else DIFFERENCE if layers[0].difference else LEVEL
     every = np.concatenate([layer.values[np.isfinite(layer.values)] for layer in layers])
     step = 1.0 if kind == _CLASSES else step_for(every, _FINEST_DB)
@@ -777,13 +747,6 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
         "axes": [{"name": axis, "values": values} for axis, values in axes.items()],
         "layers": stored,
     }
-
-
-def _place(axis: str, value: str) -> float:
-    """Return the order of a value of an axis: all towers together first, heights and K rising, others unchanged."""
-    if axis == "Tower":
-        return 0.0 if value == JOINT else 1.0
-    return float(value.removesuffix(" m")) if axis in ("Height", "K") else 0.0
 
 
 def _range(values: FloatArray, kind: str) -> list[float]:
@@ -845,19 +808,13 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
         title=data.title,
         site={"name": data.site.name, "credit": data.site.credit, "assumed": data.site.assumed},
         grid={"columns": columns, "rows": rows, "positions": columns * rows},
-        coverage=[{"tower": m.tower, "antennas": m.antennas, "foliage": m.foliage, "altitude_m": m.altitude_m,
+        coverage=[{"tower": m.tower, "antennas": m.antennas, "foliage": m.foliage, "altitude_m": m.height_m,
                    "coverage": m.coverage} for m in data.rss],
-        rank=[
-            {
-                "k": m.k, "foliage": m.foliage, "altitude_m": m.altitude_m,
-                "share": dict(zip(("Z", *map(str, RANKS)), m.share, strict=True)),
-            }
-            for m in data.rank
-        ],
+        rank=[{"k": m.k, "foliage": m.foliage, "altitude_m": m.height_m,
+               "share": dict(zip(_RANK_CLASSES, m.share, strict=True))} for m in data.rank],
         layers=[layer_numbers(layer) for layer in page_layers(data)],
-        mae=[{"evaluation": e.evaluation, "method": e.method, "k": e.k, "altitude_m": e.altitude_m, "mae": e.mae,
-              "mae_ci95": e.mae_ci95, "n": e.n} for e in data.errors],
-        paper=[{"where": p.where, "what": p.what, "paper": p.paper, "ours": p.ours} for p in data.paper],
+        mae=data.errors,
+        paper=data.paper,
         warnings=warnings(data),
         **about(data),
     )  # fmt: skip
@@ -880,11 +837,11 @@ def result_card(data: MapsData) -> Card:
 
 def coverage_table(data: MapsData) -> Table:
     """Return the share of positions in coverage by height. Rows with 100.0 % everywhere share one row."""
-    heights = sorted({m.altitude_m for m in data.rss})
+    heights = sorted({m.height_m for m in data.rss})
     rows: list[Sequence[str | None]] = []
     full = 0
     for key, maps in grouped(data.rss, lambda m: (m.antennas, m.foliage, m.tower)).items():
-        share = {m.altitude_m: percent(m.coverage, 1) for m in maps}
+        share = {m.height_m: percent(m.coverage, 1) for m in maps}
         if set(share.values()) == {percent(1.0, 1)}:
             full += 1
         else:
@@ -914,7 +871,7 @@ def ranks_card(data: MapsData) -> Card:
         caption="Share of positions with each rank.",
         columns={"K": HEAD, "Foliage": TEXT, "Height": RIGHT, "Out of coverage": RIGHT,
                  **{f"Rank {rank}": RIGHT for rank in RANKS}},
-        rows=[(k_key(m.k or 0.0), m.foliage, number(m.altitude_m, 0, "m"), *(percent(share, 1) for share in m.share))
+        rows=[(k_key(m.k or 0.0), m.foliage, number(m.height_m, 0, "m"), *(percent(share, 1) for share in m.share))
               for m in data.rank],
     )  # fmt: skip
     parts = [Card(title="The shares as a table", fold=True, tables=[table])]

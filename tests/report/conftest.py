@@ -12,8 +12,9 @@ from aerpaw_cmp.compare.level import ChannelDifference
 from aerpaw_cmp.compare.result import AuditResult, EngineResult, PairResult, RankResult, RssResult
 from aerpaw_cmp.compare.verdict import flight_verdict
 from aerpaw_cmp.logs.records import RejectedLine
+from aerpaw_cmp.maps.variogram import BiExponential, BinnedCorrelation
 from aerpaw_cmp.report.flight_data import InputFile, ReportData, Track, Waypoint
-from aerpaw_cmp.report.maps import Correlation, MapError, MapLayer, MapsData, PaperRow, RankMap, RssMap, at_height
+from aerpaw_cmp.report.maps import MapError, MapLayer, MapsData, PaperRow, RankMap, RssMap
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Tower, Trees
 from benchmarks.fabricated import rank_result, rss_result
 
@@ -175,7 +176,7 @@ def make_maps() -> MapsData:
             levels[t.name] = np.where((wood | (d > 1200)) & (height < 40), np.nan, value)
         levels["joint"] = np.take_along_axis(np.array(list(levels.values())), nearest[None], axis=0)[0]
         rss += [
-            RssMap(tower=name, antennas=antennas, altitude_m=height, rss_dbm=level, foliage="opaque",
+            RssMap(tower=name, antennas=antennas, height_m=height, values=level, foliage="opaque",
                    coverage=float(np.isfinite(level).mean()))
             for name, level in levels.items()
         ]  # fmt: skip
@@ -186,20 +187,20 @@ def make_maps() -> MapsData:
         value = np.where(d < radius / 3, 3, np.where(d < radius * (1 + height / 300), 2, 1))
         value = np.where(wood & (height < 40) | ((d > 250) & (height < 10)), 0, value)
         share = np.array([(value == r).mean() for r in range(5)])
-        rank.append(RankMap(k=k, altitude_m=float(height), rank=value, share=share))
+        rank.append(RankMap(k=k, height_m=float(height), values=np.where(value > 0, value, np.nan), share=share))
         errors += [
             MapError(evaluation="leave one out", method=method, k=k, altitude_m=float(height), n=2556,
                      mae=factor * (0.03 + radius / 4000 + 1 / height))
             for method, factor in (("Kriging", 1.0), ("makima", 1.6), ("spline", 1.9)) if height > 10
         ]  # fmt: skip
     distance = np.arange(15.0, 500, 30)
-    model = 0.2932 * np.exp(-0.0508 * distance) + 0.7057 * np.exp(-0.001 * distance)
+    model = BiExponential(0.2932, -0.0508, 0.7057, -0.001, rmse=0.007)
     lines = tuple(np.array([[-540.0, y], [540.0, y + 150]]) for y in (-350.0, 200.0))
     return MapsData(
         title="Coverage and rank of Lake Wheeler", name="lw", site=site, generated="2026-11-21T00:00:00Z", east_m=east, north_m=north,
         borders_m=lines, rss=tuple(rss), rank=tuple(rank),
-        layers=(*(MapLayer(quantity="Singular value spread", unit="dB", axes=at_height(h), values=20 + d / 30 + h / 10) for h in (30.0, 70.0)), MapLayer(quantity="Foliage loss", unit="dB", axes=at_height(30.0), values=np.where(wood, -12.0, 0.0), difference=True),),
-        correlation=(Correlation(title="Rank, horizontal", distance_m=distance, correlation=model + 0.01 * np.cos(distance), fit_distance_m=distance, fit=model, fit_label="bi-exponential, RMSE 0.007", excluded=7),),
+        layers=(*(MapLayer(quantity="Singular value spread", unit="dB", height_m=h, values=20 + d / 30 + h / 10) for h in (30.0, 70.0)), MapLayer(quantity="Foliage loss", unit="dB", height_m=30.0, values=np.where(wood, -12.0, 0.0), difference=True),),
+        correlation={"Rank, horizontal": (BinnedCorrelation(distance, distance, model(distance) + 0.01 * np.cos(distance), np.ones(len(distance), int), 2556, 7), model)},
         errors=tuple(errors),
         paper=(PaperRow(where="Fig. 12", what="c1", paper="0.2932", ours="0.2931", figure="correlation"), PaperRow(where="Fig. 13", what="lowest MAE", paper="K = 10", ours="K = 10", figure="mae_leave_one_out")),
         warnings=("Towers of another source differ by up to 9 m.",), versions={"numpy": np.__version__}, settings={"rt": {"max_depth": 2}}, stages_s={"replay": 3.0}, metrics={"fit": {"rmse": 0.0153}},

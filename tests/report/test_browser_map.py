@@ -23,7 +23,7 @@ def data(maps_data):
     east, north = np.meshgrid(maps_data.east_m, maps_data.north_m)
     tilt = east / 500 + north / 900
     without = [
-        dataclasses.replace(m, foliage="none", rss_dbm=np.where(np.isfinite(m.rss_dbm), m.rss_dbm, -70.0) + tilt)
+        dataclasses.replace(m, foliage="none", values=np.where(np.isfinite(m.values), m.values, -70.0) + tilt)
         for m in maps_data.rss
     ]
     return dataclasses.replace(maps_data, rss=(*maps_data.rss, *without))
@@ -64,7 +64,7 @@ def pick(driver, letter="a", **axes):
 
 def of(data, tower, antennas, foliage, height):
     return next(
-        m for m in data.rss if (m.tower, m.antennas, m.foliage, m.altitude_m) == (tower, antennas, foliage, height)
+        m for m in data.rss if (m.tower, m.antennas, m.foliage, m.height_m) == (tower, antennas, foliage, height)
     )
 
 
@@ -81,7 +81,7 @@ def test_switches_show_the_layer_and_its_numbers(driver, data, tower, antennas, 
         height=f"{height:g} m",
     )
     layer = of(data, tower, antennas, foliage, height)
-    assert shown(driver, data) == pytest.approx(layer.rss_dbm, abs=0.0051, nan_ok=True)
+    assert shown(driver, data) == pytest.approx(layer.values, abs=0.0051, nan_ok=True)
     numbers = driver.execute_script("return mapExplorer.statistics()")
     entry = next(
         n
@@ -100,7 +100,7 @@ def test_switches_show_the_layer_and_its_numbers(driver, data, tower, antennas, 
 def test_ranks_have_the_shares_of_the_tables(driver, data):
     choose(driver, "quantity", "Rank")
     pick(driver, k="100", height="70 m")
-    entry = next(m for m in data.rank if (m.k, m.altitude_m) == (100.0, 70.0))
+    entry = next(m for m in data.rank if (m.k, m.height_m) == (100.0, 70.0))
     share = driver.execute_script("return mapExplorer.statistics().share")
     assert share == pytest.approx(entry.share.tolist())
     assert f"{100 * entry.share[2]:.1f} %" in driver.find_element("id", "numbers").text
@@ -129,13 +129,13 @@ def test_the_pointer_reads_value_and_position(driver, data):
     row, column = 12, 29  # far south-east: a flipped or transposed map reads something else
     text = hover(driver, data, row, column)
     assert driver.execute_script("return mapExplorer.state.cell") == [row, column]
-    value = of(data, "LW3", "MIMO", "none", 30.0).rss_dbm[row, column]
+    value = of(data, "LW3", "MIMO", "none", 30.0).values[row, column]
     east, north = data.east_m[column], data.north_m[row]
     lat, lon = data.site.frame.to_geographic(east, north)
     assert f"{value:.2f} dBm".replace("-", "−") in text
     assert f"{east:.1f}, {north:.1f} m".replace("-", "−") in text
     assert f"{lat:.6f}°, {lon:.6f}°".replace("-", "−") in text
-    at = of(data, "LW3", "MIMO", "none", 110.0).rss_dbm[row, column]
+    at = of(data, "LW3", "MIMO", "none", 110.0).values[row, column]
     assert f"110 m: {at:.1f} dBm".replace("-", "−") in text
 
 
@@ -153,7 +153,7 @@ def test_the_picture_lies_where_the_values_do(driver, data, scheme, begun):
     ends = driver.execute_script("return mapExplorer.limits()")
     layer = of(data, "LW4", "SISO", "none", 30.0)
     for (east, north), colour in zip([(-405, -630), (405, -630), (-405, 630), (405, 930)], colours, strict=True):
-        value = layer.rss_dbm[np.abs(data.north_m - north).argmin(), np.abs(data.east_m - east).argmin()]
+        value = layer.values[np.abs(data.north_m - north).argmin(), np.abs(data.east_m - east).argmin()]
         share = begun + (1.0 - begun) * np.clip((value - ends[0]) / (ends[1] - ends[0]), 0, 0.9999)
         place = int(share * 128)
         expected = 255 * np.array(colormaps["viridis"](place / 127)[:3])
@@ -164,7 +164,7 @@ def test_difference_is_a_minus_b(driver, data):
     pick(driver, tower="LW2", antennas="MIMO", foliage="none", height="30 m")
     driver.find_element("id", "difference").click()
     pick(driver, "b", tower="LW2", antennas="MIMO", foliage="opaque", height="30 m")
-    expected = of(data, "LW2", "MIMO", "none", 30.0).rss_dbm - of(data, "LW2", "MIMO", "opaque", 30.0).rss_dbm
+    expected = of(data, "LW2", "MIMO", "none", 30.0).values - of(data, "LW2", "MIMO", "opaque", 30.0).values
     assert shown(driver, data) == pytest.approx(expected, abs=0.0101, nan_ok=True)
     numbers = driver.execute_script("return mapExplorer.statistics()")
     finite = expected[np.isfinite(expected)]
@@ -185,11 +185,11 @@ def test_difference_is_a_minus_b(driver, data):
 
 
 def test_the_scale_is_shared_or_own(driver, data):
-    levels = np.concatenate([m.rss_dbm[np.isfinite(m.rss_dbm)] for m in data.rss])
+    levels = np.concatenate([m.values[np.isfinite(m.values)] for m in data.rss])
     assert driver.execute_script("return mapExplorer.limits()") == pytest.approx(np.percentile(levels, [1, 99.5]))
     choose(driver, "scale", "of this layer")
     pick(driver, tower="LW1", antennas="SISO", foliage="none", height="70 m")
-    own = of(data, "LW1", "SISO", "none", 70.0).rss_dbm
+    own = of(data, "LW1", "SISO", "none", 70.0).values
     assert driver.execute_script("return mapExplorer.limits()") == pytest.approx([own.min(), own.max()], abs=0.01)
     choose(driver, "scale", "one scale for all layers")
 
@@ -206,7 +206,7 @@ def test_a_line_is_dragged_and_its_profile_runs_along_it(driver, data):
     assert e1 > e0
     profile = driver.execute_script("return mapExplorer.profile()")
     assert profile[-1][0] == pytest.approx(np.hypot(e1 - e0, n1 - n0))
-    level_dbm = of(data, "LW1", "SISO", "none", 30.0).rss_dbm
+    level_dbm = of(data, "LW1", "SISO", "none", 30.0).values
     for share in (0.0, 0.5, 1.0):
         distance, value = profile[round(share * (len(profile) - 1))]
         t = distance / profile[-1][0]

@@ -54,10 +54,10 @@ def test_numbers_of_a_layer_are_those_of_the_tables(maps_data):
         assert (entry["tower"], entry["antennas"], entry["height"]) == (
             layer.tower,
             layer.antennas,
-            f"{layer.altitude_m:g} m",
+            f"{layer.height_m:g} m",
         )
         assert entry["covered"] == table["coverage"]
-        assert entry["median"] == np.nanmedian(layer.rss_dbm)
+        assert entry["median"] == np.nanmedian(layer.values)
     ranks = [n for n in metrics["layers"] if n["quantity"] == "Rank"]
     assert min(len(numbers), len(ranks)) > 1
     for entry, table in zip(ranks, metrics["rank"], strict=True):
@@ -65,7 +65,7 @@ def test_numbers_of_a_layer_are_those_of_the_tables(maps_data):
 
 
 def test_a_layer_without_any_value_has_no_numbers():
-    layer = MapLayer(quantity="RSS", unit="dBm", axes={}, values=np.full((2, 3), np.nan))
+    layer = MapLayer(quantity="RSS", unit="dBm", values=np.full((2, 3), np.nan))
     numbers = map_explorer.layer_numbers(layer)
     assert numbers["covered"] == 0.0
     assert np.isnan([numbers[name] for name in ("mean", "median", "min", "max")]).all()
@@ -82,8 +82,8 @@ def test_a_page_keeps_its_size_whatever_the_grid(maps_data):
     """A grid of nine times the cells under a small limit: single towers go first, then cells; the page says so."""
     fine = dataclasses.replace(
         maps_data,
-        rss=tuple(dataclasses.replace(m, rss_dbm=np.kron(m.rss_dbm, np.ones((3, 3)))) for m in maps_data.rss),
-        rank=tuple(dataclasses.replace(m, rank=np.kron(m.rank, np.ones((3, 3), int))) for m in maps_data.rank),
+        rss=tuple(dataclasses.replace(m, values=np.kron(m.values, np.ones((3, 3)))) for m in maps_data.rss),
+        rank=tuple(dataclasses.replace(m, values=np.kron(m.values, np.ones((3, 3)))) for m in maps_data.rank),
         layers=(), east_m=np.linspace(-535, 535, 108), north_m=np.linspace(-1060, 1060, 213),
     )  # fmt: skip
     complete = map_explorer.payload(fine, most_bytes=10**9)
@@ -115,9 +115,9 @@ def test_one_cell_and_absurd_values(maps_data):
     odd = dataclasses.replace(
         maps_data, rss=(), rank=(), east_m=np.array([3.0]), north_m=np.array([7.0]),
         layers=(
-            MapLayer(quantity="huge", unit="1", axes={}, values=np.array([[1e30]])),
-            MapLayer(quantity="none", unit="", axes={}, values=np.array([[np.nan]])),
-            MapLayer(quantity="endless", unit="dB", axes={}, values=np.array([[np.inf]])),
+            MapLayer(quantity="huge", unit="1", values=np.array([[1e30]])),
+            MapLayer(quantity="none", unit="", values=np.array([[np.nan]])),
+            MapLayer(quantity="endless", unit="dB", values=np.array([[np.inf]])),
         ),
     )  # fmt: skip
     content = json.loads(as_json(map_explorer.payload(odd)))

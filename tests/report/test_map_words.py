@@ -28,7 +28,7 @@ def test_the_cause_that_was_put_in_is_said(
     maps_data: MapsData, covered: dict[str, float], change: dict[str, Any], said: str
 ) -> None:
     level = np.zeros((len(maps_data.north_m), len(maps_data.east_m)))
-    joint = {"tower": "joint", "antennas": "MIMO", "altitude_m": 30.0, "rss_dbm": level}
+    joint = {"tower": "joint", "antennas": "MIMO", "height_m": 30.0, "values": level}
     rss = tuple(RssMap(**joint, coverage=share, foliage=mode) for mode, share in covered.items())
     text = first_words(dataclasses.replace(maps_data, rss=rss, **change)).replace("\N{MINUS SIGN}", "-")
     assert said in text
@@ -36,7 +36,7 @@ def test_the_cause_that_was_put_in_is_said(
 
 
 def test_several_heights_name_the_best_and_the_worst(maps_data: MapsData) -> None:
-    joint = {m.altitude_m: m.coverage for m in maps_data.rss if m.tower == "joint" and m.antennas == "SISO"}
+    joint = {m.height_m: m.coverage for m in maps_data.rss if m.tower == "joint" and m.antennas == "SISO"}
     text = first_words(maps_data)
     assert f"Best height: {max(joint, key=lambda h: joint[h]):g} m, {100 * max(joint.values()):.1f} %." in text
     assert f"Least coverage: {100 * min(joint.values()):.1f} % of the positions at 30 m" in text

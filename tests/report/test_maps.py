@@ -75,9 +75,9 @@ def test_cdf_counts_positions_out_of_coverage_as_below(maps_data):
     plate = next(maps_figures.plates(dataclasses.replace(maps_data, rss=maps)))
     assert len(plate.panels) > 1
     for title, content in plate.panels.items():
-        layers = [layer for layer in maps if f"{layer.altitude_m:g} m" == title]
+        layers = [layer for layer in maps if f"{layer.height_m:g} m" == title]
         for line, layer in zip(content["marks"], layers, strict=True):
-            assert line["y"][0] == pytest.approx(100 * (1 - layer.coverage), abs=200 / layer.rss_dbm.size)
+            assert line["y"][0] == pytest.approx(100 * (1 - layer.coverage), abs=200 / layer.values.size)
             assert line["y"][-1] == 100.0
 
 
@@ -86,19 +86,19 @@ def test_shares_of_ranks_are_read_at_their_heights(maps_data):
     bands = maps_figures.rank_shares(members)["marks"]
     assert len(members) > 1
     for member in members:
-        here = [int(np.flatnonzero(band["x"] <= member.altitude_m)[-1]) for band in bands]
+        here = [int(np.flatnonzero(band["x"] <= member.height_m)[-1]) for band in bands]
         shares = [band["high"][at] - band["low"][at] for band, at in zip(bands, here, strict=True)]
         np.testing.assert_allclose(shares, 100 * np.asarray(member.share), atol=1e-9)
     assert bands[0]["x"][0] >= 0.0
     (lonely,) = {tuple(band["x"]) for band in maps_figures.rank_shares(members[:1])["marks"]}
-    assert lonely[0] < members[0].altitude_m < lonely[1]
+    assert lonely[0] < members[0].height_m < lonely[1]
 
 
 def test_borders_only_where_towers_share_the_area(maps_data):
     with canvas.style():
         _, axes = maps_figures.map_axes(maps_data, 2)
-        maps_figures.draw_map(axes[0], maps_data, maps_data.rss[0].rss_dbm, highlight="LW1")
-        maps_figures.draw_map(axes[1], maps_data, maps_data.rss[0].rss_dbm)
+        maps_figures.draw_map(axes[0], maps_data, maps_data.rss[0].values, highlight="LW1")
+        maps_figures.draw_map(axes[1], maps_data, maps_data.rss[0].values)
     triangles = [sum(line.get_marker() == "^" for line in ax.get_lines()) for ax in axes]
     assert triangles == [1, 5]
     assert len(axes[1].get_lines()) - len(axes[0].get_lines()) == 2 * len(maps_data.borders_m) + 4
@@ -154,7 +154,7 @@ def test_nothing_at_all_and_nothing_covered(maps_data):
         title="t", name="n", site=maps_data.site, generated="", east_m=maps_data.east_m, north_m=maps_data.north_m
     )
     maps_html.maps_page(empty, [])
-    dark = dataclasses.replace(maps_data.rss[0], rss_dbm=np.full_like(maps_data.rss[0].rss_dbm, np.nan), coverage=0.0)
+    dark = dataclasses.replace(maps_data.rss[0], values=np.full_like(maps_data.rss[0].values, np.nan), coverage=0.0)
     for spec in maps_figures.figure_specs(dataclasses.replace(empty, rss=(dark,))):
         canvas.render(spec)
 

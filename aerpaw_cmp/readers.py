@@ -8,20 +8,43 @@ group ``aerpaw_cmp.readers``.
 from __future__ import annotations
 
 from .common.errors import InputError, UsageError
+from .common.text import counted
+from .common.units import AnyArray, BoolArray, FloatArray, IntArray
 from .logs import dictionary
 from .logs.readers import ENTRY_POINT_GROUP, Reader, ReadOptions
-from .logs.records import COLUMNS, Kind, ReadResult, RejectedLine, RejectedReason, Stream
-from .logs.rows import Rows, built, matched, of_ues
+from .logs.records import COLUMNS, KEPT_REJECTED, Attribute, Kind, ReadResult, RejectedLine, RejectedReason, Stream
+from .logs.rows import (
+    BOM,
+    NO_TIME,
+    RELATIVE,
+    Rows,
+    built,
+    checked_ranks,
+    instants_of,
+    matched,
+    mean_rank,
+    of_ues,
+    snr_stream,
+)
 from .logs.rows import reader as text_reader
-from .logs.text import NUMBER, TIME, ZONE, Lines, add_flag, first_lines, mostly, split
+from .logs.text import NUMBER, TIME, ZONE, Lines, add_flag, first_lines, match, mostly, no_flags, split
 
 __all__ = [
+    "BOM",
     "COLUMNS",
     "ENTRY_POINT_GROUP",
+    "KEPT_REJECTED",
+    "NO_TIME",
     "NUMBER",
+    "RELATIVE",
     "TIME",
     "ZONE",
+    "AnyArray",
+    "Attribute",
+    "BoolArray",
+    "FloatArray",
     "InputError",
+    "IntArray",
     "Kind",
     "Lines",
     "ReadOptions",
@@ -34,11 +57,18 @@ __all__ = [
     "UsageError",
     "add_flag",
     "built",
+    "checked_ranks",
+    "counted",
     "dictionary",
     "first_lines",
+    "instants_of",
+    "match",
     "matched",
+    "mean_rank",
     "mostly",
+    "no_flags",
     "of_ues",
+    "snr_stream",
     "split",
     "text_reader",
 ]

@@ -167,8 +167,8 @@ class Rows:
         return level, flag
 
     def rank(self, ri: FloatArray, *, none: BoolArray | None = None) -> dict[str, FloatArray]:
-        """Return the columns ``rank`` and ``ri_raw`` of reported indicators, by :func:`ranks`."""
-        return {"rank": ranks(ri, self.flag, none=none), "ri_raw": ri}
+        """Return the columns ``rank`` and ``ri_raw`` of reported indicators, by :func:`checked_ranks`."""
+        return {"rank": checked_ranks(ri, self.flag, none=none), "ri_raw": ri}
 
     def result(self, streams: Iterable[Stream | None]) -> ReadResult:
         """Return the streams that have rows, under unique names, with the account."""
@@ -267,9 +267,9 @@ def built(
     if comment.any():
         rows, column = rows[~comment], {name: cells[~comment] for name, cells in column.items()}
     column_time = column.pop("time")
-    relative, instants, valid = times(column_time, options, clock=clock, reader=reader)
+    relative, instants, valid = instants_of(column_time, options, clock=clock, reader=reader)
     rejected += _untimed(lines, rows, column_time, valid, clock)
-    flag = _text.flags(len(rows))
+    flag = _text.no_flags(len(rows))
     instants.flag(flag)
     if lines.unterminated and not closed:
         _text.add_flag(flag, rows == len(lines) - 1, _text.UNTERMINATED)
@@ -305,7 +305,9 @@ _MOST_S = 9.2e9
 _FLIGHT_S = 9.0e9
 
 
-def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> tuple[bool, _text.Instants, BoolArray]:
+def instants_of(
+    cells: AnyArray, options: ReadOptions, *, clock: str, reader: str
+) -> tuple[bool, _text.Instants, BoolArray]:
     """Return the instants of a column of times.
 
     Parameters
@@ -345,7 +347,7 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
     return origin is None, _text.Instants(ns.astype("datetime64[ns]"), none, none.copy()), valid
 
 
-def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = None) -> Stream | None:
+def snr_stream(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = None) -> Stream | None:
     """Return the SNR stream of one tower, with levels at or below the floor flagged ``out_of_coverage``.
 
     Parameters
@@ -367,7 +369,7 @@ def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = No
     )
 
 
-def ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = None, means: bool = False) -> FloatArray:
+def checked_ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = None, means: bool = False) -> FloatArray:
     """Return the ranks of indicators that count from one, NaN for other values, and add reasons to ``flag`` in place.
 
     Parameters
@@ -416,7 +418,7 @@ def mean_rank(
         See :func:`of_ues`.
     """
     flag = (rows.flag if pick is None else rows.flag[pick]).copy()
-    rank = ranks(ri, flag, none=ri == 0, means=True)
+    rank = checked_ranks(ri, flag, none=ri == 0, means=True)
     rank_mean = np.where((ri >= 1) & (ri <= 8), ri, np.nan)
     values = {"rank": rank, "ri_raw": ri, **columns, "rank_mean": rank_mean}
     about = {"ri_base": "one", "source": "CSI report, mean over the period"}
@@ -528,7 +530,7 @@ def reader(
     fields : int
         Number of fields of a table; lines with another number are rejected.
     clock : str
-        See :func:`aerpaw_cmp.logs.rows.times`.
+        See :func:`aerpaw_cmp.logs.rows.instants_of`.
     skip : callable, optional
         ``skip(data, lines)`` returns which of the matching lines (0-based) are comments.
 

@@ -256,7 +256,7 @@ def numbers(column: AnyArray) -> AnyArray:
     return np.asarray(np.where((column == b"") | (column == b"None"), b"nan", column).astype(np.float64))
 
 
-def flags(count: int) -> AnyArray:
+def no_flags(count: int) -> AnyArray:
     """Return an empty flag column."""
     column = np.empty(count, dtype=object)
     column.fill("")  # one object for all rows: np.full would create one per row

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
 
-from aerpaw_cmp.logs.readers import Reader
+from aerpaw_cmp.readers import Reader
 
 from ._origins import CLOCKS, HEIGHTS
 

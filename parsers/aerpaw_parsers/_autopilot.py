@@ -12,12 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from aerpaw_cmp.common.geodesy import rough_m
-from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
+from aerpaw_cmp.readers import NO_TIME, RELATIVE, ReadOptions, ReadResult, RejectedLine, Rows, Stream, counted
 
 from . import _pose, _stamps
 
@@ -128,17 +125,17 @@ def result(
     number = np.concatenate([item.number for item in series])
     owner = np.repeat(np.arange(len(series)), [len(item.time_s) for item in series])
     timed = np.abs(time_s) < _MOST_S
-    rejected = [*damaged, *(RejectedLine(int(i) + 1, _rows.NO_TIME, "") for i in np.sort(number[~timed]))]
+    rejected = [*damaged, *(RejectedLine(int(i) + 1, NO_TIME, "") for i in np.sort(number[~timed]))]
     lines = messages + len(damaged)
-    rows = _rows.Rows(
+    rows = Rows(
         reader=reader, options=options, lines=lines, row=number[timed], at=np.arange(int(timed.sum())),
         time=(np.round(time_s[timed] * 1e6).astype(np.int64) * 1000 + (zero_ns or 0)).astype("datetime64[ns]"),
-        flag=_text.flags(int(timed.sum())), blank=lines - int(timed.sum()) - len(rejected), rejected=rejected,
+        flag=_text.no_flags(int(timed.sum())), blank=lines - int(timed.sum()) - len(rejected), rejected=rejected,
         relative=zero_ns is None,
     )  # fmt: skip
     if not len(rows):
         return rows.result([])
-    rows.warnings += ["no message carries UTC: " + _rows.RELATIVE] if rows.relative else []
+    rows.warnings += ["no message carries UTC: " + RELATIVE] if rows.relative else []
     if len(flights) > 1:
         systems = ", ".join(str(flight.system) for flight in flights)
         rows.warnings.append(f"{len(flights)} vehicles (systems {systems}): each has a separate track")
@@ -151,7 +148,7 @@ def result(
 _ENDS = {"RSSI": "radio", "RemRSSI": "radio_remote", "Noise": "radio_noise", "RemNoise": "radio_remote_noise"}
 
 
-def _radio(rows: _rows.Rows, radio: Series, timed: BoolArray) -> Iterator[Stream | None]:
+def _radio(rows: Rows, radio: Series, timed: BoolArray) -> Iterator[Stream | None]:
     """Yield the levels and the noise at both ends of a telemetry link [dBm].
 
     Notes
@@ -169,7 +166,7 @@ def _radio(rows: _rows.Rows, radio: Series, timed: BoolArray) -> Iterator[Stream
             yield rows.stream("rss", channel, {"rss_db": level_dbm}, where=known, about=about_level)
 
 
-def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:
+def _track(rows: Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     if not len(rows):
         return None
     time_s = flight.position.time_s[timed]
@@ -213,7 +210,7 @@ def _apart(flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> l
     ]
 
 
-def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> FloatArray:
+def _height(rows: Rows, flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> FloatArray:
     """Return heights above home at take-off, or above the ground at rest or the first position if home is unknown."""
     altitude: FloatArray = values["altitude_m"]
     known = np.flatnonzero(np.isfinite(altitude))

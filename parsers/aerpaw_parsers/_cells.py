@@ -10,12 +10,7 @@ from typing import NamedTuple, cast
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.common.text import counted
-from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.records import Attribute, Stream
-from aerpaw_cmp.readers import dictionary
+from aerpaw_cmp.readers import AnyArray, Attribute, BoolArray, FloatArray, Rows, Stream, add_flag, counted, dictionary
 
 # RSRP beyond these is a sentinel (2147483647, 0) or a mistake.
 _END_DBM = -140.0
@@ -74,7 +69,7 @@ QUANTITIES = {"pci": "PCI", "arfcn": "ARFCN", "rsrp_dbm": "RSRP", "rsrq_db": "RS
 
 
 def streams(
-    rows: _rows.Rows, readings: pd.DataFrame | Iterable[Reading], *, source: str, quantity: str = "RSRP",
+    rows: Rows, readings: pd.DataFrame | Iterable[Reading], *, source: str, quantity: str = "RSRP",
     more: Mapping[str, Mapping[str, Attribute]] | None = None,
 ) -> list[Stream]:  # fmt: skip
     """Return a stream per cell, which is a radio access, PCI and carrier. Every reading with a level is a record.
@@ -137,7 +132,7 @@ def _serving(table: pd.DataFrame) -> FloatArray:
     return served
 
 
-def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attribute | None]) -> Stream:
+def _stream(rows: Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attribute | None]) -> Stream:
     """Return the stream of one cell, in the order of the log."""
     row, level = table["row"].to_numpy(), table["rsrp_dbm"].to_numpy(np.float64, copy=True)
     flag = rows.flag[row]
@@ -156,8 +151,8 @@ def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: str, about: Mapping[str
         rows.warnings.append(f"{cell}: {levels} of {_END_DBM:g} dBm, none within 10 dB above: read as out of coverage")
     if about["quantity"] == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
         rows.warnings.append(f"{cell}: RSSI is below RSRP, which is impossible: are the columns swapped?")
-    _text.add_flag(flag, outside, "out_of_coverage")
-    _text.add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")
+    add_flag(flag, outside, "out_of_coverage")
+    add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")
     level[outside] = np.nan
     values: dict[str, AnyArray] = {"rss_db": level, "serving": table["served"].to_numpy()}
     for name in QUALITIES:
@@ -174,7 +169,7 @@ def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: str, about: Mapping[str
 
 
 def named(
-    rows: _rows.Rows, name: str, values: FloatArray, *, unit: str = "", where: BoolArray | None = None,
+    rows: Rows, name: str, values: FloatArray, *, unit: str = "", where: BoolArray | None = None,
     about: Mapping[str, Attribute | None] | None = None, alone: bool = False,
 ) -> Stream | None:  # fmt: skip
     """Return the level or KPI stream of a column by its name, or a KPI if the name is unknown.

@@ -15,10 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs.records import Attribute
-from aerpaw_cmp.readers import dictionary
+from aerpaw_cmp.readers import AnyArray, Attribute, BoolArray, FloatArray, Rows, dictionary
 
 from . import _sheet
 
@@ -33,8 +30,8 @@ _LAG_ROWS, _LAG_SHARE = 2, 0.1
 
 
 def parts(
-    rows: _rows.Rows, sheet: _sheet.Sheet, *keys: str, found: bool = True, level: int | None = None
-) -> Iterator[tuple[str, _rows.Rows, _sheet.Sheet]]:
+    rows: Rows, sheet: _sheet.Sheet, *keys: str, found: bool = True, level: int | None = None
+) -> Iterator[tuple[str, Rows, _sheet.Sheet]]:
     """Divide a table by identity: yield the name of each part, its rows and its cells.
 
     Parameters
@@ -163,9 +160,7 @@ def of_a_cell(sheet: _sheet.Sheet) -> list[int]:
     ]
 
 
-def _marks(
-    rows: _rows.Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int], level: int | None
-) -> list[int]:
+def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int], level: int | None) -> list[int]:
     """Return the columns without a known quantity whose values are separate networks or devices.
 
     Such columns are the names of cells if there is no PCI, and columns that take turns with the level. A node, a beam

@@ -12,11 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.common.units import FloatArray, IntArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine
-from aerpaw_cmp.readers import dictionary
+from aerpaw_cmp.readers import FloatArray, IntArray, Lines, ReadResult, RejectedLine, Rows, dictionary, mean_rank
 
 _MOST_LINES = 5000
 # Most bytes of incomplete objects over several lines, as a limit on time.
@@ -47,7 +43,7 @@ class Objects:
     closed: bool = False
 
 
-def objects(lines: _text.Lines) -> Objects:
+def objects(lines: Lines) -> Objects:
     """Return the objects of a file, one per line or each over several lines.
 
     A file may also be one JSON array of objects, on one line or with its brackets on separate lines. Commas at the end
@@ -94,7 +90,7 @@ def _loaded(text: bytes) -> tuple[Any, bool]:
         return None, False
 
 
-def _several(lines: _text.Lines, first: int) -> tuple[Any, int]:
+def _several(lines: Lines, first: int) -> tuple[Any, int]:
     """Return the object that begins on a line, or None, and the line on which it ends."""
     end = lines.ends[min(first + _MOST_LINES, len(lines) - 1)]
     text = _bare(lines.data[lines.starts[first] : end]).decode("utf-8", "replace")
@@ -184,7 +180,7 @@ def listed(entry: dict[str, Any], name: str) -> list[dict[str, Any]]:
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
-def ue_ranks(rows: _rows.Rows, ues: list[tuple[int, dict[str, Any]]]) -> ReadResult:
+def ue_ranks(rows: Rows, ues: list[tuple[int, dict[str, Any]]]) -> ReadResult:
     """Return the rank streams of UEs, each with its row, with the keys that the dictionary finds."""
     entries = [ue for _, ue in ues]
     none = np.full(len(entries), np.nan)
@@ -195,7 +191,7 @@ def ue_ranks(rows: _rows.Rows, ues: list[tuple[int, dict[str, Any]]]) -> ReadRes
             before = columns.get(name, none)
             columns[name] = np.where(np.isnan(before), column(entries, key), before)
     pick = np.array([i for i, _ in ues], dtype=np.int64)
-    return rows.result(_rows.mean_rank(rows, columns.pop("rank"), columns, pick=pick))
+    return rows.result(mean_rank(rows, columns.pop("rank"), columns, pick=pick))
 
 
 _OF_UE = ("rank", "cqi", "mcs", "pci")

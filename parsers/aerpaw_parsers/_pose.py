@@ -10,11 +10,8 @@ import pandas as pd
 
 from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.limits import jumps_of
-from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
-from aerpaw_cmp.readers import ReadOptions, dictionary
+from aerpaw_cmp.readers import Attribute, Lines, ReadOptions, ReadResult, RejectedLine, Rows, Stream, dictionary
 
 from . import _sheet
 
@@ -27,7 +24,7 @@ Height = dict[str, Attribute | None]
 _MOST = 1e9
 
 
-def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> Stream | None:
+def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> Stream | None:
     """Return the telemetry stream of a table, or None if it has no position.
 
     Rows without a position are omitted unless all rows are.
@@ -109,7 +106,7 @@ _MOST_DOP, _NO_DOP, _NO_ACCURACY = 20.0, 99.0, 9999.0
 
 
 def of_readings(
-    lines: _text.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine],
+    lines: Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine],
     options: ReadOptions, *, reader: str,
 ) -> ReadResult:  # fmt: skip
     """Return the telemetry ``vehicle`` of readings with a time and a position, by :func:`._sheet.of_readings`."""
@@ -130,7 +127,7 @@ def whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> str:
     return f"{names[coarse.index(True)]!r} has whole degrees only" if coarse[0] != coarse[1] else ""
 
 
-def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
+def clean(rows: Rows, values: dict[str, AnyArray]) -> AnyArray:
     """Replace impossible positions and 0, 0 by NaN in a dictionary of columns, and return their mask."""
     latitude, longitude = values["latitude_deg"], values["longitude_deg"]
     # receivers write 0, 0 before their first fix
@@ -144,7 +141,7 @@ def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
 # --- heights ----------------------------------------------------------------------------------------------------------
 
 
-def _height(rows: _rows.Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
+def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
     """Return datum and values of the most useful column of heights, in the order of the dictionary."""
     column = sheet.find("altitude_m")
     if column is None:
@@ -176,7 +173,7 @@ UNSET_M = 0.01
 
 
 def above_home(
-    rows: _rows.Rows, time_s: FloatArray, altitude: FloatArray, home_s: FloatArray, home_m: FloatArray
+    rows: Rows, time_s: FloatArray, altitude: FloatArray, home_s: FloatArray, home_m: FloatArray
 ) -> FloatArray:
     """Return heights above the home at take-off, from altitudes above sea level of the aircraft and of home."""
     if (known_home := np.abs(home_m) > UNSET_M).any() and not known_home.all():
@@ -206,7 +203,7 @@ def home_was_set(altitude: FloatArray, height: FloatArray) -> bool:
     return not np.isfinite(apart).any() or np.nanmax(apart) > UNSET_M or np.nanmin(np.abs(height)) < _NEAR_ZERO_M
 
 
-def _with_moved_home(rows: _rows.Rows, sheet: _sheet.Sheet, height: FloatArray) -> tuple[FloatArray, bool]:
+def _with_moved_home(rows: Rows, sheet: _sheet.Sheet, height: FloatArray) -> tuple[FloatArray, bool]:
     """Return heights above the home at take-off, by a column above sea level if there is one, and whether home is set.
 
     Such a column shows that home moved in one step, or that the autopilot never knew it.
@@ -233,9 +230,7 @@ def _with_moved_home(rows: _rows.Rows, sheet: _sheet.Sheet, height: FloatArray) 
 _JITTER_M, _STEADY = 0.1, 0.9
 
 
-def above_takeoff(
-    rows: _rows.Rows, values: dict[str, AnyArray], datum: str, lost: BoolArray
-) -> tuple[FloatArray, Height]:
+def above_takeoff(rows: Rows, values: dict[str, AnyArray], datum: str, lost: BoolArray) -> tuple[FloatArray, Height]:
     """Return heights above take-off, and the attributes about their source.
 
     Heights above sea level or an unknown datum count from the height at rest on the ground before the climb, which is
@@ -284,7 +279,7 @@ def above_takeoff(
     return altitude - first, about
 
 
-def astray(rows: _rows.Rows, values: Mapping[str, AnyArray]) -> BoolArray:
+def astray(rows: Rows, values: Mapping[str, AnyArray]) -> BoolArray:
     """Return the rows (n,) whose position is a jump of the receiver, from which no height counts."""
     place = {name: values[name] for name in PLACE}
     return jumps_of(pd.DataFrame({"time": rows.time, "line": rows.row + 1, **place}))[0]
@@ -345,7 +340,7 @@ def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitud
 # --- angles -----------------------------------------------------------------------------------------------------------
 
 
-def _attitude(rows: _rows.Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
+def _attitude(rows: Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
     """Return angles in degrees by the unit in the name, by the program, or else by the values of all three."""
     columns = {key: column for key in ANGLES if (column := sheet.find(key)) is not None}
     values = {key: sheet.numbers(column) for key, column in columns.items()}

@@ -20,13 +20,10 @@ import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.limits import NEAR_DEG
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine
-from aerpaw_cmp.readers import ReadOptions, dictionary
+from aerpaw_cmp.readers import ReadOptions, ReadResult, RejectedLine, Rows, built, counted, dictionary, instants_of
 
 from . import _json, _stamps
 
@@ -688,7 +685,7 @@ def _fitted(rows: list[tuple[int, list[str]]], names: list[str]) -> list[tuple[i
     return rows
 
 
-def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None = None) -> _rows.Rows | None:
+def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None = None) -> Rows | None:
     """Return the rows of a table with their times, or None if the table has no times.
 
     Parameters
@@ -716,7 +713,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     start = next((found for text in (sheet.cells or [[]])[0] if (found := _START.search(text))), None)
     if clock.startswith("relative") and start is not None:
         options = replace(options, time_origin=options.time_origin or start[1])
-    timed = _rows.built(
+    timed = built(
         sheet.lines, sheet.row, {"time": cells}, options, reader=reader, reason=lambda _line: None, clock=clock,
         extra=sheet.rejected, markup=sheet.blank_rows, closed=sheet.closed,
     )  # fmt: skip
@@ -747,7 +744,7 @@ _OF_CLOCK = ("date", "zone", "gps_week", "gps_seconds")
 _START = re.compile(r'"start_time" ?: ?"([^"]{10,40})"')
 
 
-def _to_utc(timed: _rows.Rows, sheet: Sheet, column: int | None) -> None:
+def _to_utc(timed: Rows, sheet: Sheet, column: int | None) -> None:
     """Convert times in place to UTC if the name of their column has a scale without leap seconds."""
     words = {*(() if column is None else sheet.plain[column].split())}
     scale = next((scale for scale in _stamps.SCALES_S if scale in words), None)
@@ -796,7 +793,7 @@ def _moves_on(sheet: Sheet, column: int, standing: pd.Series[str], options: Read
     """Check whether a column of times advances while another shows one time, always the same if neither has a date."""
     try:
         clock, cells, _ = _times(sheet, column, options, mapped=False)
-        _, instants, valid = _rows.times(cells, options, clock=clock, reader="the table")
+        _, instants, valid = instants_of(cells, options, clock=clock, reader="the table")
     except (InputError, UsageError):
         return False
     if (clock.startswith("relative") and standing.nunique() > 1 and not options.time_origin) or not valid.all():
@@ -1007,7 +1004,7 @@ _MOST_APART_NS = 1_500_000_000
 _MOST_NS = 2.0**62
 
 
-def _finer(rows: _rows.Rows, milliseconds: FloatArray) -> None:
+def _finer(rows: Rows, milliseconds: FloatArray) -> None:
     """Add the fractions in a column of milliseconds to times in whole seconds (AirData)."""
     time = rows.time.astype(np.int64)
     known = np.isfinite(milliseconds)

@@ -15,10 +15,8 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.readers import AnyArray, FloatArray, InputError, IntArray, ReadOptions, UsageError
 
 _NAMED_ZONE = r"Z|[A-Z][A-Za-z]+/[A-Z][\w/]+|[A-Z]{2,5}(?![A-Za-z])|(?:UTC|GMT)? ?[+-]\d{1,2}(?::?\d\d)?"
 # Java writes the place after the offset: 10:00-04:00[America/New_York], 14:00Z[UTC].
@@ -360,7 +358,7 @@ def read(
     Returns
     -------
     clock : str
-        Argument of :func:`aerpaw_cmp.logs.rows.times`.
+        Argument of :func:`aerpaw_cmp.logs.rows.instants_of`.
     cells : array, shape (n,)
         Bytes or floats for it.
     warnings : list of str

@@ -14,9 +14,7 @@ import struct
 
 import numpy as np
 
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine
-from aerpaw_cmp.readers import dictionary
+from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, RejectedLine, dictionary
 
 from . import _autopilot
 

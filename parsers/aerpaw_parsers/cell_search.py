@@ -10,10 +10,7 @@ from __future__ import annotations
 
 import re
 
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, built, match, split
 
 from . import _cells, _stamps
 
@@ -35,11 +32,11 @@ def sniff(head: bytes) -> bool:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Return a level series per cell, or raise UsageError if no time zone is given."""
-    lines = _text.split(data)
-    row, groups = _text.match(lines, _ROW)
+    lines = split(data)
+    row, groups = match(lines, _ROW)
     texts = [(group[7] or group[0]).decode("ascii", "replace") for group in groups]
     clock, time, warnings = _stamps.read(texts, options)
-    rows = _rows.built(
+    rows = built(
         lines, row, {"time": time}, options, reader="cell_search", clock=clock,
         reason=lambda line: "an incomplete cell (torn line?)" if b"Found CELL" in line else None,
     )  # fmt: skip

@@ -12,30 +12,27 @@ from collections.abc import Iterator
 import numpy as np
 
 from aerpaw_cmp.common.units import BoolArray, IntArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _lines
-from aerpaw_cmp.logs import text as _time
-from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.readers import NUMBER, TIME, ZONE, Rows, Stream, match, snr_stream, split, text_reader
 
-_STAMP = rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] "
-_VALUE = re.compile(_STAMP + rb"(?P<tower>\d{1,2}):(?P<snr>" + _lines.NUMBER + rb"|nan|-?inf)[ \t]*\r?$", re.MULTILINE)
+_STAMP = rb"^\[(?P<time>" + TIME + ZONE + rb")\] "
+_VALUE = re.compile(_STAMP + rb"(?P<tower>\d{1,2}):(?P<snr>" + NUMBER + rb"|nan|-?inf)[ \t]*\r?$", re.MULTILINE)
 _BLOCK = re.compile(_STAMP + rb"[^\n]{0,40}?\[Controller-->UAV\] (?P<what>SNR|Download):[ \t]*\r?$", re.MULTILINE)
 
 
 def _no_level(data: bytes, row: IntArray) -> BoolArray:
     """Return the value lines whose block, by the last head before them, does not contain levels."""
-    heads, kinds = _lines.match(_lines.split(data), _BLOCK)
+    heads, kinds = match(split(data), _BLOCK)
     of_levels = np.array([False] + [kind[1] == b"SNR" for kind in kinds], dtype=bool)
     return np.asarray(~of_levels[np.searchsorted(heads, row)])
 
 
-def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
+def _streams(rows: Rows) -> Iterator[Stream | None]:
     tower, level = rows.number("tower"), rows.number("snr")
     for number in np.unique(tower[np.isfinite(tower)]).astype(int).tolist():
-        yield _rows.snr(rows, f"LW{number}", level, tower == number)
+        yield snr_stream(rows, f"LW{number}", level, tower == number)
 
 
-READER = _rows.reader(
+READER = text_reader(
     "controller_log", "AADM controller console: SNR of each tower", kinds=("rss",),
     sample="[2025-01-01 12:00:07.000002] 1:-1.250000",
     mark=re.compile(rb"^\[[^\n]{0,80}\[(?:Controller-->UAV|UAV-->Controller)\]", re.MULTILINE), row=_VALUE,

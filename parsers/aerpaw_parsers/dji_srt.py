@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import re
 
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, split
 
 from . import _pose
 
@@ -53,7 +51,7 @@ def _reading(text: bytes) -> dict[str, str]:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Return the telemetry ``vehicle``."""
-    lines = _text.split(data)
+    lines = split(data)
     begin = [match.start() for match in _BEGIN.finditer(data)]
     number = lines.number_at(begin).tolist()
     texts = [data[first:last] for first, last in zip(begin, [*begin[1:], len(data)], strict=False)]

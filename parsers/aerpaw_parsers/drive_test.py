@@ -16,10 +16,8 @@ import pandas as pd
 
 from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import Attribute, ReadResult, Stream
-from aerpaw_cmp.readers import dictionary
+from aerpaw_cmp.logs import dictionary
+from aerpaw_cmp.readers import Attribute, Reader, ReadOptions, ReadResult, Rows, Stream, checked_ranks, snr_stream
 
 from . import _cells, _identity, _pose, _sheet, aadm_snr, ardupilot_bin, nemo_csv, pose_csv, quectel_ri
 
@@ -253,7 +251,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     return of_sheet(rows, sheet)
 
 
-def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
+def of_sheet(rows: Rows, sheet: _sheet.Sheet) -> ReadResult:
     """Return the streams of a table with names of a drive-test program, for each device and network."""
     _settle_names(sheet)
     streams: list[Stream | None] = []
@@ -270,7 +268,7 @@ def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
     return rows.result(streams)
 
 
-def of_radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
+def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     """Return the levels, ranks and KPIs of a table."""
     cells, others, ranks = _places(sheet)
     of_row = (sheet.find(name) for name in ("technology", "serving", "neighbouring"))
@@ -328,7 +326,7 @@ def _is_statistic(sheet: _sheet.Sheet, column: int) -> bool:
     return any((m.quantity, m.rat, m.place) == (own.quantity, own.rat, own.place) for m in measured)
 
 
-def _of_a_scheduler(rows: _rows.Rows, sheet: _sheet.Sheet) -> bool:
+def _of_a_scheduler(rows: Rows, sheet: _sheet.Sheet) -> bool:
     """Check whether a base station wrote the table, with columns of the uplink only."""
     words = {word for name in sheet.plain for word in name.split()}
     if not (words & {"ul", "uplink", "pusch", "pucch"}) or words & {"dl", "downlink", "pdsch", "csi"}:
@@ -347,7 +345,7 @@ def _short(sheet: _sheet.Sheet, column: int) -> str:
     return "_".join(words.split()) or f"column{column + 1}"
 
 
-def _name_others(rows: _rows.Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: list[int]) -> None:
+def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: list[int]) -> None:
     """Report which of several columns of a cell's level was read, and how the others were read."""
     for cell in cells:
         level = cell.columns["rsrp_dbm"]
@@ -404,10 +402,10 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
         sheet.silence(unlike, [level, quality])
 
 
-def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
+def _rank(rows: Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     ri = sheet.numbers(column)
     flag, zero = rows.flag.copy(), _FROM_ZERO.search(sheet.plain[column]) is not None
-    values = {"rank": _rows.ranks(ri + zero, flag, none=(ri == 0) & (not zero), means=True), "ri_raw": ri}
+    values = {"rank": checked_ranks(ri + zero, flag, none=(ri == 0) & (not zero), means=True), "ri_raw": ri}
     name, cqi = re.sub(r"\W+", "_", sheet.plain[column]), sheet.find("CQI")
     idle = 0 if cqi is None or zero else int(((ri == 0) & (sheet.numbers(cqi) > 0)).sum())
     if 2 * idle > len(ri):
@@ -422,13 +420,13 @@ def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
 _FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero)\b")
 
 
-def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream | None:
+def _other(rows: Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream | None:
     values, name = sheet.numbers(column), sheet.plain[column]
     meaning, about = sheet.meanings[column], {"node": f"LW{tower[1]}"} if (tower := _TOWER.search(name)) else {}
     if meaning is not None and meaning.place.startswith("cell") and "cell" in name:
         about |= {"cell": meaning.place, "part": meaning.place}  # unlike 'rsrp 2', not a second reading of one cell
     if tower and name == f"snr {tower[0]}":
-        return _rows.snr(rows, about["node"], values)
+        return snr_stream(rows, about["node"], values)
     where, unit = np.isfinite(values), sheet.unit_read(column)
     if _is_statistic(sheet, column):
         about["statistic"] = "mean"

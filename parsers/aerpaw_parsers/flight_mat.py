@@ -20,14 +20,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.matfile import MAGIC, MAGIC_73, names_of, read_arrays
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
-from aerpaw_cmp.readers import dictionary
+from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, RejectedLine, Rows, Stream, counted, dictionary
 
 from . import _pose
 
@@ -142,8 +138,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     keep = np.flatnonzero(valid)
     timed = {name: column[keep] for name, column in table.items()}
     instants, warnings = _instants(timed, wall[keep], clock, options)
-    rows = _rows.Rows(
-        reader="flight_mat", options=options, lines=count, row=keep, time=instants.time, flag=_text.flags(len(keep)),
+    rows = Rows(
+        reader="flight_mat", options=options, lines=count, row=keep, time=instants.time, flag=_text.no_flags(len(keep)),
         rejected=[RejectedLine(int(i) + 1, "the row has no time", "") for i in np.flatnonzero(~valid)],
         warnings=[*warnings, *instants.warnings], relative=clock == _COUNTED and options.time_origin is None,
     )  # fmt: skip
@@ -164,7 +160,7 @@ def _common_length(table: dict[str, AnyArray]) -> int:
     return next(iter(lengths))
 
 
-def _track(rows: _rows.Rows, table: dict[str, AnyArray], clock: str) -> Stream | None:
+def _track(rows: Rows, table: dict[str, AnyArray], clock: str) -> Stream | None:
     fields = {name: _numeric(table[name], name) for name in _TELEMETRY if name in table}
     if not fields:
         return None
@@ -184,7 +180,7 @@ def _track(rows: _rows.Rows, table: dict[str, AnyArray], clock: str) -> Stream |
     return rows.stream("telemetry", "vehicle", values, flag=flag, source=clock)
 
 
-def _measured(rows: _rows.Rows, table: dict[str, AnyArray]) -> Iterator[Stream | None]:
+def _measured(rows: Rows, table: dict[str, AnyArray]) -> Iterator[Stream | None]:
     silent = _numeric(table[_DECODED], _DECODED) == 0 if _DECODED in table else np.zeros(len(rows), dtype=bool)
     for name in _LEVELS:
         if name not in table:

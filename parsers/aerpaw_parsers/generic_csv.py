@@ -17,11 +17,21 @@ import numpy as np
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions, unknown_name
-from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, Stream
-from aerpaw_cmp.readers import dictionary
+from aerpaw_cmp.logs import dictionary
+from aerpaw_cmp.logs.readers import unknown_name
+from aerpaw_cmp.readers import (
+    COLUMNS,
+    Kind,
+    Lines,
+    Reader,
+    ReadOptions,
+    ReadResult,
+    Rows,
+    Stream,
+    add_flag,
+    no_flags,
+    split,
+)
 
 from . import _identity, _pose, _sheet
 
@@ -117,7 +127,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If ``kind``, ``columns``, ``ri_base`` or ``timezone`` is missing, or a named column does not exist.
     """
-    lines = _text.split(data)
+    lines = split(data)
     if lines.blank.all():
         return ReadResult("generic_csv", (), len(lines), 0, len(lines))
     first = int(np.argmin(lines.blank))
@@ -156,7 +166,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     return rows.result(streams)
 
 
-def _tables(lines: _text.Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
+def _tables(lines: Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
     """Yield place, separator and names of lines that may be the header, from the first on."""
     for i in range(first, min(first + _sheet.TITLES, len(lines))):
         line = lines.raw(i).removeprefix(b"\xef\xbb\xbf")
@@ -164,9 +174,7 @@ def _tables(lines: _text.Lines, first: int) -> Iterator[tuple[int, str, list[str
         yield i, separator, [name.strip() for name in _sheet.split_row(line, separator)]
 
 
-def _stream(
-    rows: _rows.Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], name: str, unit: str
-) -> Stream | None:
+def _stream(rows: Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], name: str, unit: str) -> Stream | None:
     """Return the stream of mapped columns by the rules of its kind, with rows flagged that have words as numbers."""
     options, flag = rows.options, rows.flag.copy()
     values: dict[str, AnyArray] = {key: _values(sheet, column, key, options) for key, column in where.items()}
@@ -176,7 +184,7 @@ def _stream(
         rows.warnings += [f"{coarse}: is it the right column?"] if coarse else []
     about = _lifted(rows, sheet, values, where)
     odd = np.any([_odd(sheet, where[key]) for key in _VALUE[kind]], axis=0)
-    _text.add_flag(flag, odd, "no_number")
+    add_flag(flag, odd, "no_number")
     if odd.any():
         lines = counted(int(odd.sum()), "row is", "rows are")
         first = int(rows.row[odd][0]) + 1
@@ -184,7 +192,7 @@ def _stream(
     if kind == "rss":
         level, meaning = values["rss_db"], sheet.meanings[where["rss_db"]]
         silent = ~(level > options.floor_db) | ((unit == "dBm") & (level == 0))
-        _text.add_flag(flag, silent & ~odd, "out_of_coverage")
+        add_flag(flag, silent & ~odd, "out_of_coverage")
         values["rss_db"] = np.where(silent, np.nan, level)
         quantity = meaning.quantity.name if meaning is not None and meaning.quantity.can_be[0] < 0 else None
         about = {"unit": unit or "dB re full scale", "quantity": quantity, **about}
@@ -192,22 +200,22 @@ def _stream(
         base, ri = int(options.ri_base == "one"), values["ri_raw"]
         good = (ri >= base) & (ri <= 7 + base) & (ri == np.round(ri))
         none = np.isnan(ri) | ((ri == 0) & (base == 1))
-        _text.add_flag(flag, none & ~odd, "no_csi")
-        _text.add_flag(flag, ~good & ~none, "ri_out_of_range")
+        add_flag(flag, none & ~odd, "no_csi")
+        add_flag(flag, ~good & ~none, "ri_out_of_range")
         values["rank"] = np.where(good, ri + 1 - base, np.nan)
         about = {"ri_base": options.ri_base, **about}
     else:
         latitude, longitude, altitude = (values[key] for key in _pose.PLACE)
         # -999 is what loggers write without a fix, here within rounding
         lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (altitude > -998.5))
-        _text.add_flag(flag, lost, "no_fix")
+        add_flag(flag, lost, "no_fix")
         values |= {key: np.where(lost, np.nan, values[key]) for key in _pose.PLACE}
         for key in {"fix", "satellites"} & set(values):
             values[key] = np.where(np.isnan(values[key]), -1, values[key]).clip(-1, 255).astype(np.int64)
     return rows.stream(kind, name, values, flag=flag, about=about)
 
 
-def _lifted(rows: _rows.Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], where: dict[str, int]) -> _pose.Height:
+def _lifted(rows: Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], where: dict[str, int]) -> _pose.Height:
     """Convert altitudes above sea level or the ellipsoid, by the header, to heights above take-off."""
     height = sheet.meanings[where["altitude_m"]] if "altitude_m" in where else None
     if height is None or height.quantity.datum not in ("sea level", "ellipsoid") or "latitude_deg" not in values:
@@ -218,14 +226,14 @@ def _lifted(rows: _rows.Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], 
     return about
 
 
-def _track(rows: _rows.Rows, sheet: _sheet.Sheet, where: dict[str, int], device: str) -> Stream | None:
+def _track(rows: Rows, sheet: _sheet.Sheet, where: dict[str, int], device: str) -> Stream | None:
     """Return positions in the rows of levels as the track of the flight, as in a table merged by hand."""
     names = [name for name in COLUMNS["telemetry"][:-2] if name in where]
     if not {"latitude_deg", "longitude_deg"} <= set(names):
         return None
     values: dict[str, AnyArray] = {name: sheet.numbers(where[name]) for name in names}
     values[_pose.PLACE[0]] = np.where(_pose.without_fix(sheet), np.nan, values[_pose.PLACE[0]])
-    about, flag = _lifted(rows, sheet, values, where), _text.flags(len(rows))
+    about, flag = _lifted(rows, sheet, values, where), no_flags(len(rows))
     name = f"vehicle_{device}" if device else "vehicle"
     return rows.stream("telemetry", name, values, flag=flag, source="mapped columns", about=about)
 

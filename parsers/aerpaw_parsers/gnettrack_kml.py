@@ -11,9 +11,7 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common import kml
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, split
 
 from . import _sheet, drive_test
 
@@ -30,7 +28,7 @@ def sniff(head: bytes) -> bool:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Return cells, KPIs and the track of the phone, or raise UsageError if no time zone is given."""
-    lines = _text.split(data)
+    lines = split(data)
     begin = [match.start() for match in _PLACEMARK.finditer(data)]
     row = lines.number_at(begin)
     texts = [data[first:last] for first, last in zip(begin, [*begin[1:], len(data)][: len(begin)], strict=True)]

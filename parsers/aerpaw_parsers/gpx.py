@@ -14,12 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import IntArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
+from aerpaw_cmp.readers import InputError, Lines, Reader, ReadOptions, ReadResult, RejectedLine, Rows, Stream, split
 
 from . import _pose, _sheet, drive_test, pose_csv
 
@@ -65,7 +61,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If the times have no zone and none is given.
     """
-    lines, known = _text.split(data), _points(data)
+    lines, known = split(data), _points(data)
     points = [(at, cells) for at, cells in known if {*_NAMES.values()} <= set(cells)]
     if known and not points:
         raise InputError("a GPX track without times", expected="<time> in its points", cause="a route or a drawn track")
@@ -88,19 +84,19 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     return rows.result(streams)
 
 
-def _overlap(rows: _rows.Rows, track: IntArray) -> bool:
+def _overlap(rows: Rows, track: IntArray) -> bool:
     """Check whether tracks of one file run at the same time, as those of two devices do."""
     spans = sorted((rows.time[track == i].min(), rows.time[track == i].max()) for i in np.unique(track))
     return any(start < end for (_, end), (start, _) in pairwise(spans))
 
 
-def _track(rows: _rows.Rows, sheet: _sheet.Sheet, name: str) -> Stream | None:
+def _track(rows: Rows, sheet: _sheet.Sheet, name: str) -> Stream | None:
     stream = _pose.from_sheet(rows, sheet, name=name, source="GPX")
     # GPX has one height, ele, which receivers give above sea level
     return stream and replace(stream, attributes={**stream.attributes, "height_from": "program"})
 
 
-def _torn(lines: _text.Lines, data: bytes, row: object) -> list[RejectedLine]:
+def _torn(lines: Lines, data: bytes, row: object) -> list[RejectedLine]:
     """Return the lines on which an incomplete point begins."""
     tracked = b"<trkpt" in data
     starts = (start.start() for start in _START.finditer(data) if b"trkpt" in start[0] or not tracked)

@@ -11,12 +11,9 @@ import re
 
 import numpy as np
 
-from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.matfile import MAGIC, names_of, read_arrays
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import Attribute, ReadResult
+from aerpaw_cmp.readers import Attribute, InputError, Reader, ReadOptions, ReadResult, Rows
 
 _NAME = re.compile(r"(\d{6,12})(?:\.0)?_(\d{4,10})(?:\.0)?_(\d{4})_(\d\d)_(\d\d)_(\d\d)_(\d\d)_(\d\d)_?(\d{3,6})?")
 
@@ -55,9 +52,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         )
     with np.errstate(all="ignore"):  # damaged samples may be any number
         power = np.mean(np.abs(np.atleast_2d(samples)) ** 2, axis=1)
-    rows = _rows.Rows(
+    rows = Rows(
         reader="iq_burst", options=options, lines=1, row=np.zeros(1, dtype=np.int64), time=instants.time,
-        flag=_text.flags(1), warnings=list(instants.warnings),
+        flag=_text.no_flags(1), warnings=list(instants.warnings),
     )  # fmt: skip
     instants.flag(rows.flag)
     streams = []

@@ -11,10 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _lines
-from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.readers import NUMBER, FloatArray, Rows, Stream, text_reader
 
 from . import _cells
 
@@ -22,15 +19,15 @@ _NAMES = b"index rel_time_ms lat lon alt_m pdsch_rank nr_rsrp_dbm nr_sinr_db wb_
 _HEADER = re.compile(rb"(?:\xef\xbb\xbf)?" + b", ?".join(_NAMES) + rb"[ \t]*\r?")
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm", "sinr_db", "cqi")
 _LEVELS = (("rsrp_dbm", "nr_rsrp"), ("sinr_db", "nr_sinr"), ("cqi", "wb_cqi"))
-_CELL = r", ?(?P<%s>" + _lines.NUMBER.decode() + "|nan|NaN|)"
+_CELL = r", ?(?P<%s>" + NUMBER.decode() + "|nan|NaN|)"
 _ROW = re.compile(
-    rb"^\d{1,12}(?:\.0{0,20})?, ?(?P<time>" + _lines.NUMBER + rb")"
+    rb"^\d{1,12}(?:\.0{0,20})?, ?(?P<time>" + NUMBER + rb")"
     + "".join(_CELL % name for name in _COLUMNS).encode() + rb"[ \t]*\r?$",
     re.MULTILINE,
 )  # fmt: skip
 
 
-def pdsch_rank(rows: _rows.Rows, values: dict[str, FloatArray]) -> Stream | None:
+def pdsch_rank(rows: Rows, values: dict[str, FloatArray]) -> Stream | None:
     """Return the stream of the scheduled rank from ``ri_raw`` and further columns in ``values``."""
     raw = values["ri_raw"]
     missing = np.isnan(raw)
@@ -44,7 +41,7 @@ def pdsch_rank(rows: _rows.Rows, values: dict[str, FloatArray]) -> Stream | None
     return rows.stream("rank", name, values, ri_base="one", source="scheduled PDSCH rank", clock=clock)
 
 
-def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
+def _streams(rows: Rows) -> Iterator[Stream | None]:
     values = {name: rows.number(name) for name in _COLUMNS}
     levels = [
         _cells.named(rows, name, values[column], where=np.isfinite(values[column]), about={"rat": "nr"})
@@ -57,7 +54,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     yield track
 
 
-READER = _rows.reader(
+READER = text_reader(
     "nemo_csv", "Keysight Nemo NR rank and level, CSV with relative times", kinds=("rank", "rss", "kpi", "telemetry"),
     sample="12,-1500.0,35.7280001,-78.6960002,30.5,2.0,-81.5,28.0,12.0", header=_HEADER,
     row=_ROW, streams=_streams, fields=9, otherwise="a field is no number", clock="relative_ms",

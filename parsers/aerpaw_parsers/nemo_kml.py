@@ -11,13 +11,9 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common import kml
-from aerpaw_cmp.common.units import BoolArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.limits import FASTEST_MPS
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, Stream
-from aerpaw_cmp.readers import dictionary
+from aerpaw_cmp.readers import BoolArray, FloatArray, Reader, ReadOptions, ReadResult, Rows, Stream, built, dictionary
 
 from . import _cells, _pose
 from .nemo_csv import pdsch_rank
@@ -59,7 +55,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     names = ("time", "what", "value", "unit", *_POSITION)
     column = dict(zip(names, _text.columns([item.groups(b"") for item in reports], 7), strict=True))
     in_seconds = _in_seconds(*(_text.numbers(column[name]) for name in ("time", *_POSITION[:2])))
-    rows = _rows.built(
+    rows = built(
         lines, row, column, options, reader="nemo_kml", reason=_reason,
         clock="relative_s" if in_seconds else "relative_ms",
     )  # fmt: skip
@@ -98,7 +94,7 @@ _FEW = 4
 _SERVING = " (NR SpCell)"
 
 
-def _measured(rows: _rows.Rows, name: str, where: BoolArray) -> Stream | None:
+def _measured(rows: Rows, name: str, where: BoolArray) -> Stream | None:
     """Return the level or KPI stream of one quantity, under its name in Nemo's CSV."""
     unit = next((text for text in rows.text("unit") if text), "")
     short = f"nr {name.removesuffix(_SERVING)}" if name.endswith(_SERVING) else name

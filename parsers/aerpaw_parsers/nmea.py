@@ -14,9 +14,7 @@ from operator import xor
 
 import numpy as np
 
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+from aerpaw_cmp.readers import Lines, Reader, ReadOptions, ReadResult, RejectedLine, mostly, split
 
 from . import _pose
 
@@ -34,10 +32,10 @@ _PLACE = ("latitude [ddmm.mmmm]", "lat dir", "longitude [ddmm.mmmm]", "lon dir")
 
 def sniff(head: bytes) -> bool:
     """Check whether most of the first lines are sentences, and one of them has positions."""
-    return _text.mostly(head, _BEGIN) and re.search(rb"\$..(?:GGA|GNS|RMC),", head) is not None
+    return mostly(head, _BEGIN) and re.search(rb"\$..(?:GGA|GNS|RMC),", head) is not None
 
 
-def _sentences(lines: _text.Lines, rejected: list[RejectedLine]) -> list[tuple[int, str, str, list[str]]]:
+def _sentences(lines: Lines, rejected: list[RejectedLine]) -> list[tuple[int, str, str, list[str]]]:
     """Return the 0-based line, talker, kind and fields (ten or more) of each intact sentence."""
     intact, unchecked = [], b"*" not in lines.data
     for i in np.flatnonzero(~lines.blank).tolist():
@@ -60,7 +58,7 @@ def _day_s(clock: str) -> float:
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Return the telemetry ``vehicle`` of the talker that writes most positions."""
     rejected: list[RejectedLine] = []
-    lines = _text.split(data)
+    lines = split(data)
     sentences = _sentences(lines, rejected)
     placed = Counter((kind, talker) for _, talker, kind, f in sentences if kind in _PLACED and f[4])
     source = max(placed, key=lambda item: (_PLACED.index(item[0]), placed[item]), default=("GGA", ""))

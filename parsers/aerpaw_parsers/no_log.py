@@ -10,11 +10,8 @@ import re
 from collections.abc import Callable
 
 from aerpaw_cmp.common import kml
-from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs import matfile
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.readers import InputError, Reader, ReadOptions, ReadResult, mostly
 
 _STAMP = rb"(?:\[?\d{4}-\d\d-\d\d[ T][0-9:.]{8,18}\]?[ ,]{1,2})"
 _UHD = re.compile(rb"\[(?:INFO|WARNING|ERROR)\] \[(?:UHD|B200|X300|MULTI_USRP|GPS|USRP|OV|CONFIG|AD936X|CORES)\]")
@@ -35,7 +32,7 @@ def _not(*tests: _Test) -> _Test:
 
 
 def _mostly(pattern: bytes) -> _Test:
-    return lambda head: _text.mostly(head, re.compile(pattern))
+    return lambda head: mostly(head, re.compile(pattern))
 
 
 _JSON_LEVELS = rb'(?i)"(?:rsrp|rssi|rscp|rss_\w{1,8}|sinr|pci)"\s*:'

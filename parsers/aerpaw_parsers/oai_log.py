@@ -17,10 +17,7 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, IntArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.readers import TIME, ZONE, Lines, Reader, ReadOptions, ReadResult, built, checked_ranks, of_ues, split
 
 _CSI = re.compile(rb"\bUE (?P<rnti>[0-9a-f]{4}):? [^\n]{0,120}?\bCQI (?P<cqi>\d{1,2}),? RI (?P<ri>\d{1,2}),? PMI")
 _LEVEL = re.compile(
@@ -32,7 +29,7 @@ _UE = re.compile(
     rb"SINR = (?P<sinr>-?\d{1,3}) dB, CQI = (?P<cqi>\d{1,2})"
 )
 _UE_LEVEL = re.compile(rb"\[UE \d{1,2}\] RSRP = (?P<rsrp>-?\d{1,3}) dBm")
-_STAMP = re.compile(rb"^\[?(" + _text.TIME + _text.ZONE + rb")\]?[ :]")
+_STAMP = re.compile(rb"^\[?(" + TIME + ZONE + rb")\]?[ :]")
 _SECONDS = re.compile(rb"^(?:\x1b\[[0-9;]{0,8}m)?(\d{1,10}\.\d{3,9}) ")
 _FRAME = re.compile(rb"Frame\.Slot \d")
 _FRAMES_S = 1.28
@@ -47,7 +44,7 @@ def sniff(head: bytes) -> bool:
     ) is not None  # fmt: skip
 
 
-def _rows_of(lines: _text.Lines) -> tuple[IntArray, list[dict[str, bytes]], str, AnyArray]:
+def _rows_of(lines: Lines) -> tuple[IntArray, list[dict[str, bytes]], str, AnyArray]:
     """Return the lines with a quantity, their values, the clock, and the times."""
     row, quantities, stamps = [], [], []
     stamp, seconds, frame = b"", b"", -1
@@ -75,9 +72,9 @@ def _rows_of(lines: _text.Lines) -> tuple[IntArray, list[dict[str, bytes]], str,
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Return the rank stream ``oai`` and RSRP, or raise UsageError if the zone of stamps is unknown."""
-    lines = _text.split(data)
+    lines = split(data)
     row, quantities, clock, time = _rows_of(lines)
-    rows = _rows.built(lines, row, {"time": time}, options, reader="oai_log", reason=lambda _line: None, clock=clock)
+    rows = built(lines, row, {"time": time}, options, reader="oai_log", reason=lambda _line: None, clock=clock)
     timed = [quantities[i] for i in rows.at.tolist()]
     names = ("ri", "cqi", "sinr", "rsrp", "meas")
     value = {name: np.array([float(item.get(name, b"nan")) for item in timed]) for name in names}
@@ -85,17 +82,17 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     reported = np.flatnonzero(~np.isnan(value["ri"]))
     ri = value["ri"][reported]
     flag = rows.flag[reported].copy()
-    columns = {"rank": _rows.ranks(ri, flag), "ri_raw": ri, "cqi": value["cqi"][reported], "rnti": rnti[reported]}
+    columns = {"rank": checked_ranks(ri, flag), "ri_raw": ri, "cqi": value["cqi"][reported], "rnti": rnti[reported]}
     columns |= {"sinr_db": value["sinr"][reported], "rsrp_dbm": value["rsrp"][reported]}
     about = {"ri_base": "one", "source": "CSI report, last one"}
-    ranks = _rows.of_ues(rows, "rank", options.channel or "oai", columns, pick=reported, flag=flag, about=about)
+    ranks = of_ues(rows, "rank", options.channel or "oai", columns, pick=reported, flag=flag, about=about)
     # a gNB prints 0 of 0 measurements
     measured = np.flatnonzero(~np.isnan(value["rsrp"]) & (np.isnan(value["meas"]) | (value["meas"] > 0)))
     level, flag = rows.level(value["rsrp"])
     levels = {"rss_db": level[measured], "serving": np.ones(len(measured)), "rnti": rnti[measured]}
     about = {"channel": options.channel or "nr_rsrp", "unit": "dBm", "quantity": "RSRP", "rat": "nr"}
-    of_ues = _rows.of_ues(rows, "rss", "nr_rsrp", levels, pick=measured, flag=flag[measured], about=about)
-    return rows.result([*ranks, *of_ues])
+    per_ue = of_ues(rows, "rss", "nr_rsrp", levels, pick=measured, flag=flag[measured], about=about)
+    return rows.result([*ranks, *per_ue])
 
 
 READER = Reader(

@@ -14,10 +14,7 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, Rows, Stream, built, match, matched, split
 
 from . import _cells, _json, _pose
 
@@ -70,13 +67,13 @@ def _text_cells(line: bytes) -> list[dict[str, Any]] | None:
 
 def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
     """Return the cells of the text of 2023: ``CELL_LOG_START,<ms of UTC>,...``, a block per cell."""
-    lines = _text.split(data)
-    row, groups = _text.match(lines, _TEXT)
+    lines = split(data)
+    row, groups = match(lines, _TEXT)
     cells = [_text_cells(lines.raw(i)) for i in row.tolist()]
     odd = [lines.reject(i, "a block of other fields (quantities switched off in the app?)")
              for i, block in zip(row.tolist(), cells, strict=True) if block is None]  # fmt: skip
     sound = np.array([item is not None for item in cells], dtype=bool)
-    rows = _rows.built(
+    rows = built(
         lines, row[sound], {"time": np.array([float(group[0]) for group in groups], dtype=np.float64)[sound]}, options,
         reader="pawprints", reason=lambda _line: "not a whole 'CELL_LOG_START ... CELL_LOG_STOP' (torn line?)",
         clock="epoch_ms", extra=odd,
@@ -97,7 +94,7 @@ _GPS_SECONDS = re.compile(_GPS_TEXT % rb"(?:\d{13},)?(?P<time>[\d.]{1,20})", re.
 def _read_location(data: bytes, options: ReadOptions) -> ReadResult:
     """Return the positions of the text of 2023, with seconds since the start or milliseconds of UTC."""
     dated = len(_GPS_EPOCH.findall(data)) == len(_GPS_SECONDS.findall(data))
-    rows = _rows.matched(
+    rows = matched(
         data, _GPS_EPOCH if dated else _GPS_SECONDS, options, reader="pawprints",
         reason=lambda _line: "not a whole 'GPS_LOG_START ... GPS_LOG_STOP' (torn line?)",
         clock="epoch_ms" if dated else "relative_s",
@@ -105,7 +102,7 @@ def _read_location(data: bytes, options: ReadOptions) -> ReadResult:
     return rows.result([_placed(rows, *(rows.number(name) for name in ("latitude", "longitude", "altitude")))])
 
 
-def _nr(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
+def _nr(rows: Rows, entries: list[dict[str, Any]]) -> Stream | None:
     """Return the level of the NR leg, which the phone reports separately and without a PCI."""
     legs = [_json.inside(item, "nr_signal_strength") for item in entries]
     level = _json.column(legs, "ss_rsrp")
@@ -120,14 +117,14 @@ def _nr(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
     )  # fmt: skip
 
 
-def _track(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
+def _track(rows: Rows, entries: list[dict[str, Any]]) -> Stream | None:
     """Return the positions in the objects or in their ``location``."""
     places = [{**_json.inside(item, "gps"), **_json.inside(item, "location"), **item} for item in entries]
     names = (("latitude", "lat"), ("longitude", "lon", "lng"), ("altitude", "alt"))
     return _placed(rows, *(_json.column(places, *keys) for keys in names))
 
 
-def _placed(rows: _rows.Rows, latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> Stream | None:
+def _placed(rows: Rows, latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> Stream | None:
     if not np.isfinite(latitude).any():
         return None
     values: dict[str, AnyArray] = {"latitude_deg": latitude, "longitude_deg": longitude}
@@ -144,11 +141,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         return _read_text(data, options)
     if data[:4096].lstrip().startswith(b"GPS_LOG_START,"):
         return _read_location(data, options)
-    lines = _text.split(data)
+    lines = split(data)
     parsed = _json.objects(lines)
     entries = parsed.values
     time = _json.column(entries, "companion_abs_time", "abs_time")
-    rows = _rows.built(
+    rows = built(
         lines, parsed.row, {"time": time}, options, reader="pawprints", reason=_json.bracket, clock="epoch_ms",
         extra=parsed.rejected, markup=parsed.more, closed=parsed.closed,
     )  # fmt: skip

@@ -6,10 +6,7 @@ heights above the first position. Times without a zone are local unless the name
 
 from __future__ import annotations
 
-from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
-from aerpaw_cmp.readers import dictionary
+from aerpaw_cmp.readers import InputError, Reader, ReadOptions, ReadResult, dictionary
 
 from . import _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, rtklib_pos, vehicle_out
 

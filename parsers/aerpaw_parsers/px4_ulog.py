@@ -16,11 +16,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from aerpaw_cmp.common.text import counted
-from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine
-from aerpaw_cmp.readers import dictionary
+from aerpaw_cmp.readers import AnyArray, FloatArray, Reader, ReadOptions, ReadResult, RejectedLine, counted, dictionary
 
 from . import _autopilot
 

@@ -11,10 +11,8 @@ import re
 
 import numpy as np
 
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
+from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, RejectedLine, Rows, Stream, built, checked_ranks
 
 from . import _cells
 
@@ -70,7 +68,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     row = np.array([item[0] for item in entries], dtype=np.int64)
     time = _text.cells([item[1] for item in entries])
     talk, column = lambda _line: None, {"time": time}
-    rows = _rows.built(lines, row, column, options, reader="quectel_console", reason=talk, extra=rejected)
+    rows = built(lines, row, column, options, reader="quectel_console", reason=talk, extra=rejected)
     timed = [entries[i] for i in rows.at.tolist()]
     readings = [
         _cells.reading(i, value, rat="lte" if title == "LTE" else "nr", serving=True)
@@ -80,12 +78,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     return rows.result([*ranks, *_cells.streams(rows, readings, source="Quectel console")])
 
 
-def _rank(rows: _rows.Rows, name: str, values: list[tuple[str, dict[str, float]]]) -> Stream | None:
+def _rank(rows: Rows, name: str, values: list[tuple[str, dict[str, float]]]) -> Stream | None:
     where = np.array([title == name for title, _ in values], dtype=bool)
     column = {key: np.array([value.get(key, np.nan) for _, value in values]) for key in ("ri", "cqi", "mcs")}
     ri = column["ri"]
     flag = rows.flag.copy()
-    content = {"rank": _rows.ranks(ri, flag, none=ri == 0), "ri_raw": ri, "cqi": column["cqi"], "mcs": column["mcs"]}
+    content = {"rank": checked_ranks(ri, flag, none=ri == 0), "ri_raw": ri, "cqi": column["cqi"], "mcs": column["mcs"]}
     return rows.stream("rank", name, content, where=where, flag=flag, channel=name, ri_base="one", source="CSI report")
 
 

@@ -30,10 +30,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, IntArray
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import Attribute, ReadResult, Stream
+from aerpaw_cmp.readers import Attribute, Reader, ReadOptions, ReadResult, Rows, Stream, built, checked_ranks
 
 _C = rb"[^,\n]{0,80}"
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
@@ -144,13 +142,13 @@ def _table(lines: _text.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
 _NSA_FORM, _ALONE = 3, {"lte": 4, "nr5g": 5}
 
 
-def _rank(rows: _rows.Rows, rat: str) -> Stream | None:
+def _rank(rows: Rows, rat: str) -> Stream | None:
     """Return the rank stream of one radio access."""
     mcs, ri, cqi, pmi = (rows.number(f"{rat}_{name}") for name in ("mcs", "ri", "cqi", "pmi"))
     flag = rows.flag.copy()
     idle = (mcs == 0) & (ri == 0) & (cqi == 0) & (pmi == 0)
     values = {
-        "rank": _rows.ranks(ri, flag, none=ri == 0),
+        "rank": checked_ranks(ri, flag, none=ri == 0),
         "ri_raw": ri,
         "mcs": np.where(idle | ~((mcs >= 0) & (mcs <= 31)), np.nan, mcs),
         "cqi": np.where(idle | ~((cqi >= 0) & (cqi <= 15)), np.nan, cqi),
@@ -159,7 +157,7 @@ def _rank(rows: _rows.Rows, rat: str) -> Stream | None:
     return rows.stream("rank", name, values, where=where, flag=flag, channel=name, ri_base="one", source="CSI report")
 
 
-def _levels(rows: _rows.Rows, rat: str, where: BoolArray) -> Iterator[Stream | None]:
+def _levels(rows: Rows, rat: str, where: BoolArray) -> Iterator[Stream | None]:
     """Yield the RSRP of one radio access, in one stream or a stream per cell if the log has several cells."""
     rsrp, pci, arfcn = (rows.number(f"{rat}_{name}") for name in ("rsrp", "pci", "arfcn"))
     flag = rows.flag.copy()
@@ -205,7 +203,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """
     lines = _text.split(data)
     row, table = _table(lines)
-    rows = _rows.built(lines, row, table, options, reader="quectel_csv", reason=_reason)
+    rows = built(lines, row, table, options, reader="quectel_csv", reason=_reason)
     form = rows.columns["form"]
     nr = np.isin(form, (2, _NSA_FORM)) | ((form == 1) & (rows.columns["nr_rsrp"] != b""))
     levels = (*_levels(rows, "lte", form == 1), *_levels(rows, "nr", nr))

@@ -11,20 +11,17 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _lines
-from aerpaw_cmp.logs import text as _time
-from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.readers import BOM, NUMBER, TIME, ZONE, Rows, Stream, text_reader
 
-_CELL = rb', ?"?(?P<%s>' + _lines.NUMBER + rb'|nan|NaN|)"?'
+_CELL = rb', ?"?(?P<%s>' + NUMBER + rb'|nan|NaN|)"?'
 _ROW = re.compile(
-    rb'^"?\d{1,12}(?:\.0)?"?, ?"?(?P<time>' + _time.TIME + _time.ZONE + rb')"?'
+    rb'^"?\d{1,12}(?:\.0)?"?, ?"?(?P<time>' + TIME + ZONE + rb')"?'
     + b"".join(_CELL % name for name in (b"longitude_deg", b"latitude_deg", b"altitude_m", b"ri")) + rb"[ \t]*\r?$",
     re.MULTILINE,
 )  # fmt: skip
 
 
-def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
+def _streams(rows: Rows) -> Iterator[Stream | None]:
     place = {name: rows.number(name) for name in ("latitude_deg", "longitude_deg", "altitude_m")}
     ri, lost = rows.number("ri"), ~((np.abs(place["latitude_deg"]) <= 90) & (np.abs(place["longitude_deg"]) <= 180))
     values = rows.rank(ri, none=ri == 0) | {name: np.where(lost, np.nan, column) for name, column in place.items()}
@@ -33,13 +30,13 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     yield rows.stream("rank", name, values, channel=name, ri_base="one", source="CSI report")
 
 
-READER = _rows.reader(
+READER = text_reader(
     "quectel_ri",
     "published Quectel NR rank table (six columns)",
     kinds=("rank",),
     sample="8,2025-01-01 12:00:07.250,-78.6960001,35.7280001,30.1,2",
     header=re.compile(
-        _rows.BOM + rb'(?i:"?ID"?, ?"?Time and date"?, ?"?Longitude"?, ?"?Latitude"?, ?"?Altitude"?, ?"?NR RI"?)\s*'
+        BOM + rb'(?i:"?ID"?, ?"?Time and date"?, ?"?Longitude"?, ?"?Latitude"?, ?"?Altitude"?, ?"?NR RI"?)\s*'
     ),
     row=_ROW,
     streams=_streams,

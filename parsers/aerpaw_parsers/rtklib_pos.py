@@ -10,10 +10,7 @@ import re
 
 import numpy as np
 
-from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.readers import InputError, Reader, ReadOptions, ReadResult, split
 
 from . import _pose, _stamps
 
@@ -51,7 +48,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     InputError
         If the solution has no latitude in degrees.
     """
-    lines, rejected, readings, header = _text.split(data), [], [], _HEADER.search(data)
+    lines, rejected, readings, header = split(data), [], [], _HEADER.search(data)
     if header is not None and header[2] != b"latitude(deg)":
         raise InputError(
             f"an RTKLIB solution of {ascii(header[2])[2:-1]}", expected="latitude and longitude in degrees",

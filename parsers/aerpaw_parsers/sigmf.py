@@ -22,10 +22,8 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.rows import RELATIVE, instants_of
+from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, RejectedLine, Rows, Stream, no_flags
 
 from . import _json, _pose, _stamps
 
@@ -85,20 +83,20 @@ def _times(captures: list[dict[str, Any]], own: str) -> list[str]:
     return [str(item) for stamp in stamps for item in _list(stamp)]
 
 
-def _rows_of(texts: list[str], options: ReadOptions) -> _rows.Rows:
+def _rows_of(texts: list[str], options: ReadOptions) -> Rows:
     """Return the values with times as rows, which are the lines of the account."""
     clock, cells, warnings = _stamps.read(texts, options)
-    relative, instants, valid = _rows.times(cells, options, clock=clock, reader="sigmf")
+    relative, instants, valid = instants_of(cells, options, clock=clock, reader="sigmf")
     keep = np.flatnonzero(valid)
-    flag = _text.flags(len(texts))
+    flag = no_flags(len(texts))
     instants.flag(flag)
-    return _rows.Rows(
+    return Rows(
         reader="sigmf", options=options, lines=len(texts), row=keep, at=keep, time=instants.time[keep], flag=flag[keep],
-        warnings=[*warnings, *instants.warnings, *([_rows.RELATIVE] if relative else [])], relative=relative,
+        warnings=[*warnings, *instants.warnings, *([RELATIVE] if relative else [])], relative=relative,
     )  # fmt: skip
 
 
-def _at_frequencies(rows: _rows.Rows, channel: str, values: FloatArray, frequency_hz: FloatArray) -> Iterator[Stream]:
+def _at_frequencies(rows: Rows, channel: str, values: FloatArray, frequency_hz: FloatArray) -> Iterator[Stream]:
     """Yield the levels of a channel, one series per frequency of the captures."""
     level, flag = rows.level(np.where(np.isfinite(values), values, np.nan)[rows.at])
     unit, tuned_hz = rows.options.unit or "dB re full scale", frequency_hz[rows.at]
@@ -149,7 +147,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     )  # fmt: skip
 
 
-def _levels(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tuple[_rows.Rows, Stream]]:
+def _levels(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tuple[Rows, Stream]]:
     texts = _times(captures, "measurement:time_stamp")
     for name, channel in _LEVELS.items():
         values = _column(captures, "measurement:values", name)
@@ -164,7 +162,7 @@ def _levels(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tu
             yield rows, stream
 
 
-def _track(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tuple[_rows.Rows, Stream]]:
+def _track(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tuple[Rows, Stream]]:
     """Yield the positions of the measurements, of the GPS, or of the receiver."""
     fields = ("measurement:values", "measurement:time_stamp"), ("gps:position", "gps:time_stamp")
     for field, time in (*fields, ("core:rx_location", "core:timestamp"), ("geolocation", "core:datetime")):
@@ -191,7 +189,7 @@ def _data_name(options: ReadOptions) -> str:
 
 def _powers(
     meta: dict[str, Any], captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str]
-) -> Iterator[tuple[_rows.Rows, Stream]]:
+) -> Iterator[tuple[Rows, Stream]]:
     """Yield the power of each burst of the samples, for captures with their global fields."""
     common = _json.inside(meta, "global")
     samples, full_scale = _samples(common, _json.listed(meta, "captures"), options)

@@ -17,12 +17,10 @@ from itertools import dropwhile
 
 import numpy as np
 
-from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.files import Column
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import KEPT_REJECTED, ReadResult, Stream
+from aerpaw_cmp.readers import KEPT_REJECTED, Reader, ReadOptions, ReadResult, Stream, counted
 
 from . import _identity
 
@@ -305,7 +303,7 @@ def _stream(
     instants = _text.wall_to_utc(samples.wall, options, needed_by="sounder_log")
     notes += instants.warnings
     samples.wall = _NONE
-    flag = _text.flags(len(samples.line))
+    flag = _text.no_flags(len(samples.line))
     instants.flag(flag)
     _text.add_flag(flag, repeated, "repeated")
     silent = ~(samples.value > options.floor_db)

@@ -17,13 +17,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _time
-from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.readers import TIME, ZONE, Rows, Stream, of_ues, text_reader
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _ROW = re.compile(
-    rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] *"
+    rb"^\[(?P<time>" + TIME + ZONE + rb")\] *"
     rb"(?:(?:lte|nr)(?: +\d{1,4}(?= +[0-9a-fA-F]{2,5} ))? +)?(?P<rnti>[0-9a-fA-F]{1,5})"
     + _N % b"cqi" + _N % b"ri" + _N % b"mcs"
     + rb" +[0-9.]{1,12}[kMG]?(?:(?: +\d{1,9}){2})? +\d{1,3}% [^\n]{0,160}$",
@@ -33,7 +31,7 @@ _CHANNELS = re.compile(rb"^\[[^\]\n]{19,40}\] *Opening (?P<kind>\d{1,2}) channel
 _MIXED = "srsENB prints the truncated mean of the ranks reported in a second: 1 may be a mix of 1 and 2"
 
 
-def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
+def _streams(rows: Rows) -> Iterator[Stream | None]:
     """Yield the rank ``srsenb``, with the number of transmit channels in the console as the largest rank."""
     ri = rows.number("ri")
     rows.warnings += [_MIXED] if (ri > 0).any() else []
@@ -43,10 +41,10 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     rnti = np.array([int(text, 16) for text in rows.text("rnti")], dtype=np.float64)
     values = rows.rank(ri, none=ri == 0) | {"cqi": rows.number("cqi"), "mcs": rows.number("mcs"), "rnti": rnti}
     about = {"ri_base": "one", "source": "CSI report, truncated mean", "ports": ports}
-    yield from _rows.of_ues(rows, "rank", rows.options.channel or "srsenb", values, flag=rows.flag, about=about)
+    yield from of_ues(rows, "rank", rows.options.channel or "srsenb", values, flag=rows.flag, about=about)
 
 
-READER = _rows.reader(
+READER = text_reader(
     "srsenb_log", "srsENB console: rank indicator (0 = no report)", kinds=("rank",),
     sample="[2025-01-01 12:00:07.000000] lte   46   11   2    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k",
     mark=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:rat +(?:pci +)?)?rnti +cqi +ri +mcs", re.MULTILINE), row=_ROW,

@@ -17,10 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, built, matched, mean_rank
 
 from . import _json, _stamps
 
@@ -57,14 +55,14 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     own_stamp = begun is not None and not begun[0].startswith(b"[")  # not written by ts
     if own_stamp and options.clock is None:
         options = replace(options, clock="utc")  # the program's log and metrics are in UTC
-    rows = _rows.matched(
+    rows = matched(
         data, pattern, options, reader="srsran_gnb",
         reason=lambda line: "an incomplete line of the table (torn line?)" if _TORN.match(line) else None,
     )  # fmt: skip
     rnti = np.array([int(text, 16) if text else np.nan for text in rows.text("rnti")], dtype=np.float64)
     columns = {"cqi": rows.number("cqi"), "mcs": rows.number("mcs"), "rnti": rnti, "pci": rows.number("pci")}
     rows.clock_from = rows.clock_from or ("program" if own_stamp else None)
-    return rows.result(_rows.mean_rank(rows, rows.number("ri"), columns))
+    return rows.result(mean_rank(rows, rows.number("ri"), columns))
 
 
 def sniff_json(head: bytes) -> bool:
@@ -94,7 +92,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     clock, time, warnings = _stamps.read(texts, options)
     # an object without UEs is valid and not a truncated line
     mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host: no record is made of them
-    rows = _rows.built(
+    rows = built(
         lines, row[with_ue], {"time": time}, options, reader="srsran_json", reason=_json.bracket, clock=clock,
         extra=reports.rejected, markup=np.concatenate((mute, reports.more)), closed=reports.closed,
     )  # fmt: skip

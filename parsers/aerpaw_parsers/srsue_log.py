@@ -13,22 +13,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _time
-from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.readers import TIME, ZONE, Rows, Stream, text_reader
 
 from . import _cells
 
 _N = rb" +(?P<%s>[-+]?\d{1,7}(?:\.\d{1,6})?[kMGmun]?|n/a|-?inf|nan)"
 _ROW = re.compile(
-    rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] *(?P<cc>\d{1,2}|lte|nr)"
+    rb"^\[(?P<time>" + TIME + ZONE + rb")\] *(?P<cc>\d{1,2}|lte|nr)"
     # a PCI only if three more numbers come before the bar: srsLTE before 2020 printed no PCI
     + rb"(?:" + _N % b"pci" + rb"(?=(?: +\S+){3} \|))?" + _N % b"rsrp" + _N % b"pl" + _N % b"cfo"
     + rb"(?: \|)?" + _N % b"mcs" + _N % b"snr" + rb"[^\n|]{0,80}(?:\|[^\n]{0,80})?$", re.MULTILINE,
 )  # fmt: skip
 
 
-def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
+def _streams(rows: Rows) -> Iterator[Stream | None]:
     rsrp, loss, snr, cfo, pci = (rows.si(name) for name in ("rsrp", "pl", "snr", "cfo", "pci"))
     rats = ["nr" if cc == "nr" else "lte" for cc in rows.text("cc")]
     carrier = [int(cc) if cc.isdigit() else 0 for cc in rows.text("cc")]
@@ -44,7 +42,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     yield rows.stream("kpi", "cfo", {"value": cfo}, quantity="CFO", unit="Hz")
 
 
-READER = _rows.reader(
+READER = text_reader(
     "srsue_log",
     "srsUE console: RSRP, path loss, CFO",
     kinds=("rss", "kpi"),

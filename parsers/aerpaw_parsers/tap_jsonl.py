@@ -25,12 +25,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.common.units import AnyArray
-from aerpaw_cmp.logs import text
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.files import SCHEMA, decode_record
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
+from aerpaw_cmp.readers import AnyArray, Attribute, InputError, Reader, ReadOptions, ReadResult, RejectedLine, Stream
 
 from . import _json
 
@@ -183,7 +180,7 @@ def _joined(name: str, pieces: list[Columns]) -> pd.DataFrame | None:
         return None
     values = {name: np.concatenate([piece[name] for piece in some]) for name in some[0]}
     time, line, flag = (values.pop(name) for name in ("time", "line", "flag"))
-    return text.frame("rss" if _SERIES[name][1] else "rank", time, line, flag, values, own=True)
+    return _text.frame("rss" if _SERIES[name][1] else "rank", time, line, flag, values, own=True)
 
 
 def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]], list[RejectedLine], int]:

@@ -11,30 +11,27 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _lines
-from aerpaw_cmp.logs import text as _time
-from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.readers import NUMBER, TIME, ZONE, Rows, Stream, text_reader
 
-_N = _lines.NUMBER
+_N = NUMBER
 _PLACE = rb'\{"lat": ?(?P<lat>%s), ?"lon": ?(?P<lon>%s), ?"alt": ?(?P<alt>%s)\}' % (_N, _N, _N)
 _MEANS = rb"Pwr: ?(?P<power>%s), ?P_Var: ?%s, ?Qual: ?(?P<quality>%s), ?Q_Var: ?%s, ?" % (_N, _N, _N, _N)
 _ROW = re.compile(
-    rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] (?:Filtered data \(avg\): " + _MEANS
+    rb"^\[(?P<time>" + TIME + ZONE + rb")\] (?:Filtered data \(avg\): " + _MEANS
     + rb"|(?i:(?:current|vehicle|drone|uav) (?:location|position)(?: is)?:? ?))"
     + _PLACE + rb"(?:, ?heading: ?(?P<heading>%s))?[ \t]*\r?$" % _N,
     re.MULTILINE,
 )  # fmt: skip
 
 
-def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
+def _streams(rows: Rows) -> Iterator[Stream | None]:
     place = {"latitude_deg": rows.number("lat"), "longitude_deg": rows.number("lon"), "altitude_m": rows.number("alt")}
     yield rows.stream("telemetry", "vehicle", place | {"yaw_deg": rows.number("heading")}, source="flight script")
     for name, unit in (("power", "dB re full scale"), ("quality", "dB")):
         yield rows.stream("kpi", name, {"value": rows.number(name)}, quantity=f"mean {name}", unit=unit)
 
 
-READER = _rows.reader(
+READER = text_reader(
     "vehicle_log", "flight script's console: measured positions", kinds=("telemetry", "kpi"),
     sample='[2025-01-01 12:00:07.250000] Current location is {"lat": 35.7280002, "lon": -78.6960001, "alt": 30.1}',
     mark=_ROW, row=_ROW, torn=re.compile(rb"^\[[^\]\n]{19,40}\] Filtered data \(avg\)"), streams=_streams,

@@ -20,21 +20,17 @@ import re
 
 import numpy as np
 
-from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.readers import NUMBER, TIME, ZONE, Reader, ReadOptions, ReadResult, Rows, counted, matched, mostly
 
 _NUMBERS = (
     "index", "longitude", "latitude", "altitude", "pitch", "yaw", "roll", "north", "east", "down", "volt", "fix",
     "satellites",
 )  # fmt: skip
-_CELL = rb'"?(?P<%s>' + _text.NUMBER + rb'|nan|NaN|None)"?'
+_CELL = rb'"?(?P<%s>' + NUMBER + rb'|nan|NaN|None)"?'
 _TRIPLE = rb'"?[(\[]' + b", ?".join([_CELL] * 3) + rb'[)\]]"?'
-_CHARGE = rb'"?(?:' + _text.NUMBER + rb'|nan|NaN|None|)"?'  # voltage and charge may be empty
-_VOLT = rb'"?(?P<volt>' + _text.NUMBER + rb'|nan|NaN|None|)"?'
+_CHARGE = rb'"?(?:' + NUMBER + rb'|nan|NaN|None|)"?'  # voltage and charge may be empty
+_VOLT = rb'"?(?P<volt>' + NUMBER + rb'|nan|NaN|None|)"?'
 _SEP = rb", ?"
 _BODY = (
     _SEP.join((_TRIPLE % (b"pitch", b"yaw", b"roll"), _TRIPLE % (b"north", b"east", b"down"), _VOLT)),  # 10 fields
@@ -46,7 +42,7 @@ _FIELDS = _SEP.join(
         rb'^ ?"?(?P<index>\d{1,12})"?',
         *(_CELL % name for name in (b"longitude", b"latitude", b"altitude")),
         rb"(?:" + rb"|".join(_BODY) + rb")",
-        rb'"?(?P<time>' + _text.TIME + _text.ZONE + rb')"?',
+        rb'"?(?P<time>' + TIME + ZONE + rb')"?',
         rb'"?(?P<fix>-?\d{1,3})"?',
         rb'"?(?P<satellites>-?\d{1,3})"?',
     )
@@ -62,7 +58,7 @@ _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while t
 
 def sniff(head: bytes) -> bool:
     """Check whether most of the first lines are telemetry rows."""
-    return _text.mostly(head, _ROW) or _text.mostly(head, _LONGER)
+    return mostly(head, _ROW) or mostly(head, _LONGER)
 
 
 _TITLE = re.compile(rb"(?i)(?:\xef\xbb\xbf)?\s*[\"']?(?:num|number|line_?num|index|id|no\.?)[\"']?\s*,.*lon.*")
@@ -76,7 +72,7 @@ def _reason(line: bytes) -> str | None:
     fields = len(re.sub(rb"\([^()]*\)", b"", line).split(b","))
     if fields not in (8, 9, 10, 11):
         return f"{fields} fields where 8, 9, 10 or 11 were expected (torn line?)"
-    if not re.search(_text.TIME, line):
+    if not re.search(TIME, line):
         return "no time stamp (torn line?)"
     return "a field is not of the form that vehicleOut has there"
 
@@ -89,8 +85,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If the times carry no offset and no time zone is given.
     """
-    pattern = _EITHER if _text.mostly(data, _LONGER) and not _text.mostly(data, _ROW) else _ROW
-    rows = _rows.matched(data, pattern, options, reader="vehicle_out", reason=_reason)
+    pattern = _EITHER if mostly(data, _LONGER) and not mostly(data, _ROW) else _ROW
+    rows = matched(data, pattern, options, reader="vehicle_out", reason=_reason)
     number = {name: _numbers(rows, name) for name in _NUMBERS}
     for name in ("pitch_11", "yaw_11", "roll_11", "volt_11", "volt_9"):  # other places in other layouts
         own = name.partition("_")[0]
@@ -102,11 +98,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     return rows.result([rows.stream("telemetry", "vehicle", values, source="vehicleOut")])
 
 
-def _numbers(rows: _rows.Rows, name: str) -> FloatArray:
+def _numbers(rows: Rows, name: str) -> FloatArray:
     return rows.number(name, none=(b"None",))
 
 
-def _values(rows: _rows.Rows, number: dict[str, FloatArray]) -> dict[str, AnyArray]:
+def _values(rows: Rows, number: dict[str, FloatArray]) -> dict[str, AnyArray]:
     """Return columns of the record model, NaN for positions without a fix and for attitudes of 0 in all rows."""
     place = {f"{name}_deg": number[name] for name in ("latitude", "longitude")} | {"altitude_m": number["altitude"]}
     latitude, longitude, altitude = place.values()

@@ -163,7 +163,7 @@ def test_every_form_of_one_time(text: str) -> None:
     clock, cells, _ = _stamps.read([text, text.replace("02.03", "22.03")] if "02.03." in text else [text], PLAIN)
     from aerpaw_cmp.logs import rows as _rows
 
-    _, instants, valid = _rows.times(cells, PLAIN, clock=clock, reader="x")
+    _, instants, valid = _rows.instants_of(cells, PLAIN, clock=clock, reader="x")
     assert valid[0]
     assert instants.time[0] == np.datetime64("2025-03-02T15:00:00.250")
 

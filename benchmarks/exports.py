@@ -22,6 +22,7 @@ def flight(samples: int):
     """An export of one link."""
     from aerpaw_cmp.report.columns import Column
     from aerpaw_cmp.report.exports import Export, points_table
+    from aerpaw_cmp.report.flight_data import ReportData
     from aerpaw_cmp.site.siteyaml import load_site
 
     rng = np.random.default_rng(1)
@@ -33,11 +34,11 @@ def flight(samples: int):
         **{"east_m": 500 * np.cos(50 * s), "north_m": 900 * np.sin(41 * s), "up_m": 40 + 30 * s},
         **{name: rng.normal(-80, 8, samples) for name in names},
     }
-    site = load_site("lake_wheeler")
-    known = [Column(name, "dBm", name) for name in names]
-    rss = tuple(points_table("rss", "long", known, [(time_utc, columns)], site.frame))
-    about = {"flight": "long", "title": "A long flight", "synthetic": True, "attributes": {}}
-    return Export(site=site, sets=rss, track=None, clock=True, **about)
+    data = ReportData(
+        flight="long", title="A long flight", synthetic=True, site=load_site("lake_wheeler"), generated="",
+    )  # fmt: skip
+    rss = points_table("rss", data, [Column(name, "dBm", name) for name in names], [(time_utc, columns)])
+    return Export(data=data, sets=(rss,), clock=True)
 
 
 def write_one(name: str, samples: int) -> None:

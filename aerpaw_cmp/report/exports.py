@@ -27,10 +27,9 @@ from ..common.kml import CLASS_COLOURS, xml_text
 from ..common.stages import Progress, logged
 from ..common.units import AnyArray, FloatArray, IntArray
 from ..logs.records import has_wall_clock
-from ..site.site import Site
 from .canvas import keep_extremes
 from .columns import DECIMALS, RANK, RSS, Column, tables
-from .flight_data import ReportData, Track
+from .flight_data import ReportData
 from .texts import iso_time
 
 # 8 decimals of a degree are 1 mm.
@@ -39,16 +38,19 @@ _DEGREE_DECIMALS = 8
 # Units for UDUNITS; levels of logs that are not in dBm are ratios.
 _UDUNITS = {"": "1", "m": "m", "s": "s", "dBm": DBM}
 
-
 # Columns that identify a link.
 LINK = ("flight", "tower", "channel")
+# Columns of positions, with the name and attributes of their variable in NetCDF.
 PLACES = {
-    "latitude_deg": ("degrees_north", "WGS84 latitude"),
-    "longitude_deg": ("degrees_east", "WGS84 longitude"),
-    "east_m": ("m", "east of the site origin"),
-    "north_m": ("m", "north of the site origin"),
-    "up_m": ("m", "height above the ground at the site origin"),
-}
+    "latitude_deg": ("latitude", {"long_name": "WGS84 latitude", "units": "degrees_north",
+                                  "standard_name": "latitude", "axis": "Y"}),
+    "longitude_deg": ("longitude", {"long_name": "WGS84 longitude", "units": "degrees_east",
+                                    "standard_name": "longitude", "axis": "X"}),
+    "east_m": ("east", {"long_name": "east of the site origin", "units": "m"}),
+    "north_m": ("north", {"long_name": "north of the site origin", "units": "m"}),
+    "up_m": ("up", {"long_name": "height above the ground at the site origin", "units": "m",
+                    "standard_name": "height", "axis": "Z", "positive": "up"}),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,9 +70,6 @@ class Points:
     table: Any
     columns: tuple[Column, ...]
 
-    def __len__(self) -> int:
-        return len(self.table)
-
     def links(self) -> Iterator[tuple[str, str, str, Any]]:
         """Yield flight, tower, channel and table of each link, in their order."""
         for key, rows in self.table.groupby(list(LINK), sort=False, observed=True):
@@ -81,28 +80,15 @@ class Points:
 class Export:
     """The exported content of a flight.
 
-    Parameters
-    ----------
-    flight, title : str
-    site : Site
-        Frame, towers, height of the origin.
-    sets : tuple of Points
-    track : Track, optional
-    clock : bool
-        True if times are UTC. Otherwise they count from 1970-01-01, because the logs have relative times.
-    synthetic : bool
+    ``clock`` is True if times are UTC. Otherwise they count from 1970-01-01, because the logs have relative times.
     """
 
-    flight: str
-    title: str
-    site: Site
+    data: ReportData
     sets: tuple[Points, ...]
-    track: Track | None
     clock: bool
-    synthetic: bool
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def remarks(self) -> list[str]:
         """Remarks for every user of a file."""
         texts = [
             "Heights (up_m) are metres above the ground at the site origin.",
@@ -110,69 +96,18 @@ class Export:
         ]
         if not self.clock:
             texts.append(
-                "The logs have relative times and no origin: instants count from 1970-01-01, the date is none."
+                "The logs have relative times and no origin: times count from 1970-01-01, which is not the date."
             )
-        if self.synthetic:
-            texts.append("The logs are synthetic: made by simulation, they measure nothing.")
-        return tuple(texts)
-
-    def towers(self) -> Iterator[tuple[str, float, float, float]]:
-        """Yield name, latitude, longitude [deg] and height above the ground at the origin [m]."""
-        for tower in self.site.towers.values():
-            latitude, longitude = latitude_longitude(self.site.frame, tower.east_m, tower.north_m)
-            yield tower.name, float(latitude), float(longitude), float(tower.position_m[2])
+        if self.data.synthetic:
+            texts.append("The logs are synthetic: they were simulated, not measured.")
+        return texts
 
 
-def points_table(
-    kind: str, flight: str, columns: Sequence[Column], links: Iterable[tuple[Any, dict[str, Any]]], frame: SiteFrame
-) -> Iterator[Points]:
-    """Yield the points of the links of a flight. Yields nothing without links.
-
-    Parameters
-    ----------
-    kind : str
-        Name of files and layers.
-    flight : str
-    columns : sequence of Column
-    links : iterable of (times, dict)
-        Times (n,) of a link and its further columns: arrays (n,), or one value for all rows.
-    frame : SiteFrame
-
-    Yields
-    ------
-    Points
-    """
-    import pandas as pd
-
-    link = {"channel": "", "unit": "1", "flight": flight}
-    parts = [pd.DataFrame({**link, "time": time, **values}, index=range(len(time))) for time, values in links]
-    if not parts:
-        return
-    table = pd.concat(parts, ignore_index=True)
-    table["time"] = table["time"].to_numpy("datetime64[ns]")
-    units = table["unit"].unique()
-    columns = [column for column in columns if column.name not in {*LINK, "unit", *PLACES}]
-    names = [column.name for column in columns]
-    for name in ("east_m", "north_m", "up_m", *names):
-        values = np.round(table[name].to_numpy(np.float64, na_value=np.nan), DECIMALS)
-        table[name] = np.where(np.isfinite(values), values, np.nan)
-    table["latitude_deg"], table["longitude_deg"] = latitude_longitude(
-        frame, table["east_m"].to_numpy(), table["north_m"].to_numpy()
-    )
-    table = table.astype(dict.fromkeys((*LINK, "unit"), "category"))[["time", *LINK, "unit", *PLACES, *names]]
-    shared = str(units[0]) if len(units) == 1 else "dB, reference by link"
-    known = (replace(column, unit=shared) if column.name == "measured_db" else column for column in columns)
-    yield Points(kind=kind, table=table, columns=tuple(known))
-
-
-def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[FloatArray, FloatArray]:
+def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> list[FloatArray]:
     """Return WGS84 latitude and longitude of positions (n,) [deg], NaN if a position is unknown."""
     known = np.isfinite(east_m) & np.isfinite(north_m)
-    latitude, longitude = frame.to_geographic(np.where(known, east_m, 0.0), np.where(known, north_m, 0.0))
-    return (
-        np.where(known, np.round(latitude, _DEGREE_DECIMALS), np.nan),
-        np.where(known, np.round(longitude, _DEGREE_DECIMALS), np.nan),
-    )
+    degrees = frame.to_geographic(np.where(known, east_m, 0.0), np.where(known, north_m, 0.0))
+    return [np.where(known, np.round(axis, _DEGREE_DECIMALS), np.nan) for axis in degrees]
 
 
 # --- from a report --------------------------------------------------------------------------------------------------
@@ -181,31 +116,50 @@ def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[Flo
 def of_report(data: ReportData) -> Export:
     """Return the samples of a flight."""
     kinds = {"rss": tables(RSS, data.rss), "rank": tables(RANK, data.rank)}
-    sets = tuple(p for kind, of in kinds.items() for p in points_table(kind, data.flight, *of, data.site.frame))
+    sets = tuple(points_table(kind, data, *of) for kind, of in kinds.items() if of[1])
     times = [points.table["time"].to_numpy() for points in sets] + ([] if data.track is None else [data.track.time])
     known = [time.min() for time in (time[~np.isnat(time)] for time in times) if len(time)]
-    return Export(
-        flight=data.flight, title=data.title, site=data.site, track=data.track, synthetic=data.synthetic,
-        sets=sets,
-        clock=bool(known) and has_wall_clock(min(known)),
-    )  # fmt: skip
+    return Export(data=data, sets=sets, clock=bool(known) and has_wall_clock(min(known)))
 
+
+def points_table(
+    kind: str, data: ReportData, columns: Sequence[Column], links: Sequence[tuple[Any, dict[str, Any]]]
+) -> Points:
+    """Return the samples of one kind from the times and columns of each link."""
+    import pandas as pd
+
+    link = {"channel": "", "unit": "1", "flight": data.flight}
+    parts = [pd.DataFrame({**link, "time": time, **values}, index=range(len(time))) for time, values in links]
+    table = pd.concat(parts, ignore_index=True)
+    table["time"] = table["time"].to_numpy("datetime64[ns]")
+    columns = [column for column in columns if column.name not in {*LINK, "unit", *PLACES}]
+    names = [column.name for column in columns]
+    for name in ("east_m", "north_m", "up_m", *names):
+        values = np.round(table[name].to_numpy(np.float64, na_value=np.nan), DECIMALS)
+        table[name] = np.where(np.isfinite(values), values, np.nan)
+    degrees = latitude_longitude(data.site.frame, table["east_m"].to_numpy(), table["north_m"].to_numpy())
+    table["latitude_deg"], table["longitude_deg"] = degrees
+    table = table.astype(dict.fromkeys((*LINK, "unit"), "category"))[["time", *LINK, "unit", *PLACES, *names]]
+    units = table["unit"].unique()
+    shared = str(units[0]) if len(units) == 1 else "dB, reference by link"
+    known = (replace(column, unit=shared) if column.name == "measured_db" else column for column in columns)
+    return Points(kind=kind, table=table, columns=tuple(known))
+
+
+# --- NetCDF ---------------------------------------------------------------------------------------------------------
 
 # Code of a missing value in NetCDF (attribute ``_FillValue``).
 _NO_CODE = -1
-
 
 _TITLES = {"rss": "Received level, measured and replayed", "rank": "Channel rank, reported and replayed"}
 
 
 def write_netcdf(export: Export, folder: Path) -> list[Path]:
     """Write ``<kind>.nc``: trajectories as a contiguous ragged array, one per link."""
-    paths = []
-    for points in export.sets:
-        path = folder / f"{points.kind}.nc"
+    files = {folder / f"{points.kind}.nc": points for points in export.sets}
+    for path, points in files.items():
         path.write_bytes(netcdf_bytes(_points_dataset(export, points)))
-        paths.append(path)
-    return paths
+    return list(files)
 
 
 def _points_dataset(export: Export, points: Points) -> Dataset:
@@ -224,20 +178,13 @@ def _points_dataset(export: Export, points: Points) -> Dataset:
     size = {"long_name": "number of samples of this link", "sample_dimension": "obs"}
     variables["row_size"] = ("trajectory", np.array([len(rows) for *_, rows in links], dtype=np.int32), size)
     variables["time"] = ("obs", *_seconds(export, points.table["time"].to_numpy()))
-    axes = {"latitude_deg": "Y", "longitude_deg": "X", "up_m": "Z"}
-    for name, (unit, meaning) in PLACES.items():
-        short = name.rpartition("_")[0]
-        attributes = {"long_name": meaning, "units": unit}
-        if name in axes:
-            attributes |= {"standard_name": "height" if short == "up" else short, "axis": axes[name]}
-        if short == "up":
-            attributes["positive"] = "up"
+    for name, (short, attributes) in PLACES.items():
         variables[short] = ("obs", points.table[name].to_numpy(), attributes)
     variables["crs"] = ((), np.int32(0), WGS84)
     for item in points.columns:
         variables[item.name.replace(".", "p")] = ("obs", *_values(item, points.table[item.name].to_numpy()))
     about = file_attributes(
-        title=f"{_TITLES.get(points.kind, points.kind)}: {export.title}",
+        title=f"{_TITLES[points.kind]}: {export.data.title}",
         source="field logs, replayed by ray tracing",
         comment=" ".join(export.remarks),
     )
@@ -249,15 +196,11 @@ def _seconds(export: Export, times: Any) -> tuple[Any, dict[str, str]]:
     known = times[~np.isnat(times)]
     start = known.min().astype("datetime64[s]") if len(known) and export.clock else np.datetime64("1970-01-01", "s")
     attributes = {
-        "standard_name": "time",
-        "long_name": "instant of the sample",
-        "units": f"seconds since {str(start).replace('T', ' ')} UTC",
-        "calendar": "standard",
+        "standard_name": "time", "long_name": "time of the sample", "axis": "T",
+        "units": f"seconds since {str(start).replace('T', ' ')} UTC", "calendar": "standard",
         "units_metadata": "leap_seconds: none",
-        "axis": "T",
-    }
-    if not export.clock:
-        attributes["comment"] = "the logs have relative times and no origin: the date is none"
+        **({} if export.clock else {"comment": "the logs have relative times and no origin: the date is not real"}),
+    }  # fmt: skip
     return np.where(np.isnat(times), np.nan, (times - start) / np.timedelta64(1, "s")), attributes
 
 
@@ -272,6 +215,8 @@ def _values(column: Column, values: Any) -> tuple[Any, ...]:
     comment = {} if column.unit in ("", unit) else {"comment": f"unit: {column.unit}"}
     return values, {**shared, "units": unit, **comment}, {"_FillValue": np.nan}
 
+
+# --- KMZ --------------------------------------------------------------------------------------------------------------
 
 # Largest number of points of all coloured lines, because Google Earth becomes slow with more.
 POINTS = 24_000
@@ -293,36 +238,36 @@ class _Shown:
 
 def write_kmz(export: Export, folder: Path) -> list[Path]:
     """Write ``samples.kmz``."""
-    shown = list(_shown(export))
+    shown = [item for points in export.sets for item in _shown(points)]
     scales = {item.scale.key: item.scale for item in shown}
     budget = POINTS // max(1, len(shown))
-    body = [_towers(export), _flown(export)]
+    body = [*(_style(scale) for scale in scales.values()), _towers(export), _flown(export)]
     for number, link in enumerate(shown):
         lines = "".join(_lines(link, budget, clock=export.clock, visible=number == 0))
-        body.append(kml.folder(link.name, _legend_name(link.scale), lines, visible=number == 0))
-    words = [*export.remarks, "Lines stand at their height above the ground below."]
+        body.append(kml.folder(link.name, link.scale.legend, lines, visible=number == 0))
+    words = [*export.remarks, "Lines are drawn at their height above the ground below."]
     if max((len(item.rows) for item in shown), default=0) > budget:
         words.append(
             f"Thinned to about {budget} points per line, with minimum and maximum of every segment; all samples are in "
             "rss.csv and rank.csv."
         )
-    path, text = folder / "samples.kmz", "".join([*map(_styles, scales.values()), *body])
-    legends = {_legend_name(scale): _legend(scale) for scale in scales.values()}
-    return [kml.write_archive(path, export.title, " ".join(words), text, legends)]
+    legends = {scale.legend: _legend(scale) for scale in scales.values()}
+    path = folder / "samples.kmz"
+    return [kml.write_archive(path, export.data.title, " ".join(words), "".join(body), legends)]
 
 
-def _shown(export: Export) -> Iterator[_Shown]:
-    for kind, scales in _scales_of(export).items():
-        points = next(item for item in export.sets if item.kind == kind)
-        columns = {c.name: c for c in points.columns}
-        for (_, tower, channel, rows), (name, scale) in itertools.product(points.links(), scales.items()):
-            if name.startswith("simulated_rank") and rows[name].isna().all():  # that K belongs to other links
-                continue
-            shown = f"{tower} {channel}".strip() + f", {_LEVELS.get(name, columns[name].meaning)}"
-            yield _Shown(name=shown, column=columns[name], scale=scale, rows=rows)
+def _shown(points: Points) -> Iterator[_Shown]:
+    """Yield every link with each of its coloured quantities."""
+    scales = _scales_of(points)
+    columns = {c.name: c for c in points.columns if c.name in scales}
+    for (_, tower, channel, rows), (name, column) in itertools.product(points.links(), columns.items()):
+        if name.startswith("simulated_rank") and rows[name].isna().all():  # that K belongs to other links
+            continue
+        shown = f"{tower} {channel}".strip() + f", {_LEVELS.get(name, column.meaning)}"
+        yield _Shown(name=shown, column=column, scale=scales[name], rows=rows)
 
 
-def _styles(scale: Scale) -> str:
+def _style(scale: Scale) -> str:
     """Return one line style per colour. KML writes alpha, blue, green, red."""
     return "".join(
         f'<Style id="{scale.key}{i}"><LineStyle><color>ff{c[5:7]}{c[3:5]}{c[1:3]}</color><width>4</width></LineStyle>'
@@ -332,22 +277,23 @@ def _styles(scale: Scale) -> str:
 
 
 def _towers(export: Export) -> str:
-    marks = [
-        kml.mark(name, kml.coordinates(np.array([longitude]), np.array([latitude]), np.array([up]))[0], in_the_air=True)
-        for name, latitude, longitude, up in export.towers()
-    ]
+    towers, frame = export.data.site.towers.values(), export.data.site.frame
+    east, north, up = np.array([tower.position_m for tower in towers]).reshape(-1, 3).T
+    latitude, longitude = latitude_longitude(frame, east, north)
+    places = kml.coordinates(longitude, latitude, up)
+    marks = [kml.mark(tower.name, at, in_the_air=True) for tower, at in zip(towers, places, strict=True)]
     return f"<Folder><name>Towers</name>{''.join(marks)}</Folder>"
 
 
 def _flown(export: Export) -> str:
     """Return the track: with a clock as a track for the time slider, and empty with fewer than two positions."""
-    if (line := export.track) is None:
+    if (line := export.data.track) is None:
         return ""
     known = np.flatnonzero(np.isfinite(line.east_m) & np.isfinite(line.north_m) & ~np.isnat(line.time))
     if len(known) < 2:
         return ""
     pick = known[keep_extremes([line.up_m[known]], TRACK_POINTS)]
-    latitude, longitude = latitude_longitude(export.site.frame, line.east_m[pick], line.north_m[pick])
+    latitude, longitude = latitude_longitude(export.data.site.frame, line.east_m[pick], line.north_m[pick])
     at = kml.coordinates(longitude, latitude, line.up_m[pick])
     if export.clock:
         times = "".join(f"<when>{time}</when>" for time in iso_time(line.time[pick]))
@@ -355,7 +301,7 @@ def _flown(export: Export) -> str:
         shape = f"<gx:Track>{_AIR}{times}{places}</gx:Track>"
     else:
         shape = f"<LineString>{_AIR}<coordinates>{' '.join(at)}</coordinates></LineString>"
-    name, style = xml_text(export.flight), kml.line_style("99ffffff", 2)
+    name, style = xml_text(export.data.flight), kml.line_style("99ffffff", 2)
     return f"<Placemark><name>Flown: {name}</name>{style}{shape}</Placemark>"
 
 
@@ -390,10 +336,6 @@ def _label(shown: _Shown, values: AnyArray, number: int) -> str:
     return (f"{low:.1f}" if high - low < 0.05 else f"{low:.1f} to {high:.1f}") + f" {shown.column.unit}"
 
 
-def _legend_name(scale: Scale) -> str:
-    return f"legends/{scale.key}.png"
-
-
 def _legend(scale: Scale) -> bytes:
     return kml.list_legend(scale.title, dict(zip(scale.labels, scale.colours, strict=True)))
 
@@ -416,55 +358,39 @@ class Scale:
     labels: tuple[str, ...]
     edges: FloatArray | None = None
 
+    @property
+    def legend(self) -> str:
+        """Name of the picture of the scale in the archive."""
+        return f"legends/{self.key}.png"
+
     def bin_of(self, values: FloatArray) -> IntArray:
         """Return the number of the colour of each value (n,). The last is out of coverage."""
-        known = np.isfinite(values)
-        if self.edges is None:
-            number = np.clip(np.nan_to_num(values).astype(np.int64), 0, len(self.colours) - 2) - 1
-            return np.where(known & (number >= 0), number, len(self.colours) - 1)
-        number = np.searchsorted(self.edges[1:-1], np.nan_to_num(values), side="right")
-        return np.where(known, number, len(self.colours) - 1)
+        last, known = len(self.colours) - 1, np.nan_to_num(values)
+        inner = np.arange(1.5, last) if self.edges is None else self.edges[1:-1]
+        missing = ~np.isfinite(values) | ((known < 1) & (self.edges is None))
+        return np.where(missing, last, np.searchsorted(inner, known, side="right"))
 
 
 RANKS = Scale(
-    key="rank",
-    title="Rank",
-    colours=(*CLASS_COLOURS[1:5], OUT),
+    key="rank", title="Rank", colours=(*CLASS_COLOURS[1:5], OUT),
     labels=("rank 1", "rank 2", "rank 3", "rank 4", "no path or no report"),
-)
+)  # fmt: skip
 
 
-def _scales_of(export: Export) -> dict[str, dict[str, Scale]]:
-    """Return scales by kind and column: levels share one scale, residuals another, ranks have classes."""
-    scales: dict[str, dict[str, Scale]] = {}
-    for points in export.sets:
-        names = {c.name for c in points.columns}
-        by_column = {c: RANKS for c in names if c == "measured_rank" or c.startswith("simulated_rank_k")}
-        levels = sorted(names & {"calibrated_db", "simulated_dbm"})
-        if levels:
-            values = points.table[levels].to_numpy().ravel()
-            by_column |= dict.fromkeys(levels, _level_scale(values[np.isfinite(values)]))
-        if "residual_db" in names:
-            apart = np.abs(points.table["residual_db"].to_numpy())
-            by_column["residual_db"] = _residual_scale(apart[np.isfinite(apart)])
-        scales[points.kind] = {c.name: by_column[c.name] for c in points.columns if c.name in by_column}
-    return scales
-
-
-def _level_scale(levels: FloatArray) -> Scale:
-    """Return steps of whole numbers between the 2nd and 98th percentile."""
-    low, high = np.percentile(levels, [2, 98]) if len(levels) else (-100.0, -60.0)
+def _scales_of(points: Points) -> dict[str, Scale]:
+    """Return the scale of each coloured column: levels share one, residuals have another, ranks have classes."""
+    if points.kind == "rank":
+        return {c.name: RANKS for c in points.columns if c.name.startswith(("measured_rank", "simulated_rank"))}
+    names = ["calibrated_db", "simulated_dbm"]
+    levels, apart = points.table[names].to_numpy(), np.abs(points.table["residual_db"].to_numpy())
+    low, high = np.nanpercentile(levels, [2, 98]) if np.isfinite(levels).any() else (-100.0, -60.0)
+    most = float(np.nanpercentile(apart, 98)) if np.isfinite(apart).any() else 5.0
     step = _round_step((high - low) / LEVELS)
     edges = (np.floor(low / step) + np.arange(LEVELS + 1)) * step
-    return _numbers("level", "Level [dBm]", edges, "viridis")
-
-
-def _residual_scale(apart: FloatArray) -> Scale:
-    """Return a scale symmetric about zero, up to the 98th percentile of the magnitude."""
-    most = float(np.percentile(apart, 98)) if len(apart) else 5.0
-    step = _round_step(2 * most / (LEVELS - 1))
-    edges = (np.arange(LEVELS) - (LEVELS - 1) / 2) * step
-    return _numbers("residual", "Measured minus replayed [dB]", edges, "RdBu_r")
+    level = _numbers("level", "Level [dBm]", edges, "viridis")
+    edges = (np.arange(LEVELS) - (LEVELS - 1) / 2) * _round_step(2 * most / (LEVELS - 1))
+    residual = _numbers("residual", "Measured minus replayed [dB]", edges, "RdBu_r")
+    return dict.fromkeys(names, level) | {"residual_db": residual}
 
 
 def _round_step(step: float) -> float:
@@ -476,22 +402,24 @@ def _round_step(step: float) -> float:
     return float(next(m for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9)) * power)
 
 
-def _numbers(key: str, title: str, edges: AnyArray, palette: str) -> Scale:
+def _numbers(key: str, title: str, edges: FloatArray, palette: str) -> Scale:
+    """Return a scale with colours of a palette of matplotlib between the edges."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
     count = len(edges) - 1
     colours = [to_hex(colormaps[palette]((i + 0.5) / count)) for i in range(count)]
-    labels = [f"{low:g} to {high:g}" for low, high in itertools.pairwise(edges)]
-    labels[0], labels[-1] = f"below {edges[1]:g}", f"above {edges[-2]:g}"
-    return Scale(
-        key=key, title=title, colours=(*colours, OUT), labels=(*labels, "out of coverage"), edges=np.asarray(edges)
-    )
+    between = [f"{low:g} to {high:g}" for low, high in itertools.pairwise(edges[1:-1])]
+    labels = (f"below {edges[1]:g}", *between, f"above {edges[-2]:g}", "out of coverage")
+    return Scale(key=key, title=title, colours=(*colours, OUT), labels=labels, edges=edges)
 
 
-FORMATS = ("kmz", "netcdf")
-# Modules that a format needs in addition to the default installation.
+# --- files of a report ------------------------------------------------------------------------------------------------
+
+# Writers, and modules that a format needs in addition to the default installation.
+_WRITERS = {"kmz": write_kmz, "netcdf": write_netcdf}
 _NEEDS = {"netcdf": ("netCDF4", "xarray")}
+FORMATS = tuple(_WRITERS)
 
 ALL = "all"
 FOLDER = "exports"
@@ -514,7 +442,7 @@ def chosen_formats(names: Iterable[str], known: Iterable[str] = FORMATS) -> tupl
     if unknown := [name for name in chosen if name not in (*known, ALL)]:
         raise UsageError(f"format {unknown[0]!r}", expected=", ".join((*known, ALL)))
     for name in chosen:
-        if name != ALL and (missing := _missing_module(name)):
+        if missing := _missing_module(name):
             raise UsageError(
                 f"format {name} needs {missing}, which is not installed",
                 expected="pip install 'aerpaw-cmp[geo]', or another format",
@@ -549,7 +477,6 @@ def write_exports(export: Export, folder: Path, formats: Iterable[str], progress
     OSError
         If a file cannot be written.
     """
-    writers = {"kmz": write_kmz, "netcdf": write_netcdf}
     place = folder / FOLDER
     written: list[Path] = []
     for name in formats:
@@ -557,5 +484,5 @@ def write_exports(export: Export, folder: Path, formats: Iterable[str], progress
             progress(f"export {name} left out: {missing} is not installed (pip install 'aerpaw-cmp[geo]')")
             continue
         place.mkdir(exist_ok=True)
-        written += writers[name](export, place)
+        written += _WRITERS[name](export, place)
     return written

@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
@@ -598,20 +598,6 @@ class Ahead:
         return self.level_db - 1.645 * self.sd_db, self.level_db + 1.645 * self.sd_db
 
 
-@dataclass(slots=True)
-class _Bins:
-    """The closed bins, oldest first: position (n, 3), time (n,), level (n,) and each trend (n,)."""
-
-    place: list[FloatArray] = field(default_factory=list)
-    time_s: list[float] = field(default_factory=list)
-    level: list[float] = field(default_factory=list)
-    trends: dict[str, list[float]] = field(default_factory=dict)
-
-    def cut(self) -> None:
-        for values in (self.place, self.time_s, self.level, *self.trends.values()):
-            del values[:-KEEP]  # type: ignore[attr-defined]
-
-
 class RouteAhead:
     """A prediction of the rest of a route that learns from every record.
 
@@ -628,9 +614,9 @@ class RouteAhead:
         self._trends = {**{k: np.asarray(v, dtype=np.float64) for k, v in trends.items()},
                         NONE: np.zeros(len(self.route_m))}  # fmt: skip
         self._scores: dict[tuple[str, float], tuple[float, float]] = {}
-        self._bins, self._open = _Bins(trends={name: [] for name in self._trends}), list[tuple[float, ...]]()
-        self._start, self._reached = math.nan, 0
-        self.squares, self.samples = 0.0, 0
+        # time, east, north, up, level and each trend, of the closed bins and of the records of the open bin
+        self._bins, self._open = np.empty((0, 5 + len(self._trends))), list[tuple[float, ...]]()
+        self._reached, self.squares, self.samples = 0, 0.0, 0
 
     def add(self, time_s: float, place_m: FloatArray, level_db: float, trends: Mapping[str, float]) -> Ahead | None:
         """Add a record. Return the prediction of the rest of the route if a bin closed, else None.
@@ -653,69 +639,37 @@ class RouteAhead:
         values = (time_s, *map(float, place_m), level_db, *(trends.get(name, 0.0) for name in self._trends))
         if not np.isfinite(values).all():
             return None
-        closes = bool(self._open) and time_s - self._start >= BIN_S
+        closes = bool(self._open) and time_s - self._open[0][0] >= BIN_S
         if closes:
             self._close()
-        if not self._open:
-            self._start = time_s
         self._open.append(values)
         return self._predict(np.asarray(place_m, dtype=np.float64)) if closes else None
 
     def _close(self) -> None:
         rows = np.array(self._open)
-        time, east, north, up, level, *trends = rows.mean(axis=0)
-        self.squares += float(((rows[:, 4] - level) ** 2).sum())
+        closed = rows.mean(axis=0)
+        self.squares += float(((rows[:, 4] - closed[4]) ** 2).sum())
         self.samples += len(rows) - 1
-        place = np.array([east, north, up])
-        self._judge(time, place, level, dict(zip(self._trends, trends, strict=True)))
-        bins = self._bins
-        bins.place.append(place)
-        bins.time_s.append(time)
-        bins.level.append(level)
-        for name, value in zip(self._trends, trends, strict=True):
-            bins.trends[name].append(value)
-        bins.cut()
+        self._judge(closed)
+        self._bins = np.vstack([self._bins, closed])[-KEEP:]
         self._open.clear()
 
-    def _judge(self, time: float, place: FloatArray, level: float, trends: Mapping[str, float]) -> None:
-        """Score the prediction of every trend for a bin, made :data:`AHEAD_S` earlier."""
+    def _judge(self, closed: FloatArray) -> None:
+        """Score the prediction of every trend for a bin (5 + trends,), made :data:`AHEAD_S` earlier."""
         # use only earlier bins: neighbouring levels would predict any bin well
-        known = int(np.searchsorted(self._bins.time_s, time - AHEAD_S))
-        if known < LEAST:
+        known = self._bins[: int(np.searchsorted(self._bins[:, 0], closed[0] - AHEAD_S))]
+        if len(known) < LEAST:
             return
         for length, model in _MODELS.items():
-            moments = self._moments(model, known, place[None], np.array([time]), list(self._trends))
-            for name, (mean, sd) in zip(self._trends, moments, strict=True):
-                score = float(crps_normal(level - trends[name] - mean, sd)[0])
+            moments = _moments(model, known, known[:, 5:], closed[None, :4])
+            for name, trend, (mean, sd) in zip(self._trends, closed[5:], moments, strict=True):
+                score = float(crps_normal(closed[4] - trend - mean, sd)[0])
                 total, weight = self._scores.get((name, length), (0.0, 0.0))
                 self._scores[name, length] = (_FORGET * total + score, _FORGET * weight + 1.0)
 
-    def _moments(
-        self, model: FieldModel, known: int, place: FloatArray, time_s: FloatArray, names: Sequence[str]
-    ) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the mean of each trend's residual and the standard deviation of a bin (m,), from ``known`` bins.
-
-        All trends share one factor. The strengths are scaled to the data: ``s^2 = y' inv(K) y / n``.
-        """
-        rows = _rows(np.array(self._bins.place[:known]), np.array(self._bins.time_s[:known]))
-        level = np.array(self._bins.level[:known])
-        value = np.stack([level - np.array(self._bins.trends[name][:known]) for name in names], axis=1)
-        matrix = covariance(model, rows, rows)
-        matrix[np.diag_indices(known)] += model.noise_sd_db**2
-        factor = Factor.of(matrix)
-        middle = value.mean(axis=0)
-        white = factor.whiten(value - middle)
-        # a level that has been constant so far would make every interval a point
-        scale = np.maximum((white**2).sum(axis=0) / known, 1e-2)
-        targets = _rows(place, time_s)
-        mean, explained = factor.condition(covariance(model, targets, rows), white)
-        prior = float(covariance(model, targets.part([0]), targets.part([0]))[0, 0])
-        variance = np.maximum(prior - explained, 0.0) + model.noise_sd_db**2
-        return [(middle[k] + mean[:, k], np.sqrt(scale[k] * variance)) for k in range(len(names))]
-
     def _predict(self, place: FloatArray) -> Ahead | None:
         """Return the prediction of the rest of the route from the position of the UAV."""
-        if len(self._bins.level) < LEAST:
+        if len(self._bins) < LEAST:
             return None
         # search only a little ahead: where a route crosses itself, the nearest point can be on another leg
         window = slice(self._reached, self._reached + max(50, len(self.route_m) // 10))
@@ -724,15 +678,36 @@ class RouteAhead:
         known = {key: total / weight for key, (total, weight) in self._scores.items()}
         # before the first score: no trend, and the longer length
         trend, length = min(known, key=lambda key: known[key], default=(NONE, LENGTHS_M[-1]))
-        now = self._bins.time_s[-1]
         steps = np.linalg.norm(np.diff(self.route_m[index], axis=0, prepend=place[None]), axis=1)
-        count, later = len(self._bins.level), now + np.cumsum(steps) / SPEED_MPS
-        mean, sd = self._moments(_MODELS[length], count, self.route_m[index], later, [trend])[0]
+        later = np.column_stack([self._bins[-1, 0] + np.cumsum(steps) / SPEED_MPS, self.route_m[index]])
+        own = 5 + list(self._trends).index(trend)
+        [(mean, sd)] = _moments(_MODELS[length], self._bins, self._bins[:, own : own + 1], later)
         within = math.sqrt(self.squares / self.samples) if self.samples else 0.0
         level = self._trends[trend][index] + mean
         return Ahead(index=index, level_db=level, sd_db=np.hypot(sd, within), trend=trend)
 
 
-def _rows(place: FloatArray, time_s: FloatArray) -> Rows:
-    n = len(place)
-    return Rows(position_m=place, direction=np.zeros((n, 3)), time_s=time_s, flight=np.zeros(n, dtype=np.int64))
+def _moments(
+    model: FieldModel, bins: FloatArray, trends: FloatArray, targets: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the mean of the residual of each trend, and the standard deviation of a bin, at targets (m,).
+
+    All trends (n, k) of the bins (n, 5 or more) share one factor. The strengths are scaled to the data: ``s^2 = y'
+    inv(K) y / n``. Bins and targets (m, 4) begin with time and position.
+    """
+    rows, ends = _rows(bins), _rows(targets)
+    value = bins[:, 4:5] - trends
+    factor = Factor.of(_noisy(model, covariance(model, rows, rows)))
+    middle = value.mean(axis=0)
+    white = factor.whiten(value - middle)
+    # a level that has been constant so far would make every interval a point
+    scale = np.maximum((white**2).sum(axis=0) / len(bins), 1e-2)
+    mean, explained = factor.condition(covariance(model, ends, rows), white)
+    prior = float(covariance(model, ends.part([0]), ends.part([0]))[0, 0])
+    variance = np.maximum(prior - explained, 0.0) + model.noise_sd_db**2
+    return [(middle[k] + mean[:, k], np.sqrt(scale[k] * variance)) for k in range(len(middle))]
+
+
+def _rows(bins: FloatArray) -> Rows:
+    n = len(bins)
+    return Rows(position_m=bins[:, 1:4], direction=np.zeros((n, 3)), time_s=bins[:, 0], flight=np.zeros(n, np.int64))

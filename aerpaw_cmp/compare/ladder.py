@@ -213,12 +213,11 @@ def places_of(position_m: FloatArray, blocks: int = _BLOCKS) -> IntArray:
     return place
 
 
-def _halves(cell: IntArray, position_m: FloatArray) -> tuple[IntArray, IntArray]:
+def _halves(cell: IntArray, position_m: FloatArray) -> list[IntArray]:
     if not len(cell):
-        return cell, cell
+        return [cell, cell]
     side = int(np.ptp(position_m[cell, :2], axis=0).argmax())
-    order = cell[np.argsort(position_m[cell, side], kind="stable")]
-    return order[: len(order) // 2], order[len(order) // 2 :]
+    return np.split(cell[np.argsort(position_m[cell, side], kind="stable")], [len(cell) // 2])
 
 
 def climb(
@@ -245,8 +244,10 @@ def climb(
     Ladder
     """
     enough = [_covers(measured_db, rung) for rung in rungs]
-    shared = [_shared(m, [r.level_db[i] for r, ok in zip(rungs, enough, strict=True) if ok])
-              for i, m in enumerate(measured_db)]  # fmt: skip
+    shared = [
+        np.isfinite([m, *(rung.level_db[i] for rung, ok in zip(rungs, enough, strict=True) if ok)]).all(axis=0)
+        for i, m in enumerate(measured_db)
+    ]
     places = [places_of(p[keep]) for p, keep in zip(position_m, shared, strict=True)]
     errors = tuple(
         tuple(
@@ -261,19 +262,14 @@ def climb(
     joined = [np.concatenate([*e, np.zeros(0)])[in_time] for e in errors]
     place = np.concatenate([*position_m, np.zeros((0, 3))])[in_time]
     rmse = tuple(_rmse(e) for e in joined)
-    if not any(np.isfinite(rmse)):
-        return Ladder(
-            rungs=tuple(rungs), error_db=errors, time_s=tuple(time_s), position_m=tuple(position_m), rmse_db=rmse,
-            best=None, best_replay=None, recommended=None,
-        )  # fmt: skip
     replays = [i for i, rung in enumerate(rungs) if rung.regressor_db is None and np.isfinite(rmse[i])]
     # a straight line is shown and never recommended, because it predicts no other place
     chosen = recommended = min(replays, key=lambda i: rmse[i], default=None)
     if chosen is not None:
-        recommended = next(i for i in replays if i == chosen or _as_good(joined[i], joined[chosen], place))
+        recommended = next(i for i in replays if i == chosen or _as_good(compared(joined[i], joined[chosen], place)))
     return Ladder(
         rungs=tuple(rungs), error_db=errors, time_s=tuple(time_s), position_m=tuple(position_m), rmse_db=rmse,
-        best=int(np.nanargmin(rmse)), best_replay=chosen, recommended=recommended,
+        best=int(np.nanargmin(rmse)) if any(np.isfinite(rmse)) else None, best_replay=chosen, recommended=recommended,
     )  # fmt: skip
 
 
@@ -460,19 +456,14 @@ def compared(error_db: FloatArray, best_db: FloatArray, position_m: FloatArray) 
     return paired_difference(error_db, best_db, free_offset=False, place_m=position_m)
 
 
-def _as_good(error: FloatArray, best: FloatArray, position_m: FloatArray) -> bool:
-    against_best = compared(error, best, position_m)
+def _as_good(against_best: PairedDifference) -> bool:
     return bool(against_best.difference_db <= against_best.standard_error_db)
 
 
 def _covers(measured: Sequence[FloatArray], rung: Rung) -> bool:
-    measurements = sum(int(np.isfinite(m).sum()) for m in measured)
-    pairs = (int((np.isfinite(m) & np.isfinite(x)).sum()) for m, x in zip(measured, rung.level_db, strict=True))
-    return sum(pairs) >= _LEAST_COVERED * max(measurements, 1)
-
-
-def _shared(measured: FloatArray, levels: Sequence[FloatArray]) -> BoolArray:
-    return np.asarray(np.isfinite([measured, *levels]).all(axis=0))
+    known = [np.isfinite(m) for m in measured]
+    pairs = sum(int((k & np.isfinite(x)).sum()) for k, x in zip(known, rung.level_db, strict=True))
+    return pairs >= _LEAST_COVERED * max(sum(int(k.sum()) for k in known), 1)
 
 
 def _rmse(error: FloatArray) -> float:

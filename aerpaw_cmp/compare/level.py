@@ -844,14 +844,28 @@ def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: flo
     return OffsetFit(float(grid[best]), float(np.sqrt(mse[best])), n, best in (0, len(grid) - 1))
 
 
-def error_above_floor(measured_db: FloatArray, simulated_db: FloatArray, floor_db: float) -> FloatArray:
-    """Return measured minus simulated (n,) [dB], of levels that are only known to be below the floor if they are lower.
+def error_above_floor(
+    measured_db: FloatArray, simulated_db: FloatArray, sd_db: FloatArray, floor_db: float
+) -> FloatArray:
+    """Return measured minus simulated (n,) [dB], to check the standard deviation that was stated for it.
 
-    Such a level is inside an interval if the interval extends below the floor: its error is 0 if the simulated level is
-    lower as well, else the distance of the simulated level from the floor.
+    A level at the floor is only known to be below it. It is replaced by a level below the floor from the stated normal
+    distribution, evenly spread over the samples: if the statement is right, an interval contains its nominal share.
+
+    Parameters
+    ----------
+    measured_db, simulated_db, sd_db : (n,)
+    floor_db : float
     """
-    below = measured_db <= floor_db
-    return np.where(below, np.minimum(floor_db - simulated_db, 0.0), measured_db - simulated_db)
+    below, reach = measured_db <= floor_db, (floor_db - simulated_db) / sd_db
+    evenly = np.arange(1, len(below) + 1) * _GOLDEN % 1.0
+    # far in the tail the floor itself is the likeliest level
+    replaced = np.where(reach < -_FAR, reach, ndtri(evenly * ndtr(np.maximum(reach, -_FAR))))
+    return np.where(below, sd_db * replaced, measured_db - simulated_db)
+
+
+# Multiples of the golden ratio, modulo 1, are spread evenly. Standard deviations beyond which a level is its bound.
+_GOLDEN, _FAR = 0.6180339887498949, 8.0
 
 
 def _reliability(stated: FloatArray, detected: BoolArray) -> tuple[tuple[float, float, int], ...]:

@@ -309,36 +309,28 @@ def k_grid(low: float = 1.25, high: float = 1e5, per_decade: int = 24) -> FloatA
     return np.asarray(np.where(np.isclose(k, 10.0**decade, rtol=1e-9), 10.0**decade, k))
 
 
+# Samples times K per resampling, which limits memory on flights of hours and does not change the result.
+_CELLS_AT_ONCE = 2_000_000
+
+
 @dataclass(frozen=True, slots=True)
 class KCurve:
-    """The agreement and total variation as functions of continuous K.
+    """The agreement as a function of continuous K.
 
     Parameters
     ----------
-    k : (m,)
-        Values of K.
-    agreement, total_variation : (m,)
-        Agreement and distance between simulated and measured ranks.
-    best_k_agreement, best_k_total_variation : float
-        K with the best value: the middle, on the log scale, of the first run of best K. NaN without a pair.
-    best_k_interval, best_k_total_variation_interval : (low, high)
+    k, agreement : (m,)
+        Values of K, and the agreement of simulated with measured ranks at each.
+    best_k : float
+        K with the best agreement: the middle, on the log scale, of the first run of best K. NaN without a pair.
+    best_k_ci95 : (low, high)
         Central 95 % of the best K over the bootstrap replicates, one grid step wider on either side.
-    at_edge : bool
-        True if the best agreement is at an end of the grid.
     """
 
     k: FloatArray
     agreement: FloatArray
-    total_variation: FloatArray
-    best_k_agreement: float = float("nan")
-    best_k_interval: Interval = NO_INTERVAL
-    best_k_total_variation: float = float("nan")
-    best_k_total_variation_interval: Interval = NO_INTERVAL
-    at_edge: bool = False
-
-
-# Samples times K per resampling, which limits memory on flights of hours and does not change the result.
-_CELLS_AT_ONCE = 2_000_000
+    best_k: float = float("nan")
+    best_k_ci95: Interval = NO_INTERVAL
 
 
 def k_curve(
@@ -359,52 +351,33 @@ def k_curve(
     k : array_like, optional
         Grid of K, by default :func:`k_grid`.
     replicates : int
-        Number of resamples of the block bootstrap for the intervals of the best K.
+        Number of resamples of the block bootstrap for the interval of the best K.
 
     Returns
     -------
     KCurve
-        Agreement and total variation by K, NaN if no pose has both ranks.
+        NaN if no pose has both ranks.
     """
     grid = k_grid() if k is None else unmasked(k)
-    ri = _ranks(measured)
-    profile = unmasked(sigma)
+    ri, profile = _ranks(measured), unmasked(sigma)
     # whether there is a channel does not depend on K
     paired = (ri >= 1) & (rank_from_singular_values(profile, 10.0) >= 1)
-    ri, profile = ri[paired].astype(np.int64), profile[paired]
-    if not len(ri):
-        nothing = np.full(len(grid), np.nan)
-        return KCurve(k=grid, agreement=nothing, total_variation=nothing)
-    # one byte per rank: there are 118 K for each sample of a long flight
-    ranks = np.stack([rank_from_singular_values(profile, value).astype(np.int8) for value in grid], axis=1)
-    equal = ranks == ri[:, None]
-    known = autocorrelation(equal.mean(axis=1))
+    if not paired.any():
+        return KCurve(k=grid, agreement=np.full(len(grid), np.nan))
+    # one byte per sample and K: there are 118 K for each sample of a long flight
+    equal = np.stack([rank_from_singular_values(profile[paired], value) == ri[paired] for value in grid], axis=1)
+    agree, known = equal.mean(axis=0), autocorrelation(equal.mean(axis=1))
+    ends = NO_INTERVAL
     # resamples of fewer independent samples repeat the flight's own accidents
-    enough = known.n_effective >= _FEWEST_INDEPENDENT
-    agree = equal.mean(axis=0)
-    drawn, vary, varied = np.zeros((replicates, len(grid))), np.zeros(len(grid)), np.zeros((replicates, len(grid)))
-    width = max(1, _CELLS_AT_ONCE // len(ri))
-
-    def resampled(columns: BoolArray | IntArray) -> FloatArray:  # the same seed draws the same blocks each time
-        return bootstrap_means(columns.astype(np.float64), known.block_length, replicates=replicates)
-
-    for some in (slice(start, start + width) for start in range(0, len(grid), width)):
-        drawn[:, some] = resampled(equal[:, some])
-        for rank in range(1, MAX_RANK + 1):
-            apart = (ranks[:, some] == rank).astype(np.int8) - (ri == rank)[:, None]
-            vary[some] += 0.5 * np.abs(apart.mean(axis=0))
-            varied[:, some] += 0.5 * np.abs(resampled(apart))
-    best, best_tv = _middle_of_best(agree[None], grid)[0], _middle_of_best(-vary[None], grid)[0]
-    return KCurve(
-        k=grid,
-        agreement=agree,
-        total_variation=vary,
-        best_k_agreement=float(best),
-        best_k_interval=_central(_middle_of_best(drawn, grid), grid) if enough else NO_INTERVAL,
-        best_k_total_variation=float(best_tv),
-        best_k_total_variation_interval=_central(_middle_of_best(-varied, grid), grid) if enough else NO_INTERVAL,
-        at_edge=bool(np.argmax(agree) == 0 or agree[-1] >= agree.max()),
-    )
+    if known.n_effective >= _FEWEST_INDEPENDENT:
+        # the same seed draws the same blocks each time
+        width = max(1, _CELLS_AT_ONCE // len(equal))
+        drawn = np.concatenate([
+            bootstrap_means(equal[:, i : i + width].astype(np.float64), known.block_length, replicates=replicates)
+            for i in range(0, len(grid), width)
+        ], axis=1)  # fmt: skip
+        ends = _central(_middle_of_best(drawn, grid), grid)
+    return KCurve(k=grid, agreement=agree, best_k=float(_middle_of_best(agree[None], grid)[0]), best_k_ci95=ends)
 
 
 def _middle_of_best(curves: FloatArray, k: FloatArray) -> FloatArray:
@@ -568,11 +541,6 @@ class RankComparison:
     simulated: Mapping[float, RankFit]
     curve: KCurve
     staleness: Staleness
-
-    @property
-    def best_k(self) -> float:
-        """The K with the best agreement by pose."""
-        return self.curve.best_k_agreement
 
 
 def compare_rank(

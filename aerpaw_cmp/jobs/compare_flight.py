@@ -309,7 +309,7 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
     settings, levels, series, replayed = case.data.settings.rss, case.levels, case.series, case.replayed
     wild = rss.outliers(levels.measured_db)
     detection = None if case.trained else _detection(case)
-    error_db = None if case.trained else _stated_error_db(case, score, detection)
+    error_db = None if case.trained else _stated_error_db(case, score, stated, detection)
     further = RssFurther(
         n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out,
         identifiable_db=score.identifiable_db,
@@ -379,12 +379,14 @@ def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore 
     return out or None
 
 
-def _stated_error_db(case: _Case, score: rss.RssComparison, detection: DetectionScore | None) -> FloatArray:
+def _stated_error_db(
+    case: _Case, score: rss.RssComparison, stated: StatedSpread | None, detection: DetectionScore | None
+) -> FloatArray:
     """Return the residual (n,) that stated intervals are checked with: levels without lock are below the floor [dB]."""
-    if detection is None or not detection.locks:
+    if stated is None or detection is None or not detection.locks:
         return score.residual_db
     level = case.levels.simulated_db - detection.offset_db
-    error = error_above_floor(case.levels.measured_db, level, detection.floor_db)
+    error = error_above_floor(case.levels.measured_db, level, stated.total_db, detection.floor_db)
     return np.where(np.isfinite(score.residual_db), error, np.nan)
 
 

@@ -144,10 +144,8 @@ def _rank_metrics(series: RankResult) -> dict[str, Any]:
             "n_no_csi": int((~np.isfinite(series.measured)).sum()),
         },
         "simulated": simulated,
-        "best_k": score.best_k,
-        "best_k_ci95": score.curve.best_k_interval,
-        "best_k_total_variation": score.curve.best_k_total_variation,
-        "best_k_total_variation_ci95": score.curve.best_k_total_variation_interval,
+        "best_k": score.curve.best_k,
+        "best_k_ci95": score.curve.best_k_ci95,
         "n": score.n, "n_effective": score.n_effective, "n_no_csi": score.n_no_csi,
         "stale": {"verdict": score.staleness.verdict, "n_reports": score.staleness.n_reports,
                   "hold_s": score.staleness.hold_s},
@@ -408,7 +406,7 @@ def ranks_card(data: ReportData) -> Card:
 
 def _tower(p: RankResult) -> Card:
     score = p.score
-    best = f"Over continuous K the best is {number(score.best_k)} {interval(score.curve.best_k_interval)}."
+    best = f"Over continuous K the best is {number(score.curve.best_k)} {interval(score.curve.best_k_ci95)}."
     table = Table(
         caption=f"Distances between the reported and the simulated rank at {p.tower}. Brackets: 95 % interval. p: "
         "chance of such a distance if both had one distribution.",
@@ -420,7 +418,7 @@ def _tower(p: RankResult) -> Card:
             for k, at in score.simulated.items()
         ],
     )  # fmt: skip
-    text = [paragraph(words.rank_verdict(p), best if math.isfinite(score.best_k) else "")]
+    text = [paragraph(words.rank_verdict(p), best if math.isfinite(score.curve.best_k) else "")]
     return Card(title=p.tower, group="rank-tower", text=text, tables=[table])
 
 

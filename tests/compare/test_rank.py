@@ -160,7 +160,7 @@ def test_everything_out_of_coverage():
     assert (fit.out_of_coverage, result.n, result.n_no_csi) == (4, 3, 1)
     assert np.isnan(fit.histogram).all()
     assert np.isnan(fit.agreement)
-    assert np.isnan(result.best_k)
+    assert np.isnan(result.curve.best_k)
     assert np.isnan(result.simulated[1000.0].total_variation)
 
 
@@ -199,19 +199,11 @@ def test_best_k_is_found_within_its_interval():
     lost = rng.random(n) < 0.2  # the modem is not perfect
     measured[lost] = rng.integers(1, 5, lost.sum())
     curve = k_curve(measured, singular_values(h), replicates=200)
-    assert curve.best_k_agreement == pytest.approx(truth, rel=0.15)
-    assert curve.best_k_interval[0] <= truth <= curve.best_k_interval[1]
-    by_histogram = curve.best_k_total_variation, curve.best_k_total_variation_interval
-    for best, (low, high) in ((curve.best_k_agreement, curve.best_k_interval), by_histogram):
-        assert truth / 10 < low <= best <= high < 10 * truth
-    assert not curve.at_edge
-    for alone in (1.0, 4.0):  # the lowest K makes fewest layers
-        assert k_curve(np.full(n, alone), singular_values(h), replicates=2).at_edge
+    low, high = curve.best_k_ci95
+    assert curve.best_k == pytest.approx(truth, rel=0.15)
+    assert truth / 10 < low <= truth <= high < 10 * truth
     at = np.flatnonzero(curve.k == 100.0)[0]
     assert curve.agreement[at] == pytest.approx(agreement(measured, channel_rank(h, 100)))
-    assert curve.total_variation[at] == pytest.approx(
-        total_variation(histogram(measured), histogram(channel_rank(h, 100)))
-    )
 
 
 def test_the_grid_of_k_holds_the_papers_values():
@@ -403,8 +395,5 @@ def test_places_of_two_passes_are_the_same_within_two_metres():
 
 def test_a_curve_without_a_pair_says_nothing():
     curve = k_curve([np.nan, 2.0], np.array([[1.0, 0.5], [0.0, 0.0]]), k=[10.0, 100.0])
-    assert np.isnan(
-        [*curve.agreement, *curve.total_variation, curve.best_k_agreement, curve.best_k_total_variation]
-    ).all()
-    assert curve.best_k_interval == curve.best_k_total_variation_interval == NO_INTERVAL
-    assert not curve.at_edge
+    assert np.isnan([*curve.agreement, curve.best_k]).all()
+    assert curve.best_k_ci95 == NO_INTERVAL

@@ -51,10 +51,10 @@ def test_the_rest_begins_where_the_uav_is_and_its_intervals_hold():
 
 def test_levels_that_are_no_numbers_and_old_ones_take_no_part():
     ahead, last, _ = flown(False, 1)
-    before = len(ahead._bins.level)
+    before = len(ahead._bins)
     assert ahead.add(200.0, np.array([0.0, 0.0, np.nan]), -80.0, {"free space": 0.0}) is None
     assert ahead.add(200.0, np.array([0.0, 0.0, 30.0]), np.nan, {"free space": 0.0}) is None
-    assert len(ahead._bins.level) == before <= KEEP
+    assert len(ahead._bins) == before <= KEEP
     assert last is not None
 
 

@@ -22,7 +22,7 @@ import hashlib
 import json
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any, Literal
@@ -1038,16 +1038,12 @@ class Visit:
     value: FloatArray
     heading_deg: FloatArray | None = None
 
-    @property
-    def places(self) -> _Places:
-        """The positions of samples with a position and a value."""
-        known = np.isfinite(self.position_m).all(axis=1) & np.isfinite(self.value)
-        return _Places(self.position_m, self.heading_deg, np.flatnonzero(known))
-
 
 def same_places(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> tuple[IntArray, IntArray]:
     """Pair each sample of one pass with the nearest sample of the other within a radius [m]. Return both indices."""
-    return first.places.partners(second.places, radius_m, _HEADING_WITHIN_DEG)
+    known = [np.isfinite(v.position_m).all(axis=1) & np.isfinite(v.value) for v in (first, second)]
+    mine, theirs = (_Places(v.position_m, v.heading_deg, k) for v, k in zip((first, second), known, strict=True))
+    return mine.partners(theirs, radius_m, _HEADING_WITHIN_DEG)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -1112,24 +1108,20 @@ class PassPair:
 
 
 class _Places:
-    """The samples with a position and a value, their tree and their box. ``where`` are their indices in the pass."""
+    """The samples that ``good`` (n,) selects, their tree and their box. ``where`` are their indices in the pass."""
 
-    def __init__(self, position_m: FloatArray, heading_deg: FloatArray | None, where: IntArray) -> None:
-        self.where = where
-        self.position_m = np.ascontiguousarray(position_m[where])
-        self.heading_deg = None if heading_deg is None else heading_deg[where]
-        empty = not len(where)
-        self.low = np.full(3, np.inf) if empty else self.position_m.min(axis=0)
-        self.high = np.full(3, -np.inf) if empty else self.position_m.max(axis=0)
-        self._tree: Any = None
+    def __init__(self, position_m: FloatArray, heading_deg: FloatArray | None, good: BoolArray) -> None:
+        self.where = np.flatnonzero(good)
+        self.position_m = np.ascontiguousarray(position_m[good])
+        self.heading_deg = None if heading_deg is None else heading_deg[good]
+        self.low = self.position_m.min(axis=0, initial=np.inf)
+        self.high = self.position_m.max(axis=0, initial=-np.inf)
 
-    @property
+    @cached_property
     def tree(self) -> Any:
-        if self._tree is None:
-            from scipy.spatial import cKDTree
+        from scipy.spatial import cKDTree
 
-            self._tree = cKDTree(self.position_m)
-        return self._tree
+        return cKDTree(self.position_m)
 
     def partners(self, other: _Places, radius_m: float, within_deg: float | None) -> tuple[IntArray, IntArray]:
         """Return indices, in both passes, of samples and the nearest ones of the other pass with the same heading."""
@@ -1150,9 +1142,9 @@ class _Places:
         return self.where[rows], other.where[nearest_rows]
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Prepared:
-    """A pass ready to be paired: keys of the positions of levels and residuals, and means by cell."""
+    """A pass ready to be paired: keys of the positions of levels and residuals, numbers of its cells, and means."""
 
     number: int
     flown: Pass
@@ -1163,48 +1155,41 @@ class _Prepared:
     heights: FloatArray
 
 
-class PassTable:
-    """A table of passes ready to be paired.
+def pass_pairs(
+    passes: Sequence[Pass], *, cell_m: float, radius_m: float, heading_within_deg: float | None
+) -> Iterator[PassPair]:
+    """Yield every pair of two flights' passes on one link, by first flight, second flight and link.
 
     Parameters
     ----------
     passes : sequence of Pass
     cell_m : float
         Side of the square cells on the map [m].
+    radius_m : float
+        A sample of the first pass pairs with the nearest one of the second within this distance.
+    heading_within_deg : float, optional
+        Largest difference of the headings of a pair, if both passes have headings. None allows any heading.
+
+    Yields
+    ------
+    PassPair
     """
+    places: dict[bytes, _Places] = {}
+    # by flight, then by link
+    flights: dict[str, dict[str, list[_Prepared]]] = {}
+    for number, flown in enumerate(passes):
+        links = flights.setdefault(flown.flight, {})
+        links.setdefault(flown.link, []).append(_prepare(number, flown, cell_m, places))
+    for first, second in combinations(flights.values(), 2):
 
-    def __init__(self, passes: Sequence[Pass], cell_m: float) -> None:
-        self._places: dict[bytes, _Places] = {}
-        # by flight, then by link
-        self._flights: dict[str, dict[str, list[_Prepared]]] = {}
-        for number, flown in enumerate(passes):
-            links = self._flights.setdefault(flown.flight, {})
-            links.setdefault(flown.link, []).append(_prepare(number, flown, cell_m, self._places))
+        @cache  # the links of a pair of flights share its searches
+        def met(mine: bytes, theirs: bytes) -> tuple[IntArray, IntArray]:
+            return places[mine].partners(places[theirs], radius_m, heading_within_deg)
 
-    def pairs(self, *, radius_m: float, heading_within_deg: float | None) -> Iterator[PassPair]:
-        """Yield every pair of two flights' passes on one link, by first flight, second flight and link.
-
-        Parameters
-        ----------
-        radius_m : float
-            A sample of the first pass pairs with the nearest one of the second within this distance.
-        heading_within_deg : float, optional
-            Largest difference of the headings of a pair, if both passes have headings. None allows any heading.
-
-        Yields
-        ------
-        PassPair
-        """
-        for first, second in combinations(self._flights.values(), 2):
-
-            @cache  # the links of a pair of flights share its searches
-            def met(mine: bytes, theirs: bytes) -> tuple[IntArray, IntArray]:
-                return self._places[mine].partners(self._places[theirs], radius_m, heading_within_deg)
-
-            shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
-            for link, passes in first.items():
-                for mine, theirs in product(passes, second.get(link, ())):
-                    yield _pair(mine, theirs, met, shared)
+        shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
+        for link, own in first.items():
+            for mine, theirs in product(own, second.get(link, ())):
+                yield _pair(mine, theirs, met, shared)
 
 
 def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Places]) -> _Prepared:
@@ -1216,7 +1201,8 @@ def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Place
         flown=flown,
         level=_entered(flown, placed & np.isfinite(flown.level_db), places),
         residual=_entered(flown, scored, places),
-        cells=cells,
+        # one integer per cell: NumPy intersects rows of two columns by sorting records, ten times slower
+        cells=(cells[:, 0] << 32) + cells[:, 1],
         means=means,
         heights=heights,
     )
@@ -1231,7 +1217,7 @@ def _entered(flown: Pass, good: BoolArray, places: dict[bytes, _Places]) -> byte
     # a key by content: links that were sampled together have equal positions in different arrays
     key = digest.digest()
     if key not in places:
-        places[key] = _Places(flown.position_m, flown.heading_deg, np.flatnonzero(good))
+        places[key] = _Places(flown.position_m, flown.heading_deg, good)
     return key
 
 
@@ -1280,7 +1266,7 @@ def _pair(
     residual = theirs.flown.residual_db[j] - mine.flown.residual_db[i]
     cells = mine.residual, theirs.residual  # equal positions have the same cells and heights
     if cells not in shared:
-        i, j = _common(mine.cells, theirs.cells)
+        _, i, j = np.intersect1d(mine.cells, theirs.cells, assume_unique=True, return_indices=True)
         height = float(np.median(theirs.heights[j] - mine.heights[i])) if len(i) else float("nan")
         shared[cells] = i, j, height
     i, j, height = shared[cells]
@@ -1298,11 +1284,3 @@ def _pair(
         cells=len(i),
         height_difference_m=height,
     )
-
-
-def _common(first: IntArray, second: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the rows of both with the same cell, in the order of the cells. Both are sorted without duplicates."""
-    # one integer per cell: NumPy intersects rows of two columns by sorting records, ten times slower
-    a, b = ((cells[:, 0] << 32) + cells[:, 1] for cells in (first, second))
-    _, i, j = np.intersect1d(a, b, assume_unique=True, return_indices=True)
-    return i, j

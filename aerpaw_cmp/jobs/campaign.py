@@ -37,7 +37,7 @@ from ..common.yamlfile import StrictModel, load_yaml
 from ..compare import offset, verdict
 from ..compare.offset import Pooling, pooled_moments
 from ..compare.result import FlightResult, RankResult, RssResult
-from ..compare.statistics import Pass, PassPair, PassTable, cell_means
+from ..compare.statistics import Pass, PassPair, cell_means, pass_pairs
 from ..compare.verdict import NightOffsets, NodeOffset, node_offsets, stepped
 from ..flight.data import FlightData, RankSeries, RssSeries, gather, read_logs
 from ..flight.gains import with_learned
@@ -633,7 +633,7 @@ def repeats(rows: Sequence[RssRow]) -> list[Repeat]:
         for row in rows
     ]
     rule = {"radius_m": CampaignData.radius_m, "heading_within_deg": CampaignData.heading_within_deg}
-    pairs = PassTable(passes, CampaignData.cell_m).pairs(**rule)
+    pairs = pass_pairs(passes, cell_m=CampaignData.cell_m, **rule)
     known = [int(np.isfinite(row.measured_db).sum()) for row in rows]
     ordered = sorted(pairs, key=lambda pair: (pair.first, pair.second))
     return [_repeat(pair, rows[pair.first], rows[pair.second], known[pair.first]) for pair in ordered]

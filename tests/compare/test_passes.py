@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.statistics import Pass, PassTable, correlation
+from aerpaw_cmp.compare.statistics import Pass, correlation, pass_pairs
 
 RADIUS_M, WITHIN_DEG, CELL_M = 3.0, 20.0, 20.0
 FLIGHTS, LINKS, SAMPLES = 7, 3, 160
@@ -71,7 +71,7 @@ def test_the_pairs_are_those_of_brute_force() -> None:
     passes = season()
     by_passes = {
         (p.first, p.second): p
-        for p in PassTable(passes, CELL_M).pairs(radius_m=RADIUS_M, heading_within_deg=WITHIN_DEG)
+        for p in pass_pairs(passes, cell_m=CELL_M, radius_m=RADIUS_M, heading_within_deg=WITHIN_DEG)
     }
     expected = [
         (i, j)

@@ -273,7 +273,7 @@ def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> C
         level, sd = np.full((2, len(poses), len(towers)), np.nan)
         heading, up = bearing_deg(poses.rotation[:, :, 0]), poses.rotation[:, :, 2]
         for tower, source in sources.items():
-            gain, slow, _ = memory.levels([source.targets(poses.position_m, heading, up)], len(poses))
+            gain, slow, _ = memory.levels([source.targets(poses.position_m, heading, up)])
             level[:, towers.index(tower)] = gain + source.free_space_db(poses.position_m)
             sd[:, towers.index(tower)] = memory.fading(source.antenna).total_db(slow)
         return {"level_db": level, "level_sd_db": sd, "level_unit": units, "trained_on": trained_on}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -171,28 +171,32 @@ class MapSettings:
 QUICK: dict[str, Any] = {"spacing_m": 120.0, "rss_altitudes_m": (30.0, 110.0), "rank_altitudes_m": (3.0, 30.0, 110.0)}
 
 
-def map_settings(fields: Mapping[str, Any], *, quick: bool = False) -> MapSettings:
-    """Return the settings of a map from given fields. A field of None has its default."""
-    stated = {name: value for name, value in fields.items() if value is not None}
-    return MapSettings(**({**QUICK, **stated} if quick else stated))
+def map_settings(site: str, chosen: Mapping[str, Any], *, quick: bool = False) -> MapSettings:
+    """Return the settings of a map.
 
+    Parameters
+    ----------
+    site : str
+        Site whose key ``coverage`` has a carrier and a link budget.
+    chosen : mapping
+        Fields of :class:`MapSettings` and of its link budget, which replace those of the site. None: not chosen. A
+        threshold replaces either threshold of the site.
+    quick : bool
+        Use :data:`QUICK` instead of the paper's defaults.
 
-def site_carrier_hz(site: str) -> float | None:
-    """Return the carrier of the key ``coverage`` of a site [Hz]. None if it is not set."""
-    carrier_ghz = site_model(site).coverage.carrier_ghz
-    return None if carrier_ghz is None else carrier_ghz * 1e9
-
-
-def link_budget(site: str, options: Mapping[str, float | None]) -> LinkBudget:
-    """Return the link budget of the key ``coverage`` of a site, with command-line options in its place.
-
-    A threshold among the options replaces either threshold of the site.
+    Returns
+    -------
+    MapSettings
     """
-    stated = {name: value for name, value in options.items() if value is not None}
-    kept = site_model(site).coverage.model_dump(exclude_none=True, exclude={"carrier_ghz"})
-    if "threshold_dbm" in stated or "threshold_snr_db" in stated:
-        kept = {name: value for name, value in kept.items() if not name.startswith("threshold")}
-    return LinkBudget(**(kept | stated))
+    given = {name: value for name, value in chosen.items() if value is not None}
+    stated = site_model(site).coverage.model_dump(exclude_none=True)
+    if "carrier_ghz" in stated:
+        stated["carrier_hz"] = 1e9 * stated.pop("carrier_ghz")
+    if {"threshold_dbm", "threshold_snr_db"} & set(given):
+        stated = {name: value for name, value in stated.items() if not name.startswith("threshold")}
+    every = (QUICK if quick else {}) | stated | given
+    budget = {item.name: every.pop(item.name) for item in fields(LinkBudget) if item.name in every}
+    return MapSettings(budget=LinkBudget(**budget), **every)
 
 
 # --- the engine ----------------------------------------------------------------------------------------------------

@@ -204,38 +204,32 @@ def _model_fields(
         heading_words(table["yaw_deg"].to_numpy(np.float64)),
         float(table[P_LOCK].mean()) if P_LOCK in table else None,
     )
-    if isinstance(model, Prior):
-        return {
-            "verdict": first_words(
-                None, 0.0, *expected, origin=prior_words(model.link.carrier_hz, model.link.transmit_power_dbm)
-            ),
-            "warnings": [prior_caution(PRIOR_OFFSET_DB, PRIOR_ANTENNA_DB, PRIOR_SHADOWING_DB, PRIOR_FADING_DB)],
-            "flights": [],
-            KEY: (),
-            MARKS: (),
-            "candidates": [],
-            "model": {},
-            "chosen": {"title": TITLES["prior"], "base": "prior", "corrected": False, "field": OFF},
-        }
     logs, marks = ([getattr(receiver, key) for receiver in receivers] for key in (KEY, MARKS))
+    fields: dict[str, Any] = {
+        "flights": [data.settings.flight.name for data in known], KEY: union(*logs), MARKS: union(*marks),
+        "candidates": [], "model": {},
+    }  # fmt: skip
+    if not isinstance(model, Flown):
+        base = "prior" if isinstance(model, Prior) else "memory"
+        fields["chosen"] = {"title": TITLES[base], "base": base, "corrected": False, "field": OFF}
+    if isinstance(model, Prior):
+        origin = prior_words(model.link.carrier_hz, model.link.transmit_power_dbm)
+        caution = prior_caution(PRIOR_OFFSET_DB, PRIOR_ANTENNA_DB, PRIOR_SHADOWING_DB, PRIOR_FADING_DB)
+        return fields | {"verdict": first_words(None, 0.0, *expected, origin=origin), "warnings": [caution]}
     if isinstance(model, Memory):
         entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()
-        return {
+        return fields | {
             "verdict": first_words(None, guess, *expected),
             "warnings": memory_cautions([(m.entry, m.series) for m in model.known.values()], guess),
             "flights": [name for entry in entries for name in entry.flights],
             KEY: union(*(entry.trained_on for entry in entries), *logs),
             MARKS: union(*(end.marks for m in model.known.values() for end in (m.tower, m.uav)), *marks),
-            "candidates": [],
-            "model": {},
-            "chosen": {"title": TITLES["memory"], "base": "memory", "corrected": False, "field": OFF},
         }
     correction = model.correction
     key = correction.base, correction.title
-    return {
+    return fields | {
         "verdict": first_words(correction, guess, *expected),
         "warnings": cautions(correction, guess),
-        "flights": [data.settings.flight.name for data in known],
         KEY: union(*map(flight_logs, known), *logs, *model.trained_on),
         MARKS: union(marks_of(known), *marks, *model.marks),
         "candidates": [
@@ -322,7 +316,7 @@ def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions)
     carrier_hz = options.carrier_hz or (stated.carrier_ghz or 0.0) * 1e9 or link.carrier_hz
     powers = (options.tx_power_dbm, stated.tx_power_dbm, link.transmit_power_dbm)
     link = LinkSettings(carrier_hz=carrier_hz, transmit_power_dbm=next(p for p in powers if p is not None))
-    return Prior(site, link, tuple(site.towers))
+    return Prior(site, link)
 
 
 def _nodes_of(where: Path) -> set[str]:
@@ -378,7 +372,8 @@ def _best_model(
         bases.pop("none")
     correction = choose(samples, bases, STATED_FIELDS if beyond else ())
     used = learned.get(correction.base, ())
-    return Flown(correction, sources, [item.trained_on for item in used], [item.marks for item in used])
+    count = int(targets.known.sum())
+    return Flown(correction, sources, count, [item.trained_on for item in used], [item.marks for item in used])
 
 
 def _bases(
@@ -484,7 +479,7 @@ def _table(
 
 def _stated(model: Flown | Memory | Prior, antenna: str, level_db: AnyArray, slow_db: AnyArray) -> dict[str, AnyArray]:
     """Return the columns (n,) of a level: median, standard deviation, interval, and P(lock) if lock can be lost."""
-    lock = model.lost_lock(antenna, level_db)
+    lock = model.lost_lock(antenna, level_db) if isinstance(model, Memory) else None
     if lock is None:
         fading = model.fading(antenna)
         half, sd = fading.half_width_db(slow_db, BAND), fading.total_db(slow_db)
@@ -512,7 +507,7 @@ def _levels(
             position, yaw = targets.position_m[rows], targets.yaw_deg[rows]
             up = np.broadcast_to(targets.up, targets.position_m.shape)[rows]
             each = [source.targets(position, np.where(np.isfinite(yaw), yaw, turn), up) for turn in _turns(yaw)]
-            level[k, rows], slow[k, rows], guess[k, rows] = model.levels(each, int(targets.known.sum()))
+            level[k, rows], slow[k, rows], guess[k, rows] = model.levels(each)
             level[k, rows] += source.free_space_db(position)
             progress(f"predict {source.antenna}", share)
     return level, slow, guess
@@ -786,6 +781,7 @@ def _map_levels(prediction: Prediction, source: Source, n: int) -> Iterator[Corr
     mine = table[(table["tower"] == source.tower) & (table["channel"] == source.channel)]
     position = prediction.targets.position_m
     raw = source.replayed_db(source.targets(position, np.zeros(len(position)))) + source.free_space_db(position)
+    assert isinstance(prediction.model, Flown)  # a map is corrected by named flights
     level = mine["level_db"].to_numpy() - prediction.model.offset_db(source.antenna)
     for k, height in enumerate(prediction.targets.heights_m):
         part = slice(k * n, (k + 1) * n)

@@ -22,7 +22,7 @@ from ..common.units import BoolArray, FloatArray
 from ..compare.calibration import BIN_S, Correction, Observed, Predictor, between_blocks_db, by_degree
 from ..compare.gains import NO_SPREAD, LinkSamples, LostLock, Spread, fading_of, link_directions, student_factor
 from ..compare.level import DetectionForecast
-from ..flight.data import FAR_M, FlightData, RssSeries, load_data, nearest_m
+from ..flight.data import FAR_M, FlightData, load_data, nearest_m
 from ..flight.drafting.proposals import Remembered, remembered
 from ..flight.gains import flight_of, load_with_learned, pair_db
 from ..flight.replay import attitude_rotation, replay_poses
@@ -409,22 +409,6 @@ class Source:
     rss: RssSettings = field(default_factory=RssSettings)
     samples: tuple[LinkSamples, ...] = ()
 
-    @classmethod
-    def of(cls, data: FlightData, series: RssSeries, samples: Sequence[LinkSamples]) -> Source:
-        """Return the link of a series of a flight. ``samples`` are those of all flights."""
-        of_series = tuple(s for s in samples if (s.tower, s.channel) == (series.tower, series.channel))
-        return cls(
-            tower=series.tower,
-            channel=series.channel,
-            unit=series.unit,
-            link=series.link,
-            site=data.site,
-            folder=data.folder,
-            rt=data.settings.rt,
-            rss=data.settings.rss,
-            samples=of_series,
-        )
-
     @property
     def antenna(self) -> str:
         """``tower.channel``."""
@@ -468,13 +452,18 @@ def track_m(samples: LinkSamples) -> FloatArray:
 
 def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dict[str, Source]:
     """Return links of fixed towers and the channels that a flight received, by antenna."""
-    measured = [o.samples for o in observed if np.isfinite(o.samples.residual_db).any()]
+    measured: dict[str, list[LinkSamples]] = {}
+    for o in observed:
+        if np.isfinite(o.samples.residual_db).any():
+            measured.setdefault(o.samples.antenna, []).append(o.samples)
     out: dict[str, Source] = {}
-    for data in known:
-        for series in data.rss:
-            source = Source.of(data, series, measured)
-            if source.samples and series.tower not in data.nodes and series.unit != "dB":
-                out.setdefault(source.antenna, source)
+    for data, s in [(flight, series) for flight in known for series in flight.rss]:
+        source = Source(
+            tower=s.tower, channel=s.channel, unit=s.unit, link=s.link, site=data.site, folder=data.folder,
+            rt=data.settings.rt, rss=data.settings.rss,
+        )  # fmt: skip
+        if source.antenna in measured and s.tower not in data.nodes and s.unit != "dB":
+            out.setdefault(source.antenna, replace(source, samples=tuple(measured[source.antenna])))
     if not out:
         raise InputError("no flight has levels of a fixed tower", expected="RSS logs with positions")
     return out
@@ -495,14 +484,17 @@ class Flown:
 
     correction: Correction
     sources: Mapping[str, Source]
+    targets: int
+    """Number of targets that are predicted in all."""
     trained_on: Sequence[Sequence[str]] = ()
-    marks: Sequence[Sequence[str]] = ()
     """SHA-256 of the training data of its base, in addition to the named flights."""
+    marks: Sequence[Sequence[str]] = ()
+    """Fingerprints of the same data."""
 
-    def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:
-        """Return levels at targets, averaged over the headings ``each``. ``run_targets``: targets of the whole run."""
+    def levels(self, each: Sequence[LinkSamples]) -> Levels:
+        """Return levels at targets, averaged over the headings ``each``."""
         antenna = each[0].antenna
-        level, slow = self.correction.over_headings(each, all_targets=run_targets)
+        level, slow = self.correction.over_headings(each, all_targets=self.targets)
         guess = outside(each[0].position_m, self.sources[antenna].samples)
         # The field's offset of a new flight is normal. Its spread is estimated from the differences between flights on
         # all channels: few differences determine it poorly.
@@ -518,10 +510,6 @@ class Flown:
         """Return the spread of samples about their means over 4 s."""
         sd_db, kurtosis = fading_of(self.sources[antenna].samples, BIN_S)
         return dataclasses.replace(NO_SPREAD, fading_sd_db=sd_db, fading_kurtosis=kurtosis, bin_s=BIN_S)
-
-    def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:  # noqa: ARG002
-        """Return None: only the level is learned from the named flights."""
-        return None
 
     def offset_db(self, antenna: str) -> float:
         """Return the mean of logged minus replayed levels [dB]."""
@@ -544,7 +532,7 @@ class Memory:
         self.known, self._site = known, site
         self._gain_db: Predictor = by_degree(lambda samples: known[samples.antenna].gain_db(samples))
 
-    def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:  # noqa: ARG002
+    def levels(self, each: Sequence[LinkSamples]) -> Levels:
         """Return levels as :meth:`Flown.levels`. It extrapolates off the site and where the gains are hardly known."""
         memory = self.known[each[0].antenna]
         gains, sds = (np.stack(part) for part in zip(*map(self._gain_db, each), strict=True))
@@ -575,10 +563,6 @@ class Memory:
             lost_sd_db=lock.lost_sd_db,
         )
 
-    def offset_db(self, antenna: str) -> float:
-        """Return the mean of logged levels minus those of the antennas [dB]."""
-        return self.known[antenna].level.offset_db
-
     def sources(self) -> dict[str, Source]:
         """Return one link per antenna, with isotropic ends."""
         out = {}
@@ -586,23 +570,16 @@ class Memory:
             series, level = memory.series, memory.level
             link = LinkSettings(carrier_hz=series.carrier_hz, transmit_power_dbm=level.transmit_power_dbm)
             out[antenna] = Source(
-                tower=series.tower,
-                channel=series.channel,
-                unit=level.unit,
-                link=link,
-                site=self._site,
+                tower=series.tower, channel=series.channel, unit=level.unit, link=link, site=self._site,
                 rss=RssSettings(field="power"),
-            )
+            )  # fmt: skip
         return out
 
 
 def memory_of(place: str | Path, site: Site) -> Memory | None:
     """Return the model of the antennas and levels learned for a site. None if no level of its towers was learned."""
-    known = {
-        name: entry
-        for name, entry in remembered(place).items()
-        if entry.series.level and entry.series.tower in site.towers
-    }
+    learned = remembered(place)
+    known = {name: m for name, m in learned.items() if m.series.level and m.series.tower in site.towers}
     return Memory(known, site) if known else None
 
 
@@ -620,48 +597,29 @@ class Prior:
     Parameters
     ----------
     site : Site
+        The site. All its towers are predicted.
     link : LinkSettings
         Carrier and transmit power.
-    towers : tuple of str
-        The towers that are predicted.
     """
 
     site: Site
     link: LinkSettings
-    towers: tuple[str, ...]
 
     def sources(self) -> dict[str, Source]:
         """Return one link per tower, with isotropic ends and woods that attenuate."""
-        rt = RtSettings(foliage="attenuating")
-        return {
-            f"{tower}.level": Source(
-                tower=tower, channel="level", unit="dBm", link=self.link, site=self.site, rt=rt,
-                rss=RssSettings(field="power"),
-            )
-            for tower in self.towers
-        }  # fmt: skip
+        how = {"rt": RtSettings(foliage="attenuating"), "rss": RssSettings(field="power"), "unit": "dBm"}
+        links = (Source(tower=t, channel="level", link=self.link, site=self.site, **how) for t in self.site.towers)
+        return {source.antenna: source for source in links}
 
-    def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:  # noqa: ARG002
+    def levels(self, each: Sequence[LinkSamples]) -> Levels:
         """Return level above free space and standard deviation (n,) [dB]. Isotropic antennas have no heading."""
         level = self.sources()[each[0].antenna].replayed_db(each[0])
-        return level, np.where(np.isfinite(level), self.slow_sd_db, np.nan), np.ones(len(level), dtype=np.bool_)
+        slow_sd_db = math.sqrt(PRIOR_OFFSET_DB**2 + PRIOR_ANTENNA_DB**2 + PRIOR_SHADOWING_DB**2)
+        return level, np.where(np.isfinite(level), slow_sd_db, np.nan), np.ones(len(level), dtype=np.bool_)
 
-    @property
-    def slow_sd_db(self) -> float:
-        """Standard deviation of a mean over 4 s on a first flight [dB]."""
-        return math.sqrt(PRIOR_OFFSET_DB**2 + PRIOR_ANTENNA_DB**2 + PRIOR_SHADOWING_DB**2)
-
-    def fading(self, antenna: str) -> Spread:  # noqa: ARG002
+    def fading(self, _antenna: str) -> Spread:
         """Return the spread of samples about their means over 4 s."""
         return dataclasses.replace(NO_SPREAD, fading_sd_db=PRIOR_FADING_DB)
-
-    def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:  # noqa: ARG002
-        """Return None: no receiver is known."""
-        return None
-
-    def offset_db(self, antenna: str) -> float:  # noqa: ARG002
-        """Return 0: no level was measured [dB]."""
-        return 0.0
 
 
 def outside(position_m: FloatArray, flown: Sequence[LinkSamples]) -> BoolArray:

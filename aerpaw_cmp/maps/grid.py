@@ -576,6 +576,16 @@ def in_name(number: float, digits: int = 3) -> str:
     return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")
 
 
+# Name, smallest and largest value, unit, and likely cause of a value outside the range, by field of a link budget.
+_RANGES = {
+    "tx_power_dbm": ("transmit power", -60.0, 100.0, "dBm", "watts instead of dBm"),
+    "bandwidth_mhz": ("bandwidth", 1e-6, 1e5, "MHz", "Hz instead of MHz"),
+    "noise_figure_db": ("noise figure", 0.0, 60.0, "dB", "a noise factor instead of dB"),
+    "threshold_dbm": ("threshold", -200.0, 60.0, "dBm", "another unit than dBm"),
+    "threshold_snr_db": ("SNR threshold", -60.0, 100.0, "dB", "a level instead of an SNR"),
+}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkBudget:
     """The receiver and the threshold of a coverage map.
@@ -616,34 +626,25 @@ class LinkBudget:
     threshold_snr_db: float | None = None
 
     def __post_init__(self) -> None:
-        self._check_range("transmit power", self.tx_power_dbm, -60.0, 100.0, "dBm", "watts instead of dBm")
-        self._check_range("noise figure", self.noise_figure_db, 0.0, 60.0, "dB", "a noise factor instead of dB")
-        if self.bandwidth_mhz is not None:
-            self._check_range("bandwidth", self.bandwidth_mhz, 1e-6, 1e5, "MHz", "Hz instead of MHz")
-        elif self.noise_figure_db:
-            raise UsageError("a noise figure without a bandwidth", expected="bandwidth_mhz (--bandwidth-mhz), too")
+        for name, (what, low, high, unit, cause) in _RANGES.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise UsageError(f"a {what} of {value:g} {unit}", expected=f"{low:g} to {high:g} {unit}", cause=cause)
         if self.threshold_dbm is not None and self.threshold_snr_db is not None:
             raise UsageError("threshold_dbm and threshold_snr_db", expected="one of the two")
-        if self.threshold_snr_db is not None:
-            self._check_range("SNR threshold", self.threshold_snr_db, -60.0, 100.0, "dB", "a level instead of an SNR")
-            if self.bandwidth_mhz is None:
-                raise UsageError(
-                    "threshold_snr_db without a bandwidth",
-                    expected="bandwidth_mhz (--bandwidth-mhz), from which the noise floor follows",
-                )
-        if self.threshold_dbm is not None:
-            self._check_range("threshold", self.threshold_dbm, -200.0, 60.0, "dBm", "another unit than dBm")
-            if self.noise_dbm is not None and self.threshold_dbm < round(self.noise_dbm, 1):
-                raise UsageError(
-                    f"a threshold of {self.threshold_dbm:g} dBm below the noise floor of {self.noise_dbm:.1f} dBm",
-                    expected="a level above the noise, or threshold_snr_db (--threshold-snr-db) with a negative SNR",
-                    cause="a threshold that holds for a narrower band",
-                )
-
-    @staticmethod
-    def _check_range(what: str, value: float, low: float, high: float, unit: str, cause: str) -> None:
-        if not low <= value <= high:
-            raise UsageError(f"a {what} of {value:g} {unit}", expected=f"{low:g} to {high:g} {unit}", cause=cause)
+        of_noise = {"threshold_snr_db": self.threshold_snr_db is not None, "a noise figure": self.noise_figure_db > 0.0}
+        if self.bandwidth_mhz is None and (named := [name for name, given in of_noise.items() if given]):
+            raise UsageError(
+                f"{named[0]} without a bandwidth",
+                expected="bandwidth_mhz (--bandwidth-mhz), from which the noise floor follows",
+            )
+        level_dbm, noise_dbm = self.threshold_dbm, self.noise_dbm
+        if level_dbm is not None and noise_dbm is not None and level_dbm < round(noise_dbm, 1):
+            raise UsageError(
+                f"a threshold of {level_dbm:g} dBm below the noise floor of {noise_dbm:.1f} dBm",
+                expected="a level above the noise, or threshold_snr_db (--threshold-snr-db) with a negative SNR",
+                cause="a threshold that holds for a narrower band",
+            )
 
     @property
     def noise_dbm(self) -> float | None:

@@ -366,7 +366,11 @@ def test_options_replace_the_link_budget_of_the_site(tmp_path):
         "towers: {A: {latitude_deg: 35.7, longitude_deg: -78.7}}\n"
         "coverage: {tx_power_dbm: 23, bandwidth_mhz: 10, noise_figure_db: 6, threshold_snr_db: 3}\n"
     )
-    assert coverage_map.link_budget(str(file), {}).sentence().startswith("Transmit power 23 dBm; noise floor -98.0 dBm")
-    changed = coverage_map.link_budget(str(file), {"threshold_dbm": -90.0, "tx_power_dbm": None})
+    assert (
+        coverage_map.map_settings(str(file), {})
+        .budget.sentence()
+        .startswith("Transmit power 23 dBm; noise floor -98.0 dBm")
+    )
+    changed = coverage_map.map_settings(str(file), {"threshold_dbm": -90.0, "tx_power_dbm": None}).budget
     assert (changed.tx_power_dbm, changed.threshold_snr_db, changed.level_dbm) == (23, None, -90.0)
-    assert coverage_map.link_budget("lake_wheeler", {}) == PAPER_BUDGET
+    assert coverage_map.map_settings("lake_wheeler", {}).budget == PAPER_BUDGET

@@ -11,7 +11,6 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.gains import Spread
 from aerpaw_cmp.jobs import predict
-from aerpaw_cmp.jobs.predict import corrected_maps
 from aerpaw_cmp.jobs.sources import Memory, TargetOptions, named_flights
 from aerpaw_cmp.site.learned import (
     Entry,
@@ -138,14 +137,6 @@ def test_an_unknown_heading_adds_the_spread_of_the_gain_over_headings(site: Path
     # eight headings: the cosine has mean 0 and variance 1/2
     assert any_heading["level_db"] - one_heading["level_db"] == pytest.approx(2.0, abs=0.02)
     assert any_heading["slow_sd_db"] ** 2 - one_heading["slow_sd_db"] ** 2 == pytest.approx(2.0**2 / 2, abs=0.05)
-
-
-def test_maps_are_corrected_by_the_memory_alone(site: Path) -> None:
-    maps = corrected_maps(str(site), 300.0, ((40.0,), (60.0,)), [])
-    assert [(item.link, item.height_m) for item in maps.levels] == [("LW1 A", 40.0)]
-    assert maps.ranks == {}  # this memory has no receiver
-    said = predict.predict(site, [], TargetOptions(heights_m=(40.0,), spacing_m=300.0))
-    np.testing.assert_allclose(maps.levels[0].corrected_dbm, said.table["level_db"] + 7.0, atol=1e-3)
 
 
 def test_a_site_without_learned_levels_is_predicted_by_the_prior_and_says_so(tmp_path: Path) -> None:

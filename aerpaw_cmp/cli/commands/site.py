@@ -215,31 +215,25 @@ def map_(
 ) -> None:
     """Coverage and rank maps of a site, Kriging of rank."""
     from ...jobs import run
-    from ...jobs.coverage_map import link_budget, map_settings, site_carrier_hz
+    from ...jobs.coverage_map import map_settings
 
-    modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
-    fields: dict[str, Any] = {
-        "foliage": modes,
+    chosen: dict[str, Any] = {
+        "foliage": None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage)),
         "spacing_m": spacing,
         "rss_altitudes_m": tuple(sorted(set(rss_altitude))) if rss_altitude else None,
         "rank_altitudes_m": tuple(sorted(set(rank_altitude))) if rank_altitude else None,
         "ks": tuple(sorted(set(k))) if k else None,
-        "carrier_hz": site_carrier_hz(site) if carrier_ghz is None else carrier_ghz * 1e9,
+        "carrier_hz": None if carrier_ghz is None else carrier_ghz * 1e9,
         "max_depth": max_depth,
         "study": study,
         "tile_m": tile_m,
-        "budget": link_budget(
-            site,
-            {
-                "tx_power_dbm": tx_power_dbm,
-                "bandwidth_mhz": bandwidth_mhz,
-                "noise_figure_db": noise_figure_db,
-                "threshold_dbm": threshold_dbm,
-                "threshold_snr_db": threshold_snr_db,
-            },
-        ),
+        "tx_power_dbm": tx_power_dbm,
+        "bandwidth_mhz": bandwidth_mhz,
+        "noise_figure_db": noise_figure_db,
+        "threshold_dbm": threshold_dbm,
+        "threshold_snr_db": threshold_snr_db,
     }
-    settings = map_settings(fields, quick=quick)
+    settings = map_settings(site, chosen, quick=quick)
     options = RunOptions(
         out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say, dry=dry_run
     )

@@ -266,6 +266,13 @@ def test_a_long_flight_is_thinned_with_its_extremes(data, tmp_path, monkeypatch)
     assert lines.count(" ") < 600
 
 
+def test_every_rank_has_its_own_colour():
+    """Rank 4 had the colour and the name of rank 3."""
+    numbers = kmz.RANKS.bin_of(np.array([1.0, 2.0, 3.0, 4.0, 0.0, np.nan]))
+    assert [kmz.RANKS.labels[i] for i in numbers[:4]] == ["rank 1", "rank 2", "rank 3", "rank 4"]
+    assert {kmz.RANKS.labels[i] for i in numbers[4:]} == {"no path or no report"}
+
+
 def test_formats_are_chosen_by_name():
     assert formats.chosen_formats(["NetCDF, kmz", "kmz"]) == ("kmz", "netcdf")
     assert formats.chosen_formats(["all"]) == formats.FORMATS

@@ -38,11 +38,8 @@ TITLES = {
     "prior": "ray tracing with isotropic antennas, before any flight",
 }
 
-FLAGS = {
-    "outside_flown": "outside the flown area: the standard deviation is that of the model alone",
-    "out_of_coverage": "no path",
-    "no_position": "no position",
-}
+# Flags of points: outside the flown area the standard deviation is that of the model alone.
+FLAGS = ("outside_flown", "out_of_coverage", "no_position")
 
 # Share of points outside the flown area above which the summary names it.
 MANY = 0.2
@@ -52,54 +49,32 @@ AGAINST_FREE_SPACE = {
     "better": ("On held-out {over} it is {size:.1f} dB better than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
     "worse": ("On held-out {over} it is {size:.1f} dB worse than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
     "not significant": (
-        "On held-out {over} the difference from free space [{low:+.1f}, {high:+.1f}] is not significant (95 %).",
-        "",
+        "On held-out {over} the difference from free space [{low:+.1f}, {high:+.1f}] is not significant (95 %).", ""
     ),
     "no interval": ("The flight is too short for an interval of the difference from free space.", ""),
     "two flights": (
-        "On held-out {over} the RMSE differs from free space by {effect:+.1f} dB; two flights give no interval.",
-        "",
+        "On held-out {over} the RMSE differs from free space by {effect:+.1f} dB; two flights give no interval.", ""
     ),
-}
+}  # fmt: skip
 
 # Sentences about the residual field, by the interval of the difference in CRPS; ``off`` if it includes zero.
+_FIELD = "The residual field (a spatial correction) is "
 FIELD = {
-    "better": (
-        "The residual field (a spatial correction) is on: it lowers the CRPS by {size:.2f} dB on held-out samples.",
-        "",
-    ),
-    "worse": (
-        "The residual field (a spatial correction) is off: it raises the CRPS by {size:.2f} dB on held-out samples.",
-        "",
-    ),
-    "off": (
-        "The residual field (a spatial correction) is off: the CRPS differs by {size:.2f} dB, not significantly.",
-        "",
-    ),
+    "better": (_FIELD + "on: it lowers the CRPS by {size:.2f} dB on held-out samples.", ""),
+    "worse": (_FIELD + "off: it raises the CRPS by {size:.2f} dB on held-out samples.", ""),
+    "off": (_FIELD + "off: the CRPS differs by {size:.2f} dB, not significantly.", ""),
 }
 
-HELD_OUT = "90 % intervals contain {inside:.0f} % of the held-out samples."
 # Sentences about the stated standard deviations on held-out data, by :func:`~aerpaw_cmp.compare.verdict.stated_errors`.
-STATED: dict[str, tuple[str, str]] = {
-    "none": (HELD_OUT, ""),
-    "no interval": ("", ""),
-    "narrow": (
-        HELD_OUT
-        + " They are too narrow: errors are {effect:.1f} times as large as stated (95 %: {low:.1f} to {high:.1f}).",
-        "add a flight of this area",
-    ),
-    "wide": (
-        HELD_OUT
-        + " They are too wide: errors are {effect:.1f} times as large as stated (95 %: {low:.1f} to {high:.1f}).",
-        "",
-    ),
-    "biased": (
-        HELD_OUT
-        + " The measured level is {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) above the predicted one.",
-        "check the gain of the training flights",
-    ),
+_INSIDE = "90 % intervals contain {inside:.0f} % of the held-out samples."
+_ERRORS = "errors are {effect:.1f} times as large as stated (95 %: {low:.1f} to {high:.1f})."
+_BIAS = "the measured level is {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) above the predicted one."
+STATED = {
+    "none": (_INSIDE, ""),
+    "narrow": (f"{_INSIDE} They are too narrow: {_ERRORS}", "add a flight of this area"),
+    "wide": (f"{_INSIDE} They are too wide: {_ERRORS}", ""),
+    "biased": (f"{_INSIDE} T{_BIAS[1:]}", "check the gain of the training flights"),
 }
-
 
 EXPECTED = (
     "Expect an RMSE of {error:.1f} dB{over} at these points on a new flight ({heading}); 90 % of the samples "

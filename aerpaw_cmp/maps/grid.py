@@ -18,6 +18,7 @@ The link budget of a map: transmit power, noise floor, and the lowest level of a
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -198,13 +199,8 @@ def voronoi_borders(towers_m: ArrayLike, area_m: tuple[float, float, float, floa
         Pairs that share no border are left out.
     """
     towers = unmasked(towers_m)[:, :2]
-    borders = []
-    for a in range(len(towers)):
-        for b in range(a + 1, len(towers)):
-            line = _bisector_segment(a, b, towers, area_m)
-            if line is not None:
-                borders.append(Border((a, b), line))
-    return tuple(borders)
+    lines = {pair: _bisector_segment(*pair, towers, area_m) for pair in itertools.combinations(range(len(towers)), 2)}
+    return tuple(Border(pair, line) for pair, line in lines.items() if line is not None)
 
 
 def _bisector_segment(
@@ -218,26 +214,19 @@ def _bisector_segment(
         return None
     middle = (towers[a] + towers[b]) / 2
     along = np.array([-between[1], between[0]]) / length
-    # conditions slope * t <= bound on the point middle + t * along
-    slopes = [-along[0], along[0], -along[1], along[1]]
-    bounds = [middle[0] - area_m[0], area_m[1] - middle[0], middle[1] - area_m[2], area_m[3] - middle[1]]
-    for c in range(len(towers)):
-        if c not in (a, b):
-            # |p - a|^2 <= |p - c|^2
-            slopes.append(float(2 * along @ (towers[c] - towers[a])))
-            bounds.append(float(towers[c] @ towers[c] - towers[a] @ towers[a] - 2 * middle @ (towers[c] - towers[a])))
-    low, high = -np.inf, np.inf
-    for slope, bound in zip(slopes, bounds, strict=True):
-        # the bisector is parallel to this bound: it is completely inside or outside
-        if abs(slope) < 1e-12:
-            if bound < 0:
-                return None
-        elif slope > 0:
-            high = min(high, bound / slope)
-        else:
-            low = max(low, bound / slope)
+    # conditions slope * t <= bound on the point p = middle + t * along: inside the area, and |p - a|^2 <= |p - c|^2
+    others = np.delete(towers, [a, b], axis=0)
+    away = 2 * (others - towers[a])
+    slope = np.concatenate([-along, along, away @ along])
+    nearer = (others**2).sum(axis=1) - towers[a] @ towers[a] - away @ middle
+    bound = np.concatenate([middle - area_m[::2], np.array(area_m[1::2]) - middle, nearer])
+    # the bisector is completely on one side of a bound that is parallel to it
+    parallel = np.abs(slope) < 1e-12
+    at = bound / np.where(parallel, 1.0, slope)
+    low = at[(slope < 0) & ~parallel].max(initial=-np.inf)
+    high = at[(slope > 0) & ~parallel].min(initial=np.inf)
     # three areas that meet in a point have a corner, not a border
-    if high - low < 1e-9:
+    if (bound[parallel] < 0).any() or high - low < 1e-9:
         return None
     return np.stack([middle + low * along, middle + high * along])
 

@@ -15,11 +15,9 @@ nugget
 places
     Samples at the same position (to a micrometre) become one sample, their mean. Leave-one-out holds out the position.
 near-singular systems
-    A system is near-singular if its condition number (1-norm) exceeds 1e10, or if a variance is not positive because
-    the correlation is not a valid covariance. It is solved by an eigenvalue decomposition in the space of weights that
-    sum to
-    1. Directions with less than 1e-10 of the largest variance, or less than the most negative variance, are dropped. In
-    dropped directions the weights stay equal.
+    A system that may be near-singular is solved by an eigenvalue decomposition in the space of weights that sum to 1.
+    Directions with less than 1e-10 of the largest variance are dropped. If the correlation is not a valid covariance,
+    directions with less than the most negative variance are dropped, too. In dropped directions the weights stay equal.
 out of coverage
     NaN values are ignored in each field.
 too few samples
@@ -106,20 +104,13 @@ def nearest(
     chosen = Neighbours(np.full((len(targets_m), m), -1, dtype=np.int64), np.full((len(targets_m), m), np.inf))
     if len(samples_m) == 0 or len(targets_m) == 0:
         return chosen
-    tree = cKDTree(samples_m)
-    # one more than required: its distance shows whether a tie continues beyond the last neighbour
-    least = m + 1 + (skip is not None)
-    candidates = least
-    order = in_strips(targets_m, QUERY_CHUNK)
+    tree, order = cKDTree(samples_m), in_strips(targets_m, QUERY_CHUNK)
     for start in range(0, len(targets_m), QUERY_CHUNK):
-        part = order[start : start + QUERY_CHUNK]
-        todo = _fill_nearest(tree, targets_m, part, radius_m, skip, candidates, chosen)
-        # scattered samples have no ties; on the paper's grid a ring of equal distance holds up to 12 cells
-        candidates = m + 13 if len(todo) > len(part) // 4 else least
-        ask = m + 13
+        # one more than required shows whether a tie continues; on the paper's grid up to 12 cells are equally distant
+        todo, candidates = order[start : start + QUERY_CHUNK], m + 13
         while len(todo):
-            todo = _fill_nearest(tree, targets_m, todo, radius_m, skip, ask, chosen)
-            ask *= 2
+            todo = _fill_nearest(tree, targets_m, todo, radius_m, skip, candidates, chosen)
+            candidates *= 2
     return chosen
 
 
@@ -589,85 +580,27 @@ def _trace_of_inverse(factor: FloatArray, inverse_pivot: FloatArray) -> FloatArr
 
 
 def _solve_doubtful(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Weights (t, m), normalised variance (t,), near-singular flag (t,) of systems (t, m, m) that may be singular."""
-    weight, lagrange, fine = _solve_bordered(gamma, to_target)
-    variance = (weight * to_target).sum(axis=1) + lagrange
-    # a covariance does not have negative variances: a value below zero by more than rounding shows an invalid one
-    fine &= (variance >= -1e-9) & _is_definite(gamma)
-    if not fine.all():
-        weight[~fine] = _solve_reduced(gamma[~fine], to_target[~fine])
-        variance[~fine] = _variance_of(weight[~fine], gamma[~fine], to_target[~fine])
-    return weight, variance, ~fine
+    """Return weights (t, m), normalised variance (t,) and near-singular flag (t,) of systems that may be singular.
 
-
-def _solve_bordered(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Weights, Lagrange multiplier and whether the system is well conditioned, by batched inversion.
-
-    Source: arXiv 2502.10324 eq. 16.
+    Source: arXiv 2502.10324 eq. 16, without its Lagrange multiplier: weights that sum to 1 are equal weights plus a
+    sum of orthonormal contrasts, and the variance over the contrasts is minimised without a constraint.
     """
-    t, m = to_target.shape
-    system = np.ones((t, m + 1, m + 1))
-    system[:, :m, :m] = gamma
-    system[:, m, m] = 0.0
-    right = np.ones((t, m + 1, 1))
-    right[:, :m, 0] = to_target
-    try:
-        inverse = np.linalg.inv(system)
-    except np.linalg.LinAlgError:
-        # one singular system makes the batch fail: solve all its systems in the reduced form
-        return np.zeros((t, m)), np.zeros(t), np.zeros(t, dtype=bool)
-    with np.errstate(all="ignore"):  # systems that overflow here are solved again
-        # in the 1-norm, the largest column sum, which costs no decomposition
-        condition = np.abs(system).sum(axis=1).max(axis=1) * np.abs(inverse).sum(axis=1).max(axis=1)
-        solution = inverse @ right
-        # one step of refinement gives back digits that an explicit inverse loses
-        solution += inverse @ (right - system @ solution)
-    fine = condition < CONDITION_LIMIT
-    return solution[:, :m, 0], solution[:, m, 0], fine
-
-
-def _solve_reduced(gamma: FloatArray, to_target: FloatArray) -> FloatArray:
-    """Return weights (t, m) that sum to 1 and minimise the variance over directions that carry any."""
     from scipy.linalg import helmert
 
-    m = to_target.shape[1]
+    t, m = to_target.shape
     if m == 1:
-        return np.ones((len(to_target), 1))
-    basis = helmert(m)
-    spread = _contrasts(gamma)
+        return np.ones((t, 1)), 2.0 * to_target[:, 0], np.zeros(t, dtype=bool)
+    basis = helmert(m)  # (m - 1, m): orthonormal, each row sums to 0
+    covariance = -basis @ gamma @ basis.T
     right = basis @ (gamma.mean(axis=2) - to_target)[:, :, None]
-    level, direction = np.linalg.eigh((spread + spread.transpose(0, 2, 1)) / 2)
+    level, direction = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
     # a direction weaker than the most negative one, which is an impossible variance, may be only rounding error
     strong = level > np.maximum(np.maximum(level[:, -1:], 1e-300) / CONDITION_LIMIT, -level[:, :1])
     along = (direction.transpose(0, 2, 1) @ right)[:, :, 0]
     along = np.where(strong, along / np.where(strong, level, 1.0), 0.0)
-    # equal weights satisfy the constraint; the basis contains what may be added without breaking it
-    return np.asarray(1.0 / m + (direction @ along[:, :, None])[:, :, 0] @ basis)
-
-
-def _contrasts(gamma: FloatArray) -> FloatArray:
-    """Covariance (t, m - 1, m - 1) of orthonormal contrasts of the samples: positive definite for a covariance."""
-    from scipy.linalg import helmert
-
-    basis = helmert(gamma.shape[1])  # (m - 1, m): orthonormal, each row sums to 0
-    return np.asarray(-basis @ gamma @ basis.T)
-
-
-def _is_definite(gamma: FloatArray) -> BoolArray:
-    """Check whether all variances of each system are positive (t,)."""
-    if gamma.shape[1] < 2:
-        return np.ones(len(gamma), dtype=bool)
-    covariance = _contrasts(gamma)
-    try:
-        np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:  # at least one matrix is not definite: find it by the slower method
-        return np.asarray(np.linalg.eigvalsh(covariance)[:, 0] > 0)
-    return np.ones(len(gamma), dtype=bool)
-
-
-def _variance_of(weight: FloatArray, gamma: FloatArray, to_target: FloatArray) -> FloatArray:
-    """Return the normalised variance of any weights that sum to 1: 2 w.g0 - w.G.w."""
-    return np.asarray(2 * (weight * to_target).sum(axis=1) - np.einsum("ti,tij,tj->t", weight, gamma, weight))
+    weight = 1.0 / m + (direction @ along[:, :, None])[:, :, 0] @ basis
+    variance = 2.0 * (weight * to_target).sum(axis=1) - np.einsum("ti,tij,tj->t", weight, gamma, weight)
+    return weight, variance, ~strong.all(axis=1)
 
 
 def _apply(rule: Weights, values: FloatArray) -> FloatArray:

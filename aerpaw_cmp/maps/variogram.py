@@ -353,15 +353,7 @@ def vector_correlation(
     lacking = present.sum(axis=1) < _MINIMUM_COMMON
     constant = ~lacking & _is_constant(data, present)
     varying = ~(lacking | constant)
-    if present[varying].all():
-        # without gaps one product of unit vectors gives all correlations of a block
-        unit = data[varying] - data[varying].mean(axis=1, keepdims=True)
-        unit /= np.sqrt((unit**2).sum(axis=1, keepdims=True))
-        bins = _bin_pairs(
-            points[varying], lambda rows, columns: np.clip(unit[rows] @ unit[columns].T, -1.0, 1.0), width_m, maximum_m
-        )
-    else:
-        bins = _bin_pairs(points[varying], _PairwisePearson(data[varying], _MINIMUM_COMMON), width_m, maximum_m)
+    bins = _bin_pairs(points[varying], _PairwisePearson(data[varying], _MINIMUM_COMMON), width_m, maximum_m)
     return BinnedCorrelation(*bins, int(varying.sum()), int(constant.sum()))
 
 
@@ -436,9 +428,8 @@ def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorre
         value[:, field] = table[first, second]
     # half-way goes up, as in every bin
     n = int(np.floor(gap.max(initial=0.0) / _HEIGHT_BIN_M + 0.5)) + 1
-    sums = _Sums(n, _HEIGHT_BIN_M)
-    sums.add(np.repeat(gap, fields), value.ravel())
-    return BinnedCorrelation(*sums.means(), levels, excluded)
+    sums = _sums(np.repeat(gap, fields), value.ravel(), _HEIGHT_BIN_M, n)
+    return BinnedCorrelation(*_means(sums, _HEIGHT_BIN_M), levels, excluded)
 
 
 # --- pairs ----------------------------------------------------------------------------------------------------------
@@ -543,33 +534,20 @@ def _mean_product(scaled: FloatArray, present: BoolArray) -> Block:
     return of
 
 
-class _Sums:
-    """Sums per bin that grow block by block."""
+def _sums(distance_m: FloatArray, value: FloatArray, width_m: float, bins: int) -> FloatArray:
+    """Return sums of distances and values, and numbers of pairs, per bin of distance, shape (3, bins)."""
+    # a grid distance such as sqrt(2) * 30 must not change its bin by rounding
+    number = np.floor(np.round(distance_m / width_m, 9) + 0.5).astype(np.int64)
+    good = (number < bins) & np.isfinite(value)
+    weights = distance_m[good], value[good], np.ones(int(good.sum()))
+    return np.stack([np.bincount(number[good], weight, bins) for weight in weights])
 
-    def __init__(self, bins: int, width_m: float) -> None:
-        self.width_m = width_m
-        self.value, self.distance = np.zeros(bins), np.zeros(bins)
-        self.pairs = np.zeros(bins, dtype=np.int64)
 
-    def add(self, distance_m: FloatArray, value: FloatArray) -> None:
-        # a grid distance such as sqrt(2) * 30 must not change its bin by rounding
-        number = np.floor(np.round(distance_m / self.width_m, 9) + 0.5).astype(np.int64)
-        good = (number < len(self.pairs)) & np.isfinite(value)
-        number, distance_m, value = number[good], distance_m[good], value[good]
-        self.value += np.bincount(number, value, len(self.pairs))
-        self.distance += np.bincount(number, distance_m, len(self.pairs))
-        self.pairs += np.bincount(number, minlength=len(self.pairs))
-
-    def means(self) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-        some = np.maximum(self.pairs, 1)
-        empty = self.pairs == 0
-        nominal = self.width_m * np.arange(len(self.pairs))
-        return (
-            np.asarray(nominal, dtype=np.float64),
-            np.asarray(np.where(empty, np.nan, self.distance / some)),
-            np.asarray(np.where(empty, np.nan, self.value / some)),
-            self.pairs,
-        )
+def _means(sums: FloatArray, width_m: float) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Return nominal and mean distance, mean value and number of pairs of each bin. The means of empty bins are NaN."""
+    distance, value, pairs = sums
+    some = np.where(pairs > 0, pairs, np.nan)
+    return width_m * np.arange(len(pairs), dtype=np.float64), distance / some, value / some, pairs.astype(np.int64)
 
 
 def _bin_pairs(
@@ -578,17 +556,17 @@ def _bin_pairs(
     """Bin means over all pairs i <= j up to ``maximum_m``, in blocks."""
     if not (width_m > 0 and maximum_m >= width_m and np.isfinite(maximum_m)):
         raise UsageError(f"bins of {width_m} m up to {maximum_m} m", expected="0 < width <= maximum, both finite")
-    sums = _Sums(int(np.floor(maximum_m / width_m + 1e-9)) + 1, width_m)
+    sums = np.zeros((3, int(np.floor(maximum_m / width_m + 1e-9)) + 1))
     # half a bin beyond the centre of the last bin; the micrometre includes pairs at exactly that distance
-    reach = min(maximum_m, width_m * (len(sums.pairs) - 0.5)) + 1e-6
+    reach = min(maximum_m, width_m * (sums.shape[1] - 0.5)) + 1e-6
     for rows, columns in _blocks_within(points, reach):
         distance = np.hypot(
             points[rows, None, 0] - points[None, columns, 0], points[rows, None, 1] - points[None, columns, 1]
         )
         # each pair once; a position with itself once
         once = (columns[None, :] >= rows[:, None]) & (distance <= maximum_m + 1e-6)
-        sums.add(distance[once], value_of(rows, columns)[once])
-    return sums.means()
+        sums += _sums(distance[once], value_of(rows, columns)[once], width_m, sums.shape[1])
+    return _means(sums, width_m)
 
 
 def _blocks_within(points: FloatArray, reach_m: float) -> Iterator[tuple[IntArray, IntArray]]:

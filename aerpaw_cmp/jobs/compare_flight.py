@@ -50,7 +50,7 @@ from ..compare.result import (
 from ..compare.statistics import Visit, memory_share
 from ..compare.verdict import flight_verdict, with_corrected_verdicts
 from ..flight.data import FlightData, RankSeries, RssSeries
-from ..flight.drafting.proposals import errors_elsewhere, lock_elsewhere
+from ..flight.drafting.proposals import ALONE, errors_elsewhere, lock_elsewhere
 from ..flight.gains import direct_foliage_m
 from ..flight.replay import FlightReplay, Replayed, replay_poses
 from ..flight.rows import LOCK_FLOOR_DB
@@ -262,7 +262,7 @@ def _lock(case: _Case) -> LearnedLock | None:
     """Return the lock model learned from other flights. None if the log has no lock."""
     if case.series.locked is None:
         return None
-    return lock_elsewhere(case.data.settings.antennas, case.data.folder)
+    return lock_elsewhere(case.data, case.series)
 
 
 def _forecast(series: RssSeries, lock: LearnedLock) -> DetectionForecast:
@@ -362,9 +362,10 @@ def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score:
 
 def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore | None) -> dict[str, Any] | None:
     """Return the expected error on another flight of this kind, unless this flight contradicts it."""
-    gain, lock = case.replayed.learned, _lock(case)
+    gain = case.replayed.learned
     flown = None if gain is None else (case.replayed.poses.position_m, gain.sd_db)
     errors, kind = errors_elsewhere(case.data.settings.antennas, case.series, case.data.folder, flown)
+    lock = None if kind == ALONE else _lock(case)  # its errors are those with the antennas of its flights
     if errors is not None and score.rmse_ci95_db[0] > errors.rmse_db:
         return None
     if lock is not None and detection is not None and detection.rmse_ci95_db[0] > lock.floor_rmse_db:

@@ -1040,9 +1040,23 @@ def learned_antenna(named: Named, end: str, carrier_hz: float) -> tuple[Path, Le
             file=str(named.folder / pair.file), sha256=named.entry.tables[pair.file], length=pair.length,
             prior_sd_db=pair.prior_sd_db,
         )  # fmt: skip
+    spread = series.spread if end == "tower" else _airframe_spread(named.entry.errors, series.spread)
     return path, LearnedAntenna(
-        sha256=written.sha256, command=written.command, pair=pair if end == "tower" else None, spread=series.spread
+        sha256=written.sha256, command=written.command, pair=pair if end == "tower" else None, spread=spread
     )
+
+
+def _airframe_spread(errors: Errors | None, spread: LearnedSpread) -> LearnedSpread:
+    """Return the error model of a level with the learned airframe alone.
+
+    The unknown gain of the other end is a part of the nuisance. Together with the noise it has the error of the
+    airframe alone on held-out campaigns, or that of free space if no campaign was held out.
+    """
+    if errors is None:
+        return spread
+    alone_db = errors.free_space_rmse_db if errors.airframe_rmse_db is None else errors.airframe_rmse_db
+    own_db2 = alone_db**2 - spread.noise_sd_db**2 - spread.fading_sd_db**2
+    return spread.model_copy(update={"own_sd_db": round(max(own_db2, spread.own_sd_db**2) ** 0.5, 3)})
 
 
 def _check_band(learned_hz: float, used_hz: float, band: float) -> None:

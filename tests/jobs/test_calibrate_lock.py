@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,12 +13,14 @@ from aerpaw_cmp.common.units import BoolArray, FloatArray
 from aerpaw_cmp.compare.calibration import Learned, Observed, Recipe, flight_left_out, learn
 from aerpaw_cmp.compare.gains import GainModel, LinkSamples, Term
 from aerpaw_cmp.compare.level import DetectionForecast, learn_detection
+from aerpaw_cmp.flight.data import RssSeries
 from aerpaw_cmp.flight.drafting.proposals import lock_elsewhere
 from aerpaw_cmp.flight.rows import LOCK_FLOOR_DB
+from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.jobs import calibrate
 from aerpaw_cmp.jobs.calibrate import learned_locks, lock_words
 from aerpaw_cmp.site.learned import LearnedLock, read_learned, remember
-from tests.learned_entries import learned_entry, learned_series
+from tests.learned_entries import learned_entry, learned_series, learned_tables
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
 RECIPE = Recipe(MODEL)
@@ -104,12 +107,21 @@ def test_what_a_site_remembers_of_the_lock_is_used_with_its_airframe_alone(tmp_p
         constant_log_score=0.6, floor_db=-15.0, floor_rmse_db=8.2, free_space_floor_rmse_db=10.3,
     )  # fmt: skip
     entry = learned_entry(learned_series("power", tower="ROVER", carrier_hz=3.32e9, lock=lock))
-    remember(tmp_path / "mine.yaml", "afar", entry, {})
+    remember(tmp_path / "mine.yaml", "afar", entry, learned_tables("power"))
     assert read_learned(tmp_path / "mine.yaml").entries["afar"].series[0].lock == lock
 
-    def known(antennas: dict[str, str]) -> LearnedLock | None:
-        return lock_elsewhere(antennas, tmp_path)
+    def known(antennas: dict[str, str], receiver: str = "", log: str = "b" * 64) -> LearnedLock | None:
+        content = {"flight": "f", "antennas": antennas, "logs": [{"path": "a.txt", "receiver": receiver}]}
+        settings, files = FlightFile.model_validate(content), (SimpleNamespace(sha256=log),)
+        data = SimpleNamespace(settings=settings, folder=tmp_path, site_place=tmp_path / "mine.yaml", files=files)
+        time, level = np.arange(3).astype("datetime64[s]"), np.zeros(3)
+        series = RssSeries("N", "power", "dB", time, level, data.settings.link.rss, "", np.zeros(3, np.int64), level)
+        return lock_elsewhere(data, series)
 
     assert known({"uav": "mine/afar_uav"}) == lock
     assert known({}) is None
     assert known({"uav": "mine/nobody_uav"}) is None
+    # the lock is a property of the receiver, also with the airframe of another campaign
+    assert known({}, "afar") == lock
+    assert known({}, "another") is None
+    assert known({}, "afar", log="a" * 64) is None  # learned from this very log

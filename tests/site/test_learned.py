@@ -26,11 +26,13 @@ from aerpaw_cmp.site.learned import (
     Errors,
     LearnedLock,
     LearnedReceiver,
+    LearnedSpread,
     SpherePattern,
     carry_memory,
     files_of,
     find_named,
     folder_of,
+    learned_antenna,
     read_learned,
     remember,
     sphere_csv,
@@ -469,3 +471,22 @@ def test_the_error_to_expect_is_that_of_flights_of_the_same_kind() -> None:
     assert "expect an RMSE of 3.7 dB at a height that was not flown, free space 6.0 dB" in learned_entry(
         errors=errors
     ).about(*errors.expected(100.0, unseen=False))
+
+
+def test_the_airframe_alone_states_the_error_of_held_out_campaigns(tmp_path: Path) -> None:
+    """The unknown antenna at the tower is a part of it."""
+    spread = LearnedSpread(own_sd_db=1.0, noise_sd_db=2.0, fading_sd_db=2.0, fading_kurtosis=0.0, bin_s=4.0)
+    errors = {"series": 2, "rmse_db": 3.0, "rmse_4s_db": 2.0, "free_space_rmse_db": 6.0, "inside_90": 0.9}
+
+    def own_sd_db(end: str, **more: float) -> float:
+        named_errors = Errors(**errors, **more) if more.pop("known", True) else None  # the last case has one flight
+        made = learned_entry(learned_series("A", spread=spread), errors=named_errors)
+        remember(tmp_path / "mine.yaml", "e", made, learned_tables("A"))
+        name = "mine/e_uav" if end == "uav" else "mine/e_LW1.A"
+        return learned_antenna(find_named(name, tmp_path), end, 3.3e9)[1].spread.own_sd_db
+
+    assert own_sd_db("tower") == 1.0
+    assert own_sd_db("uav") == pytest.approx(np.sqrt(6.0**2 - 8.0), abs=1e-3)
+    assert own_sd_db("uav", airframe_rmse_db=5.0) == pytest.approx(np.sqrt(5.0**2 - 8.0), abs=1e-3)
+    assert own_sd_db("uav", airframe_rmse_db=1.0) == 1.0
+    assert own_sd_db("uav", known=False) == 1.0

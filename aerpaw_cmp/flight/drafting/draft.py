@@ -42,6 +42,7 @@ from .proposals import (
     Placement,
     Placer,
     Proposal,
+    Receiver,
     listed_places,
     propose,
     searching_airframe,
@@ -215,16 +216,17 @@ def draft(
             expected="telemetry and levels or ranks of one flight",
         )
     name = _name(flown, files) if flight is None else flight.name
-    parts = _first_lines(name, lines, out, context)
-    link = _link(lines, own)
+    link, used = _link(lines, own), [line for line in lines if line.entry]
 
     def text_with(known: Proposal) -> str:
+        logs = [line.with_receiver(known.receivers.get(number)) for number, line in enumerate(used)]
+        parts = _first_lines(name, logs, out, context)
         learned_lines = _learned_lines(known, link) if "rss" in kinds else []
         rank = [RANK] if "rank" in kinds else []
         return "".join([*parts, *learned_lines, *rank, *_settings(lines, context, known)])
 
     # a report would read and gather the draft in the same way, so what the remarks promise is true
-    proof = _proof(text_with(Proposal()), folder, [line.file for line in lines if line.text])
+    proof = _proof(text_with(Proposal()), folder, [line.file for line in used])
     known, remarks = _remembered(lines, context, proof.data)
     text = text_with(known)
     parse_yaml(text, FlightFile)  # an error here is a bug of this module
@@ -247,7 +249,7 @@ def _first_lines(name: str, lines: Sequence[_Line], out: Sequence[str], context:
         parts += [f"  {node}: {_plain(place.tower or {})}  # {place.question}\n" for node, place in towers.items()]
     if context.options.timezone:
         parts.append(f"timezone: {context.options.timezone}\n")
-    parts += ["logs:\n", *(line.text for line in lines if line.text)]
+    parts += ["logs:\n", *(line.text for line in lines)]
     if context.flown is None and not all(_has_positions(stream) for line in lines for stream in line.compared):
         parts.append(_NO_TRACK)
     return parts + [f"  # left out: {remark}\n" for remark in out]
@@ -638,12 +640,12 @@ class _Line:
     file : IngestedFile
     shown : str
         Path relative to the flight.yaml, for messages.
-    text : str
-        The line with its questions; empty if the log is not used.
+    entry : mapping
+        Keys of the line; empty if the log is not used.
+    comment : str
+        Reasons and questions at its end.
     remarks : tuple of str
         Streams that are not compared, with the reason.
-    entry : mapping
-        Keys of the line.
     compared : tuple of Stream
     places : tuple of Placement
         Nodes that the levels of this log fit.
@@ -653,12 +655,24 @@ class _Line:
 
     file: IngestedFile
     shown: str
-    text: str = ""
-    remarks: tuple[str, ...] = ()
     entry: Mapping[str, Any] = field(default_factory=dict)
+    comment: str = ""
+    remarks: tuple[str, ...] = ()
     compared: tuple[Stream, ...] = ()
     places: tuple[Placement, ...] = ()
     offsets_db: tuple[float, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """The line with its questions; empty if the log is not used."""
+        return f"  - {_flow(dict(self.entry))}{self.comment}\n" if self.entry else ""
+
+    def with_receiver(self, receiver: Receiver | None) -> _Line:
+        """Return the line with the receiver of its levels, or with the question for it."""
+        if receiver is None:
+            return self
+        named = {"receiver": receiver.name} if receiver.name else {}
+        return replace(self, entry={**self.entry, **named}, comment=_also(self.comment, receiver.about))
 
 
 def _lines(files: Sequence[IngestedFile], context: _Context) -> list[_Line]:
@@ -688,13 +702,16 @@ def _line(file: IngestedFile, context: _Context, earlier: Sequence[_Line]) -> _L
     if context.is_utc(file):
         entry["clock"] = "utc"
         comment = _also(comment, "as local time it misses the telemetry, as UTC it overlaps it: is it UTC?")
+    if label := _another_channel(streams, entry, earlier):
+        entry["channel"] = label
+        comment = _also(comment, "another receiver of this tower, whose name the log does not contain: which?")
     refused = _refused(streams, entry, shown, context, earlier, dated=origin is not None)
     compared = [s for s in streams if s.name not in refused]
     reasons = list(dict.fromkeys(refused.values()))
     line = _Line(file=file, shown=shown, places=places)
     if not compared and reasons == [_RATIO] and all(may_lose_lock(s) for s in streams):
         skipped = {"path": path, "reader": file.result.reader, "skip": [s.name for s in streams]}
-        return replace(line, text=f"  - {_flow(skipped)}  # shows when the receiver was in lock\n")
+        return replace(line, entry=skipped, comment="  # shows when the receiver was in lock")
     if not compared:
         return replace(line, remarks=(f"{shown}: {'; '.join(reasons) or 'no samples'}",))
     if all(s.kind == "telemetry" for s in compared):
@@ -714,7 +731,7 @@ def _line(file: IngestedFile, context: _Context, earlier: Sequence[_Line]) -> _L
     asked += [context.unsure[file.path]] if file.path in context.unsure else []
     for question in (*asked, *questions(file, compared, context.options.timezone)):
         comment = _also(comment, question)
-    line = replace(line, entry=entry, compared=tuple(compared), text=f"  - {_flow(entry)}{comment}\n")
+    line = replace(line, entry=entry, comment=comment, compared=tuple(compared))
     nodes = _nodes([*earlier, line])
     offsets = (_offset_db(context.dated(s, origin), entry, nodes, context) for s in compared)
     return replace(
@@ -876,6 +893,40 @@ def _refused(
         if why:
             refused[stream.name] = why
     return refused
+
+
+# Means of two logs over this time [s] differ by a constant if they have the same readings, in any form. Those of two
+# antennas differ by some decibels more [dB].
+_MEANS_S, _OTHER_READINGS_DB = 2.0, 1.0
+
+
+def _another_channel(streams: Sequence[Stream], entry: Mapping[str, Any], earlier: Sequence[_Line]) -> str:
+    """Return a name for the channel of a log whose tower has other readings of the same name at the same time.
+
+    It is empty for logs that name their channel or have cells, and for the first log and its copies.
+    """
+    levels = [s for s in streams if s.kind == "rss" and not is_ratio(s)]
+    if len(levels) != 1 or {"cells", "channel"} & entry.keys() or levels[0].channel != levels[0].name:
+        return ""
+    tower, name = _key(levels[0], entry)
+    others = [
+        s
+        for line in earlier
+        for s in line.compared
+        if s.kind == "rss" and _key(s, line.entry)[0] == tower and s.channel == name
+    ]
+    differences = [_difference_sd_db(levels[0], other) for other in others]
+    return f"{name}_{len(others) + 1}" if others and min(differences) > _OTHER_READINGS_DB else ""
+
+
+def _difference_sd_db(first: Stream, second: Stream) -> float:
+    """Return the standard deviation of the difference of two levels [dB], or 0 if they have no common time."""
+    means = []
+    for stream in (first, second):
+        step = (stream.frame["time"].to_numpy("datetime64[ns]").astype(np.int64) * 1e-9 // _MEANS_S).astype(np.int64)
+        means.append(stream.frame["rss_db"].groupby(step).mean())
+    difference = (means[0] - means[1]).dropna()
+    return float(difference.std()) if len(difference) > 1 else 0.0
 
 
 def _reason(stream: Stream, span: Span, context: _Context, *, dated: bool) -> str | None:

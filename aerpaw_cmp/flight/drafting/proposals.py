@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,10 +19,12 @@ import numpy as np
 
 from ...common.errors import InputError, UsageError
 from ...common.units import FloatArray, spread_out
+from ...compare.calibration import Observed
 from ...compare.gains import (
     BODY,
     LEAST_ODDS,
     MAST,
+    PAIR,
     Evidence,
     FlightEvidence,
     KnownProcess,
@@ -57,7 +59,7 @@ from ..replay import observed_series
 from ..rows import unscored
 from ..settings import FlightFile
 from ..track import Track
-from ..training import among, flight_logs, marks_of
+from ..training import among, flight_logs, logs_of, marks_of, series_mark
 
 # Smallest log odds of a tower, and of a listed position. Of 20 real flights and thirds at LW1, 18 have more than -0.5
 # and all have more than -3. For six rovers, towers have -11 and less, and the listed positions have -3 and more.
@@ -383,6 +385,11 @@ class Remembered:
     tower_known: KnownDirections
 
     @property
+    def receiver(self) -> str:
+        """Name of the receiver of its levels: that of the training flights, or the name of the entry."""
+        return self.series.receiver or self.name
+
+    @property
     def level(self) -> learned.LearnedLevel:
         """The learned level. Only for series that have it."""
         assert self.series.level is not None
@@ -489,16 +496,35 @@ def remembered(site: str | Path) -> dict[str, Remembered]:
 _TAUGHT_SLOPE_SD = 0.2
 
 
+@dataclass(frozen=True, slots=True)
+class Receiver:
+    """The learned receiver of the levels of a log, or a question if no learned receiver fits.
+
+    Parameters
+    ----------
+    name : str
+        Name for ``receiver:`` of the log; empty if no receiver fits.
+    about : str
+        Its odds, or the question, as the end of a comment.
+    """
+
+    name: str
+    about: str
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proposal:
-    """Learned antennas and a receiver for a draft, by name, each with a sentence about the expected error."""
+    """Learned antennas and receivers for a draft, by name, with their odds and the expected error."""
 
     antennas: Mapping[str, str] = field(default_factory=dict)
     antennas_about: str = ""
     """Source and odds of the antennas, or the odds of the best ones if none fit."""
     carrier_hz: float | None = None
     receiver: str | None = None
+    """Receiver of the rank."""
     receiver_about: str = ""
+    receivers: Mapping[int, Receiver] = field(default_factory=dict)
+    """Receivers of the levels, by the number of their log."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -549,49 +575,178 @@ def propose(
     )
     if data.track is None or not data.rss or not entries:
         return ranks
-    found = _antennas_for(data, every_antenna(place), site, nodes, carrier_known=carrier_known)
-    return replace(found, receiver=ranks.receiver, receiver_about=ranks.receiver_about)
+    # a ratio to the noise is used only if there is no level
+    levels = [s for s in data.rss if s.channel.lower() not in RATIOS] or list(data.rss)
+    observed, known = [observed_series(data, series)[0] for series in levels], every_antenna(place)
+    evidence = FlightEvidence([o.samples for o in observed])
+    chosen = _antennas_for(data, levels, known, evidence, nodes, carrier_known=carrier_known)
+    if chosen.fits:
+        found = chosen.proposal(site, evidence)
+    else:
+        band = learned.AIRFRAME_BAND if carrier_known else math.inf
+        found = _airframe_for(data, known, site, evidence, band=band)
+    receivers = _receivers(list(zip(levels, observed, strict=True)), known, chosen)
+    return replace(found, receiver=ranks.receiver, receiver_about=ranks.receiver_about, receivers=receivers)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Chosen:
+    """The learned antennas of both ends of one entry that the levels support best, by ``tower.channel``."""
+
+    entry: str
+    antennas: Mapping[str, Remembered]
+    odds: Evidence
+
+    @property
+    def receiver(self) -> str:
+        """Name of the receiver with which the antennas were learned."""
+        return next((item.receiver for item in self.antennas.values()), "")
+
+    @property
+    def fits(self) -> bool:
+        """True if the antennas can be proposed."""
+        enough = self.odds.over_own >= LEAST_ODDS and self.odds.over_turned > -_MOUNTED_AS_LEARNED
+        return bool(self.antennas) and enough
+
+    def proposal(self, site: str, evidence: FlightEvidence) -> Proposal:
+        """Return the names of the antennas, with the expected error and the odds."""
+        first, samples = next(iter(self.antennas.values())), evidence.rows[0]
+        errors, kind = _expected(first.entry, first.series, samples.position_m, first.gain_db(samples)[1])
+        names = {k: f"{site}/{self.entry}_{a.series.tower}.{a.series.channel}" for k, a in self.antennas.items()}
+        return Proposal(
+            antennas=names | {"uav": f"{site}/{self.entry}_uav"},
+            antennas_about=f"{first.entry.about(errors, kind)}; {_odds(self.odds)}",
+            carrier_hz=first.series.carrier_hz,
+        )
 
 
 def _antennas_for(
-    data: FlightData, known: Sequence[Remembered], site: str, nodes: Nodes, *, carrier_known: bool
-) -> Proposal:
-    """Return the antennas of the entry with the largest odds, or of the airframe with the largest odds."""
-    # a ratio to the noise is used only if there is no level
-    levels = [s for s in data.rss if s.channel.lower() not in RATIOS] or list(data.rss)
-    evidence = FlightEvidence([observed_series(data, series)[0].samples for series in levels])
-    chosen: dict[str, dict[str, tuple[Remembered, Evidence]]] = {}
+    data: FlightData,
+    levels: Sequence[RssSeries],
+    known: Sequence[Remembered],
+    evidence: FlightEvidence,
+    nodes: Nodes,
+    *,
+    carrier_known: bool,
+) -> _Chosen:
+    """Return the antennas of both ends of the entry with the largest odds."""
+    receivers = {item.receiver for item in known}
+    tried: dict[str, dict[str, list[tuple[Remembered, Evidence]]]] = {}
     for number, series in enumerate(levels):
         for item in known:
             band = learned.BAND if carrier_known else math.inf
             if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, band):
                 continue
-            named_odds = _named_odds(data, series, item)
+            named_odds = _named_odds(_receiver_of(data, series, receivers), series, item)
             # antennas that do not predict other flights are not offered to a receiver with another unit
             if named_odds < 0.0 and not item.teaches:
                 continue
             # antennas with a different name must also fit better than their airframe with an unknown antenna
             airframe = item.airframe if item.teaches and named_odds <= 0.0 else None
             odds = evidence.of_link(number, item.moments, airframe).with_prior(named_odds)
-            best = chosen.setdefault(item.name, {})
-            key = f"{series.tower}.{series.channel}"
             if odds.over_own > 0.0:
-                best[key] = max(best.get(key, (item, odds)), (item, odds), key=lambda pair: pair[1].over_own)
-    entry = max(chosen, key=lambda name: sum(e.over_own for _, e in chosen[name].values()), default="")
-    fits = chosen.get(entry, {})
+                tried.setdefault(item.name, {}).setdefault(f"{series.tower}.{series.channel}", []).append((item, odds))
+    fits = {name: _one_each(channels) for name, channels in tried.items()}
     # judge the channels of a flight together: they need antennas of one entry, with one airframe
-    odds = _pooled([odds for _, odds in fits.values()])
-    if fits and odds.over_own >= LEAST_ODDS and odds.over_turned > -_MOUNTED_AS_LEARNED:
-        first = next(iter(fits.values()))[0]
-        samples = evidence.rows[0]
-        errors, kind = _expected(first.entry, first.series, samples.position_m, first.gain_db(samples)[1])
-        names = {key: f"{site}/{entry}_{k.series.tower}.{k.series.channel}" for key, (k, _) in fits.items()}
-        return Proposal(
-            antennas=names | {"uav": f"{site}/{entry}_uav"},
-            antennas_about=f"{first.entry.about(errors, kind)}; {_odds(odds)}",
-            carrier_hz=first.series.carrier_hz,
-        )
-    return _airframe_for(data, known, site, evidence, band=learned.AIRFRAME_BAND if carrier_known else math.inf)
+    entry = max(fits, key=lambda name: sum(e.over_own for _, e in fits[name].values()), default="")
+    chosen = fits.get(entry, {})
+    odds = _pooled([odds for _, odds in chosen.values()])
+    return _Chosen(entry=entry, antennas={key: item for key, (item, _) in chosen.items()}, odds=odds)
+
+
+def _one_each(
+    tried: Mapping[str, Sequence[tuple[Remembered, Evidence]]],
+) -> dict[str, tuple[Remembered, Evidence]]:
+    """Return the antennas of each channel by which the odds of all channels together are largest.
+
+    Two channels of a tower have two antennas. Antennas are assigned twice only if there are too few.
+    """
+    items = list({id(item): item for pairs in tried.values() for item, _ in pairs}.values())
+    over_own = np.full((len(tried), len(items)), -1e9)
+    for row, pairs in enumerate(tried.values()):
+        for item, odds in pairs:
+            over_own[row, items.index(item)] = odds.over_own
+    from scipy.optimize import linear_sum_assignment
+
+    pairs_of = list(tried.items())
+    best = dict(zip(*(indices.tolist() for indices in linear_sum_assignment(over_own, maximize=True)), strict=True))
+    out = {}
+    for row, (key, pairs) in enumerate(pairs_of):
+        assigned = [pair for pair in pairs if row in best and pair[0] is items[best[row]]]
+        out[key] = assigned[0] if assigned else max(pairs, key=lambda pair: pair[1].over_own)
+    return out
+
+
+# Standard deviation of the level of an unknown receiver [dB], and of the gains of both ends if they are not known.
+_UNKNOWN_LEVEL_DB = 30.0
+_UNKNOWN_GAINS_DB = math.hypot(BODY.sd_db, MAST.sd_db, PAIR.sd_db)
+
+# Log odds of the receiver of learned antennas that the levels support, and of one that loses its lock as the log does.
+_ITS_ANTENNAS = _ITS_LOCK = 5.0
+
+# Share of samples without lock that a receiver which always keeps its lock does not have.
+_LOST_SHARE = 0.01
+
+
+def _receivers(
+    levels: Sequence[tuple[RssSeries, Observed]], known: Sequence[Remembered], chosen: _Chosen
+) -> dict[int, Receiver]:
+    """Return the learned receiver of the levels of each log, or the question for it, by the number of the log.
+
+    A receiver is recognised by its level above free space, its unit, its loss of lock and its antennas. A question is
+    asked only if its antennas are proposed and its level differs.
+    """
+    odds: dict[int, dict[str, float]] = {}
+    words: dict[tuple[int, str], str] = {}
+    for series, observed in levels:
+        antenna = chosen.antennas.get(f"{series.tower}.{series.channel}") if chosen.fits else None
+        each: dict[str, tuple[float, str]] = {}
+        for item in known:
+            other_port = antenna is not None and antenna.name == item.name and antenna is not item
+            if item.series.level is not None and _in_band(item, series, learned.AIRFRAME_BAND) and not other_port:
+                tried = _receiver_odds(series, observed, item, antenna)
+                each[item.receiver] = max(each.get(item.receiver, tried), tried)
+        for log in np.unique(series.log).tolist():
+            together = odds.setdefault(log, {})
+            for name, (nat, text) in each.items():
+                together[name], words[log, name] = together.get(name, 0.0) + nat, text
+    out = {}
+    for log, together in odds.items():
+        best = max(together, key=lambda name: together[name], default="")
+        rivals = [nat for name, nat in together.items() if name != best]
+        over = together.get(best, -math.inf) - float(np.logaddexp.reduce([0.0, *rivals]))
+        if over >= LEAST_ODDS:
+            out[log] = Receiver(best, f"receiver {best} with odds {_ratio(over)} by its {words[log, best]}?")
+        elif chosen.fits and (log, chosen.receiver) in words:
+            out[log] = Receiver("", f"another receiver than {chosen.receiver}, by its {words[log, chosen.receiver]}?")
+    return out
+
+
+def _receiver_odds(
+    series: RssSeries, observed: Observed, item: Remembered, antenna: Remembered | None
+) -> tuple[float, str]:
+    """Return the log odds that levels are those of the receiver of an item, and the words for its level."""
+    level, lock = item.level, item.series.lock
+    lost = 0.0 if observed.locked is None else float(np.mean(observed.locked == 0.0))
+    if lost > _LOST_SHARE:
+        observed = observed.part(observed.locked == 1.0)
+    samples = observed.samples.binned(4.0)
+    its_antenna = antenna is not None and antenna.name == item.name
+    gain_db = antenna.gain_db(samples)[0] if its_antenna and antenna is not None else np.zeros(len(samples))
+    sent_db = series.link.transmit_power_dbm - level.transmit_power_dbm
+    at_carrier_db = 20.0 * math.log10(item.series.carrier_hz / series.link.carrier_hz)
+    error_db = samples.residual_db - gain_db + sent_db + at_carrier_db
+    if not np.isfinite(error_db).any():
+        return -math.inf, ""
+    offset_db = float(np.nanmean(error_db))
+    sd_db = level.sd_db if its_antenna else math.hypot(level.sd_db, _UNKNOWN_GAINS_DB)
+    nat = math.log(_UNKNOWN_LEVEL_DB / sd_db) - 0.5 * ((offset_db - level.offset_db) / sd_db) ** 2
+    nat += _OTHER_UNIT if level.unit != series.unit else 0.0
+    nat += _ITS_ANTENNAS if its_antenna else 0.0
+    if lost > _LOST_SHARE:
+        nat += _ITS_LOCK if lock is not None else -math.inf
+    stated = f"{level.offset_db:.1f} +- {level.sd_db:.1f}"
+    return nat, f"level of {offset_db:.1f} dB above free space ({stated} when learned)"
 
 
 def _airframe_for(
@@ -628,12 +783,17 @@ _SAME_NAME, _OTHER_UNIT = 10.0, -3.0
 _MOUNTED_AS_LEARNED = 3.0
 
 
-def _named_odds(data: FlightData, series: RssSeries, item: Remembered) -> float:
-    """Return the log odds that names give to the learned antennas of both ends."""
-    learned_series = item.series
+def _receiver_of(data: FlightData, series: RssSeries, known: Container[str]) -> str:
+    """Return the receiver that the flight file names for a series. Empty if it is not one of the learned ones."""
     receiver = data.settings.logs[int(series.log[0])].receiver if len(series.log) else ""
-    if receiver and learned_series.receiver:
-        return _SAME_NAME if receiver == learned_series.receiver else -math.inf
+    return receiver if receiver in known else ""
+
+
+def _named_odds(receiver: str, series: RssSeries, item: Remembered) -> float:
+    """Return the log odds that the names of receiver, tower and channel give to learned antennas of both ends."""
+    learned_series = item.series
+    if receiver:
+        return _SAME_NAME if receiver == item.receiver else -math.inf
     same = (series.tower, series.channel) == (learned_series.tower, learned_series.channel)
     other = learned_series.level is not None and learned_series.level.unit != series.unit
     return (_SAME_NAME if same else 0.0) + (_OTHER_UNIT if other else 0.0)
@@ -661,14 +821,15 @@ def _odds(odds: Evidence) -> str:
     >>> _odds(Evidence(over_own=4.0, over_turned=20.0))
     'odds 55:1 against a separate gain, more than 1000:1 against rotated copies'
     """
+    turned = "" if math.isinf(odds.over_turned) else f", {_ratio(odds.over_turned)} against rotated copies"
+    return f"odds {_ratio(odds.over_own)} against a separate gain{turned}"
 
-    def ratio(nat: float) -> str:
-        if nat > math.log(_MOST_ODDS):
-            return f"more than {_MOST_ODDS:.0f}:1"
-        return f"{math.exp(nat):.0f}:1" if nat > 0.0 else f"1:{math.exp(min(-nat, 20.0)):.0f}"
 
-    turned = "" if math.isinf(odds.over_turned) else f", {ratio(odds.over_turned)} against rotated copies"
-    return f"odds {ratio(odds.over_own)} against a separate gain{turned}"
+def _ratio(nat: float) -> str:
+    """Return log odds [nat] as a ratio such as ``55:1``."""
+    if nat > math.log(_MOST_ODDS):
+        return f"more than {_MOST_ODDS:.0f}:1"
+    return f"{math.exp(nat):.0f}:1" if nat > 0.0 else f"1:{math.exp(min(-nat, 20.0)):.0f}"
 
 
 # Assumptions about the scatter of the levels of a node at an unknown place, with an unknown gain of the airframe.
@@ -824,6 +985,9 @@ def errors_elsewhere(
     return _expected(named.entry, antenna, *(flown or ()))
 
 
+# Kind of the expected error with the antenna of the UAV alone.
+ALONE = "with the airframe alone"
+
 # Directions are new if the standard deviation of the gain exceeds this multiple of that in learned directions.
 _UNSEEN_SD = 2.0
 
@@ -841,7 +1005,7 @@ def _expected(
     if series is None:
         alone_db = errors.airframe_rmse_db
         alone = None if alone_db is None else errors.model_copy(update={"rmse_db": alone_db})
-        return alone, "with the airframe alone"
+        return alone, ALONE
     if position_m is None or sd_db is None or not np.isfinite(sd_db).any():
         return errors, usual
     heights, count = np.unique(np.round(position_m[np.isfinite(position_m[:, 2]), 2]), return_counts=True)
@@ -849,13 +1013,22 @@ def _expected(
     return errors.expected(float(heights[count.argmax()]), unseen=unseen)
 
 
-def lock_elsewhere(antennas: Mapping[str, str], folder: Path) -> learned.LearnedLock | None:
-    """Return P(lock) of the receiver with which an airframe was learned. None if the receiver never loses its lock."""
-    try:
-        named = learned.find_named(antennas["uav"], folder)
-    except (KeyError, InputError, UsageError):
-        return None
-    return next((s.lock for s in named.entry.series if s.lock is not None), None)
+def lock_elsewhere(data: FlightData, series: RssSeries) -> learned.LearnedLock | None:
+    """Return P(lock) of the receiver that the flight file names for a series, or else of that of its learned airframe.
+
+    None if the receiver never loses its lock, is not known, or was learned from this series.
+    """
+    receiver, uav = data.settings.logs[int(series.log[0])].receiver, data.settings.antennas.get("uav")
+    with suppress(InputError, UsageError):
+        named = [item for item in every_antenna(data.site_place) if item.receiver == receiver] if receiver else []
+        if named:
+            own, mark = logs_of(data, series), series_mark(series)
+            known = any(item.learned_from(log, mark) for item in named for log in own)
+            return None if known else named[-1].series.lock
+        if uav is not None:
+            entry = learned.find_named(uav, data.folder).entry
+            return next((item.lock for item in entry.series if item.lock is not None), None)
+    return None
 
 
 def _same_place(s: learned.LearnedSeries, tower: str, nodes: Nodes) -> bool:

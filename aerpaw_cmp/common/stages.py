@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import logging
-import re
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -26,24 +24,17 @@ class Progress(Protocol):
     def __call__(self, text: str, fraction: float | None = None, /) -> object: ...  # noqa: D102
 
 
+_LOGGER = logging.getLogger("aerpaw_cmp")
 # a library does not print its log by default: add a handler to this logger or call basicConfig
-logging.getLogger("aerpaw_cmp").addHandler(logging.NullHandler())
+_LOGGER.addHandler(logging.NullHandler())
 
 
 def logged(text: str, fraction: float | None = None, /) -> None:
-    """Log progress of Python calls as INFO, shares as DEBUG, on the logger of the caller's subpackage.
-
-    An example is ``aerpaw_cmp.flight``.
-    """
-    frame = sys._getframe(1)
-    # the logger of the subpackage that called common
-    while frame.f_back is not None and not re.match(r"aerpaw_cmp\.(?!common)", frame.f_globals["__name__"]):
-        frame = frame.f_back
-    room = ".".join(frame.f_globals["__name__"].split(".")[:2])
+    """Log progress of Python calls on the logger ``aerpaw_cmp``: steps as INFO, shares as DEBUG."""
     if fraction is None:
-        logging.getLogger(room).info(text)
+        _LOGGER.info(text)
     else:
-        logging.getLogger(room).debug("%s %.0f %%", text, 100 * fraction)
+        _LOGGER.debug("%s %.0f %%", text, 100 * fraction)
 
 
 def duration(seconds: float) -> str:

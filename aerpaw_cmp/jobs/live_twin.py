@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -194,7 +193,9 @@ class FlownAgain:
         self._seconds = (times - times[0]) / 1e9
         self._lasts_s = float(self._seconds[-1]) + 1.0
         self._level = self._levels(twin)
-        self.rank = self._rank_log(settings, flight.parent)
+        logs = (ranks_of(flight.parent / entry.path, entry.options(settings.timezone)) for entry in settings.logs)
+        # of the first rank log; None: those of the built-in flight
+        self.rank = next((ranks for ranks in logs if ranks is not None), None)
         self._start_ns, self._written = time.time_ns(), 0
         try:
             self._file = telemetry.open("xb", buffering=0)
@@ -202,26 +203,14 @@ class FlownAgain:
             raise UsageError("the file exists", expected="a new name", path=telemetry) from None
 
     def _levels(self, twin: LiveTwin) -> FloatArray:
-        """Return the RSRP at each line of the telemetry: the replay, an offset, and correlated fading."""
+        """Return the RSRP at each line of the telemetry: the replay, an offset, and fading."""
         names = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg")
         rows = self._frame[list(names)].to_numpy(dtype="float64")
         poses = [twin._pose(TelemetrySample(0, *row)) for row in rows]
         level = twin._replayed(np.stack([p for p, _ in poses]), np.stack([r for _, r in poses]))[1]
-        random = np.random.default_rng(7)
-        fading = np.zeros(len(level))
-        for i in range(1, len(fading)):
-            # 0.36 + 0.64 = 1: the variance stays that of one step
-            fading[i] = 0.6 * fading[i - 1] + 0.8 * _DEMO_FADING_DB * random.standard_normal()
+        fading = np.random.default_rng(7).normal(0.0, _DEMO_FADING_DB, len(level))
         # -140 dBm is the lowest RSRP that a modem reports
         return np.asarray(np.nan_to_num(level + _DEMO_OFFSET_DB + fading, nan=-140.0))
-
-    @staticmethod
-    def _rank_log(settings: FlightFile, folder: Path) -> Callable[[float], int] | None:
-        """Return the ranks of the flight's first rank log. None: use those of the built-in flight."""
-        for entry in settings.logs:
-            if (ranks := ranks_of(folder / entry.path, entry.options(settings.timezone))) is not None:
-                return ranks
-        return None
 
     def rsrp(self, seconds: float) -> float:
         """Return the RSRP at a time after the start [dBm]."""

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import itertools
 import math
 import re
 import secrets
+import struct
 import threading
 import time
-from array import array
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -55,28 +56,24 @@ _STATUS = ("connected", "records", "bytes_written", "disk_free_bytes", "disk_fau
 
 
 class Rows:
-    """The last rows of a table of 32-bit floats, in memory of fixed size. Row numbers count from zero for ever."""
+    """The last rows of a table of 32-bit floats. Row numbers count from zero for ever."""
 
-    def __init__(self, columns: int, size: int = ROWS) -> None:
-        self._columns, self._size = columns, size
-        self._values = array("f", bytes(4 * columns * size))
+    def __init__(self, size: int = ROWS) -> None:
+        self._rows: deque[bytes] = deque(maxlen=size)
         self.count = 0
 
     def add(self, row: Sequence[float | None]) -> None:
         """Append a row. None becomes NaN."""
-        start = self.count % self._size * self._columns
-        values = (math.nan if value is None else value for value in row)
-        self._values[start : start + self._columns] = array("f", values)
+        self._rows.append(struct.pack(f"<{len(row)}f", *(math.nan if value is None else value for value in row)))
         self.count += 1
 
     def after(self, first: int, most: int = CHUNK) -> tuple[int, str]:
         """Return the number of the first row, and the rows from there on as little-endian floats in base64."""
         # overwritten rows are lost; a cursor beyond the end can only be crafted, and gets no rows
-        first = max(first, self.count - self._size) if first <= self.count else self.count
-        last = min(self.count, first + most)
-        a, b = first % self._size * self._columns, last % self._size * self._columns
-        part = self._values[a:b] if a < b or first == last else self._values[a:] + self._values[:b]
-        return first, base64.b64encode(part.tobytes()).decode("ascii")
+        oldest = self.count - len(self._rows)
+        first = min(max(first, oldest), self.count)
+        part = itertools.islice(self._rows, first - oldest, first - oldest + most)
+        return first, base64.b64encode(b"".join(part)).decode("ascii")
 
 
 @dataclass(slots=True)
@@ -116,9 +113,8 @@ class _Modem:
     fix: float | None = None
     predicts: bool = False
     ended: bool = False
-    measured: Rows = field(default_factory=lambda: Rows(len(MEASURED)))
-    predicted: Rows = field(default_factory=lambda: Rows(len(PREDICTED)))
-    shift_ns: int = 0
+    measured: Rows = field(default_factory=Rows)
+    predicted: Rows = field(default_factory=Rows)
     period_s: float = 0.5
     rank_s: float = 0.0
     gps_s: float = 0.0
@@ -161,12 +157,10 @@ class Feed:
         mono_ns: Callable[[], int] = time.monotonic_ns,
         utc_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        shift = utc_ns() - mono_ns()
-        self._utc_ns = utc_ns
-        self._steady_ns: Callable[[], int] = lambda: mono_ns() + shift
+        self._mono_ns, self._utc_ns = mono_ns, utc_ns
         self.epoch = secrets.token_hex(4)
-        self.start_ns = self._steady_ns()
-        self._modems = [_Modem(name, shift_ns=shift, predicted=Rows(len(PREDICTED))) for name in names]
+        self.start_ns, self._start_mono_ns = utc_ns(), mono_ns()
+        self._modems = [_Modem(name) for name in names]
         self._pending: deque[tuple[int, Record | TapStatus]] = deque(maxlen=_PENDING)
         self._changed = threading.Condition()
         self._version = 0
@@ -187,7 +181,7 @@ class Feed:
 
     def now(self) -> float:
         """Return the monotonic seconds since the feed began."""
-        return (self._steady_ns() - self.start_ns) / 1e9
+        return self._seconds(self._mono_ns())
 
     # the server's thread ----------------------------------------------------------------------------------
 
@@ -251,8 +245,8 @@ class Feed:
             return "", 0, zeros
         return self.epoch, numbers[0], numbers[1:]
 
-    def _seconds(self, modem: _Modem, mono_ns: int) -> float:
-        return (mono_ns + modem.shift_ns - self.start_ns) / 1e9
+    def _seconds(self, mono_ns: int) -> float:
+        return (mono_ns - self._start_mono_ns) / 1e9
 
     def _status(self, modem: _Modem, status: TapStatus) -> None:
         for name in _STATUS:
@@ -280,7 +274,7 @@ class Feed:
         modem.period_s = 1.0 / record.get("settings", {}).get("ri_hz", 2.0)
         modem.connected, modem.ended = True, False
         modem.unsynchronised = record.get("clock_synchronised") is False
-        modem.rank_s = self._seconds(modem, record["mono_ns"])
+        modem.rank_s = self._seconds(record["mono_ns"])
 
     def _take_exchange(self, modem: _Modem, record: Record) -> None:
         decoded = record.get("decoded") or {}
@@ -289,7 +283,7 @@ class Feed:
             modem.rsrp_dbm, modem.sinr_db = _finite(cell.get("rsrp_dbm")), _finite(cell.get("sinr_db"))
         elif record["query"] == RI_QUERY:
             # the modem read its rank between the query and the end of the answer
-            t = self._seconds(modem, (record["sent_mono_ns"] + record["last_mono_ns"]) // 2)
+            t = self._seconds((record["sent_mono_ns"] + record["last_mono_ns"]) // 2)
             rank = _finite(decoded.get("rank"))
             modem.rank = None if rank is None else int(rank)
             if modem.rank is not None:
@@ -329,14 +323,14 @@ class Feed:
         modem.connected = record["state"] == "closed"
         modem.gap_text = "" if modem.connected else f"no modem: {record['reason']}"
         if modem.connected:
-            modem.rank_s = self._seconds(modem, record["mono_ns"])
+            modem.rank_s = self._seconds(record["mono_ns"])
         else:
             modem.rank = modem.rsrp_dbm = modem.sinr_db = None  # the last measured values are not valid during a gap
 
     def _take_clock(self, modem: _Modem, record: Record) -> None:
         step_s = record["step_ns"] / 1e9
         if abs(step_s) >= max(_STEP_S, modem.period_s / 2):  # samples of a slow tap are farther apart
-            modem.step_s = self._seconds(modem, record["mono_ns"])
+            modem.step_s = self._seconds(record["mono_ns"])
             modem.step_text = f"the wall clock stepped by {step_s:+.3f} s"
 
     def _take_end(self, modem: _Modem, _record: Record) -> None:

@@ -206,15 +206,6 @@ def readers_check() -> Check:
     return Check("Readers", "ok", f"{len(names)}: {', '.join(names)}")
 
 
-def holders(device: str) -> list[str]:
-    """Return the processes that have a device open, as ``name (pid)``. Only root sees those of other users."""
-    try:
-        from ..live import ports
-    except ImportError:  # without termios: the tap does not run on this system
-        return []
-    return [f"{holder.name} ({holder.pid})" for holder in ports.holders(Path(device), others_only=False)]
-
-
 def serial_checks() -> Iterator[Check]:
     """Check serial ports: whether this user may open them, and which processes use them. No port is opened."""
     try:
@@ -239,22 +230,19 @@ def serial_checks() -> Iterator[Check]:
 
 
 def serial_check(device: str, description: str = "") -> Check:
-    """One port: present, allowed, free."""
+    """Check whether this user may open a port, and whether it is free. Only root sees programs of other users."""
+    from ..live.ports import holders  # needs termios
+
     port = f"{device} {description}".strip()
     if not os.access(device, os.R_OK | os.W_OK):
         # the kernel applies a new group to new logins only
-        remedy = f"sudo usermod -aG {_group(device)} $USER, then log in again"
+        group = "dialout"
+        with suppress(OSError, KeyError, NotImplementedError):
+            group = Path(device).group()  # dialout on Debian, uucp on Arch
+        remedy = f"sudo usermod -aG {group} $USER, then log in again"
         return Check("Serial", "warn", f"{port}: not allowed", remedy)
-    if busy := holders(device):
+    if busy := [f"{holder.name} ({holder.pid})" for holder in holders(Path(device), others_only=False)]:
         # it opens every port of a new modem automatically, and reads the answers to our commands
         stop = "sudo systemctl stop ModemManager" if any("ModemManager" in name for name in busy) else "stop it"
         return Check("Serial", "warn", f"{port}: held by {', '.join(busy)}", stop)
     return Check("Serial", "ok", port)
-
-
-def _group(device: str) -> str:
-    try:
-        # dialout on Debian, uucp on Arch: the owner says which
-        return Path(device).group()
-    except (OSError, KeyError, NotImplementedError):
-        return "dialout"

@@ -24,14 +24,15 @@ def test_stages_keep_their_order_and_add_up() -> None:
     assert calls == [("read", None), ("replay", None), ("fails", None), ("maps", 0.5)]
 
 
-def test_what_python_calls_is_logged_by_its_room(
+def test_calls_from_python_log_their_progress(
     caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    program = "with stages('replay'):\n    share_of(stages.progress, 'replay LW1')(0.5)"
     with caplog.at_level("DEBUG", logger="aerpaw_cmp"):
-        exec(program, {"__name__": "aerpaw_cmp.flight.replay", "stages": Stages(), "share_of": share_of})
+        stages = Stages()
+        with stages("replay"):
+            share_of(stages.progress, "replay LW1")(0.5)
     lines = [(record.name, record.levelname, record.getMessage()) for record in caplog.records]
-    assert lines == [("aerpaw_cmp.flight", "INFO", "replay"), ("aerpaw_cmp.flight", "DEBUG", "replay LW1 50 %")]
+    assert lines == [("aerpaw_cmp", "INFO", "replay"), ("aerpaw_cmp", "DEBUG", "replay LW1 50 %")]
     assert capfd.readouterr() == ("", "")
 
 

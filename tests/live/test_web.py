@@ -344,7 +344,7 @@ def test_the_tap_never_waits_for_the_page():
 
 
 def test_rows_are_counted_and_the_oldest_go():
-    rows = Rows(2, size=5)
+    rows = Rows(size=5)
     for number in range(8):
         rows.add((number, None if number == 6 else -number))
     first, data = rows.after(0)

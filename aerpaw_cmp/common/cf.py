@@ -24,18 +24,12 @@ CONVENTIONS = "CF-1.11"
 # dBm and dB as UDUNITS has them: tenths of the decimal logarithm of a power over 1 mW, of a ratio.
 DBM, DB = "0.1 lg(re 1 mW)", "0.1 lg(re 1)"
 
-# Attributes of the grid mapping of latitudes and longitudes.
-WGS84 = {
-    "grid_mapping_name": "latitude_longitude",
-    "geographic_crs_name": "WGS 84",
-    "horizontal_datum_name": "World Geodetic System 1984",
-    "reference_ellipsoid_name": "WGS 84",
-    "semi_major_axis": 6378137.0,
-    "inverse_flattening": 298.257223563,
-    "longitude_of_prime_meridian": 0.0,
-    "prime_meridian_name": "Greenwich",
-    "long_name": "coordinate reference system",
-}
+
+def wgs84() -> dict[str, Any]:
+    """Return the attributes of the grid mapping of latitudes and longitudes."""
+    from pyproj import CRS
+
+    return CRS.from_epsg(4326).to_cf() | {"long_name": "coordinate reference system"}
 
 
 def flags(meanings: Sequence[str], dtype: type[np.integer[Any]] = np.int8, first: int = 0) -> dict[str, Any]:

@@ -311,25 +311,14 @@ class _Builder:
 
     def _mapping(self, location: Location) -> dict[str, Any]:
         content: dict[str, Any] = {}
-        merges: list[tuple[Any, int]] = []
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
             key = self._key(event)
             place = (*location, key)
             if key in content:
                 first = self.document.lines.get(place)
                 self._fail(event, f"duplicate key '{key}' (first on line {first})")
-            line = self.document.lines[place] = event.start_mark.line + 1
-            value = self._value(next(self.events), place)
-            if key == "<<":
-                merges.append((value, line))
-            else:
-                content[key] = value
-        # last: keys of the mapping take precedence, regardless of the position of '<<'
-        for merged, line in merges:
-            for part in merged if isinstance(merged, list) else [merged]:
-                if not isinstance(part, dict):
-                    raise UsageError("'<<' merges something that is not a mapping", path=self.path, line=line)
-                content |= {key: value for key, value in part.items() if key not in content}
+            self.document.lines[place] = event.start_mark.line + 1
+            content[key] = self._value(next(self.events), place)
         return content
 
     def _key(self, event: Any) -> str:
@@ -342,14 +331,10 @@ class _Builder:
         return str(event.value if isinstance(event, yaml.ScalarEvent) else key)
 
     def _scalar(self, event: Any) -> Any:
-        text: str = event.value
         if event.tag not in (None, "!", _TAG + "str"):
-            short = event.tag.replace(_TAG, "!!")
-            if short not in ("!!int", "!!float", "!!bool", "!!null"):
-                self._fail(event, f"the tag '{short}' is not allowed")
-        elif event.tag is not None or not event.implicit[0]:
-            return text  # quoted, block text, or !!str
-        return _plain_value(text)
+            self._fail(event, f"the tag '{event.tag.replace(_TAG, '!!')}' is not allowed")
+        is_text = event.tag is not None or not event.implicit[0]  # !!str, quoted, or block text
+        return event.value if is_text else _plain_value(event.value)
 
 
 def _plain_value(text: str) -> Any:

@@ -13,6 +13,7 @@ import contextlib
 import errno
 import hashlib
 import hmac
+import io
 import ipaddress
 import json
 import re
@@ -37,7 +38,6 @@ _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")
 _PIECE = 16_384
 # Limit of connections, of all addresses, that wait for their request.
 _MOST_WAITING = 256
-_LOW_WATER = socket.SOL_SOCKET, socket.SO_RCVLOWAT
 _TOKEN_WANTED = "the token is missing or wrong: use the address that the tap printed"
 _NO_TOKEN = f"HTTP/1.0 403 Forbidden\r\nContent-Type: text/plain\r\n\r\n{_TOKEN_WANTED}\n".encode()
 
@@ -116,8 +116,13 @@ class Address:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
-class WebServer:
-    """Serves the page of one feed until closed.
+class WebServer(ThreadingHTTPServer):
+    """A server of the page of one feed, as a context. Browsers with the token have a thread each.
+
+    A connection waits in one loop until its request is complete. Requests without the token are refused without a
+    thread. An address without the token gets a limited number of refusals, and is then closed without an answer. A
+    flood, from another computer or from pictures in another page of the same browser, therefore only blocks its
+    address.
 
     Parameters
     ----------
@@ -125,44 +130,64 @@ class WebServer:
     page : Page
     address : Address
     token : str, optional
-        Asked for in the URL; None or empty: a random one. Only that is printed: one that was set is a secret of others.
+        The token that the URL must contain. A token that the user sets is secret and is not printed. None or empty: a
+        random token.
     limits : Limits
 
     Raises
     ------
     UsageError
-        If the address cannot be had; names who holds the port and the next free one.
+        If the address cannot be used.
     """
+
+    daemon_threads = True
+    block_on_close = False
+    # the default of 5 would turn browsers away during a flood
+    request_queue_size = 128
 
     def __init__(
         self, feed: Feed, page: Page, address: Address, *, token: str | None = None, limits: Limits | None = None
     ) -> None:
-        self.feed, self.page, self.address = feed, page, address
-        self.limits = limits or Limits()
+        self.feed, self.page, self.limits = feed, page, limits or Limits()
         self._printed = not token
         self.token = token or secrets.token_urlsafe(12)
         # not the token itself, and below a path that only this server knows: a browser sends cookies of 127.0.0.1 to
         # every port of this computer, where another user may listen
         self.pass_word = hmac.new(self.token.encode(), b"cookie", "sha256").hexdigest()
         self.base = f"/{hmac.new(self.token.encode(), b'path', 'sha256').hexdigest()[:32]}/"
-        self.closing = False
+        self._secrets = quote(self.token).encode(), self.pass_word.encode()
+        self.closing = self._ended = False
+        self._lock = threading.Lock()
+        self.waiting: dict[socket.socket, _Waiting] = {}
+        self.heads: dict[socket.socket, bytes] = {}
+        self.browsers: set[socket.socket] = set()
+        self._allowances: dict[str, tuple[float, float]] = {}
+        self.address_family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
         try:
-            self._server = _Server(self)
+            super().__init__((address.host, address.port), _Handler)
         except OSError as error:
             raise _refused(address, error) from None
-        self.address = Address(address.host, self._server.server_address[1])
-        self._threads = [
-            threading.Thread(target=self._server.serve, name="tap-web", daemon=True),
-            threading.Thread(target=self._digest, name="tap-web-feed", daemon=True),
-        ]
+        self.address = Address(address.host, self.server_address[1])
+        self._thread = threading.Thread(target=self._serve, name="tap-web", daemon=True)
 
     def __enter__(self) -> WebServer:
-        for thread in self._threads:
-            thread.start()
+        self._thread.start()
+        threading.Thread(target=self._digest, name="tap-web-feed", daemon=True).start()
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self.close()
+        """Wait a moment until browsers have the latest data, and close."""
+        self.feed.digest()
+        self.closing = True
+        until = time.monotonic() + 1.5
+        while self.browsers and time.monotonic() < until:
+            time.sleep(0.02)
+        self._ended = True
+        self._thread.join()
+        self.server_close()
+        for request in list(self.browsers):
+            with contextlib.suppress(OSError):
+                request.shutdown(socket.SHUT_RDWR)
 
     @property
     def urls(self) -> list[str]:
@@ -173,47 +198,10 @@ class WebServer:
             hosts = [*_outward(), "127.0.0.1"]
         return [f"http://{Address(host, self.address.port)}{query}" for host in hosts]
 
-    def close(self, wait_s: float = 1.5) -> None:
-        """Wait a moment until browsers have the latest data, and close."""
-        self.feed.digest()
-        self.closing = True
-        until = time.monotonic() + wait_s
-        while self._server.browsers and time.monotonic() < until:
-            time.sleep(0.02)
-        self._server.ended = True
-        self._threads[0].join()
-        self._server.server_close()
-        self._server.close_all()
-
     def _digest(self) -> None:
         while not self.closing:
             self.feed.digest()
             time.sleep(self.limits.tick_s)
-
-
-class _Server(ThreadingHTTPServer):
-    """A server with a thread per browser that has the token. Other requests are refused without a thread.
-
-    A connection waits in one loop until its request is complete. An address without the token gets a limited number of
-    refusals, and is then closed without an answer. A flood, from another computer or from pictures in another page of
-    the same browser, therefore only blocks its address.
-    """
-
-    daemon_threads = True
-    block_on_close = False
-    # the default of 5 would turn browsers away during a flood
-    request_queue_size = 128
-
-    def __init__(self, web: WebServer) -> None:
-        self.web = web
-        self.ended = False
-        self._lock = threading.Lock()
-        self._secrets = quote(web.token).encode(), web.pass_word.encode()
-        self._waiting: dict[socket.socket, tuple[tuple[Any, ...], float]] = {}
-        self.browsers: set[socket.socket] = set()
-        self._allowances: dict[str, tuple[float, float]] = {}
-        self.address_family = socket.AF_INET6 if ":" in web.address.host else socket.AF_INET
-        super().__init__((web.address.host, web.address.port), _Handler)
 
     def server_bind(self) -> None:
         """Bind without the look-up of this computer's name, which may ask the network."""
@@ -221,18 +209,19 @@ class _Server(ThreadingHTTPServer):
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
 
-    def serve(self) -> None:
-        """Accept connections and answer them, until ``ended``."""
+    def _serve(self) -> None:
+        """Accept connections and read their requests."""
         self.socket.setblocking(False)
         with selectors.DefaultSelector() as ready:
             ready.register(self.socket, selectors.EVENT_READ)
-            while not self.ended:
-                for key, _ in ready.select(self.web.limits.tick_s):
-                    self._accept(ready) if key.fileobj is self.socket else self._look_at(key.fileobj, ready)
-                limit = time.monotonic() - self.web.limits.request_s
-                for request in [request for request, (_, since) in self._waiting.items() if since < limit]:
-                    self._leave(request, ready).close()
-        for request in self._waiting:
+            while not self._ended:
+                for key, _ in ready.select(self.limits.tick_s):
+                    self._accept(ready) if key.fileobj is self.socket else self._read(key.fileobj, ready)
+                limit = time.monotonic() - self.limits.request_s
+                for request in [request for request, waiting in self.waiting.items() if waiting.since_s < limit]:
+                    self._leave(request, ready)
+                    request.close()
+        for request in self.waiting:
             request.close()
 
     def _accept(self, ready: selectors.BaseSelector) -> None:
@@ -243,46 +232,43 @@ class _Server(ThreadingHTTPServer):
             time.sleep(0.01)
             return
         request.setblocking(False)
-        self._waiting[request] = address, time.monotonic()
+        self.waiting[request] = _Waiting(address, time.monotonic())
         ready.register(request, selectors.EVENT_READ)
-        if len(self._waiting) > _MOST_WAITING:
-            hosts = [host for (host, *_), _ in self._waiting.values()]
-            crowding = hosts.index(max(set(hosts), key=hosts.count))
-            self._leave(list(self._waiting)[crowding], ready).close()
+        if len(self.waiting) > _MOST_WAITING:
+            hosts = [waiting.address[0] for waiting in self.waiting.values()]
+            crowding = list(self.waiting)[hosts.index(max(set(hosts), key=hosts.count))]
+            self._leave(crowding, ready)
+            crowding.close()
 
-    def _leave(self, request: socket.socket, ready: selectors.BaseSelector) -> socket.socket:
-        del self._waiting[request]
+    def _leave(self, request: socket.socket, ready: selectors.BaseSelector) -> None:
         ready.unregister(request)
-        return request
+        del self.waiting[request]
 
-    def _look_at(self, request: Any, ready: selectors.BaseSelector) -> None:
-        """Answer a request in a separate thread if it seems to have the token (the handler verifies it)."""
-        if request not in self._waiting:
+    def _read(self, request: Any, ready: selectors.BaseSelector) -> None:
+        """Read a part of a request. Answer it in a separate thread if it seems to have the token."""
+        if request not in self.waiting:
             return  # the request was closed earlier in this loop
-        address, head = self._waiting[request][0], b""
+        waiting, data = self.waiting[request], b""
         with contextlib.suppress(OSError):
-            head = request.recv(_PIECE, socket.MSG_PEEK)
-        known = any(secret in head for secret in self._secrets)
-        more = len(head) + 1
-        # a browser may send its header in pieces, with the token in the last piece
-        if head and not known and b"\r\n\r\n" not in head and request.getsockopt(*_LOW_WATER) < more <= _PIECE:
-            request.setsockopt(*_LOW_WATER, more)  # report the socket as readable when more of the header has arrived
-            return
+            data = request.recv(_PIECE)
+        waiting.head += data
+        if data and b"\r\n\r\n" not in waiting.head and len(waiting.head) < _PIECE:
+            return  # a browser may send its header in pieces
         self._leave(request, ready)
         with contextlib.suppress(OSError, RuntimeError):  # the client has left, or no thread can be started
-            if known:
+            # the handler verifies the token
+            if any(secret in waiting.head for secret in self._secrets):
+                self.heads[request] = waiting.head
                 request.setblocking(True)
-                self.process_request(request, address)
+                self.process_request(request, waiting.address)
                 return
-            if head and self._allowed(address[0]):
-                # read first: closing a socket with unread bytes resets it, and the refusal would be lost
-                request.recv(_PIECE)
+            if waiting.head and self._is_allowed(waiting.address[0]):
                 request.send(_NO_TOKEN)
         request.close()
 
-    def _allowed(self, host: str) -> bool:
+    def _is_allowed(self, host: str) -> bool:
         """Check whether an address may have one more refusal."""
-        limits, now = self.web.limits, time.monotonic()
+        limits, now = self.limits, time.monotonic()
         if len(self._allowances) > _MOST_WAITING:
             # limit the table's memory; after clearing it, each address has at most one more burst
             self._allowances.clear()
@@ -295,36 +281,41 @@ class _Server(ThreadingHTTPServer):
         """Forget the connection, then close it."""
         with self._lock:
             self.browsers.discard(request)
+        self.heads.pop(request, None)
         super().shutdown_request(request)
 
     def let_in(self, request: Any) -> bool:
         """Register a connection that showed the token. Return False if too many of these are open."""
         with self._lock:
-            if len(self.browsers) >= self.web.limits.connections:
+            if len(self.browsers) >= self.limits.connections:
                 return False
             self.browsers.add(request)
             return True
-
-    def close_all(self) -> None:
-        """Close every connection."""
-        for request in list(self.browsers):
-            with contextlib.suppress(OSError):
-                request.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print nothing: a browser that disconnects is not an error, and the terminal belongs to the tap."""
 
 
+@dataclass(slots=True)
+class _Waiting:
+    """A connection whose request is not complete."""
+
+    address: tuple[Any, ...]
+    since_s: float
+    head: bytes = b""
+
+
 class _Handler(BaseHTTPRequestHandler):
     """A request handler with HTTP/1.0, so that each connection ends with its answer."""
 
-    server: _Server
+    server: WebServer
     server_version = "aerpaw-cmp"
     sys_version = ""
 
     def setup(self) -> None:
         super().setup()
-        self.connection.settimeout(self.server.web.limits.send_s)
+        self.rfile = io.BytesIO(self.server.heads.pop(self.request))
+        self.connection.settimeout(self.server.limits.send_s)
         # a small kernel buffer shows sooner that a browser does not read
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 * _PIECE)
 
@@ -336,7 +327,7 @@ class _Handler(BaseHTTPRequestHandler):
         except ValueError:
             self.send_error(HTTPStatus.BAD_REQUEST)
             return
-        base = self.server.web.base
+        base = self.server.base
         private = parts.path.startswith(base)
         path = f"/{parts.path[len(base) :]}" if private else parts.path
         refusal = self._refusal(path, query, private)
@@ -349,7 +340,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Location", f"{base}?{parts.query}")
             self.end_headers()
         elif path == "/":
-            body = self.server.web.page.body
+            body = self.server.page.body
             self._head("text/html; charset=utf-8", len(body), cookie=True)
             self._pieces(body)
         else:
@@ -358,7 +349,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _refusal(self, path: str, query: dict[str, str], private: bool) -> tuple[HTTPStatus, str] | None:
         """Return status and reason with which the request is refused, None if it is answered."""
-        web, headers = self.server.web, self.headers
+        web, headers = self.server, self.headers
         hosts, origins = headers.get_all("Host", []), headers.get_all("Origin", [])
         if len(hosts) != 1 or not _own_host(hosts[0], web.address.loopback):
             return HTTPStatus.FORBIDDEN, "the Host is not a name of this computer"
@@ -375,19 +366,19 @@ class _Handler(BaseHTTPRequestHandler):
 
     @property
     def _cookie(self) -> str:
-        return f"aerpaw_tap_{self.server.web.address.port}"
+        return f"aerpaw_tap_{self.server.address.port}"
 
     def _has_token(self, query: dict[str, str], private: bool) -> bool:
         """Check whether a request has the token in its address, or below the private path the cookie of a visit."""
         pairs = (item.strip().partition("=") for item in self.headers.get("Cookie", "").split(";"))
         cookie = next((value for name, _, value in pairs if private and name == self._cookie), "")
         # compare in constant time: the duration of a refusal must not show how much of the token was right
-        given = (query.get("token", ""), self.server.web.token), (cookie, self.server.web.pass_word)
+        given = (query.get("token", ""), self.server.token), (cookie, self.server.pass_word)
         return any(hmac.compare_digest(text.encode(), secret.encode()) for text, secret in given)
 
     def _events(self, cursor: str) -> None:
         """Send what is new until the browser goes, takes nothing, or the session ends."""
-        web, page = self.server.web, self.server.web.page.digest
+        web, page = self.server, self.server.page.digest
         self._pieces(b"retry: 1000\n\n")
         while True:
             message, cursor = web.feed.after(cursor, 0.0 if web.closing else 1.0)
@@ -404,9 +395,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         self.send_header("Content-Type", kind)
         if cookie:
-            secret = self.server.web.pass_word
+            secret = self.server.pass_word
             self.send_header(
-                "Set-Cookie", f"{self._cookie}={secret}; Path={self.server.web.base}; HttpOnly; SameSite=Strict"
+                "Set-Cookie", f"{self._cookie}={secret}; Path={self.server.base}; HttpOnly; SameSite=Strict"
             )
         if length is not None:
             self.send_header("Content-Length", str(length))
@@ -415,7 +406,7 @@ class _Handler(BaseHTTPRequestHandler):
     def end_headers(self) -> None:
         """Close the head with what every answer carries."""
         for name, value in (
-            ("Content-Security-Policy", self.server.web.page.policy),
+            ("Content-Security-Policy", self.server.page.policy),
             ("X-Content-Type-Options", "nosniff"),
             ("Referrer-Policy", "no-referrer"),
             ("Cross-Origin-Resource-Policy", "same-origin"),

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..common import kml
-from ..common.cf import DB, DBM, WGS84, Dataset, file_attributes, netcdf_bytes
+from ..common.cf import DB, DBM, Dataset, file_attributes, netcdf_bytes, wgs84
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
 from ..common.kml import CLASS_COLOURS, xml_text
@@ -180,7 +180,7 @@ def _points_dataset(export: Export, points: Points) -> Dataset:
     variables["time"] = ("obs", *_seconds(export, points.table["time"].to_numpy()))
     for name, (short, attributes) in PLACES.items():
         variables[short] = ("obs", points.table[name].to_numpy(), attributes)
-    variables["crs"] = ((), np.int32(0), WGS84)
+    variables["crs"] = ((), np.int32(0), wgs84())
     for item in points.columns:
         variables[item.name.replace(".", "p")] = ("obs", *_values(item, points.table[item.name].to_numpy()))
     about = file_attributes(

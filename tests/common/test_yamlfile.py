@@ -91,9 +91,10 @@ def test_alias_bomb_and_deep_nesting_are_refused() -> None:
     assert "nested deeper" in failure("anything: " + "[" * 100_000).found
 
 
-def test_anchors_and_merge_keys_work() -> None:
-    got = parse_yaml("masts:\n  a: &base {height_m: 2, label: x}\n  b: {<<: *base, label: y}", Settings)
-    assert got.masts["b"] == Mast(height_m=2, label="y")
+def test_anchors_work_and_merge_keys_are_unknown_keys() -> None:
+    got = parse_yaml("masts:\n  a: &base {height_m: 2, label: x}\n  b: *base", Settings)
+    assert got.masts["b"] == Mast(height_m=2, label="x")
+    assert "unknown key 'masts.b.<<'" in failure("masts:\n  a: &base {label: x}\n  b: {<<: *base}").found
 
 
 def test_files(tmp_path: Path) -> None:

@@ -227,7 +227,7 @@ def test_a_flood_of_an_address_keeps_neither_others_out_nor_who_has_the_token(to
         assert hostile == ["403"] * 6 + [""] * 34
         places = ("127.0.0.1", web.address.port)
         silent = [socket.create_connection(places, 10, ("127.0.0.2", 0)) for _ in range(300)]
-        until(lambda: len(web._server._waiting) == 256, 10.0)
+        until(lambda: len(web.waiting) == 256, 10.0)
         assert answer("127.0.0.2", "/?x") == ""
         for source in ("127.0.0.3", "127.0.0.2"):
             assert answer(source, f"{web.base}?token={web.token}") == "200"
@@ -239,7 +239,7 @@ def test_a_flood_of_an_address_keeps_neither_others_out_nor_who_has_the_token(to
 def test_browsers_with_the_token_are_bounded(tools):
     with WebServer(Feed(["modem"]), tools.page, Address("127.0.0.1", 0), limits=Limits(connections=2)) as web:
         browsers = [tools.Browser.of(web) for _ in range(2)]
-        until(lambda: len(web._server.browsers) == 2, 10.0)
+        until(lambda: len(web.browsers) == 2, 10.0)
         assert ask(web)[0] == 503
         for browser in browsers:
             browser.close()
@@ -294,7 +294,7 @@ def test_a_browser_that_takes_nothing_is_dropped_and_others_miss_nothing(tools):
         def streams(wanted):
             assert time.monotonic() < until
             time.sleep(0.01)
-            return len(web._server.browsers) == wanted
+            return len(web.browsers) == wanted
 
         while not streams(2):
             pass

@@ -110,7 +110,7 @@ def fly(driver):
     said = [entry for entry in complaints(driver) if "ERR_" not in entry["message"]]  # a server that ends is no fault
     driver.get("about:blank")
     for flight in running:
-        flight.server.close(wait_s=0.1)
+        flight.server.__exit__()
     assert not said
 
 
@@ -310,7 +310,7 @@ def test_a_tap_that_is_started_anew_goes_on_in_the_same_page(driver, fly):
     flight = flown(driver, fly, 6)
     port = flight.server.address.port
     driver.execute_script("window.same = true")
-    flight.server.close(wait_s=0.1)
+    flight.server.__exit__()
     until(driver, "document.getElementById('state').textContent === 'no connection to the tap'")
     again = Flight(background=made_map(), port=port, token=flight.server.token)
     again.now_ns = again.start_ns = again.feed.start_ns = flight.now_ns + 20 * SECOND

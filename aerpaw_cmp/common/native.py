@@ -145,26 +145,26 @@ def _hdf5(depth: int, netcdf: bool = False) -> Read:
 
     def read(data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
         with h5py.File(h5py.h5f.open_file_image(data)) as book:
-            items = _Items(book, depth, "fiubSO" if netcdf else "fiub")
+            items = _data_sets(book, depth, "fiubSO" if netcdf else "fiub")
             most = min(MOST_BYTES, MOST_RATIO * len(data) + FREE_BYTES)
-            total = sum(item.nbytes for item in items.data_sets.values())
+            total = sum(item.nbytes for item in items.values())
             if total > most:
                 raise InputError(
                     f"the file of {len(data)} bytes declares {total} bytes of data",
                     expected=f"at most {most}",
                     cause="a file crafted to fill the memory",
                 )
-            classes = {name: _text(item.attrs.get("MATLAB_class", b"")) for name, item in items.data_sets.items()}
+            classes = {name: _text(item.attrs.get("MATLAB_class", b"")) for name, item in items.items()}
             attributes = {name: _text(value) for name, value in book.attrs.items() if np.ndim(value) == 0}
             notes: dict[str, Any] = {
                 "attributes": attributes,
                 "classes": {name: word for name, word in classes.items() if word},
             }
             if netcdf:
-                notes["dims"] = {name: _dimensions(item) for name, item in items.data_sets.items()}
-                units = {name: _text(item.attrs.get("units", b"")) for name, item in items.data_sets.items()}
+                notes["dims"] = {name: _dimensions(item) for name, item in items.items()}
+                units = {name: _text(item.attrs.get("units", b"")) for name, item in items.items()}
                 notes["units"] = {name: unit for name, unit in units.items() if unit}
-            return {name: _plain(np.asarray(item[()])) for name, item in items.data_sets.items()}, notes
+            return {name: _plain(np.asarray(item[()])) for name, item in items.items()}, notes
 
     with h5py.File("warm", "w", driver="core", backing_store=False) as book:
         book.create_dataset("x", data=np.arange(300.0), compression="gzip", shuffle=True)
@@ -208,42 +208,33 @@ def _text(value: Any) -> str | int:
     return int(value) if isinstance(value, (int, np.integer)) else str(value)
 
 
-class _Items:
-    """Numeric data sets below a group by path. Data sets outside the file are refused."""
+def _data_sets(group: Any, depth: int, kinds: str, path: str = "", seen: set[Any] | None = None) -> dict[str, Any]:
+    """Return data sets of some kinds of numbers below a group, by path. Data sets outside the file are refused."""
+    import h5py
 
-    def __init__(self, book: Any, depth: int, kinds: str = "fiub") -> None:
-        import h5py
+    seen, found = set() if seen is None else seen, {}
+    for name in group:
+        place = f"{path}{name}"
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise _lies_elsewhere(f"{place!r} is a link, not data")
+        item = group[name]
+        if len(seen) > _MOST_ITEMS:
+            raise InputError(f"the file has more than {_MOST_ITEMS} items", expected="a log", cause="no log")
+        address = h5py.h5o.get_info(item.id).addr
+        if address in seen:
+            continue  # the file is linked twice, or contains itself
+        seen.add(address)
+        if isinstance(item, h5py.Group) and depth > 1:
+            found |= _data_sets(item, depth - 1, kinds, f"{place}/", seen)
+        elif isinstance(item, h5py.Dataset):
+            _refuse_elsewhere(place, item)
+            found |= {place: item} if item.dtype.kind in kinds else {}
+    return found
 
-        self._h5py = h5py
-        self._kinds = kinds
-        self._seen: set[Any] = set()
-        self.data_sets: dict[str, Any] = {}
-        self._walk(book, "", depth)
 
-    def _walk(self, group: Any, path: str, depth: int) -> None:
-        h5py = self._h5py
-        for name in group:
-            place = f"{path}{name}"
-            link = group.get(name, getlink=True)
-            if not isinstance(link, h5py.HardLink):
-                raise _lies_elsewhere(f"{place!r} is a link, not data")
-            item = group[name]
-            if len(self._seen) > _MOST_ITEMS:
-                raise InputError(f"the file has more than {_MOST_ITEMS} items", expected="a log", cause="no log")
-            address = h5py.h5o.get_info(item.id).addr
-            if address in self._seen:
-                continue  # the file is linked twice, or contains itself
-            self._seen.add(address)
-            if isinstance(item, h5py.Group) and depth > 1:
-                self._walk(item, f"{place}/", depth - 1)
-            elif isinstance(item, h5py.Dataset):
-                self._take(place, item)
-
-    def _take(self, place: str, item: Any) -> None:
-        if item.is_virtual or item.external:
-            raise _lies_elsewhere(f"the data of {place!r} are in other files")
-        if item.dtype.kind in self._kinds:
-            self.data_sets[place] = item
+def _refuse_elsewhere(place: str, item: Any) -> None:
+    if item.is_virtual or item.external:
+        raise _lies_elsewhere(f"the data of {place!r} are in other files")
 
 
 def _lies_elsewhere(reason: str) -> InputError:

@@ -110,8 +110,9 @@ def _serve(stack: contextlib.ExitStack, feed: Feed, twin: Any, shown: Shown, tit
     from ..report.live import live_page
 
     address = Address.parse(shown.web or "")
-    background = None if twin is None else twin.map()
-    page = Page(*live_page(background, title if background is None else background.title))
+    if twin is not None:
+        title = twin.settings.flight.title or twin.settings.flight.name
+    page = Page(*live_page(None if twin is None else twin.map(), title))
     server = stack.enter_context(WebServer(feed, page, address, token=os.environ.get(TOKEN)))
     known = f"  (... is the value of {TOKEN})" if os.environ.get(TOKEN) else ""
     shown.say("the page: " + "  ".join(server.urls) + known)

@@ -14,19 +14,19 @@ from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, FloatArray, spread_out
 from ..compare.field_gp import RouteAhead
 from ..compare.rank import channel_rank
-from ..flight.data import choose_site
+from ..flight.data import choose_site, gather, read_logs
 from ..flight.gains import load_with_learned
 from ..flight.replay import replay_poses
 from ..flight.settings import FlightFile, LogSettings
 from ..flight.simulate import planned_poses
 from ..live.predict import Predict, Prediction, TelemetryFollower, TelemetrySample, predict_along
-from ..live.simulator import ranks_of
+from ..live.simulator import flight_rank
 from ..logs.readers import by_name
 from ..logs.writers import format_vehicle_out
 from ..maps.grid import Grid
 from ..propagation.field.baselines import free_space_dbm
 from ..propagation.geometry import Link, Poses, rotation_from_aircraft
-from ..report.live import LiveMap
+from ..report.live import live_map
 from ..site.site import Site
 
 _MAP_HEIGHTS_M = (10.0, 30.0, 50.0, 70.0, 90.0, 110.0)
@@ -129,7 +129,7 @@ class LiveTwin:
         median, least, most = columns[:, 2:].mean(axis=0).round(1).tolist()
         return {"trend": forecast.trend, "level_dbm": median, "interval_dbm": [least, most], "points": shown.tolist()}
 
-    def map(self) -> LiveMap:
+    def map(self) -> dict[str, Any]:
         """Return predicted rank and level over the site at several heights, for a level UAV with heading north."""
         east_min, east_max, north_min, north_max = self.site.area_m
         spacing = max(20.0, max(east_max - east_min, north_max - north_min) / _MAP_CELLS)
@@ -138,17 +138,8 @@ class LiveTwin:
         level = rotation_from_aircraft(np.asarray(0.0), np.asarray(0.0), np.asarray(0.0))
         rank, level_dbm = self._replayed(places, np.broadcast_to(level, (len(places), 3, 3)))
         shape = (len(_MAP_HEIGHTS_M), len(grid.north_m), len(grid.east_m))
-        return LiveMap(
-            title=self.settings.flight.title or self.settings.flight.name,
-            site=self.site,
-            tower=self.settings.rank.tower,
-            k=self.k,
-            heights_m=_MAP_HEIGHTS_M,
-            east_m=grid.east_m,
-            north_m=grid.north_m,
-            rank=rank.reshape(shape),
-            level_dbm=level_dbm.reshape(shape),
-        )
+        values = rank.reshape(shape), level_dbm.reshape(shape)
+        return live_map(self.site, self.settings.rank.tower, self.k, _MAP_HEIGHTS_M, grid, values)
 
     def _pose(self, sample: TelemetrySample) -> tuple[FloatArray, FloatArray]:
         east, north = self.site.frame.to_local(sample.latitude_deg, sample.longitude_deg)
@@ -183,19 +174,18 @@ class FlownAgain:
 
     def __init__(self, flight: Path, telemetry: Path) -> None:
         twin = LiveTwin.of(flight)
-        settings, log = twin.settings, _telemetry_log(twin.settings)
-        data = (flight.parent / log.path).read_bytes()
-        streams = by_name(log.reader or "vehicle_out").read(data, log.options(settings.timezone)).streams
+        files = read_logs(twin.settings, flight.parent)
+        streams = [stream for file in files for stream in file.result.streams if stream.kind == "telemetry"]
         if not streams or not len(streams[0].frame):
             raise InputError("no telemetry in it", expected="a flight with a vehicleOut log", path=flight)
-        self._frame, self._zone = streams[0].frame.sort_values("time"), settings.timezone or "UTC"
-        times = self._frame["time"].to_numpy().astype("datetime64[ns]").astype("int64")
-        self._seconds = (times - times[0]) / 1e9
+        self._frame, self._zone = streams[0].frame.sort_values("time"), twin.settings.timezone or "UTC"
+        times = self._frame["time"].to_numpy().astype("datetime64[ns]")
+        self._seconds = (times - times[0]) / np.timedelta64(1, "s")
         self._lasts_s = float(self._seconds[-1]) + 1.0
         self._level = self._levels(twin)
-        logs = (ranks_of(flight.parent / entry.path, entry.options(settings.timezone)) for entry in settings.logs)
-        # of the first rank log; None: those of the built-in flight
-        self.rank = next((ranks for ranks in logs if ranks is not None), None)
+        measured = gather(twin.settings, flight.parent, files).rank
+        self._ranks = measured[0] if measured else None
+        self._rank_seconds = (measured[0].time - times[0]) / np.timedelta64(1, "s") if measured else self._seconds
         self._start_ns, self._written = time.time_ns(), 0
         try:
             self._file = telemetry.open("xb", buffering=0)
@@ -211,6 +201,13 @@ class FlownAgain:
         fading = np.random.default_rng(7).normal(0.0, _DEMO_FADING_DB, len(level))
         # -140 dBm is the lowest RSRP that a modem reports
         return np.asarray(np.nan_to_num(level + _DEMO_OFFSET_DB + fading, nan=-140.0))
+
+    def rank(self, seconds: float) -> int:
+        """Return the rank of the flight's first rank log, else of the built-in flight, at a time. 0: no CSI."""
+        if self._ranks is None:
+            return flight_rank(seconds)
+        at = int(np.searchsorted(self._rank_seconds, seconds % self._lasts_s, side="right")) - 1
+        return 0 if at < 0 else int(np.nan_to_num(self._ranks.rank[at]))
 
     def rsrp(self, seconds: float) -> float:
         """Return the RSRP at a time after the start [dBm]."""

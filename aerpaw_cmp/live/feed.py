@@ -32,7 +32,6 @@ _PENDING = 20_000
 CHUNK = 4_000
 _ALARMS = 300
 _LONGEST_TEXT = 300
-RATE_WINDOW_S = 10.0
 STALE_S = 3.0
 _GPS_LOST_S = 5.0
 _CLOCK_OFF_S = 2.0
@@ -52,7 +51,10 @@ _CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
 
 
 # Fields of a status that the page shows unchanged.
-_STATUS = ("connected", "records", "bytes_written", "disk_free_bytes", "disk_fault", "gaps", "missed", "predicts")
+_STATUS = (
+    *("connected", "ri_rate_hz", "gaps", "missed", "predicts"),
+    *("records", "bytes_written", "disk_free_bytes", "disk_fault"),
+)
 
 
 class Rows:
@@ -99,6 +101,7 @@ class _Modem:
     rank: int | None = None
     rsrp_dbm: float | None = None
     sinr_db: float | None = None
+    ri_rate_hz: float = 0.0
     gaps: int = 0
     missed: int = 0
     records: int = 0
@@ -123,21 +126,13 @@ class _Modem:
     gap_text: str = ""
     unsynchronised: bool = False
     sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=64))
-    times: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
     open: dict[str, Alarm] = field(default_factory=dict)
 
-    _SHOWN = (
-        "name", "port", "connected", "rank", "rsrp_dbm", "sinr_db", "gaps", "missed", "records", "bytes_written",
-        "disk_free_bytes", "offset_db", "inside", "ahead", "predicts", "ended",
-    )  # fmt: skip
+    _SHOWN = (*_STATUS, "name", "port", "rank", "rsrp_dbm", "sinr_db", "offset_db", "inside", "ahead", "ended")
 
-    def shown(self, now: float) -> dict[str, Any]:
+    def shown(self) -> dict[str, Any]:
         """Values of the moment, as the page shows them."""
-        while self.times and now - self.times[0] > RATE_WINDOW_S:
-            self.times.popleft()
-        return {name: getattr(self, name) for name in self._SHOWN} | {
-            "rate_hz": round(len(self.times) / min(RATE_WINDOW_S, max(1.0, now)), 2)
-        }
+        return {name: getattr(self, name) for name in self._SHOWN}
 
 
 class Feed:
@@ -206,7 +201,7 @@ class Feed:
                 return None, cursor
             now, modems, complete, following = self.now(), [], True, []
             for index, modem in enumerate(self._modems):
-                content = modem.shown(now)
+                content = modem.shown()
                 for place, (key, table) in enumerate((("rows", modem.measured), ("predictions", modem.predicted))):
                     first, data = table.after(rows[2 * index + place])
                     content[key] = [first, data]
@@ -288,8 +283,6 @@ class Feed:
             modem.rank = None if rank is None else int(rank)
             if modem.rank is not None:
                 modem.rank_s = t
-            if record["status"] == "ok":
-                modem.times.append(t)
             # levels come from another query, at a slower rate: store the last known levels next to each rank
             modem.measured.add((t, modem.rank, modem.rsrp_dbm, modem.sinr_db))
             modem.sent.append((record["sent_utc_ns"], t))

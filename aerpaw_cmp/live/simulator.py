@@ -15,12 +15,10 @@ import select
 import termios
 import threading
 import time
-from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ..common.errors import AerpawCmpError, UsageError
-from ..logs.readers import ReadOptions, identify
+from ..common.errors import UsageError
 from .modem import QUERIES
 from .ports import make_raw
 
@@ -28,7 +26,7 @@ from .ports import make_raw
 _LATENCY_S = 0.02
 
 
-def _flight_rank(seconds: float) -> int:
+def flight_rank(seconds: float) -> int:
     """Return the rank of the built-in flight: 1 to 4 in slow turns, now and then no CSI."""
     if seconds % 120.0 > 118.0:
         return 0
@@ -56,7 +54,7 @@ class FlightModem:
         rank: Callable[[float], int] | None = None,
         rsrp: Callable[[float], float] | None = None,
     ) -> None:
-        self._rank, self._rsrp = rank or _flight_rank, rsrp or _flight_rsrp
+        self._rank, self._rsrp = rank or flight_rank, rsrp or _flight_rsrp
         self.csi = [1, 1]
         self._start = time.monotonic()
         self._asked = 0
@@ -95,27 +93,6 @@ class FlightModem:
             if QUERIES[name].text == command:
                 return (*lines, "OK")
         return ("ERROR",)
-
-
-def ranks_of(path: Path, options: ReadOptions) -> Callable[[float], int] | None:
-    """Rank over time since the start of a log, None if no reader finds ranks in it."""
-    data = path.read_bytes()
-    try:
-        result = identify(data).read(data, options)
-    except AerpawCmpError:
-        return None
-    streams = [stream for stream in result.streams if stream.kind == "rank" and len(stream.frame)]
-    if not streams:
-        return None
-    frame = streams[0].frame.sort_values("time")
-    times = frame["time"].to_numpy().astype("datetime64[ns]").astype("int64")
-    seconds = [float(t - times[0]) / 1e9 for t in times]
-    ranks = [0 if math.isnan(rank) else round(rank) for rank in frame["rank"].to_numpy(dtype="float64").tolist()]
-
-    def rank(elapsed_s: float) -> int:
-        return ranks[max(0, bisect_right(seconds, elapsed_s % (seconds[-1] + 1.0)) - 1)]
-
-    return rank
 
 
 class ModemSimulator:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from ..common.units import AnyArray, FloatArray
+from ..maps.grid import Grid
 from ..site.site import Site
 from .packed import PackedArrays, plan_of
 from .page import as_json, digest, environment, script
@@ -21,64 +21,47 @@ _POLICY = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LiveMap:
-    """The predicted rank and level over the site for one tower, shape (heights, north, east).
+def live_map(
+    site: Site, tower: str, k: float, heights_m: Sequence[float], grid: Grid, values: tuple[AnyArray, FloatArray]
+) -> dict[str, Any]:
+    """Return the predicted rank and level over a site as plain values for the script of the page.
 
     Parameters
     ----------
-    title : str
-        Title of the flight.
     site : Site
     tower : str
     k : float
         Singular-value ratio of the ranks.
-    heights_m, east_m, north_m : sequence of float
-        Axes of the grid, evenly spaced east and north [m].
-    rank : (heights, north, east) int
-        Rank; 0 without a path.
-    level_dbm : (heights, north, east) float
-        Level [dBm]; NaN without a path.
+    heights_m : sequence of float
+    grid : Grid
+    values : (heights, north, east) int, (heights, north, east) float
+        Rank, 0 without a path, and level [dBm], NaN without a path.
     """
-
-    title: str
-    site: Site
-    tower: str
-    k: float
-    heights_m: Sequence[float]
-    east_m: FloatArray
-    north_m: FloatArray
-    rank: AnyArray
-    level_dbm: FloatArray
-
-    def content(self) -> dict[str, Any]:
-        """Return plain values for the script."""
-        arrays = PackedArrays()
-        rank, level = arrays.add(np.clip(self.rank, 0, 4), "u1"), arrays.add_steps(self.level_dbm, 0.1)
-        step = float(self.east_m[1] - self.east_m[0]) if len(self.east_m) > 1 else 20.0
-        return {
-            "site": plan_of(self.site),
-            "tower": self.tower,
-            "k": k_key(self.k),
-            "heights": [float(height) for height in self.heights_m],
-            "east": float(self.east_m[0]),
-            "north": float(self.north_m[0]),
-            "step": step,
-            "columns": len(self.east_m),
-            "rows": len(self.north_m),
-            "rank": rank,
-            "level": level,
-            **arrays.content(),
-        }
+    arrays = PackedArrays()
+    rank, level = arrays.add(np.clip(values[0], 0, 4), "u1"), arrays.add_steps(values[1], 0.1)
+    return {
+        "site": plan_of(site),
+        "tower": tower,
+        "k": k_key(k),
+        "heights": [float(height) for height in heights_m],
+        "east": float(grid.east_m[0]),
+        "north": float(grid.north_m[0]),
+        "step": float(grid.east_m[1] - grid.east_m[0]) if len(grid.east_m) > 1 else 20.0,
+        "columns": len(grid.east_m),
+        "rows": len(grid.north_m),
+        "rank": rank,
+        "level": level,
+        **arrays.content(),
+    }
 
 
-def live_page(background: LiveMap | None, title: str) -> tuple[bytes, str]:
+def live_page(background: dict[str, Any] | None, title: str) -> tuple[bytes, str]:
     """Return the page and its Content-Security-Policy.
 
     Parameters
     ----------
-    background : LiveMap, optional
-        Without a prediction the page shows the measurement alone, without a map.
+    background : dict, optional
+        Result of :func:`live_map`. None: the page shows the measurement alone, without a map.
     title : str
         Text next to the heading.
     """
@@ -91,7 +74,7 @@ def live_page(background: LiveMap | None, title: str) -> tuple[bytes, str]:
             mapped=background is not None,
             style=Markup(style),
             script=Markup(code),
-            scene=Markup(as_json(background.content() if background else {})),
+            scene=Markup(as_json(background or {})),
         )
     )
     return text.encode(), _POLICY.format(script=digest(code), style=digest(style))

@@ -12,10 +12,10 @@ import pytest
 import yaml
 
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.flight.data import choose_site
+from aerpaw_cmp.flight.data import choose_site, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import plan_trajectory, telemetry_frame
-from aerpaw_cmp.jobs.live_twin import LiveTwin
+from aerpaw_cmp.jobs.live_twin import FlownAgain, LiveTwin
 from aerpaw_cmp.live.predict import TelemetrySample
 from aerpaw_cmp.logs.writers import format_vehicle_out
 from aerpaw_cmp.propagation.geometry import Poses
@@ -114,3 +114,17 @@ def test_tap_writes_predictions_and_residuals(tmp_path: Path) -> None:
         if record.get("predicted") is not None and record.get("measured") is not None:
             assert record["residual"] == record["measured"] - record["predicted"]
     assert "predicted" in done.stderr
+
+
+def test_a_flight_is_flown_again_with_its_own_ranks_and_telemetry(tmp_path: Path) -> None:
+    settings = load_flight(FLIGHT)
+    files = read_logs(settings, FLIGHT.parent)
+    (series, *_) = gather(settings, FLIGHT.parent, files).rank
+    start = next(s.frame for file in files for s in file.result.streams if s.kind == "telemetry")["time"].iloc[0]
+    flown = FlownAgain(FLIGHT, tmp_path / "again.txt")
+    for i in (0, 10, len(series.rank) - 1):
+        seconds = (series.time[i] - start.to_datetime64()) / np.timedelta64(1, "s")
+        assert flown.rank(seconds + 0.01) == np.nan_to_num(series.rank[i])
+    flown()
+    assert len((tmp_path / "again.txt").read_text().splitlines()) >= 1
+    flown._file.close()

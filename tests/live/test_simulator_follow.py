@@ -7,31 +7,12 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.live import simulator
 from aerpaw_cmp.live.predict import Prediction, TelemetryFollower, predict_along
-from aerpaw_cmp.live.simulator import ranks_of
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS
 from aerpaw_cmp.logs.records import ReadResult, Stream
 from benchmarks.simulated_modem import FaultyModem
 from tests.live.terminals import held
-
-
-def test_the_ranks_of_a_log_are_flown_again(tmp_path, monkeypatch):
-    def read(data, options):
-        rows = [line.split(",") for line in data.decode().split()]
-        times = pd.Timestamp("2026-01-01") + pd.to_timedelta([float(row[0]) for row in rows], unit="s")
-        ranks = [float(row[1]) for row in rows]
-        frame = pd.DataFrame({"time": times, "line": range(len(rows)), "flag": "", "rank": ranks, "ri_raw": ranks})
-        return ReadResult("r", (Stream("rank", "r", frame),), len(rows), len(rows), 0)
-
-    reader = Reader("r", "", ("rank",), "", lambda _head: True, read)
-    monkeypatch.setattr(simulator, "identify", lambda _data: reader)
-    path = tmp_path / "rank.csv"
-    path.write_text("10,1\n12,4\n14,nan\n15,2\n")
-    rank = ranks_of(path, ReadOptions(timezone="UTC"))
-    ranks = [rank(t) for t in (0.0, 1.9, 2.0, 3.9, 4.5, 5.0, 5.9, 6.1)]
-    assert ranks == [1, 1, 4, 4, 0, 2, 2, 1]  # and again from the start
 
 
 def test_what_two_threads_say_at_once_comes_one_behind_the_other():

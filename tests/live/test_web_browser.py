@@ -15,7 +15,8 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.live.feed import Feed
 from aerpaw_cmp.live.ports import TapStatus
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
-from aerpaw_cmp.report.live import LiveMap, live_page
+from aerpaw_cmp.maps.grid import Grid
+from aerpaw_cmp.report.live import live_map, live_page
 from tests.report.browsing import (
     complaints,
     extents,
@@ -37,13 +38,12 @@ SECOND = 1_000_000_000
 
 def made_map():
     site = make_site()
-    east, north = np.arange(-300.0, 301.0, 30.0), np.arange(-300.0, 301.0, 30.0)
-    grid = np.broadcast_to(np.hypot(*np.meshgrid(east, north)), (2, len(north), len(east)))
-    rank = np.clip(4 - grid // 100, 0, 4).astype(int)
-    level = np.where(rank > 0, -40.0 - grid / 10, np.nan)
-    tower = next(iter(site.towers))
-    return LiveMap(title="<b>made up</b>", site=site, tower=tower, k=100.0, heights_m=(30.0, 90.0), east_m=east,
-                   north_m=north, rank=rank, level_dbm=level)  # fmt: skip
+    grid = Grid.over_area((-300.0, 300.0, -300.0, 300.0), 30.0)
+    shape = (2, len(grid.north_m), len(grid.east_m))
+    distance = np.broadcast_to(np.hypot(*np.meshgrid(grid.east_m, grid.north_m)), shape)
+    rank = np.clip(4 - distance // 100, 0, 4).astype(int)
+    level = np.where(rank > 0, -40.0 - distance / 10, np.nan)
+    return live_map(site, next(iter(site.towers)), 100.0, (30.0, 90.0), grid, (rank, level))
 
 
 class Flight:

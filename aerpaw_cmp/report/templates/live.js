@@ -128,7 +128,7 @@
       name.children[0].textContent = now.name; name.children[1].textContent = now.port === now.name ? "" : now.port;
       big.textContent = now.rank ?? (now.connected ? "no CSI" : now.ended ? "ended" : "no modem"); big.className = now.rank ? "big" : "big none"; big.style.color = now.rank ? css(`--rank${now.rank}`) : "";
       big.setAttribute("aria-label", now.rank ? `measured rank ${now.rank}` : "no rank");
-      const rows = [["RSRP", number(now.rsrp_dbm ?? NaN, 0, "dBm")], ["SINR", number(now.sinr_db ?? NaN, 0, "dB")], ["Answers", `${number(now.rate_hz, 1)} Hz`], ["Gaps", String(now.gaps)], ["Records", String(now.records)]];
+      const rows = [["RSRP", number(now.rsrp_dbm ?? NaN, 0, "dBm")], ["SINR", number(now.sinr_db ?? NaN, 0, "dB")], ["Answers", `${number(now.ri_rate_hz, 1)} Hz`], ["Gaps", String(now.gaps)], ["Records", String(now.records)]];
       if (now.disk_free_bytes !== null) rows.push(["Disk left", now.disk_free_bytes > 2 ** 30 ? number(now.disk_free_bytes / 2 ** 30, 1, "GiB") : number(now.disk_free_bytes / 2 ** 20, 0, "MiB")]);
       if (now.predicts) rows.unshift(["Predicted rank", k < 0 ? "–" : integer(c.predicted[k]) + (Number.isFinite(c.low[k]) ? ` (${c.low[k]}${c.low[k] < c.high[k] ? "–" + c.high[k] : ""})` : "")],
         ["Residual, RSRP", k < 0 ? "–" : number(c.rsrp[k] - c.level[k], 1, "dB")]);

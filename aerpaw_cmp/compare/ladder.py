@@ -244,8 +244,9 @@ def climb(
     Ladder
     """
     enough = [_covers(measured_db, rung) for rung in rungs]
+    counted = [rung for rung, ok in zip(rungs, enough, strict=True) if ok]
     shared = [
-        np.isfinite([m, *(rung.level_db[i] for rung, ok in zip(rungs, enough, strict=True) if ok)]).all(axis=0)
+        np.asarray(np.isfinite([m, *(rung.level_db[i] for rung in counted)]).all(axis=0))
         for i, m in enumerate(measured_db)
     ]
     places = [places_of(p[keep]) for p, keep in zip(position_m, shared, strict=True)]

@@ -432,21 +432,18 @@ def error_spans(
     bounds = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(t)]])
     where = {name: np.asarray(values)[ok] for name, values in (context or {}).items()}
     place = None if position_m is None else np.asarray(position_m, dtype=np.float64)[ok]
-    spans = []
-    for a, b in pairwise(bounds):  # per span, not per sample
-        if sign[a] == 0:
-            continue
-        centre = () if place is None else tuple(float(v) for v in place[a:b].mean(axis=0))
-        spans.append(
-            ErrorSpan(
-                start_s=float(t[a]),
-                end_s=float(t[b - 1]),
-                n=int(b - a),
-                mean_db=float(r[a:b].mean()),
-                position_m=centre,
-                geometry={name: _typical(values[a:b]) for name, values in where.items()},
-            )
+    spans = [
+        ErrorSpan(
+            start_s=float(t[a]),
+            end_s=float(t[b - 1]),
+            n=int(b - a),
+            mean_db=float(r[a:b].mean()),
+            position_m=() if place is None else tuple(place[a:b].mean(axis=0).tolist()),
+            geometry={name: _typical(values[a:b]) for name, values in where.items()},
         )
+        for a, b in pairwise(bounds)
+        if sign[a]
+    ]
     # a segment of one sample has no duration, but must not get the weight 0
     spans.sort(key=lambda span: -abs(span.mean_db) * np.sqrt(span.end_s - span.start_s + 1e-3))
     return spans[:largest]
@@ -783,11 +780,8 @@ def score_detection(
         return None
     # outcomes as ranks 1 and 2, for the regression of ranks
     outcome = detected.astype(np.int64) + 1
-    if forecast is None:
-        stated = _held_out(time, simulated, outcome)
-    else:
-        stated = np.stack([1.0 - (p := forecast.probability(simulated)), p], axis=1)
-    constant = np.tile([1.0 - detected.mean(), detected.mean()], (len(time), 1))
+    p = _held_out(time, simulated, outcome) if forecast is None else forecast.probability(simulated)
+    stated, constant = (np.stack([1.0 - q, q], axis=1) for q in (p, np.full(len(p), detected.mean())))
     fit = floored_fit(measured, simulated, floor_db)
     residual, order = measured - np.maximum(simulated - fit.offset_db, floor_db), np.argsort(time, kind="stable")
     place = None if position_m is None else position_m[finite][order]
@@ -804,19 +798,18 @@ def score_detection(
         rmse_ci95_db=rmse_interval(residual[order], fit.rmse_db, place),
         free_space_rmse_db=floored_fit(measured, free_space_db[finite], floor_db).rmse_db,
         detected_rmse_db=float(np.sqrt(np.mean(residual[detected] ** 2))),
-        reliability=_reliability(stated[:, 1], detected),
+        reliability=_reliability(p, detected),
         learned_on="held-out segments" if forecast is None else "other flights",
     )
 
 
 def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> FloatArray:
-    """Return the probabilities (n, 2) of each segment by the level, learned from the other segments."""
-    segment = np.minimum((time_s - time_s.min()) / max(np.ptp(time_s), 1e-9) * _SEGMENTS, _SEGMENTS - 1).astype(
-        np.int64
-    )
-    stated = out_of_group(level_db[:, None], outcome, segment, _PENALTY)[:, :2]
+    """Return P(detected) (n,) in each segment by the level, learned from the other segments."""
+    away = (time_s - time_s.min()) / max(np.ptp(time_s), 1e-9)
+    segment = np.minimum((away * _SEGMENTS).astype(np.int64), _SEGMENTS - 1)
+    stated = out_of_group(level_db[:, None], outcome, segment, _PENALTY)
     # the regression has four outcomes, of which two are used
-    return np.asarray(stated / stated.sum(axis=1, keepdims=True))
+    return np.asarray(stated[:, 1] / stated[:, :2].sum(axis=1))
 
 
 def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: float) -> OffsetFit:

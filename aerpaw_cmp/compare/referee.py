@@ -221,7 +221,7 @@ def nearest_points(
             / np.r_[1.0, 1.0, 1.0, np.full(2, 2.0 * np.sin(np.radians(_TURNED_DEG) / 2.0))]
             for place, nose in ((samples, heading_deg), (points, yaw_deg))
         )
-    known = np.isfinite(samples).all(axis=1)
+    known = np.asarray(np.isfinite(samples).all(axis=1))
     index = np.asarray(cKDTree(points).query(np.where(known[:, None], samples, 0.0))[1])
     apart = samples - points[index]
     return index, known & (np.linalg.norm(apart[:, :3], axis=1) <= 1.0) & (np.linalg.norm(apart[:, 3:], axis=1) <= 1.0)

@@ -23,7 +23,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.units import BoolArray, FloatArray, IntArray, unmasked
+from ..common.units import BoolArray, FloatArray, unmasked
 from . import statistics
 from .level import DetectionScore, floored_fit
 from .offset import SPAN_DB, nearest_offset, offset_grid
@@ -953,8 +953,13 @@ def _largest(values: FloatArray) -> float:
     return float(np.abs(values).max()) if len(values) else float("nan")
 
 
-def _changed(first: float, second: float) -> Changed:
-    return Changed(first=first, second=second, difference=second - first)
+def _changed(
+    first: float, second: float, *, added: FloatArray | None = None, place_m: FloatArray | None = None
+) -> Changed:
+    """Return the change of a statistic. ``added`` (n,) is what each sample adds to it, for the interval."""
+    change = second - first
+    ends = NO_INTERVAL if added is None else statistics.influence_interval(change, added, place_m)
+    return Changed(first=first, second=second, difference=change, ci95=ends)
 
 
 def rank_difference(
@@ -982,30 +987,19 @@ def rank_difference(
         Number of samples whose rank changed, and the change of agreement and kappa with intervals.
     """
     # a missing report and a missing path are both 0 here, and a change to or from 0 counts
-    pairs = [np.nan_to_num(np.column_stack(pair)) for pair in (first, second)]
-    usable = np.column_stack([*pairs])
-    ranked = (usable >= 1).all(axis=1) & (usable <= MAX_RANK).all(axis=1)
-    first_rank, second_rank = (pair[ranked].astype(np.int64) for pair in pairs)
-    agree, kappa = _agreement_change(first_rank, second_rank, None if place_m is None else place_m[ranked])
-    return RankDifference(
-        tower=tower,
-        k=k,
-        samples=samples,
-        n_changed=int((pairs[0][:, 1] != pairs[1][:, 1]).sum()),
-        n_reported_changed=int((pairs[0][:, 0] != pairs[1][:, 0]).sum()),
-        agreement=agree,
-        kappa=kappa,
+    pairs = np.nan_to_num(np.array([np.column_stack(first), np.column_stack(second)]))
+    ranked = ((pairs >= 1) & (pairs <= MAX_RANK)).all(axis=(0, 2))
+    both = pairs[:, ranked].astype(np.int64)
+    place = None if place_m is None else place_m[ranked]
+    changed = (pairs[0] != pairs[1]).sum(axis=0)
+    # the sequence of differences: the common part of both reports cancels
+    equal = (both[..., 0] == both[..., 1]).astype(np.float64)
+    kappas = np.array([kappa_influence(*ranks.T) for ranks in both]) if ranked.any() else equal
+    agree, kappa = (
+        _changed(*(statistic(*ranks.T) for ranks in both), added=added[1] - added[0], place_m=place)
+        for statistic, added in ((agreement, equal), (cohen_kappa, kappas))
     )
-
-
-def _agreement_change(first: IntArray, second: IntArray, place_m: FloatArray | None) -> tuple[Changed, Changed]:
-    """Compare agreement and kappa of two reports on the same poses, each (n, 2): measured and simulated rank."""
-    # use the sequence of differences: the common part of both reports cancels
-    equal = [(pairs[:, 0] == pairs[:, 1]).astype(np.float64) for pairs in (first, second)]
-    kappas = [kappa_influence(*pairs.T) for pairs in (first, second)] if len(first) else equal
-    out = []
-    for statistic, (before, after) in ((agreement, equal), (cohen_kappa, kappas)):
-        changed = _changed(*(statistic(*pairs.T) for pairs in (first, second)))
-        ends = statistics.influence_interval(changed.difference, after - before, place_m)
-        out.append(replace(changed, ci95=ends))
-    return out[0], out[1]
+    return RankDifference(
+        tower=tower, k=k, samples=samples, n_changed=int(changed[1]), n_reported_changed=int(changed[0]),
+        agreement=agree, kappa=kappa,
+    )  # fmt: skip

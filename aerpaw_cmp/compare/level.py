@@ -3,7 +3,7 @@
 The functions take arrays in time order with one entry per sample, NaN if it is missing. They do not depend on files,
 sites or engines.
 
-The module compares the measured and simulated signal strength of one tower and channel, scores predictions after a
+The module compares the measured and simulated signal strength of one tower and channel. It scores predictions after a
 flight and entries of benchmarks/published, and models receivers that lose a signal or have a floor. It compares the
 predicted strongest cell with the serving cell of a phone, and adds up the numbers of audits of fields.
 """
@@ -26,9 +26,9 @@ from .offset import SPAN_DB, OffsetFit, difference_moments, grid_offset, identif
 from .receiver import brier_losses, log_losses, out_of_group
 from .statistics import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals, rmse_interval
 
-# Two channels of one receiver "part" if they differ by more than this [dB].
+# Two channels of one receiver count as different if their levels differ by more than this [dB].
 PART_DB = 10.0
-# Averaging time of their difference [s].
+# Averaging time of the difference of two channels [s].
 _PART_S = 1.0
 
 
@@ -115,7 +115,7 @@ def compare_rss(
     Parameters
     ----------
     time_s : array_like, (n,)
-        Instants: seconds or datetime64. Samples are put into this order; instants that are not numbers come last.
+        Times in seconds or datetime64. Samples are sorted by time; unknown times come last.
     measured_db : array_like, (n,)
         dBm or dB re full scale; NaN without a received signal.
     simulated_db : array_like, (n,)
@@ -123,7 +123,7 @@ def compare_rss(
     baselines : mapping of str to array_like, (n,), optional
         Levels of simpler models at the same poses [dB].
     posed : array_like of bool, (n,), optional
-        Whether the pose of the sample is known. A sample without a pose is not out of coverage.
+        True if the pose of the sample is known. A sample without a pose is not out of coverage.
     position_m : (n, 3), optional
         East, north and up, NaN if unknown [m]: intervals then consider correlation over place, too.
     span_db : (float, float)
@@ -165,7 +165,7 @@ LEARNED_HERE = "antennas"
 
 
 def without_errors(score: RssComparison) -> RssComparison:
-    """Return a comparison without errors, for a training flight of the antennas: offset, counts and baselines."""
+    """Return a comparison with offset, counts and baselines alone, for a flight from which antennas were learned."""
     none = (float("nan"), float("nan"))
     return replace(
         score,
@@ -177,8 +177,8 @@ def without_errors(score: RssComparison) -> RssComparison:
     )
 
 
-# Levels farther than this many interquartile ranges outside the quartiles are outlying. A normal distribution has one
-# in 10^9, and deep fades of real flights are nearer.
+# Levels are outliers if they are farther than this number of interquartile ranges outside the quartiles. That is one in
+# 10^9 levels of a normal distribution. Deep fades of real flights are nearer.
 _FENCE = 4.0
 
 # Least interquartile range [dB], because a UAV that hovers has almost none.
@@ -467,7 +467,7 @@ class ChannelDifference:
     mean_db, std_db, correlation : float
         Mean and standard deviation of first minus second [dB], and correlation of both.
     spans : list of ErrorSpan
-        Segments in which the channels part, with their geometry.
+        Segments in which the channels differ by more than :data:`PART_DB`, with their geometry.
     """
 
     n: int
@@ -494,7 +494,7 @@ def channel_difference(
     first_db, second_db : array_like, (n,)
         Levels of the two channels at these instants [dB].
     position_m : (n, 3), optional
-        Positions, for the places at which the channels part [m].
+        Positions, for the places at which the channels differ [m].
     context : mapping of str to array_like (n,), optional
         Geometry that may explain the difference, as in :func:`error_spans`.
 
@@ -523,10 +523,10 @@ def channel_difference(
     )
 
 
-# Averaging window of the second error [s].
+# Averaging window of ``rmse_4s_db`` [s].
 WINDOW_S = 4.0
 
-# Nominal coverage of the interval whose coverage is scored.
+# Nominal coverage of the interval that is checked.
 COVERAGE = 0.9
 
 
@@ -544,7 +544,7 @@ class LevelSeries:
     sd_db : (n,), optional
         Standard deviation of the prediction [dB]. Without it no distribution is scored.
     own_offset : bool
-        Score after the mean error of the series is removed.
+        True if the series is scored after its mean error is subtracted.
     """
 
     name: str
@@ -627,7 +627,7 @@ _SEGMENTS = 10
 
 _PENALTY = 1.0
 _SPAN_DB = 60.0
-# Least number of detected and of undetected samples for a score.
+# Smallest number of detected, and of undetected, samples that can be scored.
 _FEWEST = 50
 
 
@@ -703,7 +703,7 @@ class DetectionScore:
     Parameters
     ----------
     floor_db : float
-        Lower levels count as this one [unit of the measurement].
+        Lower levels are raised to this level [unit of the measurement].
     n, n_detected : int
     brier, constant_brier, log_score, constant_log_score : float
         Scores of P(detected) from the predicted level, and of the constant share of this flight, which is the best
@@ -870,7 +870,7 @@ def _reliability(stated: FloatArray, detected: BoolArray) -> tuple[tuple[float, 
 # Time between two values of AERPAW's sounder [s]: 4095 chips and the rest of the correlation.
 BASE_S = 0.032768
 
-# Least gain of correlation for which the sounder's own time base is used.
+# Smallest gain of correlation for which the sounder's own time base is used.
 _BETTER = 0.1
 
 

@@ -49,7 +49,7 @@ class Case:
 
     @property
     def shadow(self) -> tuple[float, ...]:
-        """Everything but the gains."""
+        """The parameters of shadowing and scatter."""
         return self.shadow_db, self.scatter_db, self.length_m, self.time_s
 
     def with_gains(self, azimuth_db: float, airframe_db: float, weight: float = 1.0) -> Case:
@@ -93,8 +93,8 @@ _KNOWN_ODDS = 3.0
 _GAINS = (0.8, 1.5)
 _STRONG_GAINS = {_GAINS: 0.55, (3.0, 3.0): 0.28, (6.0, 6.0): 0.17}
 
-# Shadowing over the half minute of a hover, and over place. Strong shadowing over a short length and little scatter are
-# hard to distinguish from strong scatter, and are left out.
+# Shadowing over the half minute of a hover, and over place. Strong shadowing over a short length with little scatter is
+# not tried, because it is hard to distinguish from strong scatter.
 _LENGTHS_M = (15.0, 45.0, 100.0)
 _SHADOWS = (
     Case(shadow_db=8.0, scatter_db=4.0, time_s=30.0),
@@ -117,26 +117,27 @@ def known_cases(shadow_db: float, scatter_db: float) -> tuple[Case, ...]:
     return tuple(replace(case, airframe_db=_LEARNED_SD, learned=True) for case in (*own, *_SHADOWS))
 
 
-# The same without the attitude of the UAV.
+# The cases of an unknown node if the attitude of the UAV is not known.
 _UNTURNED = tuple(case.with_gains(*gains, weight) for case, (gains, weight) in product(_SHADOWS, _STRONG_GAINS.items()))
 
 # Standard deviation per axis of what the model cannot see (a tilted antenna, a wall), chosen on six flights with a
 # surveyed rover (docs/formats.md).
 SYSTEMATIC_M = 20.0
 
-# The place is where the posterior, blurred by this [m], is largest: a rough posterior has its maximum at random.
+# The estimated place is the maximum of the posterior after a blur of this standard deviation [m], because the maximum of
+# a rough posterior is at a random place.
 _SMOOTH_M = 45.0
 
 # Medians are taken over at least this time, and there are at most this many.
 WINDOW_S, _MOST_BINS = 4.0, 120
 
-# Heights of the antenna that are tried, and their prior: a rover, a tower.
+# Tried heights of the antenna [m] and their prior probability: a rover, a tower.
 _HEIGHTS_M = {1.5: 0.7, 10.0: 0.3}
 
-# Bins of a level that a search needs.
+# Smallest number of bins for a search.
 FEWEST = 20
 
-# Places up to this far beyond the track are tried, at this spacing; likely ones again at a third of it.
+# Places are tried up to this distance beyond the track, at this spacing. Likely places are divided into a third of it.
 _REACH_M, _SPACING_M = 400.0, 40.0
 
 # The first grid has at most this many positions, at 2, 4, 8 ... times the spacing; then the likeliest
@@ -148,7 +149,7 @@ _MOST_GRID, _MOST_DIVIDED = 500, 500
 # constant levels and hovers.
 _AFAR_M, _PLACED_ODDS = 30_000.0, 0.5
 
-# Places whose log evidence is lower by more are ignored.
+# Places are ignored if their log evidence is lower than that of the best place by more than this.
 _POSSIBLE = 8.0
 
 # The likeliest places are divided by three to the east and to the north.
@@ -160,14 +161,14 @@ _FREE_DB = 100.0
 # Newton steps of the Laplace approximation, and the change [dB] at which they end; there is one maximum.
 _STEPS, _SETTLED_DB = 12, 0.03
 
-# Places whose matrices are in memory at a time.
+# Number of places whose matrices are in memory at the same time.
 _AT_ONCE = 128
 
 # A search uses at most this many cases, and none that is less likely than the best by more [nat]. They are compared at
 # this many of the places that are possible with a usual case.
 _MOST_CASES, _LIKELY, _JUDGED = 8, 4.0, 60
 
-# Levels below the floor that count: they are correlated, and their time grows with the cube.
+# Largest number of levels below the floor that are used: the time grows with the cube of this number.
 _MOST_BELOW = 20
 _USUAL = Case(shadow_db=8.0, scatter_db=4.0, length_m=45.0, azimuth_db=_GAINS[0], airframe_db=_GAINS[1])
 
@@ -263,12 +264,12 @@ def fit_places(track: LevelTrack, places_m: ArrayLike, model: LevelModel = UNKNO
     places_m : (m, 3)
         East, north, up.
     model : LevelModel
-        Narrower where antennas are known.
+        Prior of slope, gains and shadowing.
 
     Notes
     -----
-    The level is mean + F c + shadowing + scatter, c ~ N(0, 1). The terms of F are the level at 100 m, the slope, two
-    of the elevation, four of the azimuth at the node, and eight of the direction in the frame of the airframe. Levels
+    The level is mean + F c + shadowing + scatter, c ~ N(0, 1). F has a term for the level at 100 m, one for the
+    slope, two for the elevation, four for the azimuth at the node, and eight for the direction at the airframe. Levels
     above the floor have a normal distribution. Those below have the probability to be there, given the others, by
     Laplace's approximation at the maximum of the posterior (Rasmussen and Williams, 2006, section 3.4).
     """
@@ -325,7 +326,7 @@ def _features(track: LevelTrack, places: FloatArray, model: LevelModel, learned:
     return np.ascontiguousarray(np.stack(columns, axis=-1).swapaxes(0, 1))
 
 
-# Numbers of terms: level, slope and elevation; azimuth; airframe.
+# Number of terms of level, slope and elevation, of the azimuth, and of the airframe.
 _TERMS = (4, 4, 8)
 
 
@@ -565,7 +566,7 @@ def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
     track : LevelTrack
         At least :data:`FEWEST` bins.
     model : LevelModel
-        Narrower where antennas are known.
+        Prior of slope, gains and shadowing, by default that of an unknown node.
 
     Raises
     ------
@@ -713,7 +714,7 @@ def _divided(places: FloatArray, steps_m: Sequence[float]) -> FloatArray:
     return np.asarray((places[:, None] + moved).reshape(-1, 3))
 
 
-# A known place against any other: nearly free space, and antennas about which nothing is known. Chosen on simulated
+# Model that compares a known place with any other place: nearly free space and unknown antennas. Chosen on simulated
 # flights.
 _TOWERS = LevelModel(
     slope=2.1,
@@ -730,12 +731,13 @@ _TOWER_SPACING_M = 60.0
 def place_odds(track: LevelTrack, known_m: ArrayLike) -> FloatArray:
     """Return the log odds (k,) of known places, such as towers, against any place about the track.
 
-    Place, gain, slope and antennas are integrated over: a place wins only by more than its freedom gives.
+    The evidence is integrated over place, gain, slope and antennas, so that another place wins only if it fits better
+    than its additional freedom explains.
 
     Parameters
     ----------
     track : LevelTrack
-        Its antennas count as unknown, and levels below the floor as levels at the floor.
+        Its antennas are treated as unknown, and levels below the floor as levels at the floor.
     known_m : (k, 3)
     """
     from scipy.special import logsumexp

@@ -31,7 +31,7 @@ from .statistics import (
 # Ranks of the histograms: 1 to 4 (RI of the AERPAW modems).
 MAX_RANK = 4
 
-# Independent samples below which K has no interval.
+# Smallest number of independent samples for which K has an interval.
 _FEWEST_INDEPENDENT = 10.0
 
 # Matrix entries per SVD batch: bounds memory.
@@ -68,7 +68,7 @@ def singular_values(h: ArrayLike) -> FloatArray:
     step = max(1, _CHUNK // max(1, rows * columns))
     for start in range(0, len(flat), step):
         part = flat[start : start + step]
-        # one matrix with NaN would make NumPy give up the whole batch
+        # NumPy raises an error for the whole batch if one matrix has a NaN
         good = np.isfinite(part).all(axis=(1, 2))
         result[start : start + step][good] = np.linalg.svd(_scaled(part[good]), compute_uv=False)
     return result.reshape(*lead, min(rows, columns))
@@ -464,7 +464,7 @@ def _changes(columns: Sequence[FloatArray]) -> BoolArray:
 
 
 def _period_starts(ri: FloatArray) -> BoolArray:
-    """Return the possible first rows of reports: one per period if RI changes at multiples of it, else all rows."""
+    """Return the possible first rows of reports: one per period if RI changes at multiples of a period, else all."""
     change = np.flatnonzero(_changes([ri]))[1:]
     if len(change) < 8:  # too few changes to distinguish a period from chance
         return np.ones(len(ri), dtype=bool)
@@ -660,7 +660,7 @@ def compare_ranks(
 class CommonestRank:
     """The forecast without a model: always the rank that was reported most often.
 
-    A model is useful if its agreement is larger. The kappa of this forecast is 0. ``rank`` is 0 without a report.
+    A model is useful if its agreement is larger. The kappa of this forecast is 0. ``rank`` is 0 if there is no report.
     """
 
     rank: int

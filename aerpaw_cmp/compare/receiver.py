@@ -30,7 +30,7 @@ from ..common.units import FloatArray, IntArray, unmasked
 from .rank import MAX_RANK, cohen_kappa, kappa_influence, one_hot, total_variation
 from .statistics import NO_INTERVAL, Interval, influence_interval
 
-# What a rank counts in the log score that a forecast held impossible.
+# Probability that the log score uses for a reported rank whose forecast is smaller.
 _LEAST_PROBABILITY = 1e-6
 
 
@@ -166,7 +166,7 @@ def score_forecast(
     )
 
 
-# Ratios of singular values below this are as good as zero to any receiver.
+# Smaller ratios of singular values are raised to this one, because no receiver uses such a stream.
 FLOOR_DB = -40.0
 
 # Ridge penalties to choose from, on coefficients of standardised features (log likelihood of the whole flight).
@@ -175,7 +175,7 @@ _PENALTIES = (1.0, 3.0, 10.0, 30.0, 100.0)
 # Ridge penalty while geometries are chosen.
 _CHOICE_PENALTY = 10.0
 
-# Training samples below which nothing is fitted.
+# Smallest number of training samples for a fit.
 FEWEST = 50
 
 # Numbers in one batch of regressions: bounds memory to some 100 MiB.
@@ -258,9 +258,9 @@ def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s:
 def sector_groups(position_m: FloatArray, tower_m: FloatArray, sectors: int = 8) -> IntArray:
     """Return the sector of directions from the tower of each sample (n,), with about equal numbers of samples.
 
-    Sectors left out are directions that the fit never saw; neighbouring samples in time mostly share one.
+    Held-out sectors are directions that the fit has not seen. Neighbouring samples in time are mostly in one sector.
     """
-    # cut where the tower has seen nothing, so that the seam splits no sector
+    # count from the largest gap between directions, so that the start does not split a sector
     azimuth = azimuth_rad(position_m[:, :2] - np.asarray(tower_m)[:2])
     order = np.sort(azimuth)
     gap = np.diff(np.append(order, order[0] + 2.0 * np.pi))
@@ -660,7 +660,7 @@ def choose_features(
     x, y, group = _training(features, rank, groups)
     step = max(1, _HELD // (x.shape[1] * (x.shape[2] + 1) * MAX_RANK))
     rough = np.concatenate([_own_losses(x[i : i + step], y) for i in range(0, len(x), step)])
-    # stable sort of nine digits: the first of candidates that differ by rounding (mounts half a turn apart) stays first
+    # round to nine digits, so that candidates that differ by rounding alone (mounts half a turn apart) keep their order
     final = np.argsort(np.round(rough, 9), kind="stable")[:finalists]
     losses = np.concatenate([_left_out_losses(x[final[i : i + step]], y, group) for i in range(0, len(final), step)])
     score = losses.mean(axis=1)
@@ -702,7 +702,7 @@ def _left_out_losses(x: FloatArray, rank: IntArray, groups: IntArray) -> FloatAr
 
 
 def _not_worse(difference: FloatArray) -> bool:
-    # the same channel by another name differs by rounding alone
+    # candidates with the same channel differ by rounding alone
     if np.abs(difference).max() < 1e-9:
         return True
     return not influence_interval(float(difference.mean()), difference)[0] > 0.0

@@ -232,7 +232,7 @@ _FLOOR_SHARE, _FLOOR_COUNT = 0.01, 10
 
 
 def detection_floor_db(level_db: FloatArray) -> float | None:
-    """Return the lowest level if a receiver repeats it, which marks its detection floor; else None [dB]."""
+    """Return the lowest level [dB] if a receiver repeats it, because it is then its detection floor, else None."""
     known = level_db[np.isfinite(level_db)]
     if not len(known) or np.ptp(known) == 0.0:
         return None

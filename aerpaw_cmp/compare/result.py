@@ -1,10 +1,10 @@
 """The numbers of one comparison, which reports, campaigns and JSON use.
 
-This file computes, draws and formats nothing. Times are naive ``datetime64[ns]`` in UTC. A missing number is NaN, and a
-number that a flight cannot have is None.
+This file computes, draws and formats nothing. Times are naive ``datetime64[ns]`` in UTC. A missing number is NaN, and
+a field that does not apply to a flight is None.
 
 A new number of a tower and channel needs one field of :class:`RssFurther` (for the rank: :class:`RankFurther`) and one
-function that computes it. metrics.json and the tables of the report list the fields by name.
+function that computes it. Both metrics.json and the tables of the report list the fields by name.
 """
 
 from __future__ import annotations

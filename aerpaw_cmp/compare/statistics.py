@@ -86,7 +86,8 @@ CALM = 1.8
 # steady flights have two loud parts, or 4 % for 100 samples of Student's t with four degrees of freedom.
 _PARTS, _LOUD, _FEWEST_FOR_PARTS = 12, 4.0, 60
 
-# Smallest widening, at which the ends contain eight of ten draws. Sums over unusual shares could otherwise reach 0.
+# Smallest widening factor, at which the interval contains eight of ten draws. Without it, the factor could reach 0 for
+# an unusual mixture of correlations.
 _LEAST_STRETCH = 0.6
 
 # Draws come in pairs of opposite sign, so that swapping two models reverses an interval exactly.
@@ -322,7 +323,7 @@ def _picked(slow: FloatArray, known: Known) -> tuple[IntArray, FloatArray, float
     weighted = likelihood * known.weights
     running = np.cumsum(weighted)
     uniform, chi_squared, *_ = _random(len(slow))
-    # a chance near 1 can round to the sum
+    # a uniform number near 1 can round to the sum
     index = np.minimum(np.searchsorted(running, uniform * running[-1]), len(running) - 1)
     own, even = known.stretches
     stretch = float(weighted @ own / running[-1] + likelihood @ even / likelihood.sum())

@@ -1,8 +1,8 @@
 """The verdicts on a flight, a campaign, a calibration, a prediction and a map.
 
-A verdict is an effect with a 95 % interval and a cause. The first sentences of a page are chosen from it. Causes of the
-error of a flight are in :mod:`.causes`. A cause is named only if its interval excludes "no effect". If several are
-tried, chance names any of them in at most :data:`_FALSE_ALARMS` of the cases.
+A verdict is an effect with a 95 % interval and a cause. It determines the first sentences of a page. Causes of the
+error of a flight are in :mod:`.causes`. A cause is named only if its interval excludes "no effect". If several causes
+are tested, a false one is named in at most :data:`_FALSE_ALARMS` of the cases.
 
 The file also compares ray tracing with the best baseline over all channels of a flight. It computes offsets from the
 other flights of a campaign, and finds the nights at which offsets of nodes step.
@@ -60,18 +60,18 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 
 
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Return the channels with an offset and enough samples, without copies, and without dead ones if any is alive."""
+    """Return the channels with an offset and enough samples, without copies, and with a signal if any has one."""
     some = [p for p in without_copies(panels) if not p.score.at_edge]
     enough = [p for p in some if p.score.n >= FEWEST and math.isfinite(p.score.rmse_db)]
     return [panel for panel in enough if not is_dead(panel)] or enough
 
 
 def without_copies(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Return the channels, of those with the same levels the first alone."""
+    """Return the channels without copies: only the first of several channels with the same levels."""
     return list({panel.measured_db.tobytes(): panel for panel in reversed(list(panels))}.values())[::-1]
 
 
-# Fading alone makes a received level vary by more [dB], even at one position.
+# Fading makes a received level vary by more than this [dB], even at one position.
 _DEAD_DB = 1.0
 
 
@@ -85,7 +85,7 @@ def is_dead(panel: RssResult) -> bool:
 
 
 def is_one_place(panels: Iterable[RssResult]) -> bool:
-    """Check whether no model predicts a change of 1 dB, as during a hover: then all models fit like a constant."""
+    """Check whether no model predicts a change of 1 dB, as during a hover, so that all models fit like a constant."""
     every = [[panel.simulated_dbm, *(b.level_dbm for b in panel.baselines.values())] for panel in scored(panels)]
     levels = [level[np.isfinite(level)] for models in every for level in models if np.isfinite(level).any()]
     return bool(levels) and max(map(middle_span, levels)) < _DEAD_DB
@@ -157,10 +157,10 @@ def _rms(values: Sequence[FloatArray]) -> float:
     return float(np.sqrt(np.nanmean(np.concatenate(values) ** 2)))
 
 
-# Flights below which a mean over flights has no interval.
+# Smallest number of flights for which a mean over flights has an interval.
 FEWEST_FLIGHTS = 3
 
-# Number of flights from which the correlation of consecutive flights is estimated.
+# Smallest number of flights for which the correlation of consecutive flights is estimated.
 _MANY_FLIGHTS = 20
 
 RankingVerdict = Literal["first", "worse", "not significant", "no interval"]
@@ -285,7 +285,7 @@ def verdict_of(difference: MeanOfFlights) -> RankingVerdict:
 # Share of campaigns without a fault in which any cause is named.
 _FALSE_ALARMS = 0.02
 
-# Flights of a campaign below which none is reported as different from the others.
+# Smallest number of flights of a campaign in which one flight can be reported as different.
 _FEWEST_TO_COMPARE = 5
 
 # An offset that differs by less [dB] changes no decision, even if it is significant.
@@ -523,7 +523,7 @@ def stated_errors(
 
 # --- map ------------------------------------------------------------------------------------------------------------
 
-# Share of positions in coverage below which a sentence explains the gaps of a map.
+# A sentence explains the gaps of a map if the share of positions in coverage is smaller than this.
 _COVERED = 0.95
 
 
@@ -576,7 +576,7 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
 # one, because a robust fit with missing links has longer tails than Student's t.
 _CHANCES = {1: 0.0025, 7: 0.0005}
 
-# Nights below which the standard deviation is not known well enough to test for a step.
+# Smallest number of nights that determine the standard deviation well enough to test for a step.
 _FEWEST_NIGHTS = 10
 
 # Robust standard deviations above which a residual counts less (Huber), for example a link with a car in front of it.

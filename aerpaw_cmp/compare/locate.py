@@ -124,8 +124,8 @@ _UNTURNED = tuple(case.with_gains(*gains, weight) for case, (gains, weight) in p
 # surveyed rover (docs/formats.md).
 SYSTEMATIC_M = 20.0
 
-# The estimated place is the maximum of the posterior after a blur of this standard deviation [m], because the maximum of
-# a rough posterior is at a random place.
+# The estimated place is the maximum of the posterior after a blur by this standard deviation [m], because the maximum
+# of a rough posterior is at a random place.
 _SMOOTH_M = 45.0
 
 # Medians are taken over at least this time, and there are at most this many.

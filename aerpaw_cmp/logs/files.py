@@ -22,12 +22,13 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from importlib import import_module
 from os.path import isfile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -35,11 +36,11 @@ from ..common.errors import InputError
 from ..common.units import AnyArray
 
 _MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\x00": "xz"}
+_MODULES = {"gzip": "gzip", "bzip2": "bz2", "xz": "lzma"}
+_BLOCKS = {b"%d1AY&SY" % level for level in range(1, 10)}
 _PIECE = 2 << 20
 # A file that unpacks to more than this multiple of its size is not a log: the most regular logs shrink to a hundredth.
 _MOST_RATIO = 1100
-# Memory of the xz library; its strongest setting needs 65 MiB.
-_MOST_MEMORY = 1 << 28
 
 
 def packed_form(head: bytes) -> str | None:
@@ -50,58 +51,13 @@ def packed_form(head: bytes) -> str | None:
     return None
 
 
-_BLOCKS = {b"%d1AY&SY" % level for level in range(1, 10)}
-
-
-class _Gunzip:
-    """One member of a gzip file, with the interface of the other two libraries."""
-
-    def __init__(self) -> None:
-        # 16 selects the gzip header and its checksum
-        self._machine = zlib.decompressobj(zlib.MAX_WBITS | 16)
-
-    def decompress(self, data: bytes, most: int) -> bytes:
-        return self._machine.decompress(self._machine.unconsumed_tail + data, most)
-
-    @property
-    def eof(self) -> bool:
-        return self._machine.eof
-
-    @property
-    def unused_data(self) -> bytes:
-        return self._machine.unused_data
-
-    @property
-    def needs_input(self) -> bool:
-        return not self._machine.unconsumed_tail
-
-
-def _machine(name: str, path: str | Path) -> Callable[[], Any]:
-    if name == "gzip":
-        return _Gunzip
-    try:
-        # import them here, because a Python build may not have these modules
-        if name == "bzip2":
-            import bz2
-
-            return bz2.BZ2Decompressor
-        import lzma
-
-        # a header may ask for GiB of dictionary
-        return lambda: lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=_MOST_MEMORY)
-    except ImportError as error:
-        raise InputError(
-            f"a {name} file, and this Python was built without {name}", expected="the log unpacked", path=path
-        ) from error
-
-
-def unpacked_pieces(content: Iterable[bytes], path: str | Path) -> Iterator[bytes]:
+def unpacked_pieces(file: BinaryIO, path: str | Path) -> Iterator[bytes]:
     """Yield the content of a packed file, some MiB at a time.
 
     Parameters
     ----------
-    content : iterable of bytes
-        Pieces of the file; the first one shows its form.
+    file : file object
+        The packed file, at its beginning.
     path : str or Path
         Path in messages.
 
@@ -110,43 +66,35 @@ def unpacked_pieces(content: Iterable[bytes], path: str | Path) -> Iterator[byte
     InputError
         If the file is damaged or truncated, or unpacks to more than a log can.
     """
-    content = iter(content)
-    unread = next(content, b"")
-    name = packed_form(unread) or "bzip2"
-    make, machine = _machine(name, path), None
-    bytes_in, bytes_out = len(unread), 0
-    while True:
-        unread = unread if machine is not None else unread.lstrip(b"\0")  # padding between streams
-        if not unread and (machine is None or machine.needs_input):
-            unread = next(content, b"")
-            bytes_in += len(unread)
-            if not unread:
-                break
-            continue
-        machine = make() if machine is None else machine
-        try:
-            piece = machine.decompress(unread, _PIECE)
-        except MemoryError:
-            raise
-        except Exception as error:  # bz2 raises OSError and ValueError, and lzma raises LZMAError
-            raise InputError(f"a damaged {name} file ({error})", cause="a cut download", path=path) from error
-        bytes_out += len(piece)
-        # check while unpacking, so that a zip bomb is stopped at its first piece
-        if bytes_out > _MOST_RATIO * bytes_in + _PIECE:
-            raise InputError(f"the {name} file unpacks to more than {_MOST_RATIO} times its size", cause="no log",
-                             path=path)  # fmt: skip
-        if piece:
-            yield piece
-        unread = machine.unused_data if machine.eof else b""
-        machine = None if machine.eof else machine
-    if machine is not None:
-        raise InputError(f"the {name} file ends too early", cause="a cut download", path=path)
+    name = packed_form(file.read(10)) or "bzip2"
+    file.seek(0)
+    try:
+        # a Python build may not have the module
+        module = import_module(_MODULES[name])
+    except ImportError as error:
+        found = f"a {name} file, and this Python was built without {name}"
+        raise InputError(found, expected="the log unpacked", path=path) from error
+    count = 0
+    try:
+        with module.open(file) as content:
+            while piece := content.read(_PIECE):
+                count += len(piece)
+                # check while unpacking, so that a zip bomb is stopped at its first piece
+                if count > _MOST_RATIO * file.tell() + _PIECE:
+                    found = f"the {name} file unpacks to more than {_MOST_RATIO} times its size"
+                    raise InputError(found, cause="no log", path=path)
+                yield piece
+    except EOFError as error:
+        raise InputError(f"the {name} file ends too early", cause="a cut download", path=path) from error
+    # the header of an xz file may ask for more memory than there is
+    except (OSError, ValueError, zlib.error, lzma.LZMAError, MemoryError) as error:
+        raise InputError(f"a damaged {name} file ({error})", cause="a cut download", path=path) from error
 
 
 def unpacked(raw: bytes, path: str | Path, most: int) -> bytes:
     """Return the content of a packed file of at most ``most`` bytes."""
     parts, size = [], 0
-    for piece in unpacked_pieces([raw], path):
+    for piece in unpacked_pieces(io.BytesIO(raw), path):
         parts.append(piece)
         size += len(piece)
         if size > most:
@@ -157,23 +105,15 @@ def unpacked(raw: bytes, path: str | Path, most: int) -> bytes:
 
 
 def head_of(place: Path, count: int) -> bytes:
-    """Return the first bytes of the content of a packed file, or no bytes if the file is damaged."""
+    """Return the first bytes of the content of a packed file, as far as it is not damaged."""
     head = b""
-    try:
-        for piece in unpacked_pieces(read_chunks(place, _PIECE), place):
+    # reading the file later reports the damage
+    with suppress(InputError), place.open("rb") as file:
+        for piece in unpacked_pieces(file, place):
             head += piece
             if len(head) >= count:
                 break
-    except InputError:
-        return b""  # reading the file later reports the damage
     return head[:count]
-
-
-def read_chunks(place: Path, size: int) -> Iterator[bytes]:
-    """Yield the content of a file, ``size`` bytes at a time."""
-    with place.open("rb") as file:
-        while chunk := file.read(size):
-            yield chunk
 
 
 # A flight of half an hour with a burst every 0.1 s has 18 000.
@@ -364,10 +304,11 @@ PIECE_BYTES = 4 << 20
 
 def file_pieces(place: Path, digest: Any) -> Iterator[bytes]:
     """Yield the unpacked content of a log, some MiB of complete lines at a time, and update ``digest`` with it."""
-    chunks = read_chunks(place, PIECE_BYTES)
-    first = next(chunks, b"")
-    content = chain((first,), chunks)
-    yield from whole_lines(_counted(content if packed_form(first) is None else unpacked_pieces(content, place), digest))
+    with place.open("rb") as file:
+        packed = packed_form(file.read(10)) is not None
+        file.seek(0)
+        chunks = unpacked_pieces(file, place) if packed else iter(partial(file.read, PIECE_BYTES), b"")
+        yield from whole_lines(_counted(chunks, digest))
 
 
 def whole_lines(chunks: Iterable[bytes]) -> Iterator[bytes]:

@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING, Any
 from ..common.errors import AerpawCmpError, InputError, UsageError, one_line, parsing
 from ..common.stages import duration
 from ..common.text import counted
-from . import files as archives
-from . import files as chunks
 from . import files as packed
 from .flight_file import IngestedFile, read_flight
 from .readers import DEEP_BYTES, HEAD_BYTES, Reader, ReadOptions, blaming, by_name, catalogue, claims, identify
@@ -87,7 +85,7 @@ def read_head(place: Path) -> bytes:
 
 def _unpacked(raw: bytes, path: str | Path) -> bytes:
     """Return the content of a packed file, and other content unchanged."""
-    most = min(MAX_BYTES, archives.most_bytes(len(raw)))
+    most = min(MAX_BYTES, packed.most_bytes(len(raw)))
     return raw if packed.packed_form(raw) is None else packed.unpacked(raw, path, most)
 
 
@@ -227,11 +225,11 @@ _present, _is_folder = os.path.exists, os.path.isdir
 
 def exists(path: Path) -> bool:
     """Check whether a path names a file, a folder, or a member of an archive."""
-    return _present(path) or archives.path_in_archive(path) is not None
+    return _present(path) or packed.path_in_archive(path) is not None
 
 
 def _part_of(path: Path) -> tuple[Path, str] | None:
-    return None if _present(path) else archives.path_in_archive(path)
+    return None if _present(path) else packed.path_in_archive(path)
 
 
 def sniffers_of(path: Path) -> list[str]:
@@ -242,7 +240,7 @@ def sniffers_of(path: Path) -> list[str]:
         return [reader.name for reader in claims(_beginning(path)) if reader.kinds]
     if _in_flight_file(path) is not None:
         return []  # a flight file contains the reader of each log
-    content = archives.archive_members(read_bytes(part[0])[0], part[0])
+    content = packed.archive_members(read_bytes(part[0])[0], part[0])
     data = as_utf8(content[part[1]].read(DEEP_BYTES)) if part[1] in content else b""
     return [reader.name for reader in claims(data) if reader.kinds]
 
@@ -348,7 +346,7 @@ def _head(place: Path) -> bytes:
 
 def _is_archive(place: Path) -> bool:
     try:
-        return archives.is_archive(_beginning(place, 1024))
+        return packed.is_archive(_beginning(place, 1024))
     except InputError:
         return False  # the error is reported when the file is read
 
@@ -357,7 +355,7 @@ def _archive(place: Path, options: _OptionsFor | None, chosen: Reader | None) ->
     """Read all logs of an archive, and report files that cannot be read."""
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
-    content = archives.archive_members(read_bytes(place)[0], place)
+    content = packed.archive_members(read_bytes(place)[0], place)
     if "xl/workbook.xml" in content:
         raise InputError("a spreadsheet (.xlsx)", expected="its table saved as CSV", path=place)
     for name, member in content.items():
@@ -370,24 +368,19 @@ def _archive(place: Path, options: _OptionsFor | None, chosen: Reader | None) ->
 
 
 def _member(
-    path: Path, member: archives.Member, content: Mapping[str, archives.Member], options: _OptionsFor | None,
+    path: Path, member: packed.Member, content: Mapping[str, packed.Member], options: _OptionsFor | None,
     chosen: Reader | None,
 ) -> IngestedFile:  # fmt: skip
     """Read one file of an archive, and unpack it only if its first bytes are those of a log."""
     # only the beginning, because data sets contain recordings of GiB next to their logs
     head = member.read(DEEP_BYTES)
-    if (
-        chosen is None
-        and member.size > DEEP_BYTES
-        and packed.packed_form(head) is None
-        and not archives.is_archive(head)
-    ):
+    if chosen is None and member.size > DEEP_BYTES and packed.packed_form(head) is None and not packed.is_archive(head):
         chosen = identify(as_utf8(head), path=str(path))
     unpacked = _unpacked(member.read(None), path)
     digest = hashlib.sha256(unpacked).hexdigest()
     data = as_utf8(unpacked)
     # do not nest archives: each level would multiply the limit of unpacked bytes
-    if archives.is_archive(data[:HEAD_BYTES]):
+    if packed.is_archive(data[:HEAD_BYTES]):
         raise InputError("an archive inside an archive: unpack it", path=path)
 
     def neighbour(name: str) -> bytes | None:
@@ -412,7 +405,7 @@ def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: R
         archive, name = part
         if _in_flight_file(place) is not None:
             return _of_kind(_source(archive, name), reader, archive)
-        content = archives.archive_members(read_bytes(archive)[0], archive)
+        content = packed.archive_members(read_bytes(archive)[0], archive)
         if name not in content:
             raise InputError(f"the archive has no member {name!r}", cause="a misspelt path", path=archive)
         return _member(place, content[name], content, options, reader)
@@ -482,7 +475,7 @@ def _in_pieces(place: Path, reader: Reader, options: _OptionsFor | None) -> Inge
         return None
     chosen, digest = _options(place, options, _neighbour_reader(place)), hashlib.sha256()
     read_pieces = reader.read_pieces
-    result = _checked(place, reader, chosen, lambda: read_pieces(chunks.file_pieces(place, digest), chosen))
+    result = _checked(place, reader, chosen, lambda: read_pieces(packed.file_pieces(place, digest), chosen))
     return IngestedFile(str(place), digest.hexdigest(), result)
 
 

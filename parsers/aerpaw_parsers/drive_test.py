@@ -1,15 +1,21 @@
-"""Exports of drive-test programs and phones: Nemo, XCAL, TEMS, QualiPoc, G-NetTrack, with one dictionary for all.
+"""Tables with named columns: exports of drive-test programs, phones, autopilots and DJI, with one dictionary for all.
 
 The name of a column contains its quantity (RSRP, RSRQ, PCI, ARFCN, rank, ...), the radio access (LTE, NR) and the role
 of the cell (serving, or the n-th neighbour). Levels with a PCI become one stream per cell, such as ``lte_pci110``; its
 column ``serving`` is 1 while that cell serves. Other quantities become streams of kind ``kpi``. RI becomes a rank
 stream (from one), and positions become the telemetry stream ``phone``.
+
+A table of positions without a level (converted vehicleOut, ArduPilot exports, AirData) is read in the same way by
+``pose_csv``, with the telemetry stream ``vehicle``. Units in brackets (``[ft]``, ``[MPH]``) are converted. Times
+without a zone are local unless the name of the column contains UTC or GPS.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -17,10 +23,21 @@ import pandas as pd
 from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import dictionary
-from aerpaw_cmp.readers import Attribute, Reader, ReadOptions, ReadResult, Rows, Stream, checked_ranks, snr_stream
+from aerpaw_cmp.readers import (
+    Attribute,
+    InputError,
+    Reader,
+    ReadOptions,
+    ReadResult,
+    Rows,
+    Stream,
+    checked_ranks,
+    snr_stream,
+)
 
-from . import _cells, _identity, _pose, _sheet, aadm_snr, ardupilot_bin, nemo_csv, pose_csv, quectel_ri
+from . import _cells, _identity, _pose, _sheet, aadm_snr, ardupilot_bin, nemo_csv, quectel_ri, rtklib_pos, vehicle_out
 
+_IsHeader = Callable[[list[str]], bool]
 # A tower of Lake Wheeler in the name of a column.
 _TOWER = re.compile(r"\blw ?([1-5])\b")
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
@@ -31,14 +48,40 @@ _NEIGHBOURS = ("neighbor", "neighbour", "neighboring", "neighbouring", "detected
 
 def is_header(names: list[str]) -> bool:
     """Check whether there is a time and a level, ratio or rank among the names."""
-    return len(names) > 1 and pose_csv.has_time(names) and pose_csv.has_radio(names)
+    return len(names) > 1 and _has_time(names) and has_radio(names)
 
 
-def sniff(head: bytes) -> bool:
-    """Check whether a file begins with a header of such names and is not one of the narrower formats."""
-    # their headers have a time and a level, too, and their readers know units that are not in the names
-    narrower = [module.READER.sniff for module in (nemo_csv, quectel_ri, aadm_snr, ardupilot_bin)]
-    return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
+def is_track_header(names: list[str]) -> bool:
+    """Check whether there is a position and a time among the names, and no quantity of a radio."""
+    known = _quantities(names)
+    return ({*_pose.PLACE[:2]} <= known or "grid" in known) and _has_time(names) and not has_radio(names)
+
+
+def has_radio(names: list[str]) -> bool:
+    """Check whether there is a level, a ratio or a rank of the channel among the names."""
+    return any(
+        what is not None and (what.quantity.role in ("rss", "rank") or what.quantity.name in ("SINR", "RSRQ"))
+        for what, *_ in dictionary.described(names)[1]
+    )
+
+
+def _quantities(names: list[str]) -> set[str]:
+    return {meaning.quantity.name for name in names if (meaning := dictionary.meaning(name)) is not None}
+
+
+def _has_time(names: list[str]) -> bool:
+    """Check whether a name is that of a time, a date, or GPS weeks."""
+    known = _quantities(names)
+    return not known.isdisjoint(("time", "date")) or {"gps_week", "gps_seconds"} <= known
+
+
+# Their headers have a time and a level or position, too, and their readers know units that are not in the names.
+_NARROWER = (nemo_csv, quectel_ri, aadm_snr, ardupilot_bin, rtklib_pos, vehicle_out)
+
+
+def _is_table(head: bytes, header: _IsHeader) -> bool:
+    """Check whether a file begins with such a header and is not of a narrower format."""
+    return _sheet.starts(head, header) and not any(module.READER.sniff(head) for module in _NARROWER)
 
 
 @dataclass
@@ -242,23 +285,47 @@ def _or_nan(sheet: _sheet.Sheet, column: int | None, count: int) -> FloatArray:
     return np.where(dictionary.is_none(meaning.quantity, values), np.nan, values)
 
 
-def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Return cells, ranks, KPIs and the track of the phone, or raise UsageError if the zone of the clock is unknown."""
-    sheet = _sheet.read(data, is_header)
-    rows = None if sheet is None else _sheet.rows(sheet, options, reader="drive_test")
+def _read(data: bytes, options: ReadOptions, *, header: _IsHeader, reader: str, **track: str) -> ReadResult:
+    """Return cells, ranks, KPIs and the track of a table.
+
+    Raises
+    ------
+    InputError
+        If the only positions are on a local grid.
+    UsageError
+        If the zone of the clock is unknown.
+    """
+    sheet = _sheet.read(data, header)
+    rows = None if sheet is None else _sheet.rows(sheet, options, reader=reader)
     if sheet is None or rows is None:
-        return _sheet.nothing(data, "drive_test", "no header with a time and a level, ratio or rank")
-    return of_sheet(rows, sheet)
+        return _sheet.nothing(data, reader, "no header with a time and a level, ratio, rank or position")
+    grid = sheet.find("grid")
+    if track and sheet.find("latitude_deg") is None and grid is not None:
+        raise InputError(
+            f"positions on a grid, such as column {sheet.names[grid]!r} (NED, ENU, UTM)",
+            expected="columns of latitude and longitude",
+            cause="an export in local coordinates, whose origin the table does not contain",
+        )
+    return of_sheet(rows, sheet, **track)
 
 
-def of_sheet(rows: Rows, sheet: _sheet.Sheet) -> ReadResult:
-    """Return the streams of a table with names of a drive-test program, for each device and network."""
+def of_sheet(rows: Rows, sheet: _sheet.Sheet, *, track: str = "phone", source: str = "table of a phone") -> ReadResult:
+    """Return the streams of a table with names of the dictionary, for each device and network.
+
+    Parameters
+    ----------
+    rows : Rows
+    sheet : Sheet
+    track, source : str
+        Name of the telemetry, and the source of its positions.
+    """
     _settle_names(sheet)
     streams: list[Stream | None] = []
     for device, of_device, table in _identity.parts(rows, sheet, "device"):
-        name = f"phone_{device}" if device else "phone"
-        streams.append(_pose.from_sheet(of_device, table, name=name, source="table of a phone"))
-        for network, part, cells in _identity.parts(of_device, table, "network"):
+        name = f"{track}_{device}" if device else track
+        streams.append(_pose.from_sheet(of_device, table, name=name, source=source))
+        measured = any(meaning and meaning.quantity.role in ("rss", "rank", "kpi") for meaning in table.meanings)
+        for network, part, cells in _identity.parts(of_device, table, "network") if measured else ():
             suffix = "_".join(word for word in (network, device) if word)
             streams += [_renamed(stream, suffix) for stream in of_radio(part, cells)]
     levels = [stream for stream in streams if stream is not None and stream.kind in ("rss", "rank")]
@@ -433,9 +500,19 @@ def _other(rows: Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream 
     return _cells.named(rows, name, values, unit=unit, where=where, about=about, alone=alone)
 
 
-READER = Reader(
-    name="drive_test",
-    title="drive-test export, CSV (Nemo, XCAL, TEMS, QualiPoc, G-NetTrack): cells by PCI, rank, KPIs, positions",
-    kinds=("rss", "rank", "kpi", "telemetry"),
-    sample="Time,Latitude,Longitude,Physical cell identity (LTE pcell),RSRP (LTE pcell)", sniff=sniff, read=read,
+READERS = (
+    Reader(
+        name="drive_test", kinds=("rss", "rank", "kpi", "telemetry"),
+        title="drive-test export, CSV (Nemo, XCAL, TEMS, QualiPoc, G-NetTrack): cells by PCI, rank, KPIs, positions",
+        sample="Time,Latitude,Longitude,Physical cell identity (LTE pcell),RSRP (LTE pcell)",
+        sniff=partial(_is_table, header=is_header), read=partial(_read, header=is_header, reader="drive_test"),
+    ),
+    Reader(
+        name="pose_csv", kinds=("telemetry", "kpi"),
+        title="positions and attitude, CSV with named columns (converted vehicleOut, ArduPilot export, DJI, AirData)",
+        sample="timestamp,Lat,Lng,Alt,Roll,Pitch,Yaw", sniff=partial(_is_table, header=is_track_header),
+        read=partial(
+            _read, header=is_track_header, reader="pose_csv", track="vehicle", source="table of positions"
+        ),
+    ),
 )  # fmt: skip

@@ -17,7 +17,7 @@ import numpy as np
 from aerpaw_cmp.common.units import IntArray
 from aerpaw_cmp.readers import InputError, Lines, Reader, ReadOptions, ReadResult, RejectedLine, Rows, Stream, split
 
-from . import _pose, _sheet, drive_test, pose_csv
+from . import _pose, _sheet, drive_test
 
 _TAG = rb"(?:\w{1,20}:)?(?:trkpt|wpt|rtept)"  # also of a named space, as programs that use an XML library write it
 _POINT = re.compile(rb"<" + _TAG + rb"\b([^<>]{0,200})>(.{0,2000}?)(?:</" + _TAG + rb">)", re.DOTALL)
@@ -79,7 +79,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     streams: list[Stream | None] = []
     for suffix, (part, cells) in parts.items():
         streams.append(_track(part, cells, f"track{suffix}"))
-        streams += drive_test.of_radio(part, cells) if pose_csv.has_radio(sheet.names) else []
+        streams += drive_test.of_radio(part, cells) if drive_test.has_radio(sheet.names) else []
     rows.warnings += [*_sheet.way_to_level(sheet), *sheet.unread()]
     return rows.result(streams)
 

@@ -18,7 +18,7 @@ belongs to two vehicles. Both are reported, and their values stay as they are.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,7 +75,7 @@ def jumps_of(frame: pd.DataFrame, what: str = "") -> tuple[BoolArray, str]:
     rows, time_s, place_m = path_of(frame)
     if len(rows) < 3:
         return none, ""
-    speed_mps = _speed_mps(time_s, place_m)
+    speed_mps = typical_speed_mps(time_s, place_m)
     if speed_mps > FASTEST_MPS and not _comes_back(time_s, place_m):
         slower = {unit: speed_mps / factor for unit, factor in _OTHER_UNITS.items()}
         units = "; ".join(f"{unit}: {mps:.1f} m/s" for unit, mps in slower.items() if 0.5 < mps <= FASTEST_MPS)
@@ -115,7 +115,7 @@ def path_of(frame: pd.DataFrame) -> tuple[IntArray, FloatArray, FloatArray]:
     return rows, (time[rows] - time[rows[0]]) / np.timedelta64(1, "s"), np.column_stack([flat, up])
 
 
-def _speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
+def typical_speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
     """Return the median speed of the moving part, over steps long enough for stamps written in bursts."""
     # over a fiftieth of the track: loggers write a second's rows in one burst
     apart = max(1, len(time_s) // 50)
@@ -126,45 +126,46 @@ def _speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
     return float(np.median(step_m[moving] / step_s[moving])) if moving.sum() >= 3 else 0.0
 
 
-class _Reach:
-    """The reach of an aircraft between two rows of a track, by the fastest aircraft and by its own speed and thrust.
+_Pairs = Callable[[IntArray, IntArray], BoolArray]
+
+
+def _out_of_reach(time_s: FloatArray, place_m: FloatArray) -> _Pairs:
+    """Return a function of two arrays of rows: the mask of pairs that no aircraft flies in the time between them.
+
+    The limits are the speed of the fastest aircraft, and the speed of this one around these rows plus its thrust.
 
     Parameters
     ----------
     time_s : (n,)
     place_m : (n, 3)
     """
-
-    def __init__(self, time_s: FloatArray, place_m: FloatArray) -> None:
-        self._time_s, self._place_m = time_s, place_m
-        self._usual_mps, self._interval_s = np.full(len(time_s), FASTEST_MPS), 0.0
-        step_m = np.linalg.norm(np.diff(place_m[:, :2], axis=0), axis=1)
-        moves = np.flatnonzero(step_m > 0)
-        if len(moves) < 2 * _AROUND:
-            return
+    usual_mps, interval_s = np.full(len(time_s), FASTEST_MPS), 0.0
+    step_m = np.linalg.norm(np.diff(place_m[:, :2], axis=0), axis=1)
+    moves = np.flatnonzero(step_m > 0)
+    if len(moves) >= 2 * _AROUND:
         # a receiver may report more rarely than the logger writes
-        self._interval_s = float(np.median(np.abs(np.diff(time_s[moves]))))
-        step_s = np.maximum(np.abs(np.diff(time_s)), self._interval_s)[moves]
+        interval_s = float(np.median(np.abs(np.diff(time_s[moves]))))
+        step_s = np.maximum(np.abs(np.diff(time_s)), interval_s)[moves]
         speed = np.pad(step_m[moves] / np.maximum(step_s, 1e-9), _AROUND, mode="reflect")
         around = np.lib.stride_tricks.sliding_window_view(speed, 2 * _AROUND + 1)
         usual = np.median(np.delete(around, _AROUND, axis=1), axis=1)
-        self._usual_mps = usual[np.searchsorted(moves, np.arange(len(time_s))).clip(0, len(moves) - 1)]
+        usual_mps = usual[np.searchsorted(moves, np.arange(len(time_s))).clip(0, len(moves) - 1)]
 
-    def beyond(self, first: IntArray, second: IntArray) -> BoolArray:
-        """Return the mask of pairs of rows that are farther apart than the time between them allows."""
+    def beyond(first: IntArray, second: IntArray) -> BoolArray:
         # the sign of the time does not count: a clock that steps back is not a jump of the position
-        seconds = np.abs(self._time_s[second] - self._time_s[first])
-        apart_m = self._place_m[second] - self._place_m[first]
-        usual_s = np.maximum(seconds, self._interval_s)
-        flown_m = (self._usual_mps[np.minimum(first, second)] + _GAIN_MPS2 * usual_s) * usual_s
+        seconds, apart_m = np.abs(time_s[second] - time_s[first]), place_m[second] - place_m[first]
+        usual_s = np.maximum(seconds, interval_s)
+        flown_m = (usual_mps[np.minimum(first, second)] + _GAIN_MPS2 * usual_s) * usual_s
         too_far = np.linalg.norm(apart_m, axis=1) > FASTEST_MPS * seconds + _JITTER_M
         return np.asarray(too_far | (np.linalg.norm(apart_m[:, :2], axis=1) > flown_m + _JITTER_M))
+
+    return beyond
 
 
 def _runs(time_s: FloatArray, place_m: FloatArray) -> tuple[IntArray, IntArray]:
     """Return the first rows, and the rows after the last, of the runs between fast steps of a track."""
     rows = np.arange(len(time_s))
-    begins = np.concatenate([[0], np.flatnonzero(_Reach(time_s, place_m).beyond(rows[:-1], rows[1:])) + 1])
+    begins = np.concatenate([[0], np.flatnonzero(_out_of_reach(time_s, place_m)(rows[:-1], rows[1:])) + 1])
     return begins, np.append(begins[1:], len(time_s))
 
 
@@ -232,13 +233,13 @@ def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArr
     still = extent_m < _JITTER_M
     # the longest run is the track: jumps are short, and a log at rest may be longer than the flight
     main = int(np.argmax((ends - begins) * (~still | still.all())))
-    few, reach = max(3.0, 0.05 * count), _Reach(time_s, place_m)
+    few, beyond = max(3.0, 0.05 * count), _out_of_reach(time_s, place_m)
 
     def walk(runs: range, near: IntArray, far: IntArray) -> None:
         last = far[main]
         for run in runs:
             short, end = ends[run] - begins[run] <= few, still[run] and run in (0, len(begins) - 1)
-            if (short or end) and reach.beyond(np.array([last]), near[run : run + 1])[0]:
+            if (short or end) and beyond(np.array([last]), near[run : run + 1])[0]:
                 astray[begins[run] : ends[run]] = True
                 at_rest[begins[run] : ends[run]] = not short
             else:

@@ -11,8 +11,9 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common import kml
+from aerpaw_cmp.common.geodesy import rough_m
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.logs.limits import FASTEST_MPS
+from aerpaw_cmp.logs.limits import FASTEST_MPS, typical_speed_mps
 from aerpaw_cmp.readers import BoolArray, FloatArray, Reader, ReadOptions, ReadResult, Rows, Stream, built, dictionary
 
 from . import _cells, _pose
@@ -77,17 +78,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 def _in_seconds(time_ms: FloatArray, latitude: FloatArray, longitude: FloatArray) -> bool:
     """Check whether times called milliseconds are seconds: the phone would be too fast in ms, but not in s."""
-    if len(time_ms) < _FEW:
+    if not len(time_ms):
         return False
-    step_m = 111_000.0 * np.hypot(np.diff(latitude), np.diff(longitude) * np.cos(np.radians(latitude[0])))
-    step_s = np.abs(np.diff(time_ms)) / 1e3
-    moving = (step_s > 0) & (step_m > 0)
-    speed_mps = float(np.median(step_m[moving] / step_s[moving])) if moving.sum() >= _FEW else 0.0
+    speed_mps = typical_speed_mps(time_ms / 1e3, rough_m(latitude, longitude, (latitude[0], longitude[0])))
     # if the phone is still too fast in seconds, the positions are wrong and not the unit
     return FASTEST_MPS < speed_mps <= 1e3 * FASTEST_MPS
-
-
-_FEW = 4
 
 
 # The cell that is called ``nr`` in Nemo's CSV, where its RSRP is ``nr_rsrp``.

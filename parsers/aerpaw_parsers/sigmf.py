@@ -15,6 +15,7 @@ reported. The lines of the account are the values.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -32,12 +33,8 @@ _BURST_S = 0.02
 _FULL, _CLIPPED_SHARE = 0.999, 1e-3
 # A DC part this far above the rest is the level that is read [dB]; below it may be the signal's own carrier.
 _DC_DB = 10.0
-_SAMPLES = {
-    "cf64": ("f8", 1.0), "cf32": ("f4", 1.0), "ci32": ("i4", 2.0**31), "ci16": ("i2", 2.0**15), "ci8": ("i1", 2.0**7),
-    "cu8": ("u1", 2.0**7), "cu16": ("u2", 2.0**15), "cu32": ("u4", 2.0**31), "ru8": ("u1", 2.0**7),
-    "ru16": ("u2", 2.0**15), "ru32": ("u4", 2.0**31), "ri8": ("i1", 2.0**7), "ri32": ("i4", 2.0**31),
-    "rf64": ("f8", 1.0), "rf32": ("f4", 1.0), "ri16": ("i2", 2.0**15),
-}  # fmt: skip
+# Complex or real, float or integer, and the bits of a number.
+_DATATYPE = re.compile(r"([cr])(f(?=32|64)|[iu](?=8|16|32))(8|16|32|64)(?:_[lb]e)?")
 _TIMES = ("core:datetime", "core:timestamp", "core:time")
 _LEVELS = {"RSS1": "USRP1", "RSS2": "USRP2", "RSS": "USRP1", "rss1": "USRP1", "rss2": "USRP2"}
 _PLACE = (("latitude_deg", ("mY", "y", "latitude", "lat")), ("longitude_deg", ("mX", "x", "longitude", "lon")),
@@ -243,13 +240,13 @@ def _samples(
     common: dict[str, Any], captures: list[dict[str, Any]], options: ReadOptions
 ) -> tuple[AnyArray | None, float]:
     """Return the stored samples, shape (n, channels, 1 or 2), or None, and the full scale of their type."""
-    kind = str(common.get("core:datatype", ""))
+    kind = _DATATYPE.fullmatch(str(common.get("core:datatype", "")))
     data = options.neighbour(_data_name(options)) if options.neighbour else None
-    code, full_scale = _SAMPLES.get(kind.split("_")[0], ("", 1.0))
-    if data is None or not code:
-        return None, full_scale
-    stored = np.dtype((">" if kind.endswith("_be") else "<") + code)
-    shape = (min(max(_integer(common.get("core:num_channels")), 1), 64), 2 if kind.startswith("c") else 1)
+    if data is None or kind is None:
+        return None, 1.0
+    stored = np.dtype(f"{'>' if kind[0].endswith('_be') else '<'}{kind[2]}{int(kind[3]) // 8}")
+    full_scale = 1.0 if kind[2] == "f" else 2.0 ** (int(kind[3]) - 1)
+    shape = (min(max(_integer(common.get("core:num_channels")), 1), 64), 2 if kind[1] == "c" else 1)
     frame_bytes = stored.itemsize * shape[0] * shape[1]
     data = data[: len(data) - max(_integer(common.get("core:trailing_bytes")), 0)]
     for capture in sorted(captures, key=lambda item: _integer(item.get("core:sample_start"))):

@@ -25,7 +25,7 @@ from ..compare.result import AuditResult, EngineResult
 from ..flight.data import FlightData
 from ..flight.gains import LOSSES, path_loss
 from ..flight.replay import Replayed, attitude_rotation, part_of
-from ..flight.settings import ArraySettings, LinkSettings, RtSettings, load_pattern
+from ..flight.settings import ArraySettings, LinkSettings, load_pattern
 from ..logs.ingest import IngestedFile
 from ..propagation.check import reference
 from ..propagation.check.audit import REFERENCE_LINKS, Audit, Expected, Second, audit, scalar_pattern
@@ -128,18 +128,20 @@ def _content_of(data: FlightData, replays: Sequence[Replayed]) -> str:
 
 def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> AuditResult | None:
     """Audit all series, with links in proportion to their poses."""
-    ks = data.settings.rank.k
+    ks, rt = data.settings.rank.k, data.settings.rt
+    search = Search(max_depth=rt.max_depth, samples=rt.advanced.samples)
     total = sum(len(r.poses) for r in replays)
     few = int(np.clip(_REFERENCE_LINKS_AT_MOST // max(len(replays), 1), 3, REFERENCE_LINKS))
     parts: list[Audit] = []
     known: dict[str, Any] = {}
     for site, replayed, expected in standing(data, replays):
         count = len(replayed.poses)
-        links = min(count, max(math.ceil(data.settings.rt.audit_links * count / max(total, 1)), 1))
+        links = min(count, max(math.ceil(rt.audit_links * count / max(total, 1)), 1))
         if links:
             progress(f"audit {replayed.replay.towers[0]}: {counted(links, 'link')}")
             second = Second(links=links, expected=expected, ks=ks, reference_links=few, known=known)
-            parts.append(_of_series(data.settings.rt, site, replayed, second))
+            field = Field(loss=path_loss(site, rt, replayed.link.carrier_hz))
+            parts.append(audit(site, replayed.link, replayed.poses, replayed.replay, search, field, second=second))
     if not parts:
         return None
     free_memory()
@@ -157,19 +159,6 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
         reference_seconds=sum(p.reference_seconds for p in parts),
         note=_TIMES + (f" Rays were raised until two pilots agreed: {rays}." if rays else ""),
         fields=dataclasses.replace(fields, not_covered=(*fields.not_covered, *_NOT_COVERED)),
-    )
-
-
-def _of_series(rt: RtSettings, site: Site, replayed: Replayed, second: Second) -> Audit:
-    """Audit one series with the search and losses of the settings."""
-    return audit(
-        site,
-        replayed.link,
-        replayed.poses,
-        replayed.replay,
-        Search(max_depth=rt.max_depth, samples=rt.advanced.samples),
-        Field(loss=path_loss(site, rt, replayed.link.carrier_hz)),
-        second=second,
     )
 
 
@@ -265,9 +254,8 @@ def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudi
         roll, pitch, yaw = (float(x) for x in angles[rows[index]])
         expected = np.array(reference.aircraft(*((roll, pitch) if mode == "logged" else (0.0, 0.0)), yaw))
         worst = max(worst, float(np.abs(expected - rotation[index]).max()))
-    failures = (
-        (f"rotations differ from the logged attitude by {worst:.2g} rad",) if worst > _ATTITUDE_TOLERANCE_RAD else ()
-    )
+    wrong = worst > _ATTITUDE_TOLERANCE_RAD
+    failures = (f"rotations differ from the logged attitude by {worst:.2g} rad",) if wrong else ()
     return FieldAudit(attitude_rows=len(used), attitude_max_rad=worst, failures=failures)
 
 

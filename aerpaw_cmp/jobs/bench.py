@@ -8,14 +8,12 @@ import statistics
 import time
 import timeit
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 from shapely import affinity
 from shapely.geometry import Point, box
 
-from ..common.errors import parsing
 from ..common.geodesy import SiteFrame
 from ..common.stages import Progress, begin_peak, logged, peak_mib
 from ..common.text import counted
@@ -33,8 +31,6 @@ _DEPTH = 2
 # Poses per PathSolver call.
 BATCH = 50
 
-T = TypeVar("T")
-
 Row: TypeAlias = "dict[str, Any]"
 
 
@@ -43,7 +39,6 @@ def run_bench(
     poses: int = 200,
     samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000),
     ratios: bool = True,
-    report: Path | None = None,
     progress: Progress = logged,
 ) -> dict[str, Any]:
     """Measure speed against error of the replay, and the speed of each part relative to its peer.
@@ -56,38 +51,23 @@ def run_bench(
         Rays per tower of the sionna engine.
     ratios : bool
         Also measure the engines of other programs.
-    report : Path, optional
-        Folder of a report, whose model comparison becomes a table.
     progress : Progress
 
     Returns
     -------
     dict
-        ``conditions``, ``replay.rows``, ``ratios``, ``details`` and, with a report, ``models``.
+        ``conditions``, ``replay.rows``, ``ratios`` and ``details``.
     """
-    models = {} if report is None else {"models": _costs(report)}
     site, link, some = random_scene(poses)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
     measured = _against_peers(progress) if ratios else {}
-    about = {"poses": poses, "towers": list(link.tower_arrays), "buildings": len(site.buildings)}
+    scene = {"poses": poses, "towers": list(link.tower_arrays), "buildings": len(site.buildings)}
     return {
-        "conditions": {**about, "cpus": os.cpu_count()},
+        "conditions": scene | {"cpus": os.cpu_count()},
         "replay": {"rows": rows},
         "ratios": {name: value["ratio"] for name, value in measured.items() if value is not None},
         "details": measured,
-        **models,
     }
-
-
-def _costs(report: Path) -> list[Row]:
-    """Return time and error of the models that a report compares, without the models that have no score."""
-    from .diff_reports import read_metrics
-
-    file = report / "metrics.json"
-    rows = read_metrics(file, report).get("models") or []
-    columns = ("model", "seconds", "rmse_heldout_db", "fastest_sufficient")
-    with parsing(file, "metrics.json of a report", "an edited file", any_shape=True):
-        return [{name: row[name] for name in columns} for row in rows if row["rmse_heldout_db"] is not None]
 
 
 def _against_peers(progress: Progress) -> dict[str, Any]:
@@ -158,7 +138,10 @@ def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: S
     alone = Run(cache_dir="")
     if sionna:
         replay(site, link, poses[:BATCH], search, run=alone)  # compiles the kernels
-    result, spent = _measured(lambda: replay(site, link, poses, search, run=alone))
+    begin_peak()
+    started = time.perf_counter()
+    result = replay(site, link, poses, search, run=alone)
+    seconds = time.perf_counter() - started
     difference = compare(result, reference, np.arange(len(poses)), RANK_K)
     errors = {"rss_max_error_db": difference.rss_max_error_db, "rss_rms_error_db": difference.rss_rms_error_db}
     return {
@@ -169,18 +152,11 @@ def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: S
         "missing_paths": difference.missing_paths, "extra_paths": difference.extra_paths,
         "coverage_differs": difference.coverage_differs,
         **{name: value if np.isfinite(value) else None for name, value in errors.items()},
-        **spent,
+        "seconds": seconds,
+        "peak_mib": peak_mib(),
         "rank_disagreement": {f"{k:g}": share for k, share in difference.rank_disagreement.items()},
-        "links_per_s": len(poses) * len(link.tower_arrays) / max(spent["seconds"], 1e-9),
+        "links_per_s": len(poses) * len(link.tower_arrays) / max(seconds, 1e-9),
     }  # fmt: skip
-
-
-def _measured(action: Callable[[], T]) -> tuple[T, dict[str, float]]:
-    """Return the result of an action, its seconds, and the peak memory of the process [MiB]."""
-    begin_peak()
-    started = time.perf_counter()
-    result = action()
-    return result, {"seconds": time.perf_counter() - started, "peak_mib": peak_mib()}
 
 
 # --- comparison with peers --------------------------------------------------------------------------------------------

@@ -71,10 +71,10 @@ def run_diff(first: Path, second: Path, *, out: Path | None = None, force: bool 
         return _compare_reports(first_report, second_report)
     from ..report.diff import write_diff
 
-    with OutputFolder(out, job="diff", inputs=[*first_report.files, *second_report.files], force=force) as output:
+    inputs = [*first_report.files, *second_report.files]
+    with OutputFolder(out, job="diff", inputs=inputs, force=force) as output, output.filling() as place:
         diff = _compare_reports(first_report, second_report)
-        with output.filling() as place:
-            write_diff(diff, place)
+        write_diff(diff, place)
     return diff
 
 
@@ -89,7 +89,7 @@ def _read_report(place: Path) -> ReadReport:
     InputError
         If a file is missing, damaged or of another kind.
     """
-    metrics = read_metrics(place / "metrics.json", place)
+    metrics = read_metrics(place / "metrics.json")
     files = {kind: place / f"{kind}.csv" for kind in ("rss", "rank")}
     rss, rank = (_table(files[kind], kind, header(columns)) for kind, columns in (("rss", RSS), ("rank", RANK)))
     changed = [name for name in changed_files(place) if name in ("metrics.json", "rss.csv", "rank.csv")]
@@ -104,21 +104,21 @@ def _read_report(place: Path) -> ReadReport:
     )
 
 
-def read_metrics(file: Path, named: Path) -> dict[str, Any]:
-    """Read the numbers of a report, ``named`` by its folder or by the file."""
+def read_metrics(file: Path) -> dict[str, Any]:
+    """Read the numbers of a report from its metrics.json."""
+    place = file.parent
     if not file.is_file():
-        foreign = next((n for n in ("campaign.json", "diff.json") if (named / n).is_file()), None)
+        foreign = next((n for n in ("campaign.json", "diff.json") if (place / n).is_file()), None)
         raise InputError(
-            "there is no metrics.json" if named.is_dir() else "there is no such file or folder",
+            "there is no metrics.json" if place.is_dir() else "there is no such file or folder",
             expected="the folder of a report, or its metrics.json",
             cause=None if foreign is None else f"the folder has {foreign}: only reports of a flight can be compared",
-            path=named,
+            path=place,
         )
     with parsing(file, "metrics.json of a report", "a truncated copy"):
         content = json.loads(read_bounded(file, LARGEST_TABLE, "metrics.json"))
-    missing = [
-        key for key in _NEEDED if not isinstance(content, dict) or not isinstance(content.get(key), _NEEDED[key])
-    ]
+    numbers = content if isinstance(content, dict) else {}
+    missing = [key for key, kind in _NEEDED.items() if not isinstance(numbers.get(key), kind)]
     if not missing and not all(isinstance(i, dict) and isinstance(i.get("path"), str) for i in content["inputs"]):
         missing = ["inputs"]
     towers = [] if missing else list(content["rss"].values())

@@ -74,7 +74,6 @@ READERS_OF_WHOLE_FILES: dict[str, dict[str, Any]] = {
     "site.learned.read_sphere_csv": {},
     "site.antennas.read_gain_grid": {"variable": "rad_pat"},
     "jobs.calibrate_rank.read_receiver": {},
-    "jobs.diff_reports.read_metrics": {"named": Path()},
 }
 
 

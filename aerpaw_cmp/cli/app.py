@@ -33,10 +33,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
 # no rich markup, because "[default: ...]" is text; no pretty exceptions, because __main__ turns them into messages
 app = typer.Typer(
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    context_settings=_SETTINGS,
+    no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, context_settings=_SETTINGS
 )
 site_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(site_app, name="site", help=COMMANDS["site"])
@@ -46,19 +43,14 @@ app.add_typer(antenna_app, name="antenna", help=COMMANDS["antenna"])
 Json = Annotated[bool, Option("--json", help="Print one JSON object on standard output and nothing else there.")]
 Force = Annotated[bool, Option("--force", help="Replace files that this tool did not write; never an input.")]
 Export = Annotated[
-    list[str] | None,
-    Option(help="Also write the samples as kmz, netcdf or all; names joined by commas, or repeated."),
+    list[str] | None, Option(help="Also write the samples as kmz, netcdf or all; names joined by commas, or repeated.")
 ]
-LogsRoot = Annotated[
-    Path | None,
-    Option("--logs-root", help="Folder for the paths of the logs."),
-]
+LogsRoot = Annotated[Path | None, Option("--logs-root", help="Folder for the paths of the logs.")]
 
 
 Workers = Annotated[int, Option(min=1, help="Workers of this machine that share the tasks.")]
 Scheduler = Annotated[
-    str | None,
-    Option("--scheduler", "--cluster", help="Address of a Dask scheduler, instead of local workers."),
+    str | None, Option("--scheduler", "--cluster", help="Address of a Dask scheduler, instead of local workers.")
 ]
 Flights = Annotated[
     list[Path] | None,
@@ -69,10 +61,7 @@ Flights = Annotated[
     ),
 ]
 DryRun = Annotated[bool, Option("--dry-run", help="Check all inputs, print the stages, and write no files.")]
-Quiet = Annotated[
-    bool,
-    Option("-q", "--quiet", help="Results, warnings and failures only."),
-]
+Quiet = Annotated[bool, Option("-q", "--quiet", help="Results, warnings and failures only.")]
 
 
 def output(text: str, metavar: str = "DIR") -> Any:

@@ -431,9 +431,7 @@ def load_campaign(path: Path) -> CampaignFile:
         raise UsageError("no flights and no soundings", expected="flights: [FLIGHT.yaml, ...]", path=path)
     if campaign.timezone is not None and not campaign.soundings:
         raise UsageError(
-            "'timezone' without 'soundings'",
-            expected="the time zone of a flight in its own flight.yaml",
-            path=path,
+            "'timezone' without 'soundings'", expected="the time zone of a flight in its own flight.yaml", path=path
         )
     return campaign
 
@@ -579,11 +577,7 @@ def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], li
     for setting in dict.fromkeys(row.setting for row in rows):
         members = [row for row in rows if row.setting == setting]
         span = (min(r.span_db[0] for r in members), max(r.span_db[1] for r in members))
-        fits = pooled_moments(
-            {row.key: row.moments for row in members},
-            per,
-            span_db=span,
-        )
+        fits = pooled_moments({row.key: row.moments for row in members}, per, span_db=span)
         pooled = [
             dataclasses.replace(row, pooled_offset_db=fits[row.key].offset_db, pooled_rmse_db=fits[row.key].rmse_db)
             for row in members

@@ -72,10 +72,7 @@ class ChannelOptions:
 
 
 def channel_parts(
-    data: FlightData,
-    chosen: ChannelOptions,
-    stages: Stages | None = None,
-    room: int | None = None,
+    data: FlightData, chosen: ChannelOptions, stages: Stages | None = None, room: int | None = None
 ) -> Iterator[Channel]:
     """Yield the channel along a flight in consecutive parts.
 

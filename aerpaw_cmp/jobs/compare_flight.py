@@ -150,9 +150,7 @@ def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> L
         posed[posed] = replayed.poses.position_m[:, 2] >= settings.minimum_height_m
     level_dbm = replayed.level_dbm("power" if settings.field == "power" else "coherent")
     return Levels(
-        measured_db=np.where(posed, series.measured_db, np.nan),
-        simulated_db=replayed.spread(level_dbm),
-        posed=posed,
+        measured_db=np.where(posed, series.measured_db, np.nan), simulated_db=replayed.spread(level_dbm), posed=posed
     )
 
 
@@ -592,11 +590,7 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
 def _worst(case: _Case, residual_db: FloatArray, line_of_sight: FloatArray) -> list[rss.ErrorSpan]:
     """Return the time spans of largest error, with position and geometry."""
     geometry = case.geometry
-    context = {
-        "los": line_of_sight,
-        "elevation_deg": geometry["elevation_deg"],
-        "height_m": geometry["altitude_m"],
-    }
+    context = {"los": line_of_sight, "elevation_deg": geometry["elevation_deg"], "height_m": geometry["altitude_m"]}
     for ours, theirs in (("heading_deg", "heading_deg"), ("foliage_depth_m", "foliage_m")):
         if ours in geometry:
             context[theirs] = geometry[ours]

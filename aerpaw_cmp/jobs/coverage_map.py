@@ -496,11 +496,7 @@ def make_maps(
 
 
 def _write_tiles(
-    outcome: MapOutcome,
-    store: TileStore,
-    run: Callable[..., None],
-    order: Callable[..., TileOrder],
-    progress: Progress,
+    outcome: MapOutcome, store: TileStore, run: Callable[..., None], order: Callable[..., TileOrder], progress: Progress
 ) -> None:
     """Compute the missing tiles, write a file for each, and read some positions of all tiles for the page."""
     tiling, missing = store.tiling, store.missing()
@@ -608,11 +604,7 @@ def _far_reaching(outcome: MapOutcome) -> dict[str, Predictor]:
 
 
 def maps_record(
-    outcome: MapOutcome,
-    *,
-    name: str,
-    stages_s: Mapping[str, float],
-    paper: Iterable[page.PaperRow] = (),
+    outcome: MapOutcome, *, name: str, stages_s: Mapping[str, float], paper: Iterable[page.PaperRow] = ()
 ) -> page.MapsData:
     """Return the record for :func:`aerpaw_cmp.report.maps.write_maps`.
 
@@ -827,11 +819,7 @@ def _notes(outcome: MapOutcome) -> tuple[str, ...]:
 
 def _metrics(outcome: MapOutcome) -> dict[str, Any]:
     """Return the content of metrics.json that is not in the tables of the page."""
-    result: dict[str, Any] = {
-        "paths": outcome.paths,
-        "tiles": outcome.tiles,
-        "settings": asdict(outcome.settings),
-    }
+    result: dict[str, Any] = {"paths": outcome.paths, "tiles": outcome.tiles, "settings": asdict(outcome.settings)}
     for key in ("zero", "missing"):
         if key not in outcome.studies:
             continue
@@ -885,9 +873,7 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
 def _about_maps(site: Site) -> dict[str, str]:
     """Return the attributes of maps.nc and maps.zarr."""
     about = file_attributes(
-        title=site.name,
-        source="ray tracing",
-        comment="A missing level or a rank of 0 means that there is no path.",
+        title=site.name, source="ray tracing", comment="A missing level or a rank of 0 means that there is no path."
     )
     return about | ({"acknowledgement": site.credit} if site.credit else {})
 

@@ -163,8 +163,7 @@ def _plan_flight(
         candidates = [*_own_patterns(plan, area, site), *_file_routes(plan, area, site)]
         if not candidates:
             raise UsageError(
-                "no route fits: no pattern lies within the geofence",
-                expected="a larger area, or --route FILE",
+                "no route fits: no pattern lies within the geofence", expected="a larger area, or --route FILE"
             )
         if all(candidate.refused for candidate in candidates):
             raise UsageError(
@@ -208,10 +207,7 @@ def _plan_flight(
         after_db=_rms_of_antennas(after),
         seen_from_m=np.asarray(site.towers[next(iter(ends.values()))[0]].position_m) if points is None else None,
         site=site,
-        files={
-            "route.plan": plan_text(ways, site.frame, speed),
-            "route.csv": waypoints_csv(ways, site.frame),
-        },
+        files={"route.plan": plan_text(ways, site.frame, speed), "route.csv": waypoints_csv(ways, site.frame)},
         warnings=[*(f"{text}." for text in site.cautions(tower for tower, _ in ends.values())), *remarks],
         stages_s=stages.seconds,
     )

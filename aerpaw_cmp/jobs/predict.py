@@ -619,10 +619,7 @@ def _place_and_nose(targets: Targets, rows: IntArray) -> FloatArray:
 
 
 def run_predict(
-    where: Path,
-    flights: Sequence[Path],
-    target: TargetOptions,
-    options: RunOptions = DEFAULT,
+    where: Path, flights: Sequence[Path], target: TargetOptions, options: RunOptions = DEFAULT
 ) -> JobOutcome:
     """Predict and write ``prediction.csv``, ``.nc``, ``.html`` and figures.
 

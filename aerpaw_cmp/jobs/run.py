@@ -417,12 +417,7 @@ def run_site_show(site: str, options: RunOptions = DEFAULT) -> JobOutcome:
 
 
 def run_map(
-    site: str,
-    settings: Any,
-    options: RunOptions = DEFAULT,
-    *,
-    flights: Sequence[Path] = (),
-    figures: str = "none",
+    site: str, settings: Any, options: RunOptions = DEFAULT, *, flights: Sequence[Path] = (), figures: str = "none"
 ) -> JobOutcome:
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
@@ -501,11 +496,7 @@ def _compared(flight: Any, options: RunOptions, stages: Stages) -> Any:
 
 
 def run_campaign(
-    path: Path,
-    options: RunOptions = DEFAULT,
-    *,
-    keep: Path | None = None,
-    fresh: bool = False,
+    path: Path, options: RunOptions = DEFAULT, *, keep: Path | None = None, fresh: bool = False
 ) -> JobOutcome:
     """Many flights and settings: replay, compare, pool, hold out, report.
 
@@ -546,10 +537,7 @@ def run_campaign(
         raise UsageError(f"--keep {keep}", expected="a folder")
     store = None if fresh else keep or cache_folder("outcomes")
     note = f"finished tasks are stored in {store}; the same command computes the rest" if store else "nothing is stored"
-    with (
-        OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output,
-        noting_interrupts(note),
-    ):
+    with OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output, noting_interrupts(note):
         data = run_all(campaign, path.parent, options, keep=store, stages=stages)
         reports = find_reports(data.flights, folder, [folder.parent, Path("reports")])
         data = with_season(data, reports, nodes)

@@ -254,11 +254,7 @@ class Cluster(Workers):
 
 @contextlib.contextmanager
 def open_workers(
-    workers: int,
-    scheduler: str | None = None,
-    *,
-    paths: Sequence[Path] = (),
-    progress: Progress = logged,
+    workers: int, scheduler: str | None = None, *, paths: Sequence[Path] = (), progress: Progress = logged
 ) -> Iterator[Workers]:
     """Open workers for the tasks of a job, and close them at the end of the block.
 

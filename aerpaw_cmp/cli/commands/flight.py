@@ -40,8 +40,7 @@ def report(
         Path | None, Option("--recommend", help="Write a flight.yaml with the recommended model.")
     ] = None,
     learned: Annotated[
-        Path | None,
-        Option("--with", metavar="CALIBRATED", help="calibrated.yaml with antennas, ground and receiver."),
+        Path | None, Option("--with", metavar="CALIBRATED", help="calibrated.yaml with antennas, ground and receiver.")
     ] = None,
     against: Annotated[
         list[Path] | None,
@@ -261,10 +260,7 @@ def calibrate(
 
 @command(
     "simulate",
-    examples=[
-        "aerpaw-cmp simulate plan/flight.yaml",
-        "aerpaw-cmp simulate plan/flight.yaml -o planned --json",
-    ],
+    examples=["aerpaw-cmp simulate plan/flight.yaml", "aerpaw-cmp simulate plan/flight.yaml -o planned --json"],
 )
 def simulate(
     flight: Annotated[Path, Argument(help="flight.yaml with flight.plan")],
@@ -281,16 +277,9 @@ def simulate(
     print_files(outcome.files)
 
 
-@command(
-    "sample",
-    examples=[
-        "aerpaw-cmp sample",
-        "aerpaw-cmp sample -o try_it",
-    ],
-)
+@command("sample", examples=["aerpaw-cmp sample", "aerpaw-cmp sample -o try_it"])
 def sample(
-    out: Annotated[Path, output("Folder for flight.yaml and the logs.")] = Path("sample"),
-    force: Force = False,
+    out: Annotated[Path, output("Folder for flight.yaml and the logs.")] = Path("sample"), force: Force = False
 ) -> None:
     """Copy the sample flight into a folder of your own."""
     from ...jobs.sample import write_sample

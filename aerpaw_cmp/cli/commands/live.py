@@ -42,8 +42,7 @@ class WebCommand(TyperCommand):
 )
 def tap(
     port: Annotated[
-        list[str] | None,
-        Argument(help="Serial port, or several  [default: the first AT port of a Quectel modem]"),
+        list[str] | None, Argument(help="Serial port, or several  [default: the first AT port of a Quectel modem]")
     ] = None,
     out: Annotated[Path, output("Folder of the log segments. With several ports, each has a folder inside.")] = Path(
         "tap"
@@ -54,8 +53,7 @@ def tap(
     no_csi_alarm: Annotated[float | None, Option(help="Seconds without CSI until the bell rings.")] = None,
     duration: Annotated[float | None, Option(help="Stop after this many seconds.")] = None,
     web: Annotated[
-        str | None,
-        Option(help=f"Also show the flight as a page, opened with a token, at HOST:PORT [default: {WEB}]."),
+        str | None, Option(help=f"Also show the flight as a page, opened with a token, at HOST:PORT [default: {WEB}].")
     ] = None,
     flight: Annotated[Path | None, Option(help="flight.yaml: also predict rank and level by the replay.")] = None,
     telemetry: Annotated[Path | None, Option(help="The growing vehicleOut file that --flight follows.")] = None,
@@ -71,11 +69,7 @@ def tap(
 
     shown = Shown(web=web, flight=flight, telemetry=telemetry, say=say)
     settings = TapSettings(
-        folder=out,
-        ri_hz=ri_hz,
-        enable_csi=enable_csi,
-        no_csi_alarm_s=no_csi_alarm,
-        duration_s=duration,
+        folder=out, ri_hz=ri_hz, enable_csi=enable_csi, no_csi_alarm_s=no_csi_alarm, duration_s=duration
     )
     line = StatusLine(status and not say.quiet)
     summaries = tap_modems(settings, port or [None], shown, on_status=line)

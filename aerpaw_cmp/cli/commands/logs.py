@@ -85,13 +85,7 @@ def _show(summary: Mapping[str, Any], every_stream: bool) -> None:
         say(note)
 
 
-@command(
-    "formats",
-    examples=[
-        "aerpaw-cmp formats",
-        "aerpaw-cmp formats --json",
-    ],
-)
+@command("formats", examples=["aerpaw-cmp formats", "aerpaw-cmp formats --json"])
 def formats() -> None:
     """List the readers with a sample line each."""
     from ...logs.readers import catalogue

@@ -11,13 +11,7 @@ from ..app import command
 from ..shown import answered, records, say, show
 
 
-@command(
-    "bench",
-    examples=[
-        "aerpaw-cmp bench --quick",
-        "aerpaw-cmp bench --poses 500 --json",
-    ],
-)
+@command("bench", examples=["aerpaw-cmp bench --quick", "aerpaw-cmp bench --poses 500 --json"])
 def bench(
     poses: Annotated[int, Option(min=2, help="Poses of the flight that is replayed.")] = 200,
     quick: Annotated[bool, Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
@@ -47,13 +41,7 @@ def bench(
         show(f"{name}: {ratio:.3g} times")
 
 
-@command(
-    "doctor",
-    examples=[
-        "aerpaw-cmp doctor",
-        "aerpaw-cmp doctor --json",
-    ],
-)
+@command("doctor", examples=["aerpaw-cmp doctor", "aerpaw-cmp doctor --json"])
 def doctor() -> int:
     """Check this machine."""
     from ...machine import doctor as doctor_room

@@ -101,10 +101,7 @@ _ROUTES = Option("--route", metavar="FILE", help="Another candidate: .plan, KML,
     ],
 )
 def plan(
-    target: Annotated[
-        str,
-        Argument(help="Target: sphere (all directions), a site (a grid), a route, or points."),
-    ],
+    target: Annotated[str, Argument(help="Target: sphere (all directions), a site (a grid), a route, or points.")],
     flights: Flights = None,
     site: Annotated[str | None, Option(help="Site, if no flight names it.")] = None,
     tower: Annotated[
@@ -181,8 +178,7 @@ def channel(
     tower: Annotated[list[str] | None, Option(help="Tower; repeatable  [default: those of the logs]")] = None,
     step: Annotated[float, Option(min=0.001, help="Time between poses [s].")] = 1.0,
     formats: Annotated[
-        list[str] | None,
-        Option("--format", help="netcdf, npz, deepmimo, csv, all; repeatable  [default: netcdf]"),
+        list[str] | None, Option("--format", help="netcdf, npz, deepmimo, csv, all; repeatable  [default: netcdf]")
     ] = None,
     bandwidth: Annotated[
         float | None, Option(min=1.0, help="Also H at the subcarriers of a band of this width [Hz] (NetCDF).")

@@ -25,10 +25,7 @@ from ..shown import answered, print_files, say, show, table, warn_all
 )
 def site_import(
     out: Annotated[Path, output("The site.yaml to write.", "FILE")],
-    files: Annotated[
-        list[Path],
-        Argument(help="Map files, or one Mitsuba XML"),
-    ],
+    files: Annotated[list[Path], Argument(help="Map files, or one Mitsuba XML")],
     base: Annotated[
         str | None,
         Option(help="Site whose towers and settings are kept  [default: lake_wheeler for a map without --tower]"),
@@ -105,10 +102,7 @@ def site_export(
     "show",
     of=site_app,
     text="Plan of a site, and a standalone page that shows it in 3-D.",
-    examples=[
-        "aerpaw-cmp site show",
-        "aerpaw-cmp site show site.yaml -o reports/site",
-    ],
+    examples=["aerpaw-cmp site show", "aerpaw-cmp site show site.yaml -o reports/site"],
 )
 def site_show(
     site: Annotated[str, Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
@@ -183,8 +177,7 @@ def map_(
         list[float] | None, Option(help="Height of rank maps [m]; repeatable  [default: 3 and 30 to 110 by 10]")
     ] = None,
     k: Annotated[
-        list[float] | None,
-        Option("-k", "--k", help="Singular-value ratio K; repeatable  [default: 10, 100, 1000]"),
+        list[float] | None, Option("-k", "--k", help="Singular-value ratio K; repeatable  [default: 10, 100, 1000]")
     ] = None,
     carrier_ghz: Annotated[float | None, Option(help="Carrier frequency [GHz]  [default: 3.4]")] = None,
     max_depth: Annotated[int | None, Option(min=0, max=3, help="Largest number of reflections  [default: 2]")] = None,

@@ -170,12 +170,3 @@ def _interpolation(outcome: MapOutcome) -> dict[str, str]:
     ours["mae_by_k"] = _by_k(ks, [finite_mean(column) for column in mae.T], "{:.3f}")
     ours["worst_height"] = _by_k(ks, [heights[i] for i in worst], "{:g} m")
     return ours
-
-
-def paper_markdown(rows: Iterable[PaperRow]) -> str:
-    """Return the rows as a Markdown table."""
-    lines = ["| where | what | paper | here | figure (--figures png) |", "| --- | --- | --- | --- | --- |"]
-    for row in rows:
-        figure = f"`figures/{row.figure}.png`" if row.figure else ""
-        lines.append(f"| {row.where} | {row.what} | {row.paper} | {row.ours} | {figure} |")
-    return "\n".join(lines) + "\n"

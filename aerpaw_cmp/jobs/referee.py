@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -477,22 +477,6 @@ class SeriesVerdict:
     differences: Mapping[str, PairedDifference]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RankVerdict:
-    """Predicted ranks of one tower and those of ray tracing, on the same samples.
-
-    ``scores`` has kappa, total variation and agreement by model. ``log_score`` and ``constant_log_score`` are those of
-    probabilities, if the prediction has them.
-    """
-
-    tower: str
-    matched: int
-    unmatched: int
-    scores: Mapping[str, Mapping[str, float]]
-    log_score: float | None = None
-    constant_log_score: float | None = None
-
-
 # Numbers of a card in the tables, with their heads.
 _HEADS = {
     "bias_db": "bias dB", "rmse_db": "RMSE dB", "rmse_offset_db": "RMSE after offset dB", "rmse_1s_db": "RMSE 1 s dB",
@@ -500,86 +484,9 @@ _HEADS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
-    """The scores of one prediction on one flight."""
-
-    name: str
-    sha256: str
-    program: str
-    series: tuple[SeriesVerdict, ...]
-    ranks: tuple[RankVerdict, ...]
-    remarks: tuple[str, ...]
-
-    def metrics(self) -> dict[str, Any]:
-        """Return the entry of ``referee`` in metrics.json and of card.json."""
-        levels: dict[str, dict[str, SeriesVerdict]] = {}
-        for item in self.series:
-            levels.setdefault(item.tower, {})[item.channel] = item
-        heads = "prediction minus model dB", "95 % low", "95 % high"
-        result: dict[str, Any] = json_safe({
-            "prediction": self.name,
-            "sha256": self.sha256,
-            "program": self.program,
-            "fitted_on_this_flight": ["the offset of each model and channel"],
-            "sentence": self.sentence(),
-            "remarks": self.remarks,
-            "means": self.means(),
-            "levels": levels,
-            "rank": {item.tower: item for item in self.ranks},
-            "table": {"columns": ("series", "model", "n", *_HEADS.values(), *heads), "rows": list(self._rows())},
-        })  # fmt: skip
-        return result
-
-    def means(self) -> list[dict[str, Any]]:
-        """Return the means over channels of each model. None for a number that is missing for a channel."""
-        rows = []
-        for model in dict.fromkeys(name for item in self.series for name in item.cards):
-            cards = [item.cards[model] for item in self.series if model in item.cards]
-            values = {key: [getattr(card, key) for card in cards] for key in _HEADS}
-            means = {key: None if None in of else float(np.mean(of)) for key, of in values.items()}
-            rows.append({"model": model, "channels": len(cards), **means})
-        return rows
-
-    def _rows(self) -> Iterator[tuple[Any, ...]]:
-        """Yield one row per series and model for page and card.json."""
-        for item in self.series:
-            for name, card in item.cards.items():
-                pair = item.differences.get(name)
-                apart = (None,) * 3 if pair is None else (pair.difference_db, *pair.difference_ci95_db)
-                yield f"{item.tower} {item.channel}", name, card.n, *(getattr(card, key) for key in _HEADS), *apart
-
-    def sentence(self) -> str:
-        """Return both errors, whether the difference is significant, and the errors as predicted."""
-        if not self.series:
-            return f"{self.name}: ranks only."
-        both = [s for s in self.series if OURS in s.differences]
-        theirs, mine = (
-            float(np.mean([s.cards[name].rmse_offset_db for s in both or self.series if name in s.cards] or [np.nan]))
-            for name in (self.name, OURS)
-        )
-        texts = [f"{self.name}: RMSE {theirs:.1f} dB after one offset per channel. Ray tracing has no level there."]
-        if both:
-            words = {kind: sum(s.differences[OURS].verdict == kind for s in both) for kind in ("better", "worse")}
-            decided = " and ".join(f"significantly {kind} on {n}" for kind, n in words.items() if n)
-            texts = [
-                f"{self.name}: RMSE {theirs:.1f} dB after one offset per channel, ray tracing {mine:.1f} dB on the "
-                f"same samples ({counted(len(both), 'channel')}). It is "
-                f"{decided or 'on no channel significantly different from ray tracing'} (95 %)."
-            ]
-        stated = self.means()[0]
-        if stated["rmse_db"] is not None:
-            band = stated["coverage_90"]
-            inside = "" if band is None else f"; the 90 % band contains {100 * band:.0f} % of the samples"
-            texts.append(f"As predicted, without an offset: RMSE {stated['rmse_db']:.1f} dB{inside}.")
-        lost, matched = sum(s.unmatched for s in self.series), sum(s.matched for s in self.series)
-        without = f"{counted(matched, 'sample')} have a prediction, {counted(lost, 'sample')} have none."
-        return " ".join([*texts, without if lost else f"All {counted(matched, 'sample')} have a prediction."])
-
-
 def judge(
     given: ForeignPrediction, data: FlightData, result: FlightResult, near_m: float = AGAINST_DISTANCE_M
-) -> Verdict:
+) -> dict[str, Any]:
     """Score a prediction on a flight.
 
     Parameters
@@ -593,7 +500,8 @@ def judge(
 
     Returns
     -------
-    Verdict
+    dict
+        The entry of ``referee`` in metrics.json and of card.json.
 
     Raises
     ------
@@ -601,7 +509,7 @@ def judge(
         If none of the predictions is near a sample.
     """
     series = [s for item in result.rss if given.quantity and (s := _series(given, item, data, near_m)) is not None]
-    ranks = [r for tower in result.rank if (r := _ranks(given, tower, data, near_m)) is not None]
+    ranks = {tower.tower: r for tower in result.rank if (r := _ranks(given, tower, data, near_m)) is not None}
     if not series and not ranks:
         raise InputError(
             f"fewer than {FEWEST} samples of the flight have a prediction nearby",
@@ -613,9 +521,71 @@ def judge(
     if series and lost > 0.1 * sum(s.matched + s.unmatched for s in series):
         where = "times of the prediction" if given.timed else f"predicted positions (within {near_m:g} m)"
         remarks += (f"{name}: {counted(lost, 'sample')} lie outside the {where} and are not scored.",)
-    return Verdict(
-        name=name, sha256=given.sha256, program=given.program, series=tuple(series), ranks=tuple(ranks), remarks=remarks
-    )
+    levels: dict[str, dict[str, SeriesVerdict]] = {}
+    for item in series:
+        levels.setdefault(item.tower, {})[item.channel] = item
+    means = _means(series)
+    heads = "series", "model", "n", *_HEADS.values(), "prediction minus model dB", "95 % low", "95 % high"
+    entry: dict[str, Any] = json_safe({
+        "prediction": name,
+        "sha256": given.sha256,
+        "program": given.program,
+        "fitted_on_this_flight": ["the offset of each model and channel"],
+        "sentence": _sentence(name, series, means[0]) if series else f"{name}: ranks only.",
+        "remarks": remarks,
+        "means": means,
+        "levels": levels,
+        "rank": ranks,
+        "table": {"columns": heads, "rows": list(_rows(series))},
+    })  # fmt: skip
+    return entry
+
+
+def _means(series: Sequence[SeriesVerdict]) -> list[dict[str, Any]]:
+    """Return the means over channels of each model. None for a number that is missing for a channel."""
+    rows = []
+    for model in dict.fromkeys(name for item in series for name in item.cards):
+        cards = [item.cards[model] for item in series if model in item.cards]
+        values = {key: [getattr(card, key) for card in cards] for key in _HEADS}
+        means = {key: None if None in of else float(np.mean(of)) for key, of in values.items()}
+        rows.append({"model": model, "channels": len(cards), **means})
+    return rows
+
+
+def _rows(series: Sequence[SeriesVerdict]) -> Iterator[tuple[Any, ...]]:
+    """Yield one row per series and model for page and card.json."""
+    for item in series:
+        for name, card in item.cards.items():
+            pair = item.differences.get(name)
+            apart = (None,) * 3 if pair is None else (pair.difference_db, *pair.difference_ci95_db)
+            yield f"{item.tower} {item.channel}", name, card.n, *(getattr(card, key) for key in _HEADS), *apart
+
+
+def _sentence(name: str, series: Sequence[SeriesVerdict], mean: Mapping[str, Any]) -> str:
+    """Return both errors, whether the difference is significant, and the errors as predicted (``mean``)."""
+    both = [s for s in series if OURS in s.differences]
+    if both:
+        theirs, mine = (np.mean([s.cards[model].rmse_offset_db for s in both]) for model in (name, OURS))
+        words = {kind: sum(s.differences[OURS].verdict == kind for s in both) for kind in ("better", "worse")}
+        decided = " and ".join(f"significantly {kind} on {n}" for kind, n in words.items() if n)
+        text = (
+            f"{name}: RMSE {theirs:.1f} dB after one offset per channel, ray tracing {mine:.1f} dB on the same samples "
+            f"({counted(len(both), 'channel')}). It is "
+            f"{decided or 'on no channel significantly different from ray tracing'} (95 %)."
+        )
+    else:
+        text = (
+            f"{name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel. "
+            "Ray tracing has no level there."
+        )
+    if mean["rmse_db"] is not None:
+        band = mean["coverage_90"]
+        inside = "" if band is None else f"; the 90 % band contains {100 * band:.0f} % of the samples"
+        text += f" As predicted, without an offset: RMSE {mean['rmse_db']:.1f} dB{inside}."
+    lost, matched = (sum(getattr(s, key) for s in series) for key in ("unmatched", "matched"))
+    if lost:
+        return f"{text} {counted(matched, 'sample')} have a prediction, {counted(lost, 'sample')} have none."
+    return f"{text} All {counted(matched, 'sample')} have a prediction."
 
 
 def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m: float) -> SeriesVerdict | None:
@@ -709,7 +679,11 @@ def predicted_at(
     return {name: np.where(near, part[name].to_numpy(np.float64)[index], np.nan) for name in names}, near
 
 
-def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData, near_m: float) -> RankVerdict | None:
+def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData, near_m: float) -> dict[str, Any] | None:
+    """Return kappa, total variation and agreement of predicted ranks and of ray tracing, on the same samples.
+
+    ``log_score`` and ``constant_log_score`` are those of probabilities, if the prediction has them.
+    """
     ranked = [name for name in ("rank", *RANKS) if name in given.table]
     part = given.table[(given.table["tower"] == item.tower) & given.table[ranked].notna().any(axis=1)]
     heading_deg = data.poses_at(item.time).heading_deg if data.track is not None else None
@@ -735,15 +709,12 @@ def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData, near_m:
         }
         for key, ranks in models.items()
     }
-    log_score = constant = None
-    if p is not None:
-        stated = scored & np.isfinite(p).all(axis=1)
-        forecast = score_forecast(item.measured[stated], p[stated], rank[stated], np.nanmean(p, axis=0))
-        log_score, constant = forecast.log_score, forecast.constant_log_score
-    return RankVerdict(
-        tower=item.tower, matched=int(scored.sum()), unmatched=int((~near).sum()), scores=scores,
-        log_score=log_score, constant_log_score=constant,
-    )  # fmt: skip
+    entry = {"tower": item.tower, "matched": int(scored.sum()), "unmatched": int((~near).sum()), "scores": scores}
+    if p is None:
+        return entry | {"log_score": None, "constant_log_score": None}
+    stated = scored & np.isfinite(p).all(axis=1)
+    forecast = score_forecast(item.measured[stated], p[stated], rank[stated], np.nanmean(p, axis=0))
+    return entry | {"log_score": forecast.log_score, "constant_log_score": forecast.constant_log_score}
 
 
 def _why_none(given: ForeignPrediction, result: FlightResult) -> str | None:

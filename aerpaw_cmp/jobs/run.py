@@ -261,7 +261,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             from .referee import judge
 
             with stages("score predictions"):
-                cards = [judge(item, data, flight_run.result, chosen.against_distance_m).metrics() for item in given]
+                cards = [judge(item, data, flight_run.result, chosen.against_distance_m) for item in given]
             record = replace(record, extra_metrics={**record.extra_metrics, "referee": cards})
         if target is not None:
             text, sentence = recommended_text(load_flight(flight), flight_run.ladder, flight)
@@ -440,7 +440,7 @@ def run_map(
     from ..report.maps import maps_metrics, write_maps
     from ..site.siteyaml import inputs_of_site, load_site
     from . import coverage_map as mapping
-    from .paper_table import paper_markdown, paper_rows
+    from .paper_table import paper_rows
     from .sources import files_of, named_flights
     from .workers import open_workers
 
@@ -478,9 +478,6 @@ def run_map(
                 outcome, name=Path(site).stem, stages_s=stages.seconds, paper=paper_rows(outcome)
             )
             written = write_maps(record, part, figures)
-            if record.paper:
-                written.append(part / "paper.md")
-                written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
         if outcome.store is not None:
             outcome.store.remove()
         return JobOutcome(folder=folder, metrics=maps_metrics(record), files=output.placed([*written, *files]))

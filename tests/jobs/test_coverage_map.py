@@ -213,8 +213,7 @@ def test_the_page_shows_every_figure_of_the_paper_rows(made):
     folder, printed = made
     html = (folder / "map.html").read_text()
     stems = {path.stem for path in (folder / "figures").glob("*.png")}
-    table = (folder / "paper.md").read_text()
-    named = {part.removeprefix("figures/").removesuffix(".png") for part in table.split("`") if ".png" in part}
+    named = {row["figure"] for row in printed["paper"]} - {""}
     assert named
     assert named <= stems
     assert "(c) OpenStreetMap contributors, ODbL" in html

@@ -223,14 +223,15 @@ def said(flown, tmp_path):
 def test_a_flown_route_is_scored_by_what_was_said(said):
     _, folder, scored = said
     verdict = scored()
-    (series,) = verdict.series
-    card = series.cards[folder.name]
+    series = verdict["levels"]["LW1"]["USRP1"]
+    card = series["cards"][folder.name]
     # the flight waits at its waypoints: there a sample is scored by a neighbour's level
-    assert card.bias_db == pytest.approx(-2.0, abs=0.3)
-    assert series.unmatched == 0
-    assert card.rmse_db == pytest.approx(np.hypot(card.bias_db, card.rmse_offset_db), abs=0.1)
-    assert 0.9 < card.coverage_90 < 1.0
-    assert f"As predicted, without an offset: RMSE {card.rmse_db:.1f} dB; the 90 % band contains" in verdict.sentence()
+    assert card["bias_db"] == pytest.approx(-2.0, abs=0.3)
+    assert series["unmatched"] == 0
+    assert card["rmse_db"] == pytest.approx(np.hypot(card["bias_db"], card["rmse_offset_db"]), abs=0.1)
+    assert 0.9 < card["coverage_90"] < 1.0
+    stated = f"As predicted, without an offset: RMSE {card['rmse_db']:.1f} dB; the 90 % band contains"
+    assert stated in verdict["sentence"]
 
 
 def test_levels_of_a_first_prediction_count_for_every_channel_after_an_offset(said):
@@ -240,10 +241,12 @@ def test_levels_of_a_first_prediction_count_for_every_channel_after_an_offset(sa
     pd.concat([frame, frame.assign(channel="rank", level_db=np.nan)]).to_csv(folder / "prediction.csv", index=False)
     about = json.loads((folder / "metrics.json").read_text()) | {"series": {"LW1 level": {"unit": "dBm"}}}
     (folder / "metrics.json").write_text(json.dumps(about))
-    series = scored().series
-    assert [(s.tower, s.channel) for s in series] == [("LW1", "USRP1"), ("LW1", "USRP2")]
-    assert all(s.cards[folder.name].bias_db is None for s in series)
-    assert series[0].cards[folder.name].offset_db == pytest.approx(2.0, abs=0.3)
+    levels = scored()["levels"]
+    assert list(levels) == ["LW1"]
+    cards = {channel: entry["cards"][folder.name] for channel, entry in levels["LW1"].items()}
+    assert set(cards) == {"USRP1", "USRP2"}
+    assert all(card["bias_db"] is None for card in cards.values())
+    assert cards["USRP1"]["offset_db"] == pytest.approx(2.0, abs=0.3)
 
 
 def test_a_neighbour_stands_for_the_rank_of_a_point(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -295,12 +298,11 @@ def test_predicted_ranks_are_scored_where_they_were_flown(said, levels):
     table = pd.read_csv(folder / "prediction.csv")
     pd.concat([table if levels else table[:0], said_ranks]).to_csv(folder / "prediction.csv", index=False)
     verdict = scored()
-    (ranks,) = verdict.ranks
-    assert ranks.tower == ranked.tower
-    assert ranks.scores[folder.name]["kappa"] > 0.9  # where the flight waits, a neighbour's rank stands for its own
-    assert ranks.log_score == pytest.approx(-np.log(0.7), abs=0.1)
-    assert ranks.constant_log_score > ranks.log_score
-    assert len(verdict.series) == int(levels)
+    ranks = verdict["rank"][ranked.tower]
+    assert ranks["scores"][folder.name]["kappa"] > 0.9  # at waypoints, a neighbour's rank stands for its own
+    assert ranks["log_score"] == pytest.approx(-np.log(0.7), abs=0.1)
+    assert ranks["constant_log_score"] > ranks["log_score"]
+    assert len(verdict["levels"]) == int(levels)
 
 
 def test_a_prediction_that_learned_from_the_flight_is_refused(said):

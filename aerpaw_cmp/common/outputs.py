@@ -522,7 +522,6 @@ class _Place:
             )
 
     def _claim(self, folder: bool) -> int:
-        fault = None
         for _ in range(1000):  # another run may remove it between our steps
             try:
                 if folder:
@@ -533,12 +532,10 @@ class _Place:
                     # links are not followed, because another user could have put one into a shared folder; private
                     # until finished
                     descriptor = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
-            except FileNotFoundError as error:
+            except FileNotFoundError:
                 if not self.part.parent.is_dir():
                     raise
-                fault = error
                 continue
-            fault = None
             if not _is_own(os.fstat(descriptor)):
                 os.close(descriptor)
                 raise UsageError(
@@ -547,16 +544,13 @@ class _Place:
                     cause="a shared folder, whose other user could replace the results before they are complete",
                     path=self.named,
                 )
-            if not _lock(descriptor):
-                os.close(descriptor)
-                raise self._busy()
-            if self._is_there(descriptor):
+            mine = _lock(descriptor)
+            if mine and self._is_there(descriptor):
                 return descriptor
             os.close(descriptor)
-        raise fault or self._busy()
-
-    def _busy(self) -> UsageError:
-        return UsageError(
+            if not mine:
+                break
+        raise UsageError(
             "another run is writing here", expected="one run at a time, or another name after -o", path=self.named
         )
 

@@ -121,9 +121,8 @@ def _entries(folder: Path, pattern: str) -> list[Path]:
     return [folder / name for name in sorted(names) if fnmatch.fnmatchcase(name, pattern)]
 
 
-def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
+def find_candidates(roots: Roots) -> list[PortInfo]:
     """Return AT ports of Quectel modems, the likeliest first: by-id names, then USB interface numbers."""
-    roots = roots or Roots()
     ports: list[PortInfo] = []
     by_name = roots.usb()
     for interface in _AT_INTERFACES:
@@ -140,8 +139,8 @@ def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
     return ports
 
 
-def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
-    """The port to open now.
+def find_port(path: Path, roots: Roots) -> PortInfo:
+    """Return what is known of a port.
 
     A given ``/dev/ttyUSB*`` that a by-id name leads to is followed by that name, so that it is found again when the
     modem comes back under another number.
@@ -151,24 +150,13 @@ def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
     PortGoneError
         If it is not there.
     """
-    roots = roots or Roots()
-    if port is None:
-        candidates = find_candidates(roots)
-        if not candidates:
-            raise PortGoneError("no AT port of a Quectel modem (USB 2c7c, interface 02 or 03) is there")
-        return candidates[0]
-    path = Path(port)
     if not path.exists():
         raise PortGoneError(f"{path} is not there")
     by_name = roots.usb()
-    usb = by_name.get(path.resolve().name) or by_name.get(path.name)
-    interface, product = (usb[1], usb[0]) if usb else (None, None)
-    by_id = roots.dev / "serial/by-id"
-    if path.parent == roots.dev:
-        for link in _entries(by_id, "*"):
-            if link.resolve() == path.resolve():
-                return PortInfo(link, path.resolve(), "by-id", interface, product)
-    return PortInfo(path, path.resolve(), "given", interface, product)
+    product, interface = by_name.get(path.resolve().name) or by_name.get(path.name) or (None, None)
+    links = _entries(roots.dev / "serial/by-id", "*") if path.parent == roots.dev else []
+    link = next((link for link in links if link.resolve() == path.resolve()), None)
+    return PortInfo(link or path, path.resolve(), "by-id" if link else "given", interface, product)
 
 
 def holders(path: Path, *, others_only: bool = True) -> list[Holder]:
@@ -405,15 +393,11 @@ class TapSettings:
     roots: Roots = field(default_factory=Roots)
 
     def __post_init__(self) -> None:
-        # this form of the test also refuses NaN
-        for name in ("ri_hz", "answer_timeout_s", "probe_timeout_s", "silent_s", "status_s", "reconnect_min_s"):
-            if not 0 < getattr(self, name) < 1e6:
-                raise UsageError(f"{name} is {getattr(self, name)}", expected="a positive number")
-        for name in ("other_hz", "pause_s"):
-            if not 0 <= getattr(self, name) < 1e6:
-                raise UsageError(f"{name} is {getattr(self, name)}", expected="zero or a positive number")
-        if self.no_csi_alarm_s is not None and not self.no_csi_alarm_s > 0:
-            raise UsageError(f"no_csi_alarm_s is {self.no_csi_alarm_s}", expected="a positive number of seconds")
+        for name in ("ri_hz", "no_csi_alarm_s", "duration_s"):
+            value = getattr(self, name)
+            # this form of the test also refuses NaN
+            if value is not None and not 0 < value < 1e6:
+                raise UsageError(f"{name} is {value}", expected="a positive number")
 
 
 @dataclass(frozen=True, slots=True)

@@ -266,8 +266,11 @@ class Tap:
         """Return the named port or every AT port at the start, and the same interface after a loss."""
         roots, last = self._settings.roots, self._info
         if last is None:
-            named = self._settings.port
-            return (ports.find_candidates(roots) if named is None else []) or [ports.find_port(named, roots)]
+            if self._settings.port is not None:
+                return [ports.find_port(Path(self._settings.port), roots)]
+            if candidates := ports.find_candidates(roots):
+                return candidates
+            raise ports.PortGoneError("no AT port of a Quectel modem (USB 2c7c, interface 02 or 03) is there")
         found = []
         with contextlib.suppress(ports.PortGoneError):
             now = ports.find_port(last.path, roots)

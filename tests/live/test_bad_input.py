@@ -303,7 +303,7 @@ def test_the_by_id_name_comes_first_and_is_followed(tmp_path):
     by_id.mkdir(parents=True)
     for interface in range(4):
         (by_id / f"usb-Quectel_RM502Q-AE-if0{interface}-port0").symlink_to(tmp_path / f"dev/ttyUSB{interface}")
-    first = find_port(None, roots)
+    first = find_candidates(roots)[0]
     assert (first.path.name, first.device.name, first.how) == ("usb-Quectel_RM502Q-AE-if02-port0", "ttyUSB2", "by-id")
     given = find_port(tmp_path / "dev/ttyUSB2", roots)
     assert given.path == first.path

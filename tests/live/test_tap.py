@@ -424,7 +424,7 @@ def test_status_line():
     [
         {"ri_hz": 0},
         {"ri_hz": float("nan")},
-        {"other_hz": -1},
+        {"duration_s": 0},
         {"no_csi_alarm_s": 0},
     ],
 )

@@ -50,11 +50,11 @@ def _feed(digest: Any, value: Any) -> None:
 # Keys in YAML and JSON files. The comments of a table have a colon after them.
 KEY, MARKS = "trained_on", "marks"
 
-# one pattern for a YAML list of either style, an array of JSON and the comment of a table
-_LIST = re.compile(KEY + r"""["']?[ \t]*:[\s\["',-]*((?:[0-9a-f]{64}[\s"',#-]*)+)""")
-_DIGEST = re.compile(r"[0-9a-f]{64}")
-_MARKS = re.compile(MARKS + r"""["']?[ \t]*:[\s\["',-]*((?:[0-9a-f.]{100,}[\s"',#-]*)+)""")
-_MARK = re.compile(r"[0-9a-f.]{100,}")
+
+def _listed(text: str, key: str, entry: str) -> tuple[str, ...]:
+    """Return the entries after a key in YAML lists of either style, arrays of JSON and comments of tables."""
+    lists = re.findall(key + rf"""["']?[ \t]*:[\s\["',-]*((?:{entry}[\s"',#-]*)+)""", text)
+    return union(*(re.findall(entry, part) for part in lists))
 
 
 def trained_on(text: str) -> tuple[str, ...]:
@@ -67,7 +67,7 @@ def trained_on(text: str) -> tuple[str, ...]:
     >>> trained_on('{"trained_on": []}')
     ()
     """
-    return union(*(_DIGEST.findall(part) for part in _LIST.findall(text)))
+    return _listed(text, KEY, "[0-9a-f]{64}")
 
 
 def marks(text: str) -> tuple[str, ...]:
@@ -78,7 +78,7 @@ def marks(text: str) -> tuple[str, ...]:
     >>> [mark[:3] for mark in marks("COMMENT marks: " + "7" * 120 + " " + "8" * 120)]
     ['777', '888']
     """
-    return union(*(_MARK.findall(part) for part in _MARKS.findall(text)))
+    return _listed(text, MARKS, "[0-9a-f.]{100,}")
 
 
 def union(*lists: Iterable[str]) -> tuple[str, ...]:

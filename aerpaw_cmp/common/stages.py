@@ -50,15 +50,6 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def share_of(progress: Progress, text: str) -> Callable[[float], None]:
-    """Return the progress of one step, for code that knows its share but not its name."""
-
-    def step(fraction: float) -> None:
-        progress(text, fraction)
-
-    return step
-
-
 @dataclass(frozen=True, slots=True)
 class PlannedStage:
     """A planned stage. ``work`` is its input, ``seconds`` its measured or estimated time, None if unknown."""

@@ -8,12 +8,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from ..common.errors import InputError
-from ..common.stages import Progress, Stages, logged, share_of
+from ..common.stages import Progress, Stages, logged
 from ..common.text import counted
 from ..common.units import BoolArray, FloatArray
 from ..compare.calibration import Observed
@@ -484,7 +485,7 @@ def replay_poses(
     long = alone and len(poses) > BLOCK
     run = Run(
         # the image engine finishes before a bar could be seen
-        progress=share_of(progress, name) if engine == "sionna" or long or towers_m is not None else None,
+        progress=partial(progress, name) if engine == "sionna" or long or towers_m is not None else None,
         extent_m=extent_m,
     )
     field = Field(path_loss(site, rt, link.carrier_hz))

@@ -19,7 +19,7 @@ import numpy as np
 from ..common.cf import file_attributes, netcdf_bytes
 from ..common.errors import InputError, UsageError, noting_interrupts
 from ..common.outputs import file_digest
-from ..common.stages import PlannedStage, Progress, Stages, share_of
+from ..common.stages import PlannedStage, Progress, Stages
 from ..common.text import counted
 from ..common.units import (
     THERMAL_NOISE_DBM_HZ,
@@ -465,7 +465,7 @@ def make_maps(
     outcome = MapOutcome(site, settings)
     grid = Grid.over_area(site.area_m, settings.spacing_m)
     crew = workers or InProcess()
-    share = share_of(stages.progress, "maps")
+    share = partial(stages.progress, "maps")
     tile_cells = None if out is None else settings.tile_cells(grid)
     # four tiles per worker: with one tile each, all would wait for the slowest worker
     shared = math.ceil(math.sqrt(len(grid) / (4 * crew.count)))

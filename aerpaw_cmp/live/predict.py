@@ -6,6 +6,7 @@ The tap passes a time and gets records back. The caller determines how a time be
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import os
@@ -142,7 +143,7 @@ class Asked:
 
 
 class PredictionWorker:
-    """A thread that runs ``predict``. While it is busy, further requests are dropped and counted.
+    """A thread that runs ``predict``. While it is busy, further requests are dropped.
 
     Parameters
     ----------
@@ -155,16 +156,13 @@ class PredictionWorker:
         self._wanted: queue.Queue[Asked | None] = queue.Queue(maxsize=1)
         self._done: deque[dict[str, Any]] = deque(maxlen=1000)
         self._rank, self._level = RunningInterval(), RunningInterval()
-        self.skipped = 0
         self._thread = threading.Thread(target=self._run, name="tap-prediction", daemon=True)
         self._thread.start()
 
     def ask(self, asked: Asked) -> None:
-        """Want the prediction for an answer."""
-        try:
+        """Request the prediction for an answer, unless a request waits already."""
+        with contextlib.suppress(queue.Full):
             self._wanted.put_nowait(asked)
-        except queue.Full:
-            self.skipped += 1
 
     def results(self) -> list[dict[str, Any]]:
         """Finished predictions, each with measured rank and residual (measured minus predicted)."""

@@ -7,7 +7,7 @@ import pytest
 
 from aerpaw_cmp.cli import shown
 from aerpaw_cmp.common import stages
-from aerpaw_cmp.common.stages import Stages, share_of
+from aerpaw_cmp.common.stages import Stages
 
 
 def test_stages_keep_their_order_and_add_up() -> None:
@@ -20,7 +20,7 @@ def test_stages_keep_their_order_and_add_up() -> None:
         _ = 1 / 0
     assert list(stages.seconds) == ["read", "replay", "fails"]
     assert stages.seconds["read"] >= 0.004 > 0.002 <= stages.seconds["replay"]
-    share_of(stages.progress, "maps")(0.5)
+    stages.progress("maps", 0.5)
     assert calls == [("read", None), ("replay", None), ("fails", None), ("maps", 0.5)]
 
 
@@ -30,7 +30,7 @@ def test_calls_from_python_log_their_progress(
     with caplog.at_level("DEBUG", logger="aerpaw_cmp"):
         stages = Stages()
         with stages("replay"):
-            share_of(stages.progress, "replay LW1")(0.5)
+            stages.progress("replay LW1", 0.5)
     lines = [(record.name, record.levelname, record.getMessage()) for record in caplog.records]
     assert lines == [("aerpaw_cmp", "INFO", "replay"), ("aerpaw_cmp", "DEBUG", "replay LW1 50 %")]
     assert capfd.readouterr() == ("", "")

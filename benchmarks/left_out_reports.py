@@ -107,7 +107,7 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
         scores["flight_left_out"] = flight_left_out(observed, chosen, learned)
     calibration = Calibration(
         settings=settings, flights=tuple(flights), campaigns=campaigns, observed=tuple(observed), scores=scores,
-        controls={}, learned=learn([o.samples for o in observed], chosen), curve=(), ground=_NO_RAY, warnings=(),
+        controls={}, learned=learn([o.samples for o in observed], chosen), ground=_NO_RAY, warnings=(),
         words=(), locks=learned_locks(observed, chosen, learned), health=learned_healths(observed, learned),
         teaching=teaching(observed, campaigns, learned),
     )  # fmt: skip
@@ -191,7 +191,7 @@ def joint(field: Path, folder: Path) -> None:
         recipe, fits = recipe_of(settings, observed, field), dict[str, Learned]()
         splits = {"flight": flight_left_out(observed, recipe, fits)}
         for split, parts in (("altitude", altitude_parts), ("sector", sector_parts), ("heading", heading_parts)):
-            splits[split] = parts_left_out(observed, recipe, fits, parts, own_rest=False)
+            splits[split] = parts_left_out(observed, recipe, fits, parts)
         print(f"learned from {', '.join(settings.campaigns)}")
         turned = [campaign_left_out(observed, recipe, turn) for turn in (90.0, 180.0, 270.0)]
         splits["campaign"] = campaign_left_out(observed, recipe)

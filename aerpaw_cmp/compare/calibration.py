@@ -1,7 +1,6 @@
 """The antenna gain learned from flights, its scores on held-out data, and the choice of a prediction.
 
-Learned antennas are scored on held-out flights, heights, sectors and headings, and against the number of flights that
-they were learned from.
+Learned antennas are scored on held-out flights, heights, sectors and headings.
 
 A prediction has a *base*, which predicts levels above free space: a constant level, free space, a replay or learned
 antennas. Its *correction* is the residual field (:mod:`.field_gp`) of the base. Both are chosen by the CRPS on held-out
@@ -11,7 +10,6 @@ flights, or on blocks of a single flight. There is no correction unless a 95 % i
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -47,18 +45,13 @@ SECTORS = 6
 # Guard around a held-out sector [deg]: directions within it are not used for learning either.
 _GUARD_DEG = 10.0
 
-STRETCHES = 8
-GUARD_S = 20.0
 _CRUISE_M = 5.0
 _LEAST_SAMPLES = 50
 
 # Fields of :class:`Score` with the errors of baselines, and their titles.
 BASELINES = {f"{name}_rmse_db": BASELINE_TITLE[name] for name in ("free_space", "log_distance", "constant")}
 
-SPLITS = (
-    *("flight_left_out", "altitude_left_out", "heading_left_out", "sector_left_out", "route_left_out"),
-    "campaign_left_out",
-)
+SPLITS = ("flight_left_out", "altitude_left_out", "heading_left_out", "sector_left_out", "campaign_left_out")
 
 
 @dataclass(frozen=True, slots=True)
@@ -442,8 +435,6 @@ def parts_left_out(
     recipe: Recipe,
     without: Mapping[str, Learned],
     parts: Parts,
-    *,
-    own_rest: bool,
 ) -> tuple[Score, ...]:
     """Score each flight as predicted part by part, from other flights without samples that are like the part.
 
@@ -457,9 +448,7 @@ def parts_left_out(
     without : mapping of str to Learned
         What was learned without each flight. Its strengths are used again.
     parts : callable
-        :func:`altitude_parts`, :func:`heading_parts`, :func:`sector_parts` or :func:`route_parts`.
-    own_rest : bool
-        True to learn from the rest of the flight, too.
+        :func:`altitude_parts`, :func:`heading_parts` or :func:`sector_parts`.
 
     Returns
     -------
@@ -473,7 +462,7 @@ def parts_left_out(
     # loop over parts first: the training data of the flights are nearly the same, and their kernels are cached
     for k in range(max(len(parts(mine[0], mine[0])) for mine in of.values())):
         for flight, mine in of.items():
-            sources = list(observed) if own_rest else [o for o in observed if o.samples.flight != flight]
+            sources = (o for o in observed if o.samples.flight != flight)
             train = [o.part(parts(mine[0], o)[k][1]).samples for o in sources]
             train = [s for s in train if np.isfinite(s.residual_db).sum() >= _LEAST_SAMPLES]
             if not train or not any(parts(o, o)[k][0].any() for o in mine):
@@ -538,23 +527,6 @@ def _angular(mine: FloatArray, sources: FloatArray, count: int, guard_deg: float
     return out
 
 
-def route_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
-    """Return segments of the scored flight in time, with a guard. All samples of other flights are used."""
-    time = scored.samples.time_s
-    # extend the last segment to include the last sample
-    edges = np.linspace(time.min(), time.max() + 1e-6, STRETCHES + 1)
-    out = []
-    for low, high in itertools.pairwise(edges):
-        mine = (time >= low) & (time < high)
-        if source.samples.flight == scored.samples.flight:
-            source_time = source.samples.time_s
-            outside = (source_time < low - GUARD_S) | (source_time >= high + GUARD_S)
-        else:
-            outside = np.ones(len(source.samples), np.bool_)
-        out.append((mine, outside))
-    return out
-
-
 def world_frame(observed: Sequence[Observed]) -> list[Observed]:
     """Return the samples with the UAV's directions in world axes, as a control: no antenna is fixed there."""
     return [_with_uav(o, -o.samples.at_tower) for o in observed]
@@ -574,115 +546,6 @@ def wrong_way(observed: Sequence[Observed]) -> list[Observed]:
 
 def _with_uav(o: Observed, at_uav: FloatArray) -> Observed:
     return dataclasses.replace(o, samples=dataclasses.replace(o.samples, at_uav=at_uav))
-
-
-# Largest number of subsets per number of flights. If there are more, subsets of consecutive flights are used.
-_MOST_FITS = 6
-
-# Largest number of points of a learning curve.
-_MOST_SIZES = 6
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CurvePoint:
-    """The mean error for one number of training flights [dB], over all subsets and the same series.
-
-    Parameters
-    ----------
-    flights : int
-        Number of training flights.
-    rmse_db, rmse_4s_db : float
-        RMSE as logged and over 4 s, after one offset.
-    fits : int
-        Number of subsets.
-    series : int
-        Number of flights and channels.
-    """
-
-    flights: int
-    rmse_db: float
-    rmse_4s_db: float
-    fits: int
-    series: int
-
-
-def learning_curve(observed: Sequence[Observed], recipe: Recipe) -> tuple[CurvePoint, ...]:
-    """Compute the error against the number of training flights, by subsets of the flights.
-
-    Parameters
-    ----------
-    observed : sequence of Observed
-        Samples of all flights.
-    recipe : Recipe
-        Terms whose strengths are fitted within each subset.
-
-    Returns
-    -------
-    tuple of CurvePoint
-        One point per number of flights, up to all but the predicted flight. Empty for fewer than three flights.
-    """
-    flights = flights_of(observed)
-    if len(flights) < 3:
-        return ()
-    sizes = np.unique(np.linspace(1, len(flights) - 1, min(len(flights) - 1, _MOST_SIZES)).round().astype(int))
-    errors: dict[int, dict[tuple[str, str], list[tuple[float, float]]]] = {}
-    fits: dict[int, int] = {}
-    for size in map(int, sizes):
-        subsets = _subsets(flights, size)
-        fits[size], errors[size] = len(subsets), {}
-        for subset in subsets:
-            learned = learn([o.samples for o in observed if o.samples.flight in subset], recipe)
-            known = {o.samples.antenna for o in observed if o.samples.flight in subset}
-            targets = [o for o in observed if o.samples.flight not in subset and o.samples.antenna in known]
-            for scored in filter(None, (score(o, learned.mean(o.samples)) for o in targets)):
-                key = scored.flight, f"{scored.tower}.{scored.channel}"
-                errors[size].setdefault(key, []).append((scored.rmse_db, scored.rmse_4s_db))
-    # use the same series for every number of flights: otherwise a curve could fall because a difficult flight is
-    # missing
-    common = set.intersection(*(set(each) for each in errors.values()))
-    if not common:
-        return ()
-    points = []
-    for size, each in errors.items():
-        rmse, rmse_4s = np.mean([np.mean(each[key], axis=0) for key in sorted(common)], axis=0)
-        points.append(
-            CurvePoint(
-                flights=size, rmse_db=float(rmse), rmse_4s_db=float(rmse_4s), fits=fits[size], series=len(common)
-            )
-        )
-    return tuple(points)
-
-
-def _subsets(flights: Sequence[str], size: int) -> list[set[str]]:
-    """Return all subsets of a size, or runs of consecutive flights (cyclic) with evenly spread starts."""
-    if math.comb(len(flights), size) <= _MOST_FITS:
-        return [set(subset) for subset in itertools.combinations(flights, size)]
-    twice = [*flights, *flights]
-    begins = np.unique(np.linspace(0, len(flights), min(len(flights), _MOST_FITS), endpoint=False).round().astype(int))
-    return [set(twice[begin : begin + size]) for begin in begins]
-
-
-def with_one_more(points: Sequence[CurvePoint], name: str = "rmse_db") -> float:
-    """Return the error to expect with one more flight than the last point [dB], NaN for a single point.
-
-    Notes
-    -----
-    The square of the error is fitted as ``a + b / flights`` with b >= 0, where ``b / flights`` averages out. The last
-    three points are used, because the first flights share few directions and the error falls slowly.
-
-    Examples
-    --------
-    >>> points = [CurvePoint(flights=n, rmse_db=(9 + 7 / n) ** 0.5, rmse_4s_db=3.0, fits=1, series=1) for n in (1, 2)]
-    >>> round(with_one_more(points) ** 2, 6) == round(9 + 7 / 3, 6)
-    True
-    """
-    if len(points) < 2:
-        return math.nan
-    x = np.array([1.0 / p.flights for p in points[-3:]])
-    square = np.array([getattr(p, name) ** 2 for p in points[-3:]])
-    slope = max(float(np.polyfit(x, square, 1)[0]), 0.0)
-    last = points[-1].flights
-    return math.sqrt(max(float(square[-1]) - slope * (1.0 / last - 1.0 / (last + 1)), 0.0))
 
 
 # Function that predicts level above free space (n,) and its standard deviation (n,) [dB]. It does not use residuals.

@@ -28,7 +28,6 @@ from ..common.yamlfile import StrictModel, load_yaml
 from ..compare import calibration, gains
 from ..compare.calibration import (
     BIN_S,
-    CurvePoint,
     Learned,
     Observed,
     Recipe,
@@ -36,7 +35,6 @@ from ..compare.calibration import (
     flights_of,
     groups_of,
     learn,
-    learning_curve,
 )
 from ..compare.gains import FlightEvidence, GainOf, KnownProcess
 from ..compare.health import HeldOut, learned_health
@@ -292,7 +290,6 @@ class Calibration:
     scores: Mapping[str, tuple[Score, ...]]
     controls: Mapping[str, tuple[Score, ...]]
     ground: GroundFit
-    curve: tuple[CurvePoint, ...]
     locks: Mapping[str, LearnedLock]
     """Lock models by antenna, for receivers that lose their lock."""
     health: Mapping[str, LearnedHealth]
@@ -392,7 +389,7 @@ def calibrate(
     with stages("read"):
         further = [load_data(load_with_learned(path), path.parent, logs_root) for path in score]
     series = [o.samples for o in observed]
-    rest = [("fit, ground, scores, curve", ", ".join(sorted({samples.antenna for samples in series})))]
+    rest = [("fit, ground, scores", ", ".join(sorted({samples.antenna for samples in series})))]
     rest += [("score", counted(len(score), "flight"))] if score else []
     rest += [("rank", "of all flights")] if settings.rank else []
     stages.checked(lambda: [PlannedStage(*row) for row in rest])
@@ -407,8 +404,6 @@ def calibrate(
         stages.progress("scores", 1.0)
         locks, health = learned_locks(observed, recipe, fits), learned_healths(observed, fits)
         taught = teaching(observed, campaigns, fits)
-    with stages("curve"):
-        curve = learning_curve(observed, recipe)
     warnings += [*_mount_warnings(learned), *_contradictions(scores["campaign_left_out"], controls, campaigns)]
     if further:
         with stages("score"):
@@ -423,15 +418,11 @@ def calibrate(
         scores=scores,
         controls=controls,
         ground=ground,
-        curve=curve,
         locks=locks,
         health=health,
         teaching=taught,
         warnings=tuple(warnings),
-        words=(
-            *sentences(scores, controls, ground.likely_m, curve),
-            *map(lock_words, locks.values()),
-        ),
+        words=(*sentences(scores, controls, ground.likely_m), *map(lock_words, locks.values())),
     )
 
 
@@ -677,12 +668,11 @@ def _score_all(
     splits: dict[str, Callable[[], tuple[Score, ...]]] = {
         "flight_left_out": lambda: calibration.flight_left_out(observed, recipe, fits),
         **{
-            f"{name}_left_out": partial(calibration.parts_left_out, observed, recipe, fits, parts, own_rest=own_rest)
-            for name, parts, own_rest in (
-                ("altitude", calibration.altitude_parts, False),
-                ("heading", calibration.heading_parts, False),
-                ("sector", calibration.sector_parts, False),
-                ("route", calibration.route_parts, True),
+            f"{name}_left_out": partial(calibration.parts_left_out, observed, recipe, fits, parts)
+            for name, parts in (
+                ("altitude", calibration.altitude_parts),
+                ("heading", calibration.heading_parts),
+                ("sector", calibration.sector_parts),
             )
         },
         "campaign_left_out": lambda: calibration.campaign_left_out(observed, recipe),

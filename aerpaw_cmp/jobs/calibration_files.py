@@ -18,7 +18,7 @@ import yaml
 from ..common.content import KEY, MARKS, union
 from ..common.gaussian import determining, gaussian_kernel
 from ..common.units import spread_out
-from ..compare.calibration import Score, cruise_height_m, mean_rmse, with_one_more
+from ..compare.calibration import Score, cruise_height_m, mean_rmse
 from ..compare.gains import Frame, Spread, directed, student_factor
 from ..flight.data import FlightData, RssSeries, quantity_of
 from ..flight.training import flight_logs, marks_of
@@ -248,8 +248,6 @@ def _record_of(
         mounts=mounts,
         strengths={"model": dataclasses.asdict(calibration.learned.model)},
         ground=ground,
-        curve=[dataclasses.asdict(point) for point in calibration.curve],
-        one_more_rmse_db=with_one_more(calibration.curve),
         antennas=tuple(maps.values()),
         settings_text=text,
         stages_s=stages_s,

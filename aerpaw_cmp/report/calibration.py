@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from ..common.jsonable import json_object
 from ..common.units import FloatArray
-from ..compare.calibration import BASELINES, CurvePoint, Score, mean_rmse, with_one_more
+from ..compare.calibration import BASELINES, Score, mean_rmse
 from ..compare.verdict import Verdict, antenna_or_place, by_flight
 from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, write_page
 from .flight_words import said_of
@@ -62,10 +62,6 @@ class CalibrationData(Made):
     mounts: Mapping[str, Mapping[str, Any]]
     strengths: Mapping[str, Any]
     ground: Mapping[str, Any] | None
-    curve: Sequence[Mapping[str, Any]]
-    """Error by number of training flights, fewest first. Empty with fewer than three flights."""
-    one_more_rmse_db: float
-    """Expected error with one more flight, extrapolated [dB]. NaN without a curve."""
     antennas: Sequence[AntennaMap]
     rank: Mapping[str, Any] | None = None
     settings_text: str = ""
@@ -138,7 +134,6 @@ def sentences(
     scores: Mapping[str, Sequence[Score]],
     controls: Mapping[str, Sequence[Score]],
     ground_m: tuple[float, float] | None,
-    curve: Sequence[CurvePoint],
 ) -> tuple[str, ...]:
     """Return the summary of page and terminal, then further sentences.
 
@@ -148,7 +143,6 @@ def sentences(
         Scores by kind of held-out data, and by wrong or simpler models.
     ground_m : (float, float), optional
         Range of the roughness height that the data allow [m]; None if no ground was fitted.
-    curve : sequence of CurvePoint
 
     Returns
     -------
@@ -169,7 +163,7 @@ def sentences(
         said_of(turned, FRAMES, near=ends[0], far=ends[1]),
         f"Next: {step}" if turned.cause != "place" else "",
     )
-    return (" ".join(text for text in first if text), *_further(scores, ground_m), *_of_curve(curve))
+    return (" ".join(text for text in first if text), *_further(scores, ground_m))
 
 
 def _further(scores: Mapping[str, Sequence[Score]], ground_m: tuple[float, float] | None) -> Iterator[str]:
@@ -192,21 +186,11 @@ def _further(scores: Mapping[str, Sequence[Score]], ground_m: tuple[float, float
         )
 
 
-def _of_curve(points: Sequence[CurvePoint]) -> Iterator[str]:
-    if len(points) > 1:
-        counts, errors = (", ".join(texts) for texts in ([str(p.flights) for p in points],
-                                                         [f"{p.rmse_db:.2f}" for p in points]))  # fmt: skip
-        more = with_one_more(points)
-        yield f"Learned from {counts} other flights, the error on a held-out flight is {errors} dB."
-        yield f"One more flight would reduce it by {points[-1].rmse_db - more:.2f} to {more:.2f} dB (extrapolated)."
-
-
 SPLIT_TITLE = {
     "flight_left_out": "each flight",
     "altitude_left_out": "and its cruising height",
     "heading_left_out": "and an eighth of the compass of headings",
     "sector_left_out": "and a sector of 60 degrees at the tower",
-    "route_left_out": "a segment of the flight's own route",
     "other_flights": "other flights (--score)",
 }
 
@@ -218,7 +202,6 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
         flights=data.flights, trained_on=data.trained_on, marks=data.marks, scores=data.scores,
         controls=data.controls, mounts=data.mounts, strengths=data.strengths, ground=data.ground, words=data.words,
         warnings=data.warnings,
-        learning_curve={"points": data.curve, "one_more_rmse_db": data.one_more_rmse_db},
         antennas=[
             {"name": a.name, "share_of_sphere_seen": _share_seen(a), "n_bins": len(a.flown)} for a in data.antennas
         ],
@@ -271,14 +254,6 @@ def scores_card(data: CalibrationData) -> Card:
         columns={"What was left out": HEAD, **each, **baselines, "series": 0},
         rows=[(SPLIT_TITLE.get(name, name), *(_mean(of, key) for key in keys), len(of)) for name, of in rows.items()],
     )  # fmt: skip
-    curve = [(point["flights"], point["rmse_db"], point["rmse_4s_db"]) for point in data.curve]
-    more = Table(
-        caption=f"Expected gain of one flight more: mean RMSE in dB over {data.curve[0]['series'] if curve else 0} "
-        "series, each predicted by subsets of the other flights. The last row is extrapolated: the squared error as a "
-        "constant and a part that falls with the number of flights.",
-        columns={"Flights learned from": 0, **each},
-        rows=[*curve, (curve[-1][0] + 1, data.one_more_rmse_db, "")] if len(curve) > 1 else [],
-    )  # fmt: skip
     every = Table(
         caption="RMSE in dB after the flight's own offset; \"offset of the training flights\": with their mean offset.",
         columns={"Held out": TEXT, "Flight": HEAD, "Tower": TEXT, "Channel": TEXT, **each,
@@ -287,7 +262,7 @@ def scores_card(data: CalibrationData) -> Card:
                                  *BASELINES, "n")),
     )  # fmt: skip
     parts = [Card(title="Every flight and channel", fold=True, tables=[every])]
-    return Card(title="Scores", id="scores", text=[data.words[1:]], tables=[means, more], parts=parts)
+    return Card(title="Scores", id="scores", text=[data.words[1:]], tables=[means], parts=parts)
 
 
 def _rows(splits: Mapping[str, Sequence[Mapping[str, Any]]] | None, keys: Sequence[str]) -> list[tuple[Any, ...]]:

@@ -154,7 +154,7 @@ def leaving(parts: Parts, flights: list[Observed]) -> tuple[calibration.Score, .
     """Scores of a split by parts, each flight predicted from the other."""
     learned: dict[str, calibration.Learned] = {}
     flight_left_out(flights, RECIPE, learned)
-    return calibration.parts_left_out(flights, RECIPE, learned, parts, own_rest=False)
+    return calibration.parts_left_out(flights, RECIPE, learned, parts)
 
 
 def planted(o: Observed, part: np.ndarray, fault_db: float) -> Observed:
@@ -182,7 +182,7 @@ def test_an_antenna_that_no_other_flight_has_is_not_scored() -> None:
     split = calibration.heading_parts
     assert [(s.flight, s.channel) for s in leaving(split, [*flights, alone])] == [("a", "USRP1"), ("b", "USRP1")]
     learned = {"a": calibration.learn([flights[1].samples], RECIPE)}
-    assert calibration.parts_left_out(flights[:1], RECIPE, learned, split, own_rest=False) == ()
+    assert calibration.parts_left_out(flights[:1], RECIPE, learned, split) == ()
 
 
 @pytest.mark.parametrize("split", ["altitude", "heading", "sector"])
@@ -245,24 +245,6 @@ def test_a_line_over_distance_is_the_one_that_least_squares_finds_outside() -> N
                 free[~outside] + (measured - free)[outside].mean()
             )
             assert np.isnan(simple.line_db[outside]).all()
-
-
-def test_a_stretch_left_out_is_learned_from_the_flight_twenty_seconds_away_and_from_others_whole() -> None:
-    flown, same, other = observed("a"), observed("a").part(np.arange(3, 190)), observed("b")
-    parts = calibration.route_parts(flown, same)
-    counted = np.zeros(len(flown.samples), dtype=int)
-    for k, (inside, outside) in enumerate(parts):
-        counted += inside
-        time, times = flown.samples.time_s[inside], same.samples.time_s
-        assert np.ptp(time) == pytest.approx(398.0 / 8, abs=2.1)
-        apart = np.maximum(time.min() - times, times - time.max())
-        assert (apart[outside] >= 20.0 - 2.0).all()  # a stretch ends between two samples of 2 s
-        assert (apart[~outside] <= 20.0 + 2.0).all()
-        assert time.min() == pytest.approx(k * 398.0 / 8, abs=2.0)
-    assert (counted == 1).all()
-    for (inside, outside_other), (mine, _) in zip(calibration.route_parts(flown, other), parts, strict=True):
-        assert outside_other.all()
-        assert np.array_equal(inside, mine)
 
 
 def test_controls_turn_the_uav_as_an_aircraft_of_the_opposite_heading_or_none_sees_the_tower() -> None:

@@ -83,8 +83,8 @@ def calibration(_: Fixture) -> str:
     as_dicts = [{k: [dataclasses.asdict(s) for s in v] for k, v in part.items()} for part in (left, controls)]
     data = CalibrationData(
         name="lake_wheeler_july", generated="2026-11-21T00:00:00+00:00", flights=["F0", "F1", "F2", "F3"],
-        trained_on=["ab" * 32], marks=[], words=sentences(left, controls, (0.02, np.inf), ()), warnings=[], scores=as_dicts[0],
-        controls=as_dicts[1], mounts={}, strengths={}, ground=None, curve=[], one_more_rmse_db=np.nan, antennas=[],
+        trained_on=["ab" * 32], marks=[], words=sentences(left, controls, (0.02, np.inf)), warnings=[], scores=as_dicts[0],
+        controls=as_dicts[1], mounts={}, strengths={}, ground=None, antennas=[],
         settings_text="link: {" + ", ".join(f"setting_{i}: {i}" for i in range(200)) + "}",
     )  # fmt: skip
     return _written(calibration_html.write_calibration, data, "calibration")

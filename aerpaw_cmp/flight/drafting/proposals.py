@@ -727,10 +727,9 @@ def _receiver_odds(
 ) -> tuple[float, str]:
     """Return the log odds that levels are those of the receiver of an item, and the words for its level."""
     level, lock = item.level, item.series.lock
-    lost = 0.0 if observed.locked is None else float(np.mean(observed.locked == 0.0))
-    if lost > _LOST_SHARE:
-        observed = observed.part(observed.locked == 1.0)
-    samples = observed.samples.binned(4.0)
+    locked = np.ones(len(observed.samples)) if observed.locked is None else observed.locked
+    lost = float(np.mean(locked == 0.0))
+    samples = observed.samples.part(np.asarray(locked != 0.0)).binned(4.0)
     its_antenna = antenna is not None and antenna.name == item.name
     gain_db = antenna.gain_db(samples)[0] if its_antenna and antenna is not None else np.zeros(len(samples))
     sent_db = series.link.transmit_power_dbm - level.transmit_power_dbm

@@ -35,7 +35,7 @@ from ..common.errors import UsageError
 from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
 from ..site.site import Site, Tower
-from .field.fresnel import FaceMaterials
+from .field.fresnel import face_table
 from .field.geometry import Elements, geometry
 from .field.sum import PAIRS_PER_CHUNK, of_one_depth, pattern_ends
 from .geometry import Array, Faces, Link, PathSet, Poses, RowsT, joined, rotation_from_yaw_pitch_roll
@@ -461,7 +461,7 @@ def basis_fields(
     """
     link, wavelength = Link(carrier_hz, {"tower": tower}, uav, uav_transmits=False), wavelength_m(carrier_hz)
     faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (_GROUND_MATERIAL,), ("ground",))
-    table, elements = FaceMaterials.of(faces, carrier_hz).table(wavelength), Elements.of(link)
+    table, elements = face_table(faces, carrier_hz), Elements.of(link)
     n, ports = len(poses), (len(uav), len(tower))
     index, zero, step = np.arange(n), np.zeros(n, dtype=np.int64), max(1, PAIRS_PER_CHUNK // (len(uav) * len(tower)))
     # cosine and sine of the two slants, against (tower's slant, paths, pairs) and (UAV's, tower's, paths, pairs)
@@ -475,7 +475,7 @@ def basis_fields(
         for start in range(0, n, step):
             some = columns.some(slice(start, start + step))
             parts = of_one_depth(some, elements, pattern_ends(some, elements, link), (slants[0], slants[1]), wavelength)
-            fields[depth, :, :, start : start + step] = parts.view(np.complex128).reshape(2, 2, -1, *ports)
+            fields[depth, :, :, start : start + step] = parts.reshape(2, 2, -1, *ports)
     return fields[0], fields[1]
 
 

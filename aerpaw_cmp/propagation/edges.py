@@ -36,7 +36,7 @@ from ..common.errors import UsageError
 from ..common.geodesy import unit_vectors
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, wavelength_m
 from .field import dyads
-from .field.fresnel import FaceMaterials, coefficients
+from .field.fresnel import coefficients, face_table
 from .field.geometry import parts_of, pattern_fields, plain, rows_of
 from .field.sum import Fields, Further, parts_between_poses
 from .geometry import Array, Faces, Link, PathSet, Poses, legs, sources_of
@@ -88,8 +88,8 @@ def wedge(
     # seen from face n, both the angles and the edge are reversed, so the matrix is the same
     te, tm = 0.0, 0.0
     for term, face in ((at_n, face_n), (at_0, face_0)):
-        te_re, te_im, tm_re, tm_im = coefficients(sine, face)
-        te, tm = te + term * (te_re + 1j * te_im), tm + term * (tm_re + 1j * tm_im)
+        face_te, face_tm = coefficients(sine, face)
+        te, tm = te + term * face_te, tm + term * face_tm
     # angle between the edge-fixed basis and the plane of incidence, whose unit normal is sigma
     askew = cos_beta * upright  # like across, multiplied by the sine of incidence: -(sigma . phi) and -(sigma . beta)
     size = across * across + askew * askew
@@ -575,7 +575,7 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
     before and after the edge, D the diffraction matrix times the square root of k, and M the dyads of mirrors.
     """
     wavelength = wavelength_m(link.carrier_hz)
-    wave_number, table = 2.0 * np.pi / wavelength, FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
+    wave_number, table = 2.0 * np.pi / wavelength, face_table(faces, link.carrier_hz)
     face_0, face_n = paths.wedge.T
     # axes of the edge as rows: positions become (along the edge, along face 0, out of face 0)
     along, face_axis, exterior = wedge_axes(faces.normal[face_0], faces.normal[face_n])
@@ -643,12 +643,12 @@ def _patterns(
     # shape (1, 1), which broadcasts against every path and element
     if all(plain(array.patterns) for array in arrays):
         return np.ones((1, 1), complex), np.zeros((1, 1), complex)
-    fields = np.empty((len(paths), 4, count))
+    fields = np.empty((len(paths), 2, count), dtype=np.complex128)
     for number, array in enumerate(arrays):
         rows = np.flatnonzero(paths.tower == number) if len(arrays) > 1 else np.arange(len(paths))
         x, y, z = (np.repeat(part, count, axis=1) for part in parts_of(toward[rows]))
         fields[rows] = pattern_fields(array, np.arange(count), rows_of(end.axes[rows]), (x, y, z))
-    return fields[:, 0] + 1j * fields[:, 1], fields[:, 2] + 1j * fields[:, 3]
+    return fields[:, 0], fields[:, 1]
 
 
 def _round_edge(
@@ -670,9 +670,8 @@ def _round_edge(
     phi: ComplexArray = np.zeros(1, complex)
     for unit, field in (((1.0, 0.0), e_theta), ((0.0, 1.0), e_phi)):
         wave = dyads.field_vector(rows_of(end.axes), tuple(sign * part for part in toward), *unit)  # type: ignore[arg-type]
-        re, im = dyads.reflected(wave, (0.0, 0.0, 0.0), toward, normal, *mirror)
         # the dyad is evaluated for all and taken where a ground bounced: a leg that is straight keeps its wave
-        after = np.hstack(re) + 1j * np.hstack(im)
+        after = np.hstack(dyads.reflected(wave, toward, normal, *mirror))
         vector = np.where(end.bounced[:, None], after, np.hstack(wave))
         beta = beta + field * (vector * flat).sum(axis=1)[:, None]
         phi = phi + field * (vector * cross).sum(axis=1)[:, None]

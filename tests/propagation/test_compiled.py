@@ -65,16 +65,6 @@ def test_no_pose_is_shared_by_two_threads(case):
         assert all(pose[part.stop - 1] != pose[part.stop] for part in parts[:-1])
 
 
-def test_sine_and_cosine_of_turns_within_one_unit_of_the_last_place():
-    from aerpaw_cmp.propagation.field.dyads import sine_cosine
-
-    turns = np.concatenate([np.linspace(-0.5, 0.5, 4001), [0.125, -0.125, 0.375, 1e-300, 0.0]])
-    sine, cosine = sine_cosine(turns)
-    exact = np.exp(2j * np.pi * turns.astype(np.longdouble) + 0)
-    assert np.abs(sine - np.float64(exact.imag)).max() < 3e-16
-    assert np.abs(cosine - np.float64(exact.real)).max() < 3e-16
-
-
 # ---------------------------------------------------------------- paths
 
 

@@ -292,18 +292,10 @@ def _wrap(monkeypatch, where, name, change):
     monkeypatch.setattr(where, name, lambda *args: change(clean(*args)))
 
 
-def _turned(h, by):
-    return np.stack([h[..., 0] * by.real - h[..., 1] * by.imag, h[..., 0] * by.imag + h[..., 1] * by.real], axis=-1)
-
-
 FAULTS = {
-    "reflections times -0.1": (
-        dyads,
-        "reflected",
-        lambda wave: tuple(tuple(-0.1 * part for part in half) for half in wave),
-    ),
-    "TE and TM exchanged": (sum, "coefficients", lambda r: (*r[2:], *r[:2])),
-    "0.011 rad": (sum, "amplitudes", lambda h: _turned(h, np.exp(0.011j))),
+    "reflections times -0.1": (dyads, "reflected", lambda wave: tuple(-0.1 * part for part in wave)),
+    "TE and TM exchanged": (sum, "coefficients", lambda r: r[::-1]),
+    "0.011 rad": (sum, "amplitudes", lambda h: h * np.exp(0.011j)),
     "0.11 dB": (sum, "amplitudes", lambda h: h * 10 ** (0.11 / 20)),
     "nothing hides": (solids.Occlusion, "segments", np.zeros_like),
 }

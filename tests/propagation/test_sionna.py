@@ -109,11 +109,7 @@ def test_audit_of_the_field_by_sionnas_own_coefficients(sionna, scenes, lone, mo
     for factor in (-0.1, 10 ** (0.1 / 20), np.exp(0.011j)):
 
         def faulty(*a, factor=complex(factor)):
-            re, im = reflect(*a)
-            return (
-                tuple(factor.real * x - factor.imag * y for x, y in zip(re, im, strict=True)),
-                tuple(factor.imag * x + factor.real * y for x, y in zip(re, im, strict=True)),
-            )
+            return tuple(factor * part for part in reflect(*a))
 
         monkeypatch.setattr(dyads, "reflected", faulty)
         assert audited().failures

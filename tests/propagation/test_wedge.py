@@ -121,8 +121,7 @@ def seen(source: FloatArray, target: FloatArray, wave: FloatArray, turn: float) 
         across = np.cross(before, NORMAL)
         across /= np.linalg.norm(across)
         field = wave - (wave @ before) * before
-        te_re, te_im, tm_re, tm_im = coefficients(np.array(abs(before @ NORMAL)), CONCRETE)
-        te, tm = te_re + 1j * te_im, tm_re + 1j * tm_im
+        te, tm = coefficients(np.array(abs(before @ NORMAL)), CONCRETE)
         upright = np.cross(across, before)
         reflected = te * (across @ field) * across - tm * (upright @ field) * (upright * mirror)
         total = total + reflected * np.exp(-1j * K * length) / length

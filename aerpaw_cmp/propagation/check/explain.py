@@ -25,7 +25,7 @@ from ...common.units import (
     power_from_db,
     wavelength_m,
 )
-from ..field.fresnel import FaceMaterials, reflection_coefficients
+from ..field.fresnel import coefficients, face_table
 from ..field.geometry import Elements, geometry
 from ..field.sum import amplitudes, pattern_ends
 from ..geometry import Faces, Link, PathSet, Poses, Surfaces
@@ -111,7 +111,7 @@ def explain_paths(
     tuple of ExplainedPath
     """
     elements, wavelength = Elements.of(link), wavelength_m(link.carrier_hz)
-    table = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
+    table = face_table(faces, link.carrier_hz)
     explained = []
     for row in range(len(paths)):
         recorded: list[tuple[str, AnyArray]] = []
@@ -163,7 +163,7 @@ def _explained(
     spreading = next(value for name, value in recorded if name == "spreading") ** 2
     uav = next(value for name, value in recorded if name == "uav")
     # spreading and the UAV's pattern multiply powers; the rest of the received power is polarisation
-    powers = [*waves, waves[-1] * spreading, waves[-1] * spreading * uav, (field**2).sum(axis=1)]
+    powers = [*waves, waves[-1] * spreading, waves[-1] * spreading * uav, np.abs(field) ** 2]
     mean = np.array([1.0, *(float(power.mean()) for power in powers)])
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = db_from_power(mean[1:]) - db_from_power(mean[:-1])
@@ -200,17 +200,14 @@ def _explained(
         arrival_elevation_deg=float(np.degrees(elevation_rad(arrival))),
         terms_db=terms,
         level_dbm=link.transmit_power_dbm + sum(terms.values()),
-        phase_deg=float(np.degrees(np.arctan2(field[0, 1], field[0, 0]))),
+        phase_deg=float(np.degrees(np.angle(field[0]))),
         planes=tuple(path.faces[0, :depth].tolist()),
     )
 
 
 def _bounce(faces: Faces, face: int, point: FloatArray, leg: FloatArray, link: Link, loss_db: float) -> Bounce:
     cosine = float(abs(faces.normal[face] @ leg) / np.linalg.norm(leg))
-    tables = FaceMaterials.of(faces, link.carrier_hz)
-    te, tm = reflection_coefficients(
-        np.array(cosine), tables.permittivity[face], tables.thickness_m[face], wavelength_m(link.carrier_hz)
-    )
+    te, tm = coefficients(np.array(cosine), face_table(faces, link.carrier_hz)[face])
     return Bounce(
         face=faces.label[face],
         material=faces.material[face],

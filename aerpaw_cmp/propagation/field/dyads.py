@@ -16,36 +16,11 @@ from typing import Any
 
 import numpy as np
 
-# A float, or an array of any shape.
+# A real or complex number, or an array of any shape.
 Number = Any
 Vector = tuple[Number, Number, Number]
 # Axes of a device, as rows.
 Rotation = tuple[Vector, Vector, Vector]
-
-_ROUND = 6755399441055744.0  # 1.5 * 2**52: adding and taking it off rounds to an integer, ties to even
-
-
-def sine_cosine(turns: Number) -> tuple[Number, Number]:
-    """Sine and cosine of an angle in turns, within 1 ulp of the angle's part of a turn (polynomials of fdlibm)."""
-    # to half a turn either way, without a call that keeps a loop from vector instructions
-    turns = turns - ((turns + _ROUND) - _ROUND)
-    # the polynomials are valid within an eighth of a turn
-    quarter = (4.0 * turns + _ROUND) - _ROUND
-    x = (turns - 0.25 * quarter) * (2.0 * np.pi)
-    z = x * x
-    tail = 2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10)
-    tail = 8.33333333332248946124e-03 + z * (-1.98412698298579493134e-04 + z * tail)
-    sine = x + x * z * (-1.66666666666666324348e-01 + z * tail)
-    tail = -2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11)
-    tail = -1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + z * tail)
-    cosine = 1.0 - (0.5 * z - z * z * (4.16666666666666019037e-02 + z * tail))
-    # in the upper and lower quarters, swap sine and cosine
-    odd = quarter * quarter == 1.0
-    sine_there, cosine_there = np.where(odd, cosine, sine), np.where(odd, sine, cosine)
-    return (
-        np.where((quarter < 0.0) | (quarter > 1.5), -sine_there, sine_there),
-        np.where((quarter > 0.5) | (quarter < -1.5), -cosine_there, cosine_there),
-    )
 
 
 def turned(m: Rotation, v: Vector) -> Vector:
@@ -145,44 +120,28 @@ def incidence(toward: Vector, normal: Vector) -> Number:
     return np.abs(normal[0] * toward[0] + normal[1] * toward[1] + normal[2] * toward[2])
 
 
-def reflected(
-    re: Vector, im: Vector, toward: Vector, normal: Vector, te_re: Number, te_im: Number, tm_re: Number, tm_im: Number
-) -> tuple[Vector, Vector]:
-    """Field vector after the dyad of one reflection.
+def reflected(wave: Vector, toward: Vector, normal: Vector, te: Number, tm: Number) -> Vector:
+    """Return the field vector of a wave after the dyad of one reflection.
 
     Parameters
     ----------
-    re, im : Vector
+    wave : Vector
         The wave before.
     toward, normal : Vector
         Unit vectors of the ray and of the face, in the last space.
-    te_re, te_im, tm_re, tm_im : Number
+    te, tm : Number
         Coefficients of the face at this angle.
 
     Returns
     -------
-    re, im : Vector
+    Vector
     """
     (x, y, z), (n0, n1, n2) = toward, normal
     s0, s1, s2 = y * n2 - z * n1, z * n0 - x * n2, x * n1 - y * n0
     # at normal incidence s is zero, and so is te + tm, which multiplies it
     scale = 1.0 / np.maximum(s0 * s0 + s1 * s1 + s2 * s2, 1e-300)
-    q_re, q_im = (te_re + tm_re) * scale, (te_im + tm_im) * scale
-    a = s0 * re[0] + s1 * re[1] + s2 * re[2]
-    b = s0 * im[0] + s1 * im[1] + s2 * im[2]
-    c_re, c_im = a * q_re - b * q_im, a * q_im + b * q_re
-    return (
-        (
-            c_re * s0 - (tm_re * re[0] - tm_im * im[0]),
-            c_re * s1 - (tm_re * re[1] - tm_im * im[1]),
-            c_re * s2 - (tm_re * re[2] - tm_im * im[2]),
-        ),
-        (
-            c_im * s0 - (tm_re * im[0] + tm_im * re[0]),
-            c_im * s1 - (tm_re * im[1] + tm_im * re[1]),
-            c_im * s2 - (tm_re * im[2] + tm_im * re[2]),
-        ),
-    )
+    q = (te + tm) * (scale * (s0 * wave[0] + s1 * wave[1] + s2 * wave[2]))
+    return q * s0 - tm * wave[0], q * s1 - tm * wave[1], q * s2 - tm * wave[2]
 
 
 def spreading(cycles: Number) -> Number:
@@ -191,26 +150,24 @@ def spreading(cycles: Number) -> Number:
     return np.minimum(1.0, 1.0 / (4.0 * np.pi * cycles))
 
 
-def received(wave_re: Vector, wave_im: Vector, uav_re: Vector, uav_im: Vector, cycles: Number) -> tuple[Number, Number]:
-    """Complex amplitude of a pair: the UAV's pattern (not conjugated: reciprocity), spreading and carrier phase.
+def received(wave: Vector, uav: Vector, cycles: Number) -> Number:
+    """Return the complex amplitude of a pair: the UAV's pattern, spreading and carrier phase.
+
+    The pattern of the receiving element is not conjugated, because of reciprocity.
 
     Parameters
     ----------
-    wave_re, wave_im : Vector
+    wave : Vector
         The wave that arrives.
-    uav_re, uav_im : Vector
+    uav : Vector
         Field vector that the UAV's element would radiate back.
     cycles : Number
         Length of the path in wavelengths.
 
     Returns
     -------
-    re, im : Number
+    Number
     """
-    (a0, a1, a2), (b0, b1, b2), (g0, g1, g2), (h0, h1, h2) = wave_re, wave_im, uav_re, uav_im
-    re = g0 * a0 + g1 * a1 + g2 * a2 - (h0 * b0 + h1 * b1 + h2 * b2)
-    im = g0 * b0 + g1 * b1 + g2 * b2 + (h0 * a0 + h1 * a1 + h2 * a2)
-    # e^{-j 2 pi cycles}: the sine enters with a minus
-    sine, cosine = sine_cosine(cycles)
-    amplitude = spreading(cycles)
-    return amplitude * (re * cosine + im * sine), amplitude * (im * cosine - re * sine)
+    # remove full cycles before the exponential: at 1 km they would cost five digits of the phase
+    carrier = np.exp(-2j * np.pi * (cycles - np.round(cycles)))
+    return spreading(cycles) * carrier * (uav[0] * wave[0] + uav[1] * wave[1] + uav[2] * wave[2])

@@ -1,116 +1,75 @@
-"""Fresnel coefficients of half-spaces and slabs, and the materials of a scene's faces.
-
-Each formula is written once, for arrays and for numbers. Complex numbers are pairs (re, im): their parts are
-evaluated in place, without arrays of complex intermediate results.
-"""
+"""Fresnel coefficients of half-spaces and slabs, and the materials of a scene's faces."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ...common.units import ComplexArray, FloatArray
+from ...common.units import ComplexArray, FloatArray, wavelength_m
 from ...site.materials import material
 from ..geometry import Faces
-from .dyads import sine_cosine
+
+# Real and imaginary part of the permittivity, and the thickness in wavelengths, which is infinite for a half-space.
+FaceMaterial = Any
 
 
-def half_space(cosine: Any, eta_re: Any, eta_im: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """TE and TM coefficients of a half-space and the root ``sqrt(eta - sin^2 theta)``: three complex numbers.
+def half_space(cosine: FloatArray, eta: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+    """Return the TE and TM coefficients of a half-space, and the root ``sqrt(eta - sin^2 theta)``.
 
     Source: ITU-R P.2040-3 eq. 37.
 
     Parameters
     ----------
-    cosine : float or (...)
+    cosine : (...)
         Cosine of the angle of incidence, from the normal.
-    eta_re, eta_im : float or (...)
+    eta : (...) complex
         Relative permittivity; the imaginary part is negative.
 
     Returns
     -------
-    te_re, te_im, tm_re, tm_im, root_re, root_im
+    te, tm, root : (...) complex
     """
-    # the root without cancellation; its imaginary part has the sign of eta's, so that the refracted wave decays
-    # eta less the squared sine of incidence
-    a = eta_re - (1.0 - cosine * cosine)
-    t = np.sqrt(0.5 * (np.sqrt(a * a + eta_im * eta_im) + np.abs(a)))
-    q = eta_im / np.maximum(2.0 * t, 1e-300)
-    root_re = np.where(a >= 0.0, t, np.abs(q))
-    root_im = np.where(a >= 0.0, q, np.copysign(t, eta_im))
-    below, above = cosine + root_re, cosine - root_re
-    scale = 1.0 / (below * below + root_im * root_im)
-    te_re = (above * below - root_im * root_im) * scale
-    te_im = -(root_im * below + above * root_im) * scale
-    n_re, n_im = eta_re * cosine - root_re, eta_im * cosine - root_im
-    d_re, d_im = eta_re * cosine + root_re, eta_im * cosine + root_im
-    scale = 1.0 / (d_re * d_re + d_im * d_im)
-    tm_re = (n_re * d_re + n_im * d_im) * scale
-    tm_im = (n_im * d_re - n_re * d_im) * scale
-    return te_re, te_im, tm_re, tm_im, root_re, root_im
+    # the imaginary part of the root has the sign of eta's, so that the refracted wave decays
+    root = np.sqrt(eta - (1.0 - cosine * cosine))
+    return (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root), root
 
 
-def echo(thickness: Any, root_re: Any, root_im: Any) -> tuple[Any, Any]:
-    """Factor of a wave's way through a slab and back: ``exp(-4 pi j thickness root)``, thickness in wavelengths."""
-    size = np.exp(4.0 * np.pi * thickness * root_im)
-    sine, cosine = sine_cosine(-2.0 * thickness * root_re)
-    return size * cosine, size * sine
+def echo(thickness: FloatArray, root: ComplexArray) -> ComplexArray:
+    """Return the factor of a wave's way through slabs and back, 0 for half-spaces. Thickness is in wavelengths."""
+    finite = np.isfinite(thickness)
+    # infinity times the root would be NaN
+    return np.where(finite, np.exp(-4j * np.pi * np.where(finite, thickness, 0.0) * root), 0.0)
 
 
-def slab(r_re: Any, r_im: Any, echo_re: Any, echo_im: Any) -> tuple[Any, Any]:
+def slab(r: ComplexArray, e: ComplexArray) -> ComplexArray:
     """Return the coefficient of a slab, ``r (1 - e) / (1 - r^2 e)``. Without an echo e it is r.
 
     Source: ITU-R P.2040-3 eq. 43.
 
     Parameters
     ----------
-    r_re, r_im : float or (...)
-        Coefficient r of a half-space of the material.
-    echo_re, echo_im : float or (...)
-        e: :func:`echo`.
+    r : (...) complex
+        Coefficient of a half-space of the material.
+    e : (...) complex
+        Echo of the second face: :func:`echo`.
 
     Returns
     -------
-    re, im : float or (...)
+    (...) complex
     """
-    s_re, s_im = r_re * r_re - r_im * r_im, 2.0 * r_re * r_im
-    d_re, d_im = 1.0 - (s_re * echo_re - s_im * echo_im), -(s_re * echo_im + s_im * echo_re)
-    n_re = r_re * (1.0 - echo_re) + r_im * echo_im
-    n_im = r_im * (1.0 - echo_re) - r_re * echo_im
-    scale = 1.0 / (d_re * d_re + d_im * d_im)
-    return (n_re * d_re + n_im * d_im) * scale, (n_im * d_re - n_re * d_im) * scale
+    return np.asarray(r * (1.0 - e) / (1.0 - r * r * e))
 
 
-def returned(thickness: Any, root_re: Any, root_im: Any) -> tuple[Any, Any]:
-    """The echo of a slab, 0 of a half-space, whose thickness is infinite."""
-    # infinity times the root would be NaN before it is thrown away
-    finite = np.isfinite(thickness)
-    e_re, e_im = echo(np.where(finite, thickness, 0.0), root_re, root_im)
-    return np.where(finite, e_re, 0.0), np.where(finite, e_im, 0.0)
-
-
-def reflection(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
-    """Return TE and TM coefficients (re and im of each) of slabs. Infinite thickness means a half-space.
-
-    ``material`` is a tuple: real and imaginary part of the permittivity, and the thickness in wavelengths.
-    """
+def coefficients(cosine: FloatArray, material: FaceMaterial) -> tuple[ComplexArray, ComplexArray]:
+    """Return the TE and TM coefficients of faces, for the cosine of incidence and the columns of :func:`face_table`."""
     eta_re, eta_im, thickness = material
-    te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)
-    e_re, e_im = returned(thickness, root_re, root_im)
-    te_re, te_im = slab(te_re, te_im, e_re, e_im)
-    tm_re, tm_im = slab(tm_re, tm_im, e_re, e_im)
-    return te_re, te_im, tm_re, tm_im
-
-
-def coefficients(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
-    """TE and TM coefficients (re, im each) of faces: the Fresnel coefficients that NumPy's field takes."""
-    eta_re, eta_im, thickness = material
+    te, tm, root = half_space(cosine, eta_re + 1j * eta_im)
     # bare ground has no second face, so its echo is 0 and is not computed
-    if np.any(np.isfinite(thickness)):
-        return reflection(cosine, material)
-    return half_space(cosine, eta_re, eta_im)[:4]
+    if not np.any(np.isfinite(thickness)):
+        return te, tm
+    e = echo(thickness, root)
+    return slab(te, e), slab(tm, e)
 
 
 def reflection_coefficients(
@@ -142,31 +101,18 @@ def reflection_coefficients(
     >>> complex(te.round(6)), complex(tm.round(6))
     ((-0.333333+0j), (0.333333+0j))
     """
-    eta, thickness = np.asarray(permittivity), np.asarray(thickness_m) / wavelength
-    te_re, te_im, tm_re, tm_im = coefficients(np.asarray(cos_theta), (eta.real, eta.imag, thickness))
-    return np.asarray(te_re + 1j * te_im), np.asarray(tm_re + 1j * tm_im)
+    eta = np.asarray(permittivity)
+    return coefficients(np.asarray(cos_theta), (eta.real, eta.imag, np.asarray(thickness_m) / wavelength))
 
 
-@dataclass(frozen=True, slots=True)
-class FaceMaterials:
-    """The permittivity and thickness per face. The last entry (-1) is a placeholder for paths without a face."""
+def face_table(faces: Faces, carrier_hz: float) -> FloatArray:
+    """Return the materials of all faces at a carrier, shape (faces + 1, 3).
 
-    permittivity: ComplexArray
-    thickness_m: FloatArray
-
-    @classmethod
-    def of(cls, faces: Faces, carrier_hz: float) -> FaceMaterials:
-        """Return the materials of all faces at a carrier."""
-        known = {name: material(name) for name in set(faces.material)}
-        eta = {name: face.relative_permittivity(carrier_hz) for name, face in known.items()}
-        thick = {name: np.inf if face.thickness_m is None else face.thickness_m for name, face in known.items()}
-        return cls(
-            # the last entry answers for -1, the padding of short paths
-            np.array([*(eta[name] for name in faces.material), 2.0 + 0j], dtype=np.complex128),
-            np.array([*(thick[name] for name in faces.material), np.inf], dtype=np.float64),
-        )
-
-    def table(self, wavelength_m: float) -> FloatArray:
-        """Return columns (faces + 1, 3): real and imaginary part of the permittivity, thickness in wavelengths."""
-        eta = self.permittivity
-        return np.column_stack([eta.real, eta.imag, self.thickness_m / wavelength_m])
+    The columns are those of :data:`FaceMaterial`. The last row, -1, is a placeholder for paths without a face.
+    """
+    rows: dict[str, tuple[float, float, float]] = {}
+    for name in set(faces.material):
+        known = material(name)
+        eta, thickness = known.relative_permittivity(carrier_hz), known.thickness_m
+        rows[name] = eta.real, eta.imag, np.inf if thickness is None else thickness / wavelength_m(carrier_hz)
+    return np.array([*(rows[name] for name in faces.material), (2.0, 0.0, np.inf)])

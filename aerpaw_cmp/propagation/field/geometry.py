@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...common.units import AnyArray, FloatArray, IntArray
+from ...common.units import AnyArray, ComplexArray, FloatArray, IntArray
 from ...site.antennas import Isotropic
 from ..geometry import Array, Faces, Link, PathSet, Pattern, Poses, sources_of
 from . import dyads
@@ -16,7 +16,7 @@ class Geometry(NamedTuple):
     """Some paths, each in the space of its last image.
 
     ``image_m`` (paths, 3) is the tower there, ``frame`` (paths, 3, 3) its device axes as rows, ``normal`` (paths, most,
-    3) those of the faces and ``face`` (paths, most, 3) what :meth:`FaceMaterials.table` has of them; ``place_m`` and
+    3) those of the faces and ``face`` (paths, most, 3) the row of :func:`face_table` of each; ``place_m`` and
     ``axes`` are the UAV's. ``depth`` and ``tower`` (paths,) are those of the path set.
     """
 
@@ -62,7 +62,7 @@ def _columns(array: Array, element: IntArray) -> tuple[FloatArray, FloatArray]:
 
 
 # Pattern fields of tower and UAV; None for 1 along theta in all directions.
-Ends = tuple[FloatArray | None, FloatArray | None]
+Ends = tuple[ComplexArray | None, ComplexArray | None]
 
 
 def geometry(
@@ -75,7 +75,7 @@ def geometry(
     paths : PathSet
     faces : Faces
     table : (faces + 1, 3)
-        Their materials: :meth:`FaceMaterials.table`.
+        Their materials: :func:`face_table`.
     sources_m : (towers, 3) or (poses, towers, 3)
         Centres of the tower arrays [m]; the latter for towers that move.
     poses : Poses
@@ -134,8 +134,8 @@ def directions(g: Geometry, elements: Elements) -> tuple[FloatArray, FloatArray,
     return ways  # type: ignore[no-any-return]
 
 
-def pattern_fields(array: Array, element: IntArray, m: dyads.Rotation, toward: dyads.Vector) -> FloatArray:
-    """E_theta and E_phi (paths, 4, pairs: real and imaginary parts) of chosen elements ``toward`` site directions.
+def pattern_fields(array: Array, element: IntArray, m: dyads.Rotation, toward: dyads.Vector) -> ComplexArray:
+    """Return E_theta and E_phi (paths, 2, pairs) of chosen elements ``toward`` site directions.
 
     Parameters
     ----------
@@ -148,18 +148,16 @@ def pattern_fields(array: Array, element: IntArray, m: dyads.Rotation, toward: d
 
     Returns
     -------
-    (paths, 4, pairs)
+    (paths, 2, pairs) complex
     """
     x, y, z = dyads.turned(m, toward)
     theta, phi = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)  # arccos would lose half of the digits at the poles
-    fields = np.empty((len(theta), 4, theta.shape[1]))
+    fields = np.empty((len(theta), 2, theta.shape[1]), dtype=np.complex128)
     patterns = array.patterns if len(array.patterns) > 1 else array.patterns * len(array)
     # elements often share one pattern object: evaluate it once for all of them
     for pattern in {id(p): p for p in patterns}.values():
         pairs = np.flatnonzero([patterns[e] is pattern for e in element])
-        e_theta, e_phi = pattern.field(theta[:, pairs], phi[:, pairs])
-        for part, value in enumerate((e_theta.real, e_theta.imag, e_phi.real, e_phi.imag)):
-            fields[:, part, pairs] = value
+        fields[:, 0, pairs], fields[:, 1, pairs] = pattern.field(theta[:, pairs], phi[:, pairs])
     return fields
 
 

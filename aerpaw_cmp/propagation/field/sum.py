@@ -15,7 +15,7 @@ Each path is evaluated alone and added in the order of the path set: results do 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -25,7 +25,7 @@ from ...common.errors import UsageError
 from ...common.units import AnyArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, db_from_power, wavelength_m
 from ..geometry import Array, Faces, Link, PathSet, Poses, Rows
 from . import dyads
-from .fresnel import FaceMaterials, coefficients
+from .fresnel import coefficients, face_table
 from .geometry import Elements, Ends, Geometry, directions, geometry, parts_of, pattern_fields, plain, rows_of
 
 # Element pairs that NumPy evaluates at once: their columns stay in the cache of a core.
@@ -158,35 +158,30 @@ def channel_matrices(
     ports, uavs = _ports(arrays), len(link.uav_array)
     _check_patterns([*arrays, link.uav_array])
     elements, wavelength = Elements.of(link), wavelength_m(link.carrier_hz)
-    table = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
-    # a link's paths side by side: reduceat adds runs
-    order = _by_link(paths, len(arrays))
-    # they are usually sorted, and copying a long flight is slow
-    ordered = paths if order is None else paths.select(order)
+    table, key = face_table(faces, link.carrier_hz), paths.pose * len(arrays) + paths.tower
+    if (np.diff(key) < 0).any():
+        # the paths of a link must follow each other, because reduceat adds runs
+        order = np.argsort(key, kind="stable")
+        some_db = None if loss_db is None else loss_db[order]
+        sorted_fields = channel_matrices(paths.select(order), faces, sources_m, poses, link, some_db)
+        power = np.empty(len(paths))
+        power[order] = sorted_fields.path_power
+        return replace(sorted_fields, path_power=power)
     if paths.terrain_db.any():
         loss_db = paths.terrain_db if loss_db is None else loss_db + paths.terrain_db
-    lost = None if loss_db is None else amplitude_from_db(-(loss_db if order is None else loss_db[order]))
     h = np.zeros((len(poses) * len(arrays), ports * uavs), dtype=np.complex128)
     power = np.zeros(len(paths))
-
-    for part in parts_between_poses(ordered.pose):
-        some = ordered.select(part)
-        columns = geometry(some, faces, table, sources_m, poses, link)
+    for part in parts_between_poses(paths.pose):
+        columns = geometry(paths.select(part), faces, table, sources_m, poses, link)
         amplitude = amplitudes(columns, elements, pattern_ends(columns, elements, link), wavelength)
-        if lost is not None:
-            amplitude *= lost[part, None, None]
-        power[part] = np.einsum("npc,npc->n", amplitude, amplitude) / (ports * uavs)
-        key = some.pose * len(arrays) + some.tower
-        first = np.flatnonzero(np.diff(key, prepend=-1))
-        # view pairs of real numbers as complex numbers, without a copy
-        h[key[first]] = np.add.reduceat(amplitude.view(np.complex128)[..., 0], first, axis=0)
-    if order is not None:
-        # back to the order in which the caller has the paths
-        power[order] = power.copy()
+        if loss_db is not None:
+            amplitude *= amplitude_from_db(-loss_db[part])[:, None]
+        power[part] = (np.abs(amplitude) ** 2).mean(axis=1)
+        first = np.flatnonzero(np.diff(key[part], prepend=-1))
+        h[key[part][first]] = np.add.reduceat(amplitude, first, axis=0)
     matrices = h.reshape(len(poses), len(arrays), uavs, ports)
     matrices = np.ascontiguousarray(matrices.swapaxes(2, 3)) if link.uav_transmits else matrices
-    links = paths.pose * len(arrays) + paths.tower
-    summed = np.bincount(links, weights=power, minlength=len(poses) * len(arrays)).astype(np.float64)
+    summed = np.bincount(key, weights=power, minlength=len(h)).astype(np.float64)
     return Fields(matrices, power, summed.reshape(len(poses), len(arrays)))
 
 
@@ -196,14 +191,14 @@ def amplitudes(
     ends: Ends,
     wavelength: float,
     record: Callable[[str, AnyArray], None] | None = None,
-) -> FloatArray:
-    """Complex amplitudes of some paths: what each adds to H, before further losses.
+) -> ComplexArray:
+    """Return the complex amplitudes of some paths: what each adds to H, before further losses.
 
     Parameters
     ----------
     g : Geometry
     elements : Elements
-    ends : (paths, 4, pairs) or None, twice
+    ends : (paths, 2, pairs) complex or None, twice
         Pattern fields of tower and UAV: :func:`pattern_ends`.
     wavelength : float
         [m]
@@ -213,11 +208,10 @@ def amplitudes(
 
     Returns
     -------
-    (paths, pairs, 2)
-        Real and imaginary parts of the amplitude.
+    (paths, pairs) complex
     """
     pairs = elements.tower_m.shape[2]
-    out = np.empty((len(g.depth), pairs, 2))
+    out = np.empty((len(g.depth), pairs), dtype=np.complex128)
     step = max(1, PAIRS_PER_CHUNK // pairs)
     # all paths of one depth together, so that no step is evaluated for shorter paths
     for depth in np.unique(g.depth):
@@ -238,7 +232,7 @@ def of_one_depth(
     slants: tuple[Any, Any],
     wavelength: float,
     record: Callable[[str, AnyArray], None] | None = None,
-) -> FloatArray:
+) -> ComplexArray:
     """Compute the same as :func:`amplitudes`, for paths of one depth.
 
     Parameters
@@ -251,42 +245,36 @@ def of_one_depth(
 
     Returns
     -------
-    (..., paths, pairs, 2)
+    (..., paths, pairs) complex
     """
     x, y, z, length = directions(g, elements)
     toward = x, y, z
-    re, im = _vectors(rows_of(g.frame), toward, ends[0], *slants[0])
+    wave = _vectors(rows_of(g.frame), toward, ends[0], *slants[0])
     for step in range(g.depth[0]):
         if record is not None:
-            record("wave", _power(re, im))
+            record("wave", _power(wave))
         normal, face = parts_of(g.normal[:, step]), parts_of(g.face[:, step])
-        re, im = dyads.reflected(re, im, toward, normal, *coefficients(dyads.incidence(toward, normal), face))
+        wave = dyads.reflected(wave, toward, normal, *coefficients(dyads.incidence(toward, normal), face))
     uav = _vectors(rows_of(g.axes), (-x, -y, -z), ends[1], *slants[1])
     cycles = length / wavelength
     with np.errstate(divide="ignore"):
         if record is not None:
-            steps = ("wave", _power(re, im)), ("spreading", dyads.spreading(cycles)), ("uav", _power(*uav))
-            for name, value in steps:
-                record(name, value)
-        return np.stack(dyads.received(re, im, *uav, cycles), axis=-1)
+            record("wave", _power(wave))
+            record("spreading", dyads.spreading(cycles))
+            record("uav", _power(uav))
+        return np.asarray(dyads.received(wave, uav, cycles))
 
 
 def _vectors(
-    m: dyads.Rotation, toward: dyads.Vector, fields: FloatArray | None, cosine: FloatArray, sine: FloatArray
-) -> tuple[dyads.Vector, dyads.Vector]:
-    """Field vectors of elements in site axes: real parts, then imaginary ones."""
-    if fields is None:
-        return dyads.field_vector(m, toward, *dyads.slant_rotation(1.0, 0.0, cosine, sine)), (0.0, 0.0, 0.0)
-    theta_re, theta_im, phi_re, phi_im = fields.swapaxes(0, 1)
-    re = dyads.field_vector(m, toward, *dyads.slant_rotation(theta_re, phi_re, cosine, sine))
-    # most patterns are real, and half of the work is then zero
-    if not (theta_im.any() or phi_im.any()):
-        return re, (0.0, 0.0, 0.0)
-    return re, dyads.field_vector(m, toward, *dyads.slant_rotation(theta_im, phi_im, cosine, sine))
+    m: dyads.Rotation, toward: dyads.Vector, fields: ComplexArray | None, cosine: FloatArray, sine: FloatArray
+) -> dyads.Vector:
+    """Return field vectors of elements in site axes."""
+    theta, phi = (1.0, 0.0) if fields is None else fields.swapaxes(0, 1)
+    return dyads.field_vector(m, toward, *dyads.slant_rotation(theta, phi, cosine, sine))
 
 
-def _power(re: dyads.Vector, im: dyads.Vector) -> FloatArray:
-    return np.asarray(sum(part**2 for part in (*re, *im)))
+def _power(wave: dyads.Vector) -> FloatArray:
+    return np.asarray(sum(np.abs(part) ** 2 for part in wave))
 
 
 def pattern_ends(g: Geometry, elements: Elements, link: Link) -> Ends:
@@ -298,7 +286,7 @@ def pattern_ends(g: Geometry, elements: Elements, link: Link) -> Ends:
         return None, None
     x, y, z, _ = directions(g, elements)
     ports, pair = len(arrays[0]), np.arange(x.shape[1])
-    towers = None if plain_towers else np.empty((len(x), 4, len(pair)))
+    towers = None if plain_towers else np.empty((len(x), 2, len(pair)), dtype=np.complex128)
     if towers is not None:
         for number, array in enumerate(arrays):
             rows = np.flatnonzero(g.tower == number)
@@ -324,12 +312,6 @@ def _ports(arrays: Sequence[Array]) -> int:
             expected="the same number of elements at every tower of a link",
         )
     return counts.pop()
-
-
-def _by_link(paths: PathSet, towers: int) -> IntArray | None:
-    """Return the order that sorts paths by pose and tower, so that each link is one run, or None if they are sorted."""
-    key = paths.pose * towers + paths.tower
-    return None if (np.diff(key) >= 0).all() else np.argsort(key, kind="stable")
 
 
 def parts_between_poses(pose: IntArray, most: int = PATHS_PER_PART) -> list[slice]:

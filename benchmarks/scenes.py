@@ -1,6 +1,6 @@
 """Scenes x engine x depth: seconds (wall and CPU), memory, paths, missing, extra; and how the cost grows.
 
-python benchmarks/scenes.py [--scenes munich,etoile,florence] [--depths 1,2] [--receivers 200] [--check]
+python benchmarks/scenes.py [--scenes munich,etoile,florence] [--depths 1,2] [--receivers 200]
     [--prisms 1000,5000] [--sionna 100000,1000000] [--limits 1000000,10000000] [--slots 24,26]
     [--json FILE]
 
@@ -8,7 +8,6 @@ Scenes are those that the installed Sionna RT ships. Each row runs in a process 
 compiled code must have been compiled before (the first row says how long that took). Receivers lie within 200 m of one
 transmitter, half at street level, half 30 to 60 m up.
 
---check     repeats a row with shadows off and says how many paths differ (and with every cut off on a crop)
 --sionna    PathSolver with so many rays on the same triangles, at the first of the depths: its paths that we lack
             (missing), ours that it lacks (extra), each of which is asked of Sionna's own scene: a ray test of every
             segment, shortened by 2 cm
@@ -32,9 +31,10 @@ import numpy as np
 from shapely.geometry import box
 
 from aerpaw_cmp.propagation.geometry import Links
+from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.search.beams import grow_paths
 from aerpaw_cmp.propagation.search.merging import merged
-from aerpaw_cmp.site.mitsuba import TriangleScene, read_scene
+from aerpaw_cmp.site.mitsuba import read_scene
 
 SOURCES = {
     "munich": (8.5, 21.0, 27.0),
@@ -61,15 +61,6 @@ def ends(name: str, receivers: int) -> tuple[np.ndarray, np.ndarray]:
         away = away / 5.0
     targets = np.column_stack([source[0] + away * np.cos(angle), source[1] + away * np.sin(angle), up])
     return source[None, :], targets
-
-
-def crop(scene: TriangleScene, middle: np.ndarray, triangles: int) -> TriangleScene:
-    """The triangles nearest to a point."""
-    from dataclasses import replace
-
-    corners = scene.vertices_m[scene.triangles]
-    near = np.argsort(np.linalg.norm(corners.mean(axis=1)[:, :2] - middle[:2], axis=1))[:triangles]
-    return replace(scene, triangles=scene.triangles[near], shape=scene.shape[near])
 
 
 def keys(paths: Any) -> set[tuple[int, ...]]:
@@ -129,12 +120,6 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
         "paths": np.bincount(paths.depth, minlength=task["depth"] + 1).tolist(),
         "duplicates": len(paths) - len(plane_keys(paths, surfaces.plane)),
     }
-    if task.get("check"):
-        other = grow_paths(surfaces, Links(sources, targets), max_depth=task["depth"], shadows=False)
-        row["differ_without_shadows"] = len(keys(paths) ^ keys(other))
-        small = merged(crop(scene, sources[0], 600))
-        on, off = (grow_paths(small, Links(sources, targets), max_depth=task["depth"], beams=b) for b in (True, False))
-        row["differ_without_beams_on_600_triangles"] = len(keys(on) ^ keys(off))
     return row
 
 
@@ -194,7 +179,7 @@ def sionna_row(task: dict[str, Any]) -> dict[str, Any]:
     clock = Clock()
     theirs = sionna.find_paths(
         surfaces.faces, Links(sources, targets),
-        sionna.Rays(max_depth=task["depth"], samples=task["samples"], batch=25),
+        Search("sionna", max_depth=task["depth"], samples=task["samples"], batch=25),
         carrier_hz=CARRIER_HZ, surfaces=surfaces,
     )  # fmt: skip
     spent = clock.since()
@@ -280,9 +265,7 @@ def tasks_of(given: argparse.Namespace, names: list[str]) -> list[dict[str, Any]
     depths = given.depths
     tasks = []
     if not given.only_sionna:
-        tasks += [
-            {"kind": "image", "scene": n, "depth": d, "check": given.check, **common} for n in names for d in depths
-        ]
+        tasks += [{"kind": "image", "scene": n, "depth": d, **common} for n in names for d in depths]
     tasks += [{"kind": "prisms", "prisms": n, "depth": d, **common} for n in given.prisms for d in depths]
     tasks += [
         {"kind": "sionna", "scene": n, "depth": depths[0], "samples": s, "limit": m, "slots": t, **common}
@@ -300,7 +283,6 @@ def main() -> None:
     parser.add_argument("--scenes", default="munich,etoile,florence")
     parser.add_argument("--depths", type=numbers, default=[1, 2])
     parser.add_argument("--receivers", type=int, default=200)
-    parser.add_argument("--check", action="store_true")
     parser.add_argument("--prisms", type=numbers, default=[])
     parser.add_argument("--sionna", type=numbers, default=[])
     parser.add_argument("--limits", type=numbers, default=[0])
@@ -320,12 +302,6 @@ def main() -> None:
     )
     rows = [run(task) for task in tasks_of(given, names)]
     table(rows)
-    for row in rows:
-        if row.get("kind") == "image" and given.check and "failed" not in row:
-            print(
-                f"{row['scene']} depth {row['depth']}: {row['differ_without_shadows']} paths differ with shadows off, "
-                f"{row['differ_without_beams_on_600_triangles']} with every cut off on 600 triangles"
-            )
     if given.json:
         text = json.dumps({"rows": rows}, indent=1)
         print(text) if str(given.json) == "-" else given.json.write_text(text)

@@ -177,8 +177,7 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
     from .search import sionna
 
     return sionna.find_paths(
-        scene.faces, links, sionna.Rays(**search.rays),
-        carrier_hz=link.carrier_hz, surfaces=scene.surfaces, progress=run.progress,
+        scene.faces, links, search, carrier_hz=link.carrier_hz, surfaces=scene.surfaces, progress=run.progress,
     )  # fmt: skip
 
 
@@ -249,7 +248,7 @@ class PathCache:
             SHA-256, in hexadecimal.
         """
         faces, surfaces = scene.faces, scene.surfaces
-        decides: list[object] = [__version__, LAYOUT, sorted({"engine": search.engine, **search.rays}.items())]
+        decides: list[object] = [__version__, LAYOUT, search.engine, search.max_depth, search.samples, search.batch]
         if search.engine == "sionna":
             # another version of its tracer may find other paths; the image engine's are exact
             decides += [[version(name) for name in ("sionna-rt", "mitsuba", "drjit")], carrier_hz, faces.material]

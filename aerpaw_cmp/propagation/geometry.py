@@ -173,8 +173,6 @@ class Surfaces:
         Corners in the axes of their face.
     window_m : (faces, 8, 3)
         Convex outline of each face, in its plane; the last corner is repeated.
-    convex : (faces,) bool
-        Faces that fill their outline.
     plane : (faces,) int
         Faces of one number lie in one plane.
     tree, face_tree : BoxTree
@@ -189,7 +187,6 @@ class Surfaces:
     first: IntArray
     flat_m: FloatArray
     window_m: FloatArray
-    convex: BoolArray
     plane: IntArray
     tree: BoxTree
     face_tree: BoxTree

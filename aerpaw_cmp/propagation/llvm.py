@@ -223,9 +223,7 @@ def _failure(child: subprocess.CompletedProcess[str]) -> str:
     return f"the trial {how}: {message[:200]}"
 
 
-def _run_trial(
-    library: Library | None, variant: str, python: str, program: str, timeout_s: float
-) -> tuple[str, dict[str, object]]:
+def _run_trial(library: Library | None, variant: str, program: str, timeout_s: float) -> tuple[str, dict[str, object]]:
     """Return the reason of failure (empty if none) and the child's answer."""
     with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-trial-") as scratch:
         # a kernel in the user's cache would hide that this library cannot compile
@@ -234,7 +232,7 @@ def _run_trial(
             environ[LIBRARY_VARIABLE] = str(library.path)
         try:
             child = subprocess.run(
-                [python, "-c", program, variant],
+                [sys.executable, "-c", program, variant],
                 # Python puts the working folder first in its path: a file mitsuba.py there would be run
                 cwd=scratch,
                 env=environ,
@@ -259,20 +257,12 @@ def _run_trial(
     return "", answer
 
 
-def try_library(
-    library: Library,
-    *,
-    python: str = sys.executable,
-    program: str = _SIONNA_LOADS,
-    timeout_s: float = _TRIAL_TIMEOUT_S,
-) -> Trial:
+def try_library(library: Library, *, program: str = _SIONNA_LOADS, timeout_s: float = _TRIAL_TIMEOUT_S) -> Trial:
     """Trace two paths with this library in a child process (about 2 s with Sionna). It never raises or crashes.
 
     Parameters
     ----------
     library : Library
-    python : str
-        Interpreter of the child.
     program : str
         What it runs: prints one JSON line.
     timeout_s : float
@@ -285,16 +275,16 @@ def try_library(
     """
     if reason := _too_old(library.version):
         return Trial(library, False, reason)
-    reason, answer = _run_trial(library, "llvm_ad_mono_polarized", python, program, timeout_s)
+    reason, answer = _run_trial(library, "llvm_ad_mono_polarized", program, timeout_s)
     version = answer.get("llvm")
     if isinstance(version, list) and version:
         library = Library(library.path, tuple(int(part) for part in version))
     return _verdict(library, reason or _too_old(library.version))
 
 
-def try_variant(variant: str, *, python: str = sys.executable, timeout_s: float = _TRIAL_TIMEOUT_S) -> Trial:
+def try_variant(variant: str) -> Trial:
     """Trace two paths with another Mitsuba variant (``cuda_ad_mono_polarized``) in a child process."""
-    return _verdict(None, _run_trial(None, variant, python, TRIAL_PROGRAM, timeout_s)[0])
+    return _verdict(None, _run_trial(None, variant, TRIAL_PROGRAM, _TRIAL_TIMEOUT_S)[0])
 
 
 def _verdict(library: Library | None, reason: str) -> Trial:
@@ -440,8 +430,17 @@ def known_to_apt() -> str:
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout
 
 
+# Lines that install an LLVM on distributions without apt, by the family of the distribution.
+_LINES = {
+    **dict.fromkeys(("fedora", "rhel", "centos"), "sudo dnf install -y llvm-libs libatomic"),
+    "arch": "sudo pacman -S --needed llvm-libs",
+    **dict.fromkeys(("suse", "opensuse"), "sudo zypper install -y libLLVM19 libatomic1"),
+    "darwin": "brew install llvm",
+}
+
+
 def install_line() -> str:
-    """The one line that installs an LLVM on this machine."""
+    """Return the line that installs an LLVM on this machine."""
     families = os_families()
     if families & {"debian", "ubuntu"}:
         known = known_to_apt()
@@ -454,12 +453,7 @@ def install_line() -> str:
             return f"{first} && sudo apt-get install -y libllvm19 {APT_RUNTIME}"
         package = next(iter(offered), "libllvm19")
         return f"sudo apt-get update && sudo apt-get install -y {package} {APT_RUNTIME}"
-    if families & {"fedora", "rhel", "centos"}:
-        return "sudo dnf install -y llvm-libs libatomic"
-    if families & {"arch"}:
-        return "sudo pacman -S --needed llvm-libs"
-    if families & {"suse", "opensuse"}:
-        return "sudo zypper install -y libLLVM19 libatomic1"
-    if families & {"darwin"}:
-        return "brew install llvm"
+    for family, line in _LINES.items():
+        if family in families:
+            return line
     return f"export {LIBRARY_VARIABLE}=/path/to/libLLVM.so  # any LLVM of {MINIMUM_MAJOR} or newer"

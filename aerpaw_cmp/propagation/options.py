@@ -50,11 +50,6 @@ class Search:
     further: tuple[Callable[..., Any], ...] = ()
     links: BoolArray | None = None
 
-    @property
-    def rays(self) -> dict[str, Any]:
-        """Options that Sionna's search takes."""
-        return {name: getattr(self, name) for name in ("max_depth", "samples", "batch")}
-
 
 @dataclass(frozen=True, slots=True)
 class Field:

@@ -239,26 +239,14 @@ def _sort(
 def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[SingleTree]:
     """Return a tree with its tagged sizes, or the trees of a row."""
     notes: list[str] = []
-    height = positive_metres(tree.tags, ("height", "est_height"), notes)
-    if height is not None and height > TALLEST_TREE_M:
-        notes.append(f"a tree {height:g} m high; feet or centimetres? The site's default holds")
-        height = None
-    crown = positive_metres(tree.tags, ("diameter_crown", "crown_diameter"), notes)
-    if crown is not None and crown > WIDEST_CROWN_M:
-        notes.append(f"a crown {crown:g} m wide; feet or centimetres? The site's default is used")
-        crown = None
-    girth = positive_metres(tree.tags, ("circumference",), notes)
-    if girth is not None and girth > _WIDEST_GIRTH_M:
-        # a number without unit that no tree reaches in metres or feet is in centimetres
-        bare = metres(f"{tree.tags['circumference'].strip()} m") is not None
-        if bare and 3.3 * _WIDEST_GIRTH_M < girth <= 100.0 * _WIDEST_GIRTH_M:
-            notes.append(
-                f"the circumference '{girth:g}' is taken as centimetres: a trunk {girth / 100 / math.pi:.2g} m thick"
-            )
-            girth /= 100.0
-        else:
-            notes.append(f"a trunk {girth:g} m around; feet or centimetres? The site's default is used")
-            girth = None
+    height = _size(tree.tags, ("height", "est_height"), TALLEST_TREE_M, "a tree {:g} m high", notes)
+    crown = _size(tree.tags, ("diameter_crown", "crown_diameter"), WIDEST_CROWN_M, "a crown {:g} m wide", notes)
+    tags, written = dict(tree.tags), tree.tags.get("circumference", "").strip()
+    # a number without unit that no tree reaches in metres or feet is in centimetres
+    if 3.3 * _WIDEST_GIRTH_M < (metres(f"{written} m") or 0.0) <= 100.0 * _WIDEST_GIRTH_M:
+        notes.append(f"the circumference '{written}' is taken as centimetres")
+        tags["circumference"] = f"{written} cm"
+    girth = _size(tags, ("circumference",), _WIDEST_GIRTH_M, "a trunk {:g} m around", notes)
     points = np.stack(frame.to_local(*np.array(tree.positions, dtype=np.float64).reshape(-1, 2).T), axis=1)
     # a truncated number of degrees projects to infinity
     points = points[np.isfinite(points).all(axis=1)]
@@ -272,6 +260,15 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
     actions += [f"{tree.source}: {note}" for note in notes]
     trunk = None if girth is None else girth / math.pi
     return [SingleTree(float(east), float(north), height, crown, trunk) for east, north in points]
+
+
+def _size(tags: Mapping[str, str], keys: tuple[str, ...], most_m: float, what: str, notes: list[str]) -> float | None:
+    """Return a size of a tree or a wood [m]. One that is too large adds a sentence to ``notes`` and is not used."""
+    size = positive_metres(tags, keys, notes)
+    if size is None or size <= most_m:
+        return size
+    notes.append(f"{what.format(size)}; feet or centimetres? The site's default is used")
+    return None
 
 
 def _along(line_m: FloatArray, spacing_m: float) -> FloatArray:
@@ -506,11 +503,7 @@ def _assumed_heights(shapes: list[_Shape]) -> str:
 
 def _describe_wood(shape: _Shape, tags: Mapping[str, str], actions: list[str]) -> None:
     notes: list[str] = []
-    height = positive_metres(tags, ("height", "est_height"), notes) or 0.0
-    if height > TALLEST_TREE_M:
-        notes.append(f"a wood {height:g} m high; feet or centimetres? The default holds")
-        height = 0.0
-    shape.height_m = height
+    shape.height_m = _size(tags, ("height", "est_height"), TALLEST_TREE_M, "a wood {:g} m high", notes) or 0.0
     shape.evergreen = max(_EVERGREEN.get(tags.get(key, ""), 0.0) for key in ("leaf_type", "leaf_cycle"))
     actions += [f"{shape.source}: {note}" for note in notes]
 

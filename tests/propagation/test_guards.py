@@ -12,6 +12,7 @@ from aerpaw_cmp.common.errors import CheckError, UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.jobs.bench import random_scene, speed_against_error
 from aerpaw_cmp.propagation.geometry import Links, site_faces, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search import sionna
 from aerpaw_cmp.site.site import Building
@@ -71,9 +72,9 @@ def test_a_batch_with_nearly_as_many_paths_as_fit_is_refused(many):
     finder.trace = lambda *_: traced
     if many == 10:
         with pytest.raises(CheckError, match="nearly 10 paths"):
-            finder.searched(TARGETS, 1, 9)
+            finder.searched(TARGETS, Search(max_depth=1, samples=9))
         return
-    searched = finder.searched(TARGETS, 1, 9)
+    searched = finder.searched(TARGETS, Search(max_depth=1, samples=9))
     assert (searched["valid"].shape, searched["kind"].shape) == ((2, 2, 30), (1, 2, 2, 30))
     assert searched["gain"][1, 0, 4] == pytest.approx(np.linalg.norm(a[:, 1, :, 0, :, 4]))
 
@@ -114,7 +115,7 @@ def test_batches_hold_one_to_a_hundred_poses(scenes, monkeypatch, batch, refused
     monkeypatch.setattr(sionna, "load_variant", load)
     links = Links(SOURCES, TARGETS)
     with pytest.raises(UsageError if refused else LoadedError, match=f"batch {batch}" if refused else None):
-        sionna.find_paths(site_faces(scenes.site()), links, sionna.Rays(batch=batch), carrier_hz=3.4e9)
+        sionna.find_paths(site_faces(scenes.site()), links, Search("sionna", batch=batch), carrier_hz=3.4e9)
 
 
 def peak_bytes(poses, link, site):

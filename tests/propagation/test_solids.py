@@ -136,8 +136,8 @@ def test_points_inside_the_planes_are_those_inside_a_building(scenes, turn):
     rng = np.random.default_rng(2)
     points = np.column_stack([rng.uniform(-3, 95, 4000), rng.uniform(-3, 23, 4000), rng.uniform(0.1, 9, 4000)])
     inside = np.zeros((len(points), len(shapes)), dtype=bool)
-    for number, pieces in enumerate(hiding.pieces):
-        for normal, offset in pieces:
+    for number, pieces in enumerate(hiding.parts):
+        for normal, offset in (hiding.pieces[piece] for piece in pieces):
             assert np.allclose(np.linalg.norm(normal, axis=1), 1.0)
             inside[:, number] |= (points @ normal.T < offset).all(axis=1)
     for number, shape in enumerate(shapes):

@@ -23,6 +23,7 @@ from ...common.content import content_digest
 from ...common.text import counted
 from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray, spread_out
 from ...compare.level import FieldAudit
+from ...compare.rank import channel_rank
 from ...site.site import Site
 from ..field.foliage import over_stands
 from ..field.sum import channel_matrices
@@ -306,8 +307,6 @@ class _OneLink:
 
 def _another_rank(ours: ComplexArray, expected: ComplexArray, ks: Sequence[float]) -> bool:
     """Check whether a rank differs for a K at which no singular value lies near the threshold."""
-    from ...compare.rank import channel_rank
-
     sigma = np.linalg.svd(expected, compute_uv=False)
     if not sigma[0] > 0:
         return any(int(channel_rank(ours, k)) for k in ks)
@@ -427,11 +426,12 @@ def against_sionna(
         few.rotation @ np.array(expected.link.uav.mount),
     )
     theirs = _own(scene, scene.links_to(few), probe, turns, search, {} if known is None else known)
-    place = np.full(int(max(len(poses), 1)), -1, dtype=np.int64)
-    place[chosen] = np.arange(len(chosen))
-    rows = np.flatnonzero((place[replay.paths.pose] >= 0) & ~_over_terrain(replay))
-    ours = replace(replay.paths.select(rows), pose=place[replay.paths.pose[rows]])
-    mine, matches = _matched(ours, replay.faces, theirs.paths, scene.faces)
+    rows, ours = _of_chosen(replay.paths, chosen)
+    ours = ours.select(~_over_terrain(replay)[rows])
+    keys, their_keys = _keyed(ours, replay.faces, theirs.paths, scene.faces)
+    known_rows = {key: index for index, key in enumerate(their_keys)}
+    mine = np.flatnonzero([key in known_rows for key in keys])
+    matches = np.array([known_rows[keys[row]] for row in mine], dtype=np.int64)
     own = replace(
         theirs, paths=theirs.paths.select(matches), gain=theirs.gain[matches], length_m=theirs.length_m[matches]
     )
@@ -446,7 +446,7 @@ def _own(
     scene: Scene, links: Links, probe: Link, turns: tuple[FloatArray, FloatArray], search: Search, known: dict[str, Any]
 ) -> Coefficients:
     """Return Sionna's own coefficients in the slants of a probe. Sionna runs once, with crossed elements."""
-    from ..search.sionna import Rays, own_coefficients
+    from ..search.sionna import own_coefficients
 
     arrays, cross = list(probe.tower_arrays.items()), np.array([0.0, np.pi / 2])
     # the slant of an element is a rotation, so two crossed elements determine every slant
@@ -456,10 +456,10 @@ def _own(
         uav_array=replace(probe.uav_array, slant_rad=cross),
     )
     patterns = [array.patterns[0].name for array in (*probe.tower_arrays.values(), probe.uav_array)]
-    key = content_digest(scene.faces, scene.surfaces, links, patterns, probe.carrier_hz, turns, search.rays)
+    asked = search.max_depth, search.samples, search.batch
+    key = content_digest(scene.faces, scene.surfaces, links, patterns, probe.carrier_hz, turns, asked)
     if key not in known:
-        rays = Rays(**search.rays)
-        known[key] = own_coefficients(scene.faces, links, upright, turns, rays, surfaces=scene.surfaces)
+        known[key] = own_coefficients(scene.faces, links, upright, turns, search, surfaces=scene.surfaces)
     slants = np.stack([array.slant_parts for _, array in arrays])[known[key].paths.tower]
     gain = np.einsum("pab,au,pbv->puv", known[key].gain, probe.uav_array.slant_parts, slants)
     return replace(known[key], gain=gain)  # type: ignore[no-any-return]
@@ -485,17 +485,6 @@ def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
     return replace(link, tower_arrays=towers, uav_array=centre(link.uav_array), uav_transmits=False), tuple(
         dict.fromkeys(unasked)
     )
-
-
-def _matched(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Faces) -> tuple[IntArray, IntArray]:
-    """Return the indices of the paths that both engines have, in ``ours`` and in ``theirs``."""
-    from ..geometry import joined
-
-    plane = planes_of(joined(our_faces, their_faces))
-    known = {key: index for index, key in enumerate(plane_keys(theirs, plane[len(our_faces) :]))}
-    pairs = [(i, known[key]) for i, key in enumerate(plane_keys(ours, plane[: len(our_faces)])) if key in known]
-    rows = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    return rows[:, 0], rows[:, 1]
 
 
 def _paths_against_sionna(
@@ -781,56 +770,45 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
         Paths that only one of the two has, errors of the level [dB], links in coverage of only one, and ranks that
         differ.
     """
-    ours, theirs = (keys.keys() for keys in _keys_of_both(replay, reference, chosen))
+    keys = _keyed(_of_chosen(replay.paths, chosen)[1], replay.faces, reference.paths, reference.faces)
+    ours, theirs = map(set, keys)
+    h, level = replay.h[chosen], replay.rss_dbm[chosen]
+    covered = np.isfinite(level) & np.isfinite(reference.rss_dbm)
+    error = np.abs(level[covered] - reference.rss_dbm[covered])
     return Difference(
         missing_paths=len(theirs - ours),
         extra_paths=len(ours - theirs),
         reference_paths=len(theirs),
-        **channels_differ((replay.h[chosen], replay.rss_dbm[chosen]), (reference.h, reference.rss_dbm), ks),
-    )
-
-
-def channels_differ(
-    channels: tuple[ComplexArray, FloatArray], reference: tuple[ComplexArray, FloatArray], ks: Sequence[float]
-) -> dict[str, Any]:
-    """Return differences of H and levels (poses, towers) [dBm] from a reference, as fields of :class:`Difference`."""
-    from ...compare.rank import channel_rank
-
-    (h, level), (reference_h, expected) = channels, reference
-    covered = np.isfinite(level) & np.isfinite(expected)
-    error = np.abs(level[covered] - expected[covered])
-    return {
         # NaN if nothing was compared: zero would mean perfect agreement
-        "rss_max_error_db": float(error.max()) if error.size else float("nan"),
-        "rss_rms_error_db": float(np.sqrt((error**2).mean())) if error.size else float("nan"),
-        "coverage_differs": int((np.isfinite(level) != np.isfinite(expected)).sum()),
-        "rank_disagreement": {float(k): float(np.mean(channel_rank(h, k) != channel_rank(reference_h, k))) for k in ks},
-    }
+        rss_max_error_db=float(error.max()) if error.size else math.nan,
+        rss_rms_error_db=float(np.sqrt((error**2).mean())) if error.size else math.nan,
+        coverage_differs=int((np.isfinite(level) != np.isfinite(reference.rss_dbm)).sum()),
+        rank_disagreement={float(k): float(np.mean(channel_rank(h, k) != channel_rank(reference.h, k))) for k in ks},
+    )
 
 
 def extra_rows(replay: Replay, reference: Replay, chosen: IntArray) -> IntArray:
     """Return the paths of a replay that the reference, which has only the poses ``chosen``, does not have."""
-    ours, theirs = _keys_of_both(replay, reference, chosen)
-    return np.array([row for key, row in ours.items() if key not in theirs], dtype=np.int64)
+    rows, ours = _of_chosen(replay.paths, chosen)
+    keys, theirs = _keyed(ours, replay.faces, reference.paths, reference.faces)
+    known = set(theirs)
+    return rows[np.array([key not in known for key in keys], dtype=np.bool_)]
 
 
-# Rows of paths by the pose's index in ``chosen``, tower and planes.
-_Keys = dict[tuple[int, ...], int]
-
-
-def _keys_of_both(replay: Replay, reference: Replay, chosen: IntArray) -> tuple[_Keys, _Keys]:
-    """Return the keyed paths of a replay and of a reference that has only the poses ``chosen``."""
-    # numbered together, because the terrain planes that a replay lists depend on its poses
-    plane = np.split(planes_of(joined(replay.faces, reference.faces)), [len(replay.faces)])
-    return _keys(replay, plane[0], chosen), _keys(reference, plane[1], np.arange(len(chosen)))
-
-
-def _keys(replay: Replay, planes: IntArray, chosen: IntArray) -> _Keys:
-    """Return rows of paths by (index in ``chosen``, tower, planes). Coplanar faces are the same mirror."""
-    place = np.full(int(max(chosen.max(initial=-1), replay.paths.pose.max(initial=-1))) + 1, -1, dtype=np.int64)
+def _of_chosen(paths: PathSet, chosen: IntArray) -> tuple[IntArray, PathSet]:
+    """Return the rows of the paths of some poses, and these paths with the index in ``chosen`` as their pose."""
+    place = np.full(int(max(chosen.max(initial=-1), paths.pose.max(initial=-1))) + 1, -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
-    index = np.flatnonzero(place[replay.paths.pose] >= 0)
-    paths = replay.paths.select(index)
-    # faces in one plane are one mirror, and engines may name either of them
-    keys = plane_keys(replace(paths, pose=place[paths.pose]), planes)
-    return dict(zip(keys, index.tolist(), strict=True))
+    rows = np.flatnonzero(place[paths.pose] >= 0)
+    return rows, replace(paths.select(rows), pose=place[paths.pose[rows]])
+
+
+def _keyed(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Faces) -> tuple[list[_Key], list[_Key]]:
+    """Return pose, tower and planes of each path of two sets. Coplanar faces are the same mirror."""
+    # numbered together, because the terrain planes that a replay lists depend on its poses
+    plane = planes_of(joined(our_faces, their_faces))
+    return plane_keys(ours, plane[: len(our_faces)]), plane_keys(theirs, plane[len(our_faces) :])
+
+
+# Pose, tower and planes of a path.
+_Key = tuple[int, ...]

@@ -3,9 +3,8 @@
 The source is mirrored at a first face. The beam from that image through the face's outline meets the tree of faces. The
 faces that it meets are second faces, and so on. At each step the receivers, which have a separate tree, are cut by all
 side planes of the beam: those of the last face and the mirrored planes of earlier faces. For the remaining receivers
-the search computes the reflection points, whether each lies in its face, and whether a triangle cuts a segment. First
-faces that lie completely in the shadow of one convex face are skipped. All cuts are conservative, so the paths do not
-depend on them. Pairs are streamed: memory does not grow with their number.
+the search computes the reflection points, whether each lies in its face, and whether a triangle cuts a segment. All
+cuts are conservative, so the paths do not depend on them. Pairs are streamed: memory does not grow with their number.
 
 For thousands of prisms, compiled beams find candidates, and the exact rules of the image engine decide.
 
@@ -16,7 +15,7 @@ in :mod:`aerpaw_cmp.propagation.search.mirror`, so both searches find the same p
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -27,7 +26,7 @@ from ...common.units import BoolArray, FloatArray, IntArray
 from .. import compiled
 from ..compiled import kernel, part
 from ..geometry import BoxTree, Faces, Links, PathSet, Surfaces, corners, triangles
-from ..options import Progress, Run
+from ..options import Run
 from .merging import DEEPEST, WINDOW, box_missed, box_outside, box_tree, next_leaf, within_planes
 from .mirror import Occlusion, images_of, merge, planes_of, scene_tolerance_m, searched_links, trace_back
 
@@ -55,9 +54,7 @@ class _Mirrors(NamedTuple):
     along: FloatArray
     across: FloatArray
     window: FloatArray
-    convex: BoolArray
     plane: IntArray
-    front_only: BoolArray
     usable: BoolArray
     first: IntArray
     flat: FloatArray
@@ -72,28 +69,22 @@ class _Solids(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Tolerances and switches of a search."""
+    """The depth and the tolerances of a search. A ``margin`` above 0 means that the faces are those of solids."""
 
     depth: int
     clearance: float
-    end: float = _END_M
     margin: float = 0.0
-    side: float = SIDE_M
-    beams: bool = True
-    shadows: bool = True
+
+    @classmethod
+    def of(cls, surfaces: Surfaces, depth: int, *, solids: bool = False) -> Rules:
+        """Return the rules for surfaces."""
+        return cls(depth, 2.0 * surfaces.merge_m, _SOLID_MARGIN if solids else 0.0)
 
 
 def grow_paths(
-    surfaces: Surfaces,
-    links: Links,
-    run: Run = Run(),
-    *,
-    max_depth: int = 2,
-    beams: bool = True,
-    shadows: bool = True,
-    solids: bool = False,
+    surfaces: Surfaces, links: Links, run: Run = Run(), *, max_depth: int = 2, solids: bool = False
 ) -> PathSet:
-    """All paths with at most ``max_depth`` reflections.
+    """Return all paths with at most ``max_depth`` reflections.
 
     Parameters
     ----------
@@ -103,13 +94,9 @@ def grow_paths(
         Progress.
     max_depth : int
         0 to 3.
-    beams : bool
-        False follows every sequence of faces: the same paths, for tests.
-    shadows : bool
-        If false, also follow first faces that are hidden by one convex face.
     solids : bool
         The faces are those of closed solids: they reflect in front only, and a segment is cut beyond doubt or not at
-        all. What is found are candidates for :mod:`aerpaw_cmp.propagation.search.beams`, coincident ones among them.
+        all. The result contains candidates for :func:`find_paths`, including coincident paths.
 
     Returns
     -------
@@ -118,42 +105,47 @@ def grow_paths(
     """
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
-    towers, threads = len(links.sources_m), compiled.thread_count()
+    faces, towers, threads = surfaces.faces, len(links.sources_m), compiled.thread_count()
+    rules, hiding = Rules.of(surfaces, max_depth, solids=solids), _solids(surfaces)
     pieces: list[PathSet] = []
-    rules = _rules(surfaces, max_depth, solids=solids, beams=beams, shadows=shadows)
-    for tower, poses, search in _searches(surfaces, links, rules):
-        levels = [search.direct()]
-        if max_depth:
-
-            def share(fraction: float, tower: int = tower) -> None:
-                if run.progress:
-                    run.progress((tower + fraction) / towers)
-
-            levels += search.run(search.first_faces(), threads, share)
-        pieces += [PathSet.from_tower(tower, poses[pose], faces, at, max_depth) for pose, faces, at in levels]
+    alive = searched_links(links)
+    # tower by tower: they share a scene but have different usable faces
+    for tower in np.flatnonzero(alive.any(axis=1)).tolist():
+        poses, source = np.flatnonzero(alive[tower]), np.ascontiguousarray(links.sources_m[tower])
+        mirrors = _mirrors(surfaces, None if links.usable is None else links.usable[tower])
+        targets = np.ascontiguousarray(links.targets_m[poses])
+        receivers = targets, box_tree(targets, targets)
+        pose = np.flatnonzero(_direct(hiding, source, targets, rules))
+        levels: list[_Level] = [(pose, np.zeros((len(pose), 0), np.int64), np.zeros((len(pose), 0, 3)))]
+        height = faces.normal @ source - faces.offset_m
+        # a sheet has two sides, but not for a source in its plane; a solid has an outside
+        first = np.flatnonzero(mirrors.usable & (height >= -SIDE_M if solids else np.abs(height) > SIDE_M))
+        # shuffled, so that the share done grows evenly
+        first = np.random.default_rng(0).permutation(first) if max_depth else first[:0]
+        # chunks small enough to share out evenly, and large enough to hide the call
+        each = max(16, min(1024, len(first) // (8 * threads) + 1))
+        chunks = [first[at : at + each] for at in range(0, len(first), each)]
+        for at in range(0, len(chunks), 4 * threads):
+            some = chunks[at : at + 4 * threads]
+            levels += compiled.in_threads(partial(_follow, mirrors, hiding, receivers, source, rules), some, threads)
+            if run.progress:
+                run.progress((tower + min(1.0, (at + 4 * threads) / len(chunks))) / towers)
+        pieces += [PathSet.from_tower(tower, poses[pose], met, at, max_depth) for pose, met, at in levels]
         if run.progress:
             run.progress((tower + 1) / towers)
     paths = merge(pieces, max_depth, None)
     return paths if solids else without_coincident(paths, surfaces)
 
 
-def _rules(surfaces: Surfaces, max_depth: int, *, solids: bool, beams: bool = True, shadows: bool = True) -> Rules:
-    margin = _SOLID_MARGIN if solids else 0.0
-    return Rules(max_depth, 2.0 * surfaces.merge_m, margin=margin, beams=beams, shadows=shadows)
+# Receivers (n,), faces (n, depth), reflection points (n, depth, 3); -1 and any point where a path has fewer.
+_Level = tuple[IntArray, IntArray, FloatArray]
 
 
-def _searches(surfaces: Surfaces, links: Links, rules: Rules) -> Iterator[tuple[int, IntArray, _Search]]:
-    """Tower, poses and search of every tower that has a pose to be searched for."""
-    # tower by tower: they share a scene but have different usable faces
-    alive = searched_links(links)
-    for tower in np.flatnonzero(alive.any(axis=1)).tolist():
-        poses = np.flatnonzero(alive[tower])
-        usable = None if links.usable is None else links.usable[tower]
-        mirrors = _mirrors(surfaces, usable, front_only=rules.margin > 0.0)
-        yield tower, poses, _Search(mirrors, surfaces, links.sources_m[tower], links.targets_m[poses], rules)
+def _solids(surfaces: Surfaces) -> _Solids:
+    return _Solids(surfaces.face_tree, surfaces.corners_m, surfaces.tree)
 
 
-def _mirrors(surfaces: Surfaces, usable: BoolArray | None = None, *, front_only: bool = False) -> _Mirrors:
+def _mirrors(surfaces: Surfaces, usable: BoolArray | None = None) -> _Mirrors:
     faces = surfaces.faces
     return _Mirrors(
         normal=np.ascontiguousarray(faces.normal),
@@ -161,69 +153,11 @@ def _mirrors(surfaces: Surfaces, usable: BoolArray | None = None, *, front_only:
         along=np.ascontiguousarray(faces.along),
         across=np.ascontiguousarray(faces.across),
         window=surfaces.window_m,
-        convex=surfaces.convex,
         plane=surfaces.plane,
-        front_only=np.full(len(faces), front_only),
         usable=np.ones(len(faces), np.bool_) if usable is None else np.ascontiguousarray(usable),
         first=surfaces.first,
         flat=surfaces.flat_m,
     )
-
-
-# Receivers (n,), faces (n, depth), reflection points (n, depth, 3); -1 and any point where a path has fewer.
-_Level = tuple[IntArray, IntArray, FloatArray]
-
-
-class _Search:
-    """The search of one source."""
-
-    def __init__(
-        self,
-        mirrors: _Mirrors,
-        surfaces: Surfaces,
-        source: FloatArray,
-        targets: FloatArray,
-        rules: Rules,
-    ) -> None:
-        self.mirrors, self.source, self.rules = mirrors, np.ascontiguousarray(source), rules
-        self.solids = _Solids(surfaces.face_tree, surfaces.corners_m, surfaces.tree)
-        targets = np.ascontiguousarray(targets)
-        self.targets = targets, box_tree(targets, targets)
-
-    def direct(self) -> _Level:
-        """Return lines of sight."""
-        free = _direct(self.solids, self.source, self.targets[0], self.rules)
-        pose = np.flatnonzero(free)
-        return pose, np.zeros((len(pose), 0), np.int64), np.zeros((len(pose), 0, 3))
-
-    def first_faces(self) -> IntArray:
-        """Return the first faces to follow, in an order whose beginning is a representative sample."""
-        good = _first_faces(self.mirrors, self.solids.face_tree, self.source, self.rules)
-        return np.random.default_rng(0).permutation(np.flatnonzero(good))
-
-    def follow(self, some: IntArray) -> _Level:
-        """Return the paths whose first face is one of ``firsts``."""
-        return _follow(self.mirrors, self.solids, self.targets, self.source, some, self.rules)  # type: ignore[no-any-return]
-
-    def run(self, first: IntArray, threads: int, share: Progress) -> list[_Level]:
-        """Follow all sequences that begin with the faces ``first``."""
-        levels: list[_Level] = []
-        followed = 0
-        for some, size in _chunks(first, threads):
-            levels += compiled.in_threads(self.follow, some, threads)
-            followed += size
-            share(followed / len(first))
-        return levels
-
-
-def _chunks(first: IntArray, threads: int) -> Iterator[tuple[list[IntArray], int]]:
-    """Rounds of chunks for all threads."""
-    # small enough to share out evenly, large enough to hide the call
-    at, each = 0, max(16, min(1024, len(first) // (8 * threads) + 1))
-    while at < len(first):
-        parts = [first[k : k + each] for k in range(at, min(at + each * 4 * threads, len(first)), each)]
-        yield parts, sum(len(p) for p in parts)
-        at += each * 4 * threads
 
 
 # Paths over parallel planes whose reflection points are all closer than this [m] are one path.
@@ -329,7 +263,7 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
 @kernel
 def _face_at(mirrors, f, coplanar, point, edge):  # type: ignore[no-untyped-def]
     """Return the face ``f`` if a point lies in it, else the first coplanar face that contains it, else -1."""
-    _, _, along, across, _, _, _, _, _, first, flat = mirrors
+    along, across, first, flat = mirrors.along, mirrors.across, mirrors.first, mirrors.flat
     if in_face(first, flat, along, across, f, point, edge):
         return f
     for neighbour in coplanar:
@@ -444,7 +378,7 @@ def _at_end(mirror, hit, distance, rules):  # type: ignore[no-untyped-def]
     normal, offset = mirror
     # zeros stand for an antenna: a record for either kind would be counted in and out
     if normal[0] == 0.0 and normal[1] == 0.0 and normal[2] == 0.0:
-        return distance <= rules.end
+        return distance <= _END_M
     return abs(normal[0] * hit[0] + normal[1] * hit[1] + normal[2] * hit[2] - offset) <= rules.clearance
 
 
@@ -461,111 +395,6 @@ def _direct(solids, source, targets, rules):  # type: ignore[no-untyped-def]
 @kernel
 def _height(normal, offset, f, p):  # type: ignore[no-untyped-def]
     return normal[f, 0] * p[0] + normal[f, 1] * p[1] + normal[f, 2] * p[2] - offset[f]
-
-
-@kernel
-def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-def]
-    """Return the faces (faces,) that may be first, without faces that one convex face hides completely."""
-    normal, offset = mirrors.normal, mirrors.offset
-    good = np.zeros(len(normal), np.bool_)
-    stack = np.empty(DEEPEST, np.int64)
-    for f in range(len(good)):
-        if not mirrors.usable[f]:
-            continue
-        height = _height(normal, offset, f, source)
-        # a sheet has two sides, but not for a source in its plane; a solid has an outside
-        if (abs(height) <= rules.side and rules.margin == 0.0) or (mirrors.front_only[f] and height < -rules.side):
-            continue
-        good[f] = not (rules.shadows and _wholly_hidden(mirrors, face_tree, source, f, -1, 0.0, rules, stack))
-    return good
-
-
-@kernel
-def _wholly_hidden(mirrors, face_tree, source, f, before, sign, rules, stack):  # type: ignore[no-untyped-def]
-    """Check whether one convex face lies between the source and every corner of the outline of face ``f``.
-
-    If the source is an image, the convex face must also be completely in front of the face ``before`` (-1: none), on
-    the side ``sign``.
-    """
-    _, _, _, _, window, convex, plane, _, _, _, _ = mirrors
-    lower, upper, child, start, many, items = face_tree
-    aim, inverse = np.zeros(3), np.empty(3)
-    for k in range(WINDOW):
-        if not np.isfinite(window[f, k, 0]):
-            return False
-        aim += window[f, k] / WINDOW
-    for axis in range(3):
-        d = aim[axis] - source[axis]
-        inverse[axis] = 1.0 / d if d != 0.0 else 1e300
-    stack[0] = 0
-    node, waiting = next_leaf(lower, upper, child, stack, 1, box_missed, (source, inverse))
-    while node >= 0:
-        for k in range(start[node], start[node] + many[node]):
-            g = items[k]
-            # a face with hollows may let the beam through, and a face in the same plane does not hide it
-            if not convex[g] or plane[g] == plane[f] or g == before:
-                continue
-            if _beyond(mirrors, before, sign, g, rules) and _hides(mirrors, source, f, g, rules):
-                return True
-        node, waiting = next_leaf(lower, upper, child, stack, waiting, box_missed, (source, inverse))
-    return False
-
-
-@part
-def _beyond(mirrors, before, sign, g, rules):  # type: ignore[no-untyped-def]
-    """Check whether the outline of ``g`` is completely in front of the face ``before``, where there is one."""
-    normal, offset = mirrors.normal, mirrors.offset
-    for corner in range(WINDOW if before >= 0 else 0):
-        if not sign * _height(normal, offset, before, mirrors.window[g, corner]) > 10.0 * rules.clearance:
-            return False
-    return True
-
-
-@kernel
-def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
-    """Check whether the convex face ``g`` cuts the lines from the source to all corners of the outline of ``f``.
-
-    It must do so well inside its outline: its triangles may lie a merge tolerance off its plane.
-    """
-    normal, offset = mirrors.normal, mirrors.offset
-    window, clearance = mirrors.window, rules.clearance
-    from_source = _height(normal, offset, g, source)
-    # so near to its plane the source may see past it
-    if abs(from_source) <= 10.0 * clearance:
-        return False
-    for k in range(WINDOW):
-        corner = window[f, k]
-        height = _height(normal, offset, g, corner)
-        if height * from_source >= 0.0 or abs(height) <= clearance:
-            return False
-        share = from_source / (from_source - height)
-        point = source + share * (corner - source)
-        run = corner - source
-        length = np.sqrt(run[0] ** 2 + run[1] ** 2 + run[2] ** 2)
-        cosine = abs(from_source - height) / length
-        # at grazing incidence a tolerance in the plane moves the point too far along it
-        if cosine < 0.05 or abs(_height(normal, offset, f, point)) <= 2.0 * clearance:
-            return False
-        if not _well_inside(window[g], normal[g], point, clearance / cosine + 1e-3):
-            return False
-    return True
-
-
-@kernel
-def _well_inside(outline, normal, point, margin):  # type: ignore[no-untyped-def]
-    """Check whether a point lies in a convex outline, which runs counter-clockwise round ``normal``, by a margin."""
-    for k in range(WINDOW):
-        a, b = outline[k], outline[(k + 1) % WINDOW]
-        e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        size = np.sqrt(e0 * e0 + e1 * e1 + e2 * e2)
-        # the outline repeats its last corner
-        if size == 0.0:
-            continue
-        # normal x edge points inwards
-        i0, i1, i2 = normal[1] * e2 - normal[2] * e1, normal[2] * e0 - normal[0] * e2, normal[0] * e1 - normal[1] * e0
-        if (i0 * (point[0] - a[0]) + i1 * (point[1] - a[1]) + i2 * (point[2] - a[2])) / size < margin:
-            return False
-    return True
 
 
 @kernel
@@ -657,10 +486,10 @@ def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-
 
 
 @kernel
-def _ahead(normal, offset, f, sign, outline, side):  # type: ignore[no-untyped-def]
+def _ahead(normal, offset, f, sign, outline):  # type: ignore[no-untyped-def]
     """Check whether a corner of an outline lies before a face, on the side ``sign`` of it."""
     for k in range(WINDOW):  # noqa: SIM110 - compiled
-        if sign * _height(normal, offset, f, outline[k]) > -side:
+        if sign * _height(normal, offset, f, outline[k]) > -SIDE_M:
             return True
     return False
 
@@ -669,15 +498,15 @@ def _ahead(normal, offset, f, sign, outline, side):  # type: ignore[no-untyped-d
 def _reflects(shapes, level, chain, signs, images, points, target, rules):  # type: ignore[no-untyped-def]
     """Check whether a path to a target meets each face of the sequence, and write its ``points`` there."""
     normal, offset, along, across, first, flat = shapes
-    side, strict, point = rules.side, rules.margin == 0.0, target
+    strict, point = rules.margin == 0.0, target
     for step in range(level, -1, -1):
         g = chain[step]
         top = signs[step] * _height(normal, offset, g, point)
         low = signs[step] * _height(normal, offset, g, images[step])
         # both ends must be in front of the mirror
-        if top < -side or low < -side or top + low <= (side if strict else 1e-12):
+        if top < -SIDE_M or low < -SIDE_M or top + low <= (SIDE_M if strict else 1e-12):
             return False
-        if step < level and top <= (side if strict else -side):
+        if step < level and top <= (SIDE_M if strict else -SIDE_M):
             return False
         # the image lies as far behind the mirror as its source before it
         share, behind = low / (low + top), images[step + 1]
@@ -714,16 +543,16 @@ def _doubled(pose, faces, points):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[no-untyped-def]
+def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[no-untyped-def]
     """All paths whose first face is one of ``firsts``: a walk, depth first, along beams.
 
     One body: a record handed to a part is counted in and out array by array, which costs as much as following a face.
     """
-    normal, offset, along, across, window, _, plane, front_only, usable, first, flat = mirrors
+    normal, offset, along, across, window, plane, usable, first, flat = mirrors
     shapes = normal, offset, along, across, first, flat
     targets, (t_lower, t_upper, t_child, t_start, t_many, t_items) = receivers
     face_tree = solids.face_tree
-    depth, side, beams = rules.depth, rules.side, rules.beams
+    depth, solid = rules.depth, rules.margin > 0.0
     pose, faces, points = np.empty(256, np.int64), np.full((256, depth), -1, np.int64), np.zeros((256, depth, 3))
     total = 0
     next_faces = np.empty((depth + 1, max(len(normal), len(firsts))), np.int64)
@@ -742,23 +571,16 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
         turn[level] += 1
         place = images[level]
         height = _height(normal, offset, f, place)
-        flatwise = abs(height) <= side
+        flatwise = abs(height) <= SIDE_M
         before = chain[level - 1]
         if level > 0:
-            if plane[f] == plane[before] or not usable[f] or (front_only[f] and height < -side):
+            if plane[f] == plane[before] or not usable[f] or (height < -SIDE_M if solid else flatwise):
                 continue
-            if flatwise and rules.margin == 0.0:
+            if _none_within(window[f], planes[level - 1], many[level - 1]):
                 continue
-            if beams and _none_within(window[f], planes[level - 1], many[level - 1]):
-                continue
-        sign = 1.0 if (height > 0.0 or front_only[f]) else -1.0
-        if level > 0 and beams:
-            if not _ahead(normal, offset, f, sign, window[before], side):
-                continue
-            worthwhile = rules.shadows and level + 1 < depth  # for a last face the test would cost more than it saves
-            last = signs[level - 1]
-            if worthwhile and _wholly_hidden(mirrors, face_tree, place, f, before, last, rules, stack):
-                continue
+        sign = 1.0 if height > 0.0 or solid else -1.0
+        if level > 0 and not _ahead(normal, offset, f, sign, window[before]):
+            continue
         chain[level], signs[level] = f, sign
         n0, n1, n2 = normal[f, 0], normal[f, 1], normal[f, 2]
         image = images[level + 1]
@@ -768,22 +590,22 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
         # planes of the beam: this face, the mirrored planes of earlier faces, and the sides of this face
         mine, number = planes[level], 1
         mine[0, 0], mine[0, 1], mine[0, 2] = sign * n0, sign * n1, sign * n2
-        mine[0, 3] = -sign * offset[f] + side
+        mine[0, 3] = -sign * offset[f] + SIDE_M
         # plane 0 of the level before is the face itself: nothing behind it is lost, and it is not a side of the beam
-        for p in range(1, many[level - 1] if beams and level > 0 else 1):
+        for p in range(1, many[level - 1] if level > 0 else 1):
             b0, b1, b2 = planes[level - 1, p, 0], planes[level - 1, p, 1], planes[level - 1, p, 2]
             twice = 2.0 * (b0 * n0 + b1 * n1 + b2 * n2)
             mine[number, 0], mine[number, 1], mine[number, 2] = b0 - twice * n0, b1 - twice * n1, b2 - twice * n2
             mine[number, 3] = planes[level - 1, p, 3] + twice * offset[f]
             number += 1
-        if beams and not flatwise and (level + 1 < depth or not box_outside(t_lower, t_upper, 0, mine, number)):
+        if not flatwise and (level + 1 < depth or not box_outside(t_lower, t_upper, 0, mine, number)):
             number = _side_planes(mine, number, image, window[f])
-        many[level] = number if beams else 0
+        many[level] = number
         stack[0], pending, met = 0, 1, 0
         while pending > 0:  # a copy of within_planes, because a call would count references to every array of the tree
             pending -= 1
             node = stack[pending]
-            if beams and box_outside(t_lower, t_upper, node, mine, number):
+            if box_outside(t_lower, t_upper, node, mine, number):
                 continue
             if t_child[node] >= 0:
                 stack[pending], stack[pending + 1] = t_child[node], t_child[node] + 1
@@ -812,7 +634,7 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
 
 def obstacle(surfaces: Surfaces, points_m: FloatArray, sequence: IntArray) -> int | None:
     """Return the face that first cuts a path (depth + 2, 3) over the faces ``sequence``, from the source, or None."""
-    rules, antenna = _rules(surfaces, len(sequence), solids=False), (np.zeros(3), 0.0)
+    rules, antenna = Rules.of(surfaces, len(sequence)), (np.zeros(3), 0.0)
     normal, offset = np.ascontiguousarray(surfaces.faces.normal), surfaces.faces.offset_m
     ends = [antenna, *((normal[face], float(offset[face])) for face in sequence), antenna]
     for (a, b), (before, after) in zip(pairwise(points_m), pairwise(ends), strict=True):
@@ -908,8 +730,6 @@ def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -
         first=np.searchsorted(owner, np.arange(len(faces) + 1)),
         flat_m=np.ascontiguousarray(flat),
         window_m=np.ascontiguousarray(outline[:, np.minimum(np.arange(WINDOW), 3)]),
-        # the ground does not hide, and faces with a polygon do not fill their outline
-        convex=(faces.solid >= 0) & np.array([polygon is None for polygon in faces.polygon], dtype=np.bool_),
         plane=planes_of(faces),
         tree=box_tree(obstacles.min(axis=1), obstacles.max(axis=1)),
         face_tree=box_tree(lower, upper),

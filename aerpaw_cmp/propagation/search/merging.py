@@ -18,7 +18,7 @@ import shapely
 
 from ...common.errors import InputError
 from ...common.text import counted
-from ...common.units import BoolArray, FloatArray, IntArray
+from ...common.units import FloatArray, IntArray
 from ...site.mitsuba import TriangleScene
 from ..compiled import inlined, kernel, part
 from ..geometry import BoxTree, Faces, Surfaces
@@ -330,7 +330,7 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
     owner_axes = np.stack([along[face], across[face]], axis=1)
     flat = np.einsum("tki,tai->tka", corners, owner_axes)
     base = normal * offset[:, None]
-    window, convex = _windows(flat, first, face_area, base, along, across)
+    window = _windows(flat, first, base, along, across)
     flat_low = np.minimum.reduceat(flat.min(axis=1), first[:-1], axis=0)
     flat_high = np.maximum.reduceat(flat.max(axis=1), first[:-1], axis=0)
     of_face = shape[first[:-1]]
@@ -352,7 +352,6 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
         first=first,
         flat_m=np.ascontiguousarray(flat),
         window_m=window,
-        convex=convex,
         plane=plane,
         tree=box_tree(corners.min(axis=1), corners.max(axis=1)),
         face_tree=face_tree,
@@ -485,21 +484,17 @@ def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type
     return plane
 
 
-def _windows(
-    flat: FloatArray, first: IntArray, area: FloatArray, base: FloatArray, along: FloatArray, across: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Convex outlines (faces, 8, 3), counter-clockwise round the normal, and which faces fill theirs."""
-    owner = np.repeat(np.arange(len(area)), 3 * np.diff(first))
+def _windows(flat: FloatArray, first: IntArray, base: FloatArray, along: FloatArray, across: FloatArray) -> FloatArray:
+    """Return convex outlines (faces, 8, 3), counter-clockwise round the normal."""
+    owner = np.repeat(np.arange(len(base)), 3 * np.diff(first))
     # a corner that turns by a tenth of a micrometre is rounding, and would take one of the eight places
     hull = shapely.simplify(shapely.convex_hull(shapely.multipoints(flat.reshape(-1, 2), indices=owner)), 1e-7)
     corners = shapely.get_num_coordinates(hull) - 1
-    # overlapping triangles of one face could add up to its outline by chance: only exact fits count
-    convex = (corners <= WINDOW) & (np.abs(shapely.area(hull) - area) <= 1e-6 * area)
     hull[corners > WINDOW] = shapely.oriented_envelope(hull[corners > WINDOW])
     point, face = shapely.get_coordinates(shapely.orient_polygons(hull), return_index=True)
-    start = np.searchsorted(face, np.arange(len(area) + 1))
+    start = np.searchsorted(face, np.arange(len(base) + 1))
     # a ring closes with its first corner, which the window does not need; a sliver may have become a line
     last = start[1:] - np.where(shapely.get_type_id(hull) == shapely.GeometryType.POLYGON, 2, 1)
     outline = point[np.minimum(start[:-1, None] + np.arange(WINDOW), last[:, None])]
     window = base[:, None] + outline[..., :1] * along[:, None] + outline[..., 1:] * across[:, None]
-    return np.ascontiguousarray(window), np.asarray(convex)
+    return np.ascontiguousarray(window)

@@ -73,13 +73,12 @@ class Occlusion:
         if len(rows):
             self.low = np.minimum.reduceat(box.min(axis=1), starts) - tolerance_m
             self.high = np.maximum.reduceat(box.max(axis=1), starts) + tolerance_m
-        solid, footprint, planes = _prisms(faces, rows, starts)
-        cuts = np.searchsorted(solid, np.arange(len(starts) + 1)).tolist()
-        touched = _abutting(footprint, tolerance_m).tolist()
-        # for each convex piece of a solid: outward normals (planes, 3) and offsets (planes,); top and bottom come first
-        self.pieces = [planes[start:stop] for start, stop in pairwise(cuts)]
-        # for each convex piece of a solid: whether another piece, of any solid, touches it
-        self.abutting = [touched[start:stop] for start, stop in pairwise(cuts)]
+        # for each convex piece: outward normals (planes, 3) and offsets (planes,); top and bottom come first
+        solid, footprint, self.pieces = _prisms(faces, rows, starts)
+        # pieces of each solid
+        self.parts = [range(*ends) for ends in pairwise(np.searchsorted(solid, np.arange(len(starts) + 1)).tolist())]
+        # whether another piece, of any solid, touches a piece
+        self.abutting = _abutting(footprint, tolerance_m)
 
     def any_segment(self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> BoolArray:
         """Check whether polylines source - vertices (paths, depth, 3) - target are cut (paths,)."""
@@ -94,7 +93,7 @@ class Occlusion:
         cut = np.zeros(len(start), dtype=np.bool_)
         if not self.pieces:
             return cut
-        step = max(1, PAIRS_PER_CHUNK // len(self.pieces))
+        step = max(1, PAIRS_PER_CHUNK // len(self.parts))
         for first in range(0, len(start), step):
             part = slice(first, first + step)
             cut[part] = self._cut(start[part], end[part])
@@ -106,26 +105,33 @@ class Occlusion:
         near = self._boxes(start, end, solids)
         result = np.zeros(len(start), dtype=np.bool_)
         # most segments touch nothing, so seams are examined after all pieces
-        seams: list[tuple[IntArray, FloatArray, FloatArray, int, int]] = []
+        seams: list[tuple[IntArray, FloatArray, FloatArray, IntArray]] = []
         for column, solid in enumerate(solids.tolist()):
             # one piece that cuts the segment is enough
             rows = np.flatnonzero(near[:, column] & ~result)
-            for number, (normal, offset) in enumerate(self.pieces[solid]):
+            for piece in self.parts[solid]:
                 if not len(rows):
                     break
+                normal, offset = self.pieces[piece]
                 before, after = start[rows] @ normal.T - offset, end[rows] @ normal.T - offset
                 enter, leave = _within(before, after, -self.tolerance_m)
                 hit = enter < leave
                 result[rows[hit]] = True
-                if self.abutting[solid][number]:
+                if self.abutting[piece]:
                     # grow the piece by the tolerance, to find segments that run along it without entering it
                     enter, leave = _within(before[~hit], after[~hit], self.tolerance_m)
                     along = enter < leave
-                    seams.append((rows[~hit][along], enter[along], leave[along], solid, number))
+                    touching = rows[~hit][along]
+                    seams.append((touching, enter[along], leave[along], np.full(len(touching), piece)))
                 rows = rows[~hit]
         # a single piece has no seam
         if len(seams) > 1:
-            self._seams(result, start, end, seams)
+            row, enter, leave, pieces = (np.concatenate(column) for column in zip(*seams, strict=True))
+            order = np.argsort(row, kind="stable")
+            first = np.searchsorted(row[order], np.arange(len(result) + 1))
+            for index in np.flatnonzero((np.diff(first) > 1) & ~result):
+                mine = order[first[index] : first[index + 1]]
+                result[index] = self._surrounded(start[index], end[index], enter[mine], leave[mine], pieces[mine])
         return result
 
     def _solids_near(self, start: FloatArray, end: FloatArray) -> IntArray:
@@ -156,46 +162,27 @@ class Occlusion:
                 np.minimum(leave, np.maximum(at_low, at_high), out=leave)
         return np.asarray(enter <= leave)
 
-    def _seams(
-        self,
-        result: BoolArray,
-        start: FloatArray,
-        end: FloatArray,
-        touches: list[tuple[IntArray, FloatArray, FloatArray, int, int]],
-    ) -> None:
-        """Mark segments that run between pieces which together surround a part of them.
-
-        ``touches`` are, per piece, the segments that run along it and the shares of their length from and to which.
-        """
-        # touches of all pieces, then gathered by segment
-        row, enter, leave = (np.concatenate([t[column] for t in touches]) for column in range(3))
-        touch = np.repeat(np.arange(len(touches)), [len(t[0]) for t in touches])
-        order = np.argsort(row, kind="stable")
-        first = np.searchsorted(row[order], np.arange(len(result) + 1))
-        for index in np.flatnonzero((np.diff(first) > 1) & ~result):
-            mine = [
-                (enter[at], leave[at], self.pieces[touches[touch[at]][3]][touches[touch[at]][4]])
-                for at in order[first[index] : first[index + 1]]
-            ]
-            result[index] = self._surrounded(start[index], end[index], mine)
-
     def _surrounded(
-        self, start: FloatArray, end: FloatArray, runs: list[tuple[float, float, tuple[FloatArray, FloatArray]]]
+        self, start: FloatArray, end: FloatArray, enter: FloatArray, leave: FloatArray, pieces: IntArray
     ) -> bool:
-        """Check whether the pieces along which one segment runs fill the whole neighbourhood of one of its points."""
+        """Check whether the pieces along which one segment runs fill the whole neighbourhood of one of its points.
+
+        It runs along each of the ``pieces`` (n,) from the share ``enter`` to the share ``leave`` of its length.
+        """
         radius_m = _NEIGHBOURHOOD * self.tolerance_m
         length_m = float(np.linalg.norm(end - start))
-        breaks = np.unique([share for enter, leave, _ in runs for share in (enter, leave)])
+        breaks = np.unique([enter, leave])
         long = np.flatnonzero(np.diff(breaks) * length_m > 10.0 * radius_m)
         # between two breaks the segment runs along the same pieces, so one point is sufficient
         for share in (breaks[long] + breaks[long + 1]) / 2:
             point = start + share * (end - start)
             ring = point + radius_m * _AROUND
             covered = np.zeros(len(ring), dtype=np.bool_)
-            for enter, leave, (normal, offset) in runs:
+            for piece in pieces[(enter < share) & (share < leave)]:
+                normal, offset = self.pieces[piece]
                 height = ring @ normal.T - offset
                 # between roof and foot: a point above a roof is not surrounded
-                if enter < share < leave and (height[:, :2] < -self.tolerance_m).all():
+                if (height[:, :2] < -self.tolerance_m).all():
                     covered |= (height[:, 2:] <= self.tolerance_m).all(axis=1)
             if covered.all():
                 return True
@@ -289,30 +276,23 @@ def _is_convex(polygons: Polygon | AnyArray) -> BoolArray:
 
 
 def _planes(footprints: list[Polygon], foot: FloatArray, top: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """Outward normals and offsets of each convex prism: top, bottom, sides."""
-    ring = shapely.get_exterior_ring(np.array(footprints, dtype=object))
+    """Return the outward normals and offsets of each convex prism: top, bottom, sides."""
+    # the outside is to the right of each edge of a counter-clockwise ring
+    ring = shapely.get_exterior_ring(shapely.orient_polygons(np.array(footprints, dtype=object)))
     point, owner = shapely.get_coordinates(ring, return_index=True)
-    count = np.bincount(owner, minlength=len(ring))
-    first = np.cumsum(count) - count
-    turned = np.arange(len(point))
-    # outward normals require one orientation of the ring
-    backwards = ~shapely.is_ccw(ring)[owner]
-    turned[backwards] = (2 * first + count - 1)[owner[backwards]] - turned[backwards]
-    point = point[turned]
     edge, start, side_of = np.diff(point, axis=0), point[:-1], owner[:-1]
     # exclude sides from the end of one ring to the start of the next, and sides without length
     real = (owner[1:] == side_of) & (edge != 0.0).any(axis=1)
     edge, start, side_of = edge[real], start[real], side_of[real]
-    outward = np.column_stack([edge[:, 1], -edge[:, 0]]) / np.hypot(edge[:, 0], edge[:, 1])[:, None]
-    planes = np.bincount(side_of, minlength=len(ring)) + 2
-    cuts = np.cumsum(np.append(0, planes))
-    normal, offset = np.zeros((cuts[-1], 3)), np.empty(cuts[-1])
-    normal[cuts[:-1], 2], normal[cuts[:-1] + 1, 2] = 1.0, -1.0
-    offset[cuts[:-1]], offset[cuts[:-1] + 1] = top, -foot
-    sides = np.arange(len(edge)) + 2 * (side_of + 1)
-    normal[sides, :2] = outward
-    offset[sides] = (outward * start).sum(axis=1)
-    return [(normal[start:stop], offset[start:stop]) for start, stop in pairwise(cuts.tolist())]
+    outward = np.column_stack([edge[:, 1], -edge[:, 0], np.zeros(len(edge))])
+    outward /= np.hypot(edge[:, 0], edge[:, 1])[:, None]
+    offset = (outward[:, :2] * start).sum(axis=1)
+    level = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    ends = pairwise(np.searchsorted(side_of, np.arange(len(ring) + 1)).tolist())
+    return [
+        (np.concatenate([level, outward[first:last]]), np.concatenate([[roof, -base], offset[first:last]]))
+        for (first, last), roof, base in zip(ends, top.tolist(), foot.tolist(), strict=True)
+    ]
 
 
 def _abutting(footprints: list[Polygon], tolerance_m: float) -> BoolArray:
@@ -385,16 +365,7 @@ def find_paths(
     known = targets_m[np.isfinite(targets_m).all(axis=1)] if extent_m is None else extent_m
     tolerance_m = scene_tolerance_m(faces, sources_m, known)
     hiding = Occlusion(faces, tolerance_m)
-    box = _Bounds.of(faces, float(max(1.0, *(np.abs(p).max(initial=0.0) for p in (known, sources_m)))))
-    growth = _Growth(
-        faces=faces,
-        bounds=box,
-        # pairs of faces are needed from the second reflection on
-        facing=_facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_),
-        tolerance_m=tolerance_m,
-        max_depth=max_depth,
-        budget=budget,
-    )
+    growth = _Growth.of(faces, np.concatenate([known, sources_m]), tolerance_m, max_depth, budget)
     alive = searched_links(links)
     pieces: list[PathSet] = []
     for tower, source in enumerate(sources_m):
@@ -443,14 +414,6 @@ class _Bounds:
     centre_m: FloatArray
     reach_m: FloatArray
 
-    @classmethod
-    def of(cls, faces: Faces, farthest_m: float) -> _Bounds:
-        """Return bounds of faces, the infinite ones cut at ten times the farthest point."""
-        # far beyond any reflection point between two points of the scene
-        box = corners(faces, 10.0 * farthest_m)
-        first, second, third, fourth = box.transpose(1, 0, 2)
-        return cls(box, (first + third) / 2, np.stack([second - first, fourth - first], axis=1) / 2)
-
 
 @dataclass(frozen=True, slots=True)
 class Sequences:
@@ -490,6 +453,19 @@ class _Growth:
     tolerance_m: float
     max_depth: int
     budget: int
+
+    @classmethod
+    def of(cls, faces: Faces, points_m: FloatArray, tolerance_m: float, max_depth: int, budget: int) -> _Growth:
+        """Return the growth between points (n, 3) [m]."""
+        # cut infinite faces at ten times the farthest point: far beyond any reflection between two points of the scene
+        box = corners(faces, 10.0 * float(max(1.0, np.abs(points_m).max(initial=0.0))))
+        first, second, third, fourth = box.transpose(1, 0, 2)
+        bounds = _Bounds(box, (first + third) / 2, np.stack([second - first, fourth - first], axis=1) / 2)
+        # pairs of faces are needed from the second reflection on
+        facing = _facing(faces, bounds, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_)
+        return cls(
+            faces=faces, bounds=bounds, facing=facing, tolerance_m=tolerance_m, max_depth=max_depth, budget=budget
+        )
 
     def sequences(self, source: FloatArray, usable: BoolArray, targets_m: FloatArray) -> list[Sequences]:
         """Sequences from the line of sight on that geometry does not rule out for all targets, by their lengths."""
@@ -570,11 +546,7 @@ class Mirrors:
     """
 
     def __init__(self, faces: Faces, extent_m: FloatArray) -> None:
-        bounds = _Bounds.of(faces, float(max(1.0, np.abs(extent_m).max(initial=0.0))))
-        none = np.zeros((0, len(faces)), np.bool_)
-        self._growth = _Growth(
-            faces=faces, bounds=bounds, facing=none, tolerance_m=REACH_SLACK_M, max_depth=1, budget=len(faces) + 1
-        )
+        self._growth = _Growth.of(faces, extent_m, REACH_SLACK_M, max_depth=1, budget=len(faces) + 1)
 
     def toward(self, source_m: FloatArray, box_m: FloatArray) -> IntArray:
         """Every face of a path from a source (3,) over one face into a box (lowest and highest corner, 3)."""
@@ -846,20 +818,17 @@ def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
     if len(rows):
         same = np.append(plane, -1)[paths.faces[rows]]
         key = np.column_stack([paths.pose[rows], paths.tower[rows], same])
-        by_key = np.lexsort(key.T[::-1])  # stable: the first in order stays
-        twin = (np.diff(key[by_key], axis=0) == 0).all(axis=1)
-        repeated[rows[by_key[1:][twin]]] = True
+        # unique returns the first of equal rows
+        repeated[rows] = True
+        repeated[rows[np.unique(key, axis=0, return_index=True)[1]]] = False
     return repeated
 
 
 def planes_of(faces: Faces) -> IntArray:
     """Return the number (faces,) of each face's plane. Coplanar faces with the same orientation share it."""
     # coplanar to the rounding of a map: a nanometre of tilt, a micrometre of offset
-    key = np.column_stack([faces.normal / 1e-9, faces.offset_m / 1e-6]).round()
-    order = np.lexsort(key.T)
-    plane = np.empty(len(key), dtype=np.int64)
-    plane[order] = np.cumsum((np.diff(key[order], axis=0, prepend=np.nan) != 0.0).any(axis=1))
-    return plane - 1
+    key = np.column_stack([faces.normal / 1e-9, faces.offset_m / 1e-6]).round() + 0.0
+    return np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def plane_keys(paths: PathSet, planes: IntArray) -> list[tuple[int, ...]]:

@@ -23,10 +23,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 from weakref import WeakSet
 
@@ -38,7 +35,7 @@ from ...common.versions import version
 from ...site.materials import material
 from ..geometry import Faces, Link, Links, PathSet, Surfaces, inside, path_lengths, triangles
 from ..llvm import INSTALL_AGAIN, SionnaMissingError, let_sionna_load, prepare_llvm
-from ..options import Progress
+from ..options import Progress, Search
 from .mirror import (
     MINIMUM_LENGTH_M,
     images_of,
@@ -102,7 +99,6 @@ def _missing(error: ImportError) -> SionnaMissingError:
 def _variant(kinds: Sequence[str]) -> str:
     """The first of the kinds that serves, now in use."""
     let_sionna_load()
-    _leave_for_later()
     without_llvm: SionnaMissingError | None = None
     if "llvm" in kinds:
         try:
@@ -130,34 +126,6 @@ def _variant(kinds: Sequence[str]) -> str:
     raise UsageError(
         f"Dr.Jit finds no {' and no '.join(kinds)} device", cause="'aerpaw-cmp doctor' says what is missing"
     )
-
-
-# Modules of Sionna RT with a class that no search uses.
-_LATER = {
-    "preview": "Previewer",
-    "rcs.scattering_model_viewer": "ScatteringModelViewer",
-    "radio_map_solvers.radio_map_solver": "RadioMapSolver",
-    "path_solvers.sb_deterministic": "SBDeterministicCandidateGenerator",
-}
-
-
-def _leave_for_later() -> None:
-    """Let Sionna load its viewers for notebooks and its other solvers when one is made, not with the package.
-
-    With the viewers come ipywidgets, pythreejs and IPython: a sixth of the time of ``import sionna.rt``.
-    """
-    if "sionna.rt" in sys.modules:
-        return
-    for name, kind in _LATER.items():
-        later = sys.modules[f"sionna.rt.{name}"] = ModuleType(f"sionna.rt.{name}")
-        vars(later)[kind] = partial(_loaded, later, kind)
-
-
-def _loaded(later: ModuleType, kind: str, *arguments: Any, **named: Any) -> Any:
-    """Load a class instead of its placeholder module, and create an object of it."""
-    if sys.modules.get(later.__name__) is later:
-        del sys.modules[later.__name__]
-    return getattr(import_module(later.__name__), kind)(*arguments, **named)
 
 
 def free_memory() -> None:
@@ -417,24 +385,24 @@ class _Finder:
         scene.edit(remove=list(scene.objects))  # before 2.2 the only way to take an object out
         self.built, self.solver = None, None  # type: ignore[assignment]
 
-    def trace(self, targets: _Ends, max_depth: int, samples: int) -> Any:
+    def trace(self, targets: _Ends, search: Search) -> Any:
         """Sionna's paths of one batch, padded, searched until there was room for all."""
         self.targets = targets.padded(self.batch).arguments()
-        paths = self._solved(max_depth, samples)
+        paths = self._solved(search)
         # lines of sight do not need a table
-        while max_depth and self._more_room():
-            paths = self._solved(max_depth, samples)
+        while search.max_depth and self._more_room():
+            paths = self._solved(search)
         return paths
 
-    def _solved(self, max_depth: int, samples: int) -> Any:
+    def _solved(self, search: Search) -> Any:
         return self.solver(
             self.built.scene,
-            max_depth=max_depth,
+            max_depth=search.max_depth,
             max_num_paths_per_src=self.limit,
-            samples_per_src=samples,
+            samples_per_src=int(search.samples),
             synthetic_array=True,
             los=True,
-            specular_reflection=max_depth > 0,
+            specular_reflection=search.max_depth > 0,
             diffuse_reflection=False,
             refraction=False,
             diffraction=False,
@@ -465,10 +433,10 @@ class _Finder:
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = slots
         return True
 
-    def searched(self, targets_m: FloatArray, max_depth: int, samples: int) -> dict[str, Any]:
+    def searched(self, targets_m: FloatArray, search: Search) -> dict[str, Any]:
         """Sionna's paths of one batch, of the real (not padding) targets: valid, kind, shape, primitive, gain."""
         count = len(targets_m)
-        paths = self.trace(_Ends.points(targets_m), max_depth, samples)
+        paths = self.trace(_Ends.points(targets_m), search)
         real, imaginary = (np.asarray(part.numpy()) for part in paths.a)
         valid = paths.valid.numpy()
         if valid.sum(axis=(0, 2)).max(initial=0) > 0.9 * self.limit:
@@ -507,29 +475,10 @@ def _each_batch(
                 yield finder, towers, poses[start : start + finder.batch]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rays:
-    """Options of Sionna's search.
-
-    Parameters
-    ----------
-    max_depth : int
-        Largest number of interactions per path, 0 to 3.
-    samples : int
-        Rays per tower and batch.
-    batch : int
-        Poses per call, at most 100; bounds the memory.
-    """
-
-    max_depth: int = 2
-    samples: int = 1_000_000
-    batch: int = 50
-
-
 def find_paths(
     faces: Faces,
     links: Links,
-    rays: Rays,
+    search: Search,
     *,
     carrier_hz: float,
     surfaces: Surfaces | None = None,
@@ -541,7 +490,8 @@ def find_paths(
     ----------
     faces : Faces
     links : Links
-    rays : Rays
+    search : Search
+        Depth, rays and batch.
     carrier_hz : float
         Sionna shoots by reflection power, so materials matter to what it finds.
     surfaces : Surfaces, optional
@@ -553,20 +503,7 @@ def find_paths(
     PathSet
         Sorted by pose, tower, depth, faces.
     """
-    pieces = list(_refined(faces, links, rays, carrier_hz=carrier_hz, surfaces=surfaces, progress=progress))
-    paths = merge(pieces, rays.max_depth, faces if surfaces is None else None)
-    if surfaces is not None:
-        from .beams import without_coincident
-
-        paths = without_coincident(paths, surfaces)
-    return paths if links.excluded is None else paths.select(~links.excluded[paths.tower, paths.pose])
-
-
-def _refined(
-    faces: Faces, links: Links, rays: Rays, *, carrier_hz: float, surfaces: Surfaces | None, progress: Progress | None
-) -> Iterator[PathSet]:
-    """Paths of each batch, refined in float64."""
-    sources_m, targets_m, batch = links.sources_m, links.targets_m, rays.batch
+    sources_m, targets_m, batch = links.sources_m, links.targets_m, search.batch
     if not 1 <= batch <= _LARGEST_BATCH:
         raise UsageError(f"batch {batch}", expected=f"1 to {_LARGEST_BATCH} poses per call")
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
@@ -578,15 +515,23 @@ def _refined(
 
     groups, alive, traced = list(_groups(faces, sources_m, links.usable)), searched_links(links), 0
     count = sum(int(alive[towers].any(axis=0).sum()) for towers, _ in groups)
+    pieces = []
     for finder, towers, some in _each_batch(make, groups, alive):
-        raw = finder.searched(targets_m[some], rays.max_depth, rays.samples)
+        raw = finder.searched(targets_m[some], search)
         _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
-        receiver, tower, _, sequence = _sequences(raw, finder.built.face_of, rays.max_depth)
-        del raw  # copy, because the next batch needs the device memory
-        yield _refine(faces, sources_m, targets_m, some[receiver], towers[tower], sequence, tolerance_m, surfaces)
+        receiver, tower, _, sequence = _sequences(raw, finder.built.face_of, search.max_depth)
+        pieces.append(
+            _refine(faces, sources_m, targets_m, some[receiver], towers[tower], sequence, tolerance_m, surfaces)
+        )
         traced += len(some)
         if progress:
             progress(traced / count)
+    paths = merge(pieces, search.max_depth, faces if surfaces is None else None)
+    if surfaces is not None:
+        from .beams import without_coincident
+
+        paths = without_coincident(paths, surfaces)
+    return paths if links.excluded is None else paths.select(~links.excluded[paths.tower, paths.pose])
 
 
 @dataclass(frozen=True, slots=True)
@@ -613,7 +558,7 @@ def own_coefficients(
     links: Links,
     probe: Link,
     turns: tuple[FloatArray, FloatArray],
-    rays: Rays,
+    search: Search,
     *,
     surfaces: Surfaces | None = None,
 ) -> Coefficients:
@@ -624,7 +569,7 @@ def own_coefficients(
 
     Parameters
     ----------
-    faces, links, rays, surfaces
+    faces, links, search, surfaces
         The same as in :func:`find_paths`.
     probe : Link
         Link with two elements of one pattern in each array's centre.
@@ -644,7 +589,7 @@ def own_coefficients(
     def make(towers: IntArray, chosen: IntArray) -> _Finder:
         ends = _Ends(sources_m[towers], turns[0][towers])
         names = str(pattern[towers[0]]), probe.uav_array.patterns[0].name
-        return _Finder(builder.scene(chosen), ends, rays.batch, patterns=names)
+        return _Finder(builder.scene(chosen), ends, search.batch, patterns=names)
 
     groups = (
         (sharing[pattern[sharing] == name], chosen)
@@ -656,10 +601,10 @@ def own_coefficients(
     slants = np.stack([array.slant_parts for array in arrays])
     every = np.ones((len(sources_m), len(targets_m)), np.bool_)
     for finder, towers, some in _each_batch(make, groups, every):
-        part, gain = _raw_paths(finder, _Ends(targets_m[some], turns[1][some]), some, towers, rays)
+        part, gain = _raw_paths(finder, _Ends(targets_m[some], turns[1][some]), some, towers, search)
         gains.append(np.einsum("pab,au,pbv->puv", gain, probe.uav_array.slant_parts, slants[part.tower]))
         pieces.append(part)
-    paths = PathSet.one_after_another(pieces) if pieces else PathSet.empty(rays.max_depth)
+    paths = PathSet.one_after_another(pieces) if pieces else PathSet.empty(search.max_depth)
     gain = np.concatenate(gains) if gains else np.zeros((0, 2, 2), dtype=np.complex128)
     if links.excluded is not None:
         counts = ~links.excluded[paths.tower, paths.pose]
@@ -670,15 +615,15 @@ def own_coefficients(
 
 
 def _raw_paths(
-    finder: _Finder, target: _Ends, poses: IntArray, towers: IntArray, rays: Rays
+    finder: _Finder, target: _Ends, poses: IntArray, towers: IntArray, search: Search
 ) -> tuple[PathSet, ComplexArray]:
     """Return paths of one batch made of reflections only, and their gains (paths, V and H, V and H)."""
-    traced = finder.trace(target, rays.max_depth, rays.samples)
+    traced = finder.trace(target, search)
     real, imaginary = (np.asarray(part.numpy()) for part in traced.a)
     raw = _arrays(traced, len(poses))
-    receiver, tower, path, sequence = _sequences(raw, finder.built.face_of, rays.max_depth)
-    points = np.full((len(path), rays.max_depth, 3), np.nan)
-    steps = min(rays.max_depth, len(raw["kind"]))
+    receiver, tower, path, sequence = _sequences(raw, finder.built.face_of, search.max_depth)
+    points = np.full((len(path), search.max_depth, 3), np.nan)
+    steps = min(search.max_depth, len(raw["kind"]))
     points[:, :steps] = np.moveaxis(traced.vertices.numpy()[:steps, receiver, tower, path], 0, 1)
     points[sequence < 0] = np.nan
     gain = (real + 1j * imaginary)[receiver, :, tower, :, path].astype(np.complex128)

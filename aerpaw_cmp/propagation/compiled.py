@@ -203,10 +203,3 @@ def part(function: Callable[..., Any]) -> Any:
     the time of a search went there. The caller holds the arrays, so nothing is counted in a part (numba's ``_nrt``).
     """
     return kernel(function, forceinline=True, _nrt=False)
-
-
-def inlined(function: Callable[..., Any]) -> None:
-    """Let kernels use a formula in plain Python, which NumPy also evaluates. Its body is inserted where it is used."""
-    from numba.extending import register_jitable
-
-    register_jitable(**_MATHS, forceinline=True)(function)

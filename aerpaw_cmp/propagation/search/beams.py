@@ -27,7 +27,7 @@ from .. import compiled
 from ..compiled import kernel, part
 from ..geometry import BoxTree, Faces, Links, PathSet, Surfaces, corners, triangles
 from ..options import Run
-from .merging import DEEPEST, WINDOW, box_missed, box_outside, box_tree, next_leaf, within_planes
+from .merging import DEEPEST, WINDOW, box_outside, box_tree, next_leaf, within_planes
 from .mirror import Occlusion, images_of, merge, planes_of, scene_tolerance_m, searched_links, trace_back
 
 # Closer to a plane than this [m] is on it.
@@ -274,7 +274,7 @@ def _face_at(mirrors, f, coplanar, point, edge):  # type: ignore[no-untyped-def]
 
 @kernel
 def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-untyped-def]
-    """Check whether a triangle cuts the segment ``a`` - ``b``.
+    """Return a triangle that cuts the segment ``a`` - ``b``, or -1.
 
     ``before`` and ``after`` are the planes of mirrors at the ends, with a normal of zeros for an antenna. A surface
     within the clearance of the mirror's plane, or of the antenna, does not cut the segment. Edges are included.
@@ -294,7 +294,7 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
 
     Returns
     -------
-    bool
+    int
     """
     way = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     length = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
@@ -306,39 +306,18 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
     lower, upper, child, start, many, items = tree
     todo = np.empty(DEEPEST, np.int64)
     todo[0] = 0
-    node, waiting = next_leaf(lower, upper, child, todo, 1, box_missed, (a, inverse))
+    node, waiting = next_leaf(lower, upper, child, todo, 1, (a, inverse))
     while node >= 0:
         for k in range(start[node], start[node] + many[node]):
-            if _cut_at(corners[items[k]], a, way, length, before, after, rules) > 0.0:
-                return True
-        node, waiting = next_leaf(lower, upper, child, todo, waiting, box_missed, (a, inverse))
-    return False
-
-
-@kernel
-def _first_cut(corners, a, b, before, after, rules):  # type: ignore[no-untyped-def]
-    """Return the triangle that first cuts a segment, by the rules of :func:`segment_cut`, or -1."""
-    way = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    length = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
-    first, share = -1, 1.0
-    for k in range(len(corners)):
-        t = _cut_at(corners[k], a, way, length, before, after, rules)
-        if 0.0 < t < share:
-            first, share = k, t
-    return first
-
-
-@part
-def _cut_at(corners, a, way, length, before, after, rules):  # type: ignore[no-untyped-def]
-    """Return the share of the segment at which a triangle cuts it, or -1."""
-    t = _share_to(corners, a, way, length, rules.margin)
-    # the open segment: its ends lie on mirrors and antennas
-    if t <= 0.0 or t >= 1.0:
-        return -1.0
-    hit = a[0] + t * way[0], a[1] + t * way[1], a[2] + t * way[2]
-    if _at_end(before, hit, t * length, rules) or _at_end(after, hit, (1.0 - t) * length, rules):
-        return -1.0
-    return t
+            t = _share_to(corners[items[k]], a, way, length, rules.margin)
+            # the open segment: its ends lie on mirrors and antennas
+            if t <= 0.0 or t >= 1.0:
+                continue
+            hit = a[0] + t * way[0], a[1] + t * way[1], a[2] + t * way[2]
+            if not (_at_end(before, hit, t * length, rules) or _at_end(after, hit, (1.0 - t) * length, rules)):
+                return items[k]
+        node, waiting = next_leaf(lower, upper, child, todo, waiting, (a, inverse))
+    return -1
 
 
 @part
@@ -388,7 +367,7 @@ def _direct(solids, source, targets, rules):  # type: ignore[no-untyped-def]
     antenna = np.zeros(3), 0.0
     for r in range(len(targets)):
         # serial, because a line of sight takes too little time for threads
-        free[r] = not segment_cut(solids.corners, solids.tree, source, targets[r], antenna, antenna, rules)
+        free[r] = segment_cut(solids.corners, solids.tree, source, targets[r], antenna, antenna, rules) < 0
     return free
 
 
@@ -525,10 +504,10 @@ def _hidden(mirrors, solids, chain, source, points, target, rules):  # type: ign
     start, before = source, antenna
     for step in range(len(chain)):
         mirror = mirrors.normal[chain[step]], mirrors.offset[chain[step]]
-        if segment_cut(solids.corners, solids.tree, start, points[step], before, mirror, rules):
+        if segment_cut(solids.corners, solids.tree, start, points[step], before, mirror, rules) >= 0:
             return True
         start, before = points[step], mirror
-    return segment_cut(solids.corners, solids.tree, start, target, before, antenna, rules)
+    return segment_cut(solids.corners, solids.tree, start, target, before, antenna, rules) >= 0
 
 
 @kernel
@@ -550,7 +529,7 @@ def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[
     """
     normal, offset, along, across, window, plane, usable, first, flat = mirrors
     shapes = normal, offset, along, across, first, flat
-    targets, (t_lower, t_upper, t_child, t_start, t_many, t_items) = receivers
+    targets, tree = receivers
     face_tree = solids.face_tree
     depth, solid = rules.depth, rules.margin > 0.0
     pose, faces, points = np.empty(256, np.int64), np.full((256, depth), -1, np.int64), np.zeros((256, depth, 3))
@@ -598,22 +577,10 @@ def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[
             mine[number, 0], mine[number, 1], mine[number, 2] = b0 - twice * n0, b1 - twice * n1, b2 - twice * n2
             mine[number, 3] = planes[level - 1, p, 3] + twice * offset[f]
             number += 1
-        if not flatwise and (level + 1 < depth or not box_outside(t_lower, t_upper, 0, mine, number)):
+        if not flatwise and (level + 1 < depth or not box_outside(tree.lower, tree.upper, 0, mine, number)):
             number = _side_planes(mine, number, image, window[f])
         many[level] = number
-        stack[0], pending, met = 0, 1, 0
-        while pending > 0:  # a copy of within_planes, because a call would count references to every array of the tree
-            pending -= 1
-            node = stack[pending]
-            if box_outside(t_lower, t_upper, node, mine, number):
-                continue
-            if t_child[node] >= 0:
-                stack[pending], stack[pending + 1] = t_child[node], t_child[node] + 1
-                pending += 2
-                continue
-            for k in range(t_start[node], t_start[node] + t_many[node]):
-                reached[met] = t_items[k]
-                met += 1
+        met = within_planes(tree, mine, number, stack, reached)
         for k in range(met):
             r = reached[k]
             if not _reflects(shapes, level, chain, signs, images, spots, targets[r], rules):
@@ -635,12 +602,20 @@ def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[
 def obstacle(surfaces: Surfaces, points_m: FloatArray, sequence: IntArray) -> int | None:
     """Return the face that first cuts a path (depth + 2, 3) over the faces ``sequence``, from the source, or None."""
     rules, antenna = Rules.of(surfaces, len(sequence)), (np.zeros(3), 0.0)
-    normal, offset = np.ascontiguousarray(surfaces.faces.normal), surfaces.faces.offset_m
-    ends = [antenna, *((normal[face], float(offset[face])) for face in sequence), antenna]
+    normal, offset = np.ascontiguousarray(surfaces.faces.normal), surfaces.faces.offset_m.tolist()
+    ends = [antenna, *((normal[face], offset[face]) for face in sequence), antenna]
     for (a, b), (before, after) in zip(pairwise(points_m), pairwise(ends), strict=True):
-        triangle = _first_cut(surfaces.corners_m, a, b, before, after, rules)
-        if triangle >= 0:
-            return int(surfaces.face[triangle])
+        first = -1
+        while (hit := segment_cut(surfaces.corners_m, surfaces.tree, a, b, before, after, rules)) >= 0:
+            # a triangle may lie a little before the plane of its face, where the segment ends now
+            if surfaces.face[hit] == first:
+                break
+            first = int(surfaces.face[hit])
+            # end the segment in this face, to find one before it
+            b = a + (offset[first] - normal[first] @ a) / (normal[first] @ (b - a)) * (b - a)
+            after = antenna
+        if first >= 0:
+            return first
     return None
 
 

@@ -11,8 +11,6 @@ tree is conservative. The decisive tests are computed on the items themselves, i
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import shapely
 
@@ -20,7 +18,7 @@ from ...common.errors import InputError
 from ...common.text import counted
 from ...common.units import FloatArray, IntArray
 from ...site.mitsuba import TriangleScene
-from ..compiled import inlined, kernel, part
+from ..compiled import kernel, part
 from ..geometry import BoxTree, Faces, Surfaces
 
 # Size of the stack of a tree search: twice the depth of a tree with 4e9 items.
@@ -97,117 +95,6 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
     )
 
 
-def next_leaf(
-    lower: FloatArray, upper: FloatArray, child: IntArray, todo: IntArray, waiting: int, missed: Any, region: Any
-) -> tuple[int, int]:
-    """Walk on to the next leaf whose box a region meets.
-
-    Parameters
-    ----------
-    lower, upper, child
-        Columns of a :class:`BoxTree`. They are separate, because compiled code would count references to a tuple at
-        every leaf.
-    todo : (DEEPEST,) int
-        Stack of nodes to visit. At the start it contains only the root, 0.
-    waiting : int
-        Number of nodes in ``todo``.
-    missed : function
-        ``missed(lower, upper, node, region)``: :func:`box_missed`, or another of this file.
-    region : tuple
-        Last argument of ``missed``.
-
-    Returns
-    -------
-    node, waiting : int
-        The leaf, or -1 after the last one, and the number of nodes in ``todo``.
-    """
-    while waiting > 0:
-        waiting -= 1
-        node = todo[waiting]
-        if missed(lower, upper, node, region):
-            continue
-        if child[node] < 0:
-            return node, waiting
-        todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
-        waiting += 2
-    return -1, waiting
-
-
-inlined(next_leaf)
-
-
-def _collected(tree: BoxTree, missed: Any, region: Any, todo: IntArray, hits: IntArray) -> int:
-    """Write the items of the leaves whose box a region meets into ``hits``, and return their number."""
-    lower, upper, child, start, many, items = tree
-    total, todo[0] = 0, 0
-    node, waiting = next_leaf(lower, upper, child, todo, 1, missed, region)
-    while node >= 0:
-        for k in range(start[node], start[node] + many[node]):
-            hits[total] = items[k]
-            total += 1
-        node, waiting = next_leaf(lower, upper, child, todo, waiting, missed, region)
-    return total
-
-
-inlined(_collected)
-
-
-@kernel
-def overlapping(tree, low, high, hits):  # type: ignore[no-untyped-def]
-    """Write the items whose leaf meets the box ``low``, ``high`` (3,) into ``hits``, and return their number.
-
-    Parameters
-    ----------
-    tree : BoxTree
-    low, high : (3,)
-        Corners of the box [m].
-    hits : (items,) int
-        Receives the items. Its length is the number of items in the tree.
-
-    Returns
-    -------
-    int
-        How many there are.
-    """
-    return _collected(tree, _apart, (low, high), np.empty(DEEPEST, np.int64), hits)
-
-
-@kernel
-def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-def]
-    """Write the items whose leaf is partly inside each of the first ``many`` planes into ``hits``. Return their number.
-
-    A plane (4,) is ``a x + b y + c z + d >= 0`` inside.
-
-    Parameters
-    ----------
-    tree : BoxTree
-    planes : (most, 4)
-        Normals pointing inwards, and offsets [m].
-    many : int
-        Number of rows that are used.
-    todo : (DEEPEST,) int
-        Room for nodes that wait.
-    hits
-        The same as in :func:`overlapping`.
-
-    Returns
-    -------
-    int
-    """
-    return _collected(tree, _outside, (planes, many), todo, hits)
-
-
-@part
-def _apart(lower, upper, node, box):  # type: ignore[no-untyped-def]
-    """Check whether a box of the tree lies apart from another, given by its corners (3,)."""
-    # touching counts as overlap: the tree only leaves out
-    low, high = box
-    for axis in range(3):  # noqa: SIM110 - compiled
-        if lower[node, axis] > high[axis] or upper[node, axis] < low[axis]:
-            return True
-    return False
-
-
 @kernel
 def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-def]
     """Check whether a box is completely outside one of the planes.
@@ -219,7 +106,7 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
     node : int
         Index of the box.
     planes : (most, 4)
-        Normals pointing inwards, and offsets [m].
+        A plane is ``a x + b y + c z + d >= 0`` inside: normals pointing inwards, and offsets [m].
     many : int
         Number of rows that are used.
 
@@ -238,11 +125,6 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
         if best < 0.0:
             return True
     return False
-
-
-@part
-def _outside(lower, upper, node, within):  # type: ignore[no-untyped-def]
-    return box_outside(lower, upper, node, within[0], within[1])
 
 
 @part
@@ -272,6 +154,74 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
         enter = max(enter, at_lower - 1e-12 * abs(at_lower))
         leave = min(leave, at_upper + 1e-12 * abs(at_upper))
     return enter > leave
+
+
+@part
+def next_leaf(lower, upper, child, todo, waiting, segment):  # type: ignore[no-untyped-def]
+    """Walk on to the next leaf whose box a segment meets.
+
+    Parameters
+    ----------
+    lower, upper, child
+        Columns of a :class:`BoxTree`. They are separate, because compiled code would count references to a tuple at
+        every leaf.
+    todo : (DEEPEST,) int
+        Stack of nodes to visit. At the start it contains only the root, 0.
+    waiting : int
+        Number of nodes in ``todo``.
+    segment : ((3,), (3,))
+        The same as in :func:`box_missed`.
+
+    Returns
+    -------
+    node, waiting : int
+        The leaf, or -1 after the last one, and the number of nodes in ``todo``.
+    """
+    while waiting > 0:
+        waiting -= 1
+        node = todo[waiting]
+        if box_missed(lower, upper, node, segment):
+            continue
+        if child[node] < 0:
+            return node, waiting
+        todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
+        waiting += 2
+    return -1, waiting
+
+
+@kernel
+def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-def]
+    """Write the items whose leaf is partly inside each of the first ``many`` planes into ``hits``. Return their number.
+
+    Parameters
+    ----------
+    tree : BoxTree
+    planes, many
+        The same as in :func:`box_outside`.
+    todo : (DEEPEST,) int
+        Space for nodes to visit.
+    hits : (items,) int
+        Receives the items. Its length is the number of items in the tree.
+
+    Returns
+    -------
+    int
+    """
+    lower, upper, child, start, count, items = tree
+    total, todo[0], waiting = 0, 0, 1
+    while waiting > 0:
+        waiting -= 1
+        node = todo[waiting]
+        if box_outside(lower, upper, node, planes, many):
+            continue
+        if child[node] >= 0:
+            todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
+            waiting += 2
+            continue
+        for k in range(start[node], start[node] + count[node]):
+            hits[total] = items[k]
+            total += 1
+    return total
 
 
 # Triangles whose corners lie within this of one plane [m] are one face. Files contain float32 coordinates: 0.1 mm at 1
@@ -463,10 +413,14 @@ def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type
     """Face whose plane each face takes: that of a larger one that it touches and lies in, or its own."""
     (normal, offset), (low, high) = planes, bounds
     plane = np.arange(len(normal))
-    near = np.empty(len(normal), np.int64)
+    near, todo = np.empty(len(normal), np.int64), np.empty(DEEPEST, np.int64)
+    # sides of the box of a face
+    sides = np.zeros((6, 4))
+    sides[:3, :3], sides[3:, :3] = np.eye(3), -np.eye(3)
     # largest first, so that each face is tested after all faces that it may join
     for f in np.argsort(-area):
-        many = overlapping(tree, low[f] - merge_m, high[f] + merge_m, near)
+        sides[:3, 3], sides[3:, 3] = merge_m - low[f], high[f] + merge_m
+        many = within_planes(tree, sides, 6, todo, near)
         best = -1
         for neighbour in near[:many]:
             if area[neighbour] < area[f] or (area[neighbour] == area[f] and neighbour >= f):

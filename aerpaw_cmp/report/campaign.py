@@ -369,13 +369,12 @@ def rss_flights(data: CampaignData) -> list[str]:
 
 def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
     """Return the mean RMSE over the links of each setting and flight [dB], NaN if there is none."""
-    known: dict[tuple[str, str], list[float]] = {}
-    for row in data.rss:
-        if np.isfinite(row.rmse_db):
-            known.setdefault((row.setting, row.flight), []).append(row.rmse_db)
-    flights, nan = rss_flights(data), float("nan")
+    errors = pd.DataFrame(
+        [(row.setting, row.flight, row.rmse_db) for row in data.rss], columns=["setting", "flight", "e"]
+    )
+    means = errors.groupby(["setting", "flight"])["e"].mean()
     return {
-        setting: {name: float(np.mean(known[setting, name])) if (setting, name) in known else nan for name in flights}
+        setting: {name: float(means.get((setting, name), np.nan)) for name in rss_flights(data)}
         for setting in data.settings
     }
 
@@ -391,17 +390,14 @@ def headline(data: CampaignData) -> list[str]:
                 + ", ".join(f"{t.total_variation:.3f} on {t.flight} (K = {k_key(t.k)})" for t in moved)
                 + "."
             )
-    if data.repeats:
-        pairs = [p for p in data.repeats if p.n > 0]
-        if pairs:
-            mean = float(np.mean([p.rmse_db for p in pairs]))
-            share = 100 * float(np.mean([p.share for p in pairs]))
-            out.append(
-                f"Two flights at the same positions differ by {mean:.1f} dB RMS after one constant "
-                f"({counted(sum(p.n for p in pairs), 'pair')}, {share:.0f} % of the samples)."
-            )
-        else:
-            out.append("No two flights visit the same positions within the radius, so repeatability is not known.")
+    if pairs := [p for p in data.repeats if p.n > 0]:
+        mean, share = np.mean([p.rmse_db for p in pairs]), 100 * np.mean([p.share for p in pairs])
+        out.append(
+            f"Two flights at the same positions differ by {mean:.1f} dB RMS after one constant "
+            f"({counted(sum(p.n for p in pairs), 'pair')}, {share:.0f} % of the samples)."
+        )
+    elif data.repeats:
+        out.append("No two flights visit the same positions within the radius, so repeatability is not known.")
     return out
 
 
@@ -476,13 +472,11 @@ def edge_warnings(data: CampaignData) -> list[str]:
     ]
 
 
-def worst_flights(data: CampaignData) -> list[tuple[str, float, str]]:
-    """Return flights under the first setting by error, largest first: name, mean error over links [dB], worst link."""
-    order = data.season.over_all()
-    return _by_error([row for row in data.rss if order and row.setting == order[0].setting], "held_out_rmse_db")
+def by_error(rows: Iterable[RssRow], name: str) -> list[tuple[str, float, str]]:
+    """Return flights by error, largest first: name, mean error over links [dB], worst link.
 
-
-def _by_error(rows: Sequence[RssRow], name: str) -> list[tuple[str, float, str]]:
+    ``name`` is the field of the error. Rows without it count with their own RMSE.
+    """
     by: dict[str, list[tuple[float, str]]] = {}
     for row in rows:
         error = getattr(row, name) if np.isfinite(getattr(row, name)) else row.rmse_db
@@ -494,7 +488,7 @@ def _by_error(rows: Sequence[RssRow], name: str) -> list[tuple[str, float, str]]
 
 def verdict(data: CampaignData) -> list[str]:
     """Return sentences about ray tracing and the baselines under the first setting."""
-    rows = [row for row in data.rss if row.setting == next(iter(data.settings)) and np.isfinite(row.rmse_db) and row.n]
+    rows = [row for row in data.reference_rows if np.isfinite(row.rmse_db) and row.n]
     if not rows:
         return []
     scored = [(row.rmse_db, row.n) for row in rows]
@@ -508,7 +502,7 @@ def verdict(data: CampaignData) -> list[str]:
             f"Mean RMSE: {mean_own:.1f} dB with each flight's own offset, {np.mean(held_out):.1f} dB with the offset "
             f"of the other flights. Expect {np.mean(held_out):.1f} dB on a new flight."
         )
-    flight, error, link = _by_error(rows, "rmse_db")[0]
+    flight, error, link = by_error(rows, "rmse_db")[0]
     return [*out, said_of(cause(data), CAUSES, flight=flight, error=error, link=link)]
 
 
@@ -650,16 +644,6 @@ _CSV_COLUMNS = [
 ]  # fmt: skip
 
 
-def _errors_of_pairs(data: CampaignData) -> list[tuple[Any, float, float]]:
-    """Return each pair of flights with the RMSE of both under the first setting."""
-    rmse = {row.key: row.rmse_db for row in data.reference_rows}
-
-    def error(pair: Repeat, flight: str) -> float:
-        return rmse.get((flight, pair.tower, pair.channel), float("nan"))
-
-    return [(pair, error(pair, pair.first), error(pair, pair.second)) for pair in data.repeats]
-
-
 # --- cards ----------------------------------------------------------------------------------------------------------
 
 
@@ -688,10 +672,10 @@ def _ranking(data: CampaignData) -> Table:
 
 
 def _worst(data: CampaignData) -> Table:
-    season, worst = data.season, worst_flights(data)
-    reports = season.reports
+    season, reports, link = data.season, data.season.reports, Markup('<a href="{}">{}</a>')
+    first = next((r.setting for r in season.over_all()), "")
+    worst = by_error((row for row in data.rss if row.setting == first), "held_out_rmse_db")
     few = f", {_FEW_FLIGHTS} of {len(worst)}" if len(worst) > _FEW_FLIGHTS else ""
-    link, first = Markup('<a href="{}">{}</a>'), next((r.setting for r in season.over_all()), "")
     return Table(
         caption=f"Flights with the largest error under “{first}”{few}.",
         columns={"Flight": HEAD, "Start": "when", "Error [dB]": 1, "Worst link": TEXT},
@@ -743,9 +727,8 @@ def _step(step: Step) -> str:
 
 def failures_card(data: CampaignData) -> Card:
     """Return the card of flights and settings without numbers."""
-    first = f", the first {ROWS_SHOWN} of {len(data.failures)}; campaign.csv contains all"
     table = Table(
-        caption=f"Flights and settings without numbers{first if len(data.failures) > ROWS_SHOWN else ''}.",
+        caption=f"Flights and settings without numbers{more(data.failures, ROWS_SHOWN)}.",
         columns={"Flight": HEAD, "Setting": TEXT, "Why": TEXT}, look="tall",
         rows=[(f.flight, f.setting, f.message) for f in data.failures[:ROWS_SHOWN]],
     )  # fmt: skip
@@ -770,21 +753,25 @@ def _pooled(data: CampaignData) -> Table:
 
 
 def _pairs(data: CampaignData) -> Table:
-    pairs = _errors_of_pairs(data)
+    rmse = {row.key: row.rmse_db for row in data.reference_rows}
+
+    def errors(pair: Repeat) -> str:
+        return ", ".join(number(rmse.get((name, pair.tower, pair.channel))) for name in (pair.first, pair.second))
+
     return Table(
         caption=f"Two flights at the same positions (within {number(data.radius_m, 0, 'm')}, headings within "
         f"{number(data.heading_within_deg, 0)}°), and the RMSE of the setting “{data.reference}”. “After the "
         f"model”: difference of their residuals. “By cell”: mean residuals in cells of "
         f"{number(data.cell_m, 0, 'm')} at all heights. With a correlation near 1 the model has the same errors on "
-        f"both flights{more(pairs, ROWS_SHOWN)}.",
+        f"both flights{more(data.repeats, ROWS_SHOWN)}.",
         columns={"Link": HEAD, "Flights": TEXT, "Pairs": 0, "Share": SHARE, "Differ by [dB]": RIGHT, "95 %": 1,
                  "One pass (÷√2)": 1, "After the model": 1, "RMSE of both": RIGHT, "By cell: RMS": 1, "Correlation": 2,
                  "Cells": 0, "Height difference": RIGHT},
         rows=[
             (f"{r.tower} {r.channel}", f"{r.first}, {r.second}", r.n, r.share, bold(number(r.rmse_db)),
-             r.rmse_ci95_db or "", r.single_db, r.residual_rmse_db, f"{number(a)}, {number(b)}", r.place_rmse_db,
+             r.rmse_ci95_db or "", r.single_db, r.residual_rmse_db, errors(r), r.place_rmse_db,
              r.place_correlation, r.cells, number(r.height_difference_m, 0, "m"))
-            for r, a, b in pairs[:ROWS_SHOWN]
+            for r in data.repeats[:ROWS_SHOWN]
         ],
     )  # fmt: skip
 
@@ -919,19 +906,12 @@ def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
     rows = []
     for (tower, channel), members in groups.items():
         meeting = [pair for pair in members if pair.n]
-        rmse = np.array([pair.rmse_db for pair in meeting if np.isfinite(pair.rmse_db)])
-        low, median, high = np.quantile(rmse, (0.1, 0.5, 0.9)).tolist() if len(rmse) else (float("nan"),) * 3
-        rows.append(
-            {
-                "tower": tower,
-                "channel": channel,
-                "pairs": len(members),
-                "meeting": len(meeting),
-                "n": sum(pair.n for pair in meeting),
-                "rmse_mean_db": float(rmse.mean()) if len(rmse) else float("nan"),
-                "rmse_quantiles_db": {"10": low, "50": median, "90": high},
-            }
-        )
+        rmse = pd.Series([pair.rmse_db for pair in meeting], dtype=np.float64).dropna()
+        quantiles = {f"{100 * share:.0f}": rmse.quantile(share) for share in (0.1, 0.5, 0.9)}
+        rows.append({
+            "tower": tower, "channel": channel, "pairs": len(members), "meeting": len(meeting),
+            "n": sum(pair.n for pair in meeting), "rmse_mean_db": rmse.mean(), "rmse_quantiles_db": quantiles,
+        })  # fmt: skip
     return rows
 
 

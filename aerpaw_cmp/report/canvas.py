@@ -344,32 +344,21 @@ def dots(ax: Axes, at: FloatArray, values: FloatArray, size: float = 2.0, **opti
     ax.plot(at[rows], values[rows], linestyle="none", markersize=size, rasterized=True, **options)
 
 
-def runs(mask: BoolArray) -> list[tuple[int, int]]:
-    """Return segments of True as (first, last) indices, both included.
+def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return the first and the last index of each segment of True, both included.
 
     Examples
     --------
-    >>> runs(np.array([True, False, True, True]))
-    [(0, 0), (2, 3)]
+    >>> [ends.tolist() for ends in runs(np.array([True, False, True, True]))]
+    [[0, 2], [0, 3]]
     """
     # add zeros at both ends, so that a segment that begins or ends with the flight has two edges
     edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
-    return list(zip(np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist(), strict=True))
+    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
 
 
-def lonely(level: FloatArray) -> BoolArray:
-    """Check whether finite samples have two missing neighbours.
-
-    Examples
-    --------
-    >>> lonely(np.array([1.0, np.nan, 2.0, 3.0, np.nan])).tolist()
-    [True, False, False, False, False]
-    """
-    good = np.isfinite(level)
-    neighboured = np.zeros(len(good), dtype=bool)
-    neighboured[1:] |= good[:-1]
-    neighboured[:-1] |= good[1:]
-    return np.asarray(good & ~neighboured)
+# More than the pixels of a time axis.
+_SPANS = 2000
 
 
 def draw_out_of_coverage(
@@ -395,30 +384,16 @@ def draw_out_of_coverage(
         return
     # a sample covers half a step on each side, because a single lost sample would have no width
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
-    spans = [(seconds[a] - step / 2, seconds[b] - seconds[a] + step) for a, b in _apart(runs(mask), seconds)]
+    first, last = runs(mask)
+    # join segments closer than a pixel
+    apart = seconds[first[1:]] - seconds[last[:-1]] >= (seconds[-1] - seconds[0]) / _SPANS
+    first, last = first[np.append(True, apart)], last[np.append(apart, True)]
+    spans = list(zip(seconds[first] - step / 2, seconds[last] - seconds[first] + step, strict=True))
     bars = ax.broken_barh(
         spans, (0.0, height), transform=ax.get_xaxis_transform(), facecolor="#EEEEEE", edgecolor="#888888",
         hatch=hatch, linewidth=0.0, label=label, zorder=0.5 if height == 1.0 else 4.0,
     )  # fmt: skip
     bars.set_rasterized(len(spans) > 300)
-
-
-# With more spans than this, spans closer than a pixel are joined.
-_SPANS = 2000
-
-
-def _apart(spans: list[tuple[int, int]], seconds: FloatArray) -> list[tuple[int, int]]:
-    """Join spans that are closer than a pixel if there are more than :data:`_SPANS`."""
-    if len(spans) <= _SPANS:
-        return spans
-    least = float(seconds[-1] - seconds[0]) / _SPANS
-    joined = [spans[0]]
-    for first, last in spans[1:]:
-        if seconds[first] - seconds[joined[-1][1]] < least:
-            joined[-1] = (joined[-1][0], last)
-        else:
-            joined.append((first, last))
-    return joined
 
 
 def draw_waypoints(
@@ -594,8 +569,8 @@ def beyond(values: FloatArray, low: float, high: float) -> str:
     >>> beyond(np.array([1.0, 9.0]), 0.0, 5.0), beyond(np.array([1.0, np.nan]), 0.0, 5.0)
     ('max', 'neither')
     """
-    under, over = bool(np.nanmin(values, initial=np.inf) < low), bool(np.nanmax(values, initial=-np.inf) > high)
-    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((under, over), "neither")
+    under, over = np.nanmin(values, initial=np.inf) < low, np.nanmax(values, initial=-np.inf) > high
+    return ("both" if over else "min") if under else ("max" if over else "neither")
 
 
 def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither", cax: Any = None) -> Any:
@@ -629,8 +604,9 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
 
 def legend_of(ax: Axes, shown: Callable[[str], bool]) -> tuple[list[Any], list[str]]:
     """Return handles and labels of the legend entries that ``shown`` accepts."""
-    pairs = [(handle, label) for handle, label in zip(*ax.get_legend_handles_labels(), strict=True) if shown(label)]
-    return [handle for handle, _ in pairs], [label for _, label in pairs]
+    handles, labels = ax.get_legend_handles_labels()
+    pick = [i for i, label in enumerate(labels) if shown(label)]
+    return [handles[i] for i in pick], [labels[i] for i in pick]
 
 
 def robust_limits(ax: Axes, levels: Sequence[FloatArray], around: float | None = None) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 from ..common.kml import CLASS_COLOURS
 from ..common.text import counted
 from ..common.units import FloatArray, spread_out
-from ..compare.rank import RankFit
 from ..compare.result import PairResult, RankResult, RssResult
 from ..site.site import Site
 from .canvas import (
@@ -33,7 +32,6 @@ from .canvas import (
     frame_around,
     legend_below,
     legend_of,
-    lonely,
     plan_shape,
     robust_limits,
     seconds_since,
@@ -43,7 +41,7 @@ from .canvas import (
 )
 from .flight_data import RANKS, ReportData, Track, start_of, used_towers
 from .flight_words import count, instants, pretty, signed
-from .texts import k_key, safe_name
+from .texts import k_key, number, safe_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,23 +89,16 @@ def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
 # --- track --------------------------------------------------------------------------------------
 
 
-def _draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
-    """Draw the track of a tower that moves. Its symbol is at the middle of the track."""
-    if (way := panel.tower_m) is not None:
-        some = spread_out(len(way), POINTS_PER_LINE)
-        label = f"way of {panel.tower}"
-        ax.plot(*way[some, :2].T, color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5, label=label)
-
-
 def trajectory(data: ReportData, track: Track) -> Figure:
     """Draw the flight on the plan of the site, and enlarged with the height as colour."""
     fig, (site_plan, close) = subplots((9.2, 5.4), 1, 2, width_ratios=(1.0, 1.35))
-    draw_site(site_plan, data.site)
-    draw_site(close, data.site)
-    nodes = {item.tower: item for item in data.series}.values()
-    for panel in nodes:
-        _draw_node(site_plan, panel)
-        _draw_node(close, panel)
+    # tracks of towers that move; their symbols are at the middle of the track
+    ways = {item.tower: item.tower_m[:, :2] for item in data.series if item.tower_m is not None}
+    for ax in (site_plan, close):
+        draw_site(ax, data.site)
+        for name, way in ways.items():
+            line = way[spread_out(len(way), POINTS_PER_LINE)].T
+            ax.plot(*line, color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5, label=f"track of {name}")
     flown = np.column_stack([track.east_m, track.north_m])
     some = spread_out(len(flown), POINTS_PER_LINE)  # the shape of a plan matters, not its extremes
     site_plan.plot(*flown[some].T, color="#0072B2", linewidth=1.0, label="flight", zorder=4)
@@ -121,8 +112,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     used = (places[name] for name in used_towers(data))
     # a tower far from the flight would reduce the flight to a dot
     near = [place for place in used if np.linalg.norm(place - centre) < extent]
-    ways = [node.tower_m[:, :2] for node in nodes if node.tower_m is not None]
-    frame_around(close, *np.concatenate([flown, *near, *ways]).T)
+    frame_around(close, *np.concatenate([flown, *near, *ways.values()]).T)
     for waypoint in data.waypoints:
         close.annotate(
             waypoint.label, (waypoint.east_m, waypoint.north_m), fontsize=8, ha="center", va="center", zorder=7,
@@ -182,8 +172,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
         band = panel.stated.columns(simulated)
         low, high = (band[f"simulated_{end}_dbm"][some] for end in ("low", "high"))
         ax.fill_between(seconds[some], low, high, color=SIMULATED, alpha=0.15, linewidth=0, label="90 % band", zorder=1)
-    alone = lonely(simulated)  # a line does not show a single point between two gaps
-    ax.plot(seconds[alone], simulated[alone], linestyle="none", marker=".", markersize=4, color=SIMULATED)
+    dots(ax, seconds, simulated, 1.5, color=SIMULATED, zorder=3)  # a line does not show a point between two gaps
     draw_waypoints(ax, data.moments, start)
     robust_limits(ax, [measured, simulated])
     ax.set_ylabel(f"RSS [{panel.unit}]")
@@ -253,26 +242,20 @@ def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: F
     title : str
     """
     draw_site(ax, site)
-    for value in (0, *RANKS):
-        at = rank == value
-        number = int(at.sum())
-        if not number:
-            continue
+    for value, at in ((value, rank == value) for value in (0, *RANKS) if (rank == value).any()):
         style: dict[str, Any] = {"color": "black", "linewidths": 0.8}
         if value:
             style = {"facecolor": CLASS_COLOURS[value], "edgecolors": "#222222", "linewidths": 0.25}
         ax.scatter(
             east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **style,
-            label=f"{'no path' if value == 0 else f'rank {value}'} ({count(number)})",
-            zorder=3.0 + 1.0 / number,  # rare ranks lie on top, so that a few points are visible among many
+            label=f"{f'rank {value}' if value else 'no path'} ({count(int(at.sum()))})",
+            zorder=3.0 + 1.0 / at.sum(),  # rare ranks lie on top, so that a few points are visible among many
         )  # fmt: skip
     ax.set_title(title)
-    handles, labels = legend_of(ax, lambda label: label.startswith(("rank", "no path")))
-    if handles:
-        ax.legend(
-            handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, markerscale=1.6,
-            columnspacing=1.0,
-        )  # fmt: skip
+    ax.legend(
+        *legend_of(ax, lambda label: label.startswith(("rank", "no path"))), loc="upper center",
+        bbox_to_anchor=(0.5, -0.13), ncols=3, markerscale=1.6, columnspacing=1.0,
+    )  # fmt: skip
 
 
 def rank_maps(data: ReportData, panel: RankResult) -> Figure:
@@ -295,21 +278,24 @@ def rank_maps(data: ReportData, panel: RankResult) -> Figure:
 
 def rank_histograms(panel: RankResult) -> Figure:
     """Draw the shares of rank 1 to 4, measured and for every K, with intervals if known."""
+    from matplotlib import colormaps
+
     fig, ax = subplots((9.2, 3.4))
     reported = int(np.isfinite(panel.measured).sum())
     score = panel.score
     series = [(f"measured ({counted(reported, 'sample')})", score.histogram, score.histogram_ci95)]
-    series += [(_at_label(k, fit), fit.histogram, fit.histogram_ci95) for k, fit in score.simulated.items()]
+    series += [
+        (f"K = {k_key(k)} (total variation {number(fit.total_variation, 2)})", fit.histogram, fit.histogram_ci95)
+        for k, fit in score.simulated.items()
+    ]
     width = 0.8 / len(series)
-    from matplotlib import colormaps
-
-    for number, (label, shares, intervals) in enumerate(series):
-        at = np.array(RANKS) + (number - (len(series) - 1) / 2) * width
-        shade = SIMULATED if number == 0 else colormaps["cividis"](0.25 + 0.75 * number / max(len(series) - 1, 1))
+    for i, (label, shares, intervals) in enumerate(series):
+        at = np.array(RANKS) + (i - (len(series) - 1) / 2) * width
+        shade = SIMULATED if i == 0 else colormaps["cividis"](0.25 + 0.75 * i / (len(series) - 1))
         share = np.nan_to_num(shares)
         ax.bar(
             at, 100 * share, width * 0.92, color=shade, edgecolor="black", linewidth=0.6, label=label,
-            hatch=("", "///", "xxx", "...", "---", "\\\\\\")[number % 6],
+            hatch=("", "///", "xxx", "...", "---", "\\\\\\")[i % 6],
         )  # fmt: skip
         low, high = np.array(intervals, dtype=np.float64).T
         spread = 100 * np.stack([share - low, high - share]).clip(min=0)
@@ -320,12 +306,6 @@ def rank_histograms(panel: RankResult) -> Figure:
     ax.grid(axis="x", visible=False)
     legend_below(ax)
     return fig
-
-
-def _at_label(k: float, fit: RankFit) -> str:
-    """Return the legend entry of one K."""
-    distance = "" if not np.isfinite(fit.total_variation) else f" (total variation {fit.total_variation:.2f})"
-    return f"K = {k_key(k)}{distance}"
 
 
 def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
@@ -343,8 +323,8 @@ def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
             color=SIMULATED, label=f"K = {k_key(k)}",
         )  # fmt: skip
         draw_out_of_coverage(ax, seconds, rank == 0, "out of coverage: no path")
-    for number, ax in enumerate(axes[:rows]):
-        draw_waypoints(ax, data.moments, start, names=number == 0)
+    for ax in axes[:rows]:
+        draw_waypoints(ax, data.moments, start, names=ax is axes[0])
         ax.set_yticks(RANKS)
         ax.set(ylim=(0.5, 4.5), ylabel="Rank")
         ax.legend(*legend_of(ax, lambda label: label != "waypoint"), loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -376,22 +356,16 @@ def _draw_singular_values(ax: Axes, seconds: FloatArray, panel: RankResult) -> N
     values = panel.singular_ratio_db
     for column, colour in enumerate(("#111111", "#0072B2", "#9AD0F0")[: values.shape[1]]):
         dots(ax, seconds, values[:, column], color=colour, label=f"σ{chr(0x2082 + column)}/σ₁")
-    for number, k in enumerate(panel.rank):
+    for k in panel.rank:
         level = -20 * np.log10(k)
-        ax.axhline(
-            level, color=TOWER, linewidth=0.9, linestyle=(0, (5, 2)), label="thresholds 1/K" if not number else None
-        )
+        ax.axhline(level, color=TOWER, linewidth=0.9, linestyle=(0, (5, 2)), label="thresholds 1/K")
         ax.annotate(
-            f"K = {k_key(k)}",
-            (0.004, level),
-            xycoords=ax.get_yaxis_transform(),
-            fontsize=7,
-            va="bottom",
-            color=TOWER,
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
-            zorder=6,
-        )
+            f"K = {k_key(k)}", (0.004, level), xycoords=ax.get_yaxis_transform(), fontsize=7, va="bottom", color=TOWER,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6}, zorder=6,
+        )  # fmt: skip
     lowest = [-20 * np.log10(k) for k in panel.rank] + values[np.isfinite(values)].tolist()
     ax.set_ylim(max(min(lowest, default=-20.0) - 6.0, -110.0), 2.0)  # values below -110 dB are rounding errors
     ax.set_ylabel("Singular value\nover largest [dB]")
-    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
+    # one entry for all thresholds
+    entries = dict(zip(*ax.get_legend_handles_labels()[::-1], strict=True))
+    ax.legend(entries.values(), entries.keys(), loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)

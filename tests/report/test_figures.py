@@ -171,7 +171,7 @@ def test_odd_flights_are_drawn_without_a_warning(report_data, drawn_before, chan
 @given(arrays(bool, st.integers(0, 60)))
 def test_runs_cover_exactly_the_true_samples(mask):
     again = np.zeros(len(mask), dtype=bool)
-    spans = canvas.runs(mask)
+    spans = list(zip(*canvas.runs(mask), strict=True))
     for a, b in spans:
         assert not again[a : b + 1].any()
         again[a : b + 1] = True
@@ -292,14 +292,13 @@ def test_a_cloud_of_a_long_flight_is_thinned_and_its_extremes_stay(monkeypatch):
 
 
 def test_very_many_outages_are_joined_where_no_eye_parts_them():
-    seconds = np.arange(100_000.0)
-    spans = canvas.runs(seconds % 10 < 5)
-    joined = canvas._apart(spans, seconds)
-    assert len(spans) == 10_000
-    assert len(joined) < 2_001
-    assert (joined[0][0], joined[-1][1]) == (spans[0][0], spans[-1][1])
-    few = canvas.runs(seconds % 1000 < 5)
-    assert canvas._apart(few, seconds) is few
+    seconds, (_, ax) = np.arange(100_000.0), canvas.subplots((4.0, 4.0))
+    for period, count in ((10, 1), (1000, 100)):
+        canvas.draw_out_of_coverage(ax, seconds, seconds % period < period / 2, "out")
+        spans = [path.get_extents() for path in ax.collections[-1].get_paths()]
+        assert len(spans) == count
+        assert spans[0].x0 == -0.5
+    assert spans[0].x1 == 499.5
 
 
 def test_both_channels_of_a_tower_stand_in_one_panel_of_report_and_map(report_data, maps_data):

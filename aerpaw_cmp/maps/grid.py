@@ -23,6 +23,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -519,44 +520,24 @@ def foliage_difference(without: MapResult, foliage: MapResult) -> FoliageDiffere
 def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
     """Return maps of a result as layers: joint ones, and with ``towers_too`` those of each tower alone."""
     layers = [Layer("serving_tower", result.serving, "1", "Serving tower", result.tower_names)]
-    for tower in (None, *(result.tower_names if towers_too else ())):
-        layers += _rss_layers(result, tower)
-        layers += _rank_layers(result, tower)
-    return layers
-
-
-def _rss_layers(result: MapResult, tower: str | None) -> list[Layer]:
-    who, of = _label(tower)
-    layers = []
     kinds: tuple[Antennas, ...] = ("siso", "mimo")
-    for antennas in kinds:
-        for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
-            name = f"rss_{antennas}_h{in_name(height)}m_{who}"
-            layers.append(Layer(name, values, "dBm", f"RSS {antennas.upper()}", height_m=height, of=of))
+    for tower in (None, *(result.tower_names if towers_too else ())):
+        # names of layers become columns, files in the KMZ and variables of NetCDF
+        who = re.sub(r"\W", "_", tower) if tower else "joint"
+        layer = partial(Layer, of=tower or "nearest tower")
+        for antennas in kinds:
+            for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
+                name = f"rss_{antennas}_h{in_name(height)}m_{who}"
+                layers.append(layer(name, values, "dBm", f"RSS {antennas.upper()}", height_m=height))
+        spread, condition = (result._of(values, tower) for values in (result.spread_db, result.condition_db))
+        for height, ranks, *ratios in zip(result.rank_altitudes_m, result.ranks(tower), spread, condition, strict=True):
+            at = f"h{in_name(height)}m_{who}"
+            for k, rank in zip(result.ks, ranks, strict=True):
+                name = f"rank_k{in_name(k, 0)}_{at}"
+                layers.append(layer(name, rank, "1", f"Rank, K = {k:g}", class_names(HIGHEST_RANK), height_m=height))
+            layers.append(layer(f"spread_{at}", ratios[0], "dB", "Singular-value spread s1/s2", height_m=height))
+            layers.append(layer(f"condition_{at}", ratios[1], "dB", "Condition number s1/s4", height_m=height))
     return layers
-
-
-def _rank_layers(result: MapResult, tower: str | None) -> list[Layer]:
-    who, of = _label(tower)
-    ratios = (
-        ("spread", "Singular-value spread s1/s2", result._of(result.spread_db, tower)),
-        ("condition", "Condition number s1/s4", result._of(result.condition_db, tower)),
-    )
-    ranks, layers = result.ranks(tower), []
-    for row, height in enumerate(result.rank_altitudes_m):
-        at = f"h{in_name(height)}m_{who}"
-        for column, k in enumerate(result.ks):
-            name, names = f"rank_k{in_name(k, 0)}_{at}", class_names(HIGHEST_RANK)
-            layers.append(Layer(name, ranks[row, column], "1", f"Rank, K = {k:g}", names, height_m=height, of=of))
-        for name, title, values in ratios:
-            layers.append(Layer(f"{name}_{at}", values[row], "dB", title, height_m=height, of=of))
-    return layers
-
-
-def _label(tower: str | None) -> tuple[str, str]:
-    """Return the parts of a layer's name and title that identify its tower."""
-    # names of layers become columns, files in the KMZ and variables of NetCDF
-    return (re.sub(r"\W", "_", tower), tower) if tower else ("joint", "nearest tower")
 
 
 def in_name(number: float, digits: int = 3) -> str:

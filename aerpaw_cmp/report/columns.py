@@ -6,7 +6,7 @@ report's page and the table in docs/outputs.md. A new column is one row here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -151,11 +151,8 @@ def described(columns: Sequence[Column]) -> list[tuple[str, str, str]]:
 
 # --- tables ---------------------------------------------------------------------------------------------------------
 
-# Times (n,) of a series, and its further columns by name: arrays (n,), or one value for all rows.
-_Table = tuple[Any, dict[str, Any]]
 
-
-def tables(columns: Sequence[Column], series: Sequence[Any]) -> tuple[list[Column], list[_Table]]:
+def tables(columns: Sequence[Column], series: Sequence[Any]) -> tuple[list[Column], list[tuple[Any, dict[str, Any]]]]:
     """Compute the columns of some series, not yet rounded. A series has NaN in columns that only other series have.
 
     Parameters
@@ -169,6 +166,7 @@ def tables(columns: Sequence[Column], series: Sequence[Any]) -> tuple[list[Colum
     columns : list of Column
         Those that any series has, each family as its members.
     tables : list of (times, mapping)
+        Times (n,) of each series, and its further columns by name: arrays (n,), or one value for all rows.
     """
     members: list[Column] = []
     rows: list[dict[str, Any]] = [{} for _ in series]
@@ -191,35 +189,24 @@ def _members(values: Any) -> Mapping[Any, Any]:
     return values if isinstance(values, Mapping) else {} if values is None else {"": values}
 
 
-def csv_text(columns: Sequence[Column], series: Sequence[Any]) -> Iterator[str]:
-    """Return the text of rss.csv or rank.csv in pieces of bounded size."""
-    return _text(tables(columns, series)[1], header(columns))
-
-
 # Rows that are text at once.
 _ROWS = 50_000
 
 
-def _text(tables: Iterable[_Table], columns: Iterable[str]) -> Iterator[str]:
-    """Tables below each other as CSV, some rows at a time: a day of samples as text would not fit into memory."""
-    head = True
-    for table in tables:
-        for start in range(0, len(table[0]), _ROWS):
-            rows = guarded(_rows(table, slice(start, start + _ROWS)))
-            yield rows.to_csv(index=False, header=head, lineterminator="\n")
-            head = False
-    if head:
-        yield ",".join(columns) + "\n"
-
-
-def _rows(table: _Table, part: slice) -> Any:
-    """Some rows of a table, rounded."""
+def csv_text(columns: Sequence[Column], series: Sequence[Any]) -> Iterator[str]:
+    """Yield the text of rss.csv or rank.csv some rows at a time: a day of samples as text would not fit into memory."""
     import pandas as pd
 
-    time, columns = table
-    parts = {name: value if isinstance(value, str) else value[part] for name, value in columns.items()}
-    frame = pd.DataFrame({**_times(time, part), **parts}, index=range(len(time[part])))
-    return frame.round(DECIMALS)
+    head = True
+    for time, values in tables(columns, series)[1]:
+        for start in range(0, len(time), _ROWS):
+            part = slice(start, start + _ROWS)
+            cells = {name: value if isinstance(value, str) else value[part] for name, value in values.items()}
+            rows = pd.DataFrame({**_times(time, part), **cells}, index=range(len(time[part]))).round(DECIMALS)
+            yield guarded(rows).to_csv(index=False, header=head, lineterminator="\n")
+            head = False
+    if head:
+        yield ",".join(header(columns)) + "\n"
 
 
 def _times(time: Any, part: slice) -> dict[str, Any]:

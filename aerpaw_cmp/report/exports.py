@@ -402,7 +402,7 @@ def _round_step(step: float) -> float:
     return float(next(m for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9)) * power)
 
 
-def _numbers(key: str, title: str, edges: FloatArray, palette: str) -> Scale:
+def _numbers(key: str, title: str, edges: AnyArray, palette: str) -> Scale:
     """Return a scale with colours of a palette of matplotlib between the edges."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex

@@ -158,14 +158,12 @@ def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
     return {
         "engine": engine.engine, "links": engine.links, "seconds": engine.seconds, "paths": engine.paths,
         "left_out": engine.left_out, "not_audited": engine.not_audited,
-        "audit": None
-        if audit is None
-        else {
+        "audit": audit and {
             "summary": words.audit_summary(audit),
             "reference": audit.reference, "links": audit.links, "missing_paths": audit.missing_paths,
             "extra_paths": audit.extra_paths, "rss_max_error_db": audit.rss_max_error_db,
-            "rank_disagreement": {k_key(k): v for k, v in audit.rank_disagreement.items()},
-            "field": None if audit.fields is None else {**fields_of(audit.fields), "failed": audit.fields.failed},
+            "rank_disagreement": audit.rank_disagreement,
+            "field": audit.fields and {**fields_of(audit.fields), "failed": audit.fields.failed},
             "seconds": audit.seconds, "reference_seconds": audit.reference_seconds,
         },
     }  # fmt: skip
@@ -209,14 +207,11 @@ def _ranks(data: ReportData) -> Table:
     for p in data.rank:
         rows.append((p.tower, "measured", *p.score.histogram, "", "", "", ""))
         for k, at in p.score.simulated.items():
-            by_ground = (p.further.agreement_sd_by_ground or {}).get(f"{k:g}")
-            sd = (
-                ""
-                if by_ground is None
-                else Markup(' <span class="small">±{}</span>').format(number(100 * by_ground, 0))
-            )
+            agreement = Markup(percent(at.agreement))
+            if (by_ground := (p.further.agreement_sd_by_ground or {}).get(f"{k:g}")) is not None:
+                agreement += Markup(' <span class="small">±{}</span>').format(number(100 * by_ground, 0))
             rows.append(("", f"K = {k_key(k)}", *at.histogram, estimate(at.total_variation, at.total_variation_ci95),
-                         Markup(percent(at.agreement)) + sd, at.kappa, at.out_of_coverage))  # fmt: skip
+                         agreement, at.kappa, at.out_of_coverage))  # fmt: skip
     grounds = any(p.further.agreement_sd_by_ground for p in data.rank)
     return Table(
         caption="Channel rank: shares of rank 1 to 4 in coverage. K: singular values of the channel matrix above the "
@@ -262,15 +257,10 @@ def _spans(data: ReportData, time: AnyArray, spans: Sequence[ErrorSpan], caption
         (*(clock(at, start) for at in words.instants(time, span)), *span.position_m, span.mean_db)
         for span in spans or ()
     ]
-    heads: dict[str, str | int] = {
-        f"From ({unit})": TEXT,
-        "To": TEXT,
-        "East [m]": 0,
-        "North [m]": 0,
-        "Up [m]": 0,
-        "Mean [dB]": 1,
-    }
-    return Table(caption=caption, columns=heads, rows=rows)
+    return Table(
+        caption=caption, rows=rows,
+        columns={f"From ({unit})": TEXT, "To": TEXT, "East [m]": 0, "North [m]": 0, "Up [m]": 0, "Mean [dB]": 1},
+    )  # fmt: skip
 
 
 def referee_card(data: ReportData) -> Card:

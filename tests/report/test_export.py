@@ -12,7 +12,10 @@ from benchmarks.fabricated import with_numbers
 
 
 def joined(columns, series):
-    frames = [export._rows(table, slice(None)) for table in export.tables(columns, series)[1]]
+    frames = [
+        pd.DataFrame({**export._times(time, slice(None)), **values}, index=range(len(time))).round(export.DECIMALS)
+        for time, values in export.tables(columns, series)[1]
+    ]
     return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=export.header(columns))
 
 

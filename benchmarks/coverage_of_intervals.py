@@ -383,7 +383,7 @@ def rank_cell(process: Shadowing, flights: int) -> dict[str, object]:
         measured, other = process.sequences(rng, 2) / size
         simulated = mix * measured + np.sqrt(1 - mix**2) * other
         sides = np.searchsorted(CUTS, measured) + 1.0, np.searchsorted(CUTS + 0.3, simulated) + 1.0
-        fit, swapped = (compare_ranks(*pair, process.track, replicates=2) for pair in (sides, sides[::-1]))
+        fit, swapped = (compare_ranks(*pair, process.track) for pair in (sides, sides[::-1]))
         ends = {
             "agreement": fit.agreement_ci95, "kappa": fit.kappa_ci95, "total_variation": fit.total_variation_ci95,
             "wasserstein": fit.wasserstein_ci95, "bar_1": swapped.histogram_ci95[0],

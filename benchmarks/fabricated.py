@@ -154,7 +154,7 @@ def rank_result(tower: str, time: Any, position_m: FloatArray, measured: FloatAr
     RankResult
     """
     seconds = (time - time[:1]) / np.timedelta64(1, "s")
-    score = compare_rank(measured, h, time_s=seconds, replicates=50)
+    score = compare_rank(measured, h, time_s=seconds)
     further = RankFurther(
         n_flagged={}, kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
         commonest=commonest_rank(measured), repeat={},

@@ -16,10 +16,9 @@ import pytest
 
 import aerpaw_cmp
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.compare.statistics import bootstrap_means
 from benchmarks.published import __main__ as published
 from benchmarks.published import entrants, tasks
-from benchmarks.published.score import block_of, intervals, rmse_replicates
+from benchmarks.published.score import block_of, bootstrap_means, intervals, rmse_replicates
 from tests.compare.test_entries import LONG, SHORT
 from tests.real_logs import REAL
 
@@ -343,14 +342,12 @@ def test_intervals_are_those_of_blocks_of_twenty_seconds() -> None:
     total = np.zeros(2000)
     for series, block, own in ((LONG, 10, True), (SHORT, 13, True)):
         error = series.error_db
-        drawn = bootstrap_means(
-            np.column_stack([error, error**2]), block, replicates=2000, seed=20240715 + (series is SHORT)
-        )
+        drawn = bootstrap_means(np.column_stack([error, error**2]), block, 20240715 + (series is SHORT))
         total += np.sqrt(drawn[:, 1] - own * drawn[:, 0] ** 2) / 2
     np.testing.assert_allclose(rmse_replicates([LONG, SHORT]), total)
     free = dataclasses.replace(LONG, own_offset=False)
     error = free.error_db
-    drawn = bootstrap_means(error[:, None] ** 2, 10, replicates=2000, seed=20240715)[:, 0]
+    drawn = bootstrap_means(error[:, None] ** 2, 10, 20240715)[:, 0]
     np.testing.assert_allclose(rmse_replicates([free]), np.sqrt(drawn))
     worse = dataclasses.replace(LONG, level_db=LONG.measured_db + 2.0 * (LONG.level_db - LONG.measured_db))
     ends = intervals([worse], {"base": [LONG]})
@@ -386,3 +383,20 @@ def test_values_by_hand_lie_near_free_space() -> None:
 def test_low_terminals_count_as_ten_metres() -> None:
     low, ten = (entrants.tr36777_loss_db("RMa-AV", NEAR, np.array([h]), 3.3e9) for h in (2.0, 10.0))
     assert low == ten
+
+
+@pytest.mark.parametrize(("n", "length", "columns"), [(97, 10, 2), (97, 1, 3), (97, 10, 400), (12, 12, 1), (1, 1, 2)])
+def test_resamples_have_the_moments_of_the_circular_block_bootstrap(n, length, columns):
+    rng = np.random.default_rng(3)
+    data = rng.normal(size=(n, columns)) + 5.0
+    drawn = bootstrap_means(data, length, 7)
+    np.testing.assert_allclose(drawn.mean(axis=0), data.mean(axis=0), atol=0.05)
+    # exact variance: independent whole blocks and one shorter one
+    full_blocks, last = -(-n // length) - 1, n - (-(-n // length) - 1) * length
+    ring = np.concatenate([data, data])
+
+    def sums(size):
+        return np.array([ring[s : s + size].sum(axis=0) for s in range(n)])
+
+    expected = (full_blocks * sums(length).var(axis=0) + sums(last).var(axis=0)) / n**2
+    np.testing.assert_allclose(drawn.var(axis=0).mean(), expected.mean(), rtol=0.08, atol=1e-12)

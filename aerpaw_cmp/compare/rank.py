@@ -16,13 +16,10 @@ from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, unmask
 from .statistics import (
     FEWEST,
     NO_INTERVAL,
-    REPLICATES,
     SAME_PLACE_M,
-    SEED,
     Interval,
     Visit,
-    autocorrelation,
-    bootstrap_means,
+    independent_samples,
     influence_interval,
     same_places,
     share_interval,
@@ -30,9 +27,6 @@ from .statistics import (
 
 # Ranks of the histograms: 1 to 4 (RI of the AERPAW modems).
 MAX_RANK = 4
-
-# Smallest number of independent samples for which K has an interval.
-_FEWEST_INDEPENDENT = 10.0
 
 # Matrix entries per SVD batch: bounds memory.
 _CHUNK = 1 << 20
@@ -267,35 +261,36 @@ def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
     return (observed - chance) / (1.0 - chance) if chance < 1.0 - 1e-12 else float("nan")
 
 
-def histogram_test(measured: ArrayLike, simulated: ArrayLike, *, replicates: int = REPLICATES) -> float:
-    """Return the p-value of the total variation between both histograms, by swapping blocks of the pair at random.
+# Number of parts of a flight that are swapped: each is much longer than most correlations, and there are 2048 swaps.
+_PARTS = 12
 
-    If measured and simulated ranks came from one distribution, swapping them over blocks as long as their correlation
-    would change nothing. NaN without a pair.
+
+def histogram_test(measured: ArrayLike, simulated: ArrayLike) -> float:
+    """Return the p-value of the total variation between both histograms, by swapping parts of the flight.
+
+    If measured and simulated ranks came from one distribution, swapping them in a part would change nothing.
 
     Parameters
     ----------
     measured, simulated : array_like, (n,)
         Ranks of the same samples. NaN and 0 are ignored.
-    replicates : int
-        Number of random swaps.
 
     Returns
     -------
     float
-        Share of swaps with a total variation at least as large, including the observed one.
+        Share of all swaps with a total variation at least as large, including the observed one. NaN without a pair.
     """
     measured_rank, simulated_rank = _pairs(measured, simulated)
     if not len(measured_rank):
         return float("nan")
-    # swapping a block changes the sign of its difference
-    difference = one_hot(measured_rank) - one_hot(simulated_rank)
-    length = max(autocorrelation(measured_rank).block_length, autocorrelation(simulated_rank).block_length, 1)
-    sums = np.add.reduceat(difference, np.arange(0, len(measured_rank), length), axis=0)
-    signs = np.random.default_rng(SEED).integers(0, 2, (replicates, len(sums))) * 2.0 - 1.0
+    # swapping a part changes the sign of its difference
+    starts = np.unique(np.arange(_PARTS) * len(measured_rank) // _PARTS)
+    sums = np.add.reduceat(one_hot(measured_rank) - one_hot(simulated_rank), starts, axis=0)
+    # swapping the other parts instead has the same distance: the last part is never swapped
+    signs = 1 - 2 * ((np.arange(2 ** (len(sums) - 1))[:, None] >> np.arange(len(sums))) & 1)
     swapped = np.abs(signs @ sums).sum(axis=1)
     # the tolerance allows for rounding: swaps with an equal result sum in another order
-    return float((1 + np.sum(swapped >= np.abs(sums.sum(axis=0)).sum() - 1e-9)) / (1 + replicates))
+    return float(np.mean(swapped >= np.abs(sums.sum(axis=0)).sum() - 1e-9))
 
 
 # --- what explains the modem's decision ----------------------------------------------------------------------------
@@ -309,10 +304,6 @@ def k_grid(low: float = 1.25, high: float = 1e5, per_decade: int = 24) -> FloatA
     return np.asarray(np.where(np.isclose(k, 10.0**decade, rtol=1e-9), 10.0**decade, k))
 
 
-# Samples times K per resampling, which limits memory on flights of hours and does not change the result.
-_CELLS_AT_ONCE = 2_000_000
-
-
 @dataclass(frozen=True, slots=True)
 class KCurve:
     """The agreement as a function of continuous K.
@@ -324,7 +315,8 @@ class KCurve:
     best_k : float
         K with the best agreement: the middle, on the log scale, of the first run of best K. NaN without a pair.
     best_k_ci95 : (low, high)
-        Central 95 % of the best K over the bootstrap replicates, one grid step wider on either side.
+        Range of K whose agreement is not significantly worse on the same samples (95 %), one grid step wider on either
+        side.
     """
 
     k: FloatArray
@@ -334,11 +326,7 @@ class KCurve:
 
 
 def k_curve(
-    measured: ArrayLike,
-    sigma: ArrayLike,
-    *,
-    k: ArrayLike | None = None,
-    replicates: int = REPLICATES,
+    measured: ArrayLike, sigma: ArrayLike, place_m: FloatArray | None = None, *, k: ArrayLike | None = None
 ) -> KCurve:
     """Compute the agreement for every K, and the K that explains the measured ranks best.
 
@@ -348,10 +336,10 @@ def k_curve(
         RI in time order, NaN if missing.
     sigma : array_like, (n, m)
         Singular values of the simulated channel at the same poses (any scale; see :func:`singular_values`).
+    place_m : (n, 3), optional
+        The same as in :func:`compare_rank`.
     k : array_like, optional
         Grid of K, by default :func:`k_grid`.
-    replicates : int
-        Number of resamples of the block bootstrap for the interval of the best K.
 
     Returns
     -------
@@ -366,37 +354,16 @@ def k_curve(
         return KCurve(k=grid, agreement=np.full(len(grid), np.nan))
     # one byte per sample and K: there are 118 K for each sample of a long flight
     equal = np.stack([rank_from_singular_values(profile[paired], value) == ri[paired] for value in grid], axis=1)
-    agree, known = equal.mean(axis=0), autocorrelation(equal.mean(axis=1))
+    agree, place = equal.mean(axis=0), None if place_m is None else place_m[paired]
+    # the middle, on the logarithmic scale on which K is tried, of the first run of best K
+    first = int(np.argmax(agree))
+    run = np.flatnonzero(np.append(agree[first:], -1.0) < agree[first] - 1e-12)[0]
     ends = NO_INTERVAL
-    # resamples of fewer independent samples repeat the flight's own accidents
-    if known.n_effective >= _FEWEST_INDEPENDENT:
-        # the same seed draws the same blocks each time
-        width = max(1, _CELLS_AT_ONCE // len(equal))
-        drawn = np.concatenate([
-            bootstrap_means(equal[:, i : i + width].astype(np.float64), known.block_length, replicates=replicates)
-            for i in range(0, len(grid), width)
-        ], axis=1)  # fmt: skip
-        ends = _central(_middle_of_best(drawn, grid), grid)
-    return KCurve(k=grid, agreement=agree, best_k=float(_middle_of_best(agree[None], grid)[0]), best_k_ci95=ends)
-
-
-def _middle_of_best(curves: FloatArray, k: FloatArray) -> FloatArray:
-    """Return the middle of the first run of K at which each row is at its maximum."""
-    top = curves >= curves.max(axis=1, keepdims=True) - 1e-12
-    first = np.argmax(top, axis=1)
-    later = np.arange(curves.shape[1]) >= first[:, None]
-    over = ~top & later
-    end = np.where(over.any(axis=1), np.argmax(over, axis=1), curves.shape[1]) - 1
-    # the middle on the logarithmic scale on which K is tried
-    return np.asarray(np.sqrt(k[first] * k[end]))
-
-
-def _central(values: FloatArray, k: FloatArray) -> Interval:
-    """Return the central 95 % of best values, one grid step wider on either side because K is tried in such steps."""
-    low, high = np.quantile(values, [0.025, 0.975])
-    first = max(0, int(np.searchsorted(k, low * (1 + 1e-9))) - 2)
-    last = min(len(k) - 1, int(np.searchsorted(k, high * (1 - 1e-9))) + 1)
-    return float(min(k[first], low)), float(max(k[last], high))
+    if len(equal) >= FEWEST:
+        lost = (equal.astype(np.float64) - equal[:, first : first + 1]).T
+        alike = np.flatnonzero([influence_interval(loss.mean(), loss, place)[1] >= 0.0 for loss in lost])
+        ends = float(grid[max(alike[0] - 1, 0)]), float(grid[min(alike[-1] + 1, len(grid) - 1)])
+    return KCurve(k=grid, agreement=agree, best_k=float(np.sqrt(grid[first] * grid[first + run - 1])), best_k_ci95=ends)
 
 
 @dataclass(frozen=True, slots=True)
@@ -551,7 +518,6 @@ def compare_rank(
     time_s: ArrayLike | None = None,
     sinr_db: ArrayLike | None = None,
     place_m: FloatArray | None = None,
-    replicates: int = REPLICATES,
 ) -> RankComparison:
     """Compare the measured RI with the ranks of simulated channels.
 
@@ -569,8 +535,6 @@ def compare_rank(
         Reported SINR [dB], used to detect repeated reports.
     place_m : (n, 3), optional
         East, north and up, NaN if unknown [m]: intervals then consider correlation over place, too.
-    replicates : int
-        Number of resamples of the bootstrap of K and of the permutation test.
 
     Returns
     -------
@@ -592,16 +556,15 @@ def compare_rank(
     simulated = {float(k): rank_from_singular_values(sigma, k) for k in ks}
     reported = np.isfinite(ri)
     place = None if place_m is None else place_m[reported]
-    known = autocorrelation(ri[reported])
     time = np.arange(len(ri)) if time_s is None else time_s
     return RankComparison(
         n=int(reported.sum()),
-        n_effective=known.n_effective,
+        n_effective=independent_samples(ri[reported], place),
         n_no_csi=int((~reported).sum()),
         histogram=histogram(ri),
         histogram_ci95=_histogram_intervals(ri[reported], place),
-        simulated={k: compare_ranks(ri, rank, place_m, replicates=replicates) for k, rank in simulated.items()},
-        curve=k_curve(ri, sigma, replicates=replicates),
+        simulated={k: compare_ranks(ri, rank, place_m) for k, rank in simulated.items()},
+        curve=k_curve(ri, sigma, place_m),
         staleness=stale_reports(time, ri, {} if sinr_db is None else {"sinr_db": sinr_db}),
     )
 
@@ -610,9 +573,7 @@ def _histogram_intervals(rank: FloatArray, place_m: FloatArray | None = None) ->
     return [share_interval(bar, place_m, rank) for bar in one_hot(rank).T]
 
 
-def compare_ranks(
-    measured: ArrayLike, simulated: ArrayLike, place_m: FloatArray | None = None, *, replicates: int = REPLICATES
-) -> RankFit:
+def compare_ranks(measured: ArrayLike, simulated: ArrayLike, place_m: FloatArray | None = None) -> RankFit:
     """Compare two sequences of ranks by pose and by histogram.
 
     The histogram distances compare all measured with all simulated ranks. Their intervals come from poses with both.
@@ -623,8 +584,6 @@ def compare_ranks(
         Ranks of the same samples: NaN unknown, 0 no channel.
     place_m : (n, 3), optional
         The same as in :func:`compare_rank`.
-    replicates : int
-        Number of swaps of the permutation test.
 
     Returns
     -------
@@ -652,7 +611,7 @@ def compare_ranks(
         wasserstein=move,
         wasserstein_ci95=bounds[3],
         confusion=confusion_matrix(measured_rank, simulated_rank),
-        p_histogram=histogram_test(measured_rank, simulated_rank, replicates=replicates),
+        p_histogram=histogram_test(measured_rank, simulated_rank),
     )
 
 

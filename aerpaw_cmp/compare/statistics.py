@@ -444,14 +444,8 @@ def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatA
     return np.tile(np.exp(middle + more * (log - middle)), 2)
 
 
-# Bootstrap replicates.
-REPLICATES = 1000
-
-# One seed for all resampling, so that the same logs have the same intervals.
-SEED = 20_250_210
-
-# Blocks have twice the length of Politis and White, which minimises the error of the variance, not of the coverage.
-_LONGER = 2.0
+# Half the 95 % interval of a standard normal variable.
+_NORMAL_95 = 1.959964
 
 # Width of an interval relative to its value above which only its lower end is reported.
 _BOUND = 2.0
@@ -463,156 +457,34 @@ _SEGMENTS = 24
 # small chances are known less well than the ends of an interval.
 _FAMILY = 0.02
 
-# Numbers per block of a bootstrap, which limits memory to tens of MiB.
-_HELD = 1 << 21
-
 Interval = tuple[float, float]
 NO_INTERVAL: Interval = (float("nan"), float("nan"))
 
 
-@dataclass(frozen=True, slots=True)
-class Autocorrelation:
-    """The effect of the autocorrelation of a sequence.
+def independent_samples(values: FloatArray, place_m: FloatArray | None = None) -> float:
+    """Return the number of independent samples that determine the mean of a sequence equally well.
 
     Parameters
     ----------
-    n : int
-        Number of samples.
-    block_length : int
-        Block length for the circular block bootstrap [samples].
-    n_effective : float
-        Number of independent samples that determine the mean equally well, 1 to ``n``. NaN below two samples.
-    """
-
-    n: int
-    block_length: int
-    n_effective: float
-
-
-def autocovariance(values: ArrayLike, lags: int) -> FloatArray:
-    """Return the biased autocovariance at lags 0 to ``lags`` (by FFT) of values (n,) without NaN."""
-    x = unmasked(values)
-    n = len(x)
-    # pad to twice the length, because the transform is circular
-    size = 1 << (2 * n - 1).bit_length()
-    spectrum = np.fft.rfft(x - x.mean(), size)
-    return np.asarray(np.fft.irfft(np.abs(spectrum) ** 2, size)[: lags + 1] / n)
-
-
-def _exponential_decay(covariance: FloatArray, n: int) -> tuple[float, float]:
-    """Return long-run variance and sum of lag times covariance for white noise plus an exponential correlation.
-
-    The decay is fitted to consecutive lags down to a correlation of one half, which the removed mean changes least.
-    """
-    correlation = covariance / covariance[0]
-    if correlation[1] < 2.0 * np.sqrt(np.log10(n) / n):  # not significant, by the rule of Politis and White
-        return float(covariance[0]), 0.0
-    below = np.flatnonzero(correlation[1:] <= 0.5)
-    last = min(max(2, int(below[0]) + 1 if len(below) else len(correlation)), len(correlation) - 1)
-    earlier, later = correlation[1:last], correlation[2 : last + 1]
-    decay = float(np.clip(earlier @ later / (earlier @ earlier), 0.0, 1.0 - 1.0 / n))
-    share = min(1.0, float(correlation[1]) / decay) if decay > 0 else 0.0
-    correlated = covariance[0] * share * decay
-    return float(covariance[0] + 2.0 * correlated / (1.0 - decay)), float(correlated / (1.0 - decay) ** 2)
-
-
-def autocorrelation(values: ArrayLike) -> Autocorrelation:
-    """Return the block length and the effective sample size of a sequence.
-
-    Parameters
-    ----------
-    values : array_like, (n,)
+    values : (n,)
         In time order, without NaN.
+    place_m : (n, 3), optional
+        The same as in :func:`mean_draws`.
 
     Returns
     -------
-    Autocorrelation
-        Blocks have a length of one for a constant sequence and for fewer than eight samples.
-
-    Notes
-    -----
-    Subtracting the mean makes all autocovariances too small by V / n, where V is the long-run variance (the sum of all
-    autocovariances). On a flight of a few correlation times, this hides most of the correlation. V and the corrected
-    covariances are therefore solved together. If there is no V below n times the variance, the effective size is one.
-
-    The correlation is white noise plus an exponential (Gudmundson 1991, doi:10.1049/el:19911328). The block length is
-    that of Patton, Politis and White (2009), doi:10.1080/07474930802459016, for the circular block bootstrap. Lags are
-    searched up to n / 2, because there are many radio samples per correlation length. Blocks are at most n / 5.
-
-    Examples
-    --------
-    >>> autocorrelation([1.0, 1.0, 1.0]).block_length
-    1
+    float
+        1 to n; n for a constant sequence, NaN for fewer than :data:`FEWEST` samples.
     """
-    x = unmasked(values)
-    n = len(x)
-    if n < 8 or np.ptp(x) == 0.0:
-        return Autocorrelation(n, 1 if n else 0, float(n) if n > 1 else float("nan"))
-    lags = n // 2
-    unbiased = autocovariance(x, lags) * n / (n - np.arange(lags + 1))
-    hidden, long_run, reach = 0.0, float(unbiased[0]), 0.0
-    for _ in range(12):
-        long_run, reach = _exponential_decay(unbiased + hidden, n)
-        if long_run >= n * (unbiased[0] + hidden):
-            return Autocorrelation(n, max(1, n // 5), 1.0)
-        if abs(long_run / n - hidden) < 1e-3 * unbiased[0]:
-            break
-        hidden = long_run / n
-    length = _LONGER * (1.5 * (2.0 * reach / long_run) ** 2 * n) ** (1.0 / 3.0)
-    # at least five blocks, because resamples of fewer repeat each other
-    block = int(np.clip(np.ceil(length), 1, max(1, n // 5)))
-    effective = float(np.clip(n * (unbiased[0] + hidden) / long_run, 1.0, n))
-    return Autocorrelation(n, block, effective)
+    if len(values) < FEWEST:
+        return float("nan")
+    return _independent(values, influence_interval(float(values.mean()), values, place_m))
 
 
-def bootstrap_means(
-    columns: FloatArray,
-    block_length: int,
-    *,
-    replicates: int = REPLICATES,
-    seed: int = SEED,
-) -> FloatArray:
-    """Return the column means of circular block resamples.
-
-    Parameters
-    ----------
-    columns : (n, m)
-        Samples in time order. Centre them first if squares of large levels would lose digits.
-    block_length : int
-        Samples per block, 1 to n.
-    replicates : int
-        Number of resamples.
-    seed : int
-        Seed of the generator.
-
-    Returns
-    -------
-    ndarray, (replicates, m)
-
-    Notes
-    -----
-    The start of a block determines its sum, so a resample is a set of starts. They are counted and multiplied, which is
-    one matrix product for all replicates.
-    """
-    n, width = columns.shape
-    rng = np.random.default_rng(seed)
-    blocks = -(-n // block_length)
-    sums, last = _block_sums(columns, block_length), _block_sums(columns, n - (blocks - 1) * block_length)
-    result = np.empty((replicates, width))
-    chunk = max(1, _HELD // n)
-    for start in range(0, replicates, chunk):
-        begin = rng.integers(0, n, (min(chunk, replicates - start), blocks))
-        cell = np.arange(len(begin))[:, None] * n + begin[:, :-1]
-        count = np.bincount(cell.ravel(), minlength=len(begin) * n).reshape(-1, n).astype(np.float64)
-        result[start : start + chunk] = (count @ sums + last[begin[:, -1]]) / n
-    return result
-
-
-def _block_sums(columns: FloatArray, length: int) -> FloatArray:
-    """Return the sum of ``length`` rows from every start (n, m), on a circle."""
-    running = np.zeros((len(columns) + length, columns.shape[1]))
-    np.cumsum(np.concatenate([columns, columns[: length - 1]]), axis=0, out=running[1:])
-    return np.asarray(running[length:] - running[:-length])
+def _independent(values: FloatArray, interval: Interval) -> float:
+    """Return the number of independent samples whose mean would have this 95 % interval."""
+    half = 0.5 * float(np.ptp(interval))
+    return float(np.clip(_NORMAL_95**2 * values.var() / half**2, 1.0, len(values))) if half else float(len(values))
 
 
 @dataclass(frozen=True, slots=True)
@@ -623,8 +495,8 @@ class ErrorIntervals:
     ----------
     offset_db, rmse_db, correlation : (low, high)
         NaN ("no interval") for fewer than :data:`FEWEST` samples, or if the statistic does not exist.
-    autocorrelation : Autocorrelation
-        Effective size and block length of the residual.
+    n_effective : float
+        Number of independent samples that would determine the offset equally well. NaN without an interval.
     notes : tuple of str
         Sentences on the limits of the intervals.
     """
@@ -632,7 +504,7 @@ class ErrorIntervals:
     offset_db: Interval
     rmse_db: Interval
     correlation: Interval
-    autocorrelation: Autocorrelation
+    n_effective: float = float("nan")
     notes: tuple[str, ...] = ()
 
 
@@ -651,17 +523,17 @@ def error_intervals(
     Returns
     -------
     ErrorIntervals
-        Offset [dB], RMSE [dB], correlation, and the autocorrelation of the residual.
+        Offset [dB], RMSE [dB] and correlation.
     """
     difference = simulated_db - measured_db
-    known = autocorrelation(difference)
     if len(difference) < FEWEST:
-        return ErrorIntervals(NO_INTERVAL, NO_INTERVAL, NO_INTERVAL, known)
+        return ErrorIntervals(NO_INTERVAL, NO_INTERVAL, NO_INTERVAL)
+    offset = mean_interval(difference, place_m)
     return ErrorIntervals(
-        mean_interval(difference, place_m),
+        offset,
         spread_interval(difference, place_m),
         _correlation_interval(measured_db, simulated_db, place_m),
-        known,
+        _independent(difference, offset),
         tuple(_notes(difference, place_m)),
     )
 
@@ -1015,9 +887,7 @@ def share_interval(
     share, varied = float(indicator.mean()), indicator
     if np.ptp(indicator) == 0.0 and sequence is not None:
         varied = sequence
-    z2 = 1.959964**2
-    half = 0.5 * float(np.ptp(influence_interval(float(varied.mean()), varied, place_m)))
-    size = float(np.clip(z2 * varied.var() / half**2, 1.0, n)) if half else float(n)
+    z2, size = _NORMAL_95**2, independent_samples(varied, place_m)
     centre = (share + z2 / (2 * size)) / (1 + z2 / size)
     reach = np.sqrt(z2 * (share * (1 - share) / size + z2 / (4 * size**2))) / (1 + z2 / size)
     low, high = float(centre - reach), float(centre + reach)

@@ -33,8 +33,8 @@ from .statistics import (
     FEWEST,
     NO_INTERVAL,
     Interval,
-    autocorrelation,
     corrected,
+    independent_samples,
     is_flat,
     mean_interval,
     middle_span,
@@ -253,8 +253,8 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
 
     Notes
     -----
-    Student's t for n flights. From :data:`_MANY_FLIGHTS` flights on, n is their effective number
-    (:func:`~aerpaw_cmp.compare.statistics.autocorrelation`), because consecutive flights of a campaign can correlate.
+    Student's t for n flights. From :data:`_MANY_FLIGHTS` flights on, n is the number of independent flights
+    (:func:`~aerpaw_cmp.compare.statistics.independent_samples`), because consecutive flights can correlate.
     """
     from scipy.special import stdtrit  # scipy.stats would load for 0.2 s what one quantile needs
 
@@ -266,11 +266,8 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
     mean = float(array.mean())
     if n < FEWEST_FLIGHTS:
         return MeanOfFlights(n=n, mean=mean, low=np.nan, high=np.nan)
-    independent = float(n)
-    if n >= _MANY_FLIGHTS and np.ptp(array) > 0:
-        known = autocorrelation(array).n_effective
-        # at least the flights that an interval requires: with one, Student's t has no degree of freedom
-        independent = float(np.clip(known, FEWEST_FLIGHTS, n)) if np.isfinite(known) else independent
+    # at least the flights that an interval requires: with one, Student's t has no degree of freedom
+    independent = max(independent_samples(array), FEWEST_FLIGHTS) if n >= _MANY_FLIGHTS else float(n)
     reach = float(stdtrit(independent - 1.0, 0.975)) * float(array.std(ddof=1)) / independent**0.5
     return MeanOfFlights(n=n, mean=mean, low=mean - reach, high=mean + reach)
 

@@ -280,7 +280,7 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mappin
         at_search_edge=score.at_edge,
         offset_ci95_db=score.intervals.offset_db,
         correlation_ci95=score.intervals.correlation,
-        n_effective=score.intervals.autocorrelation.n_effective,
+        n_effective=score.intervals.n_effective,
         lag_verdict="" if clock is None else clock.verdict,
         fitted=score.fitted_on_scored,
         baselines={name: model.rmse_db for name, model in result.baselines.items()},

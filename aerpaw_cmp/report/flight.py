@@ -93,7 +93,7 @@ def _rss_metrics(series: RssResult) -> dict[str, Any]:
         "correlation": score.correlation, "rmse_ci95_db": score.rmse_ci95_db,
         "offset_ci95_db": score.intervals.offset_db,
         "correlation_ci95": score.intervals.correlation,
-        "n_effective": score.intervals.autocorrelation.n_effective,
+        "n_effective": score.intervals.n_effective,
         "lag_s": score.lag_s,
         "lag_verdict": series.clock_verdict,
         "unit": series.unit,
@@ -235,7 +235,7 @@ def channels_card(data: ReportData) -> Card:
 
 
 def _channel(data: ReportData, p: RssResult) -> Card:
-    score, independent = p.score, p.score.intervals.autocorrelation.n_effective
+    score, independent = p.score, p.score.intervals.n_effective
     counts_as = f"The {number(score.n, 0)} samples count as about {number(independent, 0)} independent samples."
     lag = f"Clock check: {p.clock_verdict}, radio minus telemetry {number(score.lag_s, 2, 's')}."
     return Card(

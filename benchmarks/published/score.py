@@ -17,7 +17,6 @@ from aerpaw_cmp.common.jsonable import fields_of
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.compare.level import LevelSeries, level_scores
 from aerpaw_cmp.compare.receiver import constant_forecast, score_forecast
-from aerpaw_cmp.compare.statistics import bootstrap_means
 from aerpaw_cmp.jobs.options import AGAINST_DISTANCE_M
 from aerpaw_cmp.jobs.referee import predicted_at, read_foreign, split_by_series
 
@@ -243,6 +242,21 @@ def block_of(series: LevelSeries) -> int:
     return max(1, min(n, round(BLOCK_S * (n - 1) / span))) if span > 0.0 else 1
 
 
+def bootstrap_means(columns: FloatArray, block: int, seed: int) -> FloatArray:
+    """Return the column means (:data:`REPLICATES`, m) of circular resamples of blocks of rows (n, m)."""
+    n, blocks = len(columns), -(-len(columns) // block)
+    begin = np.random.default_rng(seed).integers(0, n, (REPLICATES, blocks))
+    sums, last = (_block_sums(columns, length) for length in (block, n - (blocks - 1) * block))
+    return np.asarray((sums[begin[:, :-1]].sum(axis=1) + last[begin[:, -1]]) / n)
+
+
+def _block_sums(columns: FloatArray, length: int) -> FloatArray:
+    """Return the sum of ``length`` rows from every start (n, m), on a circle."""
+    running = np.zeros((len(columns) + length, columns.shape[1]))
+    np.cumsum(np.concatenate([columns, columns[: length - 1]]), axis=0, out=running[1:])
+    return np.asarray(running[length:] - running[:-length])
+
+
 def rmse_replicates(series: Sequence[LevelSeries]) -> FloatArray:
     """Mean RMSE (replicates,) over series whose blocks of :data:`BLOCK_S` are drawn anew [dB].
 
@@ -252,7 +266,7 @@ def rmse_replicates(series: Sequence[LevelSeries]) -> FloatArray:
     for number, levels in enumerate(series):
         error = levels.error_db
         columns = np.column_stack([error**2, error])
-        drawn = bootstrap_means(columns, block_of(levels), replicates=REPLICATES, seed=SEED + number)
+        drawn = bootstrap_means(columns, block_of(levels), SEED + number)
         offset = drawn[:, 1] ** 2 if levels.own_offset else 0.0
         total += np.sqrt(np.maximum(drawn[:, 0] - offset, 0.0))
     return total / len(series)

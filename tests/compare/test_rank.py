@@ -1,5 +1,7 @@
 """Ranks, their distances and statistics against plain loops, and the rules that might explain a modem."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,7 +10,6 @@ from scipy.stats import norm, wasserstein_distance
 
 from aerpaw_cmp.compare import rank as ranks
 from aerpaw_cmp.compare.rank import (
-    MAX_RANK,
     agreement,
     channel_rank,
     cohen_kappa,
@@ -26,7 +27,7 @@ from aerpaw_cmp.compare.rank import (
     total_variation,
     wasserstein,
 )
-from aerpaw_cmp.compare.statistics import NO_INTERVAL, SEED, Visit, autocorrelation
+from aerpaw_cmp.compare.statistics import NO_INTERVAL, Visit
 
 NAN = float("nan")
 
@@ -141,7 +142,7 @@ def test_confusion_agreement_and_kappa():
 def test_ri_only_ever_two():
     n = 200
     h = with_profile(np.tile([1, 0.5, 0.01, 0.001], (n, 1)))
-    result = compare_rank(np.full(n, 2.0), h, replicates=100)
+    result = compare_rank(np.full(n, 2.0), h)
     assert result.histogram.tolist() == [0, 1, 0, 0]
     fit = result.simulated[10.0]
     assert fit.agreement == 1.0
@@ -155,7 +156,7 @@ def test_ri_only_ever_two():
 
 
 def test_everything_out_of_coverage():
-    result = compare_rank([2.0, NAN, 1.0, 3.0], np.zeros((4, 4, 4)), replicates=50)
+    result = compare_rank([2.0, NAN, 1.0, 3.0], np.zeros((4, 4, 4)))
     fit = result.simulated[10.0]
     assert (fit.out_of_coverage, result.n, result.n_no_csi) == (4, 3, 1)
     assert np.isnan(fit.histogram).all()
@@ -165,7 +166,7 @@ def test_everything_out_of_coverage():
 
 
 def test_one_sample():
-    result = compare_rank([2.0], with_profile([[1, 0.5, 0.01, 0.001]]), replicates=20)
+    result = compare_rank([2.0], with_profile([[1, 0.5, 0.01, 0.001]]))
     assert result.simulated[10.0].agreement == 1.0
     assert np.isnan(result.simulated[10.0].agreement_ci95).all()
     assert result.n == 1
@@ -198,7 +199,7 @@ def test_best_k_is_found_within_its_interval():
     measured = channel_rank(h, truth).astype(float)
     lost = rng.random(n) < 0.2  # the modem is not perfect
     measured[lost] = rng.integers(1, 5, lost.sum())
-    curve = k_curve(measured, singular_values(h), replicates=200)
+    curve = k_curve(measured, singular_values(h))
     low, high = curve.best_k_ci95
     assert curve.best_k == pytest.approx(truth, rel=0.15)
     assert truth / 10 < low <= truth <= high < 10 * truth
@@ -253,7 +254,7 @@ def test_rank_intervals_hold_the_truth_of_a_known_process():
         x /= np.sqrt(1 / (2 * np.sqrt(np.pi) * 5))  # unit variance of the process, not of the sample
         measured = np.searchsorted([-1.0, 0.5, 2.0], x) + 1.0
         simulated = np.searchsorted([-0.5, 0.5, 2.0], x) + 1.0
-        fit = compare_ranks(measured, simulated, replicates=200)
+        fit = compare_ranks(measured, simulated)
         from scipy.stats import norm
 
         moved = norm.cdf(-0.5) - norm.cdf(-1.0)  # the share whose rank drops from 2 to 1
@@ -277,7 +278,7 @@ def test_rank_intervals_cover_the_truth_of_a_process_over_place():
         first, other = rng.normal(size=(2, n)) @ root.T / np.sqrt(1.16)
         measured = np.searchsorted(cuts, first) + 1.0
         simulated = np.searchsorted(cuts, 0.8 * first + 0.6 * other) + 1.0
-        fit = compare_ranks(measured, simulated, place, replicates=20)
+        fit = compare_ranks(measured, simulated, place)
         ends = np.array([fit.agreement_ci95, fit.kappa_ci95, fit.histogram_ci95[0]])
         # agreement and kappa of thresholds on two normals that correlate by 0.8, by integration
         truth = np.array([0.6272, 0.4331, norm.cdf(-0.8)])
@@ -332,7 +333,7 @@ def test_each_interval_is_that_of_its_own_number():
     rng = np.random.default_rng(23)
     measured = rng.choice([1.0, 2.0, 3.0, 4.0], 3000, p=[0.2, 0.5, 0.2, 0.1])
     simulated = np.where(rng.random(3000) < 0.5, measured, np.clip(measured + 1, 1, 4))
-    fit = compare_ranks(measured, simulated, replicates=200)
+    fit = compare_ranks(measured, simulated)
     values = [fit.agreement, fit.kappa, fit.total_variation, fit.wasserstein]
     spans = [fit.agreement_ci95, fit.kappa_ci95, fit.total_variation_ci95, fit.wasserstein_ci95]
     for k, value in enumerate(values):
@@ -341,41 +342,28 @@ def test_each_interval_is_that_of_its_own_number():
         assert sum(inside) == 1, "the four lie far enough apart here"
 
 
-@pytest.mark.parametrize("n", [16, 31, 240])
-def test_the_histogram_test_swaps_whole_blocks(n):
+@pytest.mark.parametrize("n", [5, 16, 31, 240])
+def test_the_histogram_test_swaps_parts_of_the_flight(n):
     a, b = walk(n, 5), walk(n, 6, 1, 3)
-    length = max(autocorrelation(a).block_length, autocorrelation(b).block_length, 1)
-    signs = np.random.default_rng(SEED).integers(0, 2, (150, -(-n // length))) * 2 - 1
-    counts = []
-    for row in [np.ones(-(-n // length), dtype=int), *signs]:
-        bars = np.zeros(MAX_RANK)
-        for i in range(n):
-            bars[a[i] - 1] += row[i // length]
-            bars[b[i] - 1] -= row[i // length]
-        counts.append(np.abs(bars).sum())
-    expected = (1 + sum(c >= counts[0] - 1e-9 for c in counts[1:])) / 151
-    assert ranks.histogram_test(a, b, replicates=150) == pytest.approx(expected, rel=1e-12)
+    part = np.searchsorted(np.unique(np.arange(12) * n // 12), np.arange(n), side="right") - 1
+    distances = []
+    for signs in product((1, -1), repeat=part[-1] + 1):
+        swap = np.array(signs)[part] < 0
+        one, other = np.where(swap, b, a), np.where(swap, a, b)
+        distances.append(total_variation(histogram(one), histogram(other)))
+    expected = np.mean(np.array(distances) >= total_variation(histogram(a), histogram(b)) - 1e-12)
+    assert ranks.histogram_test(a, b) == pytest.approx(expected, rel=1e-12)
     assert np.isnan(ranks.histogram_test([np.nan, 0], [1, 1]))
 
 
-def test_the_middle_of_the_first_best_run():
-    k = np.array([1.0, 10.0, 100.0, 1000.0, 1e4])
-    curves = np.array(
-        [[0, 1, 1, 0, 1], [1, 0, 1, 1, 1], [0, 0, 0, 1, 1], [1, 1, 1, 1, 1], [0, 1, 1 - 1e-13, 0, 0]], dtype=float
-    )
-    assert ranks._middle_of_best(curves, k) == pytest.approx([10**1.5, 1.0, 10**3.5, 100.0, 10**1.5])
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "expected"),
-    [(1, 2, (0, 3)), (0, 4, (0, 4)), (0.5, 2.5, (0, 4)), (2, 2, (1, 3)), (-0.3, 9, (-0.3, 9))],
-)
-@pytest.mark.parametrize("ratio", [10.0, 1.25])
-def test_an_interval_of_k_reaches_one_step_further(ratio, low, high, expected):
-    """A value of the grid gets the next one; one between two of them the one after; never inside of what was drawn."""
-    grid = ratio ** np.arange(5)
-    ends = ranks._central(np.array([ratio**low, ratio**high] * 50), grid)
-    assert ends == pytest.approx([ratio**end for end in expected])
+def test_the_best_k_is_the_middle_of_the_first_best_run():
+    grid, profile = np.array([1.0, 10.0, 100.0, 1000.0, 1e4]), np.array([[1.0, 1.0 / 30.0, 1.0 / 3000.0]])
+    for rank, best in ((1, 10.0), (2, 10**2.5), (3, 1e4)):
+        curve = k_curve(np.full(40, float(rank)), np.repeat(profile, 40, axis=0), k=grid)
+        assert curve.best_k == pytest.approx(best)
+        # one step of the grid wider than the K with as many equal ranks
+        assert curve.best_k_ci95 == {1: (1.0, 100.0), 2: (10.0, 1e4), 3: (1000.0, 1e4)}[rank]
+    assert k_curve(np.full(19, 1.0), np.repeat(profile, 19, axis=0), k=grid).best_k_ci95 == NO_INTERVAL
 
 
 def test_profiles_without_a_value_have_no_rank():

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import t as student
 
 from aerpaw_cmp.compare.offset import grid_offset
-from aerpaw_cmp.compare.statistics import autocorrelation
+from aerpaw_cmp.compare.statistics import independent_samples
 from aerpaw_cmp.compare.verdict import error_at_offset, left_out_offsets, mean_of_flights, verdict_of
 
 
@@ -50,7 +50,7 @@ def test_few_flights_and_missing_ones():
 def test_intervals_are_those_of_students_t(n):
     """Of twenty flights that drift, as many count as are independent."""
     values = np.arange(n) // 4 + np.sin(np.arange(n))
-    mean, independent = mean_of_flights(values), min(max(autocorrelation(values).n_effective, 3.0), n) if n >= 20 else n
+    mean, independent = mean_of_flights(values), max(independent_samples(values), 3.0) if n >= 20 else n
     reach = student.ppf(0.975, independent - 1) * values.std(ddof=1) / np.sqrt(independent)
     assert (mean.n, mean.low, mean.high) == pytest.approx((n, values.mean() - reach, values.mean() + reach))
     slow = np.cumsum(np.ones(40)) + values[0]

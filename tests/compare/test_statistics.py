@@ -8,13 +8,10 @@ from scipy.signal import lfilter
 
 from aerpaw_cmp.compare import statistics
 from aerpaw_cmp.compare.statistics import (
-    Autocorrelation,
     Visit,
-    autocorrelation,
-    autocovariance,
-    bootstrap_means,
     correlation,
     error_intervals,
+    independent_samples,
     paired_difference,
     same_places,
     share_interval,
@@ -29,42 +26,24 @@ def shadowing(rng, n, samples, sigma):
     return sigma * np.sqrt(1 - keep**2) * lfilter([1], [1, -keep], noise)
 
 
-def test_autocovariance_by_hand():
-    x = np.random.default_rng(0).normal(size=50)
-    c = x - x.mean()
-    expected = [np.sum(c[lag:] * c[: 50 - lag]) / 50 for lag in range(6)]
-    np.testing.assert_allclose(autocovariance(x, 5), expected, atol=1e-14)
-
-
-@pytest.mark.parametrize(("n", "correlation", "noise"), [
-    (200, 0.5, 0.0), (200, 0.95, 0.0), (300, 0.97, 0.0), (500, 0.9, 0.0), (1000, 0.98, 0.0), (3000, 0.99, 0.0), (20_000, 0.98, 0.0), (1000, 0.95, 0.25),
+@pytest.mark.parametrize(("n", "correlation", "noise", "least"), [
+    (200, 0.5, 0.0, 0.7), (200, 0.95, 0.0, 0.2), (500, 0.9, 0.0, 0.4), (3000, 0.99, 0.0, 0.1), (20_000, 0.98, 0.0, 0.5), (1000, 0.95, 0.25, 0.4),
 ])  # fmt: skip
-def test_effective_sample_size_of_a_known_process(n, correlation, noise):
-    """The median over flights, also of flights a few correlation times long (where the mean hides the memory)."""
+def test_independent_samples_of_a_known_process(n, correlation, noise, least):
+    """The median over flights: at most the true number, and less for a correlation that a flight hardly determines."""
     rng = np.random.default_rng(1)
     ratio = (1 + correlation) / (1 - correlation)
     expected = n * (1 + noise) / (ratio + noise)
     sizes = []
     for _ in range(60 if n < 10_000 else 15):
         x = shadowing(rng, n, -1.0 / np.log(correlation), 1.0) + np.sqrt(noise) * rng.normal(size=n)
-        sizes.append(autocorrelation(x).n_effective)
-    assert np.median(sizes) == pytest.approx(expected, rel=0.25)
-
-
-def test_blocks_are_those_of_the_law_for_a_known_process():
-    """Patton, Politis and White (2009) of an exponential memory, twice as long; the median over flights."""
-    rng = np.random.default_rng(2)
-    for n, keep in ((1000, 0.5), (3000, 0.9)):
-        blocks = [autocorrelation(shadowing(rng, n, -1.0 / np.log(keep), 1.0)).block_length for _ in range(40)]
-        slope = 2.0 * keep / (1.0 - keep**2)
-        assert np.median(blocks) == pytest.approx(2.0 * (1.5 * slope**2 * n) ** (1 / 3), rel=0.2)
-    assert autocorrelation(np.arange(7.0)) == Autocorrelation(7, 1, 7.0)  # too few to tell
+        sizes.append(independent_samples(x))
+    assert least * expected < np.median(sizes) < 1.1 * expected
 
 
 def test_degenerate_sequences():
-    assert autocorrelation([]).n_effective != autocorrelation([]).n_effective  # NaN
-    assert autocorrelation([1.0]).block_length == 1
-    assert autocorrelation(np.zeros(100)).block_length == 1
+    assert np.isnan(independent_samples(np.arange(19.0)))
+    assert independent_samples(np.zeros(100)) == 100.0
     assert np.isnan(error_intervals(np.zeros(0), np.zeros(0)).rmse_db).all()
     single = error_intervals(np.array([1.0]), np.array([2.0]))
     assert np.isnan(single.offset_db).all()
@@ -123,32 +102,6 @@ def test_nineteen_samples_are_too_few_for_an_interval_and_twenty_are_not():
         assert (np.isfinite(spans) == some).all()
         assert np.isfinite(pair.standard_error_db) == some
         assert (pair.verdict == "no interval") != some
-
-
-def test_resamples_do_not_depend_on_how_many_are_held_at_once(monkeypatch):
-    for length in (2, 30):
-        data = np.random.default_rng(length).normal(size=(60, 3))
-        at_once = bootstrap_means(data, length, replicates=50)
-        monkeypatch.setattr(statistics, "_HELD", 400)
-        np.testing.assert_allclose(bootstrap_means(data, length, replicates=50), at_once, atol=1e-14)
-        monkeypatch.undo()
-
-
-@pytest.mark.parametrize(("n", "length", "columns"), [(97, 10, 2), (97, 1, 3), (97, 10, 400), (12, 12, 1), (1, 1, 2)])
-def test_resamples_have_the_moments_of_the_circular_block_bootstrap(n, length, columns):
-    rng = np.random.default_rng(3)
-    data = rng.normal(size=(n, columns)) + 5.0
-    drawn = bootstrap_means(data, length, replicates=4000)
-    np.testing.assert_allclose(drawn.mean(axis=0), data.mean(axis=0), atol=0.05)
-    # exact variance: independent whole blocks and one shorter one
-    full_blocks, last = -(-n // length) - 1, n - (-(-n // length) - 1) * length
-    ring = np.concatenate([data, data])
-
-    def sums(size):
-        return np.array([ring[s : s + size].sum(axis=0) for s in range(n)])
-
-    expected = (full_blocks * sums(length).var(axis=0) + sums(last).var(axis=0)) / n**2
-    np.testing.assert_allclose(drawn.var(axis=0).mean(), expected.mean(), rtol=0.08, atol=1e-12)
 
 
 @pytest.mark.parametrize("neighbours", [0.0, 0.9, 0.98])

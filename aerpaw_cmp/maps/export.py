@@ -79,11 +79,6 @@ class MapLayers:
         # 1e-7 degrees are 11 mm of latitude
         return np.asarray(np.round(np.column_stack([longitude, latitude]), 7), dtype=np.float64)
 
-    def towers_of(self, border: Border) -> list[str]:
-        """Return names of the towers between which a border lies."""
-        names = list(self.towers_m)
-        return [names[i] if i < len(names) else str(i) for i in border.towers]
-
 
 def write_csv(path: str | Path, maps: MapLayers) -> Path:
     """One row per position in index order: index, row, column, east, north, latitude, longitude, then the layers."""
@@ -93,14 +88,11 @@ def write_csv(path: str | Path, maps: MapLayers) -> Path:
     latitude, longitude = maps.frame.to_geographic(points[:, 0], points[:, 1])
     table = {
         "index": np.arange(1, len(maps.grid) + 1),  # the paper counts from 1
-        "row": np.repeat(np.arange(rows), columns),
-        "column": np.tile(np.arange(columns), rows),
-        "east_m": points[:, 0],
-        "north_m": points[:, 1],
-        "latitude_deg": np.round(latitude, 9),
-        "longitude_deg": np.round(longitude, 9),
+        "row": np.repeat(np.arange(rows), columns), "column": np.tile(np.arange(columns), rows),
+        "east_m": points[:, 0], "north_m": points[:, 1],
+        "latitude_deg": np.round(latitude, 9), "longitude_deg": np.round(longitude, 9),
         **{layer.name: layer.values for layer in maps.layers},
-    }
+    }  # fmt: skip
     # names of towers may be third-party input, and a spreadsheet executes a cell that begins with =
     target = Path(path)
     guarded(pd.DataFrame(table)).to_csv(target, index=False, lineterminator="\n")
@@ -126,8 +118,9 @@ def write_kmz(path: str | Path, maps: MapLayers, *, title: str = "Coverage and r
         for number, layer in enumerate(maps.layers)
     ]
     parts += [kml.mark(name, kml.coordinates(*maps.lonlat([place]).T)[0]) for name, place in maps.towers_m.items()]
+    towers = list(maps.towers_m)
     for border in maps.borders:
-        at, name = kml.coordinates(*maps.lonlat(border.line_m).T), " / ".join(maps.towers_of(border))
+        at, name = kml.coordinates(*maps.lonlat(border.line_m).T), " / ".join(towers[i] for i in border.towers)
         parts.append(kml.line(name, at, "<tessellate>1</tessellate>", style=kml.line_style("ffffffff", 2)))
     pictures = {}
     for layer in maps.layers:
@@ -146,12 +139,10 @@ def _bounding_box(maps: MapLayers) -> tuple[float, float, float, float]:
     """
     half = maps.grid.spacing_m / 2
     east, north = maps.grid.east_m, maps.grid.north_m
-    middle_east, middle_north = (east[0] + east[-1]) / 2, (north[0] + north[-1]) / 2
-    latitude, longitude = maps.frame.to_geographic(
-        np.array([middle_east, middle_east, east[-1] + half, east[0] - half]),
-        np.array([north[-1] + half, north[0] - half, middle_north, middle_north]),
-    )
-    return float(latitude[0]), float(latitude[1]), float(longitude[2]), float(longitude[3])
+    middle = (east[0] + east[-1]) / 2, (north[0] + north[-1]) / 2
+    (top, low), _ = maps.frame.to_geographic(np.full(2, middle[0]), np.array([north[-1] + half, north[0] - half]))
+    _, (right, left) = maps.frame.to_geographic(np.array([east[-1] + half, east[0] - half]), np.full(2, middle[1]))
+    return float(top), float(low), float(right), float(left)
 
 
 def _range(layer: Layer) -> tuple[float, float]:
@@ -215,7 +206,7 @@ def _legend(layer: Layer, low: float, high: float) -> bytes:
 
 
 _PLANE = ("y", "x")
-_COORDINATES = "latitude longitude"
+_ON_PLANE = {"coordinates": "latitude longitude", "grid_mapping": "crs"}
 _Variable = tuple[tuple[str, ...], AnyArray, dict[str, Any]]
 
 
@@ -250,17 +241,8 @@ def maps_dataset(
             variables[layer.name] = _PLANE, plane.astype(np.int8), _codes(codes, layer.title)
         else:
             unit = {"dBm": DBM, "dB": DB}.get(layer.unit, layer.unit)
-            attributes = {
-                "long_name": layer.title,
-                "units": unit,
-                "comment": f"unit: {layer.unit}",
-                "grid_mapping": "crs",
-            }
-            variables[layer.name] = (
-                _PLANE,
-                plane.astype(np.float32),
-                {**attributes, "coordinates": "latitude longitude"},
-            )
+            about_layer = {"long_name": layer.title, "units": unit, "comment": f"unit: {layer.unit}"}
+            variables[layer.name] = _PLANE, plane.astype(np.float32), about_layer | _ON_PLANE
     return Dataset(variables, about)
 
 
@@ -360,19 +342,10 @@ def _stacked(
     planes = np.stack([v.reshape(*v.shape[:-1], *m.grid.shape) for m, v in zip(maps.values(), values, strict=True)])
     # float32 resolves 0.01 dB and halves the file
     numbers = planes.astype(np.int8) if "flag_values" in attributes else np.round(planes, 2).astype(np.float32)
-    described = {
-        **attributes,
-        "long_name": str(attributes["long_name"]) + (", nearest tower" if joint else ""),
-        "coordinates": _COORDINATES,
-        "grid_mapping": "crs",
-    }
-    return ("foliage", *between, *_PLANE), numbers, described
+    meaning = str(attributes["long_name"]) + (", nearest tower" if joint else "")
+    return ("foliage", *between, *_PLANE), numbers, {**attributes, "long_name": meaning, **_ON_PLANE}
 
 
 def _codes(meanings: Sequence[str], long_name: str) -> dict[str, Any]:
     """Return attributes of a variable of classes 0, 1, ..."""
-    return {
-        "long_name": long_name,
-        **flags(meanings),
-        "grid_mapping": "crs",
-    }
+    return {"long_name": long_name, **flags(meanings), "grid_mapping": "crs"}

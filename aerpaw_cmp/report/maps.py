@@ -239,15 +239,10 @@ def first_words(data: MapsData) -> str:
     if not heights:
         return ""
     worst = min(heights, key=lambda height: height.covered)
-    sentence = said_of(
-        coverage_verdict(heights),
-        CAUSES,
-        percent=100.0 * worst.covered,
-        outside=100.0 * worst.outside,
-        thinner="compare the rows of attenuating trees"
-        if any(item.foliage == "attenuating" for item in data.rss)
-        else "map with `--foliage attenuating`, too",
-    )
+    thinned = any(item.foliage == "attenuating" for item in data.rss)
+    thinner = "compare the rows of attenuating trees" if thinned else "map with `--foliage attenuating`, too"
+    shares = {"percent": 100.0 * worst.covered, "outside": 100.0 * worst.outside}
+    sentence = said_of(coverage_verdict(heights), CAUSES, thinner=thinner, **shares)
     best = max(heights, key=lambda height: height.covered)
     more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if best.covered > worst.covered else ""
     measured = "" if data.corrected else "The map contains no measurement. "
@@ -262,15 +257,11 @@ def coverage(data: MapsData) -> list[Coverage]:
     first = shown[0]
     same_link = [item for item in shown if (item.tower, item.antennas) == (first.tower, first.antennas)]
     clear = {item.height_m: item.coverage for item in same_link if item.foliage == "none" != first.foliage}
+    outside = data.outside_flown
     return [
-        Coverage(
-            height_m=item.height_m,
-            covered=item.coverage,
-            clear=clear.get(item.height_m, np.nan),
-            outside=data.outside_flown,
-        )
-        for item in same_link
-        if item.foliage == first.foliage
+        Coverage(height_m=m.height_m, covered=m.coverage, clear=clear.get(m.height_m, np.nan), outside=outside)
+        for m in same_link
+        if m.foliage == first.foliage
     ]
 
 
@@ -296,18 +287,13 @@ def warnings(data: MapsData) -> list[str]:
 
 def notes(data: MapsData) -> list[str]:
     """Return notes about the computation of the maps."""
-    how = list(_made(data)) if "foliage" in data.settings else []
+    how = [
+        f"Foliage {', '.join(data.settings['foliage'])}: opaque blocks paths that touch a crown or a trunk (the "
+        "paper); attenuating applies ITU-R P.833 over the length of the path in crowns; none ignores trees.",
+        "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element.",
+        f"Spread, condition number, correlation and interpolation are those of foliage {data.rss[0].foliage}.",
+    ] if "foliage" in data.settings else []  # fmt: skip
     return [*data.site.notes, *how, *data.notes]
-
-
-def _made(data: MapsData) -> Iterator[str]:
-    s = data.settings
-    yield (
-        f"Foliage {', '.join(s['foliage'])}: opaque blocks paths that touch a crown or a trunk (the paper); "
-        "attenuating applies ITU-R P.833 over the length of the path in crowns; none ignores trees."
-    )
-    yield "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element."
-    yield f"Spread, condition number, correlation and interpolation are those of foliage {data.rss[0].foliage}."
 
 
 T = TypeVar("T")
@@ -334,10 +320,9 @@ def half_width(at_m: FloatArray) -> float:
 
 def extent_m(data: MapsData) -> tuple[float, float, float, float]:
     """Return the outer edges of the grid: west, east, south, north [m]."""
-    (west, east), (south, north) = (
-        (float(at[0]) - half_width(at), float(at[-1]) + half_width(at)) for at in (data.east_m, data.north_m)
-    )
-    return west, east, south, north
+    half_east, half_north = half_width(data.east_m), half_width(data.north_m)
+    west, east, south, north = *data.east_m[[0, -1]].tolist(), *data.north_m[[0, -1]].tolist()
+    return west - half_east, east + half_east, south - half_north, north + half_north
 
 
 def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | None = None, **options: Any) -> Any:
@@ -415,15 +400,8 @@ def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure
     columns = -(-count // rows)
     width = min((7.4 - 0.15 * columns) / columns, 3.2)  # the rest is for the colour bar and the labels
     height = float(np.clip(width * (north - south) / (east - west), 0.8, 6.5))
-    fig, grid = placed(
-        (9.2, rows * (height + 0.35) + 1.0),
-        rows,
-        columns,
-        gap_in=(0.3, 0.4),
-        right_in=right_in,
-        sharex=True,
-        sharey=True,
-    )
+    size = 9.2, rows * (height + 0.35) + 1.0
+    fig, grid = placed(size, rows, columns, gap_in=(0.3, 0.4), right_in=right_in, sharex=True, sharey=True)
     axes: list[Axes] = list(grid.ravel())
     for ax in axes[count:]:
         ax.set_visible(False)
@@ -539,11 +517,10 @@ class Plate:
     def charts(self) -> list[Chart]:
         """The charts of the page."""
         return [
-            Chart(
-                section=self.section, title=f"{self.title}: {name}", caption="" if i else self.caption, content=content
-            )
+            Chart(section=self.section, title=f"{self.title}: {name}", content=content,
+                  caption="" if i else self.caption)
             for i, (name, content) in enumerate(self.panels.items())
-        ]
+        ]  # fmt: skip
 
 
 def plates(data: MapsData) -> Iterator[Plate]:
@@ -591,13 +568,10 @@ def plates(data: MapsData) -> Iterator[Plate]:
 
 def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
     """Return one colour scale for all maps: the 1 to 99.5 % range, rounded to 5 dB [dBm]."""
-    parts = [entry.values[np.isfinite(entry.values)] for entry in maps]
-    finite = np.concatenate(parts) if parts else np.zeros(0)
-    if not len(finite):
-        return -100.0, -50.0
+    levels = np.concatenate([np.zeros(0), *(entry.values.ravel() for entry in maps)])
     # a few cells next to a tower are far above all others and would use most colours
-    low, high = np.percentile(finite, [1.0, 99.5])
-    return float(5 * np.floor(low / 5)), float(max(5 * np.ceil(high / 5), 5 * np.floor(low / 5) + 5))
+    low, high = ends_of_scale(levels[np.isfinite(levels)], 99.5)
+    return 5.0 * math.floor(low / 5), 5.0 * max(math.ceil(high / 5), math.floor(low / 5) + 1)
 
 
 def figure_specs(data: MapsData) -> list[FigureSpec]:
@@ -737,16 +711,11 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
         classes = np.nan_to_num(cells, nan=NONE["u1"])
         stored[key] = arrays.add(classes, "u1") if kind == _CLASSES else arrays.add_steps(cells, step)
     return {
-        "name": name,
-        "unit": layers[0].unit,
-        "kind": kind,
-        "step": step,
-        "range": _range(every, kind),
-        "classes": list(layers[0].classes),
-        "colours": _class_colours(layers[0].classes),
+        "name": name, "unit": layers[0].unit, "kind": kind, "step": step, "range": _range(every, kind),
+        "classes": list(layers[0].classes), "colours": _class_colours(layers[0].classes),
         "axes": [{"name": axis, "values": values} for axis, values in axes.items()],
         "layers": stored,
-    }
+    }  # fmt: skip
 
 
 def _range(values: FloatArray, kind: str) -> list[float]:
@@ -791,7 +760,7 @@ def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dic
     lat, lon = frame.to_geographic(east, north)
     powers = [(p, q) for p in range(_DEGREE + 1) for q in range(_DEGREE + 1 - p)]
     matrix = np.column_stack([u**p * v**q for p, q in powers])
-    (by_lat, by_lon), *_ = (np.linalg.lstsq(matrix, np.column_stack([lat, lon]), rcond=None)[0].T,)
+    by_lat, by_lon = np.linalg.lstsq(matrix, np.column_stack([lat, lon]), rcond=None)[0].T
     back = frame.to_local(matrix @ by_lat, matrix @ by_lon)
     worst = float(np.hypot(back[0] - east, back[1] - north).max())
     return {
@@ -898,14 +867,10 @@ def error_tables(errors: Sequence[MapError]) -> list[Table]:
             mae = {e.altitude_m: e.mae for e in group}
             mean = bold(number(sum(mae.values()) / len(mae), 3))
             rows.append((method, k_key(k), *(mae.get(height) for height in heights), mean))
-        columns: dict[str, str | int] = {
-            "Method": HEAD,
-            "K": TEXT,
-            **{f"{height:g} m": 3 for height in heights},
-            "Mean": RIGHT,
-        }
-        caption = f"Mean absolute error of the interpolated rank, {evaluation}."
-        tables.append(Table(caption=caption, columns=columns, rows=rows))
+        tables.append(Table(
+            caption=f"Mean absolute error of the interpolated rank, {evaluation}.", rows=rows,
+            columns={"Method": HEAD, "K": TEXT, **{f"{height:g} m": 3 for height in heights}, "Mean": RIGHT},
+        ))  # fmt: skip
     return tables
 
 

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from itertools import groupby, product
@@ -329,12 +329,17 @@ def own_covariance(model: GainModel, samples: LinkSamples) -> FloatArray:
 
 def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> FloatArray:
     """Return the covariance of the levels of all rows, with gains, offsets, nuisances and noise, (n, n) [dB^2]."""
-    out, start = gain_covariance(model.terms, rows, rows), 0
-    for samples in rows:
-        block = slice(start, start + len(samples))
-        out[block, block] += own_covariance(model, samples)
-        start = block.stop
-    return out
+    return _with_blocks(gain_covariance(model.terms, rows, rows), (own_covariance(model, s) for s in rows))
+
+
+def _with_blocks(covariance: FloatArray, blocks: Iterable[FloatArray]) -> FloatArray:
+    """Add the covariance of each series to its block on the diagonal, in place because of the size."""
+    start = 0
+    for block in blocks:
+        part = slice(start, start + len(block))
+        covariance[part, part] += block
+        start = part.stop
+    return covariance
 
 
 @dataclass(frozen=True, slots=True)
@@ -401,23 +406,16 @@ class GainFit:
         UsageError
             If no flight of the fit has this tower and channel.
         """
-        samples = self._like_fitted(samples)
-        gain, sd = np.full(len(samples), np.nan), np.full(len(samples), np.nan)
-        terms = [t for t in self.model.terms if frames is None or t.frame in frames]
-        known = self._known_rows(samples)
-        for start in range(0, len(known), AT_ONCE):
-            part = known[start : start + AT_ONCE]
-            gain[part], sd[part] = self._moments(terms, samples.part(part), self._rows_of(samples.antenna))
+        terms, about = (
+            [t for t in self.model.terms if frames is None or t.frame in frames],
+            self._rows_of(samples.antenna),
+        )
+        gain, sd = _in_parts(self._like_fitted(samples), lambda part: np.stack(self._moments(terms, part, about)), 2)
         return gain, sd
 
     def mean(self, samples: LinkSamples) -> FloatArray:
         """Return the gain of :meth:`predict` without its standard deviation, shape (n,) [dB]."""
-        samples = self._like_fitted(samples)
-        gain, known = np.full(len(samples), np.nan), self._known_rows(samples)
-        for start in range(0, len(known), AT_ONCE):
-            part = known[start : start + AT_ONCE]
-            gain[part] = _expected(self.model.terms, samples.part(part), self.rows, self._weights)
-        return gain - self._zero[samples.antenna]
+        return self._gain(self.model.terms, self._like_fitted(samples)) - self._zero[samples.antenna]
 
     def gain(self, frame: Frame, antenna: str, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return posterior mean and SD of the gain at one end over directions (n, 3), or of the pair (n, 6) [dB].
@@ -445,12 +443,11 @@ class GainFit:
 
     def airframe_mean(self, samples: LinkSamples) -> FloatArray:
         """Return the gain of the UAV alone, for any tower and campaign with an airframe of the fit, shape (n,) [dB]."""
-        gain, known = np.full(len(samples), np.nan), self._known_rows(samples)
-        terms = [t for t in self.model.terms if t.frame == "body"]
-        for start in range(0, len(known), AT_ONCE):
-            part = known[start : start + AT_ONCE]
-            gain[part] = _expected(terms, samples.part(part), self.rows, self._weights)
-        return gain
+        return self._gain([t for t in self.model.terms if t.frame == "body"], samples)
+
+    def _gain(self, terms: Sequence[Term], samples: LinkSamples) -> FloatArray:
+        """Return the sum of some terms along samples, shape (n,) [dB]."""
+        return _in_parts(samples, lambda part: _expected(terms, part, self.rows, self._weights))
 
     def _like_fitted(self, samples: LinkSamples) -> LinkSamples:
         """Return samples with the campaign and the airframe of their antenna in the fit."""
@@ -465,11 +462,6 @@ class GainFit:
                 f"tower and channel {antenna!r} were not fitted", expected="one of " + ", ".join(self.antennas)
             )
         return rows
-
-    @staticmethod
-    def _known_rows(samples: LinkSamples) -> IntArray:
-        finite = np.isfinite(np.concatenate([samples.at_uav, samples.at_tower, samples.position_m], axis=1))
-        return np.flatnonzero(finite.all(axis=1))
 
     def covariance(self, frame: Frame, antenna: str, direction: FloatArray) -> FloatArray:
         """Return the covariance of :meth:`gain` towards directions (n, 3), shape (n, n) [dB^2]."""
@@ -498,6 +490,15 @@ class GainFit:
 
 # Samples that are predicted at a time, which limits the memory.
 AT_ONCE = 2000
+
+
+def _in_parts(samples: LinkSamples, of: Callable[[LinkSamples], FloatArray], columns: int | None = None) -> FloatArray:
+    """Return values of ``of`` (n,) or (columns, n) along samples, NaN for samples without directions or position."""
+    finite = np.isfinite(np.concatenate([samples.at_uav, samples.at_tower, samples.position_m], axis=1)).all(axis=1)
+    out = np.full(len(samples) if columns is None else (columns, len(samples)), np.nan)
+    for rows in np.array_split(np.flatnonzero(finite), -(-int(finite.sum()) // AT_ONCE) or 1):
+        out[..., rows] = of(samples.part(rows)) if len(rows) else 0.0
+    return out
 
 
 def directed(antenna: str, direction: FloatArray) -> LinkSamples:
@@ -613,12 +614,8 @@ def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
             levels: FloatArray = levels,
         ) -> float:
             some = dataclasses.replace(model, own_sd_db=scales[0], noise_sd_db=scales[1])
-            covariance, start = gains.copy(), 0
-            for samples in mine:
-                block = slice(start, start + len(samples))
-                covariance[block, block] += own_covariance(some, samples)
-                start = block.stop
-            return Factor.of(covariance).log_likelihood(levels)
+            covariance = _with_blocks(gains.copy(), (own_covariance(some, samples) for samples in mine))
+            return _log_likelihood(covariance, levels)
 
         chosen.append((name, *max(_CAMPAIGN_SCALES_DB, key=likelihood)))
     return dataclasses.replace(model, campaigns=tuple(chosen))
@@ -730,12 +727,37 @@ def fit_mounts(series: Sequence[LinkSamples], patterns: Mapping[str, GainOf]) ->
 
     Notes
     -----
-    ``log p = -|y - u - t|^2 / (2 s^2)`` is a quadratic form of columns that are computed once. Azimuths of
-    antennas of towers are optimised for each azimuth of the UAV.
+    ``log p = -|y - u - t|^2 / (2 s^2)`` for each azimuth of the UAV and of the antenna of a tower. Antennas of towers
+    have no sample in common, so they are independent for a given azimuth of the UAV, which has their best azimuths.
     """
     grid = np.arange(0.0, 360.0, STEP_DEG)
-    chosen, probability = _best_together(_quadratic_forms(series, patterns, grid))
-    return {name: _mount(grid, probability[name], float(grid[chosen[name]])) for name in patterns}
+
+    def candidates(name: str, direction: FloatArray) -> FloatArray:
+        if name not in patterns:
+            return np.zeros((len(direction), 1))
+        return np.stack([patterns[name](direction @ turned(azimuth)) for azimuth in grid], axis=1)
+
+    log_p: dict[str, FloatArray] = {}
+    for samples in series:
+        bins = samples.binned(BIN_S)
+        at_uav, at_tower = candidates("uav", bins.at_uav), candidates(samples.antenna, bins.at_tower)
+        error = bins.residual_db[:, None, None] - at_uav[:, :, None] - at_tower[:, None]
+        # the offset of each flight and channel is free
+        error -= error.mean(axis=0) if len(bins) else 0.0
+        log_p[samples.antenna] = log_p.get(samples.antenna, 0.0) - 0.5 * (error**2).sum(axis=0) / _MOUNT_NOISE_DB**2
+    at_best = np.sum([value.max(axis=1) for value in log_p.values()], axis=0)
+    uav, best = _normalised(at_best), int(at_best.argmax())
+    fits = {"uav": _mount(grid, uav, float(grid[best]))} if "uav" in patterns else {}
+    for antenna in log_p.keys() & patterns.keys():
+        value = log_p[antenna]
+        fits[antenna] = _mount(grid, uav @ _normalised(value), float(grid[value[best].argmax()]))
+    return {name: fits[name] for name in patterns}
+
+
+def _normalised(log_p: FloatArray) -> FloatArray:
+    """Return probabilities that sum to 1 over the last axis."""
+    weight = np.exp(log_p - log_p.max(axis=-1, keepdims=True))
+    return np.asarray(weight / weight.sum(axis=-1, keepdims=True))
 
 
 def _mount(grid: FloatArray, probability: FloatArray, best_deg: float) -> MountFit:
@@ -751,75 +773,6 @@ def _mount(grid: FloatArray, probability: FloatArray, best_deg: float) -> MountF
         probability=probability,
         identified=bool(probability[apart > 45.0].sum() < 0.05),
     )
-
-
-@dataclass(frozen=True, slots=True)
-class _Forms:
-    """A quadratic form (q, q) of all columns: the target first, then the candidates of each name."""
-
-    form: FloatArray
-    columns: Mapping[str, slice]
-
-
-def _quadratic_forms(series: Sequence[LinkSamples], patterns: Mapping[str, GainOf], grid: FloatArray) -> _Forms:
-    columns = {name: slice(1 + i * len(grid), 1 + (i + 1) * len(grid)) for i, name in enumerate(patterns)}
-    mounts = [turned(azimuth) for azimuth in grid]
-
-    def candidates(samples: LinkSamples) -> FloatArray:
-        """Return target and candidates of a series (bins, q)."""
-        good = samples.part(np.isfinite(samples.residual_db) & np.isfinite(samples.at_uav).all(axis=1))
-        bins = good.binned(BIN_S)
-        out = np.zeros((len(bins), 1 + len(patterns) * len(grid)))
-        out[:, 0] = bins.residual_db
-        for name, pattern in patterns.items():
-            if name not in ("uav", samples.antenna):
-                continue
-            direction = bins.at_uav if name == "uav" else bins.at_tower
-            out[:, columns[name]] = np.stack([pattern(direction @ mount) for mount in mounts], axis=1)
-        # the offset of each flight and channel is free
-        return np.asarray(out - out.mean(axis=0), dtype=np.float64)
-
-    rows = np.concatenate([candidates(s) for s in series])
-    return _Forms(rows.T @ rows / _MOUNT_NOISE_DB**2, columns)
-
-
-def _best_together(forms: _Forms) -> tuple[dict[str, int], dict[str, FloatArray]]:
-    """Return the most probable candidate of each name, and its marginal probabilities."""
-    names = list(forms.columns)
-    first, further = names[0], names[1:]
-    size = forms.columns[first].stop - forms.columns[first].start
-    value, choices, conditional = np.empty(size), [], []
-    for candidate in range(size):
-        chosen = {first: candidate, **dict.fromkeys(further, 0)}
-        conditionals: dict[str, FloatArray] = {}
-        for _ in range(4):
-            for name in further:
-                conditionals[name] = _given_others(forms, chosen, name)
-                chosen[name] = int(conditionals[name].argmax())
-        value[candidate] = _given_others(forms, chosen, first)[candidate]
-        choices.append(chosen)
-        conditional.append(conditionals)
-    weight = np.exp(value - value.max())
-    weight /= weight.sum()
-    marginal = {first: weight}
-    for name in further:
-        parts = []
-        for conditionals in conditional:
-            share = np.exp(conditionals[name] - conditionals[name].max())
-            parts.append(share / share.sum())
-        marginal[name] = weight @ np.array(parts)
-    return choices[int(value.argmax())], marginal
-
-
-def _given_others(forms: _Forms, chosen: Mapping[str, int], name: str) -> FloatArray:
-    """Return the log likelihood of all candidates of one name for given candidates of the others."""
-    form, candidates = forms.form, forms.columns[name]
-    chosen_columns = [forms.columns[end].start + at for end, at in chosen.items() if end != name]
-    sign = np.zeros(len(form))
-    sign[0] = 1.0
-    sign[chosen_columns] = -1.0
-    product = form @ sign
-    return np.asarray(-0.5 * (sign @ product - 2.0 * product[candidates] + np.diag(form)[candidates]))
 
 
 # Nominal shares of samples within an interval.
@@ -1206,12 +1159,7 @@ class FlightEvidence:
     def _without_airframe(self) -> FloatArray:
         """Return the covariance of all parts except the gain of the UAV."""
         rows = [some for some in self.rows if len(some)]
-        covariance, start = gain_covariance([MAST, PAIR], rows, rows), 0
-        for some, noise in zip(self.rows, self._noise, strict=True):
-            part = slice(start, start + len(some))
-            covariance[part, part] += noise
-            start = part.stop
-        return covariance
+        return _with_blocks(gain_covariance([MAST, PAIR], rows, rows), self._noise)
 
 
 def judged(own: float, of: Callable[[float], float]) -> Evidence:

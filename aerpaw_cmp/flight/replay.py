@@ -232,15 +232,16 @@ def same_computer(data: FlightData) -> list[list[int]]:
 
 def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) -> Clock:
     """Return the clock that a flight file states."""
+    lag_s = radio_minus_telemetry_s
     result = ClockResult(
         receiver=receiver,
-        radio_minus_telemetry_s=radio_minus_telemetry_s,
-        ci95_s=(radio_minus_telemetry_s, radio_minus_telemetry_s),
+        radio_minus_telemetry_s=lag_s,
+        ci95_s=(lag_s, lag_s),
         verdict="given",
         reason="",
         applied=GIVEN,
     )
-    return Clock(result=result, applied_s=np.full(samples, radio_minus_telemetry_s))
+    return Clock(result=result, applied_s=np.full(samples, lag_s))
 
 
 # Number of times that are replayed together, which limits the memory on flights over half an hour.
@@ -341,19 +342,13 @@ def _levels_along(
 
 
 def _clock_levels(data: FlightData, series: RssSeries) -> FloatArray:
-    """Return the levels (n,) for the clock, which end at the lock limit for a sounder."""
-    levels = _high_enough(data, series)
+    """Return the levels (n,) for the clock, NaN below ``rss.minimum_height_m``; those of a sounder end at its floor."""
+    levels, least = series.measured_db, data.settings.rss.minimum_height_m
+    if least is not None:
+        with np.errstate(invalid="ignore"):
+            high = data.poses_at(series.time).position_m[:, 2] >= least
+        levels = np.where(high, levels, np.nan)
     return levels if series.locked is None else np.maximum(levels, LOCK_FLOOR_DB)
-
-
-def _high_enough(data: FlightData, series: RssSeries) -> FloatArray:
-    """Return the levels (n,), NaN below ``rss.minimum_height_m``."""
-    least = data.settings.rss.minimum_height_m
-    if least is None:
-        return series.measured_db
-    with np.errstate(invalid="ignore"):
-        low = ~(data.poses_at(series.time).position_m[:, 2] >= least)
-    return np.where(low, np.nan, series.measured_db)
 
 
 def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:

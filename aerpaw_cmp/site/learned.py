@@ -434,10 +434,7 @@ def carry_memory(base: str | Path, site: Path) -> list[str]:
     with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)
         # the index last, because without it the new site has no learned models
-        for name in [
-            *sorted(set().union(*map(files_of, entries.values()))),
-            _INDEX,
-        ]:  # without an index there are no learned models
+        for name in [*sorted(set().union(*map(files_of, entries.values()))), _INDEX]:
             place = inside(origin, name, origin / _INDEX, plain=True)
             if place.is_file() and not (folder / name).exists():
                 write_whole(folder / name, place.read_bytes())
@@ -563,10 +560,8 @@ def find_named(name: str, folder: Path, end: str = "") -> Named:
         If the learned models cannot be read.
     """
     site, _, entry_part = name.rpartition("/")
-    # a site next to the flight file comes before a packaged one of that name
-    place: str | Path = (
-        folder.absolute() / f"{site}.yaml"
-    )  # absolute, so that its paths are valid in any working folder
+    # a site next to the flight file comes before a packaged one; absolute, so that it is valid in any working folder
+    place: str | Path = folder.absolute() / f"{site}.yaml"
     packaged = folder_of(site)
     if not folder_of(place).is_dir() and packaged.is_absolute() and packaged.is_dir():
         place = site
@@ -698,13 +693,10 @@ def read_pair(path: Path, length: float, prior_sd_db: float, written: Written | 
     InputError
         For other columns, no row, values that are not finite, or a table that is not as it was written.
     """
-    text = read_table(path, "a table of the gain towards both ends", written).decode("utf-8-sig")
-    lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
-    table = np.loadtxt(lines[1:], delimiter=",", ndmin=2) if len(lines) > 1 else np.zeros((0, len(PAIR_COLUMNS)))
-    if lines[:1] != [",".join(PAIR_COLUMNS)] or not len(table) or table.shape[1] != len(PAIR_COLUMNS):
-        raise InputError("wrong columns, or no rows", expected=", ".join(PAIR_COLUMNS), path=path)
-    if not np.isfinite(table).all():
-        raise InputError("values that are not finite", expected="angles [deg], gains and SDs [dB]", path=path)
+    rows = _numbers(path, "a table of the gain towards both ends", PAIR_COLUMNS, written)
+    if any(len(row) != len(PAIR_COLUMNS) for row in rows):
+        raise InputError("rows of another length", expected=", ".join(PAIR_COLUMNS), path=path)
+    table = np.array(rows)
     return PairGain(
         directions=np.concatenate([vectors_of(table[:, :2]), vectors_of(table[:, 2:4])], axis=1),
         gain_db=table[:, 4],
@@ -712,6 +704,18 @@ def read_pair(path: Path, length: float, prior_sd_db: float, written: Written | 
         length=length,
         prior_sd_db=prior_sd_db,
     )
+
+
+def _numbers(path: Path, what: str, columns: Sequence[str], written: Written | None) -> list[list[float]]:
+    """Return the rows of a table with these columns. InputError for other columns, no row, or values not finite."""
+    text = read_table(path, what, written).decode("utf-8-sig")
+    lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
+    rows = [[float(cell) for cell in line.split(",")] for line in lines[1:]]
+    if lines[:1] != [",".join(columns)] or not rows:
+        raise InputError("wrong columns, or no rows", expected=", ".join(columns), path=path)
+    if not np.isfinite(np.concatenate(rows)).all():
+        raise InputError("values that are not finite", expected="numbers: " + ", ".join(columns), path=path)
+    return rows
 
 
 def angles_of(vectors: FloatArray) -> FloatArray:
@@ -993,16 +997,11 @@ def read_known(path: Path, written: Written | None = None) -> KnownDirections:
     InputError
         For other columns or lengths, values that are not finite, or a table that is not as it was written.
     """
-    text = read_table(path, _WHAT, written).decode("utf-8-sig")
-    lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
-    rows = [[float(cell) for cell in line.split(",")] for line in lines[1:]]
-    if lines[:1] != [",".join(_COLUMNS)] or not rows or [len(row) for row in rows] != [*range(3, len(rows) + 3)]:
-        raise InputError("not the columns, or rows of another length", expected=", ".join(_COLUMNS), path=path)
+    rows = _numbers(path, _WHAT, _COLUMNS, written)
+    if [len(row) for row in rows] != [*range(3, len(rows) + 3)]:
+        raise InputError("rows of another length", expected=", ".join(_COLUMNS), path=path)
     lower = np.zeros((len(rows), len(rows)))
-    for number, row in enumerate(rows):
-        lower[number, : number + 1] = row[2:]
-    if not np.isfinite(lower).all() or not np.isfinite([row[:2] for row in rows]).all():
-        raise InputError("values that are not finite", expected="angles [deg] and covariances [dB^2]", path=path)
+    lower[np.tril_indices(len(rows))] = np.concatenate([row[2:] for row in rows])
     return KnownDirections(
         directions=vectors_of(np.array([row[:2] for row in rows])),
         covariance_db2=lower + np.tril(lower, -1).T,

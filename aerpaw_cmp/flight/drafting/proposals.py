@@ -565,42 +565,33 @@ def propose(
     UsageError, InputError
         See :func:`every_antenna`.
     """
-    ranked = {(s.tower, quantity_of(data, s)) for s in data.rank}
     entries = learned.read_learned(place).entries
-    fitted = (n for n, entry in entries.items() if any((r.tower, r.quantity) in ranked for r in entry.receivers))
-    receiver = next(fitted, None)
-    ranks = Proposal(
-        receiver=f"{site}/{receiver}" if receiver else None,
-        receiver_about=entries[receiver].about() if receiver else "",
-    )
-    if data.track is None or not data.rss or not entries:
-        return ranks
-    # a ratio to the noise is used only if there is no level
-    levels = [s for s in data.rss if s.channel.lower() not in RATIOS] or list(data.rss)
-    observed, known = [observed_series(data, series)[0] for series in levels], every_antenna(place)
-    evidence = FlightEvidence([o.samples for o in observed])
-    chosen = _antennas_for(data, levels, known, evidence, nodes, carrier_known=carrier_known)
-    if chosen.fits:
-        found = chosen.proposal(site, evidence)
-    else:
-        band = learned.AIRFRAME_BAND if carrier_known else math.inf
-        found = _airframe_for(data, known, site, evidence, band=band)
-    receivers = _receivers(list(zip(levels, observed, strict=True)), known, chosen)
-    return replace(found, receiver=ranks.receiver, receiver_about=ranks.receiver_about, receivers=receivers)
+    found = Proposal()
+    if data.track is not None and data.rss and entries:
+        # a ratio to the noise is used only if there is no level
+        levels = [s for s in data.rss if s.channel.lower() not in RATIOS] or list(data.rss)
+        observed, known = [observed_series(data, series)[0] for series in levels], every_antenna(place)
+        evidence = FlightEvidence([o.samples for o in observed])
+        bands = (learned.BAND, learned.AIRFRAME_BAND) if carrier_known else (math.inf, math.inf)
+        chosen = _antennas_for(data, levels, known, evidence, nodes, bands[0])
+        if chosen.fits:
+            found = chosen.proposal(site, evidence)
+        else:
+            found = _airframe_for(data, known, site, evidence, band=bands[1])
+        found = replace(found, receivers=_receivers(zip(levels, observed, strict=True), known, chosen))
+    ranked = {(s.tower, quantity_of(data, s)) for s in data.rank}
+    for name, entry in entries.items():
+        if any((r.tower, r.quantity) in ranked for r in entry.receivers):
+            return replace(found, receiver=f"{site}/{name}", receiver_about=entry.about())
+    return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Chosen:
     """The learned antennas of both ends of one entry that the levels support best, by ``tower.channel``."""
 
-    entry: str
     antennas: Mapping[str, Remembered]
     odds: Evidence
-
-    @property
-    def receiver(self) -> str:
-        """Name of the receiver with which the antennas were learned."""
-        return next((item.receiver for item in self.antennas.values()), "")
 
     @property
     def fits(self) -> bool:
@@ -612,9 +603,9 @@ class _Chosen:
         """Return the names of the antennas, with the expected error and the odds."""
         first, samples = next(iter(self.antennas.values())), evidence.rows[0]
         errors, kind = _expected(first.entry, first.series, samples.position_m, first.gain_db(samples)[1])
-        names = {k: f"{site}/{self.entry}_{a.series.tower}.{a.series.channel}" for k, a in self.antennas.items()}
+        names = {k: f"{site}/{a.name}_{a.series.tower}.{a.series.channel}" for k, a in self.antennas.items()}
         return Proposal(
-            antennas=names | {"uav": f"{site}/{self.entry}_uav"},
+            antennas=names | {"uav": f"{site}/{first.name}_uav"},
             antennas_about=f"{first.entry.about(errors, kind)}; {_odds(self.odds)}",
             carrier_hz=first.series.carrier_hz,
         )
@@ -626,18 +617,16 @@ def _antennas_for(
     known: Sequence[Remembered],
     evidence: FlightEvidence,
     nodes: Nodes,
-    *,
-    carrier_known: bool,
+    band: float,
 ) -> _Chosen:
     """Return the antennas of both ends of the entry with the largest odds."""
     receivers = {item.receiver for item in known}
-    tried: dict[str, dict[str, list[tuple[Remembered, Evidence]]]] = {}
+    tried: dict[str, list[tuple[str, Remembered, Evidence]]] = {}
     for number, series in enumerate(levels):
         for item in known:
-            band = learned.BAND if carrier_known else math.inf
             if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, band):
                 continue
-            named_odds = _named_odds(_receiver_of(data, series, receivers), series, item)
+            named_odds = _named_odds(data, series, item, receivers)
             # antennas that do not predict other flights are not offered to a receiver with another unit
             if named_odds < 0.0 and not item.teaches:
                 continue
@@ -645,36 +634,29 @@ def _antennas_for(
             airframe = item.airframe if item.teaches and named_odds <= 0.0 else None
             odds = evidence.of_link(number, item.moments, airframe).with_prior(named_odds)
             if odds.over_own > 0.0:
-                tried.setdefault(item.name, {}).setdefault(f"{series.tower}.{series.channel}", []).append((item, odds))
-    fits = {name: _one_each(channels) for name, channels in tried.items()}
+                tried.setdefault(item.name, []).append((f"{series.tower}.{series.channel}", item, odds))
     # judge the channels of a flight together: they need antennas of one entry, with one airframe
-    entry = max(fits, key=lambda name: sum(e.over_own for _, e in fits[name].values()), default="")
-    chosen = fits.get(entry, {})
-    odds = _pooled([odds for _, odds in chosen.values()])
-    return _Chosen(entry=entry, antennas={key: item for key, (item, _) in chosen.items()}, odds=odds)
+    fits = [_one_each(each) for each in tried.values()]
+    chosen = max(fits, key=lambda fit: sum(odds.over_own for _, odds in fit.values()), default={})
+    over = [(odds.over_own, odds.over_turned) for _, odds in chosen.values()]
+    own, turned = (sum(each) for each in zip(*over, strict=True)) if over else (0.0, 0.0)
+    antennas = {key: item for key, (item, _) in chosen.items()}
+    return _Chosen(antennas=antennas, odds=Evidence(over_own=own, over_turned=turned))
 
 
-def _one_each(
-    tried: Mapping[str, Sequence[tuple[Remembered, Evidence]]],
-) -> dict[str, tuple[Remembered, Evidence]]:
-    """Return the antennas of each channel by which the odds of all channels together are largest.
+def _one_each(tried: Sequence[tuple[str, Remembered, Evidence]]) -> dict[str, tuple[Remembered, Evidence]]:
+    """Return the antennas of each channel, those with the largest odds first.
 
-    Two channels of a tower have two antennas. Antennas are assigned twice only if there are too few.
+    Two channels of a tower have two antennas, so an antenna is used twice only if there are too few.
     """
-    items = list({id(item): item for pairs in tried.values() for item, _ in pairs}.values())
-    over_own = np.full((len(tried), len(items)), -1e9)
-    for row, pairs in enumerate(tried.values()):
-        for item, odds in pairs:
-            over_own[row, items.index(item)] = odds.over_own
-    from scipy.optimize import linear_sum_assignment
-
-    pairs_of = list(tried.items())
-    best = dict(zip(*(indices.tolist() for indices in linear_sum_assignment(over_own, maximize=True)), strict=True))
-    out = {}
-    for row, (key, pairs) in enumerate(pairs_of):
-        assigned = [pair for pair in pairs if row in best and pair[0] is items[best[row]]]
-        out[key] = assigned[0] if assigned else max(pairs, key=lambda pair: pair[1].over_own)
-    return out
+    pairs = sorted(tried, key=lambda pair: -pair[2].over_own)
+    chosen: dict[str, tuple[Remembered, Evidence]] = {}
+    for key, item, odds in pairs:
+        if all(item is not other for other, _ in chosen.values()):
+            chosen.setdefault(key, (item, odds))
+    for key, item, odds in pairs:
+        chosen.setdefault(key, (item, odds))
+    return chosen
 
 
 # Standard deviation of the level of an unknown receiver [dB], and of the gains of both ends if they are not known.
@@ -689,7 +671,7 @@ _LOST_SHARE = 0.01
 
 
 def _receivers(
-    levels: Sequence[tuple[RssSeries, Observed]], known: Sequence[Remembered], chosen: _Chosen
+    levels: Iterable[tuple[RssSeries, Observed]], known: Sequence[Remembered], chosen: _Chosen
 ) -> dict[int, Receiver]:
     """Return the learned receiver of the levels of each log, or the question for it, by the number of the log.
 
@@ -710,15 +692,15 @@ def _receivers(
             together = odds.setdefault(log, {})
             for name, (nat, text) in each.items():
                 together[name], words[log, name] = together.get(name, 0.0) + nat, text
-    out = {}
+    out, theirs = {}, next((item.receiver for item in chosen.antennas.values()), "")
     for log, together in odds.items():
         best = max(together, key=lambda name: together[name], default="")
         rivals = [nat for name, nat in together.items() if name != best]
         over = together.get(best, -math.inf) - float(np.logaddexp.reduce([0.0, *rivals]))
         if over >= LEAST_ODDS:
             out[log] = Receiver(best, f"receiver {best} with odds {_ratio(over)} by its {words[log, best]}?")
-        elif chosen.fits and (log, chosen.receiver) in words:
-            out[log] = Receiver("", f"another receiver than {chosen.receiver}, by its {words[log, chosen.receiver]}?")
+        elif chosen.fits and (log, theirs) in words:
+            out[log] = Receiver("", f"another receiver than {theirs}, by its {words[log, theirs]}?")
     return out
 
 
@@ -782,30 +764,18 @@ _SAME_NAME, _OTHER_UNIT = 10.0, -3.0
 _MOUNTED_AS_LEARNED = 3.0
 
 
-def _receiver_of(data: FlightData, series: RssSeries, known: Container[str]) -> str:
-    """Return the receiver that the flight file names for a series. Empty if it is not one of the learned ones."""
-    receiver = data.settings.logs[int(series.log[0])].receiver if len(series.log) else ""
-    return receiver if receiver in known else ""
-
-
-def _named_odds(receiver: str, series: RssSeries, item: Remembered) -> float:
+def _named_odds(data: FlightData, series: RssSeries, item: Remembered, receivers: Container[str]) -> float:
     """Return the log odds that the names of receiver, tower and channel give to learned antennas of both ends."""
-    learned_series = item.series
-    if receiver:
+    receiver = data.settings.logs[int(series.log[0])].receiver if len(series.log) else ""
+    if receiver in receivers:
         return _SAME_NAME if receiver == item.receiver else -math.inf
-    same = (series.tower, series.channel) == (learned_series.tower, learned_series.channel)
-    other = learned_series.level is not None and learned_series.level.unit != series.unit
+    same = (series.tower, series.channel) == (item.series.tower, item.series.channel)
+    other = item.series.level is not None and item.level.unit != series.unit
     return (_SAME_NAME if same else 0.0) + (_OTHER_UNIT if other else 0.0)
 
 
 def _in_band(item: Remembered, series: RssSeries, band: float) -> bool:
     return abs(series.link.carrier_hz / item.series.carrier_hz - 1.0) <= band
-
-
-def _pooled(each: Sequence[Evidence]) -> Evidence:
-    """Return the evidence of several series together."""
-    own, turned = (sum(getattr(e, key) for e in each) for key in ("over_own", "over_turned"))
-    return Evidence(over_own=own, over_turned=turned)
 
 
 # Larger odds are shown as "more than".

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import glob
 import os
-import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias, cast
+from typing import Any, TypeAlias
 from zoneinfo import ZoneInfo
 
 import pandas as pd
 
 from ..common.errors import InputError, from_python
 from ..common.text import counted, html_table
-from .flight_file import IngestedFile, write_flight
+from .flight_file import write_flight
 from .ingest import Ingested, account_notes, ingest, summary
 from .readers import ReadOptions, named_tower
 
-# A file, a folder, a pattern such as ``"logs/*.txt"``, or an open binary file; ``~`` is the home folder.
-Source: TypeAlias = str | os.PathLike[str] | BinaryIO
+# A file, a folder, or a pattern such as ``"logs/*.txt"``; ``~`` is the home folder.
+Source: TypeAlias = str | os.PathLike[str]
 
 
 _TOWERS = ("LW1", "LW2", "LW3", "LW4", "LW5")
@@ -131,9 +129,8 @@ def read(
 
     Parameters
     ----------
-    path : path, pattern, open file, or several of these
-        Files and folders (searched to the bottom); ``~`` and ``"logs/*.txt"`` are understood; a file may be open in
-        binary mode.
+    path : path, pattern, or several of these
+        Files and folders (searched to the bottom); ``~`` and ``"logs/*.txt"`` are understood.
     timezone : str or ZoneInfo, optional
         IANA zone of clocks that show local time, such as ``"America/New_York"``.
     reader : str, optional
@@ -166,12 +163,8 @@ def read(
         reader = reader or "generic_csv"  # as with --map
     files = Ingested()
     # a str is also a sequence, so test it first
-    single = isinstance(path, (str, os.PathLike)) or hasattr(path, "read")
-    for source in cast("Iterable[Source]", [path] if single else path):
-        if isinstance(source, (str, os.PathLike)):
-            here = ingest(list(_matching(source)), options=chosen, reader=reader)
-        else:
-            here = _opened(source, chosen, reader)
+    for source in [path] if isinstance(path, (str, os.PathLike)) else path:
+        here = ingest(list(_matching(source)), options=chosen, reader=reader)
         files += here
         files.skipped += here.skipped
     return Logs(files)
@@ -187,14 +180,3 @@ def _matching(source: str | os.PathLike[str]) -> Iterator[Path]:
     if not matching:
         raise InputError("no file matches the pattern", expected="at least one log", path=str(source))
     yield from map(Path, matching)
-
-
-def _opened(file: BinaryIO, options: ReadOptions, reader: str | None) -> Ingested:
-    """Read an open file as a log of its name, through a temporary file, which archives and HDF5 need."""
-    name = Path(str(getattr(file, "name", "") or "log")).name
-    with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-") as folder:
-        place = Path(folder) / name
-        place.write_bytes(file.read())
-        read_there = ingest(place, options=options, reader=reader)
-    renamed: list[IngestedFile] = [replace(item, path=item.path.replace(str(place), name, 1)) for item in read_there]
-    return Ingested(renamed, read_there.skipped)

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import islice
+from itertools import compress, islice
 
 import numpy as np
 import pandas as pd
@@ -179,7 +179,6 @@ class Sheet:
     closed: bool = False
     said: dict[int, dictionary.Quantity] = field(default_factory=dict)
     used: set[int] = field(default_factory=set)
-    _silent: dict[int, BoolArray] = field(default_factory=dict)
     _numbers: dict[int, FloatArray] = field(default_factory=dict)
     _cell_units: dict[int, str] = field(default_factory=dict)
 
@@ -255,9 +254,10 @@ class Sheet:
         return bool(len(values) and (np.abs(values) > 1e5).mean() > 0.5 and (values == np.round(values)).all())
 
     def silence(self, where: BoolArray, columns: Iterable[int]) -> None:
-        """Treat the cells of some rows as empty."""
+        """Empty the cells of some rows."""
         for column in columns:
-            self._silent[column] = where
+            for cells in compress(self.cells, where.tolist()):
+                cells[column] = ""
             self._numbers.pop(column, None)
 
     def add(self, name: str, texts: list[str]) -> None:
@@ -271,17 +271,12 @@ class Sheet:
         """Return the rows of a mask, which share the notes."""
         return replace(
             self, row=self.row[where], _numbers={}, _cell_units={},
-            cells=[cells for cells, inside in zip(self.cells, where.tolist(), strict=True) if inside],
-            _silent={column: mask[where] for column, mask in self._silent.items()},
+            cells=[*compress(self.cells, where.tolist())],
         )  # fmt: skip
 
     def texts(self, column: int) -> list[str]:
         """Return a column as text."""
-        column_texts = [cells[column].strip() for cells in self.cells]
-        if column in self._silent:
-            both = zip(column_texts, self._silent[column].tolist(), strict=True)
-            column_texts = ["" if silent else text for text, silent in both]
-        return column_texts
+        return [cells[column].strip() for cells in self.cells]
 
     def numbers(self, column: int) -> FloatArray:
         """Return a column as read-only numbers in the unit of the dictionary, NaN for missing values.
@@ -724,8 +719,8 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     if len(timed.row) < len(sheet.row):
         inside = np.zeros(len(sheet.row), dtype=bool)
         inside[timed.at] = True
-        timed_part = sheet.part(inside)
-        sheet.row, sheet.cells, sheet._silent, sheet._numbers = timed_part.row, timed_part.cells, timed_part._silent, {}
+        kept = sheet.part(inside)
+        sheet.row, sheet.cells, sheet._numbers = kept.row, kept.cells, {}
     if (counter := sheet.named("time millisecond", "millisecond", "milliseconds", "msec", "ms")) not in (None, column):
         sheet.used.add(counter)
         _finer(timed, sheet.numbers(counter))

@@ -222,8 +222,8 @@ def test_each_level_of_a_table_is_a_record_or_flagged(names: list[str], chance: 
             cells.append(f"{level}" if "rs" in name else chance.choice(_CELLS))
         rows.append(cells)
     data = "\n".join(",".join(cells) for cells in [["time", *names], *rows]) + "\n"
-    assume(drive_test.sniff(data.encode()))
-    result = drive_test.read(data.encode(), ReadOptions())
+    assume(drive_test.READERS[0].sniff(data.encode()))
+    result = drive_test.READERS[0].read(data.encode(), ReadOptions())
     shown = {value for item in result.streams for value in item.frame.select_dtypes("number").to_numpy().ravel()}
     rejected = {line.number for line in result.rejected}
     kept = [row for i, row in enumerate(rows) if i + 2 not in rejected]

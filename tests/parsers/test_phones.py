@@ -44,7 +44,9 @@ def test_a_bare_rank_beside_a_level_is_the_rank_of_the_channel() -> None:
     rank = stream(result, "rank_indicator")
     assert (rank.kind, rank.frame["flag"].tolist()) == ("rank", ["", "no_csi"])
     assert rank.frame["rank"][0] == 2.0
-    assert not drive_test.sniff(b"Time,Rank,Latitude,Longitude\n2025-03-02 10:00:00,5,35.7,-78.7\n"), "a list's"
+    assert not drive_test.READERS[0].sniff(b"Time,Rank,Latitude,Longitude\n2025-03-02 10:00:00,5,35.7,-78.7\n"), (
+        "a list's"
+    )
 
 
 def test_nemo_times_of_the_day_take_the_date_of_the_file_name() -> None:

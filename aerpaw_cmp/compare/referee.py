@@ -71,7 +71,7 @@ class LevelCard:
     outages_invented: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class PredictedLevel:
     """Levels (n,) of one prediction at the samples of a series. NaN where nothing is predicted [dB].
 
@@ -79,19 +79,19 @@ class PredictedLevel:
     ----------
     level_db : (n,)
         The predicted median.
+    absolute : bool
+        The levels have the reference of the measurement: no offset is needed.
     sd_db : (n,), optional
         Standard deviation of one sample.
     low_db, high_db : (n,), optional
         Ends of the 90 % interval; by default those of the normal distribution of ``sd_db``.
-    absolute : bool
-        The levels have the reference of the measurement: no offset is needed.
     """
 
     level_db: FloatArray
+    absolute: bool = True
     sd_db: FloatArray | None = None
     low_db: FloatArray | None = None
     high_db: FloatArray | None = None
-    absolute: bool = True
 
 
 def level_card(
@@ -165,16 +165,13 @@ def _distribution(
     """Return CRPS and coverage of the 90 % band as predicted. None for what is not stated."""
     from scipy.special import ndtri
 
-    crps = half_db = low_db = high_db = None
+    level_db, low_db, high_db, crps = predicted.level_db[both], predicted.low_db, predicted.high_db, None
+    ends = None if low_db is None or high_db is None else (low_db[both] - level_db, high_db[both] - level_db)
     if predicted.sd_db is not None and np.isfinite(predicted.sd_db[both]).all():
         sd_db = predicted.sd_db[both]
-        crps, half_db = float(np.mean(crps_normal(error_db, sd_db))), float(ndtri(0.5 + 0.5 * BAND)) * sd_db
-        low_db, high_db = -half_db, half_db
-    if predicted.low_db is not None and predicted.high_db is not None:
-        low_db, high_db = (end[both] - predicted.level_db[both] for end in (predicted.low_db, predicted.high_db))
-    if low_db is None or high_db is None:
-        return crps, None
-    return crps, float(np.mean((error_db >= low_db) & (error_db <= high_db)))
+        half_db = float(ndtri(0.5 + 0.5 * BAND)) * sd_db
+        crps, ends = float(np.mean(crps_normal(error_db, sd_db))), ends or (-half_db, half_db)
+    return crps, None if ends is None else float(np.mean((error_db >= ends[0]) & (error_db <= ends[1])))
 
 
 # The nose of a predicted point and that of a sample differ by less than this [deg].
@@ -210,16 +207,12 @@ def nearest_points(
     from scipy.spatial import cKDTree
 
     samples, points = position_m / reach_m, points_m / reach_m
-    if (
-        yaw_deg is not None
-        and heading_deg is not None
-        and np.isfinite(yaw_deg).all()
-        and np.isfinite(heading_deg).any()
-    ):
+    turned = None if yaw_deg is None or heading_deg is None else (heading_deg, yaw_deg)
+    if turned is not None and np.isfinite(turned[0]).any() and np.isfinite(turned[1]).all():
         samples, points = (
             np.column_stack([place, np.sin(np.radians(nose)), np.cos(np.radians(nose))])
             / np.r_[1.0, 1.0, 1.0, np.full(2, 2.0 * np.sin(np.radians(_TURNED_DEG) / 2.0))]
-            for place, nose in ((samples, heading_deg), (points, yaw_deg))
+            for place, nose in zip((samples, points), turned, strict=True)
         )
     known = np.asarray(np.isfinite(samples).all(axis=1))
     index = np.asarray(cKDTree(points).query(np.where(known[:, None], samples, 0.0))[1])

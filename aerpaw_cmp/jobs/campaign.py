@@ -36,12 +36,12 @@ from ..common.versions import versions
 from ..common.yamlfile import StrictModel, load_yaml
 from ..compare import offset, verdict
 from ..compare.offset import Pooling, pooled_moments
-from ..compare.result import FlightResult, RankResult, RssResult
+from ..compare.result import RankResult, RssResult
 from ..compare.statistics import Pass, PassPair, cell_means, pass_pairs
 from ..compare.verdict import NightOffsets, NodeOffset, node_offsets, stepped
 from ..flight.data import FlightData, RankSeries, RssSeries, gather, read_logs
 from ..flight.gains import with_learned
-from ..flight.settings import FlightFile, Overrides, RssSettings, load_flight, overridden
+from ..flight.settings import FlightFile, Overrides, load_flight, overridden
 from ..flight.training import among, logs_of, series_mark
 from ..logs.ingest import ingest
 from ..logs.readers import ReadOptions
@@ -151,27 +151,18 @@ def flight_data(task: Task) -> FlightData:
 def run_task(task: Task) -> Outcome:
     """Replay and compare one flight under one setting. Every exception becomes a message of the outcome."""
     try:
-        flight_run = run_flight(flight_data(task), audit=False)
-        return _rows_of(task, flight_run.data, flight_run.result)
+        data = flight_data(task)
+        result = run_flight(data, audit=False).result
+        rss = zip(result.rss, data.rss, strict=True)
+        rank = zip(result.rank, data.rank, strict=True)
+        return Outcome(
+            rss=tuple(_rss_row(task, data, compared, series) for compared, series in rss),
+            rank=tuple(row for compared, series in rank for row in _rank_rows(task, data, compared, series)),
+        )
     except AerpawCmpError as error:
         return failed_task(task, str(error), error)
     except Exception as error:  # an error in one flight must not end the other tasks
         return failed_task(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
-
-
-def _rows_of(task: Task, data: FlightData, result: FlightResult) -> Outcome:
-    """Return the outcome of a compared flight."""
-    return Outcome(
-        rss=tuple(
-            _rss_row(task, data.settings.rss, compared, _identity(data, series))
-            for compared, series in zip(result.rss, data.rss, strict=True)
-        ),
-        rank=tuple(
-            row
-            for compared, series in zip(result.rank, data.rank, strict=True)
-            for row in _rank_rows(task, compared, _identity(data, series))
-        ),
-    )
 
 
 def failed_task(task: Task, message: str, error: BaseException | None = None) -> Outcome:
@@ -234,39 +225,29 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
 
     Rows of the remaining settings contain only numbers, so that 4000 tasks need no more memory than their flights.
     """
+    names = {"flight": task.flight, "setting": task.setting}
 
-    def row(kept_row: RssRow) -> RssRow:
-        named = dataclasses.replace(kept_row, flight=task.flight, setting=task.setting)
+    def row(stored: RssRow) -> RssRow:
+        named = dataclasses.replace(stored, **names)  # type: ignore[arg-type]
         if task.reference:
             return named
-        none = np.zeros(0)
-        return dataclasses.replace(
-            named,
-            difference=kept_row.moments,
-            measured_db=none,
-            simulated_dbm=none,
-            position_m=np.zeros((0, 3)),
-            heading_deg=None,
-        )
+        none, nowhere = np.zeros(0), np.zeros((0, 3))
+        samples = {"measured_db": none, "simulated_dbm": none, "position_m": nowhere, "heading_deg": None}
+        return dataclasses.replace(named, difference=stored.moments, **samples)  # type: ignore[arg-type]
 
-    failure = outcome.failure and dataclasses.replace(outcome.failure, flight=task.flight, setting=task.setting)
     return dataclasses.replace(
         outcome,
         rss=tuple(map(row, outcome.rss)),
-        rank=tuple(dataclasses.replace(item, flight=task.flight, setting=task.setting) for item in outcome.rank),
-        failure=failure,
+        rank=tuple(dataclasses.replace(item, **names) for item in outcome.rank),  # type: ignore[arg-type]
+        failure=outcome.failure and dataclasses.replace(outcome.failure, **names),
     )
 
 
 # --- rows -----------------------------------------------------------------------------------------------------------
 
 
-def _identity(data: FlightData, series: RssSeries | RankSeries) -> dict[str, Any]:
-    """Return the fields of a row that identify its log by content, regardless of name and packing."""
-    return {"logs": logs_of(data, series), "mark": series_mark(series)}
-
-
-def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mapping[str, Any]) -> RssRow:
+def _rss_row(task: Task, data: FlightData, result: RssResult, series: RssSeries) -> RssRow:
+    """Return the row of a channel. Its log is identified by content, regardless of name and packing."""
     score, clock = result.score, result.further.clock
     # a flight from which its own antennas were learned takes no part in pooling and ranking
     measured_db = np.full_like(result.measured_db, np.nan) if result.further.trained_on else result.measured_db
@@ -289,16 +270,17 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mappin
             for name in result.baselines
             if name in result.further.compared_with
         },
-        span_db=rules.span_db,
+        span_db=data.settings.rss.span_db,
         measured_db=measured_db,
         start_ns=int(result.time[0].astype("datetime64[ns]").astype(np.int64)) if len(result.time) else 0,
         heading_deg=result.geometry.get("heading_deg"),
         difference=offset.difference_moments(measured_db, result.simulated_dbm),
-        **identity,
+        logs=logs_of(data, series), mark=series_mark(series),
     )  # fmt: skip
 
 
-def _rank_rows(task: Task, result: RankResult, identity: Mapping[str, Any]) -> list[RankRow]:
+def _rank_rows(task: Task, data: FlightData, result: RankResult, series: RankSeries) -> list[RankRow]:
+    """Return a row for each K of a tower."""
     score = result.score
     return [
         RankRow(
@@ -313,7 +295,7 @@ def _rank_rows(task: Task, result: RankResult, identity: Mapping[str, Any]) -> l
             total_variation=fit.total_variation, total_variation_ci95=fit.total_variation_ci95,
             wasserstein=fit.wasserstein,
             commonest_agreement=result.further.commonest.agreement,
-            **identity,
+            logs=logs_of(data, series), mark=series_mark(series),
         )
         for k, fit in score.simulated.items()
     ]  # fmt: skip
@@ -575,16 +557,13 @@ def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], li
     pooled_rows: list[RssRow] = []
     groups: list[PooledOffset] = []
     for setting in dict.fromkeys(row.setting for row in rows):
-        members = [row for row in rows if row.setting == setting]
+        members, by_group = [row for row in rows if row.setting == setting], dict[str, list[RssRow]]()
         span = (min(r.span_db[0] for r in members), max(r.span_db[1] for r in members))
         fits = pooled_moments({row.key: row.moments for row in members}, per, span_db=span)
-        pooled = [
-            dataclasses.replace(row, pooled_offset_db=fits[row.key].offset_db, pooled_rmse_db=fits[row.key].rmse_db)
-            for row in members
-        ]
-        pooled_rows += pooled
-        by_group: dict[str, list[RssRow]] = {}
-        for row in pooled:
+        for row in members:
+            fit = fits[row.key]
+            row = dataclasses.replace(row, pooled_offset_db=fit.offset_db, pooled_rmse_db=fit.rmse_db)
+            pooled_rows.append(row)
             by_group.setdefault(_group(row, per), []).append(row)
         groups += [_pooled(setting, name, some, fits) for name, some in by_group.items()]
     return pooled_rows, groups
@@ -692,27 +671,25 @@ def with_season(
         Node offsets from tower-to-tower soundings (:func:`soundings`). They replace the offsets of the flights.
     """
     rows = _held_out_rows(data.rss)
-    data = dataclasses.replace(data, rss=tuple(rows))
+    season = Season(reports=dict(reports or {}), nodes=tuple(sounded))
     if not rows:
-        return dataclasses.replace(data, season=Season(reports=dict(reports or {}), nodes=tuple(sounded)))
+        return dataclasses.replace(data, season=season)
+    data = dataclasses.replace(data, rss=tuple(rows))
     started = _started_of(rows)
     order = sorted(data.flights, key=lambda name: (name not in started, started.get(name, 0)))
-    links = list(dict.fromkeys(row.link for row in rows))
-    ranking = rank_settings(rows, list(data.settings), order, "")
-    if len(links) > 1:
-        for link in links:
-            ranking += rank_settings([r for r in rows if r.link == link], list(data.settings), order, link)
-    return dataclasses.replace(
-        data,
-        season=Season(
-            held_out=any(np.isfinite(row.held_out_rmse_db) for row in rows),
-            started={name: _iso(ns) for name, ns in started.items()},
-            ranking=tuple(ranking),
-            nodes=tuple(sounded) or _flown(data.reference_rows, order, started),
-            places=_place_map(data.reference_rows, data.cell_m),
-            reports=dict(reports or {}),
-        ),
+    links, settings = list(dict.fromkeys(row.link for row in rows)), list(data.settings)
+    ranking = rank_settings(rows, settings, order, "")
+    for link in links if len(links) > 1 else ():
+        ranking += rank_settings([r for r in rows if r.link == link], settings, order, link)
+    season = dataclasses.replace(
+        season,
+        held_out=any(np.isfinite(row.held_out_rmse_db) for row in rows),
+        started={name: _iso(ns) for name, ns in started.items()},
+        ranking=tuple(ranking),
+        nodes=season.nodes or _flown(data.reference_rows, order, started),
+        places=_place_map(data.reference_rows, data.cell_m),
     )
+    return dataclasses.replace(data, season=season)
 
 
 def _started_of(rows: Iterable[RssRow]) -> dict[str, int]:
@@ -788,14 +765,13 @@ def rank_settings(
     choices = []
     for name in known:
         difference = verdict.mean_of_flights(_paired(table[name], table[known[0]], flights))
-        low, *middle, high = (float(v) for v in np.quantile(means[name], (0.0, *_QUANTILES, 1.0)))
         choices.append(
             SettingRank(
                 setting=name,
                 link=link,
                 n_flights=len(means[name]),
                 mean_db=float(means[name].mean()),
-                quantiles_db=(low, *middle, high),
+                quantiles_db=tuple(np.quantile(means[name], (0.0, *_QUANTILES, 1.0)).tolist()),
                 difference_db=difference.mean,
                 difference_ci95_db=None if name == known[0] else (difference.low, difference.high),
                 n_paired=difference.n,

@@ -270,14 +270,15 @@ def _forecast(series: RssSeries, lock: LearnedLock) -> DetectionForecast:
 
 
 def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
-    settings, trained = data.settings.rss, learned_here(data, series, replayed.link)
-    levels = levels_of(series, replayed, settings)
+    levels = levels_of(series, replayed, data.settings.rss)
     geometry = link_geometry(data.site, series.tower, replayed, data.settings.rt)
-    simple = {
-        name: replayed.spread(level) for name, level in _baseline_levels(data.site, series.tower, replayed).items()
-    }
     position = replayed.spread(replayed.poses.position_m)
-    simple |= _fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)
+    simple = _baseline_levels(data.site, series.tower, replayed)
+    # the empirical baselines are about the mean of free space
+    known = np.isfinite(levels.measured_db) & np.isfinite(simple["free_space"])
+    mean = float(simple["free_space"][known].mean()) if known.any() else np.nan
+    line = log_distance_level_db(levels.measured_db, geometry["distance_m"], position)
+    simple |= {"constant": np.where(np.isfinite(line), mean, np.nan), "log_distance": mean + line}
     return _Case(
         data=data,
         series=series,
@@ -286,7 +287,7 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
         position_m=position,
         geometry=geometry,
         simple=simple,
-        trained=trained,
+        trained=learned_here(data, series, replayed.link),
     )
 
 
@@ -398,24 +399,17 @@ def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[st
 
 
 def _baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
-    """Return free space and two-ray levels (isotropic) at the replayed poses (n,) [dBm]."""
+    """Return free space and two-ray levels (isotropic) at the samples (n,) [dBm]."""
     place, link = site.towers[tower], replayed.link
     source, target = replayed.source_m(site), replayed.poses.position_m
     if replayed.tower_m is not None:  # one position per pose: (poses, towers, 3)
         source = source[:, None, :]
     ends = (source, target, link.carrier_hz, link.transmit_power_dbm)
     two_ray = two_ray_dbm(*ends, ground_material=site.ground_material, ground_m=place.ground_m)
-    return {"free_space": free_space_dbm(*ends)[:, 0], "two_ray": two_ray[:, 0]}
-
-
-def _fitted_levels(
-    free_space_dbm: FloatArray, measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray
-) -> dict[str, FloatArray]:
-    """Return the empirical baselines about the mean of free space (n,) [dBm]: a constant, and log-distance."""
-    known = np.isfinite(measured_db) & np.isfinite(free_space_dbm)
-    mean = float(free_space_dbm[known].mean()) if known.any() else np.nan
-    line = log_distance_level_db(measured_db, distance_m, position_m)
-    return {"constant": np.where(np.isfinite(line), mean, np.nan), "log_distance": mean + line}
+    return {
+        name: replayed.spread(level[:, 0])
+        for name, level in (("free_space", free_space_dbm(*ends)), ("two_ray", two_ray))
+    }
 
 
 def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> dict[str, ModelLevel]:
@@ -574,11 +568,9 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
         uav_mount=link.uav_array.mount,
     )
     directions["azimuth_deg"] = directions["tower_azimuth_deg"]  # residuals are drawn in the frame of the antenna
+    names = "distance_m", "elevation_deg", "azimuth_deg", "tower_elevation_deg", "uav_azimuth_deg", "uav_elevation_deg"
     out = {"altitude_m": replayed.spread(replayed.poses.position_m[:, 2])}
-    for name in (
-        "distance_m", "elevation_deg", "azimuth_deg", "tower_elevation_deg", "uav_azimuth_deg", "uav_elevation_deg",
-    ):  # fmt: skip
-        out[name] = replayed.spread(directions[name])
+    out |= {name: replayed.spread(directions[name]) for name in names}
     if replayed.track is not None:
         out["heading_deg"] = replayed.spread(replayed.track.heading_deg)
     if site.wooded and rt.foliage != "none":
@@ -590,10 +582,9 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
 def _worst(case: _Case, residual_db: FloatArray, line_of_sight: FloatArray) -> list[rss.ErrorSpan]:
     """Return the time spans of largest error, with position and geometry."""
     geometry = case.geometry
-    context = {"los": line_of_sight, "elevation_deg": geometry["elevation_deg"], "height_m": geometry["altitude_m"]}
-    for ours, theirs in (("heading_deg", "heading_deg"), ("foliage_depth_m", "foliage_m")):
-        if ours in geometry:
-            context[theirs] = geometry[ours]
+    names = {"elevation_deg": "elevation_deg", "height_m": "altitude_m", "heading_deg": "heading_deg",
+             "foliage_m": "foliage_depth_m"}  # fmt: skip
+    context = {"los": line_of_sight} | {name: geometry[ours] for name, ours in names.items() if ours in geometry}
     spans = rss.error_spans(
         case.series.time, residual_db, position_m=case.position_m, context=context, largest=len(residual_db)
     )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,6 @@ from ..compare.level import nearest_in_time
 from ..compare.rank import agreement, cohen_kappa, histogram, total_variation
 from ..compare.receiver import score_forecast
 from ..compare.referee import (
-    LevelCard,
     PredictedLevel,
     detection_floor_db,
     level_card,
@@ -40,7 +40,7 @@ from ..compare.referee import (
     nearest_points,
 )
 from ..compare.result import BASELINE_TITLE, FlightResult, RankResult, RssResult
-from ..compare.statistics import FEWEST, PairedDifference, paired_difference
+from ..compare.statistics import FEWEST, paired_difference
 from ..flight.data import FlightData, load_data
 from ..flight.drafting.draft import DraftOptions, drafts
 from ..flight.gains import load_with_learned
@@ -239,7 +239,7 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
         elapsed = columns.pop("time")  # seconds after an unknown start cannot be matched
         if " since " in unit:
             columns["time"] = _since(elapsed, unit, path)
-    frame = pd.DataFrame(columns)
+    frame: pd.DataFrame = pd.DataFrame(columns)
     frame.attrs = {"program": str(notes["attributes"].get("source", "NetCDF")), "remarks": remarks}
     return frame
 
@@ -271,7 +271,7 @@ def _radio_map(content: bytes, path: Path) -> pd.DataFrame:
     with np.errstate(divide="ignore", invalid="ignore"):
         loss_db = -10.0 * np.log10(gain.astype(np.float64).ravel())
     places = np.tile(centre.reshape(-1, 3), (len(names), 1)).astype(np.float64)
-    frame = pd.DataFrame(places, columns=list(_PLACE)).assign(
+    frame: pd.DataFrame = pd.DataFrame(places, columns=list(_PLACE)).assign(
         tower=np.repeat(names.astype(str), gain[0].size), path_loss_db=np.where(np.isfinite(loss_db), loss_db, np.nan)
     )
     remark = "The cell centres of the radio map are taken as east, north and up of the site [m]."
@@ -298,7 +298,7 @@ def _emulated(folder: Path, data: FlightData) -> pd.DataFrame:
         ]
     )
     # a hover has many levels at one position: their mean is what the emulator predicts there
-    frame = every.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False)["level_db"].mean()
+    frame: pd.DataFrame = every.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False)["level_db"].mean()
     units, ours = (sorted({s.unit for s in of.rss}) for of in (twin, data))
     remarks = [f"{folder.name} is an emulated flight: {counted(len(frame), 'level')} with a position."]
     if units != ours:
@@ -362,16 +362,14 @@ def _times(frame: pd.DataFrame, path: Path) -> Any:
     if name is None:
         return pd.Series(pd.NaT, index=frame.index, dtype="datetime64[ns]")
     column = frame[name]
-    form = "ISO 8601 in UTC, such as 2025-06-10T14:00:00Z"
-    if pd.api.types.is_numeric_dtype(column):
-        raise InputError(f"times as numbers ({column.iloc[0]})", expected=form, path=path)
-    dated = pd.api.types.is_datetime64_any_dtype(column)
-    if name == "time" and not dated and not column.astype(str).str.contains(r"Z$|[+-]\d\d:?\d\d$").all():
+    numeric, dated = pd.api.types.is_numeric_dtype(column), pd.api.types.is_datetime64_any_dtype(column)
+    if name == "time" and not numeric | dated and not column.astype(str).str.contains(r"Z$|[+-]\d\d:?\d\d$").all():
         expected = "a column time_utc, or times that end in Z"
         raise InputError(f"times without a zone, such as {column.iloc[0]!r}", expected=expected, path=path)
     stamps = pd.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
-    if stamps.isna().all():
-        raise InputError(f"no time that can be read ({column.iloc[0]!r})", expected=form, path=path)
+    if numeric or stamps.isna().all():
+        expected = "ISO 8601 in UTC, such as 2025-06-10T14:00:00Z"
+        raise InputError(f"no time that can be read ({column.iloc[0]!r})", expected=expected, path=path)
     return stamps.dt.tz_localize(None).astype("datetime64[ns]")
 
 
@@ -449,34 +447,6 @@ def _check_names(table: pd.DataFrame, data: FlightData, path: Path) -> None:
 # --- scores --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeriesVerdict:
-    """The cards of one tower and channel.
-
-    Parameters
-    ----------
-    tower, channel, unit : str
-    matched, unmatched : int
-        Samples of the flight with and without a prediction nearby.
-    floor_db : float or None
-        Detection floor that the predicted levels show (an emulated receiver).
-    cards : mapping of str to LevelCard
-        The prediction first, then ray tracing and the baselines, on the same samples. A model with too few levels has
-        no card.
-    differences : mapping of str to PairedDifference
-        RMSE of the prediction minus that of each other model, each after one offset, with its interval.
-    """
-
-    tower: str
-    channel: str
-    unit: str
-    matched: int
-    unmatched: int
-    floor_db: float | None
-    cards: Mapping[str, LevelCard]
-    differences: Mapping[str, PairedDifference]
-
-
 # Numbers of a card in the tables, with their heads.
 _HEADS = {
     "bias_db": "bias dB", "rmse_db": "RMSE dB", "rmse_offset_db": "RMSE after offset dB", "rmse_1s_db": "RMSE 1 s dB",
@@ -508,8 +478,8 @@ def judge(
     InputError
         If none of the predictions is near a sample.
     """
-    series = [s for item in result.rss if given.quantity and (s := _series(given, item, data, near_m)) is not None]
-    ranks = {tower.tower: r for tower in result.rank if (r := _ranks(given, tower, data, near_m)) is not None}
+    series = [s for item in result.rss if given.quantity and (s := _series(given, item, data, near_m))]
+    ranks = {item.tower: r for item in result.rank if (r := _ranks(given, item, data, near_m))}
     if not series and not ranks:
         raise InputError(
             f"fewer than {FEWEST} samples of the flight have a prediction nearby",
@@ -517,16 +487,17 @@ def judge(
             cause=_why_none(given, result),
             path=given.path,
         )
-    name, remarks, lost = given.path.name, given.remarks, sum(s.unmatched for s in series)
-    if series and lost > 0.1 * sum(s.matched + s.unmatched for s in series):
+    name, remarks = given.path.name, given.remarks
+    matched, lost = (sum(s[key] for s in series) for key in ("matched", "unmatched"))
+    if lost > 0.1 * (matched + lost):
         where = "times of the prediction" if given.timed else f"predicted positions (within {near_m:g} m)"
         remarks += (f"{name}: {counted(lost, 'sample')} lie outside the {where} and are not scored.",)
-    levels: dict[str, dict[str, SeriesVerdict]] = {}
-    for item in series:
-        levels.setdefault(item.tower, {})[item.channel] = item
+    levels: dict[str, dict[str, _Series]] = {}
+    for entry in series:
+        levels.setdefault(entry["tower"], {})[entry["channel"]] = entry
     means = _means(series)
     heads = "series", "model", "n", *_HEADS.values(), "prediction minus model dB", "95 % low", "95 % high"
-    entry: dict[str, Any] = json_safe({
+    score: dict[str, Any] = json_safe({
         "prediction": name,
         "sha256": given.sha256,
         "program": given.program,
@@ -538,57 +509,64 @@ def judge(
         "rank": ranks,
         "table": {"columns": heads, "rows": list(_rows(series))},
     })  # fmt: skip
-    return entry
+    return score
 
 
-def _means(series: Sequence[SeriesVerdict]) -> list[dict[str, Any]]:
+def _means(series: Sequence[_Series]) -> list[dict[str, Any]]:
     """Return the means over channels of each model. None for a number that is missing for a channel."""
     rows = []
-    for model in dict.fromkeys(name for item in series for name in item.cards):
-        cards = [item.cards[model] for item in series if model in item.cards]
+    for model in dict.fromkeys(name for entry in series for name in entry["cards"]):
+        cards = [entry["cards"][model] for entry in series if model in entry["cards"]]
         values = {key: [getattr(card, key) for card in cards] for key in _HEADS}
         means = {key: None if None in of else float(np.mean(of)) for key, of in values.items()}
         rows.append({"model": model, "channels": len(cards), **means})
     return rows
 
 
-def _rows(series: Sequence[SeriesVerdict]) -> Iterator[tuple[Any, ...]]:
+def _rows(series: Sequence[_Series]) -> Iterator[tuple[Any, ...]]:
     """Yield one row per series and model for page and card.json."""
-    for item in series:
-        for name, card in item.cards.items():
-            pair = item.differences.get(name)
+    for entry in series:
+        for name, card in entry["cards"].items():
+            pair = entry["differences"].get(name)
             apart = (None,) * 3 if pair is None else (pair.difference_db, *pair.difference_ci95_db)
-            yield f"{item.tower} {item.channel}", name, card.n, *(getattr(card, key) for key in _HEADS), *apart
+            link = f"{entry['tower']} {entry['channel']}"
+            yield link, name, card.n, *(getattr(card, key) for key in _HEADS), *apart
 
 
-def _sentence(name: str, series: Sequence[SeriesVerdict], mean: Mapping[str, Any]) -> str:
+def _sentence(name: str, series: Sequence[_Series], mean: Mapping[str, Any]) -> str:
     """Return both errors, whether the difference is significant, and the errors as predicted (``mean``)."""
-    both = [s for s in series if OURS in s.differences]
-    if both:
-        theirs, mine = (np.mean([s.cards[model].rmse_offset_db for s in both]) for model in (name, OURS))
-        words = {kind: sum(s.differences[OURS].verdict == kind for s in both) for kind in ("better", "worse")}
-        decided = " and ".join(f"significantly {kind} on {n}" for kind, n in words.items() if n)
+    text = f"{name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel. Ray tracing has no level there."
+    if both := [entry for entry in series if OURS in entry["differences"]]:
+        theirs, mine = (np.mean([entry["cards"][model].rmse_offset_db for entry in both]) for model in (name, OURS))
+        verdicts = Counter(entry["differences"][OURS].verdict for entry in both)
+        decided = [f"significantly {kind} on {verdicts[kind]}" for kind in ("better", "worse") if verdicts[kind]]
         text = (
             f"{name}: RMSE {theirs:.1f} dB after one offset per channel, ray tracing {mine:.1f} dB on the same samples "
             f"({counted(len(both), 'channel')}). It is "
-            f"{decided or 'on no channel significantly different from ray tracing'} (95 %)."
-        )
-    else:
-        text = (
-            f"{name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel. "
-            "Ray tracing has no level there."
+            f"{' and '.join(decided) or 'on no channel significantly different from ray tracing'} (95 %)."
         )
     if mean["rmse_db"] is not None:
         band = mean["coverage_90"]
         inside = "" if band is None else f"; the 90 % band contains {100 * band:.0f} % of the samples"
         text += f" As predicted, without an offset: RMSE {mean['rmse_db']:.1f} dB{inside}."
-    lost, matched = (sum(getattr(s, key) for s in series) for key in ("unmatched", "matched"))
+    matched, lost = (sum(entry[key] for entry in series) for key in ("matched", "unmatched"))
     if lost:
         return f"{text} {counted(matched, 'sample')} have a prediction, {counted(lost, 'sample')} have none."
     return f"{text} All {counted(matched, 'sample')} have a prediction."
 
 
-def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m: float) -> SeriesVerdict | None:
+# The cards of one tower and channel:
+# - ``tower channel unit``;
+# - ``matched unmatched``: samples of the flight with and without a prediction nearby;
+# - ``floor_db``: detection floor that the predicted levels show (an emulated receiver), or None;
+# - ``cards``: LevelCard by model, the prediction first, then ray tracing and the baselines, on the same samples. A
+#   model with too few levels has no card;
+# - ``differences``: PairedDifference by model, RMSE of the prediction minus that of the model, each after one offset.
+_Series = dict[str, Any]
+
+
+def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m: float) -> _Series | None:
+    """Return the cards of one tower and channel. None if too few samples have a prediction."""
     part = split_by_series(given.table, item.tower, item.channel)
     heading_deg = item.geometry.get("heading_deg")
     predicted, near = predicted_at(given, part, item.time, item.position_m, heading_deg, near_m)
@@ -600,17 +578,15 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
     scored = near & heard & np.isfinite(level)
     if scored.sum() < FEWEST:
         return None
-    # the offset of a prediction without a reference is fitted, so that its outages cannot be compared
+    # without a reference in common with the log, a missing level is not a predicted outage
     rows = near if absolute else scored
     same = rows & (np.isfinite(level) | ~heard)
-    band = {key: predicted.get(name) for key, name in (("sd_db", "sd_db"), ("low_db", "q05_db"), ("high_db", "q95_db"))}
-    name = given.path.name
-    models = {
-        name: (PredictedLevel(level_db=level, absolute=absolute, **band), rows),
-        OURS: (PredictedLevel(level_db=item.simulated_dbm, absolute=item.unit == "dBm"), same),
+    name, band = given.path.name, [predicted.get(column) for column in ("sd_db", "q05_db", "q95_db")]
+    models = {name: (PredictedLevel(level, absolute, *band), rows),
+              OURS: (PredictedLevel(item.simulated_dbm, item.unit == "dBm"), same)}  # fmt: skip
+    models |= {
+        BASELINE_TITLE[key]: (PredictedLevel(of.level_dbm, absolute=False), same) for key, of in item.baselines.items()
     }
-    for key, baseline in item.baselines.items():
-        models[BASELINE_TITLE[key]] = PredictedLevel(level_db=baseline.level_dbm, absolute=False), same
     seconds = (item.time - item.time[0]) / np.timedelta64(1, "s")
     thresholds = measured_thresholds(item.measured_db[near], ratio=item.unit == "dB")
     cards = {
@@ -619,15 +595,14 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
         if (np.isfinite(model.level_db) & heard & on).sum() >= FEWEST
     }
     errors = {key: np.where(scored, item.measured_db - models[key][0].level_db, np.nan) for key in cards}
-    return SeriesVerdict(
-        tower=item.tower, channel=item.channel, unit=item.unit, matched=int(near.sum()),
-        unmatched=int((item.posed & ~near).sum()), floor_db=detection_floor_db(part["level"].to_numpy(np.float64)),
-        cards=cards,
-        differences={
-            key: paired_difference(errors[name], error, place_m=item.position_m)
-            for key, error in errors.items() if key != name
-        },
-    )  # fmt: skip
+    theirs = errors.pop(name)
+    return {
+        "tower": item.tower, "channel": item.channel, "unit": item.unit,
+        "matched": int(near.sum()), "unmatched": int((item.posed & ~near).sum()),
+        "floor_db": detection_floor_db(part["level"].to_numpy(np.float64)),
+        "cards": cards,
+        "differences": {key: paired_difference(theirs, of, place_m=item.position_m) for key, of in errors.items()},
+    }  # fmt: skip
 
 
 def split_by_series(table: pd.DataFrame, tower: str, channel: str) -> pd.DataFrame:
@@ -688,13 +663,9 @@ def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData, near_m:
     part = given.table[(given.table["tower"] == item.tower) & given.table[ranked].notna().any(axis=1)]
     heading_deg = data.poses_at(item.time).heading_deg if data.track is not None else None
     predicted, near = predicted_at(given, part, item.time, item.position_m, heading_deg, near_m)
-    p = np.column_stack([predicted[name] for name in RANKS]) if set(RANKS) <= set(predicted) else None
-    if "rank" in predicted:
-        rank = predicted["rank"]
-    elif p is not None:
-        rank = np.where(np.isfinite(p).all(axis=1), np.nan_to_num(p).argmax(axis=1) + 1.0, np.nan)
-    else:
-        return None
+    p = np.column_stack([predicted.get(name, np.full(len(near), np.nan)) for name in RANKS])
+    stated = np.isfinite(p).all(axis=1)
+    rank = predicted.get("rank", np.where(stated, np.nan_to_num(p).argmax(axis=1) + 1.0, np.nan))
     scored = near & np.isfinite(rank) & np.isfinite(item.measured) & (item.measured > 0)
     if scored.sum() < FEWEST:
         return None
@@ -710,10 +681,10 @@ def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData, near_m:
         for key, ranks in models.items()
     }
     entry = {"tower": item.tower, "matched": int(scored.sum()), "unmatched": int((~near).sum()), "scores": scores}
-    if p is None:
+    scored &= stated
+    if not scored.any():
         return entry | {"log_score": None, "constant_log_score": None}
-    stated = scored & np.isfinite(p).all(axis=1)
-    forecast = score_forecast(item.measured[stated], p[stated], rank[stated], np.nanmean(p, axis=0))
+    forecast = score_forecast(item.measured[scored], p[scored], rank[scored], np.nanmean(p, axis=0))
     return entry | {"log_score": forecast.log_score, "constant_log_score": forecast.constant_log_score}
 
 

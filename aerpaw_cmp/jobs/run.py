@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -90,48 +90,51 @@ def run_ingest(
     if out is not None and draft is not None and os.path.realpath(out) == os.path.realpath(draft):
         raise UsageError("-o and --draft name the same file", expected="two names", path=draft)
     inputs = [*paths, *([] if site is None else [Path(site)])]
-    with ExitStack() as outputs:  # report a wrong output name before the logs are read
-        target = None
-        if out is not None:
-            target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=inputs, force=force))
-        if draft is not None:
-            from ..flight.drafting.draft import SITE, DraftOptions, drafts
+    with ExitStack() as outputs:
 
-            drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=inputs, force=force))
+        def output(path: Path, own: Callable[[Path], bool] = is_sealed) -> OutputFile:
+            return outputs.enter_context(OutputFile(path, own=own, inputs=inputs, force=force))
+
+        # report a wrong output name before the logs are read
+        target = None if out is None else output(out, is_flight_file)
+        drafted = None if draft is None else output(draft)
         files = ingest(paths, options=ReadOptions(**options), reader=reader)
         account = summary(files)
-        if draft is not None:
-            keys = ("columns", "kind", "unit", "ri_base")
-            mapping = {key: options[key] for key in keys if options.get(key)}
-            home = drafted.target.parent
-            if site is not None and Path(site).is_file():
-                site = os.path.relpath(Path(site).resolve(), home.resolve())
-            clock = {key: options.get(key) for key in ("timezone", "time_origin")}
-            try:
-                flights = drafts(files, home, DraftOptions(mapping=mapping, site=site or SITE, **clock))
-            except UsageError as error:
-                error.others = files  # the account of the files shows what is missing
-                raise
-            # drafts of further flights are in the folder of the first, because paths in a draft are relative to it
-            numbered = (
-                draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in range(2, len(flights) + 1)
-            )
-            places = [draft, *numbered]
-            further = [OutputFile(place, own=is_sealed, inputs=inputs, force=force) for place in places[1:]]
-            for file, flight_draft in zip([drafted, *map(outputs.enter_context, further)], flights, strict=True):
-                file.write(sealed(flight_draft.text))
-            account["draft"] = [
-                remark if place is draft else f"{place.name}: {remark}"
-                for place, flight_draft in zip(places, flights, strict=True)
-                for remark in flight_draft.remarks
-            ]
-            account["drafts"] = [str(place) for place in places]
+        if draft is not None and drafted is not None:
+            account |= _write_drafts(files, draft, drafted, output, site, options)
         if target is not None:
-            target.write(partial(fill, files=files))
             from ..flight.drafting.draft import flights_by_name
 
+            target.write(partial(fill, files=files))
             account["flights"] = list(flights_by_name(files))
     return account
+
+
+def _write_drafts(
+    files: list[Any], draft: Path, first: OutputFile, output: Callable[[Path], OutputFile], site: str | None,
+    options: dict[str, Any],
+) -> dict[str, Any]:  # fmt: skip
+    """Write a flight file for each flight of some logs, and return its remarks and the paths."""
+    from ..flight.drafting.draft import SITE, DraftOptions, drafts
+
+    home = first.target.parent
+    if site is not None and Path(site).is_file():
+        site = os.path.relpath(Path(site).resolve(), home.resolve())
+    mapping = {key: options[key] for key in ("columns", "kind", "unit", "ri_base") if options.get(key)}
+    clock = {key: options.get(key) for key in ("timezone", "time_origin")}
+    try:
+        flights = drafts(files, home, DraftOptions(mapping=mapping, site=site or SITE, **clock))
+    except UsageError as error:
+        error.others = files  # the account of the files shows what is missing
+        raise
+    # drafts of further flights are in the folder of the first, because paths in a draft are relative to it
+    numbers = range(2, len(flights) + 1)
+    places = [draft, *(draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in numbers)]
+    remarks = []
+    for place, file, flight in zip(places, [first, *map(output, places[1:])], flights, strict=True):
+        file.write(sealed(flight.text))
+        remarks += [remark if place is draft else f"{place.name}: {remark}" for remark in flight.remarks]
+    return {"draft": remarks, "drafts": [str(place) for place in places]}
 
 
 def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:

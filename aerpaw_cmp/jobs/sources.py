@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -607,7 +608,11 @@ class Prior:
 
     def sources(self) -> dict[str, Source]:
         """Return one link per tower, with isotropic ends and woods that attenuate."""
-        how = {"rt": RtSettings(foliage="attenuating"), "rss": RssSettings(field="power"), "unit": "dBm"}
+        how: dict[str, Any] = {
+            "rt": RtSettings(foliage="attenuating"),
+            "rss": RssSettings(field="power"),
+            "unit": "dBm",
+        }
         links = (Source(tower=t, channel="level", link=self.link, site=self.site, **how) for t in self.site.towers)
         return {source.antenna: source for source in links}
 

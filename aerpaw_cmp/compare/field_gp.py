@@ -204,10 +204,7 @@ def covariance(model: FieldModel, rows: Rows, columns: Rows, parts: Collection[P
     -------
     (..., n, m)
     """
-    return _covariance(model, _Apart.of(rows, columns), parts)
-
-
-def _covariance(model: FieldModel, apart: _Apart, parts: Collection[Part]) -> FloatArray:
+    apart = _Apart.of(rows, columns)
     out = np.full(apart.same.shape, MEAN_SD_DB**2 if "mean" in parts else 0.0)
     if "place" in parts:
         out += _place(model, apart)

@@ -140,8 +140,7 @@ def distinct(rows: Sequence[LadderRow], keep: str) -> tuple[list[LadderRow], lis
     same = []
     for name, own in models.items():
         error = np.array([row.rmse_heldout_db for row in own])
-        alike = any(np.nanmax(np.abs(error - other), initial=0.0) < _SAME_DB for other in known.values()
-                    if np.array_equal(np.isnan(error), np.isnan(other)))  # fmt: skip
+        alike = any(np.allclose(error, other, rtol=0.0, atol=_SAME_DB, equal_nan=True) for other in known.values())
         if alike and np.isfinite(error).any() and name != keep and not any(row.recommended for row in own):
             same.append(name)
         else:

@@ -238,16 +238,11 @@ def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> Fl
     """
     time, level = seconds(time_s), _levels(level_db)
     known = np.isfinite(level) & np.isfinite(time)
-    result = np.full(len(level), np.nan)
-    if not known.any():
-        return result
-    rows = np.flatnonzero(known)
-    rows = rows[np.argsort(time[rows], kind="stable")]
-    t, x = time[rows], level[rows]
-    top = x.max()
-    # powers relative to the strongest level stay in range for any gain
-    power = power_from_db(x - top)
-    result[rows] = db_from_power(_window_means(t, power, window_s)) + top
+    result, rows = np.full(len(level), np.nan), np.flatnonzero(known)[np.argsort(time[known], kind="stable")]
+    if len(rows):
+        # powers relative to the strongest level stay in range for any gain
+        top = level[rows].max()
+        result[rows] = db_from_power(_window_means(time[rows], power_from_db(level[rows] - top), window_s)) + top
     return result
 
 

@@ -662,7 +662,8 @@ def choose_features(
     rough = np.concatenate([_own_losses(x[i : i + step], y) for i in range(0, len(x), step)])
     # round to nine digits, so that candidates that differ by rounding alone (mounts half a turn apart) keep their order
     final = np.argsort(np.round(rough, 9), kind="stable")[:finalists]
-    losses = np.concatenate([_left_out_losses(x[final[i : i + step]], y, group) for i in range(0, len(final), step)])
+    held_out = (out_of_group(x[final[i : i + step]], y, group, _CHOICE_PENALTY) for i in range(0, len(final), step))
+    losses = np.array([log_losses(probability, y) for part in held_out for probability in part])
     score = losses.mean(axis=1)
     rows = np.argsort(np.round(score, 9), kind="stable")
     tied = tuple(int(final[r]) for r in rows if _not_worse(losses[r] - losses[rows[0]]))
@@ -695,10 +696,6 @@ def _own_losses(x: FloatArray, rank: IntArray) -> FloatArray:
     weights = _fit_multinomial(z, rank, np.ones(len(rank)), _CHOICE_PENALTY, steps=6)
     p = _softmax(_design(z) @ np.swapaxes(weights, -1, -2))
     return np.array([log_losses(item, rank).mean() for item in p])
-
-
-def _left_out_losses(x: FloatArray, rank: IntArray, groups: IntArray) -> FloatArray:
-    return np.stack([log_losses(item, rank) for item in out_of_group(x, rank, groups, _CHOICE_PENALTY)])
 
 
 def _not_worse(difference: FloatArray) -> bool:

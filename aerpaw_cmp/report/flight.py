@@ -552,7 +552,7 @@ def page(data: ReportData, files: Sequence[str]) -> str:
     settings = [data.settings, {"engine": data.engine.settings} if data.engine else {}]
     return Page(
         kind="report", title=data.title, tag="synthetic flight" if data.synthetic else "",
-        verdict=words.paragraph(data), cautions=words.cautions(data), about=[made, " ".join(data.antennas)],
+        verdict=words.paragraph(data), cautions=words.cautions(data), about=[" · ".join([made, *data.antennas])],
         numbers=words.headlines(data), charts=charts,
         first=[Card(positions=Positions(view="explorer", data=linked))] if linked else [],
         cards=[*(card(data) for card in CARDS), settings_card(data, *settings, fold=True), method_card(data, files)],

@@ -67,6 +67,7 @@ def payload(
     lines: Iterable[FloatArray] = (),
     rings: Iterable[FloatArray] = (),
     charts: Sequence[Chart] = (),
+    note: str = "",
 ) -> dict[str, Any]:
     """Return all data of the script as plain values.
 
@@ -79,6 +80,8 @@ def payload(
     rings : iterable of (k, 2)
         Outlines of the area in which a route may run [m].
     charts : sequence of Chart
+    note : str
+        Sentence below the map that explains its lines.
 
     Returns
     -------
@@ -98,6 +101,7 @@ def payload(
         "rings": [listed(np.round(ring[:, :2], 1)) for ring in rings],
         "groups": [_group(group, arrays, total, ranges) for group in groups],
         "ranks": {str(rank): CLASS_COLOURS[rank] for rank in RANKS},
+        "note": note,
         "plots": [packed(chart.content, arrays) for chart in charts],
         "packed": arrays.content(),
     }

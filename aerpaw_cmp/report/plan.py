@@ -67,9 +67,9 @@ def plan_metrics(data: PlanPage) -> dict[str, Any]:
 def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
     """Return the page; ``shown`` is the data of its map."""
     candidates = Table(
-        caption="Expected standard deviation over the target after each flight, dB; now "
-        f"{number(_sd_now_db(data), 2)} dB.",
-        columns={"Route": HEAD, "SD [dB]": 2, "Length [km]": 1, "Time [min]": 1, "May be flown": TEXT},
+        caption="Expected standard deviation (SD) over the target after each flight, best first; now "
+        f"{number(_sd_now_db(data), 1, 'dB')}.",
+        columns={"Route": HEAD, "SD [dB]": 1, "Length [km]": 1, "Time [min]": 1, "May be flown": TEXT},
         rows=[(c["name"], c["sd_db"], c["length_m"] / 1000, c["minutes"], c["refused"] or "yes")
               for c in data.candidates],
         notes=["The number is the error to expect of a predicted level about the mean of a later flight, without that "
@@ -80,7 +80,7 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
     curve = Table(
         caption="Expected standard deviation after a shorter or longer flight: the best of three candidates, flown for "
         "a part of the battery or beyond it. A longer flight may contain the shorter one.",
-        columns={"Time [min]": 1, "Length [km]": 1, "SD [dB]": 2},
+        columns={"Time [min]": 1, "Length [km]": 1, "SD [dB]": 1},
         rows=[(p["minutes"], p["length_m"] / 1000, p["sd_db"]) for p in data.curve],
     )  # fmt: skip
     known = f"Known flights: {', '.join(data.flights)}."
@@ -98,7 +98,10 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
 
 def write_plan(data: PlanPage, folder: Path) -> list[Path]:
     """Write the page and its files, and return their paths, the page first."""
-    shown = payload(list(_groups(data)), data.site, lines=[data.track_m], rings=[data.outline_m, *data.holes_m])
+    shown = payload(
+        list(_groups(data)), data.site, lines=[data.track_m], rings=[data.outline_m, *data.holes_m],
+        note="Black line: the recommended route. Dashed lines: limits of the area in which it may run.",
+    )  # fmt: skip
     written = write_page(folder, "plan", plan_page(data, shown), plan_metrics(data))
     written += [write_file(folder / name, text) for name, text in data.files.items()]
     columns = dict(zip(("east_m", "north_m", "height_m"), data.place_m.T, strict=True))

@@ -377,7 +377,9 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
     said : list of str
     """
     numbers = prediction_metrics(data)
-    shown = payload(list(_groups(data)), data.site, lines=[np.asarray(line).T for line in data.flown.values()])
+    flown = [np.asarray(line).T for line in data.flown.values()]
+    note = "Black lines: the flights from which the prediction is learned." if flown else ""
+    shown = payload(list(_groups(data)), data.site, lines=flown, note=note)
     written = write_page(folder, "prediction", prediction_page(data, numbers, shown), numbers)
     digits = {c: 3 for c in data.table.columns if c.endswith(("_db", "_m", "_deg", "_s"))}
     digits |= {c: 4 for c in data.table.columns if c.startswith("p_")}

@@ -132,7 +132,7 @@
     fill(at("layer"), group().layers.map(l => l.name), state.layer, true);
     at("plan-buttons").hidden = sphere(); at("sphere-buttons").hidden = !sphere();
     const n = arrays[group().at[0]].length, some = n < group().of ? ` ${n} of ${group().of} points are in this page; the files in the same folder contain all.` : "";
-    at("hint").textContent = `${sphere() ? "Drag turns" : "Drag moves"}; Ctrl + wheel or + and − zoom; arrows step.${group().dots.length && arrays[group().dots[0]].length ? " Dots: directions flown." : ""}${some}`;
+    at("hint").textContent = `${sphere() || !data.note ? "" : data.note + " "}${sphere() ? "Drag turns" : "Drag moves"}; Ctrl + wheel or + and − zoom; arrows step.${group().dots.length && arrays[group().dots[0]].length ? " Dots: directions flown." : ""}${some}`;
     const rows = () => [[...(sphere() ? ["x", "y", "z"] : ["east_m", "north_m", "up_m"]), ...group().layers.map(l => l.name)], ...Array.from({ length: n }, (_, k) => [...group().at.map(j => arrays[j][k]), ...group().layers.map(l => values(l)[k])])];
     at("saves").replaceChildren(common.downloads(canvas, group().name, rows, drawMap));
     everything();

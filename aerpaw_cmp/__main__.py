@@ -154,15 +154,6 @@ def _notes(error: BaseException | None) -> list[str]:
     return notes
 
 
-def _run(arguments: list[str]) -> int:
-    from . import cli
-
-    code = cli.main(arguments)
-    if code == SIGNALLED + signal.SIGINT:
-        interrupts.raise_interrupt()  # typer returns this code for an interrupt while it parsed the arguments
-    return code
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line.
 
@@ -193,7 +184,11 @@ def main(arguments: list[str] | None = None) -> int:
         code = _quick_answer(arguments)
         if code is None:
             with interrupts.noted():
-                code = _run(arguments)
+                from . import cli
+
+                code = cli.main(arguments)
+                if code == SIGNALLED + signal.SIGINT:
+                    interrupts.raise_interrupt()  # typer returns this code for an interrupt while it parsed arguments
     except KeyboardInterrupt as interrupt:
         exec("")  # after an interrupt in exec(), CPython would end by the signal instead of with code 130
         code = _interrupted(interrupt)

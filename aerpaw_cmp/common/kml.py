@@ -266,33 +266,19 @@ def write_archive(path: Path, title: str, description: str, body: str, pictures:
 
 def list_legend(title: str, colours: Mapping[str, str], width: float = 2.6) -> bytes:
     """Return a legend with colours by label as PNG, ``width`` inches wide."""
-    sheet = _Sheet(title, width, 0.38 + 0.155 * len(colours))
+    import matplotlib
+    from PIL import Image, ImageDraw, ImageFont
+
+    # drawn without a figure of matplotlib, which takes 0.1 s; partly transparent, so that the ground is visible
+    size = round(width * _DPI), round((0.38 + 0.155 * len(colours)) * _DPI)
+    picture = Image.new("RGBA", size, (255, 255, 255, 230))
+    pen = ImageDraw.Draw(picture)
+    font = ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", 12)
+    pen.text((picture.width / 2, 4), title, fill="black", font=font, anchor="ma")
     for number, (label, colour) in enumerate(colours.items()):
         top = round((0.28 + 0.155 * number) * _DPI)
-        sheet.pen.rectangle((6, top + 3, 28, top + 12), fill=colour)
-        sheet.write(38, top, label)
-    return sheet.png()
-
-
-class _Sheet:
-    """A white picture with a title and a size in inches, drawn without matplotlib (0.1 s per picture)."""
-
-    def __init__(self, title: str, width: float, height: float) -> None:
-        import matplotlib
-        from PIL import Image, ImageDraw, ImageFont
-
-        # partly transparent, so that the ground is visible
-        self.picture = Image.new("RGBA", (round(width * _DPI), round(height * _DPI)), (255, 255, 255, 230))
-        self.pen = ImageDraw.Draw(self.picture)
-        self._font = ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", 12)
-        self.write(self.picture.width / 2, 4, title, "ma")
-
-    def write(self, x: float, y: float, text: str, anchor: str = "la") -> None:
-        """Write one line of text at a point [pixel]."""
-        self.pen.text((x, y), text, fill="black", font=self._font, anchor=anchor)
-
-    def png(self) -> bytes:
-        """Return the picture as PNG."""
-        buffer = io.BytesIO()
-        self.picture.save(buffer, "PNG")
-        return buffer.getvalue()
+        pen.rectangle((6, top + 3, 28, top + 12), fill=colour)
+        pen.text((38, top), label, fill="black", font=font)
+    buffer = io.BytesIO()
+    picture.save(buffer, "PNG")
+    return buffer.getvalue()

@@ -6,7 +6,6 @@ It speaks to whatever opens the port, so the tap, a terminal program and the tes
 from __future__ import annotations
 
 import contextlib
-import errno
 import math
 import os
 import pty
@@ -196,11 +195,11 @@ class ModemSimulator:
             try:
                 with self._lock:
                     count = os.write(self._master, data[:4096])
-            except OSError as error:
-                if error.errno not in (errno.EAGAIN, errno.EINTR):
-                    return False
+            except BlockingIOError:
                 self._stop.wait(0.002)
                 continue
+            except OSError:
+                return False
             data = data[count:]
         return not data
 

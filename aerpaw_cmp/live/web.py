@@ -63,8 +63,6 @@ class Limits:
     ----------
     connections : int
         Open at once, of browsers with the token.
-    per_second, burst : float
-        Refusals to an address without the token, on average and at once; beyond, its connections are closed.
     request_s : float
         Longest time between a connection and the end of its request [s].
     send_s : float
@@ -74,8 +72,6 @@ class Limits:
     """
 
     connections: int = 24
-    per_second: float = 50.0
-    burst: float = 40.0
     request_s: float = 5.0
     send_s: float = 5.0
     tick_s: float = 0.1
@@ -119,10 +115,9 @@ class Address:
 class WebServer(ThreadingHTTPServer):
     """A server of the page of one feed, as a context. Browsers with the token have a thread each.
 
-    A connection waits in one loop until its request is complete. Requests without the token are refused without a
-    thread. An address without the token gets a limited number of refusals, and is then closed without an answer. A
-    flood, from another computer or from pictures in another page of the same browser, therefore only blocks its
-    address.
+    A connection waits in one loop until its request is complete, for a limited time. Requests without the token are
+    refused there, without a thread. If too many connections wait, those of the most frequent address are closed, so a
+    flood only blocks its address.
 
     Parameters
     ----------
@@ -161,7 +156,6 @@ class WebServer(ThreadingHTTPServer):
         self.waiting: dict[socket.socket, _Waiting] = {}
         self.heads: dict[socket.socket, bytes] = {}
         self.browsers: set[socket.socket] = set()
-        self._allowances: dict[str, tuple[float, float]] = {}
         self.address_family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
         try:
             super().__init__((address.host, address.port), _Handler)
@@ -262,20 +256,8 @@ class WebServer(ThreadingHTTPServer):
                 request.setblocking(True)
                 self.process_request(request, waiting.address)
                 return
-            if waiting.head and self._is_allowed(waiting.address[0]):
-                request.send(_NO_TOKEN)
+            request.send(_NO_TOKEN)
         request.close()
-
-    def _is_allowed(self, host: str) -> bool:
-        """Check whether an address may have one more refusal."""
-        limits, now = self.limits, time.monotonic()
-        if len(self._allowances) > _MOST_WAITING:
-            # limit the table's memory; after clearing it, each address has at most one more burst
-            self._allowances.clear()
-        left, counted = self._allowances.get(host, (limits.burst, now))
-        left = min(limits.burst, left + (now - counted) * limits.per_second)
-        self._allowances[host] = left - float(left >= 1.0), now
-        return left >= 1.0
 
     def shutdown_request(self, request: Any) -> None:
         """Forget the connection, then close it."""

@@ -86,7 +86,7 @@ def test_an_interrupt_that_became_another_error_is_told_as_one(wrapped, monkeypa
             add_note(wrapped, "out is as it was before")
             raise wrapped from None
 
-    monkeypatch.setattr(__main__, "_run", job)
+    monkeypatch.setattr("aerpaw_cmp.cli.main", job)
     assert __main__.main(["ingest"]) == 130
     assert capsys.readouterr().err == "aerpaw-cmp: interrupted; out is as it was before\n"
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -135,7 +135,7 @@ def test_each_signal_is_told_and_ends_with_its_code(name, code, monkeypatch, cap
             os.kill(os.getpid(), getattr(signal, name))
         raise AssertionError("not interrupted")
 
-    monkeypatch.setattr(__main__, "_run", job)
+    monkeypatch.setattr("aerpaw_cmp.cli.main", job)
     before = signal.getsignal(signal.SIGTERM)
     assert __main__.main(["ingest"]) == code
     word = "interrupted" if name == "SIGINT" else f"ended by {name}"
@@ -187,7 +187,7 @@ def test_an_interrupt_while_the_hidden_place_is_made_leaves_none(tmp_path, kind,
             raise AssertionError("not interrupted")
 
     monkeypatch.setattr(outputs, "_lock", locked)
-    monkeypatch.setattr(__main__, "_run", job)
+    monkeypatch.setattr("aerpaw_cmp.cli.main", job)
     assert __main__.main(["ingest"]) == 143
     assert list(tmp_path.iterdir()) == []
 
@@ -207,8 +207,8 @@ def test_an_interrupt_that_met_an_exec_ends_with_its_exit_code(tmp_path):
     """dataclasses and namedtuples are made by exec(); run by ``-m``, the interpreter would end by the signal."""
     (tmp_path / "program.py").write_text(
         "import sys\n"
-        "from aerpaw_cmp import __main__ as program\n"
-        "program._run = lambda _: exec('raise KeyboardInterrupt')\n"
+        "from aerpaw_cmp import __main__ as program, cli\n"
+        "cli.main = lambda _: exec('raise KeyboardInterrupt')\n"
         "sys.exit(program.main(['ingest']))\n"
     )
     paths = os.pathsep.join([str(tmp_path), *sys.path])

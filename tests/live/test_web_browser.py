@@ -55,7 +55,7 @@ class Flight:
         self.feed = Feed(list(names), lambda: self.now_ns - self.start_ns, lambda: self.now_ns)
         self.names = names
         self.server = WebServer(self.feed, Page(*live_page(background, "<b>made up</b>")), Address("127.0.0.1", port), token=token,
-                                limits=Limits(burst=1000.0, tick_s=0.02))  # fmt: skip
+                                limits=Limits(tick_s=0.02))  # fmt: skip
         for modem in range(len(names)):
             self.feed.put(
                 modem, {"kind": "header", "utc_ns": self.now_ns, "mono_ns": 0, "port": {"device": "/dev/pts/9"}}

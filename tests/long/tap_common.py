@@ -41,13 +41,12 @@ if capture := values.pop("capture", None):  # a copy of what the kernel gives, a
 
     SerialPort.__init__, SerialPort.read = begin, copied
 watch = None
-if web := values.pop("web", None):  # a page at this port; no limit on new connections, which a fuzz run would meet
+if web := values.pop("web", None):  # a page at this port
     from aerpaw_cmp.live.feed import Feed
-    from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
+    from aerpaw_cmp.live.web import Address, Page, WebServer
     from aerpaw_cmp.report.live import live_page
     feed = Feed(["modem"])
-    WebServer(feed, Page(*live_page(None, "benchmark")), Address("127.0.0.1", web), token="benchmark",
-              limits=Limits(per_second=1e6, burst=1e6)).__enter__()
+    WebServer(feed, Page(*live_page(None, "benchmark")), Address("127.0.0.1", web), token="benchmark").__enter__()
     watch = lambda item: feed.put(0, item)
 try:
     summary = run_tap(TapSettings(folder=Path(values.pop("folder")), log=log, **values),

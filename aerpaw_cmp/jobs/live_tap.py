@@ -69,7 +69,11 @@ def tap_modems(
         If a port, the folder or the page's address cannot be used, at the start.
     """
     names = _names([port or "modem" for port in ports])
-    twin = _twin(shown)
+    twin = None
+    if shown.flight is not None:
+        from .live_twin import LiveTwin
+
+        twin = LiveTwin.of(shown.flight, shown.telemetry)
     with contextlib.ExitStack() as stack:
         feed = None
         if shown.web is not None:
@@ -94,14 +98,6 @@ def tap_modems(
         if feed is not None:
             feed.end(_ended(settings.folder, summaries, twin))
     return summaries
-
-
-def _twin(shown: Shown) -> Any:
-    if shown.flight is None:
-        return None
-    from .live_twin import LiveTwin
-
-    return LiveTwin.of(shown.flight, shown.telemetry)
 
 
 def _serve(stack: contextlib.ExitStack, feed: Feed, twin: Any, shown: Shown, title: str) -> None:

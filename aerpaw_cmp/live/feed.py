@@ -227,9 +227,6 @@ class Feed:
 
     def _bump(self) -> None:
         self._version += 1
-        for alarm in self._alarms:
-            if alarm.version == -1:
-                alarm.version = self._version
         self._changed.notify_all()
 
     def _parsed(self, cursor: str) -> tuple[str, int, list[int]]:
@@ -332,8 +329,9 @@ class Feed:
     # alarms -----------------------------------------------------------------------------------------------
 
     def _raise(self, modem: _Modem, kind: str, text: str) -> Alarm:
-        # version -1: numbered by the next _bump, as the present version may have been sent
-        alarm = Alarm(self._alarm_count, self._modems.index(modem), kind, text[:_LONGEST_TEXT], self.now(), version=-1)
+        number, place, now = self._alarm_count, self._modems.index(modem), self.now()
+        # the next version, because the present one may have been sent
+        alarm = Alarm(number, place, kind, text[:_LONGEST_TEXT], now, None, self._version + 1)
         self._alarm_count += 1
         self._alarms.append(alarm)
         return alarm
@@ -345,7 +343,7 @@ class Feed:
             conditions = {} if modem.ended or self._ended else _alarms_of(modem, self.now())
             for kind in [kind for kind in modem.open if kind not in conditions]:
                 alarm = modem.open.pop(kind)
-                alarm.end_s, alarm.version, changed = self.now(), -1, True
+                alarm.end_s, alarm.version, changed = self.now(), self._version + 1, True
             for kind, text in conditions.items():
                 if kind not in modem.open:
                     modem.open[kind], changed = self._raise(modem, kind, text), True

@@ -18,8 +18,8 @@ import numpy as np
 from ..common.units import BoolArray, FloatArray
 from .records import Kind
 
-# What Android, modems and autopilots write for "not available".
-# Ends of integer types, of 28 bits (a cell's number of LTE) and of MAVLink's 16 bits (heading, voltage); -999 by hand.
+# Numbers that Android, modems, autopilots and scripts write for "not available".
+# They are the ends of integer types, also of 28 bits (LTE cell identity) and 16 bits (MAVLink), and -999 of scripts.
 UNAVAILABLE = (2147483647.0, -2147483648.0, 9223372036854775807.0, 268435455.0, 65535.0, -32768.0, -999.0, -9999.0)
 _ANY = (-np.inf, np.inf)
 
@@ -64,7 +64,7 @@ class Quantity:
         return "rss" if self.role == "rss" else "rank" if self.role == "rank" else "kpi"
 
 
-# A row with _UP[2:] has a word before it, so it omits the boundary at the beginning.
+# A pattern with a word in front contains _UP[2:], which has no word boundary at its beginning.
 _UP = r"\b(alt|altitude|height|hgt|elevation|ele|hoehe|h he)"
 _ANGLE = (-360.0, 360.0)
 _SPEED = (-400.0, 400.0)
@@ -231,7 +231,7 @@ QUANTITIES: tuple[Quantity, ...] = (
 
 @cache
 def _forms() -> tuple[tuple[re.Pattern[str], Quantity], ...]:
-    """Return one expression per row: most names match none of its patterns."""
+    """Return one expression per row, because one search excludes all patterns of a row for most names."""
     return tuple((re.compile("|".join(f"(?:{pattern})" for pattern in row.names)), row) for row in QUANTITIES)
 
 
@@ -377,7 +377,7 @@ _OF_WHO = re.compile(r"\b(id|identity|name|no|num|number|index|address|addr)\b")
 
 
 def _split(name: str, what: Meaning | None) -> tuple[str, str]:
-    """Return the words of a name for a cell other than its PCI, and the words that an identity and a level share."""
+    """Return the words that name a cell other than its PCI, and the words that an identity and a level share."""
     bare = re.sub(r"(?<=[a-z])(?=\d)", " ", without_unit(name)[0])
     kind = "" if what and what.quantity.role != "identity" else " ".join(part[0] for part in _WHO.finditer(bare))
     form = next((form for form, row in _forms() if what and row.name == what.quantity.name), _OF_WHO)
@@ -385,7 +385,7 @@ def _split(name: str, what: Meaning | None) -> tuple[str, str]:
     return kind, " ".join(_UNPAIRED.sub(" ", rest).split())
 
 
-def of_pairs(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | None]:
+def with_places(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | None]:
     """Return the meanings of columns, with a place for each level and identity that share their other words.
 
     A place with several identities, such as "PCI A" and "PCI B", has several cells: "RSRP A" is the level of the first.
@@ -393,13 +393,13 @@ def of_pairs(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | No
     Examples
     --------
     >>> names = ["PCI A", "RSRP A", "PCI B", "RSRP B"]
-    >>> [what.place for what in of_pairs([(name, meaning(name)) for name in names])]
+    >>> [what.place for what in with_places([(name, meaning(name)) for name in names])]
     ['cell a', 'cell a', 'cell b', 'cell b']
 
     Other identities, such as "CID_1" or "AP1", have the role ``mark`` if at least two share the words of a level:
 
     >>> names = ["AP1", "RSSI1", "AP2", "RSSI2"]
-    >>> [(what.quantity.role, what.place) for what in of_pairs([(name, meaning(name)) for name in names])]
+    >>> [(what.quantity.role, what.place) for what in with_places([(name, meaning(name)) for name in names])]
     [('mark', 'cell1'), ('rss', 'cell1'), ('mark', 'cell2'), ('rss', 'cell2')]
     """
     named = [(*_split(name, what), what) for name, what in columns]
@@ -564,7 +564,7 @@ _SCALED = re.compile(r"(0\.0{0,8}1|1?e-\d{1,2}) ?\*? ?([a-z\u00b0\u00b5\u03bc].{
 
 
 def is_unit(text: str) -> bool:
-    """Check whether a text is a unit that values are converted from."""
+    """Check whether a text is a unit from which values can be converted."""
     unit = _scale(text.lower())[1]
     return unit in UNITS or unit in _DDMM
 
@@ -598,17 +598,17 @@ def converted(values: FloatArray, written: str) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A program, recognised by its own columns, and what it is known to write.
+    """A program that is recognised by its columns, with its known words, units and datums.
 
     Parameters
     ----------
     name : str
     signs : collection of str
-        Plain names: all of one of the sets.
+        Sets of plain names. A table with all names of one set is by this program.
     words : mapping of str to str
         Patterns of the program's names, matched against complete plain names, and the dictionary's words for them.
     units : mapping of str to str
-        Units of plain names that have none in brackets; ``time`` for that of the clock.
+        Units of plain names without a unit in brackets; the name ``time`` is the clock.
     datum : str
         Datum of heights whose name does not contain it.
     angles : str
@@ -671,8 +671,8 @@ PROGRAMS: tuple[Program, ...] = (
         "position lat": "semicircles", "position long": "semicircles"}),
     _program("Open DroneLog", "vps height m,height m", datum="sea level", words={
         r"height m": "height above takeoff", r"velocity ([xyz]) ms": r"velocity \1"}),
-    # Its dB are dBm. 1RSS and 2RSS are received by the aircraft, TRSS by the transmitter. FrSky's RSSI is not in dBm,
-    # and Hdg is the course over ground.
+    # EdgeTX writes dB for dBm. 1RSS and 2RSS are received by the aircraft, TRSS by the transmitter. FrSky's RSSI is not
+    # in dBm, and Hdg is the course over ground.
     _program("EdgeTX", "date,time,txbat v", "rqly,rsnr db", "date,time,rxbt v", words={
         r"([12])rss( dbm?)?": r"rssi \1", r"trss( dbm?)?": "rssi telemetry", r"rsnr( db)?": "sinr 1",
         r"tsnr( db)?": "sinr telemetry", r"rssi( db)?": "rssi count", r"ptch( rad)?": "pitch", r"hdg( .*)?": "course",
@@ -705,7 +705,7 @@ _CELL_ID = re.compile(r"\b(cell ?id|l?cid|e?ci|nci|[en]?cgi|[eg]nb ?id|sector ?i
 
 
 def names_a_cell(words: str, *, alone: bool = False) -> bool:
-    """Check whether a plain name names a cell, an antenna or a beam, only that of the row itself if ``alone``."""
+    """Check whether a plain name names a cell, an antenna or a beam, without other words if ``alone``."""
     return _OF_A_CELL.fullmatch(words) is not None or (not alone and _CELL_ID.search(words) is not None)
 
 
@@ -736,9 +736,9 @@ def described(
     names : iterable of str
         Names as written in the file.
     known : Program, optional
-        The program, if it is known before.
+        The program, if the caller knows it.
     of : collection of str
-        Further names that tell it.
+        Further names that identify it.
     """
     own = [(name, plain(name)) for name in names]  # a table may have a name twice
     present = [bare for _, bare in own]
@@ -768,7 +768,7 @@ def record_columns(
     integers : collection of str
         Names of integer fields: only these have the units of integers (mm, 1e-7 deg).
     of : collection of str
-        Further names that tell the program.
+        Further names that identify the program.
 
     Returns
     -------

@@ -44,7 +44,7 @@ _OptionsFor = ReadOptions | Callable[[Path], ReadOptions]
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """A file of a folder that no reader took, and why."""
+    """A file of a folder that was not read, and why."""
 
     path: str
     reason: str
@@ -79,7 +79,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 
 
 def read_head(place: Path) -> bytes:
-    """Return as many first bytes of a log on disk as the sniffers look at."""
+    """Return the first bytes of a log on disk, which the sniffers look at."""
     return as_utf8(_raw(place, HEAD_BYTES))
 
 
@@ -126,7 +126,7 @@ def ingest(
     Returns
     -------
     Ingested
-        List of :class:`IngestedFile`; its ``skipped`` names files of folders that no reader took.
+        List of :class:`IngestedFile`; its ``skipped`` lists files of folders that were not read.
 
     Raises
     ------
@@ -564,7 +564,7 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
     except OSError as error:
         raise InputError(f"the folder cannot be searched ({error})", path=folder) from error
     for place in places:
-        if not place.is_file():  # links to folders are not followed: they may go round in circles
+        if not place.is_file():  # links to folders are not followed, because they may form a circle
             what = "a link to a folder; also name that folder" if place.is_dir() else "a link to nothing"
             skipped.append(Skipped(str(place), what))
             continue

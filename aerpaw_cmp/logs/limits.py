@@ -4,13 +4,13 @@ A value beyond its range becomes NaN; a position, an attitude or a velocity lose
 flag, and a warning gives the number of such rows and the first of them. Rows with a flag of :data:`UNSCORED` stay in
 the records and are not compared.
 
-The ranges are those of physics and of small aircraft, wide on purpose: they catch what cannot be (a corrupted digit, an
-overflow, a sentinel), not what is unusual.
+The ranges are those of physics and of small aircraft. They are wide, to find impossible values (a corrupted digit, an
+overflow, a sentinel) and not unusual ones.
 
-Speeds judge clocks and positions: no small aircraft flies faster than 100 m/s, or gains 10 m/s in a second.
+Speeds reveal wrong clocks and positions: no small aircraft flies faster than 100 m/s, or gains 10 m/s in a second.
 
 A few positions that cannot be reached in time from the rows around them are jumps of the receiver. They are flagged and
-read as missing, as is a place where a log begins or ends without moving: the origin of an autopilot's filter, say.
+read as missing, as is a distant place where a log begins or ends at rest, such as the origin of an autopilot's filter.
 Positions that stay the same while the logged speed moves the aircraft on are stale, flagged and read as missing, too.
 A track that is too fast throughout has its times in another unit; one that is in two places at once
 belongs to two vehicles. Both are reported, and their values stay as they are.

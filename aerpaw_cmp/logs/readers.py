@@ -6,8 +6,8 @@ lists it in the catalogue that the entry-point group ``aerpaw_cmp.readers`` name
 Provenance of a stream's clock, height datum and identity: written in the file, stated by its program, or assumed.
 
 Attributes ``clock_from``, ``height_from`` (streams with altitudes) and ``identity_from`` (levels and ranks) are one of
-``written``, ``program``, ``assumed``; ``clock_source`` and ``height_source`` say what the program or the assumption is.
-What a user states in flight.yaml counts as written. What is assumed is a question of the draft.
+``written``, ``program``, ``assumed``; ``clock_source`` and ``height_source`` describe the program or the assumption.
+Values in flight.yaml count as written. ``ingest --draft`` asks about assumed values.
 """
 
 from __future__ import annotations

@@ -138,7 +138,7 @@ class Rows:
         about : mapping, optional
             Further attributes.
         **attributes
-            Attributes; those that are None are omitted.
+            Attributes. None means that an attribute is unknown, and is omitted.
 
         Returns
         -------

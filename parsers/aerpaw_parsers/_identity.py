@@ -2,7 +2,7 @@
 
 A column joins the key of a series if it distinguishes rows that the other columns of the key do not distinguish. The
 number of a cell does so next to a PCI only if one PCI has two numbers. A column with an unknown name joins the key if
-rows of one time, or rows that take turns with the level, differ in it.
+its values distinguish rows of one time, or if they and the level take turns from row to row.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def parts(
     several = [i for i in columns if len({*texts[i]}) > 1]
     several = [i for i in several if 1 < len({texts[i][row] for row in picked}) <= _MOST_PARTS]
     base = ["\t".join(row) for row in zip(*(texts[i] for i in several), strict=True)]
-    several += refining({i: texts[i] for i in marks}, counted, base)
+    several += dividing_columns({i: texts[i] for i in marks}, counted, base)
     if unknown := [sheet.names[i] for i in several if i in marks and sheet.meanings[i] is None]:
         shown = ", ".join(map(repr, unknown))
         rows.warnings.append(f"column {shown} distinguishes the rows: each of its values is a series")
@@ -106,7 +106,7 @@ def _with_level(sheet: _sheet.Sheet) -> BoolArray:
     return filled if filled.any() else np.ones(len(sheet), dtype=bool)
 
 
-def refining(texts: _Texts, counts: BoolArray, base: Sequence[str] = ()) -> list[int]:
+def dividing_columns(texts: _Texts, counts: BoolArray, base: Sequence[str] = ()) -> list[int]:
     """Return the columns, in order, that divide the rows further than the columns before them do.
 
     Parameters
@@ -114,7 +114,7 @@ def refining(texts: _Texts, counts: BoolArray, base: Sequence[str] = ()) -> list
     texts : mapping of int to list of str, length n
         Texts of each column, empty where it names nothing.
     counts : bool array, shape (n,)
-        Rows that count.
+        Rows that are considered.
     base : sequence of str, length n, optional
         Identity that is known before.
     """
@@ -123,18 +123,18 @@ def refining(texts: _Texts, counts: BoolArray, base: Sequence[str] = ()) -> list
     chosen = []
     for i, cells in texts.items():
         values = {*cells} - {""}
-        # one text in all rows divides nothing
+        # a column with one text does not divide the rows
         if len({*cells}) < 2 or len(values) > _MOST_PARTS:
             continue
         both = Counter((before, cells[row]) for before, row in zip(key, picked, strict=True))
-        if _divides(both, alone=len(values) == 1):
+        if _is_divided(both, alone=len(values) == 1):
             chosen.append(i)
             key = [f"{before}\t{cells[row]}" for before, row in zip(key, picked, strict=True)]
     return chosen
 
 
-def _divides(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
-    """Check whether a key has two values of a column, the few rows of a program's lag aside."""
+def _is_divided(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
+    """Check whether a key has two values of a column, without the few rows in which a program lags."""
     totals, values = Counter[str](), Counter[str]()
     for (before, _), count in counts.items():
         totals[before] += count
@@ -153,7 +153,7 @@ _OTHERS = re.compile(
 )
 
 
-def of_a_cell(sheet: _sheet.Sheet) -> list[int]:
+def cell_columns(sheet: _sheet.Sheet) -> list[int]:
     """Return the columns that are named like a cell and that the dictionary does not know."""
     return [
         i for i, words in enumerate(sheet.plain) if not sheet.meanings[i] and dictionary.names_a_cell(words, alone=True)
@@ -167,7 +167,7 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
     or a direction is found because most times have several rows without it. Devices also differ in their positions.
     """
     key = keys[0]
-    marks = of_a_cell(sheet) if key == "network" and ("PCI" in keys or sheet.find("PCI") is None) else []
+    marks = cell_columns(sheet) if key == "network" and ("PCI" in keys or sheet.find("PCI") is None) else []
     columns = [*known, *marks, *(i for i, m in enumerate(sheet.meanings) if m is not None and m.quantity.name in _CELL)]
     columns = list(dict.fromkeys(columns))
     table = pd.DataFrame({"time": rows.time, "levels": _levels(sheet), **{str(i): sheet.texts(i) for i in columns}})
@@ -181,7 +181,7 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
         i for i, m in enumerate(sheet.meanings) if m is None and i not in marks and not _OTHERS.search(sheet.plain[i])
     ]
     while (repeated := table.duplicated().mean()) >= _REPEATED:
-        # the column that leaves fewest rows of one time and one key, then the next
+        # add the column after which fewest rows share their time and key, then look for another one
         left = {i: table.assign(mark=sheet.texts(i)).duplicated().mean() for i in unknown if _few(sheet.texts(i))}
         best = min(left, key=lambda i: left[i], default=-1)
         if best < 0 or left[best] > repeated - _REPEATED / 2:
@@ -252,18 +252,18 @@ def _typical(steps: FloatArray) -> float:
 
 
 def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
-    """Return the texts of a column, empty if they name nothing: a network is never 0, a device, beam or SIM may be."""
+    """Return the texts of a column, empty where they name nothing, such as a network 0; a device 0 is a name."""
     meaning = sheet.meanings[column]
     zero = (
         meaning is None or meaning.quantity.name != "network" or sheet.plain[column].startswith(("sim", "slot", "sub"))
     )
     texts = sheet.texts(column)
-    named = {text: text if _says(text, zero=zero) else "" for text in {*texts}}
+    named = {text: text if _is_identity(text, zero=zero) else "" for text in {*texts}}
     return [named[text] for text in texts]
 
 
-def further(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dict[str, dict[str, Attribute]]]:
-    """Return the name of what distinguishes cells of one PCI and carrier in each row, and attributes by that name.
+def cell_names(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dict[str, dict[str, Attribute]]]:
+    """Return a name per row that distinguishes cells of one PCI and carrier, and the attributes of each name.
 
     Parameters
     ----------
@@ -271,15 +271,15 @@ def further(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dict[s
     base : sequence of str, length n
         PCI and carrier of each row.
     """
-    texts = {i: _named(sheet, i) for i in of_a_cell(sheet)}
-    chosen = refining(texts, _with_level(sheet), base)
+    texts = {i: _named(sheet, i) for i in cell_columns(sheet)}
+    chosen = dividing_columns(texts, _with_level(sheet), base)
     sheet.used |= {i for i, values in _values(texts).items() if len(values) <= _MOST_PARTS}
     about: dict[str, dict[str, Attribute]] = {}
     return labels(sheet, chosen, about), about
 
 
 def labels(sheet: _sheet.Sheet, columns: Sequence[int], about: dict[str, dict[str, Attribute]]) -> list[str]:
-    """Return the name of what some columns identify in each row, and add its attributes by that name to ``about``."""
+    """Return a name per row made of identity columns, and add the attributes of each name to ``about``."""
     of_row, texts = [""] * len(sheet), {i: _named(sheet, i) for i in columns}
     # the same cell has the same name in 'CID 1' and 'CID 2'
     kinds = {i: m.quantity.name if (m := sheet.meanings[i]) else sheet.plain[i] for i in columns}
@@ -307,7 +307,7 @@ _SI = re.compile(r"(\d{1,12}(?:\.\d{1,9})?) ?([kMG])?(?:Hz)?")
 _NO_IDENTITY = ("2147483647", "4294967295", "268435455", "65535", "-1", "9223372036854775807")
 
 
-def _says(text: str, *, zero: bool) -> bool:
+def _is_identity(text: str, *, zero: bool) -> bool:
     """Check whether a cell names something."""
     return text.lower() not in _sheet.NO_VALUE and text not in _NO_IDENTITY and (zero or text != "0")
 

@@ -181,7 +181,7 @@ def listed(entry: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def ue_ranks(rows: Rows, ues: list[tuple[int, dict[str, Any]]]) -> ReadResult:
-    """Return the rank streams of UEs, each with its row, with the keys that the dictionary finds."""
+    """Return the rank streams of UEs, each given with its row, with the keys that are in the dictionary."""
     entries = [ue for _, ue in ues]
     none = np.full(len(entries), np.nan)
     columns = {"rank": none, "cqi": none, "mcs": none, "rnti": column(entries, "rnti")}

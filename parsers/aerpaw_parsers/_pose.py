@@ -113,14 +113,14 @@ def of_readings(
     sheet = _sheet.of_readings(lines, readings, rejected)
     rows = _sheet.rows(sheet, options, reader=reader) if readings else None
     if rows is None:
-        return _sheet.nothing(lines.data, reader, "no reading with a time and a position")
+        return _sheet.all_rejected(lines.data, reader, "no reading with a time and a position")
     track = from_sheet(rows, sheet, name="vehicle", source=reader)
-    rows.warnings += sheet.unread()
+    rows.warnings += sheet.remarks()
     return rows.result([track])
 
 
 def whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> str:
-    """Return the clause about one of two angles that has whole degrees only, or an empty text."""
+    """Return a clause that names the only one of two angles in whole degrees, or an empty text."""
     known = [angle[np.isfinite(angle)] for angle in (values[key] for key in PLACE[:2])]
     # a receiver writes decimals even at rest; an index or a count does not
     coarse = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]
@@ -289,7 +289,7 @@ def astray(rows: Rows, values: Mapping[str, AnyArray]) -> BoolArray:
 _FASTEST_MPS = 60.0
 # Heights that begin within this distance of zero are relative to take-off.
 _NEAR_ZERO_M = 10.0
-# Other heights are damaged or placeholders.
+# Heights beyond these limits are damaged or placeholders [m].
 _POSSIBLE_M = (-1000.0, 20_000.0)
 _REST_S, _REST_M, _REST_MPS, _CLIMB_M, _CLIMB_MPS = 2.0, 3.0, 0.3, 5.0, 20.0
 _DEGREE_M = 111_000.0

@@ -1,8 +1,8 @@
 """Tables with a header and columns in any order, whose meaning is in the dictionary.
 
 The header may follow title lines, and its separator is that of the table. Decimal commas are read if the separator is
-another character. A header in mid-file begins a new table. If a program omits empty last cells, they are read as empty.
-A table whose values do not fit its header by the ranges of the dictionary is refused.
+another character. A header in the middle of the file begins a new table. Last cells that a program omits are read as
+empty. A table whose values are outside the ranges of the dictionary for its header is refused.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def split_row(line: bytes, separator: str) -> list[str]:
     if '"' not in text:
         return text.split(separator)
     try:
-        # csv refuses NUL (Python 3.10) and a bare carriage return
+        # the csv module raises for NUL (Python 3.10) and for a bare carriage return
         return next(csv.reader([text.replace("\0", "\ufffd").replace("\r", " ")], delimiter=separator), [])
     except csv.Error:
         return text.split(separator)
@@ -59,7 +59,7 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
             names = [name.strip() for name in split_row(line, separator)]
             below = [name.strip() for name in split_row(lines[i + 1], separator)] if i + 1 < len(lines) else []
             filled = [name or group for group, name in zip(names, below, strict=False)]
-            # merged cells of groups above the names: the names fill the cells that are empty here
+            # merged cells above the names, such as those of a tower: the empty cells are filled with the names below
             grouped = any(name and not group for group, name in zip(names, below, strict=False))
             grouped &= len(below) == len(names) and not any(map(_VALUE.match, below))
             if len(names) > 1 and is_header(filled if grouped else names):
@@ -68,7 +68,7 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
 
 
 def starts(head: bytes, is_header: _IsHeader) -> bool:
-    """Check whether a file begins with such a header, after title lines, and with rows of its width."""
+    """Check whether a file begins with a header of this kind, perhaps below title lines, and with rows of its width."""
     if _OBJECT.match(head):  # JSON lines: the names of the values in the first object are the header
         entry = None if _OF_PROGRAMS.search(head) else _json.first(head)
         return entry is not None and is_header([*_json.flat(entry)])
@@ -99,7 +99,7 @@ def _number(text: str) -> tuple[float, str]:
         return np.nan, ""
 
 
-# Words for the fix of a GNSS receiver, the first that fits, and MAVLink's numbers for them.
+# Words for the fix of a GNSS receiver, in the order in which they are tried, and MAVLink's number of each.
 _FIXES = tuple((re.compile(form), number) for form, number in (
     (r"\bno\b|no ?(fix|gps|gnss)|invalid|none|lost|searching|^(n|v|f|false|void|bad)$", "0"), (r"float", "5"),
     (r"rtk|fixed|\bint\b", "6"), (r"dgps|dgnss|diff|sbas", "4"), (r"\b2 ?d", "2"),
@@ -160,7 +160,7 @@ class Sheet:
         0-based lines of titles, headers and text below the table.
     rejected : list of RejectedLine
     notes : dict
-        Sentences about columns that are read otherwise than written, by column.
+        Sentences about columns that are not read as they are written, by column.
     closed : bool
         True if rows have their own end mark, so that a missing line end does not matter.
     said : dict
@@ -217,7 +217,7 @@ class Sheet:
                 for what, cells in zip(known, rats, strict=True)
             ]
             known = [dictionary.meaning("technology") if it else what for what, it in zip(known, named, strict=True)]
-        return dictionary.of_pairs(zip(self.plain, known, strict=True))
+        return dictionary.with_places(zip(self.plain, known, strict=True))
 
     def find(self, *quantities: str) -> int | None:
         """Return the column that fits one of the quantities best, an empty column only if there is no other."""
@@ -371,8 +371,8 @@ class Sheet:
         """Check whether the first row has numbers with a decimal comma."""
         return bool(self.cells) and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for cell in self.cells[0])
 
-    def unread(self) -> list[str]:
-        """Return sentences about columns that were read otherwise than they are written, or not at all."""
+    def remarks(self) -> list[str]:
+        """Return sentences about columns that are not read as they are written, or not read at all."""
         left = [i for i in range(len(self.names)) if i not in self.used and self._is_of_interest(i)]
         shown = ", ".join(repr(self.names[i]) for i in left[:_MOST_NAMED])
         more = f" and {len(left) - _MOST_NAMED} more" if left[_MOST_NAMED:] else ""
@@ -389,7 +389,7 @@ class Sheet:
         return said
 
     def _is_of_interest(self, column: int) -> bool:
-        """Check whether a column with values is a level, an identity, a position or a time, as far as names show it."""
+        """Check whether a column has values and looks like a level, an identity, a position or a time."""
         meaning, words = self.meanings[column], self.plain[column]
         like = bool(dictionary.like_levels([self.names[column]])) or dictionary.names_a_cell(words)
         if meaning is not None:
@@ -408,7 +408,7 @@ _WHERE_OR_WHEN = re.compile(
 )
 # Gains of a receiver, not those of an antenna or a transmitter.
 _GAIN = re.compile(r"^(?!.*\b(tx|transmit\w*|ant|antenna)\b).*\b(gain|agc|atten(uation|uator)?)\b")
-# Largest share of rows that are equal to another row, as at the same second.
+# Largest share of rows that are equal to another row: rows within one second may be equal.
 _MOST_EQUAL = 0.3
 # Names of columns in one sentence.
 _MOST_NAMED = 20
@@ -507,11 +507,11 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     below[: at + 1] = False
     numbers = np.flatnonzero(below).tolist()
     group = [text.strip() for text in split_row(lines.raw(at - 1), separator)] if at else []
-    table = _Table(_unlike(names, group), [*range(at + 1)])
+    table = _Table(_unique_names(names, group), [*range(at + 1)])
     written = list(_logical([(i, lines.raw(i)) for i in numbers], separator, len(names)))
     if len(written) < len(numbers):  # the further lines of a row are comments
         table.comments += sorted({*numbers} - {i for i, _ in written})
-    for i, fields in _fitted(written, names):
+    for i, fields in _without_empty_end(written, names):
         table.add(i, fields)
     return table.sheet(lines, numbers[-1] if numbers else at)
 
@@ -523,7 +523,7 @@ _MOST_LINES = 40
 def _logical(lines: Sequence[tuple[int, bytes]], separator: str, width: int) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of lines with the number of the first line of each: a quoted cell may have line breaks.
 
-    A lone quote, such as the sign of inches, joins nothing: a joined row has the width of the header.
+    A lone quote, such as the sign of inches, does not join lines: they are joined only to a row as wide as the header.
     """
     last = -1
     for place, (i, line) in enumerate(lines):
@@ -538,7 +538,7 @@ def _logical(lines: Sequence[tuple[int, bytes]], separator: str, width: int) -> 
         yield i, fields
 
 
-def _unlike(names: Sequence[str], group: Sequence[str] = ()) -> list[str]:
+def _unique_names(names: Sequence[str], group: Sequence[str] = ()) -> list[str]:
     """Return unique names of a header: repeated ones get the text of merged cells above them, or a number."""
     counts, before = Counter(names), Counter[str]()
     unlike, above = [], ""
@@ -557,7 +557,7 @@ class _Table:
         self.names, self.comments = names, comments
         self._place = list(range(len(names)))  # column of each field under the present header
         self._unit = [""] * len(names)  # unit of each field that differs from that of the first header
-        self._known, self._turned = {dictionary.without_unit(name)[0] for name in names}, False
+        self._known, self._repeated = {dictionary.without_unit(name)[0] for name in names}, False
         self._row: list[int] = []
         self._cells: list[list[str]] = []
         self._short: list[tuple[int, list[str]]] = []
@@ -568,7 +568,7 @@ class _Table:
         width = len(self._place)
         words = [text.strip() for text in fields]
         if self._is_units(words) or (not any(_VALUE.match(text) for text in words) and self._is_header(words)):
-            self.comments.append(i)  # units below the names, or files joined by hand
+            self.comments.append(i)  # units below the names, or the header of a file that was appended
         elif len(fields) == width:
             self._row.append(i)
             self._cells.append(self._placed(fields))
@@ -592,7 +592,7 @@ class _Table:
 
     def _is_header(self, texts: list[str]) -> bool:
         """Check whether a line is a header, with the same columns or others, for the lines below it."""
-        texts = _unlike(texts)
+        texts = _unique_names(texts)
         bare = [dictionary.without_unit(text) for text in texts]
         both = zip(bare, texts, strict=True)
         known = [name in self._known or dictionary.meaning(text) is not None for (name, _), text in both]
@@ -601,7 +601,7 @@ class _Table:
         spare: dict[str, list[int]] = {}
         for j, name in enumerate(self.names):
             spare.setdefault(dictionary.without_unit(name)[0], []).append(j)
-        self._place, self._unit, self._turned = [], [], True
+        self._place, self._unit, self._repeated = [], [], True
         for (name, unit), text in zip(bare, texts, strict=True):
             if not spare.get(name):
                 spare[name] = [len(self.names)]
@@ -614,7 +614,7 @@ class _Table:
         return True
 
     def _placed(self, fields: list[str]) -> list[str]:
-        if len(self.names) == len(self._place) and not self._turned:
+        if len(self.names) == len(self._place) and not self._repeated:
             return fields
         cells = [""] * len(self.names)
         for j, text, unit in zip(self._place, fields, self._unit, strict=True):
@@ -625,7 +625,7 @@ class _Table:
         """Return the table, with rows shorter than their header if the program often writes such rows."""
         # the last line may be cut short in every file
         inner, full = [i for i, _ in self._short if i != last_line], bool(self._row)
-        # a single short row is truncated; a twentieth of all rows is a habit of the program
+        # a single short row is truncated, but a program that omits last cells writes many short rows
         if len(inner) >= max(2, len(self._row) // 20):
             meanings = [dictionary.meaning(name) for name in self.names]
             read = {i for i, cells in self._short if not _torn(cells, meanings)}
@@ -665,8 +665,8 @@ def _torn(cells: list[str], meanings: list[dictionary.Meaning | None]) -> bool:
     return len(set(place.values())) > 1
 
 
-def _fitted(rows: list[tuple[int, list[str]]], names: list[str]) -> list[tuple[int, list[str]]]:
-    """Return rows without the empty field that a separator at the end of rows, or of the header alone, adds.
+def _without_empty_end(rows: list[tuple[int, list[str]]], names: list[str]) -> list[tuple[int, list[str]]]:
+    """Return rows without the empty field that a separator at the end of the rows or of the header adds.
 
     Most rows must have this field: an unquoted decimal comma also adds a field, and shifts the columns.
     """
@@ -691,7 +691,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     known = {i: m.quantity for i, m in enumerate(sheet.meanings) if m is not None and not m.indirect}
     mapped = column is not None
     if not mapped:  # columns that the user named are not checked by their values
-        _refuse_positions_beside(sheet)
+        _refuse_positions_elsewhere(sheet)
         bounded = {i: q for i, q in known.items() if q.role in ("position", "cell", "rss") and q.can_be[1] < np.inf}
         _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in bounded.items()])
     column = _time_column(sheet, options) if column is None else column
@@ -723,7 +723,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         sheet.row, sheet.cells, sheet._numbers = kept.row, kept.cells, {}
     if (counter := sheet.named("time millisecond", "millisecond", "milliseconds", "msec", "ms")) not in (None, column):
         sheet.used.add(counter)
-        _finer(timed, sheet.numbers(counter))
+        _add_milliseconds(timed, sheet.numbers(counter))
     if (valid := sheet.named("valid", "is valid", "data valid")) is not None:
         words = ("0", "0.0", "false", "no", "n", "invalid")
         invalid = np.array([text.lower() in words for text in sheet.texts(valid)], dtype=bool)
@@ -785,7 +785,7 @@ _STANDS_S = 2.0
 
 
 def _moves_on(sheet: Sheet, column: int, standing: pd.Series[str], options: ReadOptions) -> bool:
-    """Check whether a column of times advances while another shows one time, always the same if neither has a date."""
+    """Check whether a column of times advances while another column shows one time."""
     try:
         clock, cells, _ = _times(sheet, column, options, mapped=False)
         _, instants, valid = instants_of(cells, options, clock=clock, reader="the table")
@@ -800,12 +800,12 @@ def _moves_on(sheet: Sheet, column: int, standing: pd.Series[str], options: Read
 
 def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> tuple[str, FloatArray, list[str]]:
     texts = sheet.texts(column)
-    # also for a mapped column, if it is a time of day with a column of dates
+    # a mapped column may also be a time of day that needs the column of dates
     day = sheet.find("date") if not mapped or column == _time_column(sheet) else None
     if day is not None and day != column and not _stamps.is_dated(next(filter(None, texts), "")):
         pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
         texts = [f"{date} {time}".strip() for date, time in pairs]
-    half = [i for i, cell in enumerate(sheet.cells[0] if sheet.cells else ()) if _HALF.fullmatch(cell.strip())]
+    half = [i for i, cell in enumerate(sheet.cells[0] if sheet.cells else ()) if _AM_PM.fullmatch(cell.strip())]
     if half:
         sheet.used.add(half[0])
         texts = [" ".join(pair) for pair in zip(texts, sheet.texts(half[0]), strict=True)]
@@ -824,7 +824,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     if day is not None and not zone:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
     if (beside := sheet.find("zone")) is not None:
-        zone, texts = _zone_beside(sheet, beside, zone, texts, options)
+        zone, texts = _zone_column(sheet, beside, zone, texts, options)
     gps = re.search(r"\bgps", name) is not None
     heads = " ".join(sheet.names[i].lower() for i in (day, column) if i is not None)
     first = _DAY_OR_MONTH.search(heads)
@@ -841,10 +841,10 @@ def _devices(sheet: Sheet) -> IntArray | None:
     return pd.factorize(pd.Series(list(texts), dtype=object))[0] if columns else None
 
 
-def _zone_beside(sheet: Sheet, column: int, zone: str, texts: list[str], options: ReadOptions) -> tuple[str, list[str]]:
-    """Return the zone of the times by the column of zones, and the times with their zones if there are several."""
+def _zone_column(sheet: Sheet, column: int, zone: str, texts: list[str], options: ReadOptions) -> tuple[str, list[str]]:
+    """Return the zone in a column of zones, or an empty zone and the times with their zones if there are several."""
     cells = sheet.texts(column)
-    known = {text: "" if text.lower() in _NO_ZONE else _stamps.beside(text) for text in cells}
+    known = {text: "" if text.lower() in _NO_ZONE else _stamps.zone_of_cell(text) for text in cells}
     word = next(filter(None, known.values()), "")
     if unknown := next((text for text, own in known.items() if not own and text.lower() not in _NO_ZONE), ""):
         sheet.notes[column] = f"column {sheet.names[column]!r}: {unknown[:30]!r} is not a known zone: not used"
@@ -863,8 +863,8 @@ def _zone_beside(sheet: Sheet, column: int, zone: str, texts: list[str], options
 # Epochs, and times with an offset.
 _DATED = re.compile(r"\d{9,}[.,]?\d*|.*\d(?:Z|[+-]\d\d:?\d\d)")
 _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
-# A cell of a column that only has the half of the day.
-_HALF = re.compile(r"[AaPp]\.?[Mm]\.?")
+# A cell of a column that contains only AM or PM.
+_AM_PM = re.compile(r"[AaPp]\.?[Mm]\.?")
 # The order in a name: 'date (dd/mm/yyyy)'.
 _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 
@@ -940,7 +940,7 @@ def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray
     if not wrong or not len(wrong[0][1]):
         return
     count = np.sum([mask for *_, mask in wrong], axis=0)
-    # fewer than three rows or a twentieth are damaged, not shifted
+    # a few impossible rows are damaged; more of them mean that the columns are shifted
     few = max(3, len(count) // 20)
     alone = [
         mask
@@ -954,8 +954,8 @@ def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray
     raise shifted(shown, "values that their columns can have")
 
 
-def _refuse_positions_beside(sheet: Sheet) -> None:
-    """Refuse a table with positions in columns of other names, while a column named as a position has none."""
+def _refuse_positions_elsewhere(sheet: Sheet) -> None:
+    """Refuse a table whose positions are in other columns than those named as positions."""
     names = {i: what.quantity.name for i, what in enumerate(sheet.meanings) if what is not None and not what.indirect}
     place = [i for i, name in names.items() if name in ("latitude_deg", "longitude_deg")]
     astray = [i for i in place if np.isfinite(sheet.numbers(i)).sum() > 2 and not _is_place(sheet.numbers(i))]
@@ -999,13 +999,13 @@ _MOST_APART_NS = 1_500_000_000
 _MOST_NS = 2.0**62
 
 
-def _finer(rows: Rows, milliseconds: FloatArray) -> None:
+def _add_milliseconds(rows: Rows, milliseconds: FloatArray) -> None:
     """Add the fractions in a column of milliseconds to times in whole seconds (AirData)."""
     time = rows.time.astype(np.int64)
     known = np.isfinite(milliseconds)
     if rows.relative or not known.any() or (time % 1_000_000_000).any():
         return
-    # rounded before conversion to integers: 0.1 ms is not an exact number of ns in binary
+    # round before the conversion to integers, because 0.1 ms is not exact in binary
     counted_ns = np.round(np.where(known, milliseconds, 0.0) * 1e6)
     fits = np.abs(counted_ns).max() < _MOST_NS
     counted = counted_ns.astype(np.int64) if fits else np.zeros_like(time)
@@ -1016,7 +1016,7 @@ def _finer(rows: Rows, milliseconds: FloatArray) -> None:
     rows.time = np.where(known, zero.max() + counted, time).astype("datetime64[ns]")
 
 
-def nothing(data: bytes, reader: str, reason: str) -> ReadResult:
+def all_rejected(data: bytes, reader: str, reason: str) -> ReadResult:
     """Return the account of a file without such a table, with all lines rejected."""
     lines = _text.split(data)
     filled = np.flatnonzero(~lines.blank)

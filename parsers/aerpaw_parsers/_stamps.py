@@ -1,6 +1,6 @@
-"""Dates and times in the forms that programs write, brought to one: ``YYYY-mm-dd HH:MM:SS.f`` with the zone if any.
+"""Conversion of dates and times in any form to ``YYYY-mm-dd HH:MM:SS.f``, with the zone if there is one.
 
-All readers and ``--map`` use this parser. The zone in the cell wins, then that in the name of the column, then the
+All readers and ``--map`` use this parser. The zone is that in the cell, else that in the name of the column, else the
 user's. The complete column decides whether ``03/04/2025`` is in March or April; if it cannot, the order is assumed
 and a warning reports it.
 """
@@ -54,7 +54,7 @@ def _forms() -> tuple[re.Pattern[str], ...]:
 
 
 _OF_DAY = re.compile(r"T?" + _CLOCK.replace("[:.h-]", ":", 1).replace("[:.m-](?P<second>", ":(?P<second>") + _ZONE)
-# Python, pandas and C print up to 17 digits, decimals of arbitrary precision more: 0.30000000000000004.
+# Python, pandas and C print up to 17 digits (0.30000000000000004), programs with decimal arithmetic more.
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,40})?(?:[eE][-+]?\d{1,3})?")
 # An epoch shortened by a spreadsheet, ``1.74093E+12``: fewer than nine digits after the first omit seconds.
 _ROUNDED = re.compile(r"\d(?:[.,]\d{0,8})?[eE]\+?0?(?:9|1\d)")
@@ -62,7 +62,7 @@ _ROUNDED = re.compile(r"\d(?:[.,]\d{0,8})?[eE]\+?0?(?:9|1\d)")
 _MINUTES = re.compile(r"\d{1,2}:\d\d[.,]\d")
 _COMMON = re.compile((_text.TIME + rb"(?:Z|[+-]\d\d:\d\d)?").decode())
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-# Dates with hyphens or none, and Nemo's year, month, day: its summary of ``24Feb09`` says ``2024 Feb 09``.
+# Dates with or without hyphens, and Nemo's: its summary of the log ``24Feb09`` contains the date ``2024 Feb 09``.
 _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
     re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
@@ -116,7 +116,6 @@ class _Order:
         self._year(dates)
         keys = ("b", "c") if self.year_first else ("a", "b")
         firsts = [(int(match[keys[0]]), int(match[keys[1]])) for match in dates]
-        # points are the marks of countries that write the day first
         if all(match["mark"] == "." for match in dates) and not self.year_first:
             return  # 02.03.2025: with points, the day comes first
         if any(first > 12 for first, _ in firsts):
@@ -153,7 +152,7 @@ class _Order:
         self.warnings.append(f"the years of the dates have two digits: the {word} number was taken, a guess")
 
     def _span_d(self, dates: Iterable[re.Match[str]], day_first: bool) -> float:
-        """Return how many days the dates span in one order of day and month, to a day or two."""
+        """Return the days between the first and the last date in one order of day and month, within a day or two."""
         parts = (self.parts(match, day_first=day_first) for match in dates)
         days = [365.25 * int(year) + 30.44 * month + day for year, month, day in parts]
         return max(days) - min(days)
@@ -177,7 +176,7 @@ class _Order:
 
 # Two orders of the same dates are distinguished if their spans differ by this number of days.
 _WEEKS_D = 20
-# Two digits of years in which logs of this kind are written.
+# The first and the last year of a log of this kind, as two digits.
 _FIRST_YEAR, _LAST_YEAR = 15, 40
 
 
@@ -312,14 +311,14 @@ def header_zone(name: str, brackets: str) -> str:
     return next((word for word in (*words, last) if word in {*_HOURS, *_text.WINTER, *_WITH_SUMMER}), "")
 
 
-def beside(text: str) -> str:
+def zone_of_cell(text: str) -> str:
     """Return the zone in a cell of a column of zones, also from hours, minutes or seconds east of UTC.
 
     Examples
     --------
-    >>> beside("edt"), beside("-240"), beside("-14400"), beside("-0400"), beside("5.5"), beside("here")
-    ('EDT', '-04:00', '-04:00', '-0400', '+05:30', '')
-    >>> beside("Asia/Tokyo"), beside("Asia/Nowhere")
+    >>> [zone_of_cell(text) for text in ("edt", "-240", "-14400", "-0400", "5.5", "here")]
+    ['EDT', '-04:00', '-04:00', '-0400', '+05:30', '']
+    >>> zone_of_cell("Asia/Tokyo"), zone_of_cell("Asia/Nowhere")
     ('Asia/Tokyo', '')
     """
     number = re.fullmatch(r"[+-]?\d{1,5}(?:\.\d{1,2})?", text)
@@ -363,7 +362,8 @@ def read(
         Bytes or floats for it.
     warnings : list of str
     """
-    texts = [text.replace("\u202f", " ").replace("\xa0", " ") for text in texts]  # in front of AM, as browsers write it
+    # browsers write a narrow space before AM
+    texts = [text.replace("\u202f", " ").replace("\xa0", " ") for text in texts]
     shown = [
         text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else _PLACE.sub(r"\1", text.strip())
         for text in texts
@@ -371,7 +371,7 @@ def read(
     shown = _padded(shown)
     filled = [text for text in shown if text]
     compact = [match for text in filled if (match := _COMPACT.fullmatch(text))]
-    # counts of seconds reach 60 to 99, times of the day never do
+    # counts of seconds pass 60 to 99 in these places, times of the day never do
     clocks = len(compact) == len(filled) and all(len({match[part] for match in compact}) > 1 for part in (6, 7))
     if 2 * sum(clocks or bool(match[1] or zone) for match in compact) > len(filled):
         shown = [_COMPACT.sub(_with_marks, text) for text in shown]
@@ -459,9 +459,9 @@ _NAMES = {
     "min": "minutes",
     "h": "hours",
 }
-# Counts that last less as seconds may be minutes or hours [s].
+# A log that is shorter than this if its numbers are seconds may be in minutes or hours [s].
 _SHORT_S = 60.0
-# Steps of loggers at rest: quarters of an hour, but no number of milliseconds that programs use [s].
+# Steps of loggers that do not move [s]. No program writes rows in such steps of milliseconds.
 _QUARTERS = (900.0, 1800.0, 3600.0)
 # No program of a radio or an autopilot writes rows in such steps [ns].
 _LEAST_NS = 1e6
@@ -504,7 +504,7 @@ def _numbers(
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
     step, likely = _step(value), _likely_units(value)
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
-        # 0.9e9 s is July 1998: a clock that shows less counts from another origin, and one with steps of odd hours
+        # 0.9e9 s is July 1998: smaller numbers, and those with steps of odd hours, count from another origin
         hours = step / scale * 1e9 / 3600
         odd = unit is None and bool(likely) and hours > 1 and hours % 1 > 0
         if middle >= 0.9 * scale and not odd and (unit is None or scale >= _text.COUNTS[unit].least_epoch):
@@ -574,8 +574,8 @@ def _of_day(
     """Return times of day with the date of ``time_origin`` or of the file name, if there is one."""
     matches = [_OF_DAY.fullmatch(text) for text in texts]
     seconds = np.array([_seconds(item.groupdict()) if item else np.nan for item in matches], dtype=np.float64)
-    # back by more than half a day is midnight; less is a clock that was set; forward, where another device's rows
-    # begin, is the day before
+    # a step back by more than half a day is midnight, a smaller one is a clock that was set; a step forward to the
+    # first row of another device leads to the day before
     step = np.nan_to_num(np.diff(seconds, prepend=np.nan))
     other = np.zeros(len(step), dtype=bool) if device is None else np.diff(device, prepend=device[:1]) != 0
     seconds += 86_400.0 * (np.cumsum(step < -43_200) - np.cumsum((step > 43_200) & other))

@@ -35,7 +35,7 @@ _TEXT = re.compile(rb"FMT, ?128, ?89, ?FMT,")
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether it begins with the description of the description."""
+    """Check whether a log begins with the message that describes the messages ``FMT``."""
     return head[:3] == _MARK + bytes([_FMT]) or _TEXT.match(head) is not None
 
 

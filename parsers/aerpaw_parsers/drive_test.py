@@ -209,7 +209,7 @@ def _readings(
         level = sheet.numbers(cell.columns["rsrp_dbm"])
         values = {name: _or_nan(sheet, cell.columns.get(name), len(level)) for name in _FIELDS.values()}
         none = np.isnan(values["rsrp_dbm"]) & ~(values["pci"] > 0) if cell.rat == "nr" or not cell.serving else False
-        # refused above where most are fractions; here a single damaged cell
+        # a table with mostly fractions was refused before: a fraction here is a single damaged cell
         pci = np.where(values["pci"] == np.round(values["pci"]), values["pci"], np.nan)  # identities are integers
         rat = of_row if technology is not None and not cell.rat else cell.rat
         about = {
@@ -230,7 +230,7 @@ def _marked(readings: pd.DataFrame) -> pd.DataFrame:
     """
     known, marks = readings["pci"].notna(), readings["mark"]
     both = (known & marks.ne("")).to_numpy()
-    if not _identity.refining({0: marks.tolist()}, both, readings["pci"].astype(str).tolist()):
+    if not _identity.dividing_columns({0: marks.tolist()}, both, readings["pci"].astype(str).tolist()):
         marks = marks.where(~known, "")
     marks = marks.where(known | marks.ne(""), readings["column"])
     more = ["_".join(filter(None, pair)) for pair in zip(readings["more"], marks, strict=True)]
@@ -298,7 +298,7 @@ def _read(data: bytes, options: ReadOptions, *, header: _IsHeader, reader: str, 
     sheet = _sheet.read(data, header)
     rows = None if sheet is None else _sheet.rows(sheet, options, reader=reader)
     if sheet is None or rows is None:
-        return _sheet.nothing(data, reader, "no header with a time and a level, ratio, rank or position")
+        return _sheet.all_rejected(data, reader, "no header with a time and a level, ratio, rank or position")
     grid = sheet.find("grid")
     if track and sheet.find("latitude_deg") is None and grid is not None:
         raise InputError(
@@ -331,7 +331,7 @@ def of_sheet(rows: Rows, sheet: _sheet.Sheet, *, track: str = "phone", source: s
     levels = [stream for stream in streams if stream is not None and stream.kind in ("rss", "rank")]
     if all(stream.attributes.get("quantity") == "SNR" for stream in levels):
         rows.warnings += _sheet.way_to_level(sheet)
-    rows.warnings += sheet.unread()
+    rows.warnings += sheet.remarks()
     return rows.result(streams)
 
 
@@ -341,7 +341,7 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     of_row = (sheet.find(name) for name in ("technology", "serving", "neighbouring"))
     sheet.used |= {*others, *ranks, *(i for i in of_row if i is not None)}
     sheet.used |= {i for cell in cells for i in (*cell.columns.values(), *cell.ports, *cell.marks)}
-    more, about = _identity.further(sheet, _identities(sheet, cells))
+    more, about = _identity.cell_names(sheet, _identities(sheet, cells))
     owned: dict[tuple[str, str, str], list[_Cell]] = {}
     for cell in cells:
         owner = cell.place if cell.place.startswith(_OWNERS) else ""
@@ -407,7 +407,7 @@ def _of_a_scheduler(rows: Rows, sheet: _sheet.Sheet) -> bool:
 
 
 def _short(sheet: _sheet.Sheet, column: int) -> str:
-    """Return the words of a column's name that are not its quantity, as a name."""
+    """Return a short name for a column: the words of its name without those of its quantity."""
     words = re.sub(r"\b(\w*rsrp|dbm|lte|nr|4g|5g|serving)\b", " ", sheet.plain[column])
     return "_".join(words.split()) or f"column{column + 1}"
 

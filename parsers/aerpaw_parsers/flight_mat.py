@@ -94,7 +94,7 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
     raise InputError("the MATLAB file has no clock", expected=f"a variable {clocks}", cause="not a flight")
 
 
-# Clock of files that have none.
+# Name of the clock of files without a clock, whose rows are counted.
 _COUNTED = "row number"
 
 

@@ -162,7 +162,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
             streams.append(_stream(part, cells, kind, where, words, options.unit or unit))
         if kind == "rss":
             streams.append(_track(of_device, table, where, device))
-    rows.warnings += sheet.unread()
+    rows.warnings += sheet.remarks()
     return rows.result(streams)
 
 

@@ -39,7 +39,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     sheet = _sheet.of_readings(lines, [(int(row[i]), readings[i]) for i in timed], torn)
     rows = _sheet.rows(sheet, options, reader="gnettrack_kml") if timed else None
     if rows is None:
-        return _sheet.nothing(data, "gnettrack_kml", "no placemark with a time")
+        return _sheet.all_rejected(data, "gnettrack_kml", "no placemark with a time")
     return drive_test.of_sheet(rows, sheet)
 
 

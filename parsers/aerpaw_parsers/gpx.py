@@ -70,7 +70,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     sheet = _sheet.of_readings(lines, readings, _torn(lines, data, row))
     rows = _sheet.rows(sheet, options, reader="gpx") if readings else None
     if rows is None:
-        return _sheet.nothing(data, "gpx", "a point without position or time (torn?)")
+        return _sheet.all_rejected(data, "gpx", "a point without position or time (torn?)")
     begun = [track.start() for track in re.finditer(rb"<(?:\w{1,20}:)?trk\b", data)]
     track = np.searchsorted(begun, np.array([at for at, _ in points], dtype=np.int64))[rows.at]
     parts = {"": (rows, sheet)}
@@ -80,7 +80,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     for suffix, (part, cells) in parts.items():
         streams.append(_track(part, cells, f"track{suffix}"))
         streams += drive_test.of_radio(part, cells) if drive_test.has_radio(sheet.names) else []
-    rows.warnings += [*_sheet.way_to_level(sheet), *sheet.unread()]
+    rows.warnings += [*_sheet.way_to_level(sheet), *sheet.remarks()]
     return rows.result(streams)
 
 

@@ -235,7 +235,7 @@ def _columns(answers: list[Answer], names: Mapping[str, str]) -> Columns:
 
 
 def _answered(exchanges: list[tuple[int, dict[str, Any]]], query: str, leg: str) -> Iterator[Answer]:
-    """Yield the answers to a query; a failed exchange of a rank is an answer without it, flagged with its status."""
+    """Yield the answers to a query, and failed exchanges of a rank as flagged answers without a rank."""
     for number, record in exchanges:
         decoded = _json.inside(record, "decoded")
         values = _json.inside(decoded, leg) if leg else decoded

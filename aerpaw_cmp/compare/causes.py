@@ -948,7 +948,7 @@ _PATTERN = {
     ),
     "learned": (
         "the learned antennas do not fit this UAV",
-        "check which aircraft flew, else `aerpaw-cmp calibrate` with it",
+        "check which aircraft and antennas flew",
     ),
 }
 

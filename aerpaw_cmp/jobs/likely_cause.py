@@ -86,8 +86,8 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     # an antenna that the file names is missing: errors by direction are expected, and the first caution has the reason
     if any(not c.used for c in data.settings.cautions) and by_direction:
         return None, "see the first caution: a learned antenna that the flight file names is not used"
-    # learned antennas have some decibels of error on any flight
-    if cause is not None or data.settings.antennas or not gains_by_direction(evidence):
+    # learned antennas, from the flight file or of `report --with`, have some decibels of error on any flight
+    if cause is not None or any(e.antenna == "learned" for e in evidence) or not gains_by_direction(evidence):
         return cause, None
     return None, _CALIBRATE
 

@@ -10,7 +10,14 @@ import pandas as pd
 import pytest
 import yaml
 
+import aerpaw_cmp
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.compare import causes
+from aerpaw_cmp.flight.data import load_data
+from aerpaw_cmp.flight.gains import load_with_learned
+from aerpaw_cmp.flight.replay import replay_flight
+from aerpaw_cmp.jobs import likely_cause
+from aerpaw_cmp.jobs.compare_flight import compare_flight
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 
@@ -214,3 +221,24 @@ def test_an_option_that_cannot_act_is_refused(
     places = {name: f"{name}.yaml" for name in ("flight", *texts)} | {"route": "route.csv"}
     assert main([word.format(**places) for word in command]) == 2
     assert found in capsys.readouterr().err
+
+
+def test_a_calibration_is_not_recommended_to_a_report_that_uses_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The antennas of ``report --with`` are not among the named antennas of the flight file."""
+    monkeypatch.setattr(likely_cause, "flight_cause", lambda _: None)
+    monkeypatch.setattr(likely_cause, "gains_by_direction", lambda _: True)
+    path = write_flight(tmp_path)
+    packaged = Path(aerpaw_cmp.__file__).parent / "site/data/lake_wheeler.learned/dataset12.LW1.USRP1.uav.csv.gz"
+    antenna = Path(shutil.copy(packaged, tmp_path)).name
+    learned = tmp_path / "learned.yaml"
+    uav = {"uav": {"antenna": {"model": "sphere", "file": antenna}}}
+    learned.write_text(yaml.safe_dump({"link": {"channels": {"A": uav, "B": uav}}}))
+    steps = []
+    for calibrated in (None, learned):
+        data = load_data(load_with_learned(path, calibrated), tmp_path)
+        result = compare_flight(data, replay_flight(data))
+        steps.append(result.next_step or "")
+    assert ["calibrate" in step for step in steps] == [True, False]
+    assert "calibrate" not in causes._PATTERN["learned"][1]

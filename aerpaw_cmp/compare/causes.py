@@ -19,7 +19,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import combinations, combinations_with_replacement
-from typing import Protocol
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, w
 from ..site.learned import LearnedSeries
 from .health import Judged, Step, level_of, step_of
 from .noise import LEAST_VARIANCE, START, Memories, MemoryFit, fit_with_memories
-from .statistics import Interval
+from .result import Cause, ClockResult
 
 # Samples are averaged over this time [s]. Longer flights have longer means, so that their number is limited.
 BIN_S, _MOST_BINS = 1.0, 2000
@@ -45,46 +44,12 @@ MOST_CAUSE_WORDS = 28
 _LEAST_SHARE, _CERTAIN = 0.1, 30.0
 # The sentence states the error without a cause and with it: they must differ in print, however certain the cause.
 SHOWN_DB = 0.1
-# The nearest of all places explains a part of many errors, and learned antennas miss some decibels of each flight.
-_PLACE_SHARE = 0.3
-_OF_ANTENNA, _LEARNED_SHARE = ("heading", "pattern"), 0.25
-# Causes that must bring the error back to a usual value, and the smallest share of the reduction by all candidates
-# together.
-_RESTORING = frozenset({"pattern", "heading", "height", "telemetry", "clock", "saturation", "place", "channels"})
-_LEAST_PART = 0.5
-# Another tower and another place imitate many errors of the position, and a step imitates other faults of a receiver.
-_LEAST_PARTS = {"tower": 0.75, "place": 0.75, "gain step": 0.5}
-# Causes that change the levels of all channels.
-_OF_UAV = frozenset({"height", "heading", "telemetry", "attitude"})
-# A cause that leaves more than this factor of the largest usual error does not explain the error.
-_MOST_LEFT, _LEAVING = 2.0, frozenset({"decibels", "tower"})
-# Causes whose level the log must follow.
-_FOLLOWED = frozenset({"pattern", "heading", "height", "telemetry", "place", "tower"})
 # Half of the 95 % point of chi-squared with one degree of freedom.
 _NEAR = 1.92
 _EPOCH = np.datetime64(0, "s")
+_UNNAMED = ""
 _Estimate = tuple[float, float, float]
 _NOTHING: _Estimate = (math.nan, math.nan, math.nan)
-
-
-class JudgedClock(Protocol):
-    """The radio clock as :class:`~..result.ClockResult` has it."""
-
-    @property
-    def radio_minus_telemetry_s(self) -> float:
-        """Lag [s], positive if the radio shows later times."""
-
-    @property
-    def ci95_s(self) -> Interval:
-        """Interval of the lag [s]."""
-
-    @property
-    def shifted(self) -> bool:
-        """True if the clock is wrong and was not corrected."""
-
-    @property
-    def in_words(self) -> str:
-        """The lag with its interval."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,7 +85,7 @@ class LevelEvidence:
         Predicted level of each other tower of the site.
     locked, serving : (n,), optional
         1 in lock or served by this cell, 0 not, NaN unknown; None if the log has no such column.
-    clock : JudgedClock, optional
+    clock : ClockResult, optional
         Test result of the radio clock.
     """
 
@@ -142,7 +107,7 @@ class LevelEvidence:
     other_towers_db: Mapping[str, FloatArray] = field(default_factory=dict)
     locked: FloatArray | None = None
     serving: FloatArray | None = None
-    clock: JudgedClock | None = None
+    clock: ClockResult | None = None
     floored: bool = False
     """True if the settings remove levels at the floor: of the lowest links only those that fade upwards remain."""
     limits_known: bool = False
@@ -162,50 +127,19 @@ class LevelEvidence:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Cause:
-    """A named cause.
-
-    Parameters
-    ----------
-    name : str
-    sentence : str
-        Channels, numbers, and the RMSE without and with the cause.
-    next_step : str
-        A clause.
-    estimate, ci95 : float, (low, high)
-        Number of the cause (lag [s], angle [deg], height [m], loss, floor or step [dB]; else NaN) and its interval.
-    channels : sequence of str
-        Channels that show the cause.
-    rmse_db, rmse_with_db : float
-        RMSE of 1-s means of these channels without and with the cause [dB].
-    gain : float
-        Log odds of the explanations with the cause to all without it.
-    """
-
-    name: str
-    sentence: str
-    next_step: str
-    estimate: float = math.nan
-    ci95: Interval = (math.nan, math.nan)
-    channels: tuple[str, ...] = ()
-    rmse_db: float = math.nan
-    rmse_with_db: float = math.nan
-    gain: float = 0.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
     """A fault with its numbers, its effect on the level, and its words.
 
     ``change_db`` (n,) is added to the predicted level. ``columns`` (n, k) have free coefficients with a unit normal
     prior. ``clipped`` (n,) are samples whose level is not that of the link. ``fading`` (n,) is the share of the link's
-    fading that the log shows. ``cost`` is the log likelihood lost by averaging over all possible numbers.
+    fading that the log shows. ``cost`` is the log likelihood lost by averaging over all possible numbers. A trial
+    without a name is an alternative that is not named as a cause.
     """
 
-    name: str
-    cost: float
-    sentence: str
-    next_step: str
+    name: str = _UNNAMED
+    cost: float = 0.0
+    sentence: str = ""
+    next_step: str = ""
     change_db: FloatArray | None = None
     columns: FloatArray | None = None
     clipped: BoolArray | None = None
@@ -256,7 +190,8 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             continue
         name = max(either & best)
         # the UAV has one height and one attitude: all channels must show that these are wrong
-        shown = [table for table in tables if either <= _OF_UAV or name in _names(_best(table, best))]
+        of_all = all(_demand(each).of_uav for each in either)
+        shown = [table for table in tables if of_all or name in _names(_best(table, best))]
         # the words are those of the channel that shows the cause most clearly
         shown.sort(key=lambda table: -_best(table, {name}).gain)
         if all(
@@ -354,43 +289,113 @@ def _alternatives(best: Set[str], odds: Mapping[frozenset[str], float], least: f
 _DISTINCT = 1.7
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Demand:
+    """What a cause must show before it is named."""
+
+    lead: float = -math.inf
+    """Log odds per channel against all explanations without it."""
+    share: float = 0.1
+    """Least reduction of the RMSE."""
+    learned_share: float | None = None
+    """The same with learned antennas, which miss some decibels of each flight."""
+    part: float = 0.0
+    """Least share of the reduction by all candidates together, for flights without learned antennas."""
+    of_uav: bool = False
+    """The cause changes the levels of all channels."""
+    restores: bool = False
+    """With learned antennas, the cause must bring the error back to that of held-out flights."""
+    follows: bool = False
+    """The log must follow the level of the cause better than a constant."""
+    most_left: float = 2.0
+    """Largest remaining error as a multiple of the largest usual one."""
+
+
+_DEMANDS = {
+    "attitude": _Demand(of_uav=True),
+    # imitated by slow fading and by levels that belong to other places
+    "blocked": _Demand(lead=5.0),
+    "channels": _Demand(part=0.5, restores=True),
+    "clock": _Demand(part=0.5, restores=True),
+    "decibels": _Demand(most_left=math.inf),
+    "gain step": _Demand(lead=2.5, part=0.5),
+    "heading": _Demand(learned_share=0.25, part=0.5, of_uav=True, restores=True, follows=True),
+    "height": _Demand(part=0.5, of_uav=True, restores=True, follows=True),
+    "pattern": _Demand(learned_share=0.25, part=0.5, restores=True, follows=True),
+    # the nearest of all places explains a part of many errors
+    "place": _Demand(lead=2.5, share=0.3, part=0.75, restores=True, follows=True),
+    "saturation": _Demand(part=0.5, restores=True),
+    "telemetry": _Demand(part=0.5, of_uav=True, restores=True, follows=True),
+    "tower": _Demand(part=0.75, follows=True, most_left=math.inf),
+}
+
+
+def _demand(name: str) -> _Demand:
+    return _DEMANDS.get(name, _Demand())
+
+
 def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]) -> bool:
     """Check whether a cause explains the error of the channels that show it, by what it takes off their RMSE.
 
     ``beside`` are the other causes of the likeliest explanation.
     """
-    sound = [table[_SOUND] for table in shown]
-    if not all(frozenset([name]) in table for table in shown):
+    demand, sound = _demand(name), [table[_SOUND] for table in shown]
+    if not all(frozenset([name]) in table for table in shown) or lead < demand.lead:
         return False
+    alone = [table[frozenset([name])] for table in shown]
     # the cause alone must reduce the RMSE, not only the changes from second to second
-    alone_models = [table[frozenset([name])] for table in shown]
-    if name in _OF_UAV and any(model.gain <= 0.0 for model in alone_models):
+    if demand.of_uav and any(model.gain <= 0.0 for model in alone):
         return False
-    known_db, alone_db = _rmse_db(sound), _rmse_db(alone_models)
-    share = max(alone_db / known_db, _share_of_error(shown, beside, {*beside, name})) if known_db else 1.0
-    certain, least_share = lead >= _CERTAIN and share <= 1.0 - 0.5 * _LEAST_SHARE, _LEAST_SHARE
-    if name == "place":  # the nearest of all places takes up a part of many an error
-        certain, least_share = False, _PLACE_SHARE
-    if name in _OF_ANTENNA and sound[0].evidence.antenna == "learned":
-        certain, least_share = False, _LEARNED_SHARE
-    # any smoother level fits a log of noise or of a gain control: the cause must leave less than a constant does
-    most = {_CATCH_ALL: 1.0}.get(name, 1.0 - _LEAST_SHARE)
-    follows = name in _FOLLOWED
-    if follows and any(m.residual_db.std() >= most * m.evidence.measured_db.std() for m in alone_models):
+    known_db, alone_db = _rmse_db(sound), _rmse_db(alone)
+    before_db, after_db = (_rmse_db([_best(table, of) for table in shown]) for of in (beside, {*beside, name}))
+    share = max(alone_db / known_db, after_db / before_db) if known_db and before_db else 1.0
+    certain, least_share = lead >= _CERTAIN and share <= 1.0 - 0.5 * _LEAST_SHARE, demand.share
+    if demand.learned_share is not None and sound[0].evidence.antenna == "learned":
+        least_share = demand.learned_share
+    certain &= least_share <= _LEAST_SHARE
+    # any smoother level fits a log of noise or of a gain control
+    most = 1.0 if name == _CATCH_ALL else 1.0 - _LEAST_SHARE
+    if demand.follows and any(m.residual_db.std() >= most * m.evidence.measured_db.std() for m in alone):
+        return False
+    if name == _CATCH_ALL and lead < _SURE_GAIN and not _holds_in_halves(alone):
         return False
     # a floor that the settings remove is known, and explains why the remaining low links look too strong
     if (name == "floor" and sound[0].evidence.floored) or known_db - alone_db < SHOWN_DB:
         return False
     usual = _usual_db(shown)
-    if usual is not None:
+    if usual is None:
+        # half of what all candidates take off together, or more
+        enough = not demand.part or alone_db <= known_db - demand.part * (known_db - _together_db(shown))
+        restored = False
+    else:
         # from above the error of any held-out flight to below it
-        restored = name in _RESTORING - {_CATCH_ALL} and known_db > usual[1] >= alone_db
+        restored = demand.restores and name != _CATCH_ALL and known_db > usual[1] >= alone_db
         # an error as large as that of any flight has no such cause
         least_db = usual[1] if name in OF_DIRECTION else usual[0] if name == "saturation" and not certain else 0.0
-        most_db = usual[1] if name in _RESTORING else math.inf if name in _LEAVING else _MOST_LEFT * usual[1]
-        enough = known_db > least_db and alone_db <= most_db
-        return enough and (share <= 1.0 - least_share or certain or restored)
-    return (share <= 1.0 - least_share or certain) and _is_enough(name, shown, known_db, alone_db)
+        enough = known_db > least_db and alone_db <= (1.0 if demand.restores else demand.most_left) * usual[1]
+    return enough and (share <= 1.0 - least_share or certain or restored)
+
+
+def _holds_in_halves(models: Sequence[_Model]) -> bool:
+    """Check whether a gain over directions that is fitted to one half of the flight reduces the error of the other."""
+    before = after = 0.0
+    for model in models:
+        e, columns = model.evidence, model.trials[0].columns
+        assert columns is not None
+        error_db = e.measured_db - e.predicted_db
+        first = np.arange(len(error_db)) < len(error_db) // 2
+        for half, other in ((first, ~first), (~first, first)):
+            x, y = columns[half] - columns[half].mean(axis=0), error_db[half] - error_db[half].mean()
+            gain = x.T @ x / (_CORRELATED_BINS * max(float(y.var()), LEAST_VARIANCE)) + np.eye(columns.shape[1])
+            fit = np.linalg.solve(gain, x.T @ y / (_CORRELATED_BINS * max(float(y.var()), LEAST_VARIANCE)))
+            before += len(error_db) * float(error_db[other].var())
+            after += len(error_db) * float((error_db - columns @ fit)[other].var())
+    return after <= _MOST_IN_HALVES**2 * before
+
+
+# Means per independent sample of the error, largest error of the other half with the gain as a share, and log odds per
+# channel from which on the halves may show different directions.
+_CORRELATED_BINS, _MOST_IN_HALVES, _SURE_GAIN = 10.0, 0.85, 20.0
 
 
 def _usual_db(shown: Sequence[_Models]) -> tuple[float, float] | None:
@@ -403,27 +408,21 @@ def _usual_db(shown: Sequence[_Models]) -> tuple[float, float] | None:
     return mean_db, most_db
 
 
-def _is_enough(name: str, shown: Sequence[_Models], known_db: float, alone_db: float) -> bool:
-    """Check whether a cause takes off half of what all candidates take off together."""
-    part = _LEAST_PARTS.get(name, _LEAST_PART if name in _RESTORING else 0.0)
-    if part == 0.0:
-        return True
-    together_db = math.sqrt(float(np.mean([_together_db(table) ** 2 for table in shown])))
-    return alone_db <= known_db - part * (known_db - together_db)
-
-
-def _together_db(table: _Models) -> float:
-    """Return the RMSE of a channel with all candidates at once, each with a free coefficient [dB]."""
-    e = table[_SOUND].evidence
-    columns = [np.ones(len(e.time_s))]
-    for trial in (model.trials[0] for names, model in table.items() if len(names) == 1):
-        columns += [] if trial.change_db is None else [trial.change_db]
-        columns += [] if trial.columns is None else list(trial.columns.T)
-    design, target = np.column_stack(columns), e.measured_db - e.predicted_db
-    # a place at the tower itself has no level
-    design = design[:, np.isfinite(design).all(axis=0)]
-    residual = target - design @ np.linalg.lstsq(design, target, rcond=1e-9)[0]
-    return float(np.sqrt((residual**2).sum() / max(len(target) - design.shape[1], 1)))
+def _together_db(shown: Sequence[_Models]) -> float:
+    """Return the RMSE of some channels with all candidates at once, each with a free coefficient [dB]."""
+    squares = []
+    for table in shown:
+        e = table[_SOUND].evidence
+        columns = [np.ones(len(e.time_s))]
+        for trial in (model.trials[0] for names, model in table.items() if len(names) == 1):
+            columns += [] if trial.change_db is None else [trial.change_db]
+            columns += [] if trial.columns is None else list(trial.columns.T)
+        design, target = np.column_stack(columns), e.measured_db - e.predicted_db
+        # a place at the tower itself has no level
+        design = design[:, np.isfinite(design).all(axis=0)]
+        residual = target - design @ np.linalg.lstsq(design, target, rcond=1e-9)[0]
+        squares.append((residual**2).sum() / max(len(target) - design.shape[1], 1))
+    return math.sqrt(float(np.mean(squares)))
 
 
 def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
@@ -484,11 +483,10 @@ def _models(e: LevelEvidence) -> _Models:
             if len(names) == len(trials) and (names not in best or tried.gain > best[names].gain):
                 best[names] = tried
         likely = sorted(best.values(), key=lambda m: -m.gain)[:_MOST_TRIED]
-        return [model(*m.trials, at=at) for m in likely]
+        return sorted((model(*m.trials, at=at) for m in likely), key=lambda m: -m.gain)
 
+    # pairs are made of the best with each other
     alone = best_of(((trial,) for trial in _candidates(e)), sound.memories)
-    # the best first: pairs are made of it with each other
-    alone.sort(key=lambda m: -m.gain)
     models, likely = [model(climb=False), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
     pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
     models += [model(first.trials[0], second.trials[0], at=first.memories) for first, second in pairs]
@@ -511,12 +509,6 @@ def _without(e: LevelEvidence, first: _Model) -> LevelEvidence:
     moved = predicted - e.predicted_db
     others = {name: level + moved for name, level in e.other_towers_db.items()}
     return dataclasses.replace(e, predicted_db=predicted, other_towers_db=others)
-
-
-def _share_of_error(shown: Sequence[_Models], before: Set[str], after: Set[str]) -> float:
-    """Return the ratio of the RMSE with the faults ``after`` to the RMSE with the faults ``before``."""
-    rmse, known = (_rmse_db([_best(table, faults) for table in shown]) for faults in (after, before))
-    return rmse / known if known else 1.0
 
 
 def _rmse_db(models: Sequence[_Model]) -> float:
@@ -684,20 +676,22 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
         lag = e.clock.radio_minus_telemetry_s
         late = np.interp(e.time_s - lag, e.time_s, e.predicted_db)
         yield Trial(
-            name="clock", cost=0.0, sentence=f"the radio clock is {e.clock.in_words}", next_step="`rss: {lag: apply}`",
+            name="clock", sentence=f"the radio clock is {e.clock.in_words}", next_step="`rss: {lag: apply}`",
             change_db=late - e.predicted_db, estimate=(lag, *e.clock.ci95_s),
         )  # fmt: skip
         yield from _drifting(e)
         return
     yield from _drifting(e)
-    # a lag outside the tested range, or hidden by another fault, must not be attributed to other causes
-    levels = np.array([np.interp(e.time_s - lag, e.time_s, e.predicted_db) for lag in _LAGS_S])
-    nearer = _nearer(e, levels)
-    if not nearer.any():
-        return
-    gain = np.where(nearer, _likelihoods(e, levels), -np.inf)
-    cost, change_db = _concentration(gain, np.ones(len(gain))), levels[gain.argmax()] - e.predicted_db
-    yield Trial(name=_UNNAMED, cost=cost, sentence="", next_step="", change_db=change_db)
+    # levels of another time, or in reverse order, must not be attributed to other causes
+    since, length = e.time_s - e.time_s[0], max(float(np.ptp(e.time_s)), 1e-9)
+    backwards = np.interp(length - since, since, e.predicted_db)
+    if _nearer(e, backwards):
+        yield Trial(cost=_RARE, change_db=backwards - e.predicted_db)
+    lags = [*_LAGS_S, *np.arange(_LAGS_S[-1], length + _LAGS_S[0], 2.0 * _LAG_STEP_S)]
+    levels = np.array([np.interp((since - lag) % length, since, e.predicted_db) for lag in lags])
+    if (nearer := _nearer(e, levels)).any():
+        best, cost = _likeliest(e, levels, possible=nearer)
+        yield Trial(cost=cost, change_db=levels[best] - e.predicted_db)
 
 
 def _drifting(e: LevelEvidence) -> Iterator[Trial]:
@@ -711,13 +705,12 @@ def _drifting(e: LevelEvidence) -> Iterator[Trial]:
         return
     lags = [rate * (e.time_s - middle + (0.5 - begin) * length) for rate, begin in pairs]
     levels = np.array([np.interp(e.time_s - lag, e.time_s, e.predicted_db) for lag in lags])
-    gain = np.where(_nearer(e, levels), _likelihoods(e, levels), -np.inf)
-    if not np.isfinite(gain).any():
+    if not (nearer := _nearer(e, levels)).any():
         return
-    best = int(gain.argmax())
+    best, cost = _likeliest(e, levels, possible=nearer)
     rate = pairs[best][0]
     yield Trial(
-        name="clock", cost=_RARE + _concentration(gain, np.ones(len(gain))), change_db=levels[best] - e.predicted_db,
+        name="clock", cost=_RARE + cost, change_db=levels[best] - e.predicted_db,
         sentence=f"the radio clock {'gains' if rate > 0 else 'loses'} {Printed(100.0 * abs(rate)):.1f} % "
         f"({abs(rate) * length:.0f} s in {length:.0f} s)",
         next_step="synchronise both clocks by GPS or NTP", estimate=(rate * length, math.nan, math.nan),
@@ -730,11 +723,17 @@ _RATES = tuple(sign * rate for rate in (0.0025, 0.004, 0.006, 0.008, 0.01, 0.015
 _LEAST_DRIFT_S, _MOST_DRIFT_S, _RIGHT_AT = 3.0, 60.0, (0.0, 0.25, 0.5)
 
 
-def _likelihoods(e: LevelEvidence, levels_db: FloatArray) -> FloatArray:
-    """Return the log likelihood of levels (m, n) under noise of a usual correlation: a quick search."""
+def _likeliest(
+    e: LevelEvidence, levels_db: FloatArray, *, weight: AnyArray | float = 1.0, possible: BoolArray | bool = True
+) -> tuple[int, float]:
+    """Return the index of the likeliest of levels (m, n) under noise of a usual correlation, and the search's cost.
+
+    The prior probability of each level is proportional to ``weight``. Levels that are not ``possible`` are not chosen.
+    """
     error = e.measured_db - levels_db
     left = error[:, 1:] - _SEARCHED_PHI[1] * error[:, :-1]
-    return np.asarray(-0.5 * left.shape[1] * np.log(left.var(axis=1) + LEAST_VARIANCE))
+    gain = np.where(possible, -0.5 * left.shape[1] * np.log(left.var(axis=1) + LEAST_VARIANCE), -np.inf)
+    return int(gain.argmax()), _concentration(gain, weight * np.ones(len(gain)))
 
 
 def _nearer(e: LevelEvidence, level_db: FloatArray) -> BoolArray:
@@ -743,8 +742,9 @@ def _nearer(e: LevelEvidence, level_db: FloatArray) -> BoolArray:
     return np.asarray((e.measured_db - level_db).std(axis=-1) <= (1.0 - _LEAST_SHARE) * error_db)
 
 
-# Name of alternatives that are not named as causes, and lags of a clock without a test result.
-_UNNAMED, _LAGS_S = "", np.arange(-60.0, 61.0, 2.0)
+# Lags of a clock without a test result. Longer lags are rarer.
+_LAG_STEP_S = 2.0
+_LAGS_S = np.arange(-60.0, 61.0, _LAG_STEP_S)
 
 
 def _profiled(e: LevelEvidence, trials: Mapping[float, Trial], at: Memories = START) -> Trial:
@@ -831,7 +831,7 @@ def _height(e: LevelEvidence) -> Iterator[Trial]:
 
     def raised(rise: float, change: FloatArray) -> Trial:
         return Trial(
-            name="height", cost=0.0, change_db=change,
+            name="height", change_db=change,
             sentence=f"the UAV flew about {abs(rise):.0f} m {'higher' if rise > 0 else 'lower'} than the log says",
             next_step="check the telemetry's height datum",
         )  # fmt: skip
@@ -840,10 +840,9 @@ def _height(e: LevelEvidence) -> Iterator[Trial]:
         return
     yield _tuned(e, e.raised_db, raised)
     changes = _growing(e)
-    gain = _likelihoods(e, e.predicted_db + changes)
-    best = int(gain.argmax())
+    best, cost = _likeliest(e, e.predicted_db + changes)
     yield Trial(
-        name="height", cost=_RARE + _concentration(gain, np.ones(len(gain))), change_db=changes[best],
+        name="height", cost=_RARE + cost, change_db=changes[best],
         sentence=f"the logged height drifts by about {-_DRIFTS_M[best]:+.0f} m until the end of the flight",
         next_step="check the barometer, or log the height of the GNSS", estimate=(_DRIFTS_M[best], math.nan, math.nan),
     )  # fmt: skip
@@ -890,12 +889,11 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     table = np.array([[e.displaced_db[radius, azimuth] for azimuth in azimuths] for radius in radii])
     # the radii grow by a factor: each is weighted by its area, and far places are unlikely
     weight = np.repeat(radii**2 * (1.0 + (radii / _NEAR_PLACE_M) ** 2) ** -1.5, len(azimuths))
-    gain = _likelihoods(e, e.predicted_db + table.reshape(len(weight), -1))
-    cost = _concentration(gain, weight)
-    i, j = np.unravel_index(int(gain.argmax()), table.shape[:2])
+    coarse, cost = _likeliest(e, e.predicted_db + table.reshape(len(weight), -1), weight=weight)
+    i, j = np.unravel_index(coarse, table.shape[:2])
     fine = [(i + r, j + a) for r in _FINER for a in _FINER if 0 <= i + r <= len(radii) - 1]
     changes = np.array([_between(table, at, around) for at, around in fine])
-    best = int(_likelihoods(e, e.predicted_db + changes).argmax())
+    best, _ = _likeliest(e, e.predicted_db + changes)
     at, around = fine[best]
     radius = float(np.exp(np.interp(at, np.arange(len(radii)), np.log(radii))))
     azimuth = (around * 360.0 / len(azimuths)) % 360.0
@@ -923,9 +921,9 @@ _SIDES = ("north", "north-east", "east", "south-east", "south", "south-west", "w
 
 def _channels(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the log of the other channel of the tower."""
-    if e.swapped_db is not None:
+    if e.swapped_db is not None and e.swapped_db.std() > SHOWN_DB:
         yield Trial(
-            name="channels", cost=0.0, sentence="the channels of the tower are swapped", change_db=e.swapped_db,
+            name="channels", sentence="the channels of the tower are swapped", change_db=e.swapped_db,
             next_step="check the cables, or swap the channels in the flight file",
         )  # fmt: skip
 
@@ -963,7 +961,7 @@ def _pattern(e: LevelEvidence) -> Iterator[Trial]:
         columns.append(np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1))
     sentence, step = _PATTERN[e.antenna]
     yield Trial(
-        name=_CATCH_ALL, cost=0.0, sentence=sentence, next_step=step, columns=np.column_stack(columns),
+        name=_CATCH_ALL, sentence=sentence, next_step=step, columns=np.column_stack(columns),
     )  # fmt: skip
 
 
@@ -977,7 +975,7 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a level that changes with the serving cell."""
     if e.serving is not None and np.ptp(e.serving) > 0.5:
         yield Trial(
-            name="cell", cost=0.0, sentence="the level steps where the phone changes its cell",
+            name="cell", sentence="the level steps where the phone changes its cell",
             next_step="compare the cells apart", columns=_STEP_DB * e.serving[:, None],
         )  # fmt: skip
 
@@ -992,7 +990,7 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     elevation = _GAIN_DB * np.column_stack([up, up**2, up**3])
     rivals = [_SLOPE * e.predicted_db[:, None], elevation]
     rivals += [] if e.distance_db is None else [_SLOPE * e.distance_db[:, None]]
-    others = [Trial(name=_UNNAMED, cost=0.0, sentence="", next_step="", columns=columns) for columns in rivals]
+    others = [Trial(columns=columns) for columns in rivals]
     for factor, words in ((0.5, "half"), (2.0, "twice")):
         trial = Trial(
             name="decibels", cost=2.0 * _RARE + math.log(2.0), change_db=(factor - 1.0) * e.predicted_db,
@@ -1024,8 +1022,7 @@ def _is_slope(e: LevelEvidence, factor: float, at: Memories) -> bool:
     step = factor * (_SLOPE_SHARE if e.learned is None else _LEARNED_SLOPE_SHARE)[factor]
 
     def likelihood(slope: float) -> float:
-        change = Trial(name="", cost=0.0, sentence="", next_step="", change_db=(slope - 1.0) * e.predicted_db)
-        return _fitted(e, change, at=at, climb=False).log_likelihood
+        return _fitted(e, Trial(change_db=(slope - 1.0) * e.predicted_db), at=at, climb=False).log_likelihood
 
     # the log likelihood is a parabola in the slope
     below, middle, above = (likelihood(factor + i * step) for i in (-1, 0, 1))
@@ -1061,7 +1058,7 @@ def _lock(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the noise that the receiver writes without lock, by the quality in the log."""
     if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
         yield Trial(
-            name="lock", cost=0.0, clipped=lost,
+            name="lock", clipped=lost,
             sentence="the receiver had no lock in parts of the flight",  # the cautions count the samples
             next_step="",  # the first sentence has the error with the floor already
         )  # fmt: skip
@@ -1074,7 +1071,7 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
         # means over seconds spread less than samples
         top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
         yield Trial(
-            name="no detection", cost=0.0, clipped=e.least, estimate=(level, level, level),
+            name="no detection", clipped=e.least, estimate=(level, level, level),
             sentence=f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: not detected",
             next_step=f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` in this `logs:` line",
         )  # fmt: skip
@@ -1125,7 +1122,11 @@ def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
     inside, outside = pile[1:] & pile[:-1], ~(pile[1:] | pile[:-1])
     if inside.sum() < max(_LEAST_BINS, _LEAST_CLIPPED * len(pile)) or outside.sum() < _LEAST_BINS:
         return None
-    return pile if np.median(step[inside]) < _MOST_FADING * np.median(step[outside]) else None
+    # interference at one power is not a limit: without the limit, the link would be at it or beyond
+    error = e.measured_db - e.predicted_db
+    missing = side * float(np.median(error[pile]) - np.median(error[~pile]))
+    limited = np.median(step[inside]) < _MOST_FADING * np.median(step[outside]) and missing > -_BEYOND_DB
+    return pile if limited else None
 
 
 def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
@@ -1135,7 +1136,7 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     name, words, step = _LIMITS[side]
     sentence = words.format(level=f"{Printed(limit):.0f} {e.unit}")
     next_step = step.format(typed=f"{limit + _OVER_FLOOR_DB:.0f}")
-    return Trial(name=name, cost=0.0, sentence=sentence, next_step=next_step)
+    return Trial(name=name, sentence=sentence, next_step=next_step)
 
 
 def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
@@ -1238,7 +1239,7 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     masks = (np.arange(n)[None, :] >= starts[:, None]).astype(np.float64)
     # a creeping gain is not a step, and has no name
     creep = _STEP_DB * (np.arange(n) / n)[:, None]
-    yield Trial(name=_UNNAMED, cost=0.0, sentence="", next_step="", columns=creep)
+    yield Trial(columns=creep)
     for phi in _SEARCHED_PHI:
         shift, error, gain = _shift(residual, masks, phi)
         at = int(np.argmax(gain))

@@ -9,6 +9,7 @@ function that computes it. Both metrics.json and the tables of the report list t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, db_from_amplitude
-from .causes import Cause
 from .gains import StatedSpread
 from .ladder import LadderRow, ModelRow
 from .level import (
@@ -73,6 +73,38 @@ class ClockResult:
         ends = "[{:+.2f}, {:+.2f}]".format(*map(Printed, self.ci95_s))
         side = "ahead of" if self.radio_minus_telemetry_s > 0 else "behind"
         return f"{abs(self.radio_minus_telemetry_s):.2f} s {side} the telemetry clock {ends}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cause:
+    """A named cause.
+
+    Parameters
+    ----------
+    name : str
+    sentence : str
+        Channels, numbers, and the RMSE without and with the cause.
+    next_step : str
+        A clause.
+    estimate, ci95 : float, (low, high)
+        Number of the cause (lag [s], angle [deg], height [m], loss, floor or step [dB]; else NaN) and its interval.
+    channels : sequence of str
+        Channels that show the cause.
+    rmse_db, rmse_with_db : float
+        RMSE of 1-s means of these channels without and with the cause [dB].
+    gain : float
+        Log odds of the explanations with the cause to all without it.
+    """
+
+    name: str
+    sentence: str
+    next_step: str
+    estimate: float = math.nan
+    ci95: Interval = (math.nan, math.nan)
+    channels: tuple[str, ...] = ()
+    rmse_db: float = math.nan
+    rmse_with_db: float = math.nan
+    gain: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,9 +28,9 @@ from ..common.stages import PlannedStage, Stages
 from ..common.text import counted
 from ..common.units import FloatArray
 from ..common.yamlfile import KeyPath, edited, parse_yaml
-from ..compare.causes import OF_DIRECTION, Cause
+from ..compare.causes import OF_DIRECTION
 from ..compare.ladder import Ladder, Rung, climb, model_rows, series_rows
-from ..compare.result import BASELINE_TITLE, FlightResult
+from ..compare.result import BASELINE_TITLE, Cause, FlightResult
 from ..compare.statistics import pooled_difference
 from ..compare.verdict import is_one_place
 from ..flight.data import FlightData, RssSeries, choose_site

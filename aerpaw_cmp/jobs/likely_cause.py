@@ -16,14 +16,13 @@ from ..compare import level as rss
 from ..compare.causes import (
     OF_DIRECTION,
     SHOWN_DB,
-    Cause,
     LevelEvidence,
     fall_without_lag_db,
     flight_cause,
     gains_by_direction,
 )
 from ..compare.gains import turned
-from ..compare.result import RssResult
+from ..compare.result import Cause, RssResult
 from ..compare.verdict import lock_lost, pooled_db, without_copies
 from ..flight.data import FlightData, RssSeries, Times
 from ..flight.gains import mean_gain_db
@@ -226,7 +225,7 @@ def _evidence(
     track = None if replayed.track is None else replayed.track.pick(some)
     thin = dataclasses.replace(replayed, poses=replayed.poses[some], track=track)
     link = _Direct(data.site, series.tower, thin, rotations)
-    known_db, known_both_db = link.level_db, link.level_of_both_db
+    known_db, known_both_db = link.level(), link.level(tower=True)
     time_s = rss.seconds(series.time)
     order = np.argsort(time_s, kind="stable")
 
@@ -295,45 +294,36 @@ class _Direct:
 
     @property
     def place_m(self) -> FloatArray:
+        """Position of the tower, (1, 3) or (m, 3) [m]."""
         return self.replayed.source_m(self.site)
 
     @property
-    def level_db(self) -> FloatArray:
-        return self._level(self.place_m, self.replayed.poses.position_m, self.replayed.poses.rotation)
-
-    @property
-    def level_of_both_db(self) -> FloatArray:
-        """Level with the gain of the tower's antenna, which changes where the direction from the tower does."""
-        return self._level(self.place_m, self.replayed.poses.position_m, self.replayed.poses.rotation, tower=True)
+    def _has_pattern(self) -> bool:
+        return not all(isinstance(pattern, Isotropic) for pattern in self.replayed.link.uav_array.patterns)
 
     def turned_db(self) -> dict[float, FloatArray]:
         """Return levels with a greater heading, or nothing for isotropic antennas."""
-        if not self._has_pattern:
-            return {}
-        place_m, poses = self.place_m, self.replayed.poses
+        rotation = self.replayed.poses.rotation
         # a heading grows clockwise, the angle of a mount the other way
-        turns = {angle: turned(-angle) @ poses.rotation for angle in _ANGLES_DEG}
-        return {angle: self._level(place_m, poses.position_m, rotation) for angle, rotation in turns.items()}
+        angles = _ANGLES_DEG if self._has_pattern else ()
+        return {angle: self.level(rotation=turned(-angle) @ rotation) for angle in angles}
 
     def raised_db(self) -> dict[float, FloatArray]:
         """Return levels with the UAV at other heights above the ground."""
-        poses, levels = self.replayed.poses, {}
-        for rise in _RISES_M:
-            place = poses.position_m + np.array([0.0, 0.0, rise])
-            if len(place) and place[:, 2].min() > -_BELOW_GROUND_M:
-                levels[rise] = self._level(self.place_m, place, poses.rotation, tower=True)
-        return levels
+        positions = {rise: self.replayed.poses.position_m + np.array([0.0, 0.0, rise]) for rise in _RISES_M}
+        return {
+            rise: self.level(position_m=position_m, tower=True)
+            for rise, position_m in positions.items()
+            if len(position_m) and position_m[:, 2].min() > -_BELOW_GROUND_M
+        }
 
     def attitude_db(self, used: str) -> dict[str, FloatArray]:
         """Return levels with another use of the logged attitude."""
-        track, poses = self.replayed.track, self.replayed.poses
+        track = self.replayed.track
         if track is None or not self._has_pattern or not track.attitude_known.any():
             return {}
-        return {
-            mode: self._level(self.place_m, poses.position_m, attitude_rotation(track, mode))
-            for mode in ("logged", "ignored")
-            if mode != used
-        }
+        modes = {"logged", "ignored"} - {used}
+        return {mode: self.level(rotation=attitude_rotation(track, mode)) for mode in sorted(modes, reverse=True)}
 
     @property
     def distance_db(self) -> FloatArray:
@@ -358,23 +348,21 @@ class _Direct:
         for radius, azimuth in product(_RADII_M, _AZIMUTHS_DEG):
             turn = math.radians(azimuth)
             place_m = self.place_m + radius * np.array([math.sin(turn), math.cos(turn), 0.0])
-            change = self._level(place_m, position_m, rotation, tower=True) - known_db[at]
+            change = self.level(place_m=place_m, position_m=position_m, rotation=rotation, tower=True) - known_db[at]
             levels[radius, azimuth] = known_db + np.interp(np.arange(n), at, change)
         return levels
 
     def misread_db(self, data: FlightData, time: Times, *, scaled: bool = True) -> dict[str, FloatArray]:
         """Return levels with telemetry that means something else, at the instants of the poses (m,)."""
-        poses, track, used = self.replayed.poses, self.replayed.track, data.settings.rt.attitude
+        position_m, track, used = self.replayed.poses.position_m, self.replayed.track, data.settings.rt.attitude
         if data.track is None or track is None:
             return {}
-        ground_m, levels = data.track.ground_m, {}
-        mirrored_m = poses.position_m.copy()
         begin_m = data.track.pose_at(np.array([data.track.start_ns], dtype="datetime64[ns]")).position_m[0, :2]
-        mirrored_m[:, :2] = begin_m + (mirrored_m[:, :2] - begin_m)[:, ::-1]
-        levels[_MIRRORED] = self._level(self.place_m, mirrored_m, poses.rotation, tower=True)
+        ground_m = np.array([0.0, 0.0, data.track.ground_m])
+        positions = {_MIRRORED: np.column_stack([begin_m + (position_m[:, :2] - begin_m)[:, ::-1], position_m[:, 2]])}
         for meaning, scale in _HEIGHTS.items() if scaled else ():
-            place = np.column_stack([poses.position_m[:, :2], ground_m + scale * (poses.position_m[:, 2] - ground_m)])
-            levels[meaning] = self._level(self.place_m, place, poses.rotation, tower=True)
+            positions[meaning] = ground_m + (position_m - ground_m) * [1.0, 1.0, scale]
+        levels = {meaning: self.level(position_m=moved_m, tower=True) for meaning, moved_m in positions.items()}
         if used != "ignored" and self._has_pattern and track.attitude_known.any():
             for meaning in MISREAD:
                 # the channels of a tower have the same times
@@ -382,21 +370,13 @@ class _Direct:
                 if key not in self.rotations:
                     self.rotations[key] = data.track.rotations_if(meaning, time)
                 rotation = attitude_rotation(dataclasses.replace(track, rotation=self.rotations[key]), used)
-                levels[meaning] = self._level(self.place_m, poses.position_m, rotation, tower=True)
+                levels[meaning] = self.level(rotation=rotation, tower=True)
         return levels
 
     def other_towers_db(self) -> dict[str, FloatArray]:
         """Return levels from each other tower of the site."""
-        poses = self.replayed.poses
-        return {
-            name: self._level(neighbour.position_m[None, :], poses.position_m, poses.rotation)
-            for name, neighbour in self.site.towers.items()
-            if name != self.tower
-        }
-
-    @property
-    def _has_pattern(self) -> bool:
-        return not all(isinstance(pattern, Isotropic) for pattern in self.replayed.link.uav_array.patterns)
+        towers = self.site.towers.items()
+        return {name: self.level(place_m=of.position_m[None, :]) for name, of in towers if name != self.tower}
 
     def directions(self, place_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> dict[str, FloatArray]:
         """Return the directions between a place and the UAV, in the frames of both antennas."""
@@ -404,11 +384,22 @@ class _Direct:
         mounts = {"uav_mount": self.replayed.link.uav_array.mount, "tower_mount": tower_array.mount}
         return rss.link_geometry(place_m, position_m, rotation, **mounts)
 
-    def _level(
-        self, place_m: FloatArray, position_m: FloatArray, rotation: FloatArray, *, tower: bool = False
+    def level(
+        self,
+        *,
+        place_m: FloatArray | None = None,
+        position_m: FloatArray | None = None,
+        rotation: FloatArray | None = None,
+        tower: bool = False,
     ) -> FloatArray:
-        """Return free space and the mean gain of the UAV's antenna [dB], with ``tower`` also of the tower's."""
-        link, at = self.replayed.link, self.directions(place_m, position_m, rotation)
+        """Return free space and the mean gain of the UAV's antenna [dB] with the tower, UAV or attitude elsewhere.
+
+        ``tower`` adds the gain of the tower's antenna, which changes where the direction from the tower does.
+        """
+        link, poses = self.replayed.link, self.replayed.poses
+        place_m = self.place_m if place_m is None else place_m
+        position_m = poses.position_m if position_m is None else position_m
+        at = self.directions(place_m, position_m, poses.rotation if rotation is None else rotation)
         (tower_array,) = link.tower_arrays.values()
         level_db = free_space_dbm(place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0]
         for end, array in (("uav", link.uav_array), ("tower", tower_array))[: 1 + tower]:

@@ -16,8 +16,7 @@ import numpy as np
 from ..common.text import counted
 from ..common.units import AnyArray, FloatArray, IntArray
 from ..common.versions import utc_now, versions
-from ..compare.causes import Cause
-from ..compare.result import APPLIED, NOT_APPLIED, ClockResult, FlightResult, RankResult, RssResult
+from ..compare.result import APPLIED, NOT_APPLIED, Cause, ClockResult, FlightResult, RankResult, RssResult
 from ..flight.gains import antennas_used
 from ..logs.records import RejectedLine
 from ..site.site import Site

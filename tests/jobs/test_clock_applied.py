@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.causes import Cause
-from aerpaw_cmp.compare.result import ESTIMATED, FlightResult
+from aerpaw_cmp.compare.result import ESTIMATED, Cause, FlightResult
 from aerpaw_cmp.flight.clock import ClockEstimate
 from aerpaw_cmp.flight.replay import _clock_of, telemetry_time
 from aerpaw_cmp.report.flight import clock_metrics

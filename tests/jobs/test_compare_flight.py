@@ -14,9 +14,8 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import noise_floor_dbm
-from aerpaw_cmp.compare.causes import Cause
 from aerpaw_cmp.compare.gains import NO_SPREAD, StatedSpread
-from aerpaw_cmp.compare.result import RssResult
+from aerpaw_cmp.compare.result import Cause, RssResult
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.gains import foliage_notes
 from aerpaw_cmp.flight.replay import replay_rank, replay_rss
@@ -46,8 +45,8 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
         (False, None, 0.4, False),
         (True, None, 0.4, None),  # nothing is asked after an error below 1 dB
     ):
-        late = SimpleNamespace(name="LW1 A", clock=SimpleNamespace(shifted=shifted, in_words="0.40 s ahead"))
-        right = SimpleNamespace(name="LW2 A", clock=SimpleNamespace(shifted=False))
+        late = SimpleNamespace(name="LW1 A", antenna="", clock=SimpleNamespace(shifted=shifted, in_words="0.40 s ahead"))
+        right = SimpleNamespace(name="LW2 A", antenna="", clock=SimpleNamespace(shifted=False))
         named = None if other is None else Cause(name=other, sentence="", next_step="")
         monkeypatch.setattr(likely_cause, "flight_cause", lambda _, named=named: named)
         monkeypatch.setattr(likely_cause, "fall_without_lag_db", lambda _, fall_db=fall_db: fall_db)

@@ -12,7 +12,7 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.yamlfile import edited
-from aerpaw_cmp.compare.causes import Cause
+from aerpaw_cmp.compare.result import Cause
 from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.drafting.proposals import offered

@@ -22,7 +22,7 @@ from ..compare.verdict import NodeOffset, Step, Verdict, campaign_verdict, poole
 from ..site.site import Site
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, settings_card
 from .charts import Chart
-from .flight_words import first_sentence, judge, pretty, ranking_sentence, said_of
+from .flight_words import first_sentence, pretty, ranking_sentence, said_of
 from .page import Made, about, json_text, write_file
 from .places import RESIDUAL, Places, payload
 from .texts import interval, k_key, minute, more, number
@@ -494,7 +494,7 @@ def verdict(data: CampaignData) -> list[str]:
     scored = [(row.rmse_db, row.n) for row in rows]
     known = {name: [row.baselines.get(name, np.nan) for row in rows] for row in rows for name in row.baselines}
     errors = {name: pooled_db(each, [row.n for row in rows]) for name, each in known.items() if np.isfinite(each).all()}
-    out = [first_sentence(judge(scored, errors, [row.verdicts for row in rows], "flights x channels"))]
+    out = [first_sentence(scored, errors, [row.verdicts for row in rows], "flights x channels")]
     held_out = [row.held_out_rmse_db for row in rows if np.isfinite(row.held_out_rmse_db)]
     mean_own = float(np.mean([row.rmse_db for row in rows]))
     if held_out:

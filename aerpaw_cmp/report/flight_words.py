@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -38,6 +39,7 @@ def said_of(verdict: Verdict, table: Mapping[str, tuple[str, str]], **facts: Any
     return f"{text} Next: {action}." if action else text
 
 
+NO_INTERVAL = "no interval"
 # Name of the model with the settings of the flight file.
 AS_SET = "as set in flight.yaml"
 
@@ -104,66 +106,66 @@ def headline(data: ReportData) -> str:
 # --- summary -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Judged:
-    """The comparison of ray tracing with one baseline: pooled RMSE [dB], and numbers of channels.
-
-    ``judged`` channels have an interval. It excludes zero on ``better`` and on ``worse`` of them.
-    """
-
-    ray_db: float
-    channels: int
-    name: str = ""
-    other_db: float = math.nan
-    judged: int = 0
-    better: int = 0
-    worse: int = 0
-    unit: str = "channels"
-
-
-# Sentences after the two errors; the first whose condition is true is used. Only they contain "better" and "worse".
-SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
-    (lambda f: not f.name, "No baseline could be scored."),
-    (lambda f: not f.judged, "The flight is too short to distinguish them."),
-    (lambda f: f.better > 0 and f.worse > 0,
-     "Ray tracing is significantly better on {better} and worse{of} (95 %)."),
-    (lambda f: f.worse > 0, "Ray tracing is significantly worse{of} (95 %)."),
-    (lambda f: f.better > 0, "Ray tracing is significantly better{of} (95 %)."),
-    (bool, "The difference is not significant{of} (95 %)."),
-)  # fmt: skip
-
-# Sentences about a ranking of settings, by the verdicts of the intervals of all settings but the first.
-RANKING: tuple[tuple[Callable[[set[str]], bool], str], ...] = (
-    (lambda said: said == {"no interval"}, "Too few flights for an interval of the difference to another setting."),
-    (lambda said: said == {"worse"}, "Every other setting is significantly worse (95 %)."),
-    (bool, "Not significantly worse (95 %): {named}."),
-)
-
-
 def ranking_sentence(verdicts: Mapping[str, str], most: int) -> str:
-    """Return the sentence about the settings that are not significantly worse. At most ``most`` are named."""
+    """Return the sentence about the settings that are not significantly worse than the best one.
+
+    ``verdicts`` has the verdict of the paired interval of each other setting. At most ``most`` settings are named.
+    """
+    if set(verdicts.values()) == {NO_INTERVAL}:
+        return "Too few flights for an interval of the difference to another setting."
     alike = [name for name, word in verdicts.items() if word != "worse"]
+    if not alike:
+        return "Every other setting is significantly worse (95 %)."
     named = ", ".join(alike[:most]) + (f" and {len(alike) - most} more" if len(alike) > most else "")
-    return next(text for holds, text in RANKING if holds(set(verdicts.values()))).format(named=named)
+    return f"Not significantly worse (95 %): {named}."
 
 
 NOTHING_COMPARED = "Nothing could be compared: no sample has a measurement, a pose and a path."
 TOO_FEW_COMPARED = "Nothing could be compared: no channel has 20 samples with measurement, pose and path (at most {n})."
 
 
-def first_sentence(facts: Judged) -> str:
-    """Return the sentence with two errors and the verdict of the paired intervals.
+def first_sentence(
+    scored: Sequence[tuple[float, int]],
+    baselines_db: Mapping[str, float],
+    verdicts: Sequence[Mapping[str, str]],
+    unit: str = "channels",
+) -> str:
+    """Return the sentence with the error of ray tracing, that of one baseline, and the verdict of the paired intervals.
+
+    The baseline is the best one that is better than ray tracing, or otherwise the best one.
+
+    Parameters
+    ----------
+    scored : sequence of (float, int)
+        RMSE [dB] and samples of each series.
+    baselines_db : mapping of str to float
+        Pooled RMSE of each baseline that all series have [dB].
+    verdicts : sequence of mapping
+        Verdict of the paired interval of each series, by baseline.
+    unit : str
+        Plural name of a series.
 
     Examples
     --------
-    >>> first_sentence(Judged(ray_db=6.72, channels=2, name="free_space", other_db=6.0, judged=2))
+    >>> first_sentence([(6.72, 9), (6.72, 9)], {"free_space": 6.0}, [{"free_space": "not significant"}] * 2)
     'Ray tracing: RMSE 6.7 dB; free space: 6.0 dB. The difference is not significant on any of 2 channels (95 %).'
     """
-    baseline = f"; {pretty(facts.name)}: {facts.other_db:.1f} dB" if facts.name else ""
-    text = next(text for holds, text in SIGNIFICANCE if holds(facts))
-    of = f" on {facts.worse or facts.better or 'any'} of {facts.channels} {facts.unit}"
-    significance = text.format(better=facts.better, of="" if facts.channels == 1 else of)
-    return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{baseline}. {significance}"
+    error = f"Ray tracing: RMSE {pooled_db(*map(list, zip(*scored, strict=True))):.1f} dB"
+    if not baselines_db:
+        return f"{error}. No baseline could be scored."
+    counts = {name: Counter(row.get(name, NO_INTERVAL) for row in verdicts) for name in baselines_db}
+    lost = [name for name, of in counts.items() if of["worse"] > of["better"]]
+    name = min(lost or baselines_db, key=lambda baseline: baselines_db[baseline])
+    better, worse, undecided = (counts[name][verdict] for verdict in ("better", "worse", NO_INTERVAL))
+    of = "" if len(scored) == 1 else f" on {worse or better or 'any'} of {len(scored)} {unit}"
+    if undecided == len(verdicts):
+        significance = "The flight is too short to distinguish them."
+    elif not better and not worse:
+        significance = f"The difference is not significant{of} (95 %)."
+    else:
+        side = f"better on {better} and worse" if better and worse else "better" if better else "worse"
+        significance = f"Ray tracing is significantly {side}{of} (95 %)."
+    return f"{error}; {pretty(name)}: {baselines_db[name]:.1f} dB. {significance}"
 
 
 # Sentences by the verdict over all channels, with error, best baseline and interval.
@@ -527,9 +529,6 @@ def offset_sentences(panels: Sequence[RssResult]) -> list[str]:
     ]  # fmt: skip
 
 
-NO_INTERVAL = "no interval"
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Headline:
     """One number of the first screen, with its label, interval and reference."""
@@ -615,44 +614,6 @@ def _baseline_sentence(panels: Sequence[RssResult]) -> str:
 def _pooled(panels: Sequence[RssResult]) -> float:
     """Return the RMSE of ray tracing over all samples of several series [dB]."""
     return pooled_db([p.score.rmse_db for p in panels], [p.score.n for p in panels])
-
-
-def judge(
-    scored: Sequence[tuple[float, int]],
-    baselines_db: Mapping[str, float],
-    verdicts: Sequence[Mapping[str, str]],
-    unit: str = "channels",
-) -> Judged:
-    """Compare ray tracing with the best baseline that is better than it, or otherwise with the best baseline.
-
-    Parameters
-    ----------
-    scored : sequence of (float, int)
-        RMSE [dB] and samples of each series.
-    baselines_db : mapping of str to float
-        Pooled RMSE of each baseline that all series have [dB].
-    verdicts : sequence of mapping
-        Verdict of the paired interval of each series, by baseline.
-    unit : str
-        Plural name of a series.
-
-    Returns
-    -------
-    Judged
-    """
-    total, count_of = pooled_db(*map(list, zip(*scored, strict=True))), len(scored)
-    every = []
-    for name, error in baselines_db.items():
-        decided = [row[name] for row in verdicts if row.get(name, "no interval") != "no interval"]
-        every.append(Judged(ray_db=total, channels=count_of, name=name, other_db=error, judged=len(decided),
-                            better=decided.count("better"), worse=decided.count("worse"), unit=unit))  # fmt: skip
-    return _most_telling(every) if every else Judged(ray_db=total, channels=count_of, unit=unit)
-
-
-def _most_telling(every: Sequence[Judged]) -> Judged:
-    """Return the comparison with the best baseline that is better than ray tracing, or with the best baseline."""
-    lost = [entry for entry in every if entry.worse > entry.better]
-    return min(lost or every, key=lambda comparison: comparison.other_db)
 
 
 def _forecast_of(panel: RankResult) -> ForecastScore | None:

@@ -45,7 +45,9 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
         (False, None, 0.4, False),
         (True, None, 0.4, None),  # nothing is asked after an error below 1 dB
     ):
-        late = SimpleNamespace(name="LW1 A", antenna="", clock=SimpleNamespace(shifted=shifted, in_words="0.40 s ahead"))
+        late = SimpleNamespace(
+            name="LW1 A", antenna="", clock=SimpleNamespace(shifted=shifted, in_words="0.40 s ahead")
+        )
         right = SimpleNamespace(name="LW2 A", antenna="", clock=SimpleNamespace(shifted=False))
         named = None if other is None else Cause(name=other, sentence="", next_step="")
         monkeypatch.setattr(likely_cause, "flight_cause", lambda _, named=named: named)

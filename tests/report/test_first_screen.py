@@ -6,11 +6,11 @@ import itertools
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.causes import MOST_CAUSE_WORDS, Cause
+from aerpaw_cmp.compare.causes import MOST_CAUSE_WORDS
 from aerpaw_cmp.compare.ladder import ModelRow
 from aerpaw_cmp.compare.level import DetectionScore, FieldAudit, floored_fit
 from aerpaw_cmp.compare.receiver import score_forecast
-from aerpaw_cmp.compare.result import FlightVerdict
+from aerpaw_cmp.compare.result import Cause, FlightVerdict
 from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.compare.verdict import (
     baseline_errors,
@@ -29,7 +29,6 @@ from aerpaw_cmp.report.flight_words import (
     OFFSETS,
     ONE_PLACE,
     TWO_LEVELS,
-    Judged,
     cautions,
     expected_sentence,
     first_sentence,
@@ -134,10 +133,8 @@ def test_no_sentence_contradicts_its_numbers(better, worse, channels):
     """Every combination of counts: "better" and "worse" stand only where an interval says so."""
     if better + worse > channels:
         return
-    facts = Judged(
-        ray_db=6.0, channels=channels, name="constant", other_db=5.0, judged=channels, better=better, worse=worse
-    )
-    said = first_sentence(facts)
+    verdicts = ["better"] * better + ["worse"] * worse + ["not significant"] * (channels - better - worse)
+    said = first_sentence([(6.0, 9)] * channels, {"constant": 5.0}, [{"constant": verdict} for verdict in verdicts])
     assert ("better" in said) == (better > 0)
     assert ("worse" in said) == (worse > 0)
     assert ("not significant" in said) == (better + worse == 0)

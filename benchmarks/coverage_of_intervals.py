@@ -1,22 +1,24 @@
-"""How often the stated 95 % intervals hold the truth, and how often a pooled verdict is false, on simulated flights.
+"""Coverage of the stated 95 % intervals and share of false pooled verdicts, on simulated flights.
 
-Each flight has shadowing of one kind: over time, rough (AR(1)) or smooth (AR(2)), with white noise, heavy tails
-(Student's t of four degrees of freedom), uneven spacing or a gap; over place, along a lawnmower, random waypoints, an
-orbit, legs out and back or legs with hovers; or over both. Two tables:
+The errors of a flight are of one kind. Over time they are rough (AR(1)) or smooth (AR(2)), with white noise, heavy
+tails (Student's t with four degrees of freedom), uneven spacing or a gap. Over place they follow a lawnmower, random
+waypoints, an orbit, legs out and back, or legs with hovers. Some kinds are correlated over both. There are two kinds
+of tables:
 
-* offset and RMSE of one channel: share of intervals that cover the mean of the process and the RMSE that such flights
-  have on average; median width over that of an interval of someone who knows the correlation. Coverage is to be
-  92-97 %, for errors over place at least 92 %: kinds that might lie on either side of a bound, by the Wilson interval
-  of their own count, fly :data:`NEAR` times as often. The ratio of widths is to be at most 1.5 (20 correlation times
-  and more in a flight), and 3 for offsets over place.
-* two models over ten channels (4 dB): false verdicts on equal models, whose errors are random or whose predictions
-  differ along a route; power where the truth is 0.3 dB; the same of someone who knows the spread; flights on which a
-  channel is called better or worse, corrected for their number. And coverage where one model is right.
+* Offset and RMSE of one channel: share of intervals that cover the mean of the process and the RMSE that such flights
+  have on average, and median width relative to the interval for a known correlation. Coverage should be 92-97 %, and
+  at least 92 % for errors over place. If chance can explain a deviation (Wilson interval), :data:`NEAR` times as many
+  flights are simulated. The ratio of widths should be at most 1.5 from 20 correlation times per flight, and at most 3
+  for offsets over place.
+* Two models over ten channels (4 dB): false verdicts on equal models, whose errors are random or whose predictions
+  differ along a route. Power if the difference is 0.3 dB, and that of a test that knows the spread. Share of flights
+  on which a channel is called better or worse, corrected for the number of channels. Share of verdicts if one model
+  is right.
 
-Tables "level", "place" and "pooled" have the kinds that the weights are fitted to, "between" and "place-between"
-others; "loud" has flights whose error is five times larger for a sixth of the time. Ranks come from thresholds on two
-shadowing processes. ``--only sample``: levels of the sample flight, redrawn about its replay, with the noise of its
-plan, and the share of draws whose verdict against the best baseline excludes zero.
+The weights are fitted to the kinds of the tables "level", "place" and "pooled". "between" and "place-between" have
+other kinds. In "loud", the error is five times larger for a sixth of the flight. Ranks come from thresholds on two
+processes. ``--only sample`` redraws the levels of the sample flight about its replay, with the noise of its plan, and
+prints the share of draws whose verdict against the best baseline is significant.
 
     python benchmarks/coverage_of_intervals.py [--flights 200] [--quick] [--seed 0] [--figure PNG] [--only TABLE]
 """
@@ -77,10 +79,11 @@ def flown(route: str, n: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Shadowing:
-    """A kind of flight.
+    """A kind of flight of ``n`` samples.
 
-    ``roots`` of the autoregression, white noise over the standard deviation of the rest, ``placed`` share of the
-    variance that is correlated over ``length_m`` along a ``route``, and times ``loud`` for a sixth of the flight.
+    ``roots`` are those of the autoregression. ``noise`` is the standard deviation of white noise relative to the rest.
+    The share ``placed`` of the variance is correlated over ``length_m`` along a ``route``. A sixth of the flight is
+    ``loud`` times as large.
     """
 
     n: int
@@ -110,13 +113,13 @@ class Shadowing:
 
     @property
     def memories(self) -> float:
-        """Correlation times that the flight lasts, or independent errors that fix the mean as well."""
+        """Number of correlation times of the flight, or of independent errors that determine the mean equally well."""
         by_time = self.n * (1.0 - max(self.roots, default=0.0))
         return by_time if self.over_place is None else float(1.0 / self.over_place.mean())
 
     @cached_property
     def track(self) -> FloatArray | None:
-        """Positions (n, 3) that intervals are given [m]; None of a flight without a route."""
+        """Positions (n, 3) for the intervals [m], None if the flight has no route."""
         return flown(self.route, self.n) if self.route else None
 
     @cached_property
@@ -141,7 +144,7 @@ class Shadowing:
 
     @cached_property
     def response(self) -> FloatArray:
-        """Levels that one drive adds to the instants after it."""
+        """Response of the process to one impulse."""
         length = int(min(40.0 / (1.0 - max(self.roots, default=0.0)), 2e5))
         impulse = lfilter([1.0], np.poly(self.roots), np.eye(1, length)[0]) if self.roots else np.ones(1)
         return impulse / np.sqrt((impulse**2).sum())
@@ -159,7 +162,7 @@ class Shadowing:
         return float(1.0 - of_mean + self.noise**2 * (1.0 - 1.0 / self.n))
 
     def sequences(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Errors (count, n): unit variance where not loud, and noise."""
+        """Return errors (count, n) of unit variance, plus noise."""
 
         def drawn(*shape: int) -> FloatArray:
             if self.tails is None:
@@ -244,9 +247,9 @@ def shadowed_pair(
     rng: np.random.Generator, shadowing: Shadowing, count: int, channels: int = CHANNELS, *,
     larger: float = 1.0, shared: float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Errors (count, n x channels) of two models that share half of their shadowing, the first ``larger`` times.
+    """Return errors (count, n x channels) of two models that share half of their shadowing, the first ``larger`` times.
 
-    Samples of one instant stand together; ``shared`` is the part that all channels have in common.
+    Samples of one time are adjacent. ``shared`` is the part that all channels have in common.
     """
     both = [shadowing.sequences(rng, count) for _ in range(2)] if shared else [0.0, 0.0]
     columns = []
@@ -261,7 +264,7 @@ def shadowed_pair(
 def routed_pair(
     rng: np.random.Generator, shadowing: Shadowing, count: int, channels: int, b: float
 ) -> tuple[FloatArray, FloatArray]:
-    """The same where the predictions differ along a route and the measurement lies the share ``b`` between them."""
+    """Return errors of predictions that differ along a route. The measurement is at the share ``b`` between them."""
     columns = []
     for channel in range(channels):
         phase, route = np.linspace(0.0, 2.0 * np.pi, shadowing.n), np.random.default_rng(channel)
@@ -281,12 +284,12 @@ def _together(columns: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray,
 
 
 def wilson(share: float, flights: int) -> tuple[float, float]:
-    """95 % interval of a coverage that was counted on so many flights."""
+    """Return the 95 % interval of a share that was counted on a number of flights."""
     return binomtest(round(share * flights), flights).proportion_ci(method="wilson")
 
 
 def level_cell(shadowing: Shadowing, flights: int) -> dict[str, object]:
-    """Coverage and width of offset and RMSE."""
+    """Return coverage and width of offset and RMSE."""
     rng = np.random.default_rng([SEED, shadowing.n, *str(shadowing).encode()])
     many = SHADOW_DB * shadowing.sequences(rng, 2000)
     truth = float(np.sqrt(many.var(axis=1).mean())) if shadowing.loud != 1.0 else (
@@ -315,7 +318,7 @@ def level_cell(shadowing: Shadowing, flights: int) -> dict[str, object]:
 
 
 def pooled_cell(shadowing: Shadowing, flights: int) -> dict[str, object]:
-    """False verdicts, power and coverage of two models over ten channels."""
+    """Return false verdicts and power of the comparison of two models over ten channels."""
     rng = np.random.default_rng([SEED, shadowing.n, *str(shadowing).encode()])
     time = np.arange(shadowing.n)
     places = None if shadowing.track is None else [shadowing.track] * CHANNELS
@@ -354,7 +357,7 @@ def pooled_cell(shadowing: Shadowing, flights: int) -> dict[str, object]:
 
 
 def rank_truth(mix: float) -> dict[str, float]:
-    """Agreement, kappa, total variation and first bar of two thresholded unit normals with correlation ``mix``."""
+    """Return agreement, kappa, distances and first bar of two thresholded unit normals with correlation ``mix``."""
     edges = np.concatenate([[-8.0], CUTS, [8.0]])
     shifted = np.concatenate([[-8.0], CUTS + 0.3, [8.0]])
     pair = multivariate_normal([0, 0], [[1, mix], [mix, 1]])
@@ -375,7 +378,7 @@ def rank_truth(mix: float) -> dict[str, float]:
 
 
 def rank_cell(process: Shadowing, flights: int) -> dict[str, object]:
-    """Coverage of what is said of ranks."""
+    """Return the coverage of the intervals of a comparison of ranks."""
     rng, mix, size = np.random.default_rng([SEED, process.n]), 0.8, np.sqrt(1.0 + process.noise**2)
     truth = rank_truth(mix)
     hits = dict.fromkeys(truth, 0)
@@ -394,7 +397,7 @@ def rank_cell(process: Shadowing, flights: int) -> dict[str, object]:
 
 
 def sample_verdicts(draws: int) -> float:
-    """Share of draws of the sample flight's levels on which ray tracing is better by an interval without zero."""
+    """Return the share of draws of the sample flight on which ray tracing is significantly better."""
     folder = Path(__file__).parents[1] / "sample_logs"
     data = load_data(load_flight(folder / "flight.yaml"), folder)
     plan, run = data.settings.flight.plan, run_flight(data, audit=False)
@@ -414,7 +417,7 @@ def sample_verdicts(draws: int) -> float:
 
 
 def judge(rows: list[dict[str, object]]) -> None:
-    """Print which coverages are outside what is asked, by count and beyond chance, and which intervals are too wide."""
+    """Print the kinds with a coverage outside the goal, by count and beyond chance, and those with wide intervals."""
     for name in ("offset", "rmse"):
         # above 97 % only the width judges errors over place
         above = [1.0 if row["over_place"] else ASKED[1] for row in rows]
@@ -432,7 +435,7 @@ def judge(rows: list[dict[str, object]]) -> None:
 
 
 def judge_verdicts(rows: list[dict[str, Any]], flights: int) -> None:
-    """Print which kinds have too many false verdicts beyond chance, and which less than 60 % of the power."""
+    """Print the kinds with too many false verdicts beyond chance, and those with less than 60 % of the power."""
     for name in ("false", "false_shared", "false_route"):
         sure = [row["flight"] for row in rows if wilson(row[name], flights)[0] > FALSE]
         print(f"{name}: at most {100 * max(row[name] for row in rows):.1f} %; above 6 % beyond chance: {sure or 0}")
@@ -442,7 +445,7 @@ def judge_verdicts(rows: list[dict[str, Any]], flights: int) -> None:
 
 
 def draw(rows: list[dict[str, object]], file: Path) -> None:
-    """Draw the coverage of the kinds over place, by time alone and by time and place."""
+    """Draw the coverage of the kinds over place, with intervals over time alone and over time and place."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -465,7 +468,7 @@ def draw(rows: list[dict[str, object]], file: Path) -> None:
 
 
 def show(rows: list[dict[str, object]]) -> None:
-    """The last row of a table, below its head where it is the first."""
+    """Print the last row of a table, and the names of its columns before the first row."""
     if len(rows) == 1:
         print(
             " ".join(f"{name.replace('_', ' '):>18s}" for name, value in rows[0].items() if isinstance(value, float)),
@@ -483,7 +486,7 @@ TABLES = {
                          *(Shadowing(n, (), 0.4, route=route, length_m=50.0)
                            for n, route in ((1000, "lawnmower"), (400, "waypoints")))]),
 }  # fmt: skip
-# With ``--quick``, one kind in three, and as many flights of each.
+# With ``--quick``: every third kind, and this number of flights.
 EVERY, QUICK = 3, 60
 
 

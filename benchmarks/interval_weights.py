@@ -1,10 +1,11 @@
-"""Weights of the memories in ``memory_weights.json``, and stretches: those whose 95 % intervals hold in every cell.
+"""Weights and widening factors of ``memory_weights.json``, for 95 % intervals with the right coverage in every cell.
 
 Sequences of the kinds of ``benchmarks/coverage_of_intervals.py`` are simulated. The weights minimise the squared
-distance of every cell's coverage from 95 %, plus something for the width of the intervals, where a sequence holds many
-memories, and a little for weights that are not smooth over the rate. They begin at those of the file, and a cell
-outside the asked coverage counts more in the next round. Prints the coverage of each cell and the table, in tenths.
-``--stretch``: instead, what each memory adds to the stretch of the draws, in hundredths, under the weights of the file.
+distance of the coverage of each cell from 95 %. The width of the intervals costs something if a sequence lasts many
+correlation times, and weights that are not smooth over the rate cost a little. The search starts from the weights of
+the file. A cell outside the goal counts more in the next round. The coverage of each cell and the table, in tenths,
+are printed. ``--stretch`` fits what each correlation adds to the widening factor instead, in hundredths, with the
+weights of the file.
 
     python benchmarks/interval_weights.py mean|power|ratio [--sequences 700] [--stretch]
 """
@@ -34,22 +35,23 @@ from aerpaw_cmp.compare.statistics import (
 
 TAIL, STEEP, ROUNDS = 0.025, 5.0, 2
 LIMIT = logit(TAIL)
-SMOOTH = np.array([1.8e-4, 2.7e-3, 2.7e-3])[:, None, None]  # of the weights, of both stretches
-# Coverage aimed at; price of the width; price of a coverage that is too large, over that of one too small; distance
-# from the aim at which a cell counts twice what its square says, so that none pays for the others.
+# Price of the roughness of the weights and of both widening factors.
+SMOOTH = np.array([1.8e-4, 2.7e-3, 2.7e-3])[:, None, None]
+# Intended coverage, price of the width, price of a coverage that is too large relative to one that is too small, and
+# distance from the intended coverage at which the price doubles, so that no cell is sacrificed for the others.
 AIM = {
     "mean": (0.949, 5e-3, 1.0, 0.01), "power": (0.95, 1.9e-2, 1.0, 0.02), "ratio": (0.951, 8e-3, 0.15, np.inf),
 }  # fmt: skip
 SHAPE = (len(WHITE_SHARES) + 1, len(RATES))
 
 
-# Likelihood, probability that a draw lies below the truth, square of the width (each (count, memories)); weights of
-# coverage and width.
+# Likelihood, probability that a draw is below the truth, and square of the width, each (count, correlations), and the
+# weights of coverage and width.
 Cell = tuple[FloatArray, FloatArray, FloatArray, float, float]
 
 
 def mean_cell(x: FloatArray, away: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sequences (count, n) under each memory, on a mean that theirs is ``away`` (count,) from."""
+    """Evaluate sequences (count, n) for each correlation. Their mean is ``away`` (count,) from the true mean."""
     slow = np.array([cosine_terms(row).slow for row in x])
     known, terms = memories(slow.shape[1]), slow.shape[1]
     likelihood, square = likelihoods(slow)
@@ -105,12 +107,12 @@ def scaled(parts: tuple[FloatArray, FloatArray, FloatArray], of_coverage: float,
 
 
 def shares(likelihood: FloatArray, log_weight: FloatArray) -> list[FloatArray]:
-    """Posterior shares (count, memories) with weights and without."""
+    """Return the posterior shares (count, correlations) with and without the weights."""
     return [p / p.sum(axis=1, keepdims=True) for p in (likelihood * np.exp(log_weight - log_weight.max()), likelihood)]
 
 
 def loss(tables: FloatArray, made: list[Cell], kind: str) -> tuple[float, FloatArray]:
-    """Sum to be minimised, and its gradient, by logarithms of weights and both stretches (3, memories)."""
+    """Return the price and its gradient for the logarithms of weights and both widening factors (3, correlations)."""
     aim, price, idle, far = AIM[kind]
     log_weight, own, even = tables
     total, gradient = 0.0, np.zeros(tables.shape)

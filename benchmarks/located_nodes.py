@@ -134,7 +134,7 @@ def flights(name: str, count: int, seed: int) -> Iterator[tuple[LevelTrack, Floa
 
 
 def judged(track: LevelTrack, at: FloatArray) -> tuple[float, float, float, bool]:
-    """Return the share of the posterior in likelier cells than the node's, error and radius [m], and ``placed``."""
+    """Return the share of the posterior in cells likelier than the node's, error and radius [m], and ``placed``."""
     estimate = locate(track)
     regions = estimate.regions
     column, row = (

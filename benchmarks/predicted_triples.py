@@ -1,12 +1,12 @@
-"""The share of samples of a third flight in the 90 % band of ``predict`` learned from two, simulated or real.
+"""The share of samples of a flight in the 90 % band of ``predict`` from two other flights, simulated or real.
 
 Each triple is made by ``aerpaw-cmp simulate``: three flights on different routes at Lake Wheeler. Their offset is the
 same (even seeds) or varies by 1.5 dB between flights and towers (odd seeds). Antennas are isotropic or tilted dipoles,
 and the flight files do not state them. Two of the flights teach. The third is predicted along its plan, and scored as
-``report --against`` scores it. Printed per triple and as means: share of samples inside the 90 % band, RMSE, RMSE after
-the flight's own offset, stated standard deviation, and CRPS. The goal is a mean share of 88 to 93 %. Seeds below 300
-were used to choose how ``predict`` states its standard deviation. With FIELD, each flight of three campaigns
-is predicted from the others of its campaign.
+``report --against`` scores it. The share of samples inside the 90 % band, the RMSE, the RMSE after the flight's own
+offset, the stated standard deviation and the CRPS are printed per triple and as means. The goal is a mean share of 88
+to 93 %. Seeds below 300 were used to choose how ``predict`` states its standard deviation. With FIELD, each flight of
+three campaigns is predicted from the others of its campaign.
 
     python benchmarks/predicted_triples.py [--triples 20] [--first 300] [FIELD]
 """

@@ -56,7 +56,7 @@ from .options import AGAINST_DISTANCE_M, RANKS
 QUANTITIES = ("level_dbm", "level_db", "path_loss_db")
 _PLACE = ("east_m", "north_m", "height_m")
 _GEOGRAPHIC = ("latitude_deg", "longitude_deg", "height_m")
-_OPTIONAL = ("sd_db", "q05_db", "q95_db", "rank", "yaw_deg", *RANKS)
+_OPTIONAL = ("sd_db", "q05_db", "q95_db", "rank", "yaw_deg", "time_s", *RANKS)
 
 _EXPECTED = (
     "time_utc, or east_m, north_m, height_m, or latitude_deg, longitude_deg, height_m; tower; level_dbm, level_db or "
@@ -90,7 +90,7 @@ class ForeignPrediction:
     table : DataFrame
         One row per prediction: ``time`` (datetime64[ns], NaT if unknown), ``east_m north_m height_m`` in the site
         frame (NaN if unknown), ``tower``, ``channel`` (empty: every channel of the tower), ``level`` [dB or dBm], and
-        those of ``sd_db q05_db q95_db rank yaw_deg p_rank1..4`` that the file has.
+        those of ``sd_db q05_db q95_db rank yaw_deg time_s p_rank1..4`` that the file has.
     sha256 : str
         Digest of the file. Empty for a folder of logs.
     remarks : tuple of str
@@ -236,9 +236,9 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
         columns[name] = np.broadcast_to(arrays[name].transpose(order).reshape(place), tuple(shape.values())).ravel()
     unit = str(notes["units"].get("time", ""))
     if "time" in columns and columns["time"].dtype.kind in "fiu":
-        elapsed = columns.pop("time")  # seconds after an unknown start cannot be matched
+        columns["time_s"] = columns.pop("time")
         if " since " in unit:
-            columns["time"] = _since(elapsed, unit, path)
+            columns["time"] = _since(columns["time_s"], unit, path)
     frame: pd.DataFrame = pd.DataFrame(columns)
     frame.attrs = {"program": str(notes["attributes"].get("source", "NetCDF")), "remarks": remarks}
     return frame
@@ -413,8 +413,11 @@ def _check_levels(level: FloatArray, quantity: str, path: Path) -> None:
 
 
 def _check_repeats(table: pd.DataFrame, path: Path) -> None:
-    """Refuse two rows of one tower, channel and time (or position and heading) with different levels."""
-    key = ["time"] if table["time"].notna().any() else [*_PLACE, *({"yaw_deg"} & set(table))]
+    """Refuse two rows of one tower, channel and time with different levels. Without times: position and heading.
+
+    A route can pass a position several times: ``time_s`` after an unknown start distinguishes the passes.
+    """
+    key = ["time"] if table["time"].notna().any() else [*_PLACE, *({"yaw_deg", "time_s"} & set(table))]
     distinct = table.dropna(subset="level").drop_duplicates(["tower", "channel", *key, "level"])
     twice = distinct[distinct.duplicated(["tower", "channel", *key], keep=False)]
     if len(twice):

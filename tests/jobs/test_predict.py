@@ -211,9 +211,9 @@ def said(flown, tmp_path):
     levels = next(o for o in observe([data])[0] if o.samples.antenna == "LW1.USRP1")
     level = levels.samples.residual_db + levels.free_space_db + 2.0
     place = dict(zip(("east_m", "north_m", "height_m"), levels.samples.position_m.T, strict=True))
-    frame = pd.DataFrame({**place, "yaw_deg": levels.heading_deg, "tower": "LW1", "channel": "USRP1", "level_db": level,
+    time_s = np.arange(float(len(level)))  # the flight waits: one position has several predicted levels
+    frame = pd.DataFrame({"time_s": time_s, **place, "yaw_deg": levels.heading_deg, "tower": "LW1", "channel": "USRP1", "level_db": level,
                           "sd_db": 3.0, "q05_db": level - 4.935, "q95_db": level + 4.935})  # fmt: skip
-    frame = frame.drop_duplicates([*place, "yaw_deg"])
     frame.to_csv(tmp_path / "prediction.csv", index=False)
     about = {"trained_on": ["0" * 64], "marks": [], "series": {"LW1 USRP1": {"unit": "dB re full scale"}}}
     (tmp_path / "metrics.json").write_text(json.dumps(about))

@@ -53,7 +53,7 @@ class Skipped:
 
     @classmethod
     def of(cls, path: Path, names: Collection[str], error: AerpawCmpError) -> Skipped:
-        """Return a skipped file of a folder with such names, with the way to read it if it is a table."""
+        """Return a file that is skipped, with the files in its folder, and the way to read it if it is a table."""
         way_out = f"; {error.cause}" if "--map" in (error.cause or "") else ""
         return cls(str(path), _samples_of(path.name, names) or error.found + way_out, error)
 
@@ -72,7 +72,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
     Raises
     ------
     InputError
-        If the file is missing, not readable, no file, too large, or a damaged packed file.
+        If the file is missing, not readable, not a regular file, too large, or a damaged packed file.
     """
     data = _unpacked(_raw(Path(path)), path)
     return data, hashlib.sha256(data).hexdigest()
@@ -117,7 +117,7 @@ def ingest(
     ----------
     paths : sequence of path
         Files, folders and archives (zip, tar); folders are searched to the bottom, in sorted order. Hidden files are
-        left out. A flight file that ``ingest -o`` wrote gives the files that it holds.
+        left out. The logs in a flight file of ``ingest -o`` are returned.
     options : ReadOptions or callable, optional
         Facts that are not in the files; a callable returns them per path.
     reader : str, optional
@@ -160,7 +160,7 @@ def ingest(
 
 
 def _check_readable(places: Sequence[Path]) -> None:
-    """Raise InputError for all files that cannot be opened: reading the folder before them may take minutes."""
+    """Raise InputError for all files that cannot be opened, before the minutes that reading a folder may take."""
     errors = []
     # a path may name a member of an archive, which does not exist on disk
     for place in (place for place in places if not _is_folder(place) and _part_of(place) is None):
@@ -301,7 +301,7 @@ def read_log(
         files = [_of_kind(_source(*part, held), None if reader is None else by_name(reader), part[0])]
     else:
         files = ingest([path], options=options, reader=reader)
-    # a folder of pieces is one log; several would have one node and one channel
+    # a folder of pieces is one log; several logs would get the same node and channel
     if len(files) != 1:
         names = ", ".join(one_line(Path(item.path).name) for item in files[:4])
         raise UsageError(

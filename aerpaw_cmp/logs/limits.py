@@ -12,8 +12,8 @@ Speeds reveal wrong clocks and positions: no small aircraft flies faster than 10
 A few positions that cannot be reached in time from the rows around them are jumps of the receiver. They are flagged and
 read as missing, as is a distant place where a log begins or ends at rest, such as the origin of an autopilot's filter.
 Positions that stay the same while the logged speed moves the aircraft on are stale, flagged and read as missing, too.
-A track that is too fast throughout has its times in another unit; one that is in two places at once
-belongs to two vehicles. Both are reported, and their values stay as they are.
+The times of a track that is too fast throughout are in another unit. A track in two places at once belongs to two
+vehicles. Both are reported, and their values stay as they are.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def _out_of_reach(time_s: FloatArray, place_m: FloatArray) -> _Pairs:
         usual_mps = usual[np.searchsorted(moves, np.arange(len(time_s))).clip(0, len(moves) - 1)]
 
     def beyond(first: IntArray, second: IntArray) -> BoolArray:
-        # the sign of the time does not count: a clock that steps back is not a jump of the position
+        # the sign of the time is ignored, because a clock that steps back is not a jump of the position
         seconds, apart_m = np.abs(time_s[second] - time_s[first]), place_m[second] - place_m[first]
         usual_s = np.maximum(seconds, interval_s)
         flown_m = (usual_mps[np.minimum(first, second)] + _GAIN_MPS2 * usual_s) * usual_s
@@ -293,8 +293,8 @@ _APART_S = 86_400.0
 
 _FEW_SHARE = 0.01
 
-# A computer without a battery of its clock begins in 1970 and is set by GNSS or network.
-# Some begin in 1980 or 2000; AERPAW began later.
+# A computer whose clock has no battery starts in 1970, 1980 or 2000, until GNSS or the network sets the clock. AERPAW
+# began later.
 _CLOCK_SET_NS = int(np.datetime64("2010-01-01", "ns").astype(np.int64))
 
 # At most this share, or this many, are "a few".
@@ -393,7 +393,7 @@ class _Check:
         beyond: dict[str, BoolArray] = {}
         for name in names:
             value, (low, high) = self._values(name), ranges[name]
-            # least and greatest first: a mask of every column of a large log would cost more than reading it
+            # test the least and greatest first, because masks of all columns of a large log take longer than reading it
             least = np.fmin.reduce(value) if len(value) else np.nan
             if not np.isnan(least) and not (low <= least and np.fmax.reduce(value) <= high):
                 beyond[name] = (value < low) | (value > high)
@@ -499,7 +499,7 @@ class _Check:
 
     def _near_in_time(self) -> None:
         """Flag a few stamps that lie days from all the others."""
-        # differences as floats: those of int64 would wrap for NaT and for stamps 300 years apart
+        # subtract as floats, because int64 would overflow for NaT and for stamps 300 years apart
         time = self.frame["time"].to_numpy("datetime64[ns]")
         stamp: IntArray = time.view(np.int64)
         timed = ~np.isnat(time)

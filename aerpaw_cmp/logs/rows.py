@@ -1,4 +1,4 @@
-"""The way from lines to records that all text formats share.
+"""Conversion of lines to records, for all text formats.
 
 :func:`matched` returns the :class:`Rows` of a pattern with named groups, one of them ``time``. :func:`built` does the
 same for readers that find their rows in another way. ``Rows.number`` and ``Rows.text`` are the columns,
@@ -55,7 +55,7 @@ class Rows:
     clock_from : str, optional
         ``written`` if all times have an offset or are epochs.
     height_from : str, optional
-        The source of the track's heights, if the table shows more than its format.
+        The source of the track's heights, if it is known from the table and not from the format alone.
     about : dict
         Attributes of all streams, such as the device that wrote these rows.
     at : int array, shape (n,)
@@ -212,7 +212,7 @@ def matched(
     reader : str
         Its name.
     clock : str
-        See :func:`times`.
+        See :func:`instants_of`.
 
     Returns
     -------
@@ -380,7 +380,7 @@ def checked_ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = No
     none : bool array, shape (m,), optional
         True where the number means that nothing was reported.
     means : bool
-        True if the program prints means over its period: a value between two ranks is then missing, but not an error.
+        True if the program prints means over its period: a value between two ranks is then missing and not an error.
 
     Returns
     -------
@@ -559,7 +559,7 @@ def reader(
         return _text.mostly(head, row) if isinstance(row, re.Pattern) else False
 
     def marked(head: bytes) -> bool:
-        # an expression that begins with a line's start takes 5 ms of each MiB, and a KML gives it four of them
+        # an expression that is anchored to line starts takes 5 ms per MiB, and sniffers see 4 MiB of a KML
         return mark is not None and not head.startswith(_text.MARKUP) and mark.search(head) is not None
 
     return Reader(

@@ -67,7 +67,7 @@ class Lines:
     def blank(self) -> BoolArray:
         """Mask of lines that contain white space only."""
         empty = self.ends <= self.starts
-        # only short lines or those that begin with white space can be blank: few are looked at one by one
+        # only lines that begin with white space can be blank, so that few lines are tested one by one
         first = self.buffer[np.minimum(self.starts, max(len(self.data) - 1, 0))] if len(self) else np.empty(0, np.uint8)
         for i in np.flatnonzero(
             ~empty & ((first == 32) | (first == 9) | (first == 13) | (first == 11) | (first == 12))
@@ -183,7 +183,7 @@ class Rejects:
         # numbers count from the first piece of the file
         low, high = int(min(numbers)) + self.before + 1, int(max(numbers)) + self.before + 1
         self._reasons.append(RejectedReason(reason, len(numbers), low, high))
-        # enough lines: they arrive in file order, except for several reasons within a piece
+        # more than are kept, because the reasons of one piece are not added in the order of the file
         if len(self._first_lines) < 4 * KEPT_REJECTED:
             for i in sorted(numbers)[:KEPT_REJECTED]:
                 self._first_lines.append(RejectedLine(int(i) + self.before + 1, reason, lines.text(int(i))))
@@ -314,7 +314,7 @@ class Count(NamedTuple):
     least_epoch: float
 
 
-# In the order in which a name is searched. 1e9 microseconds are a quarter of an hour of PX4's own clock, no epoch.
+# In the order in which a name is searched. 1e9 microseconds are a quarter of an hour of PX4's own clock, not an epoch.
 COUNTS = {
     "ns": Count(1.0, re.compile(r"\bn(s|sec|anos\w*)\b"), 1e18),
     "us": Count(1e3, re.compile(r"(\b|time|stamp)(us|usec|micros\w*)\b"), 1e15),
@@ -450,7 +450,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
 
 
 def _minus(wall_ns: IntArray, offset_s: IntArray, length: IntArray) -> AnyArray:
-    """Return UTC of wall clocks [ns] in runs of ``length`` with one offset [s], without further memory."""
+    """Return UTC of wall clocks [ns] in runs of ``length`` with one offset [s], in one array."""
     utc = np.repeat(offset_s * 1_000_000_000, length)
     np.subtract(wall_ns, utc, out=utc)
     return utc.view("datetime64[ns]")

@@ -55,7 +55,7 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
     if coarse := whole_degrees([sheet.names[latitude], sheet.names[longitude]], values):
         raise _sheet.shifted(coarse, "positions")
     datum, height = _height(rows, sheet)
-    if datum not in ("take-off", "ground"):  # a barometer knows these without a fix
+    if datum not in ("take-off", "ground"):  # these come from a barometer and need no fix
         height = np.where(unfixed, np.nan, height)
     values["altitude_m"] = height
     about: Height = {"height_from": rows.height_from}
@@ -82,7 +82,7 @@ def without_fix(sheet: _sheet.Sheet) -> BoolArray:
         name = "" if meaning is None else meaning.quantity.name
         words = sheet.plain[i]
         if meaning is None and words in ("status", "state", "mode") and {*sheet.texts(i)} == {"A", "V"}:
-            unfixed |= np.array(sheet.texts(i)) == "V"  # as sentences of NMEA have it
+            unfixed |= np.array(sheet.texts(i)) == "V"  # as in NMEA sentences
         if name not in ("fix", "satellites", "accuracy"):
             continue
         values = sheet.numbers(i)
@@ -226,7 +226,7 @@ def _with_moved_home(rows: Rows, sheet: _sheet.Sheet, height: FloatArray) -> tup
     return height, True
 
 
-# Two columns of one estimate go together to this [m], in all rows but those in which home moves.
+# Two heights of one estimate differ by a constant within this [m], except in the few rows in which home moves.
 _JITTER_M, _STEADY = 0.1, 0.9
 
 
@@ -280,7 +280,7 @@ def above_takeoff(rows: Rows, values: dict[str, AnyArray], datum: str, lost: Boo
 
 
 def astray(rows: Rows, values: Mapping[str, AnyArray]) -> BoolArray:
-    """Return the rows (n,) whose position is a jump of the receiver, from which no height counts."""
+    """Return the rows (n,) whose position is a jump of the receiver, which cannot be the zero of heights."""
     place = {name: values[name] for name in PLACE}
     return jumps_of(pd.DataFrame({"time": rows.time, "line": rows.row + 1, **place}))[0]
 
@@ -298,7 +298,7 @@ _DEGREE_M = 111_000.0
 def _without_first_zeros(altitude: FloatArray, time: AnyArray | None) -> FloatArray:
     """Return altitudes with NaN in first rows of 0 if all others are far from 0: the receiver had no fix yet.
 
-    With times, as for an unknown datum, only if the step is faster than any climb.
+    If times are given, as for an unknown datum, the step must also be faster than any climb.
     """
     # argmax is also 0 for heights that are 0 throughout: nothing is removed
     begun = int(np.argmax(np.nan_to_num(altitude) != 0))
@@ -359,13 +359,13 @@ def _attitude(rows: Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
 
 
 def small_angles(values: Iterable[str]) -> str:
-    """Return the sentence about angles whose unit is neither in a name nor visible in the values."""
+    """Return the sentence about angles whose unit is neither in their names nor visible in their values."""
     words = " and ".join(name.removesuffix("_deg") for name in values)
     return f"the unit of {words} is unknown, and no value is beyond 2 pi: read as degrees; or is it 'yaw [rad]'?"
 
 
 def are_small(values: dict[str, FloatArray]) -> bool:
-    """Check whether angles, not all of roll, pitch and yaw, may be radians as well as degrees."""
+    """Check whether the values of angles are possible both in radians and in degrees."""
     most = max((float(np.nanmax(np.abs(value), initial=0.0)) for value in values.values()), default=0.0)
     return "yaw_deg" in values and 0 < most <= 2 * np.pi + 1e-3
 

@@ -75,7 +75,7 @@ def _has_time(names: list[str]) -> bool:
     return not known.isdisjoint(("time", "date")) or {"gps_week", "gps_seconds"} <= known
 
 
-# Their headers have a time and a level or position, too, and their readers know units that are not in the names.
+# Readers of tables that also have a time and a level or position. They know units that are not in the names.
 _NARROWER = (nemo_csv, quectel_ri, aadm_snr, ardupilot_bin, rtklib_pos, vehicle_out)
 
 
@@ -111,7 +111,7 @@ _OWNERS = ("sim", "slot", "dev", "modem", "phone", "ue")
 
 
 def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
-    """Return the cells of the table, the columns of other quantities, and those of ranks."""
+    """Return the cells of the table, the columns of other quantities, and the columns of ranks."""
     cells: dict[tuple[str, str], _Cell] = {}
     fields: dict[tuple[str, str], dict[str, list[int]]] = {}
     others, ranks, marks = [], [], []
@@ -132,7 +132,7 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
         cells[place] = cell = _Cell(*place)
         for name, listed in columns.items():
             alone = len(listed) == 1 or name in _IDENTITY
-            cell.columns[name], *second = listed if alone else sorted(listed, key=lambda i: _doubts(sheet, i))
+            cell.columns[name], *second = listed if alone else sorted(listed, key=lambda i: _preference(sheet, i))
             if name == "rsrp_dbm":
                 cell.ports = [i for i in second if _part(sheet, i) != "mean"]
             others += [i for i in second if i not in cell.ports and name not in _IDENTITY]  # read as KPIs
@@ -160,8 +160,8 @@ def _part(sheet: _sheet.Sheet, column: int) -> str:
     return "" if meaning is None else meaning.part
 
 
-def _doubts(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, bool, int]:
-    """Return the order of columns of one quantity: filled, not a mean, not a single port, most distinct values."""
+def _preference(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, bool, int]:
+    """Return a sort key: first filled columns, then no means, then no single ports, then most distinct values."""
     known = sheet.numbers(column)
     count = len(np.unique(known[np.isfinite(known)]))
     return not count, _part(sheet, column) == "mean", _part(sheet, column) == "port", -count
@@ -224,7 +224,7 @@ def _readings(
 
 
 def _marked(readings: pd.DataFrame) -> pd.DataFrame:
-    """Return readings whose ``more`` contains the identity other than a PCI, or the column of levels without any.
+    """Return readings whose ``more`` contains an identity other than the PCI, or else the column of the level.
 
     Next to a PCI, such an identity counts only if one PCI has two of them.
     """
@@ -238,7 +238,7 @@ def _marked(readings: pd.DataFrame) -> pd.DataFrame:
     return marked
 
 
-# Share of the times with several cells that call themselves serving from which a table is a scan.
+# A table is a scan if several cells serve at more than this share of the times.
 _SCANNED = 0.3
 
 
@@ -248,7 +248,7 @@ def _of_one_phone(readings: pd.DataFrame, time: AnyArray) -> pd.DataFrame:
     claims = claims.assign(time=time[claims["row"].to_numpy(np.int64)])
     of_time = claims.groupby(["time", "rat"])[["row", "pci", "arfcn"]].nunique()
     several = of_time[(of_time["row"] > 1) & (of_time[["pci", "arfcn"]] > 1).any(axis=1)].index
-    if len(several) < _SCANNED * len(of_time):  # a handover within a second of a clock of seconds
+    if len(several) < _SCANNED * len(of_time):  # a few such times are handovers within a second
         return readings
     keys = pd.MultiIndex.from_arrays([time[readings["row"].to_numpy(np.int64)], readings["rat"]])
     doubted: pd.DataFrame = readings.assign(serving=readings["serving"].astype(bool) & ~keys.isin(several))

@@ -1,4 +1,4 @@
-"""Any CSV with a header, its columns mapped by the user: ``columns: {time: Time, rss_db: Power}``, ``kind: rss``.
+"""Any CSV with a header and columns that the user maps: ``columns: {time: Time, rss_db: Power}``, ``kind: rss``.
 
 The columns of a CSV are never guessed: flight.yaml names them. Times are texts (``YYYY-mm-dd HH:MM:SS[.f][offset]``, or
 forms of other programs such as ``15.07.2024 11:49:27,231``) or numbers. Numbers count from ``time_origin`` if it is
@@ -43,7 +43,7 @@ _VALUE = {"telemetry": _pose.PLACE, "rss": ("rss_db",), "rank": ("ri_raw",)}
 
 # Units of record columns, by the ends of their names.
 _UNITS = {"_deg": "deg", "_m": "m", "_mps": "m/s", "_dbm": "dBm", "_db": "dB"}
-# Quantities of record columns whose values show their unit, or that rows do not fit their header.
+# Quantities of record columns whose values can show a wrong unit or shifted rows.
 _QUANTITIES = {row.name: row for row in dictionary.QUANTITIES if row.role in ("position", "height")}
 # Quantities whose names do not contradict a mapping to a column of the telemetry.
 _NO_POSE = ("time", "fix", "satellites")
@@ -175,14 +175,14 @@ def _tables(lines: Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
 
 
 def _stream(rows: Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], name: str, unit: str) -> Stream | None:
-    """Return the stream of mapped columns by the rules of its kind, with rows flagged that have words as numbers."""
+    """Return the stream of mapped columns by the rules of its kind, and flag rows with words in place of numbers."""
     options, flag = rows.options, rows.flag.copy()
     values: dict[str, AnyArray] = {key: _values(sheet, column, key, options) for key, column in where.items()}
     if {*_pose.PLACE[:2]} <= set(values):
         values[_pose.PLACE[0]] = np.where(_pose.without_fix(sheet), np.nan, values[_pose.PLACE[0]])
         coarse = _pose.whole_degrees([sheet.names[where[key]] for key in _pose.PLACE[:2]], values)
         rows.warnings += [f"{coarse}: is it the right column?"] if coarse else []
-    about = _lifted(rows, sheet, values, where)
+    about = _above_takeoff(rows, sheet, values, where)
     odd = np.any([_odd(sheet, where[key]) for key in _VALUE[kind]], axis=0)
     add_flag(flag, odd, "no_number")
     if odd.any():
@@ -215,7 +215,7 @@ def _stream(rows: Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], 
     return rows.stream(kind, name, values, flag=flag, about=about)
 
 
-def _lifted(rows: Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], where: dict[str, int]) -> _pose.Height:
+def _above_takeoff(rows: Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], where: dict[str, int]) -> _pose.Height:
     """Convert altitudes above sea level or the ellipsoid, by the header, to heights above take-off."""
     height = sheet.meanings[where["altitude_m"]] if "altitude_m" in where else None
     if height is None or height.quantity.datum not in ("sea level", "ellipsoid") or "latitude_deg" not in values:
@@ -233,7 +233,7 @@ def _track(rows: Rows, sheet: _sheet.Sheet, where: dict[str, int], device: str) 
         return None
     values: dict[str, AnyArray] = {name: sheet.numbers(where[name]) for name in names}
     values[_pose.PLACE[0]] = np.where(_pose.without_fix(sheet), np.nan, values[_pose.PLACE[0]])
-    about, flag = _lifted(rows, sheet, values, where), no_flags(len(rows))
+    about, flag = _above_takeoff(rows, sheet, values, where), no_flags(len(rows))
     name = f"vehicle_{device}" if device else "vehicle"
     return rows.stream("telemetry", name, values, flag=flag, source="mapped columns", about=about)
 

@@ -93,7 +93,7 @@ LIMIT_S, LONG_S = 900.0, 3600.0
 
 
 def machine() -> dict[str, Any]:
-    """What the numbers depend on."""
+    """Return the conditions that the numbers depend on."""
     from aerpaw_cmp.common.versions import versions
 
     model = platform.processor() or platform.machine()
@@ -115,14 +115,14 @@ def machine() -> dict[str, Any]:
 
 
 def version() -> str:
-    """Of this tree."""
+    """Return the commit of this tree."""
     from aerpaw_cmp.common.versions import tool_version
 
     return tool_version()
 
 
 def _run(command: list[str], limit_s: float = LIMIT_S) -> tuple[str, str | None]:
-    """What a benchmark prints, and its last words where it fails."""
+    """Return the output of a benchmark, and its last lines if it failed."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "parsers")])}
     environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     try:

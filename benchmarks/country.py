@@ -29,7 +29,7 @@ TOWERS = {"north": (-2_000.0, 9_000.0), "south": (3_000.0, -8_000.0), "west": (-
 
 
 def region(folder: Path, seed: int = 1) -> Path:
-    """site.yaml of villages whose houses stand in all directions, with masts of 30 m between them."""
+    """Return a site.yaml of villages whose houses have all orientations, with masts of 30 m between them."""
     rng = np.random.default_rng(seed)
     frame = SiteFrame(35.7, -78.7)
     villages = rng.uniform(-0.48 * SIDE_M, 0.48 * SIDE_M, (VILLAGES, 2))

@@ -29,7 +29,7 @@ from aerpaw_cmp.logs.records import has_wall_clock
 
 
 def outcome(read: Callable[[], Sequence[IngestedFile]], timezone: str) -> tuple[str, str]:
-    """``drafted``, ``refused`` or ``silent``, and what is said."""
+    """Return ``drafted``, ``refused`` or ``silent``, and the message."""
     try:
         files = read()
         if not files:
@@ -59,7 +59,7 @@ def _kinds(made: Sequence[IngestedFile]) -> set[str]:
 
 
 def _may_meet(track: Sequence[IngestedFile], radio: Sequence[IngestedFile]) -> bool:
-    """Whether the spans overlap, or one of the clocks is relative."""
+    """Check whether the logs overlap in time, or one of the clocks is relative."""
     (first, last), (other_first, other_last) = _span(track), _span(radio)
     relative = not (has_wall_clock(first) and has_wall_clock(other_first))
     return relative or bool(first <= other_last and other_first <= last)

@@ -178,7 +178,7 @@ def with_numbers(result: Any, **values: Any) -> Any:
 
 
 def long_flight(samples: int = 50_000, channels: int = 10) -> ReportData:
-    """A report of ten channels with so many samples together: levels of free space, noise, and nothing else."""
+    """Return a report of ten channels with this total number of samples: free space and noise."""
     rng = np.random.default_rng(2)
     site = load_site("lake_wheeler")
     n = samples // channels

@@ -293,7 +293,7 @@ def error_db(result: FlightResult) -> float:
 
 
 def drafted(log: Path, table: Table, site: Path) -> None:
-    """Write the log and its draft beside it."""
+    """Write the log, and its draft into the same folder."""
     savemat(log, table)
     words = ["ingest", log, "--timezone", TIMEZONE, "--site", site, "--draft", log.with_name("flight.yaml"), "--force"]
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):

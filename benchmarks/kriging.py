@@ -114,7 +114,7 @@ def on_the_grid(quick):
 
 
 def window_jobs(quick):
-    """Numbers of targets off the samples, and what each side does with so many of them: its estimates."""
+    """Return numbers of targets between the samples, and the function of each program that estimates them."""
     _, points, values = samples(quick)
     rng, low, high = np.random.default_rng(3), points.min(axis=0), points.max(axis=0)
     counts = (len(points), 200, 400) if quick else (len(points), 20_000, 100_000)

@@ -94,7 +94,7 @@ def rows_of(o: Observed) -> pd.DataFrame:
 def questions(
     bench: Bench, split: tasks.Split, known: Sequence[str], flight: str
 ) -> Iterator[tuple[list[LinkSamples], list[LinkSamples]]]:
-    """What may be known and what is asked of each fold of a flight; with a split that asks for it, of itself too."""
+    """Return the known samples and the targets of each fold of a flight, and the flight itself if needed."""
     tests, train = bench.observed(flight), samples_of(bench, known)
     folds = [tasks.folds_of(split, rows_of(o)) for o in tests]
     for fold in np.unique(np.concatenate(folds)):
@@ -263,7 +263,7 @@ def protocol(
 
 
 def whole_flight(asked: Observed, train: Observed, quick: bool) -> FloatArray:
-    """Errors where all of the flight is known but a stretch of 30 s and :data:`GUARD_S` about it."""
+    """Return errors if the complete flight is known except 30 s and :data:`GUARD_S` around them."""
     samples, out = asked.samples, []
     for start in np.arange(0.0, samples.time_s[-1], 30.0)[:: 30 if quick else 1]:
         away = np.abs(samples.time_s - start - 15.0)
@@ -275,7 +275,7 @@ def whole_flight(asked: Observed, train: Observed, quick: bool) -> FloatArray:
 
 
 def folds(bench: Bench, names: Sequence[str]) -> Iterator[tuple[list[LinkSamples], list[LinkSamples]]]:
-    """Each flight and the others; of a single flight, eighths of its time and the rest but 20 s."""
+    """Return each flight and the other flights. Of a single flight, take eighths of its time."""
     for name in names:
         others = [other for other in names if other != name]
         yield from questions(bench, "flights" if others else "stretches", others, name)

@@ -53,7 +53,7 @@ def command(*arguments: str) -> None:
 
 
 def report_page(folder: Path) -> Path:
-    """Of the sample flight, without audit and speed table."""
+    """Return the page of the sample flight, without audit and speed table."""
     content = yaml.safe_load((ROOT / "sample_logs" / "flight.yaml").read_text())
     content["rt"] = {**content.get("rt", {}), "audit_links": 0}
     shutil.copytree(ROOT / "sample_logs", folder / "sample")
@@ -63,7 +63,7 @@ def report_page(folder: Path) -> Path:
 
 
 def long_page(folder: Path, samples: int = 50_000) -> Path:
-    """A made-up flight of ten channels with so many samples together, from the records alone."""
+    """Return the page of a simulated flight with ten channels and this total number of samples."""
     from aerpaw_cmp.report import flight as write
     from benchmarks.fabricated import long_flight
 
@@ -77,7 +77,7 @@ def map_page(folder: Path) -> Path:
 
 
 def campaign_page(folder: Path, flights: int, settings: int) -> tuple[Path, dict[str, Any]]:
-    """A season that was never flown."""
+    """Return the page of a simulated campaign."""
     from aerpaw_cmp.report.campaign import write_campaign
     from benchmarks.fabricated import season
 

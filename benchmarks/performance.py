@@ -66,7 +66,7 @@ def last_whole(history: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def size_of(row: dict[str, Any]) -> float:
-    """What a row is plotted against."""
+    """Return the label of the axis of sizes."""
     return float(row.get("samples", row.get("faces", row["size"])))
 
 
@@ -116,7 +116,7 @@ def extrapolated(scaling: dict[str, Any], axis: str, size: float) -> tuple[float
 
 
 def season(scaling: dict[str, Any]) -> list[str]:
-    """A season by the cost of one more task of the campaign."""
+    """Extrapolate a campaign from the cost of one more task."""
     rows = measured(scaling, "flights")
     if len(rows) < 2:
         return []
@@ -201,7 +201,7 @@ def last_result(history: list[dict[str, Any]], name: str) -> tuple[str, dict[str
 
 
 def town(history: list[dict[str, Any]]) -> list[str]:
-    """The path search of a town, beside that of the bench scene: our search, and PathSolver on the same triangles."""
+    """Compare the path search in a town with that in the bench scene, and with PathSolver on the same triangles."""
     when, result = last_result(history, "town")
     rows = [row for row in result.get("rows", []) if "failed" not in row]
     ours = {row["depth"]: row["search_s"][1] for row in rows if row["kind"] == "image"}
@@ -292,7 +292,7 @@ def imports_of(row: dict[str, Any]) -> str:
 
 
 def reports(run: dict[str, Any]) -> list[str]:
-    """What users run first: reports as they come, with their audit, and without it, against the imports they need."""
+    """Compare reports with and without the audit with the imports that they need."""
     result = run["benchmarks"].get("report", {}).get("result")
     if not result or "later" not in result:
         return []

@@ -120,7 +120,7 @@ def antenna(draw: np.random.Generator) -> Antenna:
 
 
 def fading(draw: np.random.Generator, time: Array) -> Array:
-    """Fading of two memories, and noise with heavy tails [dB]."""
+    """Return fading with two correlation times, and noise with heavy tails [dB]."""
     total = draw.standard_t(4, len(time)) * draw.uniform(0.3, 1.0)
     for memory, spread in (
         (draw.uniform(0.5, 4.0), draw.uniform(0.8, 2.0)),
@@ -278,7 +278,7 @@ def judged(evidence: LevelEvidence, late: float, tower: Array, place: Array, use
 
 
 def plans(flights: int, seed: int) -> list[tuple[str, ...]]:
-    """Troubles of each flight: of six, one is sound and one has two."""
+    """Return the injected faults of each flight: of six flights, one has none and one has two."""
     draw = np.random.default_rng([seed, flights])
     out: list[tuple[str, ...]] = []
     for number in range(flights):

@@ -95,7 +95,7 @@ def rows_of(name: str) -> Iterator[list[str]]:
 
 
 def fit_woods() -> Iterator[str]:
-    """Lines on the attenuation and height that AADM's towers ask for, each eighth of the flight left out in turn."""
+    """Fit attenuation and height of the woods to AADM's towers, with each eighth of the flight held out in turn."""
     data = flight("aadm").replay(**{**_BARE, "rt.foliage": "attenuating"}).data
     rt = data.settings.rt
     errors: dict[str, dict[tuple[float, float], np.ndarray]] = {s.tower: {} for s in data.rss}

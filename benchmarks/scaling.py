@@ -61,7 +61,7 @@ def timed(action: Callable[[], Any]) -> dict[str, float]:
 
 
 def warm_timed(action: Callable[[], Any]) -> dict[str, float]:
-    """As :func:`timed`, once kernels that are compiled at first use are compiled: by the same action."""
+    """Time an action like :func:`timed`, after one run that compiles its kernels."""
     action()
     return timed(action)
 
@@ -76,7 +76,7 @@ def replay_of(poses: int, towers: int = 1, buildings: int = 12) -> dict[str, flo
 
 
 def faces(count: int) -> dict[str, float]:
-    """A field that grows with its buildings, so that they stand as densely as the 12 of the bench scene."""
+    """Return a field that grows with its buildings, so that they are as dense as the 12 of the bench scene."""
     from dataclasses import replace as change
 
     from shapely import affinity
@@ -106,7 +106,7 @@ def faces(count: int) -> dict[str, float]:
 
 
 def samples(count: int) -> dict[str, float]:
-    """One channel whose residual remembers a second and a half, ten samples a second."""
+    """Return one channel at ten samples per second whose residual has a correlation time of 1.5 s."""
     from scipy.signal import lfilter
 
     from aerpaw_cmp.compare.level import compare_rss
@@ -135,7 +135,7 @@ def flight_on_laps(hours: float) -> dict[str, Any]:
 
 
 def _seconds(points: list[dict[str, Any]], plan: dict[str, Any]) -> float:
-    """How long a planned route takes [s]."""
+    """Return the duration of a planned route [s]."""
     total = sum(p.get("hold_s", 0.0) for p in points[:-1])
     for a, b in itertools.pairwise(points):
         far = np.hypot(b["east_m"] - a["east_m"], b["north_m"] - a["north_m"])

@@ -206,7 +206,7 @@ SHORTENED_M = 0.02
 
 
 def free_in_sionna(surfaces: Any, paths: Any, sources: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Which paths (paths,) have no segment that Sionna's own scene cuts, and reflect on its surfaces."""
+    """Check which paths (paths,) reflect on surfaces of Sionna's own scene and are not blocked there."""
     import mitsuba as mi
 
     from aerpaw_cmp.propagation.search import sionna

@@ -110,7 +110,7 @@ class FaultyModem(ModemSimulator):
         return super()._read()
 
     def _write(self, data: bytes) -> bool:
-        """Another thread's bytes stand before or behind these."""
+        """Write bytes without mixing them with those of another thread."""
         with self._speaking:
             sent = super()._write(data)
         self.sent_bytes += len(data) if sent else 0
@@ -180,7 +180,7 @@ class FaultyModem(ModemSimulator):
 
 @dataclass(frozen=True, slots=True)
 class BadLine:
-    """A line of a log that is no record."""
+    """A line of a log that is not a record."""
 
     path: Path
     number: int

@@ -38,7 +38,7 @@ def at_hand() -> list[str]:
 
 
 def run(*command: str | Path, cwd: Path) -> str:
-    """Run a command in a folder that is none of this tree's; its output, or what it said as it failed."""
+    """Run a command in a folder outside of this tree. Return its output, or its error if it failed."""
     kept = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     done = subprocess.run(
         [str(part) for part in command], cwd=cwd, env=kept, capture_output=True, text=True, check=False
@@ -51,7 +51,7 @@ def run(*command: str | Path, cwd: Path) -> str:
 
 
 def tried(python: str, archive: Path, folder: Path) -> str:
-    """Install an archive, report the sample with Sionna RT and without it; what came of both."""
+    """Install an archive and report the sample with and without Sionna RT. Return both results."""
     run(python, "-m", "venv", folder / "env", cwd=folder.parent)
     own = folder / "env" / "bin"
     run(own / "python", "-m", "pip", "install", "--quiet", archive, cwd=folder)

@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Fixtures and checks for all tests."""
 
 import dataclasses
 import gc
@@ -98,7 +98,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def skips(reasons: Iterable[str]) -> str:
-    """How many tests were skipped and why, as the last line of ``make test``."""
+    """Print the number of skipped tests and the reasons as the last line of ``make test``."""
     counts = Counter(reason.removeprefix("Skipped: ") for reason in reasons)
     return (
         "; ".join(f"skipped: {counted(n, 'test')}, {reason}" for reason, n in counts.most_common()) or "skipped: none"
@@ -161,7 +161,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """What was imported and collected stays to the end: the collector need not look through it again."""
+    """Freeze imported and collected objects, so that the garbage collector does not search them again."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 50)
@@ -237,7 +237,7 @@ def few_pictures(blank_pictures: None) -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="module")
 def no_wait_for_the_disk(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Where outputs are only looked at, the disk need not have them yet: only a descriptor that is none is told."""
+    """Skip fsync in tests that only read outputs. An invalid descriptor is still an error."""
     with pytest.MonkeyPatch.context() as patch:
         if request.path.parent.name in ("jobs", "maps", "report", "site", "tests"):
             patch.setattr(os, "fsync", lambda descriptor: os.fstat(descriptor) and None)
@@ -262,12 +262,12 @@ def field_logs() -> Any:
 
 @pytest.fixture
 def cf_faults() -> Callable[[Path], list[str]]:
-    """What the checker of the CF conventions has against a NetCDF file."""
+    """Return the complaints of the CF checker about a NetCDF file."""
     return _cf_faults
 
 
 def _cf_faults(path: Path) -> list[str]:
-    """What compliance-checker has against a file, at the version that the file claims."""
+    """Return the complaints of compliance-checker about a file, for the CF version that the file states."""
     import netCDF4
 
     pytest.importorskip("compliance_checker")
@@ -286,7 +286,7 @@ def _cf_faults(path: Path) -> list[str]:
 
 
 def _messages(result: Any) -> list[str]:
-    """Of every result that did not get all its points."""
+    """Return each result that did not get all its points."""
     if result.children:
         return [text for child in result.children for text in _messages(child)]
     value = result.value

@@ -1,4 +1,4 @@
-"""Frames compared: told apart by pandas' own assertion, which takes milliseconds, only where they are not the same."""
+"""Comparison of data frames. The slow assertion of pandas runs only if the frames differ."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from aerpaw_cmp.logs.records import ReadResult
 
 
 def assert_same_frame(left: pd.DataFrame, right: pd.DataFrame, **how: Any) -> None:
-    """As ``pandas.testing.assert_frame_equal``, whose options these are."""
+    """Compare like ``pandas.testing.assert_frame_equal``, with its options."""
     if not left.equals(right):
         pd.testing.assert_frame_equal(left, right, **how)
 

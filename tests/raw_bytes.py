@@ -317,7 +317,7 @@ class RawPath:
         self.floor = floor or (lambda _east, _north: ground_m)
 
     def pose(self, time_us: float) -> Pose | None:
-        """At an instant [us]; None before the first and after the last row."""
+        """Interpolate at a time [us]. None before the first and after the last row."""
         times = self.times_us
         if not times or not times[0] <= time_us <= times[-1]:
             return None

@@ -61,7 +61,7 @@ class Account:
 
     @property
     def failures(self) -> list[str]:
-        """What is out of tolerance, with the worst place of each kind."""
+        """Return what is out of tolerance, with the worst position of each kind."""
         lines = [
             f"{kind} differs by {self.worst[kind][0]:.3g} {_TOLERANCES[kind][1]} at {self.worst[kind][1]} ({count} differ)"
             for kind, count in self.failed.items()

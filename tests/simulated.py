@@ -13,7 +13,7 @@ NO_LOGS = shutil.ignore_patterns("flight.yaml", "SHA256SUMS")
 
 
 def simulate(flight: Path, folder: Path | None = None) -> None:
-    """Write the logs of a flight file and what was planted, beside it or to a folder with others."""
+    """Write the logs of a flight file, and the truth next to it or into a folder with others."""
     out = flight.parent / f"{flight.stem}_simulated"
     assert main(["simulate", str(flight), "-o", str(out), "--quiet"]) == 0
     shutil.copytree(out, folder or flight.parent, dirs_exist_ok=True, ignore=NO_LOGS)

@@ -1,4 +1,4 @@
-"""Flights whose logs are small tables: what a test plants stands in the columns."""
+"""Flights whose logs are small tables with known columns."""
 
 from pathlib import Path
 from typing import Any

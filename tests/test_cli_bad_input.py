@@ -122,7 +122,7 @@ KINDS = {
 def test_settings_of_another_kind_are_told_as_such(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Not key by key; and the next step names the command that reads them."""
+    """The file is refused as a whole, and the next step names the command that reads it."""
     for reader, text in KINDS.items():
         (file := tmp_path / "file.yaml").write_text(text)
         if reader != command and (reader, command) != ("report", "calibrate"):  # which takes flight files, too
@@ -155,7 +155,7 @@ def test_a_line_without_end_is_offered_no_columns(tmp_path: Path, capsys: pytest
 
 
 def test_named_columns_are_those_of_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A table beside other logs: the options that its line names are taken for the folder, too."""
+    """A table in a folder with other logs: the options that its message names apply to the folder, too."""
     (tmp_path / "1.BIN").write_bytes(dataflash())
     (tmp_path / "walk.csv").write_text("time,lat,lon,alt\n2025-03-02T15:00:01Z,35.73,-78.7,1\n")
     (tmp_path / "levels.csv").write_text("Time (UTC),Received power (dBm)\n2025-03-02T15:00:01,-80\n")

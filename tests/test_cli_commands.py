@@ -51,7 +51,7 @@ def test_formats_shows_every_reader(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_doctor_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """What this machine's LLVM did in its trial is remembered; tests/propagation/test_llvm.py tries it anew."""
+    """The result of this machine's LLVM trial is cached. tests/propagation/test_llvm.py repeats the trial."""
     trials = list(llvm._trials())
     monkeypatch.setattr(llvm, "first_that_works", lambda _: trials)
     capsys.readouterr()
@@ -86,7 +86,7 @@ def test_site_import_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.sionna
 def test_bench_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Of the two numbers of samples that ``--quick`` asks for, one is run: the rows are of the same kinds."""
+    """``--quick`` requests two numbers of samples, and one is run. The rows are of the same kinds."""
     real = bench.run_bench
 
     def one_of_them(*, samples: tuple[int, ...], **asked: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What every command has: -h, examples that parse, --quiet, --json; completion; what is said when it is interrupted."""
+"""Conventions of every command: -h, examples that parse, --quiet, --json, completion, messages of interrupts."""
 
 import json
 import os

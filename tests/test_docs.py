@@ -28,7 +28,7 @@ STARTS = ("aerpaw-cmp ", "python benchmarks/", "python tools/", "python -m ", "p
 
 
 def commands(text: str) -> list[tuple[str, bool]]:
-    """Command lines of a page, and whether each stands in a block (True) or within a sentence (False)."""
+    """Yield the command lines of a page, and whether each is in a block (True) or in a sentence (False)."""
     text = text.replace("\\\n", " ")
     lines = [line.strip().removeprefix("$ ") for line in text.splitlines()]
     inside = re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
@@ -37,13 +37,13 @@ def commands(text: str) -> list[tuple[str, bool]]:
 
 
 def words_of(line: str) -> list[str]:
-    """Words of a line without comment, pipe, and the brackets and dots of a synopsis; N, DB and the like are numbers."""
+    """Return the words of a line without comment, pipe, brackets and dots. N, DB and the like are numbers."""
     line = re.split(r"\s#|\s\||\s>|\s&", line)[0].replace("[", " ").replace("]", " ").replace("...", " ")
     return ["1" if word in _NUMBERS else word for word in shlex.split(line)]
 
 
 def check(line: str, in_block: bool) -> None:
-    """An exception if the line could not run as it stands: unknown command, option, file, target, wrong value."""
+    """Raise an exception if the line could not run: unknown command, option, file, target, or a wrong value."""
     program, *words = words_of(line)
     if program == "make":
         targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)

@@ -1,4 +1,4 @@
-"""docs/equations.md against the code: every function is there and names its equation back."""
+"""docs/equations.md against the code: each function exists and names its equation."""
 
 import importlib.util
 import inspect

@@ -37,7 +37,7 @@ def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.sionna
 def test_the_notebook_with_sionna_runs(sionna: object) -> None:
-    """Scenes of the notebook would stay alive beside those of later tests, so the cells run in another process."""
+    """Scenes of the notebook would stay in memory during later tests, so the cells run in another process."""
     source = "\n".join(source_of(cell) for cell in cells(SIONNA))
     check = "assert len(card['levels']) == 5 and gain.shape[1] == 5 and (gain > 0).mean() > 0.95"
     lines = [sys.executable, "-c", f"{source}\n{check}"]

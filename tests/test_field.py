@@ -74,7 +74,7 @@ def test_free_space_leaves_what_an_independent_trial_left(report: Report, name: 
 
 
 def test_snr_of_four_towers_is_scored_per_tower(report: Report) -> None:
-    """Beside the noise that the file takes: what is left after its mean is the comparison's own error."""
+    """The residual after the mean of the file's noise is the error of the comparison itself."""
     towers = report("aadm")["rss"]
     assert set(towers) == {"LW1", "LW2", "LW3", "LW4"}
     for channels in towers.values():
@@ -130,7 +130,7 @@ def test_what_no_reader_takes_is_named_with_a_reason(field_logs: Ingested) -> No
 def test_ingest_of_the_whole_folder_through_the_command_line(
     field_logs: Ingested, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """What is read was read above; here it is asked for as there, told and, one of six, written."""
+    """Each file was read above. Here it is read by the command, and one of six is written."""
     some = Ingested(field_logs[::6], field_logs.skipped)
 
     def read_above(paths: list[Path], *, options: ReadOptions, reader: str | None) -> Ingested:

@@ -1,4 +1,4 @@
-"""What the project says about itself is true: documents against code."""
+"""Statements of the project about itself are true: documents against code."""
 
 import ast
 import email
@@ -57,7 +57,7 @@ def test_classifiers_are_known_and_name_every_python_that_set_up_looks_for() -> 
 
 @pytest.mark.parametrize("owner", ["<owner>", "lab"], ids=["no owner", "an owner"])
 def test_the_readme_of_a_package_index_needs_no_file_of_ours(owner: str, tmp_path: Path) -> None:
-    """Without an owner the README is as it stands; with one, no link is left that leads nowhere there."""
+    """Without an owner, the README is unchanged. With an owner, no link is broken."""
     pytest.importorskip("hatchling", reason="hatchling is not installed")
     for name in ("README.md", "LICENSE", "aerpaw_cmp/__init__.py", "tools/readme_links.py"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -94,7 +94,7 @@ def test_every_dependency_has_a_lowest_version() -> None:
 
 
 def test_the_conda_recipe_asks_for_what_the_package_asks_for() -> None:
-    """But for Sionna RT, which has no conda package; names that conda spells otherwise are mapped."""
+    """All dependencies except Sionna RT, which has no conda package, are listed, with conda's names."""
     recipe = yaml.safe_load((ROOT / "packaging/conda-forge/recipe.yaml").read_text())
     assert recipe["context"]["version"] == aerpaw_cmp.__version__
     assert PROJECT["requires-python"] == f">={recipe['context']['python_min']}"
@@ -295,7 +295,7 @@ def test_the_files_that_run_first_are_there() -> None:
 
 
 def test_docstrings_begin_with_the_thing_or_a_verb() -> None:
-    """Not with What, Whether and the like, which tell the reader nothing before the verb comes."""
+    """Docstrings do not begin with What, Whether and similar words, which delay the verb."""
     asked = {"What", "Whether", "How", "Where", "Why", "Which", "Whose", "Who", "When"}
     for path in [*(ROOT / "aerpaw_cmp").rglob("*.py"), *(ROOT / "parsers").rglob("*.py")]:
         for node in ast.walk(parsed(path)):

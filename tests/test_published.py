@@ -99,7 +99,7 @@ def entry(place: Path, frame: pd.DataFrame, name: str = "mine", head: str = "") 
 
 
 def guess(bench: tasks.Bench, task: str = "unseen", **changes: object) -> pd.DataFrame:
-    """What a stranger hands in after ten lines of NumPy."""
+    """Return the predictions of a simple third-party model in ten lines of NumPy."""
     table = bench.rows(task)
     distance = np.sqrt(sum((table[f"{a}_m"] - table[f"tower_{a}_m"]) ** 2 for a in ("east", "north", "up")))
     level = -15.0 - 25.0 * np.log10(distance)
@@ -134,7 +134,7 @@ def test_scores_by_plain_loops(place: Path, bench: tasks.Bench) -> None:
 
 
 def _crps(error: float, sd: float) -> float:
-    """By its definition: the integral of the squared difference of the distributions."""
+    """Compute by the definition: the integral of the squared difference of the distributions."""
     x = np.linspace(-60.0, 60.0, 240_001)
     forecast = 0.5 * (1.0 + np.vectorize(math.erf)(x[::40] / sd / math.sqrt(2.0)))
     return float(np.trapezoid((np.interp(x, x[::40], forecast) - (x >= error)) ** 2, x)) if abs(error) < 60 else 0.0
@@ -222,7 +222,7 @@ def _refused(place: Path, bench: tasks.Bench, frame: pd.DataFrame, head: str = "
 def test_the_ten_lines_of_the_page_make_an_entry_that_is_scored(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What the README tells a stranger, from the template to the scores, on made-up flights."""
+    """Follow the README from the template to the scores, on simulated flights."""
     monkeypatch.chdir(tmp_path)
     data = ["--data", str(place / "logs"), "--manifest", str(place / "manifest.yaml")]
     assert published.main(["template", *data, "-o", "predictions.csv", "--task", "unseen"]) == 0
@@ -371,7 +371,7 @@ def test_slopes_are_those_of_the_tables() -> None:
 
 
 def test_values_by_hand_lie_near_free_space() -> None:
-    """At 200 m and 3.3 GHz free space loses 88.8 dB; every model of a path in sight is within 4 dB of it."""
+    """At 200 m and 3.3 GHz, free space loses 88.8 dB, and each line-of-sight model is within 4 dB of it."""
     free = 20.0 * np.log10(4.0 * np.pi * 200.0 * 3.3e9 / 299_792_458.0)
     assert free == pytest.approx(88.83, abs=0.01)
     assert entrants.p1411_loss_db(NEAR, 3.3e9) == pytest.approx(91.46, abs=0.01)  # 52.69 + 28.6 + 10.16

@@ -71,7 +71,7 @@ def test_planted_offsets_lie_in_their_intervals_with_noise(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("shift", [3.25, -1.5])
 def test_planted_clock_shift_is_found_and_applied(tmp_path: Path, shift: float) -> None:
-    """At LW1: the level at LW2 hardly depends on where this flight was."""
+    """Check LW1, because the level at LW2 hardly depends on the position on this flight."""
     (result, *_) = round_trip(tmp_path, clock_shift_s={"LW1": shift})["LW1"].values()
     clock = result.further.clock
     assert clock.verdict == "shifted"

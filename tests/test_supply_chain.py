@@ -1,4 +1,4 @@
-"""What is installed is what was locked, workflows run what was read, and nothing talks to other machines but Dask."""
+"""Installed packages are locked, workflows run fixed versions, and only Dask connects to other machines."""
 
 import ast
 import re

@@ -1,4 +1,4 @@
-"""Words of user-visible text: field terms, no private metaphors (docs/vocabulary.md). The law: test_project.py."""
+"""Words of user-visible text: terms of the field and no private metaphors (docs/vocabulary.md)."""
 
 import ast
 import functools
@@ -32,12 +32,12 @@ BANNED = {
 
 @functools.cache
 def parsed(path: Path) -> ast.Module:
-    """Syntax tree of a file, which several laws of test_project.py look through."""
+    """Return the syntax tree of a file, which several tests of test_project.py use."""
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def texts_of(path: Path) -> Iterator[tuple[int, str]]:
-    """Line and text of strings with a blank that are no docstrings, and of templates."""
+    """Yield line and text of strings with a blank that are not docstrings, and of templates."""
     if path.suffix != ".py":
         yield from enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
         return

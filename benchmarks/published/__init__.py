@@ -1,1 +1,1 @@
-"""Channel models scored on published AERPAW flights with frozen splits (README.md beside this file)."""
+"""Channel models scored on published AERPAW flights with fixed splits (see README.md in this folder)."""

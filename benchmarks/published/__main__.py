@@ -69,7 +69,7 @@ def score(bench: Bench, path: Path, tasks: list[str], *, accept_levels: bool = F
 
 
 def template(bench: Bench, out: Path, tasks: list[str], *, force: bool = False) -> list[Path]:
-    """Write the table to fill (no level of a test flight is in it) and, beside it, NAME_train.csv: what is known."""
+    """Write the table to fill, without levels of test flights, and NAME_train.csv with the training data."""
     chosen = bench.chosen(tasks)
     test = pd.concat([bench.rows(task) for task in chosen], ignore_index=True).drop(columns="measured")
     if test.empty:

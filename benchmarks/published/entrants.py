@@ -30,7 +30,7 @@ def _distance_m(rows: pd.DataFrame) -> Any:
 
 
 def _offsets(values: Any, known: pd.DataFrame, asked: pd.DataFrame) -> Any:
-    """Mean of values (n,) of known rows for asked rows: of the same series, else the same channel, else all."""
+    """Return means (n,) for target rows: of known rows of the same series, else the same channel, else all."""
     table, out = known.assign(value=values), np.full(len(asked), np.mean(values))
     for keys in (["tower", "channel"], ["flight", "tower", "channel"]):
         means = asked[keys].merge(table.groupby(keys, as_index=False)["value"].mean(), how="left", on=keys)["value"]

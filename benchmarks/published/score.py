@@ -31,7 +31,7 @@ REPLICATES, SEED = 2000, 20240715
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Predictions of one entrant: ``frame`` by :data:`KEY`, and what its head says (``entrant``, ``who``, ...)."""
+    """The predictions of one entrant: ``frame`` by :data:`KEY`, and its head (``entrant``, ``who``, ...)."""
 
     frame: pd.DataFrame
     head: Mapping[str, str]

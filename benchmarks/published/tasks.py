@@ -1,4 +1,4 @@
-"""What is asked of an entrant: files known by their bytes, flights, splits, and the table of each task."""
+"""The tasks of an entrant: files identified by their bytes, flights, splits, and the table of each task."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Task(StrictModel):
 
     @property
     def rule(self) -> str:
-        """What an entrant may know and how levels are counted."""
+        """The data that an entrant may use, and how its levels are scored."""
         known = {
             "flights": "the training flights",
             "sectors": f"the training flights outside the sample's sector of {360 // SECTORS} degrees at the tower "
@@ -125,7 +125,7 @@ def locate(manifest: Manifest, folder: Path) -> dict[str, Path]:
 
 
 def _content_digest(path: Path, sizes: set[int]) -> str:
-    """SHA-256 of a file after unpacking; empty where its size is none of those wanted."""
+    """Return the SHA-256 of a file after unpacking. Empty if no file with this size is expected."""
     with path.open("rb") as stream:
         zipped = stream.read(2) == b"\x1f\x8b"
     if not zipped:

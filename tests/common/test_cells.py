@@ -1,4 +1,4 @@
-"""Names from strangers' logs are no formulas in the tables of a report."""
+"""Names from third-party logs are not formulas in the tables of a report."""
 
 import csv
 import io

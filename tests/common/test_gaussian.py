@@ -1,4 +1,4 @@
-"""Gaussian processes against 50 digits, closed forms and fits that never had the part left out."""
+"""Gaussian processes against 50 digits, closed forms, and fits without the held-out part."""
 
 import mpmath as mp
 import numpy as np
@@ -32,7 +32,7 @@ def test_answers_are_those_of_fifty_digits():
 
 
 def test_two_values_in_closed_form():
-    """Of unit variances with correlation r, the second is expected at r times the first, and leaves 1 - r^2."""
+    """For unit variances and correlation r, the second has the mean r times the first, and the variance 1 - r^2."""
     r = 0.6
     alone = Factor.of(np.array([[1.0]]))
     mean, explained = alone.condition(np.array([[r]]), alone.whiten(np.array([2.0])))

@@ -34,7 +34,7 @@ def test_between_two_places_of_a_site_the_distance_is_that_of_the_geodesic_to_a_
 @pytest.mark.parametrize("shape", [(), (0,), (1,), (1, 1), (2,), (2, 3)])
 @pytest.mark.filterwarnings("error")
 def test_places_come_back_in_their_shape(shape: tuple[int, ...]) -> None:
-    """Of an array of one, pyproj up to 3.7.1 makes a number, with a warning of NumPy."""
+    """pyproj up to 3.7.1 treats an array of one element as a number, with a warning of NumPy."""
     rng = np.random.default_rng(5)
     east, north = rng.uniform(-2000, 2000, shape), rng.uniform(-2000, 2000, shape)
     latitude, longitude = FRAME.to_geographic(east, north)
@@ -52,7 +52,7 @@ def test_one_longitude_for_many_latitudes() -> None:
 
 
 def test_bearings_turn_with_the_clock_and_azimuths_against_it() -> None:
-    """A vector made of its bearing has that bearing, and its azimuth is what the bearing lacks to a right angle."""
+    """A vector computed from a bearing has that bearing, and its azimuth is 90 degrees minus the bearing."""
     bearing = np.linspace(-179.0, 180.0, 360)
     turned, up = np.radians(bearing), np.radians(np.linspace(-90.0, 90.0, 360))
     vectors = 7.0 * np.column_stack([np.cos(up) * np.sin(turned), np.cos(up) * np.cos(turned), np.sin(up)])

@@ -28,7 +28,7 @@ def interrupt() -> None:
 
 
 class Finalised:
-    """Where Python prints "Exception ignored in" and goes on."""
+    """Interrupt code in which Python prints "Exception ignored in" and continues."""
 
     def __del__(self) -> None:
         interrupt()
@@ -204,7 +204,7 @@ def test_a_hang_up_that_nohup_ignores_stays_ignored():
 
 
 def test_an_interrupt_that_met_an_exec_ends_with_its_exit_code(tmp_path):
-    """dataclasses and namedtuples are made by exec(); run by ``-m``, the interpreter would end by the signal."""
+    """An interrupt in exec(), which makes dataclasses, ends ``-m`` with exit code 130, not by the signal."""
     (tmp_path / "program.py").write_text(
         "import sys\n"
         "from aerpaw_cmp import __main__ as program, cli\n"

@@ -1,4 +1,4 @@
-"""What JSON cannot hold becomes null, text or a mapping, and nothing else changes."""
+"""Values that JSON does not support become null, text or a mapping. All others are unchanged."""
 
 import json
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What NumPy's mask hides is missing, as NaN is: gaps of NetCDF and GeoTIFF files come so."""
+"""Values under NumPy's mask are missing like NaN: gaps of NetCDF and GeoTIFF files have this form."""
 
 import ast
 from collections.abc import Callable

@@ -52,7 +52,7 @@ def virtual(book: h5py.Group, name: str, path: object) -> None:
 
 
 def names(folder: Path) -> list[str]:
-    """Private things, as a stranger may write their names."""
+    """Private files, named as a hostile file might name them."""
     here = Path("x.mat").absolute().parent
     return [str(folder / "key"), os.path.relpath(folder / "key", here), str(folder / "fifo"), str(folder / "key.h5"),
             "/dev/zero"]  # fmt: skip
@@ -99,7 +99,7 @@ def hostile(folder: Path) -> dict[str, bytes]:
 
 
 def read(path: Path) -> object:
-    """What a command does with a file of this name."""
+    """Run the command that reads a file of this name."""
     if path.suffix == ".tif":
         from aerpaw_cmp.common.geodesy import SiteFrame
 
@@ -213,7 +213,7 @@ def test_variables_named_as_arguments_are_variables() -> None:
 
 
 def test_a_module_in_the_working_folder_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stranger's folder of logs may hold a numpy.py."""
+    """A third-party folder of logs may contain a numpy.py."""
     for name in ("numpy", "h5py", "aerpaw_cmp"):
         (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
     monkeypatch.chdir(tmp_path)

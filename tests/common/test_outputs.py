@@ -150,7 +150,7 @@ def test_a_folder_with_something_of_others_is_refused_and_left_alone(tmp_path: P
 @pytest.mark.parametrize("name", ["../thesis.tex", "{folder}/thesis.tex", "link/thesis.tex", "a/../../thesis.tex"])
 @pytest.mark.parametrize("force", [False, True])
 def test_a_list_that_names_a_file_outside_its_folder_removes_nothing(tmp_path: Path, name: str, force: bool) -> None:
-    """A folder of results that somebody handed on, with a list that its own tool could have written."""
+    """A third-party result folder has a list of files that this tool could have written."""
     thesis, out = tmp_path / "thesis.tex", tmp_path / "out"
     thesis.write_text("years of work")
     out.mkdir()
@@ -290,7 +290,7 @@ def test_folders_that_cannot_be_exchanged_are_told_first(tmp_path: Path, monkeyp
 
 
 def test_a_folder_is_told_first_where_is_dir_hides_every_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From Python 3.14 on ``Path.is_dir`` is as silent as ``os.path.isdir``."""
+    """From Python 3.14 on, ``Path.is_dir`` returns False for errors, like ``os.path.isdir``."""
     monkeypatch.setattr(Path, "is_dir", lambda path, **_: os.path.isdir(path))  # noqa: PTH112 - the one that is silent
     with pytest.raises(UsageError, match="name too long"), OutputFolder(tmp_path / ("x" * 300), job="report"):
         pytest.fail("the work begins")

@@ -1,4 +1,4 @@
-"""Whatever a file of others makes a parser raise is one message about that file."""
+"""Any exception of a parser because of a file's content becomes one message about that file."""
 
 import ast
 from collections.abc import Callable
@@ -48,7 +48,7 @@ def test_messages_of_our_own_and_interrupts_pass_through() -> None:
 
 
 def line_of(module: str) -> Callable[..., int]:
-    """A line of a module that adds a number to whatever it is given."""
+    """Return a line of a module of this package that adds a number to its argument."""
     scope: dict[str, Any] = {"__name__": module}
     exec("def add(cell, *_, **__): return cell + 1", scope)
     return cast("Callable[..., int]", scope["add"])

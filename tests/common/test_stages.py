@@ -70,7 +70,7 @@ def test_a_terminal_gets_one_bar_with_the_time_left(
 def test_a_bar_goes_on_where_the_terminal_is_hidden_behind_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """While a bar is drawn, rich stands in the place of standard error, and up to 13.7 it says that it is no terminal."""
+    """While a bar is drawn, rich replaces standard error, and up to 13.7 its replacement is not a terminal."""
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     progress = shown.ProgressLines()

@@ -1,4 +1,4 @@
-"""Which tree made a number: a release names its version alone, every other tree its commit too."""
+"""The version of the tree that made a number: a release has its version only, other trees also their commit."""
 
 import shutil
 import subprocess

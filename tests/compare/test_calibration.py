@@ -98,7 +98,7 @@ def test_the_mean_alone_is_that_of_the_prediction() -> None:
 
 
 def test_levels_below_the_floor_of_a_receiver_teach_no_gain() -> None:
-    """Where the receiver lost its lock it writes noise: taken as levels, they flatten the antenna's null."""
+    """A receiver without lock writes noise. Used as levels, this noise would flatten the antenna's null."""
 
     def lost(o: Observed, floor_db: float | None) -> Observed:
         faded = o.samples.residual_db + np.random.default_rng(4).normal(0.0, 3.0, len(o.samples))
@@ -117,7 +117,7 @@ def test_levels_below_the_floor_of_a_receiver_teach_no_gain() -> None:
 
 @pytest.mark.parametrize("floor_db", [None, -90.0])
 def test_pattern_and_learned_gain_together_are_the_planted_gain(floor_db: float | None) -> None:
-    """The gain is learned on top of the pattern as mounted, whatever part of the levels the pattern explains."""
+    """The gain is added to the mounted pattern, even if the pattern explains only a part of the levels."""
 
     def pattern(direction: np.ndarray) -> np.ndarray:
         return 6.0 * direction[:, 0] ** 2 + 2.0 * direction[:, 1]
@@ -318,7 +318,7 @@ def test_parts_of_a_circle_and_of_the_heights_are_those_by_hand() -> None:
 
 
 def test_below_its_floor_a_receiver_has_what_the_fit_says_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Levels 3 dB above the gain, a floor of -5 dB beside a pattern of 2 dB: by hand."""
+    """Levels 3 dB above the gain, and a floor of -5 dB with a pattern of 2 dB, computed by hand."""
     gain, pattern_db = np.linspace(-20.0, 20.0, 200), np.full(200, 2.0)
     level_db = gain + 3.0 + pattern_db
     base = observed("a").samples

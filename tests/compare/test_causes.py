@@ -59,7 +59,7 @@ def test_a_sound_flight_and_a_short_or_silent_one_accuse_nobody() -> None:
 
 
 def test_the_clock_has_the_lag_of_its_judgement_and_no_other() -> None:
-    """The page, the warning and the table have one lag; a clock that could not be judged or was corrected is no cause."""
+    """Page, warning and table have the same lag. A clock that was corrected or not determined is not a cause."""
     sound = _sound()
     late = np.interp(sound.time_s - 4.0, sound.time_s, sound.predicted_db) + sound.measured_db - sound.predicted_db
     cause = flight_cause([replace(sound, measured_db=late, clock=_clock(3.93, "shifted"))])
@@ -136,7 +136,7 @@ def test_a_signal_below_the_noise_overloads_no_receiver() -> None:
 
 @pytest.mark.parametrize("step_db", [0.05, 6.0])
 def test_an_error_that_no_page_shows_has_no_cause(step_db: float) -> None:
-    """Exact levels but for a step of 0.05 dB: as sure as one of 6 dB, and nobody need do anything about it."""
+    """A step of 0.05 dB in exact levels is as certain as one of 6 dB, but too small to matter."""
     sound = _sound()
     stepped = replace(sound, measured_db=sound.predicted_db + MEASURED_DB + step_db * (sound.time_s > 120.0))
     assert _named(stepped) == ("gain step" if step_db > 1.0 else NONE)
@@ -167,7 +167,7 @@ def test_fading_that_stands_where_a_uav_hovers_is_no_trouble(spread_db: float) -
 
 
 def test_a_loss_that_rests_on_undetected_samples_is_none() -> None:
-    """What looks like an obstacle is the level that a receiver writes where it detects nothing."""
+    """A loss in one sector may be the level that a receiver writes if it detects nothing."""
     sound = _sound()
     sector = (np.abs(sound.tower_azimuth_deg - 40.0) < 45.0) | (sound.time_s % 50.0 < 2.0)
     for spread_db in (0.0, 0.15):
@@ -189,7 +189,7 @@ def test_a_flat_level_is_neither_floor_nor_saturation(spread_db: float) -> None:
 
 
 def test_what_is_left_above_a_floor_is_no_ceiling_and_no_other_trouble() -> None:
-    """A second run, with the floor of the first: of the low links those that fade upwards remain."""
+    """In a second run with the floor of the first, only weak links whose fading raises them remain."""
     sound = _sound()
     floor = np.quantile(sound.measured_db, 0.4)
     shown = floor + 10.0 * np.log10(1.0 + 10.0 ** (0.1 * (sound.measured_db - floor)))
@@ -456,7 +456,7 @@ def test_an_exponent_of_the_distance_or_a_gain_over_elevation_is_no_unit() -> No
 
 
 def test_a_cause_brings_the_error_back_to_that_of_other_flights() -> None:
-    """A wave over directions beside a wave of time: the antenna explains a part, and less than is usual."""
+    """A wave over directions plus a wave over time: the antenna explains a part of the error, less than usual."""
     sound = _sound()
     pattern, time = 4.0 * np.sin(np.radians(2 * sound.uav_azimuth_deg)), 4.0 * np.sign(np.sin(sound.time_s / 17.0))
     e = replace(sound, antenna="learned", measured_db=sound.measured_db + pattern)
@@ -546,7 +546,7 @@ def test_a_limit_that_the_page_counts_is_not_found_again() -> None:
 
 
 def test_a_gain_control_that_levels_all_is_no_other_tower() -> None:
-    """What a smoother level leaves must be less than what a constant leaves."""
+    """The residual of a smoother level must be smaller than that of a constant."""
     sound = _sound()
     levelled = MEASURED_DB + 1.5 * (sound.measured_db - sound.predicted_db - MEASURED_DB) + 0.1 * sound.predicted_db
     flat = {"LW5": 0.5 * np.cos(sound.time_s / 40.0)}

@@ -96,7 +96,7 @@ def unsure(known: Sequence[LinkSamples]) -> object:
 
 @pytest.mark.parametrize("base", [fixed_base(gain), unsure])
 def test_what_is_left_out_is_scored_as_by_hand(base: Base) -> None:
-    """Two flights share antenna A, the third alone has B: it is scored by nobody."""
+    """Two flights share antenna A, and only the third has B, so no flight can score B."""
     series = [flight("a", 1), flight("b", 2), flight("c", 3, "B")]
     choice = choose(series, {"made": base})
     for title, model in FEW.items():

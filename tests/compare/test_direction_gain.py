@@ -194,7 +194,7 @@ def test_mounts_are_found_together():
 
 
 def test_probabilities_of_mounts_by_trying_all_pairs():
-    """Least squares of levels over 4 s about the patterns, 10 dB each; of a mast, weighted over azimuths of the UAV."""
+    """Compute a least-squares fit of 4 s levels about the patterns (10 dB each), for a mast weighted over azimuths."""
     pattern = lambda d: 9.0 * d[:, 0] + 4.0 * d[:, 1] ** 2  # noqa: E731
 
     (flight,) = planted("f", 57, {"uav": pattern, "A": pattern}, n=60, channels=("A",))

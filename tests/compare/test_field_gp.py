@@ -251,7 +251,7 @@ def test_long_flights_are_thinned_to_whole_stretches_from_end_to_end():
 
 
 def test_scales_are_sought_within_their_limits_from_the_usual_ones_on(monkeypatch):
-    """Decibels to 12, lengths of 10 to 300 m, 5 to 100 m of height, memories of 3 s to 10 minutes."""
+    """The bounds: 12 dB, lengths of 10 to 300 m, heights of 5 to 100 m, correlation times of 3 s to 10 minutes."""
     limits = {"place_sd_db": (0.05, 12), "length_m": (10, 300), "height_m": (5, 100), "turn": (0.2, 5),
               "drift_sd_db": (0.05, 12), "drift_s": (3, 600), "noise_sd_db": (0.2, 12)}  # fmt: skip
     asked = []

@@ -13,7 +13,7 @@ def ranks(n=400, seed=1):
 
 
 def test_both_scores_are_proper():
-    """Nobody does better than with the probabilities that the ranks were drawn from."""
+    """No forecast scores better than the probabilities from which the ranks were drawn."""
     truth = np.array([0.1, 0.5, 0.3, 0.1])
     rng = np.random.default_rng(3)
     for _ in range(50):
@@ -45,7 +45,7 @@ def test_samples_without_report_or_forecast_take_no_part():
 
 
 def test_every_interval_is_that_of_the_influence_of_the_samples():
-    """By leaving out one sample at a time: what that changes is the influence, and its mean's interval that of a number."""
+    """The influence of a sample is the change without it, and the mean influence has the interval of the score."""
     rng, rank = np.random.default_rng(5), ranks(600, 4)
     p = rng.dirichlet([2, 5, 3, 1], 600)
     p[::2] = p[1::2]

@@ -1,4 +1,4 @@
-"""Ladder of models on planted truths."""
+"""Model comparison on simulated truths."""
 
 import numpy as np
 import pytest
@@ -23,14 +23,14 @@ def ladder_rows(ladder, names):
 
 
 def wave(n, seed, sd=1.0):
-    """Noise that remembers some 10 samples."""
+    """Return noise with a correlation time of about 10 samples."""
     white = np.random.default_rng(seed).normal(size=n + 50)
     kernel = np.exp(-np.arange(50) / 10.0)
     return sd * np.convolve(white, kernel / np.sqrt((kernel**2).sum()), "valid")[:n]
 
 
 def along(count):
-    """Places on a line, one after the other: cells of places are stretches of time."""
+    """Return positions along a line, so that areas of the plan are segments in time."""
     return np.column_stack([np.arange(float(count)), np.zeros((count, 2))])
 
 
@@ -169,7 +169,7 @@ def test_the_slope_of_a_place_does_not_come_from_that_place() -> None:
 
 
 def test_a_missing_level_or_place_leaves_the_line_of_the_others() -> None:
-    """What was not measured gets the line of all; where the ends coincide there is none."""
+    """Samples without a measurement get the line of all samples. Coinciding ends get no value."""
     rng = np.random.default_rng(2)
     distance = rng.uniform(50.0, 900.0, 400)
     position = np.column_stack([distance, rng.uniform(-50.0, 50.0, 400), np.zeros(400)])
@@ -207,7 +207,7 @@ def test_the_fastest_sufficient_model_is_not_significantly_worse_than_the_best()
 
 
 def test_models_that_cannot_differ_are_one_row() -> None:
-    """Of models without a path through what they add the first stays, with those of the flight file and the advice."""
+    """If several models do not differ, the first is kept, with the models of the flight file and the recommendation."""
 
     def rows(model: str, *errors_db: float, recommended: bool = False) -> list[LadderRow]:
         return [

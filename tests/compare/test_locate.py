@@ -106,7 +106,7 @@ def test_a_median_is_below_the_floor_where_most_samples_are() -> None:
 
 
 def _flights(count: int, floor_db: float, bins: int = 75) -> Iterator[tuple[LevelTrack, FloatArray]]:
-    """Flights drawn from the model, and where the node truly stood: away from where the levels say, as in the field."""
+    """Return flights drawn from the model, and the true position of the node, away from the estimate."""
     random = np.random.default_rng(5)
     time, position = _lawnmower(bins)
     for _ in range(count):

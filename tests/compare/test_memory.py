@@ -1,4 +1,4 @@
-"""Memories of a sequence: covariances by numerical integration, likelihoods by SciPy, and what draws owe to the sequence."""
+"""Correlations of a sequence: covariances by numerical integration, likelihoods by SciPy, posterior draws."""
 
 from collections.abc import Callable
 
@@ -16,7 +16,7 @@ POINTS = 2000
 
 
 def integrated(rate: float, terms: int, law: Callable[[np.ndarray], np.ndarray] | None = None) -> np.ndarray:
-    """Covariance of mean and cosine terms of exp(-rate |s - t|) or another law, by the midpoint rule on a fine grid."""
+    """Return the covariance of mean and cosine terms of exp(-rate |s - t|) or another kernel, by the midpoint rule."""
     at = (np.arange(POINTS) + 0.5) / POINTS
     basis = np.sqrt(2.0) * np.cos(np.pi * np.outer(np.arange(terms + 1), at))
     basis[0] = 1.0
@@ -211,7 +211,7 @@ def test_errors_as_large_as_stated_get_no_verdict_on_a_lawnmower_over_shadowing(
 
 
 def test_intervals_of_a_lawnmower_over_shadowing_cover_the_truth() -> None:
-    """By time alone they cover the offset in three of four flights: the track returns next to its earlier legs."""
+    """With correlation over time alone, three of four offsets are covered, because the track returns."""
     place = lawnmower(400)
     errors = shadowed(place, 150.0, 150, seed=3)
     truth = np.sqrt(errors.var(axis=1).mean())

@@ -1,4 +1,4 @@
-"""Every pair of a season's passes: those of brute force, exactly; intervals as the bootstrap gives them."""
+"""Pairs of passes of a campaign: equal to brute force, with intervals like those of the bootstrap."""
 
 import numpy as np
 import pytest

@@ -214,7 +214,7 @@ def test_the_grid_of_k_holds_the_papers_values():
 
 @pytest.mark.parametrize(("repeated", "verdict"), [(11, "fresh"), (12, "held")])
 def test_a_report_is_held_where_fewer_than_nine_tenths_of_the_rows_are_new(repeated, verdict):
-    """A row is new where the rank or a number beside it changes, or where no number stands beside it."""
+    """A row is new if the rank or a number of the same row changes, or if the row has no such number."""
     other = np.cumsum(np.arange(100) % 100 >= repeated).astype(float)  # the first rows repeat each other
     numbers = {"sinr_db": other, "cqi": np.full(100, 7.0)}
     reports = stale_reports(np.arange(100) * 0.5, np.where(np.arange(100) < 60, 2.0, 3.0), numbers)

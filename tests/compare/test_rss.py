@@ -44,7 +44,7 @@ def test_a_planted_offset_comes_back():
 
 @pytest.mark.parametrize("away_db", [30.04, 80.0])
 def test_an_interval_is_of_the_error_that_is_stated(away_db):
-    """Beside the mean by a rounding of the offset, and by an offset beyond the span, 30 dB."""
+    """The offset differs from the mean by the rounding, and by the limit of the search range of 30 dB."""
     time, measured, simulated = flight(60, sigma=0.0)
     noise = np.random.default_rng(1).normal(0, 0.01, 60)
     fit = compare_rss(time, measured + noise + away_db - 30.0, simulated, baselines={"free_space": simulated})

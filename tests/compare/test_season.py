@@ -1,4 +1,4 @@
-"""Numbers over a season: against closed forms, brute force, and the coverage of their intervals."""
+"""Numbers of a campaign against closed forms, brute force, and the coverage of their intervals."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_few_flights_and_missing_ones():
 
 @pytest.mark.parametrize("n", [3, 19, 20])
 def test_intervals_are_those_of_students_t(n):
-    """Of twenty flights that drift, as many count as are independent."""
+    """For twenty flights that drift, the effective number is that of independent flights."""
     values = np.arange(n) // 4 + np.sin(np.arange(n))
     mean, independent = mean_of_flights(values), max(independent_samples(values), 3.0) if n >= 20 else n
     reach = student.ppf(0.975, independent - 1) * values.std(ddof=1) / np.sqrt(independent)

@@ -1,4 +1,4 @@
-"""Error bars of a learned prediction hold what they say."""
+"""The error bars of a learned prediction have the stated coverage."""
 
 import dataclasses
 
@@ -98,7 +98,7 @@ def test_two_parts_hold_their_share_and_their_score_is_the_integral_over_levels(
 
 
 def test_fading_does_not_depend_on_the_zero_of_the_clock() -> None:
-    """Bins begin with the first sample, whatever its time is called."""
+    """Bins begin with the first sample, for any origin of time."""
     random = np.random.default_rng(8)
     flown = samples(random.normal(0.0, 3.0, 800) + np.repeat(random.normal(0.0, 8.0, 100), 8))
     flown = dataclasses.replace(
@@ -135,7 +135,7 @@ def test_the_kurtosis_counts_only_as_far_as_the_expansion_holds() -> None:
 
 
 def test_fading_is_the_pooled_variance_about_the_means_of_bins() -> None:
-    """Of bins of any size, down to two samples; one alone says nothing."""
+    """Bins may have any size of two samples or more. A single sample has no estimate."""
     random = np.random.default_rng(9)
     bins = [random.normal(10.0 * k, 1.0 + k, size) for k, size in enumerate((2, 3, 2, 7, 1, 2))]
     time_s = np.concatenate([4.0 * k + np.linspace(0.5, 3.5, len(part)) for k, part in enumerate(bins)])

@@ -19,7 +19,7 @@ from aerpaw_cmp.compare.statistics import (
 
 
 def shadowing(rng, n, samples, sigma):
-    """AR(1) sequence that forgets in so many samples."""
+    """Return an AR(1) sequence with a correlation time in samples."""
     keep = np.exp(-1.0 / samples)
     noise = rng.normal(size=n)
     noise[0] /= np.sqrt(1 - keep**2)
@@ -54,7 +54,7 @@ def test_degenerate_sequences():
 
 
 def test_what_a_pair_may_add_by_chance_is_the_rest_of_regression_on_the_other_stretches():
-    """By hand: each of 24 stretches takes its share from the other 23; a stretch alone with a difference takes half."""
+    """By hand: each of 24 segments uses the slope of the other 23. A single segment with a difference uses half."""
     rng = np.random.default_rng(15)
     first, second = rng.normal(size=(2, 240))
     apart, expected = first - second, np.empty(240)
@@ -69,7 +69,7 @@ def test_what_a_pair_may_add_by_chance_is_the_rest_of_regression_on_the_other_st
 
 
 def test_the_channels_of_a_flight_are_one_test():
-    """Fading that ten channels share counts once; samples of one instant stand together whatever the channel."""
+    """Fading that ten channels share is counted once. Samples at one time are grouped over channels."""
     rng, time = np.random.default_rng(16), np.arange(600.0)
     a, b = (shadowing(rng, 600, 8, 4.0) for _ in range(2))
     alone = statistics.pooled_difference([(time, a, b)])

@@ -104,7 +104,7 @@ def test_intervals_of_a_step_cover_it_if_a_third_of_the_links_is_missing() -> No
 
 
 def seasons(count: int, link_sd_db: float, seed: int, step_db: float = 1.0) -> dict[str, float]:
-    """Shares over seasons of soundings between ten radios with one step each; 2 % of the links missing."""
+    """Return detection rates over simulated campaigns of ten radios with one step each and 2 % missing links."""
     rng, same, soon, held, false, sd = np.random.default_rng(seed), 0, 0, 0, 0, []
     night = [f"{number:03}" for number in range(NIGHTS)]
     for _ in range(count):

@@ -44,7 +44,7 @@ def campaign(trouble: str, draw: Generator) -> Verdict:
 
 
 def calibration(trouble: str, draw: Generator) -> Verdict:
-    """4 to 8 flights left out, two channels: hard flights are hard for both models."""
+    """Return 4 to 8 held-out flights with two channels. A difficult flight has larger errors for both models."""
     n = int(draw.integers(4, 9))
     hard = draw.normal(6.0, 1.0, n)
     change = {"better": -2.0, "worse": 2.0}.get(trouble, 0.0) + draw.normal(0.0, 0.5, n)
@@ -64,7 +64,7 @@ def frames(trouble: str, draw: Generator) -> Verdict:
 
 
 def prediction(trouble: str, draw: Generator) -> Verdict:
-    """A flight of 2 to 5 dB of error that remembers 2 to 10 s, its offset drawn as stated."""
+    """Return a flight with an error of 2 to 5 dB, a correlation time of 2 to 10 s, and an offset drawn as stated."""
     n, sd, common = 1500, draw.uniform(2.0, 5.0), 1.5
     error = correlated_noise(draw, n, 0.8 * sd, 0.4, draw.uniform(2.0, 10.0)) + draw.normal(0.0, 0.6 * sd, n)
     error += draw.normal(0.0, common) if trouble != "biased" else draw.choice([-1.0, 1.0]) * draw.uniform(9.0, 14.0)
@@ -180,7 +180,7 @@ def test_two_groups_of_flights_are_compared_by_students_test() -> None:
 def test_chance_is_shared_by_all_that_is_tried_and_two_decibels_are_small(
     chances: tuple[float, ...], effect: float, cause: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two false alarms in a hundred campaigns, whatever the number of shifts that are tried."""
+    """There are at most two false alarms in a hundred campaigns, for any number of shifts that are tested."""
     shifts = [(chance, Verdict(cause="gain step", effect=effect)) for chance in chances]
     monkeypatch.setattr(verdicts, "_shifts", lambda *_: iter(shifts))
     assert campaign_verdict({}, {}, []).cause == cause
@@ -250,7 +250,7 @@ def test_the_worst_height_says_what_takes_its_coverage(
      ("no_interval no_interval", "no interval"), ("better no_interval", "not separable")],
 )  # fmt: skip
 def test_an_antenna_beats_every_wrong_frame_and_a_place_loses_to_one(causes: str, verdict: str) -> None:
-    """The nearest rival stands: of those that win, where one does."""
+    """The most similar model is named: among the better models if there are any."""
     against = [Verdict(cause=c.replace("_", " "), effect=float(k - 2)) for k, c in enumerate(causes.split())]
     nearest = antenna_or_place([*against, Verdict(cause="better")])
     assert (nearest.cause, nearest.effect) == (verdict, float(len(against) - 3))

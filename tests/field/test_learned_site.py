@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.usefixtures("few_pictures"), pytest.mark.field]
 
 
 def calibrated(name: str, folder: Path) -> Path:
-    """A site in a folder that remembers a calibration."""
+    """Return a site in a folder with a stored calibration."""
     content = yaml.safe_load((HERE / f"{name}.yaml").read_text(encoding="utf-8"))
     for part in content.get("campaigns", {"": content}).values():
         part["flights"] = [str((HERE / flight).resolve()) for flight in part["flights"]]
@@ -40,7 +40,7 @@ def calibrated(name: str, folder: Path) -> Path:
 
 
 def same_numbers(left: Any, right: Any) -> bool:
-    """Whether two records agree but for rounding."""
+    """Check whether two records agree up to rounding."""
     if isinstance(left, dict):
         return set(left) == set(right) and all(same_numbers(value, right[key]) for key, value in left.items())
     if isinstance(left, list):

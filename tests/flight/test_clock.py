@@ -38,7 +38,7 @@ REACHED_S = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(CORNERS, axi
 
 
 def flown(t):
-    """A zigzag with sharp turns beside and over a tower: position (n, 3) [m]."""
+    """Return a zigzag with sharp turns next to and above a tower: position (n, 3) [m]."""
     return np.column_stack([np.interp(t, REACHED_S, CORNERS[:, axis]) for axis in range(3)])
 
 
@@ -334,7 +334,7 @@ def test_a_jittering_attitude_makes_no_sharp_optimum():
 
 
 def test_ratios_do_not_vote_on_the_clock_where_levels_do(monkeypatch):
-    """The sounder's quality saturates: pooled with the level, it said +14.8 s for a planted lag of 5 s."""
+    """The sounder's quality saturates. Combined with the level, it gave +14.8 s for an injected lag of 5 s."""
     monkeypatch.setattr(flight_replay, "_along", lambda *_: [ALONG])
     monkeypatch.setattr(flight_replay, "_clock_levels", lambda _, series: series.measured_db)
     track = SimpleNamespace(start_ns=0, end_ns=10**9)
@@ -382,7 +382,7 @@ def test_half_a_second_is_no_shift_on_any_grid():
 
 @pytest.mark.parametrize("width", [0.4, 3.0, 10.0, 12.6])
 def test_a_running_mean_moves_nothing_in_time(width: float) -> None:
-    """Of a line it is the line: a mean over an even number of rows, half a step early, would shift every clock."""
+    """The mean of a straight line is the line. A mean that is half a step early would shift every clock."""
     line = np.arange(60.0)[:, None] * [1.0, -3.0]
     np.testing.assert_allclose(_averaged(line, width)[8:-8], line[8:-8], atol=1e-9)
     peak = (np.arange(60.0) == 30.0)[:, None] * [1.0, 2.0]
@@ -457,7 +457,7 @@ def test_lags_are_tried_finely_where_one_stands_out(bend: float, finest: float) 
 
 
 def test_an_optimum_between_two_excluded_lags_is_found() -> None:
-    """Two lags explain a level about equally well: the second lies half way between lags that are excluded by themselves."""
+    """Two lags explain a level about equally well, and the second is between two excluded lags."""
     lags = np.arange(-30, 31) * 0.5
 
     def likelihood(some: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What contradicts a log is a question with both values; what agrees is none."""
+"""A contradiction of a log becomes a question with both values. Agreement leads to no question."""
 
 import zipfile
 from dataclasses import replace
@@ -102,7 +102,7 @@ def test_a_log_that_ends_in_the_air_begins_on_the_ground(step_m: float, after_m:
 
 @pytest.mark.parametrize(("low_m", "asked"), [(140.0, True), (90.0, True), (180.0, False), (60.0, False)])
 def test_heights_near_the_ground_above_the_sea_are_asked_about_in_the_air(low_m: float, asked: bool) -> None:
-    """The ground is 120 m above the sea; the part of a flight at 90 m above its take-off is no mistake."""
+    """The ground is 120 m above the sea. A flight segment at 90 m above take-off is not an error."""
     site = replace(load_site("lake_wheeler"), ground_above_sea_m=120.0)
     (log,) = _log("plain.csv", "2024-07-02T15:00:00", low_m=low_m).result.streams
     aloft = replace(log, frame=log.frame.iloc[10:])

@@ -1,4 +1,4 @@
-"""From logs to the series of one flight."""
+"""Series of a flight from its logs."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,7 +50,7 @@ def test_a_radio_started_anew_is_one_record(tmp_path: Path) -> None:
 
 
 def test_parts_of_which_one_says_no_serving_cell_are_one_record(tmp_path: Path) -> None:
-    """A phone that changed its log: where a part says nothing of the serving cell, nothing is known, in either order."""
+    """A phone changed its log. If one part does not name the serving cell, it is unknown, in either order."""
     halves = _halves(tmp_path, "LW1/USRP1_power_log.txt")
     uncut = _flight(tmp_path, *(f"path: {p}, node: LW1, channel: USRP1" for p in halves))
     settings = load_flight(tmp_path / "flight.yaml")
@@ -67,7 +67,7 @@ def test_parts_of_which_one_says_no_serving_cell_are_one_record(tmp_path: Path) 
 
 @pytest.mark.parametrize(("digits", "frozen"), [(6, 139), (0, 0)])
 def test_a_level_frozen_to_all_digits_in_flight_is_not_scored(digits: int, frozen: int, tmp_path: Path) -> None:
-    """For 70 s; a level that is rounded to 1 dB keeps its value often."""
+    """A level is constant for 70 s. A level that is rounded to 1 dB often repeats."""
     written = (SAMPLE / "LW1/USRP1_power_log.txt").read_text().splitlines()
     lines = [line for line in written if len(line.split()) == 4]
     assert len(lines) > 600
@@ -244,7 +244,7 @@ def _stream(kind: str, name: str, frame: pd.DataFrame, **attributes: str) -> Any
 
 @pytest.mark.parametrize(("away", "near"), [(29.9, True), (30.1, False), (-29.9, True), (-30.1, False)])
 def test_places_are_near_a_tower_up_to_thirty_kilometres(away: float, near: bool) -> None:
-    """On a map whose degrees are kilometres; the nearest of the places and of the towers counts."""
+    """On a map whose degrees are kilometres, the nearest of positions and towers is used."""
     frame: Any = SimpleNamespace(to_local=lambda latitude, longitude: (1000.0 * longitude, 1000.0 * latitude))
     towers = {
         "A": SimpleNamespace(position_m=[500.0, 700.0, 9.0]),

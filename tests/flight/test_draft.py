@@ -349,7 +349,7 @@ def test_a_draft_of_a_flight_file_names_logs_in_it_that_came_from_above(
 
 @pytest.mark.parametrize(("top_m", "low_m"), [(40.0, 5.0), (12.0, None)])
 def test_a_rank_log_with_positions_of_its_own_is_compared_in_flight(logs: Path, top_m: float, low_m: float) -> None:
-    """On the ground grass and airframe decide the rank: on a real flight that took half of the log score's gain."""
+    """On the ground, grass and airframe determine the rank. This took half of a gain in log score."""
     (rank,) = ingest(logs / "UAV/modem_ri.csv", options=OPTIONS)
     frame = rank.result.streams[0].frame.assign(rsrp_dbm=-80.0, cqi=9.0)
     frame["altitude_m"] = np.minimum(np.arange(len(frame)), top_m)
@@ -368,7 +368,7 @@ def stream(kind: str, level: list[float] | np.ndarray, **attributes: object) -> 
     ("held", "n", "floor"), [(9, 500, None), (10, 500, -90.0), (14, 1500, None), (15, 1500, -90.0), (500, 500, None)]
 )
 def test_a_floor_is_a_least_level_that_returns(held: int, n: int, floor: float | None) -> None:
-    """Ten times and in one of a hundred samples, among others; of several streams the highest counts."""
+    """The floor occurs ten times, and in one of a hundred samples. The highest floor of several streams is used."""
     level = np.where(np.arange(n) < held, -90.0, -80.0 + 1e-3 * np.arange(n))
     level = np.append(level, np.nan)
     assert receiver_floor_db([stream("rss", level)]) == floor

@@ -210,7 +210,7 @@ def test_a_log_that_goes_with_no_flight_is_said_once_beside_the_first(tmp_path: 
 
 @pytest.mark.parametrize(("aside_m", "agrees"), [(0.0, True), (13.2, True), (13.5, False)])
 def test_a_log_may_lie_twelve_metres_beside_the_track(aside_m: float, agrees: bool) -> None:
-    """To the east: of a curved track another instant is nearer, by a tenth here."""
+    """An offset to the east moves the nearest time of a curved track by a tenth."""
     flown = track("2025-03-02T15:00:00")
     log = flown.iloc[40:240].assign(time=lambda f: np.datetime64(0, "ns") + (f["time"] - f["time"].iloc[0]).to_numpy())
     east = np.degrees(aside_m / (6378137.0 * np.cos(np.radians(flown["latitude_deg"].iloc[0]))))

@@ -18,7 +18,7 @@ ROWS = [(f"2025-03-02 10:00:{i:02d}", 35.7275 + 1e-5 * i, -78.696 + 2e-5 * i, -7
 
 
 def write(path: Path, *, altitude: bool) -> None:
-    """A phone's log of one cell, 30 m above take-off where its altitude is told."""
+    """Return a phone's log of one cell, 30 m above take-off if it has an altitude."""
     head = "Timestamp,Latitude,Longitude,RSRP" + (",Height" if altitude else "")
     rows = [",".join(map(str, row)) + (",30" if altitude else "") for row in ROWS]
     path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A flight gets the same learned antennas and the same error in every form of its logs, whatever its names are."""
+"""A flight gets the same learned antennas and the same error for each format and name of its logs."""
 
 import json
 from collections.abc import Callable

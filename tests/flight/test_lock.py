@@ -1,4 +1,4 @@
-"""When a sounder's receiver was in lock: which streams say so, and at which times."""
+"""Receiver lock of a sounder: which streams contain it, and at which times."""
 
 import numpy as np
 import pandas as pd

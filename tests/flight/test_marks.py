@@ -1,4 +1,4 @@
-"""A log is known by its marks whatever was done to it, and two flights of one route are two logs."""
+"""Fingerprints recognise a changed copy of a log, and distinguish two flights of one route."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +17,7 @@ Change = Callable[[np.ndarray, np.ndarray], Readings]
 
 
 def route_db(t: np.ndarray) -> np.ndarray:
-    """What every flight of one route shares: distance, and ripples of 40 s and 12 s."""
+    """Return the part of the level that every flight of one route shares: distance, and ripples of 40 s and 12 s."""
     return 8 * np.sin(t / 90) + 2 * np.sin(2 * np.pi * t / 40) + np.sin(2 * np.pi * t / 12)
 
 

@@ -60,7 +60,7 @@ def _drafted(folder: Path, node: tuple[float, float, float], level_100_m: float 
 def test_of_two_vehicles_the_levels_name_the_one_that_carried_the_radio(
     tmp_path: Path, first: bool, apart_m: float
 ) -> None:
-    """Another aircraft flew the same pattern beside the one with the radio; a second log of one aircraft is no other."""
+    """Another aircraft that flew the same pattern is distinguished from a second log of one aircraft."""
     files = _logs(tmp_path, tuple(SITE.towers["LW1"].position_m), -60.0, slope=2.0)
     (stream,) = files[0].result.streams
     moved = stream.frame.assign(longitude_deg=stream.frame["longitude_deg"] - apart_m / 90_400.0)
@@ -266,7 +266,7 @@ def _flown(placer: node.Placer, gains: node.Taught, at: str | tuple[float, float
 def test_a_cut_flight_keeps_a_tower_whose_antennas_flights_taught(
     at: str | tuple[float, float, float], keeps: bool, part: slice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a node elsewhere the tower's antennas explain nothing."""
+    """For a node elsewhere, the tower's antennas explain nothing."""
     monkeypatch.setattr(node, "place_odds", lambda _, towers: np.full(len(towers), -9.0))
     placer, gains = _placer(), _taught()
     placement = placer.propose(_flown(placer, gains, at, part), {"LW1": [gains]})
@@ -298,7 +298,7 @@ def test_of_towers_that_fit_alike_the_receivers_own_is_proposed(
 def test_a_tower_stands_beside_antennas_of_which_nothing_is_known(
     at: str | tuple[float, float, float], part: slice, said: str
 ) -> None:
-    """Their lobes look like another place to a law of the distance alone; a node within reach is still found."""
+    """With a model of distance alone, antenna lobes look like another position. A node in range is still found."""
     placer, gains = _placer(), _taught()
     placement = placer.propose(_flown(placer, gains, at, part))
     assert placement is not None
@@ -308,7 +308,7 @@ def test_a_tower_stands_beside_antennas_of_which_nothing_is_known(
 
 @pytest.mark.parametrize("head", ["cell_id,rsrp", "rsrp cell 1,rsrp cell 2"])
 def test_cells_without_a_pci_have_the_tower_that_their_levels_fit(head: str, tmp_path: Path) -> None:
-    """A number of a cell is told in a column of its own, or in the names of the levels: none is a PCI."""
+    """The number of a cell may be in a separate column or in the names of the levels. It is not always a PCI."""
     track, random, rows = _track(), np.random.default_rng(3), []
     latitude, longitude = SITE.frame.to_geographic(track[:, 0], track[:, 1])
     levels = [

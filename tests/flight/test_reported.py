@@ -54,7 +54,7 @@ def test_a_descent_below_the_take_off_keeps_its_heights(case: Path) -> None:
 
 @reported("below_takeoff")
 def test_a_drift_below_flat_ground_is_raised(case: Path) -> None:
-    """As after a landing; farther down nothing can have flown."""
+    """A descent after a landing is plausible. Lower positions are not."""
     rewrite(case / "site.yaml", "takeoff_ground_m: 30", "takeoff_ground_m: 0")
     data = loaded(case)
     pose = data.poses_at(data.rss[0].time)

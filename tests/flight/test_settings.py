@@ -51,7 +51,7 @@ LIMITS: dict[str, tuple[list[Any], list[Any]]] = {
 
 
 def flight(key: str, value: Any) -> dict[str, Any]:
-    """A flight file with one key, whatever else it needs beside it."""
+    """Return a flight file with one key and the other keys that it requires."""
     content: dict[str, Any] = {
         "flight": {"name": "f", "plan": dict(PLAN)}, "logs": [{"path": "a"}], "link": {"rss": {"carrier_hz": 3e9, "uav": {}}},
         "towers": {"N": {"latitude_deg": 35.0, "longitude_deg": -78.0}},

@@ -1,4 +1,4 @@
-"""Logs of flights that nobody flew: routes by hand, noise and faults by their shares."""
+"""Simulated logs: routes computed by hand, shares of noise and faults."""
 
 from collections.abc import Sequence
 from datetime import datetime

@@ -37,7 +37,7 @@ def past_sector_antenna(place: Path) -> Path:
 
 
 def calibrated(path: Path) -> tuple[Calibration, list[str]]:
-    """What was learned, and what is said of copied logs."""
+    """Return what was learned, and the warnings about copied logs."""
     settings = load_calibration(path)
     flights, said, _ = read_flights(settings, path.parent, None)
     return calibrate(settings, flights, path.parent), said

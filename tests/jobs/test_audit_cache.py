@@ -1,4 +1,4 @@
-"""An audit is read from the cache where this machine made it of the same inputs, and made anew where one differs."""
+"""An audit of the same inputs is read from this machine's cache, and repeated if an input differs."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""What the audit is told of a flight's settings, and its check of the attitude."""
+"""The settings that the audit gets from a flight, and its check of the attitude."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the ratios of ``bench`` stand for; the times themselves are not tested."""
+"""The definitions of the ratios of ``bench``. Times are not tested."""
 
 import pytest
 

@@ -80,7 +80,7 @@ def test_flight_files_by_themselves_are_learned_from_as_a_list_of_them_is(folder
 
 
 def test_the_planted_antenna_is_in_the_file(folder: Path, metrics: dict) -> None:
-    """Where flights looked, the file is the sector antenna at its yaw, give or take its own standard deviation."""
+    """In the directions of the flights, the file is the sector antenna at its yaw within its standard deviation."""
     learned = read_sphere_csv(folder / "calibrated" / "LW1.USRP1.tower.csv")
     azimuth = np.radians(np.arange(0.0, 360.0, 10.0))
     theta = np.full(len(azimuth), np.radians(82.0))

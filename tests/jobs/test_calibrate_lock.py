@@ -71,7 +71,7 @@ def test_the_planted_lock_is_recovered_and_beats_the_share_on_flights_left_out()
 
 
 def test_a_forecast_that_is_scored_knows_nothing_of_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither its law nor the gains behind the levels of its law saw the flight that it is scored on."""
+    """Neither P(lock) nor its gains were fitted on the flight that it is scored on."""
     taught: list[set[str]] = []
     calls: list[list[float]] = []
 

@@ -103,7 +103,7 @@ def test_offsets_are_shared_per_channel(summary: dict[str, Any]) -> None:
 
 
 def test_one_route_flown_twice_repeats_to_the_fading_of_both(summary: dict[str, Any]) -> None:
-    """The model is right nowhere (its azimuth is wrong), and still both flights err alike in every place."""
+    """The model has a wrong azimuth, so both flights have the same errors at each position."""
     pairs = summary["repeatability"]["pairs"]
     assert [(p["first"], p["second"], p["channel"]) for p in pairs] == [
         ("first", "second", "USRP1"),
@@ -264,7 +264,7 @@ def test_repeatability_is_the_noise_of_both_flights_after_one_constant() -> None
 
 
 def test_k_is_chosen_on_the_other_flights() -> None:
-    """Flight c alone likes K = 1000; what the others choose for it costs it, and that is what is told."""
+    """Only flight c is best with K = 1000. The K that the others choose for it is worse, and the page states this."""
     errors = {"a": (0.1, 0.5), "b": (0.2, 0.4), "c": (0.6, 0.05)}
     rows = [
         RankRow(

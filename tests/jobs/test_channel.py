@@ -144,7 +144,7 @@ def test_a_file_of_many_parts_is_that_of_one(written, folder, short_parts, monke
 
 
 def test_links_with_fewer_paths_than_a_later_part_have_no_path_there(tmp_path):
-    """Of a file that grows along both dimensions: what was never written is a gain of 0 and a delay of NaN."""
+    """In a file that grows along both dimensions, values that were not written are a gain of 0 and a delay of NaN."""
     with GrowingNetcdf(tmp_path / "grown.nc", ("pose", "path")) as book:
         for count in (1, 3):
             shape = ("path", "pose"), np.full((count, 2), float(count))
@@ -255,7 +255,7 @@ def test_the_gain_of_an_emulator_has_no_transmit_power_and_sums_as_the_flight_sa
 
 
 def test_a_deepmimo_scenario_is_read_as_its_loader_reads_it(written, folder, monkeypatch):
-    """By the loader itself where it is installed; else by the names and keys that DeepMIMO 4 documents."""
+    """Open the files with DeepMIMO's loader if it is installed, else check the documented names and keys."""
     _, book = written
     gain = complex_of(book, "gain")[:, :, 1, 0, 0]
     scenario = folder / "out" / "deepmimo" / "to_the_tower"

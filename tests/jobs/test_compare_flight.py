@@ -392,7 +392,7 @@ def test_exchanged_or_mirrored_angles_are_told_before_anything_else(
 
 
 def rank_with_positions(folder: Path, origin: str = ORIGIN) -> Path:
-    """A flight whose rank log carries positions of its own, beside telemetry with attitude."""
+    """A flight whose rank log has separate positions, in addition to telemetry with attitude."""
     at = np.arange(1.0, 59.0)
     rank = np.where(at % 2, 1.0, 2.0)
     path = flight(folder, rank=(at, rank))
@@ -487,7 +487,7 @@ def test_the_noise_under_an_snr_cuts_nothing_off(tmp_path: Path) -> None:
 def test_an_expectation_that_the_flight_refutes_is_withdrawn(
     monkeypatch: pytest.MonkeyPatch, low_db: float, floor_low_db: float | None, expected: bool
 ) -> None:
-    """Flights left out had 3.5 dB, 7.7 with the floor: one whose interval begins above has another fault."""
+    """Held-out flights had 3.5 dB, or 7.7 dB with the floor. If the interval begins above, there is another cause."""
     errors = Errors(series=2, rmse_db=3.5, rmse_4s_db=2.8, free_space_rmse_db=6.1, inside_90=0.9)
     monkeypatch.setattr(compare_flight, "errors_elsewhere", lambda *_: (errors, "at a height that was not flown"))
     data = SimpleNamespace(settings=SimpleNamespace(antennas={}), folder=Path())
@@ -503,7 +503,7 @@ def test_an_expectation_that_the_flight_refutes_is_withdrawn(
 
 
 def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In lock about the prediction and the flight's mean error in lock, else about what other flights wrote without."""
+    """With lock, levels are about the prediction and the mean error; without lock, about the level of other flights."""
     lock = SimpleNamespace(
         gain_db=-100.0,
         per_db=0.1,

@@ -338,7 +338,7 @@ def test_paths_of_infinite_loss_are_no_paths(site):
 
 
 def test_coverage_is_the_share_of_levels_at_the_threshold(site, tmp_path):
-    """With free space alone the covered positions lie in a disc around the tower, whose radius Friis states."""
+    """With free space alone, the covered positions are a disc around the tower with the radius of Friis' equation."""
     open_site = replace(site, buildings=(), trees=join_trees([]))
     budget = LinkBudget(tx_power_dbm=20.0, bandwidth_mhz=10.0, noise_figure_db=5.0, threshold_snr_db=30.0)
     chosen = settings(foliage=("none",), budget=budget, max_depth=0, study=False)

@@ -1,4 +1,4 @@
-"""The ladder of models on a flight whose truth is planted, from logs to page and recommended flight file."""
+"""The model comparison of a flight with known truth, from logs to page and recommended flight file."""
 
 import hashlib
 import json
@@ -39,7 +39,7 @@ def flight(folder: Path, exponent: float = 2.0) -> Path:
 
 
 def with_model(path: Path, model: Model) -> Path:
-    """A file beside a flight file, with the keys of a model."""
+    """Return a file next to a flight file, with the keys of a model."""
     text = path.read_text(encoding="utf-8")
     changes = recommended_changes(load_flight(path), yaml.safe_load(text), model)
     changed = path.with_name(f"{path.stem}_changed.yaml")
@@ -99,7 +99,7 @@ def test_a_reflection_is_seen_where_a_wood_hides_it_from_free_space(tmp_path: Pa
 
 
 def test_a_hover_recommends_no_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """At one place antennas that flights left out prefer fit as a constant does: no reason to change the settings."""
+    """At a single position, learned antennas fit like a constant, so the settings are not changed."""
     path, t = remembering(tmp_path, 3.5), np.arange(0.0, 121.0)
     eastwards(tmp_path, t, 200.0 + 4.0 * np.sin(t / 7.0))
     at = np.arange(0.0, 120.0, 0.2)
@@ -111,7 +111,7 @@ def test_a_hover_recommends_no_model(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_a_replay_that_loses_to_a_line_says_so_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Levels that fall by 40 dB per decade: the two-parameter line beats every replay, in report, ladder and words."""
+    """Levels fall by 40 dB per decade: the two-parameter line is best in report, model comparison and text."""
     metrics = report(flight(tmp_path, 4.0), capsys)
     rss = metrics["rss"]["LW1"]["A"]
     error = {name: fit["rmse_db"] for name, fit in rss["baselines"].items()}
@@ -128,7 +128,7 @@ def test_a_replay_that_loses_to_a_line_says_so_first(tmp_path: Path, capsys: pyt
 
 
 def test_learned_antennas_are_scored_on_other_flights_alone(tmp_path: Path) -> None:
-    """Antennas that a calibration learned: a rung of their own, and none on the flights that they were learned from."""
+    """Learned antennas are a separate model, which is not scored on their training flights."""
     path = flight(tmp_path)
     own = hashlib.sha256((tmp_path / "A.csv").read_bytes()).hexdigest()
     for logs, scored in (("b" * 64, True), (f"{'b' * 64}, {own}", False)):
@@ -236,7 +236,7 @@ def test_a_rung_with_diffraction_states_its_key(tmp_path: Path) -> None:
 
 
 def test_the_rung_with_diffraction_is_what_its_settings_replay(tmp_path: Path) -> None:
-    """Free space with edges has no reflection off the ground beside it."""
+    """Free space with edges has no reflection off the ground."""
     path = flight(tmp_path)
     stated = yaml.safe_load(path.read_text(encoding="utf-8"))
     asked = {**stated["rt"], "diffraction": "edges"}
@@ -260,7 +260,7 @@ def test_channels_that_share_a_replay_cost_its_seconds_once() -> None:
 
 @pytest.mark.parametrize(("share", "line", "gains"), [(0.98, 2, False), (0.9, 2, True), (0.9, 0.9, False)])
 def test_a_gain_that_no_page_could_show_is_no_advice(share: float, line: float, gains: bool) -> None:
-    """Of 3 dB, 0.06 and 0.3 dB less: both are significant; and no gain on a constant level, as at one place."""
+    """Improvements of 0.06 and 0.3 dB from 3 dB are significant, but not for a constant level at one position."""
     error_db = 3.0 * np.random.default_rng(1).normal(size=3000)
     climber = _Climber.__new__(_Climber)
     climber._series = [SimpleNamespace(time_s=np.arange(3000.0))]  # type: ignore[list-item]

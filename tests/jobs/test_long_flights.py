@@ -1,4 +1,4 @@
-"""What a long flight is cut into for memory's sake gives the numbers of the whole."""
+"""A long flight that is computed in parts has the same numbers as in one part."""
 
 import dataclasses
 from pathlib import Path

@@ -50,7 +50,7 @@ def assert_like(outcome, reference):
 
 
 class Watched(InProcess):
-    """Runs tasks here; ends as told after so many."""
+    """A crew that runs tasks in this process and stops after a given number."""
 
     def __init__(self, ending=None, after=99):
         self.numbers, self.ending, self.after = [], ending, after

@@ -100,7 +100,7 @@ def test_tiles_are_the_map_in_one_piece(change):
 
 
 def test_a_tile_that_only_the_border_of_a_beam_touches_keeps_what_stands_on_that_border():
-    """The mirrored ray over a wall's very end meets the tile's corner, and a hut stands on it."""
+    """A mirrored ray at the end of a wall meets the corner of the tile, with a hut at that corner."""
     tower = {"T": Tower("T", 35.7, -78.7, 0.0, -10.0, 10.0)}
     wall, hut = Building("wall", box(20, 0, 40, 1), 30.0), Building("hut", box(29.5, -5.5, 30.5, -4.5), 30.0)
     site = Site("corner", FRAME, tower, (wall, hut), area_m=(-50.0, 50.0, -50.0, 50.0))

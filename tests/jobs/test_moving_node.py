@@ -134,7 +134,7 @@ def test_the_tables_carry_the_place(case):
 
 
 def test_the_drawings_show_the_way(case):
-    """The page's plan and the figures: where it stood at each sample, not its middle alone."""
+    """The plan and the figures show the node's position at each sample, not only the middle of its track."""
     _, data, (replayed,), (rank,) = case
     rss = compare_rss_series(data, data.rss[0], replayed)
     ranks = compare_rank_series(data, data.rank[0], rank)

@@ -1,4 +1,4 @@
-"""Outcomes of tasks: kept, taken again under any name, never taken when damaged or stale; tried twice, then told."""
+"""Stored task results: reused under any name, ignored if damaged or out of date; tasks are tried twice."""
 
 import io
 import shutil
@@ -291,7 +291,7 @@ def test_a_lost_worker_costs_its_own_task_alone(flight: Path) -> None:
 def test_a_fault_in_the_rows_of_a_flight_is_a_failure_of_that_flight(
     flight: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It ended the whole campaign: only the replay stood where faults become messages."""
+    """An error outside the replay ended the complete campaign, because only the replay converted errors to messages."""
     nothing = SimpleNamespace(data=None, result=None)
     monkeypatch.setattr(campaign, "run_flight", lambda *_, **__: nothing)
     outcome = campaign.run_task(Task(flight, "f", "as written", {}, None))

@@ -1,4 +1,4 @@
-"""What the commands write: inputs stay, others' files stay, sets are of one run, a bad ``-o`` is told first."""
+"""Outputs of the commands: inputs are unchanged, a set is of one run, a bad ``-o`` is reported first."""
 
 import hashlib
 import json
@@ -85,7 +85,7 @@ def test_site_import_never_replaces_the_map(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_simulate_replaces_its_own_folder_only(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Real logs stand in the flight's folder; a folder of simulated ones is a flight that a report takes."""
+    """With real logs in the flight's folder, a folder of simulated logs is a flight that a report accepts."""
     out = logs.parent / "out"
     assert "contains an input" in refused(capsys, logs, "simulate", logs / "flight.yaml", "-o", logs)
     shutil.copytree(logs / "UAV", out / "UAV")
@@ -250,7 +250,7 @@ def test_a_limit_on_the_size_of_files_is_one_message(logs: Path) -> None:
 
 
 def test_a_map_that_fails_in_its_exports_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exports were written in place: a cut maps.kmz stood under its final name."""
+    """Exports were written in place, so a truncated maps.kmz had its final name."""
     out = tmp_path / "map"
     small = ["--spacing", "500", "--rss-altitude", "30", "--rank-altitude", "30", "-k", "10", "--foliage", "none"]
     command = ["map", *small, "--max-depth", "0", "--no-study", "-o", str(out)]

@@ -1,4 +1,4 @@
-"""``predict``: what is said where, on the sample flight whose levels and offsets are planted."""
+"""``predict`` on the sample flight, whose levels and offsets are known."""
 
 import dataclasses
 import json
@@ -250,7 +250,7 @@ def test_levels_of_a_first_prediction_count_for_every_channel_after_an_offset(sa
 
 
 def test_a_neighbour_stands_for_the_rank_of_a_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As dense as a million points over 640 m x 640 m x 30 m, of which 50 000 are ranked."""
+    """Points as dense as a million over 640 m x 640 m x 30 m, of which 50 000 are ranked."""
     site, rng, count = load_site("lake_wheeler"), np.random.default_rng(0), 4000
     place = np.column_stack([rng.uniform(-25, 25, count), rng.uniform(-175, -125, count), rng.uniform(35, 65, count)])
     targets = Targets(

@@ -1,4 +1,4 @@
-"""Predictions at a site where nobody has flown: ray tracing with a prior that is stated."""
+"""Predictions at a site without any flight: ray tracing with a stated prior."""
 
 import json
 from pathlib import Path

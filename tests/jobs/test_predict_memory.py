@@ -1,4 +1,4 @@
-"""Prediction from what a site remembers: planted tables, and a flight that nobody named, against its planted offset."""
+"""Prediction from the learned models of a site: known tables, and a flight that is not named, with a known offset."""
 
 import json
 from dataclasses import asdict
@@ -58,7 +58,7 @@ def entry(level: LearnedLevel | None, lock: LearnedLock | None = None) -> Entry:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A site that remembers one channel at LW1: cosines of 4 dB and 2 dB at its ends."""
+    """Return a site with one learned channel at LW1: cosines of 4 dB and 2 dB at its ends."""
     place = copied(tmp_path_factory.mktemp("memory"))
     files = learned_tables("A", t=table(4.0, (1.0, 5.0)), u=table(2.0, (0.5, 0.5), f"marks: {MARK}"))
     remember(place, "planted", entry(LEVEL), files)
@@ -159,7 +159,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_flight_is_predicted_before_it_from_the_memory_alone(flown: Path) -> None:
-    """Planted offsets are added to the measurement: 12 and 9 dB are remembered, 4 dB are flown."""
+    """Known offsets are added to the measurement: 12 and 9 dB are stored, 4 dB are flown."""
     level = read_learned(flown / "mine.yaml").entries["planted"].series[0].level
     assert level is not None
     # t with 3 degrees of freedom: one difference of 3 dB, and a prior of 1.5 dB as two more; 90 % within 2.353 scales

@@ -1,4 +1,4 @@
-"""Two runs of ``report`` on one small flight, end to end: their exports, and what ``diff`` says of them."""
+"""Two runs of ``report`` on one small flight: their exports, and their ``diff``."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A season from the rows of a campaign: held-out errors against brute force, a planted hill found again."""
+"""A campaign from its rows: held-out errors against brute force, and a known hill of residuals."""
 
 import dataclasses
 import json

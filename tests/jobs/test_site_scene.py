@@ -174,7 +174,7 @@ TWINS = (
 
 
 def test_masts_hide_nothing_and_meshes_of_trees_are_media(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """An antenna inside its mast and beside its sector sees all round; a canopy takes what its chord does."""
+    """An antenna inside its mast and next to its sector panel is not blocked. A canopy attenuates by its chord."""
     (tmp_path / "twin.xml").write_text(TWIN.format("".join(box(tmp_path, *mesh) for mesh in TWINS)))
     out = tmp_path / "site.yaml"
     arguments = ["site", "import", str(tmp_path / "twin.xml"), "--origin", "35.7,-78.7", "--tower", "T=0,0,10"]
@@ -201,7 +201,7 @@ def test_masts_hide_nothing_and_meshes_of_trees_are_media(tmp_path: Path, capsys
 
 
 def test_a_mesh_is_as_full_as_its_volume_and_its_parts_stand_apart() -> None:
-    """Two pyramids in one mesh: two media, each a third of its prism; a hill is no mesh that encloses."""
+    """Two pyramids in one mesh are two media, each a third of its prism. A hill is not an enclosing mesh."""
     corners = np.array([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0], [0, 0, 9.0]])
     faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
     hill = np.array([[-90, -90, 0], [90, -90, 0], [90, 90, 0], [-90, 90, 0], [0, 0, 9.0]])

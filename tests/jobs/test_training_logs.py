@@ -1,4 +1,4 @@
-"""Nothing learned is scored on a log that it was learned from, whatever that log is called or packed in."""
+"""Learned models are not scored on their training logs, for any name or archive of the log."""
 
 import bz2
 import gzip
@@ -37,7 +37,7 @@ LOG = "first/LW1_USRP1.txt"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two flights, antennas learned from the first and second, and a third flight that nobody learned from."""
+    """Return two flights that antennas were learned from, and a third flight that was not used."""
     place = past_sector_antenna(tmp_path_factory.mktemp("training"))
     assert main(["calibrate", str(place / "calibration.yaml"), "-o", str(place / "calibrated.yaml")]) == 0
     return place

@@ -80,7 +80,7 @@ def interrupted(_number: int, _result: object) -> None:
 
 
 def test_workers_run_no_module_that_lies_in_the_working_folder(tmp_path: Path) -> None:
-    """A folder of logs that somebody handed on, with files named like modules that a new interpreter loads."""
+    """Return a third-party folder of logs with files that are named like modules that a new interpreter loads."""
     script, logs = tmp_path / "script.py", tmp_path / "logs"
     logs.mkdir()
     for name in ("multiprocessing", "pickle", "numpy", "signal"):
@@ -153,7 +153,7 @@ def test_a_scheduler_that_stays_away_or_never_was_is_one_message(seen: dict[str,
 
 
 class NoWorkers:
-    """A client of a scheduler that loses its last worker and gets one when its absence was told twice."""
+    """A client of a scheduler that loses its last worker, and gets one after two reports of its absence."""
 
     status = "running"
 
@@ -183,11 +183,11 @@ class Later:
         return self._value
 
     def release(self) -> None:
-        """Nothing is held."""
+        """Do nothing."""
 
 
 def test_a_scheduler_without_workers_is_spoken_of(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A season waited for half an hour without a word for workers that had given up while the machine was busy."""
+    """A campaign waited silently for workers that had given up while the machine was busy."""
     monkeypatch.setattr(workers, "NO_WORKER_S", 0.1)
     monkeypatch.setattr(workers, "COUNT_EVERY_S", 0.05)
     messages: list[str] = []

@@ -59,7 +59,7 @@ class Browser:
 
 @pytest.fixture(params=["alone", "web"])
 def web(request):
-    """Whether a page is open meanwhile: one browser that reads it and one that takes nothing."""
+    """Return whether a page is open at the same time: one browser that reads it and one that does not."""
     return request.param == "web"
 
 
@@ -136,7 +136,7 @@ def exchanges(folder, query=None):
 
 
 def all_kept(sim, folder, query="nr5g_csi"):
-    """Every answer that the modem saw read stands in the log once, in order, and nothing that it did not send."""
+    """Return the logged answers. Each answer that was read must be there once, in order, and no others."""
     command = QUERIES[query].text
     logged = []
     for r in records_of(folder)[0]:

@@ -1,4 +1,4 @@
-"""Pseudo-terminals opened so that closing them hangs up nobody, and waiting for what they bring."""
+"""Pseudo-terminals that can be closed without a hang-up of other readers, and waiting for their data."""
 
 import os
 import time
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def held(port: Path) -> RawIOBase:
-    """The port, open for reading; of a session leader (a suite in a container) it does not become the terminal."""
+    """Open the port for reading. It does not become the controlling terminal of a session leader."""
     return open(port, "rb", buffering=0, opener=lambda path, flags: os.open(path, flags | os.O_NOCTTY))
 
 

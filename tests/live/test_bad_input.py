@@ -63,7 +63,7 @@ def test_not_a_serial_port(tmp_path, content):
 
 
 def opened_by_nobody(node):
-    """What a user without rights is told who opens a port."""
+    """Return the message for a user without permission who opens a port."""
     code = (
         "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.ports import SerialPort\n"
         "from aerpaw_cmp.common.errors import InputError\nos.setgroups([])\nos.setuid(65534)\n"

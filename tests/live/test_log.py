@@ -216,7 +216,7 @@ def test_a_sync_that_fails_is_told_and_the_log_goes_on(tmp_path, monkeypatch):
 
 
 def test_a_sync_that_stalls_holds_the_polling_once(tmp_path, monkeypatch):
-    """fdatasync of a card takes seconds: the record before it is in the kernel, and those after it wait in memory."""
+    """While fdatasync stalls, the record before it is in the kernel, and later records wait in memory."""
     real, hang, stalled = os.fdatasync, threading.Event(), threading.Event()
 
     def stalling(fd):

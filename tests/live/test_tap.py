@@ -258,7 +258,7 @@ def test_sigkill_loses_no_answer(modem, child, tools, tmp_path):
 
 
 def test_clock_steps_are_recorded(modem, tap, tools, tmp_path):
-    """A pause between the readings of both clocks is no step."""
+    """A pause between the readings of both clocks is not a clock step."""
     step, pause = [0], [0.0]
 
     def wall():

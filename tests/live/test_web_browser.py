@@ -276,7 +276,7 @@ def test_it_comes_back_by_itself_and_refills(driver, fly):
 
 
 def browsers_of(driver):
-    """Processes of the browser: all that come of chromedriver."""
+    """Return the processes of the browser: the descendants of chromedriver."""
     parents = {}
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():

@@ -1,4 +1,4 @@
-"""The flight file: what goes in comes out, whole or not at all."""
+"""The flight file: a round trip returns all records, and writing is atomic."""
 
 import contextlib
 import dataclasses
@@ -138,7 +138,7 @@ def test_a_failure_leaves_the_old_file_and_no_rest(tmp_path: Path, monkeypatch: 
 
 
 class _Full(io.BytesIO):
-    """A disk with so many bytes left."""
+    """A disk with a given number of free bytes."""
 
     def __init__(self, left: int, failure: BaseException) -> None:
         super().__init__()

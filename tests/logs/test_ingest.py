@@ -1,4 +1,4 @@
-"""Finding and naming logs, and what bad input says."""
+"""Finding and naming logs, and messages for bad input."""
 
 import gzip
 import json
@@ -286,7 +286,7 @@ def test_files_that_are_no_logs_are_not_read_whole(tmp_path: Path, monkeypatch: 
 def test_a_log_of_a_named_reader_is_read_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pack: Callable[[bytes], bytes]
 ) -> None:
-    """What another reader would say of it takes its first bytes alone, however large the log is."""
+    """A hint about another reader uses the first bytes alone, for logs of any size."""
     (tmp_path / "log").write_bytes(pack(VEHICLE * 2000))
     unlimited = []
     raw = room._raw

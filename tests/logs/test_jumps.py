@@ -1,4 +1,4 @@
-"""Speeds judge clocks and positions, whatever the reader."""
+"""Speed limits judge clocks and positions of all readers."""
 
 import numpy as np
 import pandas as pd
@@ -119,7 +119,7 @@ def test_a_receiver_that_reports_more_rarely_than_the_logger_writes_does_not_jum
 
 @pytest.mark.parametrize(("speed_mps", "flagged"), [(5.0, 99), (0.0, 0), (0.1, 0)])
 def test_positions_that_stand_still_at_speed_are_stale(speed_mps: float, flagged: int) -> None:
-    """The first of them is where the aircraft was; a hover, and the noise of its speed, are none."""
+    """The first position is valid. Hovers and noise of the speed are not jumps."""
     frame = straight(step_s=1.0)
     frame.loc[50:149, "latitude_deg"] = frame["latitude_deg"][50]
     frame["velocity_north_mps"], frame["velocity_east_mps"] = 5.0, 0.0

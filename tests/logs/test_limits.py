@@ -1,4 +1,4 @@
-"""What cannot be is flagged in one place, whatever the reader, and no comparison scores it."""
+"""Impossible values of all readers are flagged in one place and never scored."""
 
 import numpy as np
 import pandas as pd

@@ -1,4 +1,4 @@
-"""Routes of plans, maps, tables and logs: the same points whatever the file."""
+"""Routes of plans, maps, tables and logs contain the same points."""
 
 import json
 import math

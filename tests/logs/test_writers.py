@@ -1,4 +1,4 @@
-"""What the writers write, the readers read: the round trip is the specification."""
+"""The readers restore what the writers wrote."""
 
 import re
 

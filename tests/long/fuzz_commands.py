@@ -209,7 +209,7 @@ def violation(call: Call, root: Path, said: Path) -> tuple[str, str]:
 
 
 def run(calls: int, seed: int, only: int | None = None) -> tuple[dict[str, int], list[str]]:
-    """How often each exit came, and the violations."""
+    """Return the number of runs per exit code, and the violations."""
     from aerpaw_cmp.logs.readers import catalogue
 
     catalogue()

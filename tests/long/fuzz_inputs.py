@@ -268,7 +268,7 @@ def mutated(target: Target, seed: int, index: int) -> bytes:
 
 
 def check_law(result: ReadResult, data: bytes, binary: bool) -> None:
-    """The accounting law of a read file, and what frames of records promise."""
+    """Check that a file's lines are accounted for, and that its frames have the promised columns."""
     if result.lines != result.accepted + result.rejected_count + result.blank:
         raise ViolationError("lines are not accepted + rejected + blank")
     if not binary and result.lines != data.count(b"\n") + (not data.endswith(b"\n") and len(data) > 0):
@@ -293,7 +293,7 @@ RANGES = {name: bounds for limit in limits.LIMITS for name, bounds in zip(limit.
 
 
 def _check_frame(name: str, kind: str, frame: Any, lines: int) -> set[int]:
-    """What a stream's frame promises; gives the lines that its records are of."""
+    """Check the promises of a stream's frame. Return the lines of its records."""
     time_, line = frame["time"].to_numpy(), frame["line"].to_numpy()
     if time_.dtype != np.dtype("datetime64[ns]") or np.isnat(time_).any():
         raise ViolationError(f"{name}: a record without a time")
@@ -599,7 +599,7 @@ def _scene(path: Path) -> Any:
 
 
 def _report(path: Path) -> Any:
-    """Differences of a report from itself; the tables beside its numbers have no rows."""
+    """Return the differences of a report from itself. Its tables have no rows."""
     from aerpaw_cmp.jobs.diff_reports import run_diff
     from aerpaw_cmp.report.columns import RANK, RSS, header
 
@@ -759,7 +759,7 @@ def _block(target: Target, seed: int, start: int, stop: int, place: mmap.mmap, s
 
 
 def _processor_s(pid: int | None) -> float:
-    """What a process has had of the processor [s]; 0 when it is gone."""
+    """Return the processor time of a process [s]. 0 if it has ended."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
     except OSError:

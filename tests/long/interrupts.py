@@ -139,7 +139,7 @@ def group(number: int) -> list[int]:
 
 
 def left_behind(folder: Path) -> list[str]:
-    """What an interrupted command must not leave."""
+    """Return the files that an interrupted command must not leave."""
     names = [str(place.relative_to(folder)) for place in folder.rglob("*")]
     hidden = [name for name in names if "/." in f"/{name}"]
     torn = changed_files(folder / "out") if (folder / "out").is_dir() else []
@@ -148,7 +148,7 @@ def left_behind(folder: Path) -> list[str]:
 
 
 def one_run(words: str, root: Path, after_s: float | None) -> dict[str, Any]:
-    """A command, interrupted once it has had so much of the processor."""
+    """Interrupt a command once it has used a given processor time."""
     live = words.startswith(LIVE)
     with tempfile.TemporaryDirectory() as home:
         folder = Path(home)

@@ -87,7 +87,7 @@ PRELOADED = (
 
 @dataclass(frozen=True, slots=True)
 class Mutant:
-    """One change: the file, its line, what stood there and what stands there now; the how-manieth node and change."""
+    """One change: the file, its line, the old and the new text, and the numbers of node and change."""
 
     path: str
     line: int
@@ -98,7 +98,7 @@ class Mutant:
 
     @property
     def name(self) -> str:
-        """Told apart from every other mutant of the file by its words."""
+        """Return the text that distinguishes the mutant from all others of the file."""
         return f"{self.path}:{self.line}: {self.was} -> {self.now}"
 
     @property
@@ -125,7 +125,7 @@ _COMPARISONS: dict[type, tuple[type, ...]] = {
 
 
 def changes(node: ast.AST) -> Iterator[ast.AST]:
-    """Every node that may stand in place of this one."""
+    """Yield each node that may replace this node."""
     if isinstance(node, ast.BinOp):
         for other in _OPERATORS.get(type(node.op), ()):
             yield ast.BinOp(node.left, other(), node.right)
@@ -208,14 +208,14 @@ class Planted(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         self.name, self.path, self.source = name, path, source
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> Any:
-        """Of the module alone."""
+        """Return the name of the module alone."""
         del path, target
         if fullname != self.name:
             return None
         return importlib.util.spec_from_file_location(fullname, self.path, loader=self)
 
     def create_module(self, spec: Any) -> None:
-        """As usual."""
+        """Run as usual."""
 
     def exec_module(self, module: Any) -> None:
         """The changed source in place of the file."""
@@ -238,7 +238,7 @@ def pytest_on(tests: tuple[str, ...], plugins: list[Any], options: tuple[str, ..
 
 
 def own_folders() -> None:
-    """Nothing that one mutant leaves in a cache reaches the next."""
+    """Clear caches, so that a mutant cannot change the results of the next."""
     import tempfile
 
     os.environ["AERPAW_CMP_CACHE"] = tempfile.mkdtemp(prefix="aerpaw-cmp-mutant-")
@@ -284,7 +284,7 @@ Reach = dict[str, dict[str, Any]]
 
 
 class Recorder:
-    """A plug-in of pytest that notes the lines of the rooms that each test reaches, those of its fixtures with them."""
+    """A plug-in of pytest that records the lines of the packages that each test and its fixtures reach."""
 
     def __init__(self) -> None:
         self.reach: Reach = {}
@@ -308,7 +308,7 @@ class Recorder:
             self._lines, self._left = outer, left
 
     def pytest_runtest_protocol(self, item: Any, nextitem: Any) -> bool:
-        """In place of pytest's own."""
+        """Replace pytest's own function."""
         from _pytest.runner import runtestprotocol
 
         forget("aerpaw")
@@ -371,7 +371,7 @@ class Recorder:
 
 
 def forget(begin: str) -> None:
-    """What modules whose names begin so keep of earlier calls."""
+    """Return the caches of modules whose names have this prefix."""
     for name, module in list(sys.modules.items()):
         if name.startswith(begin):
             for value in list(vars(module).values()):
@@ -391,7 +391,7 @@ class Trials:
         self.chosen, self.reach, self.answer, self.budget_s = chosen, reach, answer, budget_s
 
     def pytest_runtestloop(self, session: Any) -> bool:
-        """In place of pytest's own."""
+        """Replace pytest's own function."""
         items = {item.nodeid: item for item in session.items}
         controls: dict[tuple[str, ...], bool] = {}
         for mutant in self.chosen:
@@ -464,7 +464,7 @@ def within(budget_s: float, reach: Reach, path: str, lines: tuple[int, int] | No
 
 
 def planted(mutant: Mutant, source: str, tests: tuple[str, ...]) -> str:
-    """In a child: whether a test fails when the module, and all that imports it, is imported anew from a source."""
+    """Check in a child process whether a test fails after the module and its importers are imported from a source."""
     if mutant.path in COMPILED:
         numba = importlib.import_module("numba")
         numba.config.DISABLE_JIT = True  # its cache would not see the change
@@ -480,7 +480,7 @@ def planted(mutant: Mutant, source: str, tests: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a change stands: the names of the function (with its classes) and the lines of its statement."""
+    """Return the location of a change: the function with its classes, and the lines of the statement."""
 
     names: tuple[str, ...]
     begin: int
@@ -488,7 +488,7 @@ class Place:
 
 
 def place_of(tree: ast.Module, node: ast.AST) -> Place | None:
-    """Of a node in the body of a function; None elsewhere."""
+    """Return the function of a node in its body. None elsewhere."""
     body: list[ast.stmt] = tree.body
     names: list[str] = []
     while True:
@@ -559,7 +559,7 @@ def change_of(mutant: Mutant) -> str:
 
 
 def modules() -> list[str]:
-    """Files of the rooms, and those of `jobs` that hold rules of honesty."""
+    """Return the files of the packages, and those files of `jobs` that decide what is scored."""
     package = ROOT / "aerpaw_cmp"
     files = [path for room in ROOMS for path in sorted((package / room).rglob("*.py"))]
     files += [package / "jobs" / f"{name}.py" for name in RULES]
@@ -567,7 +567,7 @@ def modules() -> list[str]:
 
 
 def record(target: Path, tests: tuple[str, ...]) -> None:
-    """Add to a map which test reaches which line; a test file that is recorded anew replaces what was known of it."""
+    """Add the lines that each test reaches to a map. A test file that is recorded again replaces its former entries."""
     recorder = Recorder()
     pytest_on(tests, [recorder], OPTIONS[:1] + OPTIONS[2:])
     known: Reach = json.loads(target.read_text(encoding="utf-8")) if target.is_file() else {}

@@ -207,7 +207,7 @@ class Runs:
     def start(
         self, variant: str, fault: tuple[int, int, int, int, str] = (0, NOTHING, 0, 0, ""), limit: int | None = None
     ) -> int:
-        """Begin a run; gives its process id. ``fault`` is (at, kind, error, sticky, command)."""
+        """Begin a run and return its process id. ``fault`` is (at, kind, error, sticky, command)."""
         main = installed_program()
 
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -237,14 +237,14 @@ class Runs:
             os._exit(code)
 
     def clean(self, variant: str) -> int:
-        """A run without a fault, which must succeed; gives its number of calls."""
+        """Do a run without a fault, which must succeed. Return its number of calls."""
         code = os.waitstatus_to_exitcode(os.waitpid(self.start(variant), 0)[1])
         if code:
             raise SystemExit(f"{self.job.name} without a fault: exit {code}: {self.said()}")
         return int(self.said().rsplit("calls ", 1)[1])
 
     def said(self) -> str:
-        """What the last run printed; asked once."""
+        """Return and forget the output of the last run."""
         assert self.pipe is not None
         with os.fdopen(self.pipe, "rb") as stream:
             self.pipe = None
@@ -271,7 +271,7 @@ class Runs:
         )
 
     def learn(self) -> None:
-        """Which files two clean runs of a variant write alike: they tell the variants apart."""
+        """Return the files that two clean runs of a variant write equally, which distinguish the variants."""
         for variant in VARIANTS:
             seen = []
             for number in range(2):
@@ -293,7 +293,7 @@ class Runs:
         self.folder.mkdir(parents=True)
 
     def wrong(self, before: bool) -> str | None:
-        """What is not whole or not of one run, or None."""
+        """Return what is incomplete or not of one run. None if nothing is."""
         digests = self.content()
         if not os.path.lexists(self.target) or not digests:
             return "the output that was there is gone" if before else None

@@ -116,7 +116,7 @@ def planted(fault: Fault) -> Iterator[None]:
 
 
 def _forget() -> None:
-    """What the package keeps of the functions as they were."""
+    """Restore the functions that the package caches."""
     from aerpaw_cmp.propagation import geometry as faces
     from aerpaw_cmp.propagation.field import foliage
 
@@ -228,7 +228,7 @@ def _stand(towers: list[Any]) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """What a fault does to the replay: largest changes, and links with another rank at K = 10."""
+    """Return the effect of a fault on the replay: largest changes, and links with another rank at K = 10."""
 
     rss_db: float
     phase_rad: float
@@ -236,7 +236,7 @@ class Change:
 
     @property
     def counts(self) -> bool:
-        """Whether the audit has to see it."""
+        """Check whether the audit has to detect the fault."""
         return self.rss_db > 0.1 or self.phase_rad > 0.01 or self.ranks > 0
 
 
@@ -255,7 +255,7 @@ def ranks_of(replays: Any) -> list[Any]:
 
 
 def change(clean: Any, faulty: Any, clean_ranks: list[Any], faulty_ranks: list[Any]) -> Change:
-    """Of the faulty replay from the clean one."""
+    """Return the changes of the faulty replay from the clean replay."""
     rss = phase = 0.0
     for before, after in zip(clean, faulty, strict=True):
         a, b = before.replay, after.replay
@@ -273,7 +273,7 @@ def change(clean: Any, faulty: Any, clean_ranks: list[Any], faulty_ranks: list[A
 
 
 def failures(data: Any, replays: Any, *, sionna: bool = True) -> list[str]:
-    """What ``report --strict`` would name, of the audit."""
+    """Return the failures of the audit that ``report --strict`` would name."""
     from aerpaw_cmp.jobs import audit_flight
 
     if sionna:

@@ -1,4 +1,4 @@
-"""What the benchmarks of the tap share: a tap in its own process on a simulated modem."""
+"""Common parts of the long tests of the tap: a tap in a separate process on a simulated modem."""
 
 import json
 import os
@@ -142,7 +142,7 @@ def damaged(chance: random.Random) -> bytes:
 
 
 def free_port() -> int:
-    """A port that nobody has."""
+    """Return a free port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -168,7 +168,7 @@ def resident_kib(pid: int) -> int:
 
 
 def conditions() -> dict[str, object]:
-    """What the numbers depend on."""
+    """Return the conditions that the numbers depend on."""
     load = [round(x, 2) for x in os.getloadavg()]
     return {"python": platform.python_version(), "kernel": platform.release(), "cores": os.cpu_count(), "load": load}
 

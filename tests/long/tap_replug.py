@@ -27,7 +27,7 @@ FINAL = {"ok": "OK", "error": "ERROR", "cme": "+CME ERROR: ", "cms": "+CMS ERROR
 
 
 def lines_given(pieces: Iterable[bytes]) -> Counter[str]:
-    """Lines that the kernel gave: cut at CR and LF, blank ones left out; each opening of the port for itself."""
+    """Return the lines of the kernel's bytes, cut at CR and LF without blank lines, for each opening of the port."""
     given: Counter[str] = Counter()
     for data in pieces:
         given.update(line for text in re.split(rb"[\r\n]+", data) if (line := text.decode("latin-1").strip(" \t")))
@@ -115,7 +115,7 @@ def cycles(count: int, seed: int, folder: Path, bytewise_s: float = 3e-4) -> dic
 
 
 def failed(result: dict[str, Any]) -> bool:
-    """Whether a byte, an answer or a gap is missing."""
+    """Check whether a byte, an answer or a gap is missing."""
     return bool(
         result["lost"]
         or result["bad_lines"]

@@ -34,7 +34,7 @@ from tests.long.tap_common import (
 
 
 def log_against_modem(log: Path, modem: FaultyModem) -> dict[str, int]:
-    """Answers that the modem saw read against the log: lost, out of order; lines that are no record."""
+    """Compare the answers that the modem saw read with the log: lost, out of order, and lines that are not records."""
     bad: list[BadLine] = []
     logged = [tuple(r["lines"]) for r in read_log(log, bad) if r["kind"] == "exchange" and r["query"] == "nr5g_csi"]
     read = [served.lines for served in modem.journal if served.read and served.command == CSI]

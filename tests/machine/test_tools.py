@@ -1,4 +1,4 @@
-"""What ``make test`` says of skipped tests, and does where the browser of the pages is missing."""
+"""``make test``: its line about skipped tests, and its behaviour without a browser."""
 
 import shutil
 import subprocess

@@ -26,7 +26,7 @@ GRID = Grid.over_area((0.0, 600.0, 0.0, 450.0))
 
 
 class Spy:
-    """Predicts the mean of what it was given, and remembers it."""
+    """A method that predicts the mean of its samples, and records them."""
 
     def __init__(self):
         self.seen = []

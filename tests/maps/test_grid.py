@@ -65,7 +65,7 @@ def test_nearest_tower_serves_and_ties_go_to_the_first():
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.integers(-500, 500), st.integers(-1000, 1000)), min_size=2, max_size=6, unique=True))
 def test_borders_part_the_serving_areas(places):
-    """On a border its two towers are equally near and none is nearer; a step to each side changes the server."""
+    """On a border, two towers are equally near. A step to either side changes the serving tower."""
     towers = np.array(places, dtype=float)
     borders = voronoi_borders(towers, AREA)
     assert borders, "all towers stand in the area"

@@ -47,7 +47,7 @@ def test_order_of_samples_does_not_matter(ours, theirs):
 
 
 def test_makima_does_not_overshoot_a_step_of_ranks():
-    """The reason MATLAB gives for the modification: flat data stay flat beside a jump."""
+    """MATLAB's reason for the modification: flat data stay flat next to a jump."""
     x = np.arange(8.0)
     y = np.array([1.0, 1, 1, 1, 2, 2, 2, 2])
     for at in np.linspace(0, 3, 13):

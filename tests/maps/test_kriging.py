@@ -102,7 +102,7 @@ def test_tied_neighbours_follow_the_rule_whatever_the_order():
 
 
 def test_ties_survive_coordinates_that_are_not_exact():
-    """0.1 m steps are no binary numbers: the pattern of inner targets must still be one."""
+    """Steps of 0.1 m are not binary numbers. Inner targets must still have one pattern."""
     grid = Grid.over_area((0.1, 3.1, 0.7, 3.7), 0.1)
     model = OrdinaryKriging(lambda d: np.exp(-d), 20, 1.0).fit(grid.points_m, np.arange(len(grid)))
     chosen = model._neighbours(grid.points_m, grid.points_m, np.arange(len(grid)))
@@ -168,7 +168,7 @@ def test_no_sample_at_all():
 
 @pytest.mark.parametrize(("neighbours", "count"), [(20, 30_000), (59, 3_000)])
 def test_memory_of_a_prediction_is_bounded(neighbours, count):
-    """What grows with the targets is neighbours and weights (a few hundred bytes), not the systems (7 kB and more)."""
+    """Only neighbours and weights grow with the targets (some hundred bytes each), not the systems (7 kB and more)."""
     import tracemalloc
 
     model = OrdinaryKriging(PAPER, neighbours, np.inf).fit(scattered(60, 40), np.zeros(60))

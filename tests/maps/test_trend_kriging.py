@@ -56,7 +56,7 @@ def test_a_trend_that_explains_the_field_beats_none_between_distant_samples() ->
 
 @pytest.mark.parametrize("kind", ["ordinary", "trend"])
 def test_ranks_stay_within_their_bounds(kind: str) -> None:
-    """A step of ranks with a Gaussian correlation, which leaves 1 .. 4 without bounds."""
+    """A step of ranks with a Gaussian correlation exceeds 1 .. 4 without bounds."""
     rank = np.where(PLACES[:, 0] < 200, 1.0, 4.0)
 
     def smooth(distance):

@@ -159,7 +159,7 @@ DISTANCE = np.arange(0.0, 501.0, 30.0)
 
 @pytest.mark.parametrize("seed", range(5))
 def test_paper_coefficients_with_the_paper_residual(seed):
-    """With noise of the paper's RMSE the curve, not each coefficient, is determined."""
+    """With noise of the paper's RMSE, the curve is determined, but not each coefficient."""
     noisy = PAPER_BIEXPONENTIAL(DISTANCE) + np.random.default_rng(seed).normal(0, 0.0153, DISTANCE.size)
     fit = fit_biexponential(DISTANCE, noisy)
     assert fit.rmse <= np.sqrt(np.mean((noisy - PAPER_BIEXPONENTIAL(DISTANCE)) ** 2)) + 1e-12
@@ -214,7 +214,7 @@ def test_flat_data_are_fitted_although_degenerate():
 
 
 def test_no_amplitude_is_negative():
-    """A curve that is no covariance is fitted as well as amplitudes of at least 0 can."""
+    """A curve that is not a covariance is fitted as well as non-negative amplitudes allow."""
     held = fit_biexponential(DISTANCE, 1.5 * np.exp(-DISTANCE / 60) - 0.5 * np.exp(-DISTANCE / 300))
     assert held.rmse > 0.01
     assert min(held.c1, held.c3) >= 0.0

@@ -27,7 +27,7 @@ OPTIONS = ReadOptions(
 
 
 def sounder_log(count: int) -> bytes:
-    """A power log of so many samples: a run of '*', a jump and a silent sample among them."""
+    """Return a power log with this number of samples, with a run of '*', a jump and a silent sample."""
     out, offset = [], 0
     for i in range(count):
         stamp = f"[2025-03-02 10:{i // 1500:02d}:{i // 25 % 60:02d}.{i % 25 * 40000:06d}]"
@@ -82,7 +82,7 @@ def lte_flight() -> bytes:
 
 
 def processed_flight() -> bytes:
-    """What the authors of the LTE flights make of one: no clock, heading in radians, other tables beside."""
+    """Return a log as the authors of the LTE flights publish it: no clock, heading in radians, other tables."""
     table = {
         "RSRP_s": np.linspace(-80.0, -90.0, 4)[:, None], "acceler_s": np.zeros((4, 1)), "azim_s": np.zeros((4, 1)),
         "elev_s": np.zeros((4, 1)), "height_s": np.full((4, 1), 30.0), "lat_s": np.full((4, 1), 35.73),

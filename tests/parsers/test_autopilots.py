@@ -1,4 +1,4 @@
-"""Damaged logs of autopilots, and what peers' libraries say of the same bytes; their poses are in test_truth.py."""
+"""Damaged logs of autopilots, and other libraries on the same bytes. Their poses are in test_truth.py."""
 
 import struct
 
@@ -82,7 +82,7 @@ def test_a_message_described_anew_keeps_what_was_read_before(columns: str) -> No
 
 
 def test_a_message_of_an_unknown_kind_of_value_is_left_unread() -> None:
-    """A letter that stands for nothing, beside letters that make up the whole length."""
+    """A format with an unknown letter among letters that make up the complete length."""
     names = b"TimeUS,Lat,More,Lng,Alt"
     described = struct.pack("<BB4s16s64s", 129, 3 + struct.calcsize("<Qiif"), b"POS", b"QL?Lf", names)
     row = b"\xa3\x95\x81" + struct.pack("<Qiif", 1_000_000, 357_275_000, -786_960_000, 30.0)
@@ -94,7 +94,7 @@ def test_a_message_of_an_unknown_kind_of_value_is_left_unread() -> None:
 
 @pytest.mark.parametrize(("north_deg", "apart"), [(4e-4, True), (4e-5, False)])
 def test_a_filter_far_from_the_receiver_of_its_log_is_reported(north_deg: float, apart: bool) -> None:
-    """In POS 40 m (4 m) north of GPS, which the same log holds."""
+    """POS is 40 m (4 m) north of GPS, which the same log contains."""
     moved = struct.pack("<i", round(357_300_000 + north_deg * 1e7))
     data = LOGS["ardupilot_bin"]
     for i in range(COUNT):

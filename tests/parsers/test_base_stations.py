@@ -80,7 +80,7 @@ def test_sigmf_of_single_bursts_and_the_sounder() -> None:
 
 
 def test_power_of_sigmf_samples() -> None:
-    """A carrier of amplitude a has the power 20 log10 a, whatever the data type."""
+    """A carrier of amplitude a has the power 20 log10 a, for each data type."""
     rate = 10_000
     phase = np.exp(2j * np.pi * 0.01 * np.arange(600))
     amplitude = np.repeat([0.5, 0.05, 0.005], 200)

@@ -30,7 +30,7 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class Right:
-    """What a log says: columns of streams by name, the first time, words of a warning, parts of attributes."""
+    """The content of a log: columns of streams by name, the first time, words of a warning, parts of attributes."""
 
     streams: dict[str, dict[str, list[float]]]
     start: str = START
@@ -63,7 +63,7 @@ def check(result: ReadResult, right: Right) -> None:
 
 
 def cases(name: str) -> dict[str, Right]:
-    """A table beside ``cases/``, whose keys are the fields of :class:`Right`."""
+    """Read a table next to ``cases/``, whose keys are the fields of :class:`Right`."""
     table = yaml.load((CASES / name).read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     return {key: Right(**entry) for key, entry in table.items()}
 
@@ -128,7 +128,7 @@ def climb(first: list[float], rest: float) -> str:
 
 @pytest.mark.parametrize(("name", "first"), [("altitude", []), ("alt_msl", []), ("alt_msl", [0.0, 0.0])])
 def test_heights_count_from_the_ground_before_the_climb(name: str, first: list[float], tmp_path: Path) -> None:
-    """Not from the first row, and not from the zeros of a receiver without a fix."""
+    """Heights do not count from the first row or from the zeros of a receiver without a fix."""
     (tmp_path / "x.csv").write_text(climb(first, 110.0).format(name))
     shown = read(tmp_path / "x.csv", (), {}).streams[0].frame["altitude_m"].to_numpy()
     np.testing.assert_allclose(shown, [*[NAN] * len(first), *[0.0] * 6, 5, 10, 15, 20, 25])

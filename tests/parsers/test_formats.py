@@ -1,4 +1,4 @@
-"""What each format means: units, order, sentinels, clocks."""
+"""The meaning of each format: units, order, missing values, clocks."""
 
 import gzip
 from dataclasses import replace
@@ -227,7 +227,7 @@ def test_nemo_relative_times(reader: str, data: bytes) -> None:
 
 
 def test_nemo_calls_one_level_alike_in_both_exports() -> None:
-    """What was learned of the level of one export fits the other: same channel, technology and quantity."""
+    """Learned levels of one export apply to the other: same channel, technology and quantity."""
     table = next(s for s in read("nemo_csv", samples.FILES["nemo_csv/table"]).streams if s.kind == "rss")
     placemarks = samples.FILES["nemo_kml/placemarks"].replace(b"PDSCH rank (NR) = 2.0", b"RSRP (NR SpCell) = -80.5 dBm")
     level = next(s for s in read("nemo_kml", placemarks).streams if s.kind == "rss")

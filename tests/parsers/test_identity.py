@@ -1,4 +1,4 @@
-"""Whose reading a row holds: two sources never become one series without a warning, and one source never becomes two."""
+"""The source of a row: two sources never become one series without a warning, and one never becomes two."""
 
 import random
 from collections.abc import Callable
@@ -108,7 +108,7 @@ def test_rows_whose_identity_is_empty_are_no_part_of_another(tmp_path: Path) -> 
 
 
 def test_a_column_of_an_unknown_name_whose_values_alternate_without_turns_is_asked_about(tmp_path: Path) -> None:
-    """A second source 12 dB lower, at random between the rows of the first; a waypoint is none."""
+    """A second source is 12 dB lower, at random between the rows of the first. A waypoint is not a source."""
     chance = random.Random(3)
     rows = [
         (1749564000 + i, source := chance.randrange(2), -70 - 12 * source - chance.random(), i // 10) for i in range(80)

@@ -1,4 +1,4 @@
-"""What every reader owes: it knows its own format only, accounts for each line, and never fails raw."""
+"""Invariants of every reader: it recognises only its format, accounts for each line, and has no raw exceptions."""
 
 import io
 import random
@@ -25,7 +25,7 @@ TEXT_CASES = [case for case in CASES if case[0] not in BINARY]
 
 
 def check_law(reader: str, data: bytes) -> ReadResult | None:
-    """Read; a clear error is an answer, any other exception and a broken law of the fuzzer fail the test."""
+    """Read a file. A clear error is an answer. Other exceptions and violated invariants fail the test."""
     try:
         result = limits.check(by_name(reader).read(data, OPTIONS))
     except AerpawCmpError:
@@ -213,7 +213,7 @@ _CELLS = ("", "nan", "-", "A", "B", "7", "0", "2147483647")
 @given(st.lists(st.sampled_from(_NAMES), min_size=2, max_size=9, unique=True), st.randoms(use_true_random=False))
 @settings(max_examples=60, deadline=None)
 def test_each_level_of_a_table_is_a_record_or_flagged(names: list[str], chance: random.Random) -> None:
-    """Reading law: whoever is named beside it, by whichever columns, or by none."""
+    """The number of readings does not depend on the identities in other columns."""
     level, rows = -60.0, []
     for i in range(8):
         cells = [str(1_749_564_000 + i)]

@@ -1,4 +1,4 @@
-"""docs/adding_a_reader.md as it stands: a reader in a package of its own, found through the entry point."""
+"""The example of docs/adding_a_reader.md as a separate package, found by its entry point."""
 
 import json
 import os

@@ -67,7 +67,7 @@ def test_lines_with_one_sign_changed_are_left_to_the_strict_way(row: int, place:
 
 
 def test_levels_are_the_numbers_that_python_reads() -> None:
-    """Bit by bit, among texts of the same characters that are no numbers."""
+    """Numbers are read exactly, among texts of the same characters that are not numbers."""
     rng = np.random.default_rng(0)
     texts = [f"{value:16.{n}f}"[-16:] for n in range(10) for value in rng.normal(0.0, 10.0 ** (5 - n), 200)]
     texts += ["".join(rng.choice(list("   -.0123456789e"), 9)).rjust(16) for _ in range(20_000)]
@@ -173,7 +173,7 @@ def test_a_star_that_stands_for_no_sample_is_accepted() -> None:
 
 
 def test_offsets_of_two_widths_stay_in_the_order_of_the_file() -> None:
-    """A second run in one file begins anew with seven digits."""
+    """A second run in one file begins again with seven digits."""
     result = read(sample(0, 0o10000000), sample(1, 0), sample(2, 0o10000000), sample(3, 0))
     assert seconds(result) == [0, 1, 2, 3]
 

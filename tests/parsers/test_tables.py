@@ -182,7 +182,7 @@ def test_the_minus_sign_of_typesetting_is_one() -> None:
 
 
 def test_commas_of_thousands_are_no_decimal_commas() -> None:
-    """Where the table writes decimal points a quoted 1,300 is thirteen hundred; 30,5 in a table of commas is a half."""
+    """With decimal points, a quoted 1,300 is thirteen hundred. In a table with commas, 30,5 is thirty and a half."""
     heights = column_of(drive_test(six_rows(GOOD.replace("3{i}", '"1,30{i}"'))), "telemetry", "altitude_m")
     assert heights == [1300.0 + i for i in range(6)]
     commas = '2025-03-02 10:00:0{i},"35,72{i}","-78,69","30,{i}","-8{i},5"'
@@ -321,7 +321,7 @@ def test_times_without_seconds_are_said() -> None:
 
 
 def test_levels_in_another_unit_are_said() -> None:
-    """RSRP as the index of the standard, or in tenths: out of coverage everywhere, and nobody would know why."""
+    """RSRP as the index of the standard or in tenths would be out of coverage everywhere, without a reason."""
     result = drive_test(six_rows(GOOD.replace("-8{i}", "5{i}")))
     assert any("6 of 6 levels outside" in text for text in result.warnings)
 

@@ -106,7 +106,7 @@ def test_an_rtklib_baseline_is_refused_with_the_option_that_makes_it_readable() 
 
 
 def test_levels_of_a_telemetry_radio_are_those_of_its_scale() -> None:
-    """133 steps of 1/1.9 dB from -127 dBm are -57 dBm; 255 is no value."""
+    """133 steps of 1/1.9 dB from -127 dBm are -57 dBm. 255 is a missing value."""
     result = by_name("ardupilot_bin").read(autopilots.dataflash(radio=True), ReadOptions())
     streams = {stream.name: stream for stream in result.streams}
     assert result.accepted == 2 * autopilots.COUNT

@@ -28,7 +28,7 @@ Truth = dict[str, dict[str, list[Any]]]
 
 @dataclass(frozen=True)
 class Case:
-    """A file and what it says: columns of its streams, what a stream says of itself, words of a warning and of a reason."""
+    """A file and its content: columns and attributes of its streams, words of a warning and of a reason."""
 
     name: str
     data: str | bytes
@@ -41,7 +41,7 @@ class Case:
 
 
 def written(name: str) -> dict[str, Any]:
-    """A table beside this module."""
+    """Read a table in this folder."""
     content = Path(__file__).with_name(f"{name}.yaml").read_bytes()
     table: dict[str, Any] = yaml.load(content, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     return table

@@ -1,4 +1,4 @@
-"""What editors, spreadsheets and shells make of a log on its way: the same records."""
+"""Logs that were changed by editors, spreadsheets or shells give the same records."""
 
 import re
 from dataclasses import replace
@@ -86,7 +86,7 @@ def test_a_mapped_table_has_any_separator() -> None:
 
 
 def test_what_fuzzing_found() -> None:
-    """A dot is no number; a number means the same whatever stands on other lines."""
+    """A dot is not a number. A number has the same value regardless of other lines."""
     log = b"2025-03-02T10:00:00.250000 [METRICS ] [I] Scheduler UE pci=1 rnti=0x4601 cqi=. dl_ri=. dl_mcs=27\n"
     assert by_name("srsran_gnb").read(log, OPTIONS).accepted == 0
     head = FILES["nemo_csv/table"].split(b"\r\n")[0] + b"\n"

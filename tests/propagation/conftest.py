@@ -54,7 +54,7 @@ def path_keys(paths):
 
 
 def _covered(site, start, end, tolerance=1e-7):
-    """Whether a segment runs through the inside of a building: by 2-D intersection of its shadow, not by faces."""
+    """Check whether a segment passes through a building, by 2-D intersection of its shadow instead of faces."""
     start, end = np.asarray(start), np.asarray(end)
     shadow = LineString([start[:2], end[:2]])
     length = shadow.length

@@ -81,7 +81,7 @@ def _points(sequence, source, target):
 
 
 def blocked(boxes, start, end):
-    """Whether the open segment meets the inside of the union of the closed boxes."""
+    """Check whether the open segment meets the inside of the union of the closed boxes."""
     step = [e - s for s, e in zip(start, end, strict=True)]
     if not any(step):
         return False
@@ -104,7 +104,7 @@ def blocked(boxes, start, end):
 
 
 def _inside(boxes, point):
-    """Whether each of the eight octants round a point belongs to a box near the point."""
+    """Check whether each of the eight octants around a point belongs to a box near the point."""
     return all(any(_octant(b, point, signs) for b in boxes) for signs in itertools.product((-1, 1), repeat=3))
 
 

@@ -92,7 +92,7 @@ def _inside(corners, normal, points):
 
 @lru_cache(maxsize=4096)
 def _edges(corners, normal):
-    """For each side: the inward unit vectors (mirrors, 3), and the least component along them of a point inside."""
+    """Return, for each side, the inward unit vectors (mirrors, 3) and their smallest component at an inner point."""
     corners, normal = np.frombuffer(corners).reshape(-1, 3, 3), np.frombuffer(normal).reshape(-1, 3)
     sides = []
     for k in range(3):

@@ -219,7 +219,7 @@ def test_a_link_s_error_is_that_of_its_sum_where_all_paths_are_near_and_none_fad
 
 @pytest.mark.parametrize(("samples", "rays"), [("auto", 100_000), (5_000, 5_000), (300_000, 100_000)])
 def test_an_audit_adds_up_its_checks(monkeypatch: pytest.MonkeyPatch, samples: object, rays: int) -> None:
-    """The image engine by itself, two poses by the second implementation, and what Sionna would be asked."""
+    """The image engine alone, two poses by the second implementation, and the requests to Sionna."""
     spots = np.array([[120.0, 60, 40], [40, -90, 25], [-200, 90, 60], [60, 10, 30], [90, 0, 50]])
     poses, asked = Poses(spots, np.tile(np.eye(3), (5, 1, 1))), []
     search = Search("image", max_depth=1)
@@ -265,7 +265,7 @@ def test_an_audit_adds_up_its_checks(monkeypatch: pytest.MonkeyPatch, samples: o
 
 
 def test_audited_poses_are_spread_or_taken_for_the_kinds_of_their_paths() -> None:
-    """By hand: pose 3 has most kinds, then pose 1 adds one, as pose 0 does with fewer; pose 4 is not asked."""
+    """By hand: pose 3 has most kinds of paths, pose 1 adds one, pose 0 adds the same one, pose 4 is not used."""
     kinds = {0: [7], 1: [7, 2, 3], 2: [4, 5], 3: [2, 3, 4, 5], 4: [8, 9, 10, 11, 12]}
     some = replay(SITE, LINK, POSES, Search("image", max_depth=1))
     pose, face = np.array([(p, f) for p, several in kinds.items() for f in several]).T

@@ -156,7 +156,7 @@ def test_a_replay_on_three_threads_is_that_on_one_bit_by_bit(monkeypatch, case):
 
 @pytest.fixture
 def fresh():
-    """Nothing remembered, before and after."""
+    """Clear the caches before and after a test."""
     compiled._failure.cache_clear()
     compiled.warn_once.cache_clear()
     yield
@@ -217,7 +217,7 @@ def test_every_compiled_module_runs_where_nothing_can_be_written():
 
 @pytest.mark.parametrize("way", ["broken", "never"])
 def test_many_faces_without_compiled_code(monkeypatch, fresh, case, way):
-    """Prisms fall back to the image engine, a broken numba told once; a scene of triangles is one message."""
+    """Prisms fall back to the image engine with one warning if numba is broken. A scene of triangles is one error."""
     site, link, poses, paths = case
     monkeypatch.setattr(engines, "MANY_FACES", 5)
 

@@ -62,7 +62,7 @@ class ByForce:
         return point if face < 0 else point - 2 * self.above(face, point) * self.faces.normal[face]
 
     def shortest(self, edge: int, a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
-        """Where |a p| + |p b| is shortest along an edge, by golden sections; None beyond its ends."""
+        """Return where |a p| + |p b| is shortest along an edge, by golden sections. None beyond its ends."""
         start, way = self.edges.start_m[edge], (self.edges.end_m - self.edges.start_m)[edge]
 
         def length(share: float) -> float:
@@ -199,7 +199,7 @@ def test_a_face_that_another_building_covers_has_no_edge() -> None:
 
 @pytest.mark.parametrize("east_m", [8.0, 12.0])
 def test_no_path_bends_where_a_neighbour_touches_a_face(east_m: float) -> None:
-    """From above, too: of the common wall alone what stands out of the lower roof can bend a wave."""
+    """Only the part of a common wall above the lower roof diffracts, also for rays from above."""
     west, east = Building("west", box(40, -15, 46, 25), 8.0), Building("east", box(46, -15, 52, 25), east_m)
     where = poses((70.0, 3.0, 20.0), (30.0, 6.0, 15.0), (46.0, -40.0, 9.0), (49.0, 60.0, 3.0))
     halves = place(west, east, tower=(0.0, 0.0, 16.0))
@@ -296,7 +296,7 @@ def right_handed(edges: Edges) -> None:
 
 @pytest.mark.parametrize(("sides", "ground_m", "uprights"), [(3, 0.0, 3), (6, 1.0, 6), (5, 7.9, 5), (4, 8.0, 0)])
 def test_edges_of_a_regular_prism(sides: int, ground_m: float, uprights: int) -> None:
-    """Uprights turn by a whole turn over the number of sides and begin at the ground; what it buries is no edge."""
+    """The turns of upright edges add up to 360 degrees. They begin at the ground, and buried parts are not edges."""
     angle = 2 * np.pi * np.arange(sides) / sides
     tower = Building("tower", Polygon(np.column_stack([50 + 9 * np.cos(angle), 9 * np.sin(angle)])), 8.0)
     site = place(tower)

@@ -163,7 +163,7 @@ def forest(*rows: tuple[float, ...]) -> Trees:
 
 
 def inside(point, tree, shape):
-    """Whether points (n, 3) lie in a crown: the definition of each solid."""
+    """Check whether points (n, 3) are in a crown, by the definition of each solid."""
     east, north, ground, height, diameter, base, _ = tree
     h = (point[:, 2] - ground - base) / (height - base)
     r = np.hypot(point[:, 0] - east, point[:, 1] - north) / (diameter / 2)

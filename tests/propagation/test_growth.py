@@ -95,7 +95,7 @@ def test_a_mirror_is_seen_past_a_face_with_hollows(name):
 
 
 def test_a_square_behind_a_mirror_hides_nothing_before_it():
-    """As seen from the source's image at (20, 0, 0) the square at 15 covers the mirror at -5, but no path meets it."""
+    """Seen from the source's image at (20, 0, 0), the square at 15 hides the mirror at -5, but blocks no path."""
     squares = [
         quad((east, -half, -half), (0, 2 * half, 0), (0, 0, 2 * half)) for east, half in ((10, 3), (-5, 3), (15, 20))
     ]

@@ -1,4 +1,4 @@
-"""The cases that break float32 or careless geometry, each by itself."""
+"""Cases that break float32 or careless geometry, one at a time."""
 
 import dataclasses
 
@@ -52,7 +52,7 @@ def exact_line_of_sight(tower, source, uav, target):
 
 @pytest.mark.parametrize("k", [10, 100, 1000])
 def test_line_of_sight_with_sigma_2_within_1e_6_of_the_limit(scenes, k):
-    """The rank changes where exact arithmetic says so, 1e-6 beside the limit; float32 noise is 1000 times larger."""
+    """The rank changes at the exact limit within 1e-6. The noise of float32 is 1000 times larger."""
     site = scenes.site()
     source = site.towers["LW1"].position_m
     # a wide tower array, so that the limit of K = 10 lies outside its near field
@@ -91,7 +91,7 @@ def test_line_of_sight_with_sigma_2_within_1e_6_of_the_limit(scenes, k):
 
 
 def test_sionna_note_links_have_the_exact_ranks(scenes):
-    """Of lines of sight between 20 m and 1.5 km float32 makes rank 3 at K = 1000; exact arithmetic never does."""
+    """For lines of sight of 20 m to 1.5 km, float32 gives rank 3 at K = 1000, which exact arithmetic never does."""
     site = scenes.site()
     distance = np.geomspace(20, 1500, 60)
     poses = scenes.poses(np.column_stack([distance, 0.1 * distance, np.full(60, 30.0)]))

@@ -48,7 +48,7 @@ def test_same_paths_as_brute_force_at_depth_3(scenes):
 
 
 def test_mirrors_toward_a_box_are_those_of_all_paths_into_it_and_hardly_more(scenes):
-    """Boxes beside and above buildings; every face of a path over one face into a box, at random places of it."""
+    """Return boxes next to and above buildings, and all faces of paths over one face, at random positions of a box."""
     rng = np.random.default_rng(8)
     site = scenes.site(scenes.buildings(rng, 9, spread_m=120.0))
     faces = site_faces(site)

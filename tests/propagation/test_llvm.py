@@ -135,7 +135,7 @@ def as_root_on_debian(monkeypatch: pytest.MonkeyPatch, libraries: Path) -> None:
 
 
 def test_what_drjit_itself_lacks_is_named_and_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a minimal Debian: the loader's message comes first, an unrelated NameError last."""
+    """On a minimal Debian, the loader's message comes first and an unrelated NameError last."""
     program = (
         "try: raise ImportError('libatomic.so.1: cannot open shared object file: No such file or directory')\n"
         "except ImportError: _drjit_ext"
@@ -211,7 +211,7 @@ def fake_tool(folder: Path, name: str, script: str) -> None:
 def test_install_takes_the_newest_and_falls_back_when_its_trial_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """apt is a shell script that puts libraries down; version 22 fails its trial, 19 passes."""
+    """apt is a shell script that installs libraries. Version 22 fails its trial, and 19 passes."""
     tools, libraries = tmp_path / "bin", tmp_path / "lib"
     tools.mkdir()
     libraries.mkdir()
@@ -264,7 +264,7 @@ def test_the_line_of_a_debian_names_what_can_be_had(known: str, line: str, monke
 
 
 def test_a_library_that_is_called_by_its_interface_has_the_version_of_its_other_name(tmp_path: Path) -> None:
-    """As the project's own packages have it: libLLVM-19.so.1 leads to libLLVM.so.1."""
+    """As in the packages of the LLVM project, libLLVM-19.so.1 is a link to libLLVM.so.1."""
     (tmp_path / "libLLVM.so.1").touch()
     for name in ("libLLVM-19.so.1", "libLLVM.so", "libLLVM-19.so"):
         (tmp_path / name).symlink_to("libLLVM.so.1")
@@ -315,7 +315,7 @@ def run_setup(folder: Path, *, path: str = "", before: str = "") -> subprocess.C
 
 
 def test_setup_script_installs_no_llvm_where_a_package_is_what_fails(tmp_path: Path) -> None:
-    """The script beside a Dr.Jit that asks typing for a name that is not there, as Sionna RT did on Python 3.10."""
+    """The script with a Dr.Jit that imports a missing name from typing, as Sionna RT did on Python 3.10."""
     (tmp_path / "drjit").mkdir()
     (tmp_path / "drjit/__init__.py").write_text("from typing import no_such_name\n")
     (tmp_path / "libLLVM.so.19.1").touch()

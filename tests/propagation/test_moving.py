@@ -1,4 +1,4 @@
-"""A tower that moves: no approximation, and the limits in which it is a tower that stands."""
+"""A tower that moves: exact positions, and the limit of a fixed tower."""
 
 import dataclasses
 
@@ -100,7 +100,7 @@ def test_messages_of_blocks_are_counted_together():
 
 
 def test_a_place_that_is_visited_again_keeps_the_order_of_the_poses():
-    """Out and back: poses of one place lie far apart, and their paths stand where other parts look for them."""
+    """Out and back: poses at one position are far apart in the list, and their paths must still be found."""
     way = np.concatenate([rover(N // 2), rover(N // 2)[::-1]])
     replayed = replay_moving(SITE, LINK, poses(), way, Search(max_depth=1))
     assert (np.diff(replayed.paths.pose) >= 0).all()

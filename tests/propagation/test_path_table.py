@@ -1,4 +1,4 @@
-"""Paths by themselves against H, closed forms, numerical derivatives and Sionna."""
+"""Path tables against H, closed forms, numerical derivatives and Sionna."""
 
 from dataclasses import replace
 

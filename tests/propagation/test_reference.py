@@ -232,7 +232,7 @@ def test_limits_of_links_are_those_of_the_replay(scenes):
 
 
 def test_a_pose_within_reach_of_one_tower_has_paths_to_all(scenes):
-    """A hundred kilometres count from the nearest tower: the link to one behind it is longer, and is no phantom."""
+    """The limit of 100 km applies to the nearest tower. A longer link to a tower behind it is valid."""
     site = scenes.site(towers=((0.0, 0.0, 10.0), (-2000.0, 0.0, 10.0)))
     link = scenes.link(site)
     for east_m, paths in ((99_000.0, 4), (101_000.0, 0)):
@@ -243,7 +243,7 @@ def test_a_pose_within_reach_of_one_tower_has_paths_to_all(scenes):
 
 
 def test_rough_ground_and_each_reflection_lose_what_their_formulas_say(scenes):
-    """Ament's factor at the ground alone, whatever else a path meets; a roof is level, too, and not the ground."""
+    """Ament's factor applies to the ground alone. A flat roof is level, but not the ground."""
     site = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), ((-10.0, 0.0, 20.0),))
     link = field_audit.Expected.of(scenes.link(site)).link
     second_way = reference.Reference(

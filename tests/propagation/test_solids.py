@@ -123,7 +123,7 @@ def test_field_goes_on_smoothly_to_the_ground_a_wall_and_a_roof(scenes):
 
 @pytest.mark.parametrize("turn", [False, True])
 def test_points_inside_the_planes_are_those_inside_a_building(scenes, turn):
-    """Against shapely: convex and not, with a court, with a corner named twice, either way round, one beside another."""
+    """Compare with shapely: convex or not, with a court, with a repeated corner, in both orientations, adjacent."""
     shapes = [
         box(0, 0, 12, 7),
         Polygon([(20, 0), (31, 2), (31, 2), (25, 9)]),

@@ -210,7 +210,7 @@ def test_the_evergreen_share_keeps_its_leaves() -> None:
 
 
 def test_sight_lines_through_woods_and_behind_buildings_are_counted() -> None:
-    """Of eight poses around a tower two lie behind a wood, one more behind a barn, one of them behind both."""
+    """Of eight poses around a tower, two are behind a wood, and two behind a barn, one of them behind both."""
     site = wood(box(100.0, -300.0, 200.0, 300.0))
     site = replace(
         site, buildings=(Building("barn", box(-60, -20, -50, 20), 12.0), Building("shed", box(50, -5, 60, 5), 12.0))

@@ -143,7 +143,7 @@ def test_a_trace_of_plain_positions_is_that_of_level_poses(case):
 
 
 def test_poses_within_100_km_of_a_tower_count(case, scenes):
-    """On the straight line; a flight is decided by its box, or pose by pose, with the same answer."""
+    """A flight on a straight line is decided by its box or pose by pose, with the same result."""
     site, _, _ = case
     second = list(site.towers.values())[1].position_m
     limit = np.array(

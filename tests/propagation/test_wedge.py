@@ -26,7 +26,7 @@ def matrix(*values: float, face=CONDUCTOR) -> ComplexArray:
 
 
 def test_transition_function() -> None:
-    """By the Fresnel integrals of its definition, before they cancel."""
+    """Compute by the Fresnel integrals of the definition, before they cancel."""
     root = np.linspace(1e-3, 4.0, 400)
     sine, cosine = fresnel(root * np.sqrt(2 / np.pi))
     tail = np.sqrt(np.pi / 2) * (0.5 - cosine - 1j * (0.5 - sine))
@@ -131,7 +131,7 @@ def seen(source: FloatArray, target: FloatArray, wave: FloatArray, turn: float) 
 @pytest.mark.parametrize("end", [-1.0, 1.0])
 @pytest.mark.parametrize("height", [-24.0, 2.0, 70.0])
 def test_field_of_concrete_is_continuous_over_both_boundaries(end: float, height: float) -> None:
-    """Of any polarisation, at oblique incidence; beside the boundary, where nothing is a limit."""
+    """For any polarisation at oblique incidence, and next to the boundary, where a limit is not needed."""
     turn = 1.0
     source = np.array([30 * np.cos(turn), 30 * np.sin(turn), -25.0])
     boundary = np.pi + end * turn

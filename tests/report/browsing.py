@@ -32,7 +32,7 @@ def open_page(driver, path, ready: str) -> None:
 
 
 def reload_page(driver, ready: str) -> None:
-    """As :func:`open_page`, the page that is shown."""
+    """Open a page like :func:`open_page`, in the page that is shown."""
     driver.refresh()
     _wait(driver, ready)
 
@@ -54,7 +54,7 @@ def frame(driver) -> None:
 
 
 def saved(driver, menus: str) -> dict[str, str]:
-    """What every choice of the menus of charts that are shown would save, by name of file: CSS chooses the menus."""
+    """Return what each item of the visible chart menus would save, by file name."""
     from selenium.webdriver.support.ui import WebDriverWait
 
     chosen = driver.execute_script(
@@ -82,13 +82,13 @@ def saves_every_chart(driver) -> dict[str, str]:
 
 
 def complaints(driver) -> list[dict]:
-    """What the console says; but not that pixels are read often: tests do, no page does."""
+    """Return the console's messages, except those about frequent reading of pixels, which only tests do."""
     said = [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
     return [entry for entry in said if "using getImageData" not in entry["message"]]
 
 
 def asked_outside(driver) -> list[str]:
-    """Addresses that the page asked for and that are no part of it."""
+    """Return addresses outside of the page that it requested."""
     messages = (json.loads(entry["message"])["message"] for entry in driver.get_log("performance"))
     asked = [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
     return [url for url in asked if not url.startswith(("file:", "data:", "chrome:"))]

@@ -109,7 +109,7 @@ def test_ranks_have_the_shares_of_the_tables(driver, data):
 
 
 def hover(driver, data, row, column):
-    """Point at the middle of a cell; gives what the page says there."""
+    """Point at the middle of a cell. Return the text that the page shows."""
     from selenium.webdriver import ActionChains
 
     canvas = driver.find_element("id", "map")

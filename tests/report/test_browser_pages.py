@@ -1,4 +1,4 @@
-"""Pages in a real browser: the first words of each above the fold; never wider than the window; dark where asked."""
+"""Pages in a real browser: the summary is visible without scrolling, no page is wider than the window, dark scheme."""
 
 import io
 from collections.abc import Iterator
@@ -83,7 +83,7 @@ def test_no_page_is_wider_than_its_window_or_light_in_the_dark(page: str, path: 
 
 
 def test_the_view_of_a_site_can_be_saved(driver: Any, tmp_path: Path, report_data: Any) -> None:
-    """Round crowns of trees too; the table has the corners of all that stands there."""
+    """The table contains the corners of all objects, also of round tree crowns."""
     path = tmp_path / "site.html"
     path.write_text(viewer(report_data.site), encoding="utf-8")
     open_page(driver, path, "shape")

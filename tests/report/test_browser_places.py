@@ -65,7 +65,7 @@ def test_the_map_names_its_towers_and_reads_the_point_under_the_pointer(driver, 
 
 
 def test_a_saved_table_has_no_formula_of_a_name(driver):
-    """As the tables that Python writes; numbers stay numbers."""
+    """The page saves tables like those that Python writes, and numbers stay numbers."""
     driver.execute_script("""
         const rows = () => [["=1+1", "a;@b", "plain"], [-1.5, null, "+2"]], menu = common.downloads(document.createElement("canvas"), "t", rows, () => {});
         menu.id = "guarded"; document.body.append(menu);
@@ -75,7 +75,7 @@ def test_a_saved_table_has_no_formula_of_a_name(driver):
 
 
 def test_directions_lie_on_a_sphere_that_turns(driver):
-    """From above north is up and the zenith in the middle; from the side the middle is the south."""
+    """Seen from above, north is up and the zenith is in the middle. Seen from the side, the south is in the middle."""
     from selenium.webdriver import Keys
 
     choose(driver, "group", "ranks")

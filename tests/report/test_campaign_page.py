@@ -1,4 +1,4 @@
-"""campaign.html at the size of a season: what stands on it, what is left to the files, and how large it gets."""
+"""campaign.html for a large campaign: its content, what only the files contain, and its size."""
 
 import dataclasses
 import json
@@ -120,7 +120,7 @@ def test_campaign_json_has_the_telling_pairs_and_a_file_has_all(data, tmp_path):
 
 
 def test_the_page_opens_with_a_verdict_against_the_baselines_and_explains_its_means(data):
-    """Free space wins in every row: the first words say it, every row says it, and both means say what they are for."""
+    """Free space is best in every row: the summary and every row say so, and both means are labelled."""
     first = next(iter(data.settings))
     rows = tuple(
         dataclasses.replace(

@@ -51,7 +51,7 @@ def test_every_card_function_of_a_page_stands_on_it() -> None:
 
 
 def test_a_new_card_is_one_function(report_data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As CONTRIBUTING says: the function, and its name in CARDS."""
+    """A new card needs the function and its name in CARDS, as CONTRIBUTING describes."""
 
     def samples_card(data: ReportData) -> Card:
         table = Table(

@@ -1,4 +1,4 @@
-"""Charts that the page's script draws: what they show is what the numbers say; the table of serving cells."""
+"""Charts of the page's script show the given numbers. The table of serving cells."""
 
 import dataclasses
 import re

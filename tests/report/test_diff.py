@@ -87,7 +87,7 @@ def test_one_setting_is_named_by_its_key(pair):
 
 
 def test_fingerprints_that_differ_are_printed_by_their_first_digits(pair, capsys):
-    """A fingerprint of a log has 2000 digits; nobody compares those by eye."""
+    """A fingerprint has 2000 digits, so a table shows only the first."""
     fingerprints = ["3501f" + "7a" * 1000 + "f" + "0c" * 256, "3502f" + "6b" * 1000 + "f"]
     change_metrics(pair[1], lambda m: m["settings"].update(rank={"marks": fingerprints}))
     assert main(["diff", str(pair[0]), str(pair[1])]) == 0
@@ -194,7 +194,7 @@ def test_a_replay_that_moved_without_harm_is_said_to_have_moved(pair):
 
 
 def test_links_are_pooled_by_what_each_adds_at_an_instant():
-    """Two links with a change of opposite sign: the means of links are no memory of the flight."""
+    """Two links change in opposite directions: their means are not a correlation of the flight."""
     rng = np.random.default_rng(8)
     time, links, truth = np.arange(3000) * 0.1, [], []
     for before, after in ((2.0, 3.0), (4.0, 3.5)):

@@ -1,4 +1,4 @@
-"""The data of the linked views: what the script gets is what the record holds."""
+"""The data of the linked views: the script gets the numbers of the record."""
 
 import base64
 import dataclasses

@@ -21,7 +21,7 @@ DBM = "0.1 lg(re 1 mW)"
 
 
 def thinned(record, every, **change):
-    """Every so many samples of a record."""
+    """Return every n-th sample of a record."""
     n = len(record.time)
     cut = {
         f.name: value[::every]
@@ -78,7 +78,7 @@ def same(table, column, values, *, atol=1e-9):
 
 
 def same_places(table, latitude, longitude, atol=2e-3):
-    """Back to metres with the site's own projection, from what the file says."""
+    """Convert back to metres with the site's projection, from the values in the file."""
     east, north = FRAME.to_local(np.asarray(latitude, dtype=float), np.asarray(longitude, dtype=float))
     same(table, "east_m", east, atol=atol)
     same(table, "north_m", north, atol=atol)
@@ -295,7 +295,7 @@ def test_a_missing_library_is_named_with_its_extra(data, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", formats.FORMATS)
 def test_a_limit_of_the_disk_is_an_oserror_in_every_format(name, data, tmp_path, monkeypatch):
-    """A library that writes by itself must not end the process or keep silent."""
+    """A library that writes its own files must not end the process or hide an error."""
     resource = pytest.importorskip("resource")
     monkeypatch.setattr(kmz, "_legend", lambda _: b"")
     export = points.of_report(data)

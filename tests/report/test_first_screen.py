@@ -202,7 +202,7 @@ def every_outcome(data):
     ],
 )
 def test_the_expected_error_is_that_of_flights_of_one_kind(report_data, floor, words):
-    """The error with a floor is that of all held-out flights."""
+    """For a receiver with a floor, the expected error is that of all held-out flights."""
     known = {"rmse_db": 3.5, "kind": "in directions that were not flown", **floor}
     assert expected_sentence([with_numbers(panel, elsewhere=known) for panel in report_data.rss]) == words
 
@@ -301,7 +301,7 @@ def test_a_flight_at_one_place_tells_no_models_apart(report_data):
 
 
 def test_a_good_result_says_nothing_about_causes(report_data):
-    """An error of 2 dB, or one below that of the best baseline, is no fault; few samples and two levels have a reason."""
+    """An error of 2 dB, or one below the best baseline, has no cause. Few samples and two levels have a reason."""
     verdict, panel = report_data.verdict, report_data.rss[0]
     few = dataclasses.replace(panel, score=dataclasses.replace(panel.score, n=60))
     two = dataclasses.replace(
@@ -427,7 +427,7 @@ def test_a_dead_channel_takes_no_part_in_the_verdict_of_one_that_lives(report_da
 
 @pytest.mark.parametrize("shift_db", [0.0, 1.0])
 def test_channels_of_the_same_levels_are_corrected_for_once(report_data, shift_db):
-    """At 0.02 over all channels: 0.012 stays as that of one measurement, not as one of three."""
+    """With the limit 0.02 over all channels, 0.012 passes for one measurement and not for three."""
     panel = report_data.rss[0]
     pair = dataclasses.replace(paired_difference([], []), p_value=0.012, verdict="better")
     further = dataclasses.replace(panel.further, compared_with={"free_space": pair})

@@ -1,4 +1,4 @@
-"""The data of the map page's script: what it gets is what the maps hold, in steps that are said, within a size."""
+"""The data of the map page's script: the values of the maps in stated steps, and a limited size."""
 
 import base64
 import dataclasses

@@ -1,4 +1,4 @@
-"""First words of a map: the gaps of coverage are explained by what was put in."""
+"""Summary of a map: gaps of coverage are explained by the inputs."""
 
 import dataclasses
 from typing import Any

@@ -50,7 +50,7 @@ def test_every_map_figure_has_units_and_a_legend(few_maps):
 
 
 def test_north_is_up_and_east_is_right(maps_data):
-    """The one bright cell of a map must lie where its tower stands."""
+    """The only bright cell of a map must be at its tower."""
     values = np.full((len(maps_data.north_m), len(maps_data.east_m)), -100.0)
     values[70, 0] = 0.0  # north-west corner
     with canvas.style():
@@ -119,7 +119,7 @@ def test_tables(maps_data):
 
 @pytest.mark.parametrize("all_full", [True, False])
 def test_rows_in_full_coverage_are_one(maps_data, all_full):
-    """A map where every path arrives tells no tower from another."""
+    """A map in which every path arrives does not distinguish the towers."""
     full = [dataclasses.replace(m, coverage=1.0 if all_full or m.tower != "LW4" else 0.98765) for m in maps_data.rss]
     rows = maps_html.coverage_table(dataclasses.replace(maps_data, rss=tuple(full))).rows
     towers = len({m.tower for m in full})

@@ -1,4 +1,4 @@
-"""Sentences of a prediction: each follows from an interval on what was left out, or on the flight that followed."""
+"""Sentences of a prediction: each follows from an interval on held-out data, or on the later flight."""
 
 import re
 from typing import Any

@@ -35,7 +35,7 @@ INLINE = {"b", "i", "em", "strong", "code", "a", "br", "sup", "sub", "abbr"}
 
 
 def of_module(path: Path) -> Iterator[tuple[str, str]]:
-    """Condition and text of each string of a module that is no docstring; values of an f-string are gaps."""
+    """Yield condition and text of each string of a module that is not a docstring. Values of an f-string are gaps."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     yield from _strings(tree, [])
 
@@ -184,7 +184,7 @@ SKIPPED = ("script", "style", "td", "pre", "code", "svg")
 
 
 def unknown(html: str) -> list[str]:
-    """Runs of three words of a page that neither the table nor the data have."""
+    """Return sequences of three words of a page that are neither in the table nor in the data."""
     parser = Text()
     parser.feed(html)
     texts = [part for *_, text in pieces() for part in re.split(GAP, text)] + list(DATA)

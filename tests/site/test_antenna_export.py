@@ -1,4 +1,4 @@
-"""Patterns of two cuts, and patterns for other programs: what is written says the same where it is read."""
+"""Patterns of two cuts, and patterns for other programs: a round trip returns the same gains."""
 
 import importlib.util
 

@@ -1,4 +1,4 @@
-"""Planes are interpolated exactly; a ridge blocks what geometry says it blocks."""
+"""Planes are interpolated exactly, and a ridge blocks as in plane geometry."""
 
 from pathlib import Path
 
@@ -133,7 +133,7 @@ def test_grounds_that_the_elevation_model_contradicts_are_told(
 
 @pytest.mark.parametrize(("value", "size"), [(0.0, 1), (0.0, 6), (5.0, 6)])
 def test_gaps_filled_with_a_number_are_a_caution_of_the_tower_on_them(tmp_path: Path, value: float, size: int) -> None:
-    """A tower on a hole of one height stands 100 m below the origin; a lake or a level field is no such hole."""
+    """A tower on a hole of constant height is 100 m below the origin. A lake or a level field is not such a hole."""
     ground = 110.0 + plane(-500, -500, 10, (101, 101)) / 100.0
     ground[20 : 20 + size, 70 : 70 + size] = value
     ground[40:60, 10:30] = ground[40, 9] - 1.0

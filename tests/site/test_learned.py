@@ -1,4 +1,4 @@
-"""What a site remembers: written, found by name, refused where it does not fit."""
+"""Learned models of a site: written, found by name, refused if they do not fit."""
 
 import errno
 import gzip
@@ -59,7 +59,7 @@ LOCK = LearnedLock(
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A site that remembers one channel, its tower antenna 3 dB below its UAV antenna."""
+    """Return a site with one learned channel, whose tower antenna is 3 dB below its UAV antenna."""
     low = sphere_csv(np.full((7, 8), -3.0), np.ones((7, 8)), ("aerpaw-cmp calibrate: c", f"marks: {MARK}")).encode()
     remember(tmp_path / "mine.yaml", "d12", entry("A"), learned_tables("A", (f"marks: {MARK}",), t=low))
     return tmp_path
@@ -127,7 +127,7 @@ def test_an_antenna_of_another_band_is_a_caution(folder: Path) -> None:
 
 
 def test_the_airframe_is_the_end_of_every_channel(folder: Path) -> None:
-    """Whether the file lists a channel or not; a channel of another band keeps its own antenna."""
+    """The file may list a channel or not. A channel of another band keeps its own antenna."""
     path = flight(folder, {"uav": "mine/d12_uav"})
     overrides = {"link.channels.B.carrier_hz": 3.31e9, "link.channels.C.carrier_hz": 3.6e9}
     settings = load_with_learned(path, overrides=overrides)
@@ -321,7 +321,7 @@ def test_a_copied_memory_is_whole_or_not_there_and_holds_its_own_files_alone(
 
 @pytest.mark.parametrize("name", ["A.t.csv.gz", "B.t.csv.gz"])
 def test_a_table_that_no_calibration_wrote_is_neither_replaced_nor_removed(folder: Path, name: str) -> None:
-    """One of another channel that lies there already, and one of the entry that somebody changed."""
+    """Existing files: one of another channel, and one of the entry that was changed by hand."""
     site = folder / "mine.yaml"
     (folder_of(site) / name).write_bytes(b"mine")
     before = (folder_of(site) / "learned.yaml").read_text()
@@ -358,7 +358,7 @@ def test_two_processes_store_all_of_their_entries(tmp_path: Path) -> None:
 def test_learned_antennas_are_found_from_any_working_folder(
     folder: Path, where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The flight file is named relative to the working folder, and its site's memory lies beside it."""
+    """The flight file is named relative to the working folder, and its site has learned models in the same folder."""
     (folder / "rl" / "deep").mkdir(parents=True)
     folder_of(folder / "mine.yaml").rename(folder / "rl" / "mine.learned")
     receiver = LearnedReceiver(tower="LW1", quantity="scheduled PDSCH rank", carrier_hz=3.4e9, file="r.json.gz")
@@ -393,7 +393,7 @@ def test_the_packaged_memory_is_small_and_says_where_it_comes_from() -> None:
     [("dataset12", 3.7, 3.0, 0.62), ("lte", 6.1, 3.75, 0.9), ("afar", 12.0, 8.8, 0.8), ("nr_rank", 3.7, 3.1, 0.75)],
 )
 def test_packaged_antennas_predict_flights_left_out(name, rmse_db, rmse_4s_db, of_free_space) -> None:
-    """Bounds on what tests/field/test_learned_site.py makes anew from the logs."""
+    """Limits for the tables that tests/field/test_learned_site.py learns again from the logs."""
     errors = read_learned("lake_wheeler").entries[name].errors
     assert errors is not None
     assert errors.rmse_db < min(rmse_db, of_free_space * errors.free_space_rmse_db)

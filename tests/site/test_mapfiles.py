@@ -1,4 +1,4 @@
-"""Damaged and unusual map data: what can be used is used, and nothing goes without a line that says so."""
+"""Damaged and unusual map data: usable data are used, and each ignored object has a line."""
 
 import gzip
 import io

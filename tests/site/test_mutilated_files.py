@@ -1,4 +1,4 @@
-"""Whatever is done to a file, the answer is a result or one message: never another exception."""
+"""A damaged file gives a result or one message, never another exception."""
 
 import contextlib
 from pathlib import Path

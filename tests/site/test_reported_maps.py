@@ -18,7 +18,7 @@ def heights(content: Footprints) -> list[float]:
 
 
 def village(path: Path, *tags: dict[str, object]) -> Footprints:
-    """Buildings beside each other with these properties."""
+    """Return adjacent buildings with these properties."""
     shapes = [feature(polygon(lonlat(square(40.0 * n, 0))), **given) for n, given in enumerate(tags)]
     path.write_text(json.dumps(collection(*shapes)))
     return import_footprints([path], FRAME)
@@ -78,7 +78,7 @@ def test_what_lies_below_the_ground_is_not_drawn(tmp_path: Path, tags: dict[str,
 
 
 def test_a_building_with_cellars_stands(tmp_path: Path) -> None:
-    """Its cellars do not count, nor does the height of the roof by itself."""
+    """Cellars do not count as levels, and neither does the height of the roof alone."""
     tags = {"building": "yes", "building:levels": "2", "building:levels:underground": "1", "roof:height": "4"}
     assert heights(osm(tmp_path / "a.osm", ((0, 0, 20), tags))) == [6.0]
 

@@ -329,9 +329,14 @@ class Feed:
     # alarms -----------------------------------------------------------------------------------------------
 
     def _raise(self, modem: _Modem, kind: str, text: str) -> Alarm:
-        number, place, now = self._alarm_count, self._modems.index(modem), self.now()
-        # the next version, because the present one may have been sent
-        alarm = Alarm(number, place, kind, text[:_LONGEST_TEXT], now, None, self._version + 1)
+        alarm = Alarm(
+            number=self._alarm_count,
+            modem=self._modems.index(modem),
+            kind=kind,
+            text=text[:_LONGEST_TEXT],
+            start_s=self.now(),
+            version=self._version + 1,  # the present version may have been sent
+        )
         self._alarm_count += 1
         self._alarms.append(alarm)
         return alarm

@@ -95,7 +95,7 @@ def command(
     register = of.command(name, cls=kind, help=COMMANDS[name] if text is None else text, epilog=epilog)
 
     def take(function: _Function) -> _Function:
-        register(_with_manners(function))
+        register(_with_common_options(function))
         return function
 
     return take
@@ -115,7 +115,7 @@ def _bare(hint: Any) -> Any:
     return inner[0] if get_origin(hint) is Union and get_origin(inner[0]) is Annotated else hint
 
 
-def _with_manners(function: Callable[..., Any]) -> Callable[..., Any]:
+def _with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the function with ``--json``, ``--quiet`` and interrupts that reach :func:`aerpaw_cmp.cli.main`."""
 
     @functools.wraps(function)

@@ -1,10 +1,11 @@
-"""Many flights and settings: run each, pool the offsets, compare flights at the same positions.
+"""The ``campaign`` job: compare many flights under many settings.
 
 A campaign.yaml names flight files and, optionally, settings: labels with overrides of flight keys in dotted form
 (``rt.max_depth: 1``). Every setting runs on every flight. A flight that cannot be read is a row with its message.
 
 A task is one flight under one setting. Workers run tasks and return rows of numbers, which are stored. The rows of
-several flights give held-out errors, a ranking of settings, steps of offsets, and mean residuals by position.
+several flights give pooled offsets, held-out errors, a ranking of settings, steps of offsets, and mean residuals by
+position.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Rows of one task, or its failure, and the time that it took [s]."""
+    """The rows of one task or its failure, and its computing time [s]."""
 
     rss: tuple[RssRow, ...] = ()
     rank: tuple[RankRow, ...] = ()
@@ -140,7 +141,7 @@ class _Logs:
 
 
 def flight_data(task: Task) -> FlightData:
-    """Read and gather the flight of a task. Errors are those of :mod:`aerpaw_cmp.flight.data`."""
+    """Read the flight of a task. It raises the errors of :mod:`aerpaw_cmp.flight.data`."""
     settings = _settings(task)
     folder, root = task.path.parent, task.logs_root
     text = "\n".join([str(settings.timezone), *(log.model_dump_json() for log in settings.logs)])
@@ -249,7 +250,7 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
 def _rss_row(task: Task, data: FlightData, result: RssResult, series: RssSeries) -> RssRow:
     """Return the row of a channel. Its log is identified by content, regardless of name and packing."""
     score, clock = result.score, result.further.clock
-    # a flight from which its own antennas were learned takes no part in pooling and ranking
+    # exclude a flight from pooling and ranking if its antennas were learned from its own log
     measured_db = np.full_like(result.measured_db, np.nan) if result.further.trained_on else result.measured_db
     return RssRow(
         flight=task.flight,
@@ -307,8 +308,8 @@ def _rank_rows(task: Task, data: FlightData, result: RankResult, series: RankSer
 def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: int) -> list[PlannedStage]:
     """Return the tasks of each setting for a dry run. ``kept`` has the stored outcomes by task number.
 
-    The time of a task is the mean of the stored tasks of its setting, else of all stored tasks, divided by ``workers``.
-    It is unknown if no task is stored.
+    The time of a task is the mean of the stored tasks of its setting, divided by ``workers``. If its setting has no
+    stored task, the mean is that of all stored tasks. The time is unknown if no task is stored.
     """
     spent: dict[str, list[float]] = {}
     for number, outcome in kept.items():
@@ -384,12 +385,12 @@ def compute(
         workers.run(carry_out, [orders[number] for number in numbers], take)
 
 
-# Label of the only setting of a campaign that names none.
+# Label of the setting of a campaign.yaml without ``settings``.
 _AS_WRITTEN = "as written"
 
 
 class CampaignFile(StrictModel):
-    """The whole campaign.yaml."""
+    """The content of campaign.yaml."""
 
     campaign: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
     title: str | None = None
@@ -729,7 +730,7 @@ def _held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
 
 
 def _error_of(row: RssRow) -> float:
-    """Return the error for the ranking of settings [dB]: held-out, or its own if there is no other flight."""
+    """Return the error by which settings are ranked [dB]: held-out, or its own RMSE if there is no other flight."""
     return row.held_out_rmse_db if np.isfinite(row.held_out_rmse_db) else row.rmse_db
 
 

@@ -1,4 +1,4 @@
-"""The map job: the replay engine as :mod:`aerpaw_cmp.maps.grid` uses it, foliage modes, study, record of the page.
+"""The ``map`` job: coverage and rank maps in several foliage modes, their study, and the record of the page.
 
 Paths depend neither on arrays nor on foliage, so each chunk of positions is searched once. Single elements, arrays and
 all foliage modes are evaluated on these paths, and a foliage mode only evaluates the links with foliage.
@@ -96,7 +96,7 @@ class MapSettings:
     rss_altitudes_m, rank_altitudes_m : tuple of float
         Heights above ground.
     ks : tuple of float
-        Singular-value ratios.
+        Singular-value ratios K of the channel rank.
     carrier_hz : float
         Carrier frequency.
     budget : LinkBudget
@@ -110,7 +110,7 @@ class MapSettings:
     block_m : float
         Side of the held-out blocks.
     study : bool
-        Also correlation, interpolation and their errors.
+        True to compute correlation, interpolation and their errors, too.
     seed : int
         Seed of random samples.
     tile_m : float, optional
@@ -203,7 +203,7 @@ def map_settings(site: str, chosen: Mapping[str, Any], *, quick: bool = False) -
 
 
 class SiteChannels:
-    """The replay engine as :data:`~aerpaw_cmp.maps.grid.Evaluate`, one per foliage mode, on common paths.
+    """The replay of all links of a map in several foliage modes, on common paths.
 
     The first request for a chunk evaluates all modes. Their results are stored until each mode requests them.
     """
@@ -248,7 +248,7 @@ class SiteChannels:
         return evaluate
 
     def try_at(self, position_m: FloatArray) -> None:
-        """Evaluate one position (3,) [m] in every mode, for the errors that it raises."""
+        """Evaluate one position (3,) [m] in every mode, to raise the errors of the map before it is computed."""
         self._all_modes(position_m[None])
 
     def tile(self, order: TileOrder, progress: Callable[[float], None] | None = None) -> TileDone:
@@ -392,7 +392,7 @@ def level_sd_db(h: ComplexArray) -> FloatArray:
 
 # --- the job -------------------------------------------------------------------------------------------------------
 
-# Number of draws of M random samples. An interpolator wins in some draws only.
+# Number of draws of M random samples, because the best interpolator differs between draws.
 DRAWS = 10
 
 
@@ -425,7 +425,7 @@ class MapOutcome:
         return self.maps[self.settings.shown]
 
     def ordered(self) -> list[tuple[str, job.MapResult]]:
-        """Modes and maps, the paper's mode first."""
+        """Return foliage modes and maps, the paper's mode first."""
         return sorted(self.maps.items(), key=lambda item: -FOLIAGE.index(item[0]))
 
 
@@ -523,7 +523,7 @@ def _write_tiles(
         )
     step = math.ceil(math.sqrt(len(tiling.grid) / SHOWN_POSITIONS))
     outcome.maps, outcome.paths = store.every_nth(step)
-    # every n-th position has no neighbours at the distances of the study
+    # the study needs neighbours at distances that every n-th position does not have
     outcome.settings = replace(outcome.settings, study=False)
     outcome.tiles = {"tiles": len(tiling), "positions": len(tiling.grid), "shown_every": step}
 

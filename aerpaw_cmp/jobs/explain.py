@@ -38,7 +38,7 @@ from ..site.site import Site
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Explanation:
-    """One link at one time.
+    """The paths and levels of one link at one time.
 
     Parameters
     ----------

@@ -63,7 +63,7 @@ _MOST_SAMPLES = 4000
 
 AS_SET = "as set in flight.yaml"
 _FREE_SPACE = BASELINE_TITLE["free_space"]
-# Models without a replay, which every replay must beat.
+# Models without a replay. A replay must have a smaller error than these to be useful.
 LINES = BASELINE_TITLE["constant"], BASELINE_TITLE["log_distance"]
 
 # Added to the name of a model that would be scored on its training data.
@@ -260,8 +260,8 @@ class _Climber:
         if ladder.recommended is None:
             return False
         chosen = ladder.error_db[ladder.recommended]
-        # Both tests must pass, so no correction for two tests is needed: if one gain is not real, its test passes in at
-        # most 2.5 %, and so do both (intersection-union, Berger 1982, doi 10.2307/1267823).
+        # Both tests must pass, so no correction for two tests is needed. If one gain is not real, its test passes in at
+        # most 2.5 % of the flights, and so do both tests (intersection-union, Berger 1982, doi 10.2307/1267823).
         for other in (ladder.error_db[0], ladder.error_db[-1]):
             columns = [(s.time_s, a, b) for s, a, b in zip(self._series, chosen, other, strict=True)]
             pair = pooled_difference(columns, free_offset=False, place_m=ladder.position_m)
@@ -642,7 +642,7 @@ def run_flight(
                     models=tuple(model_rows(climbed.ladder)),
                     ladder=tuple(row for of_series in rows for row in of_series),
                 )
-    result = dataclasses.replace(result, likely_cause=unrivalled(result.likely_cause, climbed))
+    result = dataclasses.replace(result, likely_cause=cause_beyond_models(result.likely_cause, climbed))
     result = dataclasses.replace(result, next_step=next_step(data, result, climbed))
     return FlightRun(data=data, replays=replays, result=result, ladder=climbed)
 
@@ -671,7 +671,7 @@ def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
     return [PlannedStage(name, work) for name, work in stages.items() if work]
 
 
-def unrivalled(cause: Cause | None, climbed: FlightLadder | None) -> Cause | None:
+def cause_beyond_models(cause: Cause | None, climbed: FlightLadder | None) -> Cause | None:
     """Return the likely cause. None for a function of direction if the recommended model explains as much."""
     if cause is None or cause.name not in OF_DIRECTION or climbed is None or climbed.recommended is None:
         return cause

@@ -54,7 +54,7 @@ from .sources import (
     target_files,
 )
 
-# The target of all directions of the tower seen from the UAV, at all headings.
+# Name of the target that has all directions between tower and UAV, at all headings.
 _SPHERE = "sphere"
 
 _SPHERE_AWAY_M = 150.0
@@ -417,7 +417,10 @@ _CURVE_OF = 3
 def _curve(
     ranked: Sequence[Candidate], leaves_db: Callable[[Route], float], site: Site, area: Any, plan: PlanOptions
 ) -> list[dict[str, float]]:
-    """Return standard deviations after shorter and longer versions of the best candidates. Files get shorter only."""
+    """Return standard deviations after shorter and longer versions of the best candidates.
+
+    A route from a file can only be cut.
+    """
     out: list[dict[str, float]] = []
     best = [r for r in ranked if not r.refused][:_CURVE_OF]
     for share in SHARES:

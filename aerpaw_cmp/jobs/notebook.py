@@ -29,7 +29,7 @@ from ..site.site import Site
 from .compare_flight import compare_flight
 from .options import RunOptions
 
-# Tower and channel of an RSS series; tower and ``"rank"`` of a rank series.
+# Tower and channel of an RSS series. A rank series has ``"rank"`` as its channel.
 Series = tuple[str, str]
 
 
@@ -351,7 +351,7 @@ class ReplayedFlight:
 
 @from_python
 class Comparison:
-    """The numbers of a flight.
+    """The numbers of the comparison of a flight.
 
     Parameters
     ----------

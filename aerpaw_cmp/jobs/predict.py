@@ -81,7 +81,7 @@ from .sources import (
 # Number of headings with equal weights that are used if the heading is not known.
 HEADINGS = 8
 
-# Targets per block, which limits memory.
+# Largest number of targets per block, which limits memory.
 AT_ONCE = 50_000
 
 # Column of the probability of lock, for receivers that can lose it.
@@ -89,7 +89,7 @@ P_LOCK = "p_lock"
 
 _TILE_M = 100.0
 
-# Targets at which the channel matrices of a receiver are evaluated.
+# Largest number of targets at which the channel matrices of a receiver are evaluated.
 MOST_RANKED = 50_000
 
 # Distance that is equivalent to a turn of 60 degrees when the nearest ranked target is chosen [m].
@@ -103,7 +103,7 @@ Receivers = Mapping[str, tuple[FittedReceiver, LinkSettings, Path]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
-    """The record of a page, and further data for maps."""
+    """A prediction: the record of its page, and further data for maps."""
 
     page: PredictionPage
     targets: Targets
@@ -320,7 +320,7 @@ def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions)
 
 
 def _nodes_of(where: Path) -> set[str]:
-    """Return the nodes of the logs of a flight file, empty for another WHERE."""
+    """Return the nodes of the logs of a flight file. The set is empty if WHERE is not a flight file."""
     planned = flight_of(where)
     return set() if planned is None else {log.node for log in planned.logs if log.node}
 

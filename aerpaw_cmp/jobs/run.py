@@ -1,4 +1,4 @@
-"""Each job as named stages on one page."""
+"""The jobs of the command line, each as named stages."""
 
 from __future__ import annotations
 
@@ -379,7 +379,7 @@ def run_site_import(
     Returns
     -------
     list of str
-        A line per thing that was done.
+        One line per action.
     """
     from ..site.footprints import import_site, site_yaml
     from ..site.learned import carry_memory
@@ -394,7 +394,7 @@ def run_site_import(
 
 
 def run_site_show(site: str, options: RunOptions = DEFAULT) -> JobOutcome:
-    """Plan view and a page of the scene in 3-D.
+    """Write a plan view of a site and a page that shows it in 3-D.
 
     Parameters
     ----------
@@ -422,7 +422,7 @@ def run_site_show(site: str, options: RunOptions = DEFAULT) -> JobOutcome:
 def run_map(
     site: str, settings: Any, options: RunOptions = DEFAULT, *, flights: Sequence[Path] = (), figures: str = "none"
 ) -> JobOutcome:
-    """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
+    """Write coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
     Parameters
     ----------
@@ -498,7 +498,7 @@ def _compared(flight: Any, options: RunOptions, stages: Stages) -> Any:
 def run_campaign(
     path: Path, options: RunOptions = DEFAULT, *, keep: Path | None = None, fresh: bool = False
 ) -> JobOutcome:
-    """Many flights and settings: replay, compare, pool, hold out, report.
+    """Replay and compare many flights under many settings, and write a page with pooled and held-out numbers.
 
     Parameters
     ----------

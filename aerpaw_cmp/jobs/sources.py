@@ -503,7 +503,7 @@ class Flown:
         flights, differences, fitted = count[antenna], sum(count.values()) - len(count), self.correction
         wider = math.sqrt((1.0 + 1.0 / flights) * (student_factor(1 + differences) ** 2 - 1.0))
         slow = np.hypot(slow, fitted.sd_factor * wider * fitted.model.offset_sd_db)
-        if flights == 1:  # of several flights the errors on held-out ones contain what changes from place to place
+        if flights == 1:  # held-out errors of several flights already contain the change between areas
             slow = np.where(guess, np.hypot(slow, between_blocks_db(self.correction.channels[antenna])), slow)
         return level, slow, guess
 
@@ -534,7 +534,10 @@ class Memory:
         self._gain_db: Predictor = by_degree(lambda samples: known[samples.antenna].gain_db(samples))
 
     def levels(self, each: Sequence[LinkSamples]) -> Levels:
-        """Return levels as :meth:`Flown.levels`. It extrapolates off the site and where the gains are hardly known."""
+        """Return levels as in :meth:`Flown.levels`.
+
+        The model extrapolates outside the site and in directions that few training samples have.
+        """
         memory = self.known[each[0].antenna]
         gains, sds = (np.stack(part) for part in zip(*map(self._gain_db, each), strict=True))
         level, spread, gain_variance = memory.level, memory.spread, (sds**2).mean(axis=0)

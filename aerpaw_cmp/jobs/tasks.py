@@ -191,7 +191,7 @@ class OutcomeStore:
         write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)
 
 
-# Key of the name of an array, in its place in the JSON.
+# Key that marks the name of an array in the JSON.
 _ARRAY = "array of the entry"
 
 
@@ -207,7 +207,7 @@ def _plain(value: Any, arrays: _Arrays) -> Any:
 
 
 def _with_arrays(value: Any, arrays: Mapping[str, AnyArray]) -> Any:
-    """Return plain values of JSON with the arrays put back."""
+    """Replace the names of arrays in plain values of JSON by the arrays."""
     if isinstance(value, dict):
         named = value.get(_ARRAY)
         return arrays[named] if named else {key: _with_arrays(item, arrays) for key, item in value.items()}

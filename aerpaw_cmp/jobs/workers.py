@@ -47,7 +47,7 @@ CONNECT_S, NO_WORKER_S, COUNT_EVERY_S = 10.0, 30.0, 2.0
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The replacement for a result: the worker ended twice, or the task or its result could not be pickled."""
+    """The replacement of a result if its worker ended twice, or if task or result could not be pickled."""
 
     message: str
 
@@ -64,8 +64,10 @@ class Workers(ABC):
         """The number of tasks that run at the same time."""
 
     @abstractmethod
-    def _through(self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult) -> list[int]:
-        """Run waiting items by number. Return the numbers of tasks whose worker ended; the rest may still wait."""
+    def _run_waiting(
+        self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult
+    ) -> list[int]:
+        """Run waiting items by number until a worker ends. Return the numbers of the tasks that ended with it."""
 
     def run(self, function: Task, items: Sequence[Any], on_result: _OnResult) -> None:
         """Run a function on every item, in any order.
@@ -86,14 +88,14 @@ class Workers(ABC):
         """
         waiting = deque(range(len(items)))
         while waiting:
-            # repeat tasks alone, so that one task that ends its worker cannot spoil others
-            for number in self._through(function, items, waiting, on_result):
-                if self._through(function, items, deque([number]), on_result):
+            # repeat tasks one at a time, so that a task that ends its worker does not end other tasks
+            for number in self._run_waiting(function, items, waiting, on_result):
+                if self._run_waiting(function, items, deque([number]), on_result):
                     on_result(number, _ENDED)
 
 
 def _outcome(future: Any) -> Any:
-    """Return the result of a finished future, or :class:`Lost`. Messages, and errors of lost workers, are raised."""
+    """Return the result of a finished future, or :class:`Lost`. Raise messages of tasks and errors of lost workers."""
     try:
         return future.result()
     except (AerpawCmpError, BrokenProcessPool, CancelledError):
@@ -109,7 +111,9 @@ class InProcess(Workers):
 
     count = 1
 
-    def _through(self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult) -> list[int]:
+    def _run_waiting(
+        self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult
+    ) -> list[int]:
         while waiting:
             number = waiting.popleft()
             on_result(number, function(items[number]))
@@ -127,16 +131,18 @@ class Processes(Workers):
         """The number of processes."""
         return self._count
 
-    def _through(self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult) -> list[int]:
+    def _run_waiting(
+        self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult
+    ) -> list[int]:
         active: dict[Future[Any], int] = {}
         others = multiprocessing.active_children()  # processes of the calling program
-        with _away() as folder:
+        with _in_trusted_folder() as folder:
             # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
-            pool = ProcessPoolExecutor(min(self.count, len(waiting)), get_context("spawn"), _begin, (folder,))
+            pool = ProcessPoolExecutor(min(self.count, len(waiting)), get_context("spawn"), _start_worker, (folder,))
         try:
             while waiting or active:
                 while waiting and len(active) < self.count:
-                    with _away():
+                    with _in_trusted_folder():
                         future = pool.submit(function, items[waiting[0]])
                     active[future] = waiting.popleft()
                 ready = wait_for(active, return_when=FIRST_COMPLETED).done
@@ -154,8 +160,8 @@ class Processes(Workers):
 
 
 @contextlib.contextmanager
-def _away() -> Iterator[Path]:
-    """Start processes in a trusted folder, and yield the folder before it.
+def _in_trusted_folder() -> Iterator[Path]:
+    """Change to a trusted folder while processes start, and yield the present working folder.
 
     A new interpreter imports modules from its working folder, which can be a folder of logs from someone else.
     """
@@ -167,7 +173,7 @@ def _away() -> Iterator[Path]:
         os.chdir(folder)
 
 
-def _begin(folder: Path) -> None:
+def _start_worker(folder: Path) -> None:
     """Start a worker process in the folder of its parent. It ignores Ctrl-C and ends with the parent."""
     os.chdir(folder)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -207,9 +213,11 @@ class Cluster(Workers):
         try:
             return dict(self._client.nthreads())
         except OSError:
-            raise self._gone() from None
+            raise self._scheduler_lost() from None
 
-    def _through(self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult) -> list[int]:
+    def _run_waiting(
+        self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult
+    ) -> list[int]:
         killed: list[int] = []
         active = {self._client.submit(function, items[number], pure=False): number for number in waiting}
         waiting.clear()
@@ -223,7 +231,7 @@ class Cluster(Workers):
                 try:
                     on_result(number, _outcome(future))
                 except CancelledError:
-                    raise self._gone() from None
+                    raise self._scheduler_lost() from None
                 except Exception as error:
                     if type(error).__name__ != "KilledWorker":
                         raise
@@ -234,7 +242,7 @@ class Cluster(Workers):
     def _check_scheduler(self) -> None:
         """Raise an InputError if the scheduler is lost. Report a scheduler that has had no worker for a while."""
         if self._client.status != "running":
-            raise self._gone()
+            raise self._scheduler_lost()
         now = time.monotonic()
         if now - self._counted_s < COUNT_EVERY_S:
             return
@@ -245,7 +253,7 @@ class Cluster(Workers):
             self._progress(f"the scheduler has had no worker for {NO_WORKER_S:.0f} s; finished tasks are stored")
             self._staffed_s = now
 
-    def _gone(self) -> InputError:
+    def _scheduler_lost(self) -> InputError:
         return InputError(
             "the scheduler of the workers went away",
             cause="it was stopped; finished tasks are stored, run the same command again",
@@ -287,7 +295,7 @@ def open_workers(
         yield Processes(workers)
 
 
-def _quiet() -> None:
+def _hide_log_lines() -> None:
     """Hide the log lines of distributed: this module reports what matters."""
     for name in list(logging.root.manager.loggerDict):
         if name.split(".")[0] in ("distributed", "tornado"):
@@ -300,7 +308,7 @@ def _scheduler(address: str, paths: Sequence[Path], progress: Progress) -> Itera
     try:
         from distributed import Client
 
-        _quiet()
+        _hide_log_lines()
     except ImportError:
         raise UsageError(
             f"--scheduler {address!r} needs the package 'distributed'", expected="pip install 'aerpaw-cmp[cluster]'"
@@ -363,7 +371,7 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
     """
     answers = client.run(_worker_facts, [str(path.absolute()) for path in paths], on_error="return")
     ours = _worker_facts([])
-    wrong = [f"{worker}: {text}" for worker, facts in answers.items() if (text := _trouble(facts, ours))]
+    wrong = [f"{worker}: {text}" for worker, facts in answers.items() if (text := _difference(facts, ours))]
     if wrong:
         more = f"; and {len(wrong) - 4} more" if len(wrong) > 4 else ""
         raise UsageError(
@@ -373,7 +381,7 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
         )
 
 
-def _trouble(facts: Any, ours: WorkerFacts) -> str:
+def _difference(facts: Any, ours: WorkerFacts) -> str:
     if isinstance(facts, BaseException):
         return f"aerpaw-cmp cannot be loaded there ({type(facts).__name__}: {facts})"
     if facts.code != ours.code:

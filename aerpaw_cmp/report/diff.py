@@ -36,7 +36,10 @@ class Entry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputEntry:
-    """An input file of one of the reports; ``what`` is added, removed or changed."""
+    """An input file that differs between the reports.
+
+    ``what`` is added, removed or changed.
+    """
 
     role: str
     path: str

@@ -17,7 +17,7 @@ from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.drafting.proposals import offered
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.flight_run import Model, _Climber, next_step, recommended_changes, run_flight, unrivalled
+from aerpaw_cmp.jobs.flight_run import Model, _Climber, cause_beyond_models, next_step, recommended_changes, run_flight
 from aerpaw_cmp.site.learned import Errors, folder_of, remember, sphere_csv, unit_mean_gain
 from tests.learned_entries import learned_entry, learned_series, learned_tables
 from tests.simulated import planned, simulate, write_yaml
@@ -280,9 +280,9 @@ def test_a_loss_over_directions_is_no_cause_where_another_model_explains_as_much
     cause = Cause(name=name, sentence="", next_step="", rmse_db=3.4, rmse_with_db=3.4 - explained_db)
     ladder = SimpleNamespace(recommended=0, rmse_db=(3.0, 5.0, 3.7))
     climbed: Any = SimpleNamespace(recommended=Model(), ladder=ladder)
-    assert (unrivalled(cause, climbed) is cause) == stays
+    assert (cause_beyond_models(cause, climbed) is cause) == stays
     climbed.recommended = None
-    assert unrivalled(cause, climbed) is cause
+    assert cause_beyond_models(cause, climbed) is cause
 
 
 @pytest.mark.parametrize("logs", [None, ("ab" * 32,)])

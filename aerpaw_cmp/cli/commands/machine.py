@@ -16,7 +16,7 @@ def bench(
     poses: Annotated[int, Option(min=2, help="Poses of the flight that is replayed.")] = 200,
     quick: Annotated[bool, Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
 ) -> None:
-    """Speed against error on this machine."""
+    """Measure speed and error of the replay on this machine."""
     from ...jobs import bench as job
 
     few: dict[str, Any] = {"poses": min(poses, 40), "samples": (1_000, 10_000), "ratios": False}

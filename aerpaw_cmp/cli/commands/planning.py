@@ -153,7 +153,7 @@ def _print_plan(outcome: Any) -> None:
     show(m["sentence"])
     length = {"SD dB": "sd_db:.2f", "km": "km:.1f", "min": "minutes:.1f"}
     records([_in_km(c) for c in m["candidates"]], {"route": "name", **length, "may be flown": "flown"}, "Candidates")
-    records([_in_km(p) for p in m["length"]], length, "What a longer flight buys")
+    records([_in_km(p) for p in m["length"]], length, "SD after shorter and longer flights")
     warn_all(m["warnings"])
     show(f"page: {outcome.folder / 'plan.html'}")
 

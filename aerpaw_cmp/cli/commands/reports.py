@@ -95,7 +95,7 @@ def diff(
     strict: Annotated[bool, Option("--strict", help="Exit code 1 when a number differs by more than 0.01 dB.")] = False,
     force: Force = False,
 ) -> int:
-    """Differences between two reports of a flight: settings, inputs, versions, numbers on common samples."""
+    """Compare two reports of a flight: settings, inputs, versions, numbers on common samples."""
     from ...jobs.diff_reports import run_diff
     from ...report.diff import diff_metrics
 
@@ -166,7 +166,7 @@ def campaign(
     strict: Annotated[bool, Option("--strict", help="Exit code 1 also when a stated check failed.")] = False,
     force: Force = False,
 ) -> int:
-    """Many flights and settings, with results that need several flights."""
+    """Compare many flights under many settings."""
     from ...jobs import run
 
     options = RunOptions(

@@ -206,7 +206,7 @@ def map_(
     dry_run: DryRun = False,
     force: Force = False,
 ) -> None:
-    """Coverage and rank maps of a site, Kriging of rank."""
+    """Map coverage and rank of a site."""
     from ...jobs import run
     from ...jobs.coverage_map import map_settings
 

@@ -173,14 +173,9 @@ def _fill_nearest(
     exhausted = (candidates == len(samples_m)) | ~np.isfinite(last)
     if skip is not None:
         # queried and then removed: a tree without this sample would have to be built for every target
-        excluded = who == skip[todo, None]
-        distance[excluded] = np.inf
-        # the excluded sample goes to the end, and the order of the others stays
-        order = np.argsort(excluded, axis=1, kind="stable")
-        distance, who = np.take_along_axis(distance, order, axis=1), np.take_along_axis(who, order, axis=1)
+        distance[who == skip[todo, None]] = np.inf
     ring = _in_micrometres(distance)
-    tied = (ring[:, 1:] == ring[:, :-1]) & np.isfinite(ring[:, 1:])
-    rows = np.flatnonzero(tied.any(axis=1))
+    rows = np.flatnonzero(((ring[:, 1:] <= ring[:, :-1]) & np.isfinite(ring[:, 1:])).any(axis=1))
     if len(rows):
         # for a missing neighbour the tree returns the number of samples, which is not a valid row
         numbers = np.where(np.isfinite(distance[rows]), who[rows], 0)
@@ -388,15 +383,15 @@ class OrdinaryKriging:
     # --- settings and shapes -------------------------------------------------------------------------------------
 
     def _check_settings(self) -> None:
-        wrong = []
-        if int(self.neighbours) != self.neighbours or self.neighbours < 1:
-            wrong.append(f"neighbours = {self.neighbours}: expected a whole number of at least 1")
-        if not self.radius_m > 0:
-            wrong.append(f"radius_m = {self.radius_m}: expected a positive length")
-        if self.selection not in ("nearest", "random"):
-            wrong.append(f"selection = {self.selection!r}: expected 'nearest' or 'random'")
-        if self.outside not in ("nan", "nearest"):
-            wrong.append(f"outside = {self.outside!r}: expected 'nan' or 'nearest'")
+        checks = {
+            "neighbours": (int(self.neighbours) == self.neighbours >= 1, "a whole number of at least 1"),
+            "radius_m": (self.radius_m > 0, "a positive length"),
+            "selection": (self.selection in ("nearest", "random"), "'nearest' or 'random'"),
+            "outside": (self.outside in ("nan", "nearest"), "'nan' or 'nearest'"),
+        }
+        wrong = [
+            f"{k} = {getattr(self, k)!r}: expected {expected}" for k, (fine, expected) in checks.items() if not fine
+        ]
         if wrong:
             raise UsageError("; ".join(wrong))
 

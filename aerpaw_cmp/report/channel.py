@@ -306,10 +306,7 @@ def _write_npz(channel: Channel, folder: Path) -> Path:
 def _write_csv(channel: Channel, folder: Path) -> Path:
     """Write a row per time and tower: the level of the link, delay and Doppler shift of its strongest path."""
     path, table, (poses, towers) = folder / "channel.csv", channel.table, channel.replay.has_path.shape
-    # the strongest path of a link comes last; of equal paths, the first one
-    order = np.argsort(-(np.abs(table.gain) ** 2).mean(axis=(1, 2)), kind="stable")[::-1]
-    strongest = np.full((poses, towers), -1)
-    strongest[table.pose[order], table.tower[order]] = order
+    strongest = channel.by_link((np.abs(table.gain) ** 2).mean(axis=(1, 2)), -1.0).argmax(axis=0)
     time: AnyArray = channel.along.time_s
     if channel.along.start is not None:
         instants = channel.along.start + np.round(channel.along.time_s * 1e9).astype("timedelta64[ns]")
@@ -318,8 +315,8 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
     shown: dict[str, Any] = {"time": np.repeat(time, towers), "tower": np.tile(channel.replay.towers, poses)}
     shown["gain_db"] = gain_db.ravel().round(3)
     for name, values in (("delay_s", table.delay_s), ("doppler_hz", channel.doppler_hz)):
-        # row -1 is the appended NaN of a link without paths
-        shown[name] = np.nan if values is None else np.append(values, np.nan)[strongest].ravel()
+        each = channel.by_link(values)
+        shown[name] = np.nan if each is None else np.take_along_axis(each, strongest[None], axis=0).ravel()
     # parts are appended to the file that the first part begins
     guarded(pd.DataFrame(shown)).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")
     return path

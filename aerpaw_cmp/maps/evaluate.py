@@ -1,24 +1,22 @@
-"""Baselines that Kriging is measured against.
+"""Baselines of Kriging, the scores of interpolators, and the comparison of the paper.
 
-The paper's two (arXiv 2502.10324, section VI-C): the samples near a target are sorted by position index, and a
-one-dimensional interpolant over the index is read at the target's index. They follow MATLAB's ``interp1`` with
+The paper has two baselines (arXiv 2502.10324, section VI-C). The samples near a target are sorted by position index,
+and a curve over the index is evaluated at the index of the target. The curves follow MATLAB's ``interp1`` with
 ``'extrap'``:
 
-- ``spline``: cubic with not-a-knot ends; three samples give the parabola, two the line.
-- ``makima``: modified Akima piecewise cubic Hermite; two samples give the line.
+- ``spline``: cubic with not-a-knot ends; a parabola for three samples, a line for two.
+- ``makima``: modified Akima piecewise cubic Hermite; a line for two samples.
 
-Beyond the first and last sample the end piece is extrapolated. One sample returns its value, and no samples return NaN.
+Beyond the first and last sample the end piece is extrapolated. The value is that of the sample if there is only one,
+and NaN if there is none.
 
-Three more are included for comparison: the nearest sample, inverse distance, and the mean over the area that a tower
-serves. All classes share ``fit(points_m, values)``, ``predict(targets_m)`` and ``leave_one_out()`` with
+Three further baselines are the nearest sample, inverse distance, and the mean over the area that a tower serves.
+All classes share ``fit(points_m, values)``, ``predict(targets_m)`` and ``leave_one_out()`` with
 :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`. They have no error estimate, so the variance they return is NaN.
 
-Quality of an interpolator: the paper's leave-one-out, and blocked tests, in which close neighbours are held out too.
-
+Interpolators are scored by leave-one-out, as in the paper, and by blocks, in which close neighbours are held out, too.
 Errors are in the unit of the field (rank, dB). Rank is not rounded: the paper's MAE (section VII-C) compares the
 interpolated number. A position without a value (NaN, out of coverage) or without an estimate is not scored.
-
-Correlation and interpolation of maps: the paper's comparison (section VII-C).
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-# Targets whose samples are stacked at once; bounds the memory.
+# Targets whose samples are stacked at once, which limits the memory.
 CHUNK = 512
 
 
@@ -48,7 +46,7 @@ CHUNK = 512
 
 
 def makima(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> FloatArray:
-    """Modified Akima interpolation, one curve per row.
+    """Interpolate with the modified Akima method, one curve per row.
 
     Parameters
     ----------
@@ -57,7 +55,7 @@ def makima(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> FloatArray:
     values : (..., m, fields)
         Ordinates.
     at : (...)
-        One abscissa per row; outside the data the end piece is continued.
+        One abscissa per row. Outside the data the end piece is extrapolated.
 
     Returns
     -------
@@ -83,18 +81,18 @@ def makima(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> FloatArray:
 
 def _makima_tangents(slope: FloatArray) -> FloatArray:
     """Return tangents (..., m, fields) from slopes (..., m - 1, fields), m >= 3."""
-    # Akima's two further slopes at each end: those of a parabola through the last samples
+    # Akima's two additional slopes at each end are those of a parabola through the last samples
     before = 2 * slope[..., :1, :] - slope[..., 1:2, :]
     after = 2 * slope[..., -1:, :] - slope[..., -2:-1, :]
     padded = np.concatenate(
         [2 * before - slope[..., :1, :], before, slope, after, 2 * after - slope[..., -1:, :]], axis=-2
     )
-    # the term with the sum is MATLAB's: Akima's own weights overshoot where data turn flat
+    # the term with the sum is MATLAB's, because Akima's weights overshoot where data become constant
     weight = np.abs(np.diff(padded, axis=-2)) + np.abs(padded[..., 1:, :] + padded[..., :-1, :]) / 2
     left, right = weight[..., 2:, :], weight[..., :-2, :]
     total = left + right
     some = total > 0
-    # both weights vanish only where the data are flat on both sides: the tangent is 0 there
+    # both weights are 0 only where the data are constant on both sides, and the tangent is 0
     mixed = left * padded[..., 1:-2, :] + right * padded[..., 2:-1, :]
     return np.where(some, mixed / np.where(some, total, 1.0), 0.0)
 
@@ -124,7 +122,7 @@ def _parabola_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
 
 
 def _not_a_knot_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
-    """Tangents of the C2 cubic whose first two and last two pieces are one polynomial each (de Boor, chapter IV)."""
+    """Return tangents of the C2 cubic whose first two pieces are one polynomial, like the last two (de Boor, IV)."""
     rows, m = step.shape[:-1], step.shape[-1] + 1
     system = np.zeros((*rows, m, m))
     inner = np.arange(1, m - 1)
@@ -149,7 +147,7 @@ def _not_a_knot_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
 def _hermite(x: FloatArray, y: FloatArray, tangent: FloatArray, at: FloatArray) -> FloatArray:
     """Evaluate a piecewise cubic Hermite curve at one abscissa per row. The end pieces continue outside."""
     m = x.shape[-1]
-    # clipped: beyond the data the end piece is extrapolated, as interp1 with 'extrap' does
+    # clip the number of the piece, because the end pieces are extrapolated
     piece = np.clip((x <= at[..., None]).sum(axis=-1) - 1, 0, m - 2)[..., None]
     left, right = np.take_along_axis(x, piece, -1), np.take_along_axis(x, piece + 1, -1)
     low, high = piece[..., None], piece[..., None] + 1
@@ -181,7 +179,7 @@ def _sorted(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> tuple[FloatAr
 
 @dataclass(frozen=True, slots=True)
 class _Near:
-    """Input of an interpolant at t targets: m samples each (t, m, dims), their values (t, m, fields), distances."""
+    """The input at t targets: m samples each (t, m, dims), their values (t, m, fields) and distances (t, m)."""
 
     points_m: FloatArray
     values: FloatArray
@@ -191,7 +189,7 @@ class _Near:
 
 @dataclass(eq=False, kw_only=True)
 class _Local:
-    """Samples, neighbours and field-by-field handling of NaN, shared by the predictors that use near samples."""
+    """The base of predictors that use near samples, which ignores NaN in each field."""
 
     neighbours: int = 20
     radius_m: float = 150.0
@@ -248,12 +246,12 @@ class _Local:
 
 @dataclass(eq=False)
 class IndexInterpolation(_Local):
-    """The paper's baselines: spline or makima over the position index of the M samples within the radius.
+    """A baseline of the paper: spline or makima over the position index of the M samples within the radius.
 
     Parameters
     ----------
     kind : {"spline", "makima"}
-        The interpolant.
+        Kind of curve.
     grid : Grid
         Determines the index of each sample and target. All must lie in distinct cells.
     neighbours, radius_m, selection, seed
@@ -289,7 +287,7 @@ class InverseDistance(_Local):
 
 
 class ServingTowerMean:
-    """Mean of all samples in the area of the target's serving tower.
+    """The mean of all samples in the area of the serving tower.
 
     Parameters
     ----------
@@ -310,7 +308,7 @@ class ServingTowerMean:
         towers = len(np.asarray(self.towers_m))
         self.total_ = np.zeros((towers, self.values_.shape[1]))
         self.count_ = np.zeros_like(self.total_)
-        # not +=, which adds once where an index repeats
+        # not +=, which adds only one of several values with the same index
         np.add.at(self.total_, self.tower_, np.where(finite, self.values_, 0.0))
         np.add.at(self.count_, self.tower_, finite)
         return self
@@ -321,7 +319,7 @@ class ServingTowerMean:
         return self._mean(self.total_[tower], self.count_[tower])
 
     def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
-        """The same without the sample itself."""
+        """Return the mean of each sample's tower without the sample, and NaN for the variance."""
         finite = np.isfinite(self.values_)
         total = self.total_[self.tower_] - np.where(finite, self.values_, 0.0)
         return self._mean(total, self.count_[self.tower_] - finite)
@@ -354,7 +352,7 @@ class Score:
     Parameters
     ----------
     mae, rmse : ndarray
-        Mean absolute and root mean square error. NaN if nothing was scored.
+        Mean absolute and root mean square error. NaN if no position was scored.
     n : ndarray of int
         Number of scored positions.
     """
@@ -374,7 +372,7 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
         raise UsageError(f"values of shape {truth.shape}, estimates of shape {guess.shape}")
     known = np.isfinite(truth)
     scored = known & np.isfinite(guess)
-    # NaN times zero is NaN, so remove values without weight before summing
+    # set values that are not scored to 0, because NaN would remain in the sums
     error = np.where(scored, guess - np.where(known, truth, 0.0), 0.0)
     n = scored.sum(axis=0)
 
@@ -389,7 +387,7 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
 
 
 def leave_one_out(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> Score:
-    """Score each position from all others, as in the paper. Values (n, altitudes, K) return MAE (altitudes, K)."""
+    """Score the estimate of each position from all others, as in the paper, for values (n, altitudes, K)."""
     data = unmasked(values)
     estimate, _ = model.fit(points_m, data.reshape(len(data), -1)).leave_one_out()
     return score(data, estimate.reshape(data.shape))
@@ -398,8 +396,8 @@ def leave_one_out(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> S
 def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: float = 300.0) -> Score:
     """Hold out one square block of the area at a time.
 
-    Near neighbours of a left-out position are left out with it, so that the score says how the interpolator
-    bridges gaps of about ``block_m``. Blocks start at the south-western position.
+    Near neighbours of a position are held out with it, so the score shows how well the interpolator bridges gaps of
+    about ``block_m``. Blocks start at the south-western position.
 
     Parameters
     ----------
@@ -425,7 +423,7 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     if not block_m > 0:
         raise UsageError(f"blocks of {block_m} m", expected="a positive length")
     points = unmasked(points_m)
-    # a position on a seam must not change its block by rounding
+    # a position on the border of blocks must not change its block by rounding
     cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / block_m + 1e-9).astype(np.int64)
     _, block = np.unique(cell, axis=0, return_inverse=True)
     data = unmasked(values)
@@ -439,18 +437,18 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     return score(data, estimate.reshape(data.shape))
 
 
-# The paper's nine altitudes of interpolation begin here; its 3 m are for blockage alone.
+# Lowest altitude of interpolation in the paper, which uses 3 m only to show blockage.
 LOWEST_M = 30.0
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """The paper's section VII-C on maps: correlation, curve, and leave-one-out errors of each interpolator.
+    """The study of the paper's section VII-C: correlation, curve, and leave-one-out errors of each interpolator.
 
     Parameters
     ----------
     correlation : BinnedCorrelation
-        Correlation of the positions' vectors.
+        Correlation of the vectors of two positions.
     fit : BiExponential
         Curve fitted to the correlation.
     scores : mapping of str to Score
@@ -492,14 +490,14 @@ def interpolation_study(
     selection: Literal["nearest", "random"] = "nearest",
     seed: int = 0,
 ) -> Study:
-    """Correlation and leave-one-out interpolation of maps.
+    """Compute the correlation of maps and the leave-one-out errors of all interpolators.
 
     Parameters
     ----------
     grid : Grid
         Positions.
     values : (n, altitudes, K)
-        Rank or RSS; NaN out of coverage. For RSS the last axis may hold towers.
+        Rank or RSS; NaN out of coverage. For RSS the last axis may be towers.
     towers_m : (towers, 2+)
         Positions of the towers, for the mean per serving tower.
     neighbours, radius_m, selection, seed
@@ -508,15 +506,15 @@ def interpolation_study(
     Returns
     -------
     Study
-        The correlation and its fit, scores of every interpolator.
+        Correlation, fitted curve, and scores of every interpolator.
     """
     points = grid.points_m
-    # bins as wide as the grid's step, as the paper's are: narrower ones would be empty
+    # bins as wide as the step of the grid, as in the paper, because narrower bins would be empty
     correlation = variogram.vector_correlation(points, values, width_m=grid.spacing_m)
     fit = _curve(correlation)
     rule: dict[str, Any] = {"neighbours": neighbours, "radius_m": radius_m, "selection": selection, "seed": seed}
     models: dict[str, Predictor] = {
-        # the weight of a single sample is 1 at any distance
+        # a single sample has the weight 1 at any distance
         "nearest": InverseDistance(neighbours=1, radius_m=radius_m),
         "inverse distance": InverseDistance(neighbours=neighbours, radius_m=radius_m),
         "serving-tower mean": ServingTowerMean(towers_m),
@@ -542,7 +540,7 @@ def paper_scores(
     grid : Grid
         Positions.
     values : (n, altitudes, K)
-        NaN out of coverage.
+        Values; NaN out of coverage.
     fit : BiExponential
         Correlation that Kriging uses.
     neighbours, radius_m, selection, seed

@@ -1,20 +1,17 @@
-"""Maps as files that other programs open: one function per format, ``write_X(path, maps)`` (NetCDF: ``netcdf.py``).
+"""Maps as files for other programs: CSV, KMZ, and a dataset after CF-1.11 for NetCDF and Zarr.
 
-A :class:`MapLayers` holds what is written: a grid, the site's frame and any layers (a level, its standard deviation, a
-corrected level, classes). Out of coverage is an empty cell (CSV), and in layers of classes the class 0, "Z". Samples
+``write_csv`` and ``write_kmz`` take :class:`MapLayers`: a grid, the frame of the site and any layers, such as a level,
+its standard deviation or classes. A position out of coverage is an empty cell of the CSV, or the class 0 ("Z"). Samples
 along a flight are written by :mod:`aerpaw_cmp.report.exports`.
 
     maps = MapLayers(grid=grid, frame=site.frame, layers=(Layer("level_db", level, "dBm", "Level"),))
     write_csv(folder / "level.csv", maps)
 
-A file that exists is replaced; each function returns its path.
+Each function replaces an existing file and returns its path.
 
-Maps as one dataset after CF-1.11, in memory and as NetCDF: arrays over foliage, tower, K, height, y and x.
-
-Values are rounded to 0.01 dB, more than the site's data hold. Maps in which the nearest tower serves are separate
-variables (``..._joint``). They contain the values that ``serving_tower`` selects from the maps per tower.
-
-Both need ``pip install aerpaw-cmp[geo]``.
+:func:`maps_dataset` has arrays over foliage, tower, K, height, y and x, rounded to 0.01 dB, which is finer than the
+data of the site. Maps in which the nearest tower serves are separate variables (``..._joint``). They contain the
+values that ``serving_tower`` selects from the maps of each tower. NetCDF requires ``pip install aerpaw-cmp[geo]``.
 """
 
 from __future__ import annotations
@@ -40,7 +37,7 @@ PIXELS_PER_CELL = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapLayers:
-    """Layers over one grid.
+    """The layers over one grid.
 
     Parameters
     ----------
@@ -54,8 +51,8 @@ class MapLayers:
     borders : sequence of Border
         Lines between the areas that two towers serve.
     credit : str
-        Attribution of the map from which the site was made, "" if there is none. Its licence requires the attribution
-        in derived works. A CSV table has no place for it.
+        Attribution of the map from which the site was made, which its licence requires in derived works. Empty if there
+        is none. The CSV does not contain it.
     """
 
     grid: Grid
@@ -73,7 +70,7 @@ class MapLayers:
             raise ValueError(f"layers of the wrong shape: {wrong}, with the same name: {twice}; the grid has {n} cells")
 
     def lonlat(self, points_m: Any) -> FloatArray:
-        """Longitude and latitude (n, 2) [deg] of points east and north, to 1 cm."""
+        """Return longitude and latitude (n, 2) [deg] of points east and north, to 1 cm."""
         points = np.asarray(points_m, dtype=np.float64)
         latitude, longitude = self.frame.to_geographic(points[:, 0], points[:, 1])
         # 1e-7 degrees are 11 mm of latitude
@@ -81,7 +78,7 @@ class MapLayers:
 
 
 def write_csv(path: str | Path, maps: MapLayers) -> Path:
-    """One row per position in index order: index, row, column, east, north, latitude, longitude, then the layers."""
+    """Write a CSV with a row per position in index order: numbers, positions, and the layers."""
     import pandas as pd
 
     points, (rows, columns) = maps.grid.points_m, maps.grid.shape
@@ -93,7 +90,7 @@ def write_csv(path: str | Path, maps: MapLayers) -> Path:
         "latitude_deg": np.round(latitude, 9), "longitude_deg": np.round(longitude, 9),
         **{layer.name: layer.values for layer in maps.layers},
     }  # fmt: skip
-    # names of towers may be third-party input, and a spreadsheet executes a cell that begins with =
+    # guarded, because names of towers may be third-party input, and a spreadsheet executes a cell that begins with =
     target = Path(path)
     guarded(pd.DataFrame(table)).to_csv(target, index=False, lineterminator="\n")
     return target
@@ -103,14 +100,14 @@ def write_csv(path: str | Path, maps: MapLayers) -> Path:
 
 
 def write_kmz(path: str | Path, maps: MapLayers, *, title: str = "Coverage and rank") -> Path:
-    """Ground overlays with one legend each (only the first is switched on), towers and serving borders."""
+    """Write a KMZ with an overlay and a legend per layer, of which the first is visible, with towers and borders."""
     north, south, east, west = _bounding_box(maps)
     box = f"<north>{north:.9f}</north><south>{south:.9f}</south><east>{east:.9f}</east><west>{west:.9f}</west>"
     parts = [
         kml.folder(
             layer.title,
             f"legends/{layer.name}.png",
-            # KML writes alpha, blue, green, red: c0 lets a quarter of the imagery through
+            # KML writes alpha, blue, green, red; with c0 a quarter of the imagery below is visible
             f"<GroundOverlay><name>map</name><visibility>{int(number == 0)}</visibility><color>c0ffffff</color>"
             f"<Icon><href>maps/{layer.name}.png</href></Icon><LatLonBox>{box}</LatLonBox></GroundOverlay>",
             visible=number == 0,
@@ -133,9 +130,8 @@ def write_kmz(path: str | Path, maps: MapLayers, *, title: str = "Coverage and r
 def _bounding_box(maps: MapLayers) -> tuple[float, float, float, float]:
     """Return north, south, east and west [deg] of the grid's edge.
 
-    A KML box follows meridians and parallels, and the grid follows the site's east and north. Over 2 km the corners
-    agree
-    within 0.3 m, so the middles of the four edges are used.
+    A KML box is along meridians and parallels, and the grid is along east and north of the site. Over 2 km their
+    corners agree within 0.3 m, so the middles of the four edges are used.
     """
     half = maps.grid.spacing_m / 2
     east, north = maps.grid.east_m, maps.grid.north_m
@@ -146,7 +142,8 @@ def _bounding_box(maps: MapLayers) -> tuple[float, float, float, float]:
 
 
 def _range(layer: Layer) -> tuple[float, float]:
-    """Return the colour range, 2nd to 98th percentile: one position next to a tower must not flatten the map."""
+    """Return the colour range, from the 2nd to the 98th percentile."""
+    # positions next to a tower are far above all others and would use most colours
     finite = np.asarray(layer.values, dtype=np.float64)
     finite = finite[np.isfinite(finite)]
     if not finite.size:
@@ -166,7 +163,7 @@ def _colours(layer: Layer, low: float, high: float) -> AnyArray:
         colours = to_rgba_array(_class_palette(layer))
         return np.where((number == 0)[:, None] & (layer.classes[0] == "Z"), grey, colours[number])
     values = np.asarray(layer.values, dtype=np.float64)
-    # a ratio to a singular value of zero is infinite: the top of the scale, not a hole in the map
+    # a ratio to a singular value of zero is infinite, and has the colour of the top of the scale
     share = np.clip((np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) / (high - low), 0, 1)
     return np.where(np.isnan(values)[:, None], grey, colormaps["viridis"](share))
 
@@ -178,7 +175,7 @@ def _class_palette(layer: Layer) -> list[str]:
 
 
 def _picture(grid: Grid, layer: Layer, low: float, high: float) -> bytes:
-    """PNG with a block of pixels per cell: viewers that smooth must not mix classes."""
+    """Return a PNG with a block of pixels per cell, so that viewers that smooth it do not mix classes."""
     from PIL import Image
 
     colours = (255 * _colours(layer, low, high)).round().astype(np.uint8)
@@ -213,7 +210,7 @@ _Variable = tuple[tuple[str, ...], AnyArray, dict[str, Any]]
 def maps_dataset(
     maps: Mapping[str, MapResult], frame: SiteFrame, about: Mapping[str, str], further: Sequence[Layer] = ()
 ) -> Dataset:
-    """Maps as variables with dimensions foliage, tower, k, height, y, x.
+    """Return maps as variables with the dimensions foliage, tower, k, height, y, x.
 
     Parameters
     ----------
@@ -236,7 +233,7 @@ def maps_dataset(
     for layer in further:
         plane = first.grid.raster(np.asarray(layer.values))
         if layer.classes:
-            # rank_1, not 1: next to flag_values a bare number would be mistaken for a value
+            # rank_1 instead of 1, because a number next to flag_values could be mistaken for a value
             codes = tuple(f"rank_{c}" if c.isdigit() else c for c in layer.classes)
             variables[layer.name] = _PLANE, plane.astype(np.int8), _codes(codes, layer.title)
         else:
@@ -252,7 +249,7 @@ def _text(dimension: str, names: Mapping[str, Any] | Sequence[str], meaning: str
 
 
 def _places(maps: MapResult, frame: SiteFrame) -> dict[str, _Variable]:
-    """Axes, towers, latitude and longitude, the tower that serves, the reference system."""
+    """Return axes, towers, latitude and longitude, the serving tower, and the reference system."""
     variables: dict[str, _Variable] = {
         "k": (("k",), np.array(maps.ks), {"long_name": "singular-value ratio K of the rank", "units": "1"}),
         "tower": _text("tower", maps.tower_names, "name of the tower"),
@@ -282,7 +279,7 @@ def _places(maps: MapResult, frame: SiteFrame) -> dict[str, _Variable]:
 
 
 def _levels(maps: Mapping[str, MapResult]) -> dict[str, _Variable]:
-    """Levels and ratios of singular values, by tower and of the nearest tower."""
+    """Return levels and ratios of singular values, of each tower and of the nearest tower."""
     limit = f"at most {RATIO_LIMIT_DB:g} dB"
     kinds: dict[str, tuple[str, str, str, str, Callable[[MapResult], FloatArray]]] = {
         "rss_siso": ("received level, one element at both ends", "height", DBM, "dBm", lambda m: m.rss_siso_dbm),
@@ -321,7 +318,7 @@ def _ranks(maps: Mapping[str, MapResult]) -> dict[str, _Variable]:
 def _stacked(
     maps: Mapping[str, MapResult], values: Sequence[AnyArray], between: tuple[str, ...], attributes: Mapping[str, Any]
 ) -> _Variable:
-    """Values of every mode, (..., n) each, as a variable over foliage, ``between`` and the plane.
+    """Return values (..., n) of every mode as a variable over foliage, ``between`` and the plane.
 
     Parameters
     ----------
@@ -329,7 +326,7 @@ def _stacked(
     values : sequence of ndarray
         One array per mode.
     between : tuple of str
-        Dimensions of the values but the last; without ``"tower"`` they are those of the nearest tower.
+        Dimensions of the values except the last. Without ``"tower"`` the values are those of the nearest tower.
     attributes : mapping
 
     Returns
@@ -338,7 +335,7 @@ def _stacked(
         Dimensions, values, attributes.
     """
     joint = "tower" not in between
-    # the last axis, positions in index order, as y and x
+    # the last axis contains the positions in index order and becomes y and x
     planes = np.stack([v.reshape(*v.shape[:-1], *m.grid.shape) for m, v in zip(maps.values(), values, strict=True)])
     # float32 resolves 0.01 dB and halves the file
     numbers = planes.astype(np.int8) if "flag_values" in attributes else np.round(planes, 2).astype(np.float32)

@@ -1,19 +1,16 @@
-"""The map grid in the paper's order, the serving tower of each position, and out of coverage as a separate class.
+"""The grid of a map, its values for each tower and jointly, and the link budget.
 
 Positions are numbered from the south-west corner, east first, then one row north (arXiv 2502.10324,
 section VI-A). Position ``i`` of ``columns`` is therefore in row ``i // columns`` and column ``i % columns``.
 Each position is the centre of its cell: 1080 m x 2130 m at 30 m contains 36 x 71 = 2556 positions.
 
-The map job: RSS and rank of every tower at every position and altitude, alone and jointly.
-
 The replay engine is passed as a function, so that this module does not depend on an engine::
 
     evaluate(position_m (n, 3), tower_names) -> Evaluation
 
-The function is called for one altitude and at most ``chunk`` positions at a time. Only the result grows with the number
-of altitudes: per tower and position 24 bytes of levels, 16 bytes of singular-value ratios, and 1 byte of rank per K.
-
-The link budget of a map: transmit power, noise floor, and the lowest level of a covered position.
+The function is called for one altitude and at most ``chunk`` positions at a time, so only the result grows with the
+number of altitudes. It has 24 bytes of levels, 16 bytes of singular-value ratios, and 1 byte of rank per K, for each
+tower, altitude and position.
 """
 
 from __future__ import annotations
@@ -36,25 +33,25 @@ from ..compare.rank import rank_from_singular_values
 # Horizontal interval d_rx of the UAV positions.
 PAPER_SPACING_M = 30.0
 
-# With a mistyped spacing, a map would have 1e8 positions and take days.
+# Limit that detects a mistyped spacing: a map of 1e8 positions would take days.
 _MAXIMUM_CELLS_A_SIDE = 10_000
 
-# How plots and tables name a position without any path.
+# Class of a position without any path.
 OUT_OF_COVERAGE = "Z"
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Regular horizontal grid of UAV positions.
+    """A regular horizontal grid of UAV positions.
 
     Parameters
     ----------
     east_m : (columns,)
-        Ascending, evenly spaced [m].
+        Centres of the cells, ascending and evenly spaced [m].
     north_m : (rows,)
-        Ascending, evenly spaced [m].
+        Centres of the cells, ascending and evenly spaced [m].
     spacing_m : float
-        Cell size, the paper's d_rx [m].
+        Side of a cell, the paper's d_rx [m].
 
     Examples
     --------
@@ -107,7 +104,7 @@ class Grid:
 
     @property
     def area_m(self) -> tuple[float, float, float, float]:
-        """Extent of the cells ``(east_min, east_max, north_min, north_max)``."""
+        """The extent of the cells ``(east_min, east_max, north_min, north_max)``."""
         half = self.spacing_m / 2
         return (
             float(self.east_m[0] - half), float(self.east_m[-1] + half),
@@ -119,13 +116,13 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns): south to north, west to east."""
+        """The numbers of rows (south to north) and columns (west to east)."""
         return len(self.north_m), len(self.east_m)
 
     @property
     def points_m(self) -> FloatArray:
-        """Positions (n, 2), east and north [m], in index order."""
-        # north is the slow axis: the paper counts along a row from west to east, then goes north
+        """The positions (n, 2), east and north [m], in index order."""
+        # north changes last: the paper counts along a row from west to east, then goes north
         north, east = np.meshgrid(self.north_m, self.east_m, indexing="ij")
         return np.column_stack([east.ravel(), north.ravel()])
 
@@ -146,7 +143,7 @@ class Grid:
         column = np.floor((points[..., 0] - self.east_m[0]) / self.spacing_m + 0.5)
         row = np.floor((points[..., 1] - self.north_m[0]) / self.spacing_m + 0.5)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        # outside, row and column may be NaN, which cannot be an integer
+        # outside the grid, row and column may be NaN, which cannot be an integer
         return np.where(inside, np.where(inside, row, 0) * columns + np.where(inside, column, 0), -1).astype(np.int64)
 
 
@@ -169,7 +166,7 @@ def serving_tower(points_m: ArrayLike, towers_m: ArrayLike) -> IntArray:
     if len(towers) == 0:
         raise UsageError("the site has no tower", expected="at least one tower to serve the map")
     squared = ((points[:, None, :] - towers[None, :, :]) ** 2).sum(axis=-1)
-    # tied to the micrometre squared scale, so that the rule and not rounding decides
+    # rounded, so that the rule for ties decides and not a rounding error
     return np.asarray(np.argmin(np.round(squared, 6), axis=1), dtype=np.int64)
 
 
@@ -197,7 +194,7 @@ def voronoi_borders(towers_m: ArrayLike, area_m: tuple[float, float, float, floa
     Returns
     -------
     tuple of Border
-        Pairs that share no border are left out.
+        Borders of the pairs of towers that have one.
     """
     towers = unmasked(towers_m)[:, :2]
     lines = {pair: _bisector_segment(*pair, towers, area_m) for pair in itertools.combinations(range(len(towers)), 2)}
@@ -210,7 +207,7 @@ def _bisector_segment(
     """Return the part (2, 2) of the bisector of towers a and b that is their border, or None."""
     between = towers[b] - towers[a]
     length = float(np.hypot(*between))
-    # two towers on one mast have no bisector
+    # two towers at one position have no bisector
     if length < 1e-6:
         return None
     middle = (towers[a] + towers[b]) / 2
@@ -278,15 +275,15 @@ class Layer:
         return ", ".join(part for part in parts if part)
 
 
-# Section VII: ranks also at 3 m, to show blockage; levels at three of the other heights.
+# Section VII of the paper has ranks also at 3 m, to show blockage, and levels at three heights.
 PAPER_RSS_ALTITUDES_M = (30.0, 70.0, 110.0)
 PAPER_RANK_ALTITUDES_M = (3.0, *(float(h) for h in range(30, 111, 10)))
 PAPER_KS = (10.0, 100.0, 1000.0)
-# Positions of one call: H of five towers with 4 x 4 elements takes 2.6 MB of them.
+# Positions per call. H of five towers with 4 x 4 elements then takes 2.6 MB.
 CHUNK = 2048
-# Four elements at each end of the paper's maps: no matrix of theirs has more.
+# The arrays of the paper have four elements at each end, so no channel matrix has a higher rank.
 HIGHEST_RANK = 4
-# Largest ratio of singular values that is drawn and exported: values below 1e-9 of the largest are rounding.
+# Largest ratio of singular values that is drawn and exported. Values below 1e-9 of the largest are rounding errors.
 RATIO_LIMIT_DB = 180.0
 
 Antennas = Literal["siso", "mimo"]
@@ -313,7 +310,7 @@ class Evaluation:
 
     @property
     def levels(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Values of each RSS altitude in a map."""
+        """The values that a map has at each altitude of RSS."""
         return self.rss_siso_dbm, self.rss_mimo_dbm, self.level_sd_db
 
 
@@ -322,7 +319,7 @@ Evaluate = Callable[[FloatArray, tuple[str, ...]], Evaluation]
 
 @dataclass(frozen=True, slots=True)
 class MapResult:
-    """Maps of one foliage mode. Axes: altitude, (K,) tower, position, with positions in the grid's index order.
+    """The maps of one foliage mode, with the axes altitude, (K,) tower, position. Positions are in index order.
 
     Parameters
     ----------
@@ -333,15 +330,15 @@ class MapResult:
     towers_m : (towers, 3)
         East, north, up [m].
     rss_altitudes_m, rank_altitudes_m, ks : tuple of float
-        The axes.
+        Altitudes [m] and singular-value ratios of the axes.
     rss_siso_dbm, rss_mimo_dbm, level_sd_db : (RSS altitudes, towers, n)
-        NaN out of coverage.
+        Levels and their standard deviations; NaN out of coverage.
     rank : (rank altitudes, K, towers, n) int8
-        0 out of coverage.
+        Ranks; 0 out of coverage.
     spread_db, condition_db : (rank altitudes, towers, n)
         20 log10 of sigma_1 / sigma_2 and sigma_1 / sigma_last; NaN out of coverage, infinite for a zero value.
     serving : (n,) int
-        Nearest tower.
+        Number of the nearest tower.
     borders : tuple of Border
         Borders between the serving areas.
     """
@@ -383,7 +380,7 @@ class MapResult:
             if tower not in self.tower_names:
                 raise UsageError(f"unknown tower {tower!r}", expected=f"one of {', '.join(self.tower_names)}")
             return np.asarray(values[..., self.tower_names.index(tower), :])
-        # both indices are arrays of positions: each takes the value of its own serving tower
+        # with two index arrays each position takes the value of its serving tower
         return np.asarray(values[..., self.serving, np.arange(len(self.grid))])
 
 
@@ -407,9 +404,9 @@ def map_job(
     towers : mapping of str to (3,)
         Array centres [m], in drawing order.
     evaluate : callable
-        The engine, see the module text.
+        The engine, as described at the top of this module.
     rss_altitudes_m, rank_altitudes_m : sequence of float
-        Heights above ground [m]; one that is in both is evaluated once.
+        Heights above ground [m]. A height in both is evaluated once.
     ks : sequence of float
         Singular-value ratios.
     chunk : int
@@ -428,12 +425,12 @@ def map_job(
     at = {"rss": tuple(map(float, rss_altitudes_m)), "rank": tuple(map(float, rank_altitudes_m))}
     t, n = len(names), len(grid)
     rss = np.full((3, len(at["rss"]), t, n), np.nan)
-    # zero means out of coverage, so values that no engine writes have no channel
+    # 0 is out of coverage, the value of positions that the engine does not cover
     rank = np.zeros((len(at["rank"]), len(ks), t, n), dtype=np.int8)
     ratio = np.full((2, len(at["rank"]), t, n), np.nan)
     heights = sorted({*at["rss"], *at["rank"]})
     for step, height in enumerate(heights):
-        # height by height, so that the memory does not depend on the number of heights
+        # one height at a time, so that the memory does not depend on the number of heights
         positions = grid.positions_m(height)
         for start in range(0, n, chunk):
             part = slice(start, min(start + chunk, n))
@@ -469,7 +466,7 @@ def map_job(
 
 
 def rank_of_singular_values(singular_values: ArrayLike, ks: Sequence[float]) -> IntArray:
-    """Return the channel rank (..., K): the number of ``sigma`` (..., r) above ``sigma_1 / k``. 0 for no channel."""
+    """Return the rank (..., K): the number of ``sigma`` (..., r) above ``sigma_1 / k``, 0 if there is no channel."""
     sigma = unmasked(singular_values)
     return np.stack([rank_from_singular_values(sigma, k) for k in ks], axis=-1)
 
@@ -478,26 +475,26 @@ def _ratios_db(singular_values: FloatArray) -> FloatArray:
     """Return sigma_1 / sigma_2 and sigma_1 / sigma_last (2, n, t) [dB]."""
     sigma = np.nan_to_num(singular_values)
     covered = sigma[..., 0] > 0
-    # one element at an end: there is no second value, and the ratio of the first to itself is 1
+    # with one element at an end there is one singular value, and its ratio to itself is 1
     if sigma.shape[-1] < 2:
         return np.where(covered, 0.0, np.full((2, *covered.shape), np.nan))
-    # a later value of zero stays: its ratio is infinite, which plots and files cut at RATIO_LIMIT_DB
+    # a singular value of zero has an infinite ratio, which figures and files limit to RATIO_LIMIT_DB
     strongest = db_from_power(np.where(covered, sigma[..., 0], 1.0) ** 2)
     return np.stack([np.where(covered, strongest - db_from_power(sigma[..., i] ** 2), np.nan) for i in (1, -1)])
 
 
 @dataclass(frozen=True, slots=True)
 class FoliageDifference:
-    """Effect of foliage on the joint maps.
+    """The effect of foliage on the joint maps.
 
     Parameters
     ----------
     rss_loss_db : (RSS altitudes, n)
-        RSS without minus with foliage (arrays); NaN where either is out of coverage.
+        RSS without foliage minus RSS with foliage (arrays); NaN if either is out of coverage.
     lost : (RSS altitudes, n) bool
         Positions that foliage takes out of coverage.
     rank_change : (rank altitudes, K, n) int
-        Rank with minus without foliage; 0 where either is out of coverage.
+        Rank with foliage minus rank without foliage; 0 if either is out of coverage.
     """
 
     rss_loss_db: FloatArray
@@ -512,7 +509,7 @@ def foliage_difference(without: MapResult, foliage: MapResult) -> FoliageDiffere
     return FoliageDifference(
         clear - shaded,
         np.isfinite(clear) & ~np.isfinite(shaded),
-        # a link that foliage removes is counted in ``lost``: as a decrease to rank 0 it would count twice
+        # a link that foliage removes is counted in ``lost``, and would count twice as a decrease to rank 0
         np.where((before > 0) & (after > 0), after - before, 0),
     )
 
@@ -542,7 +539,7 @@ def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
 
 def in_name(number: float, digits: int = 3) -> str:
     """Return a height or K as part of a layer's name: 030 for 30, 12p5 for 12.5."""
-    # padded with zeros, so that layers sorted by name are sorted by height
+    # padded with zeros, so that layers in the order of their names are in the order of their heights
     return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")
 
 
@@ -565,9 +562,9 @@ class LinkBudget:
     Parameters
     ----------
     tx_power_dbm : float
-        Power of a tower; 40 dBm are the paper's 10 W.
+        Transmit power of a tower. The paper's 10 W are 40 dBm.
     bandwidth_mhz : float, optional
-        Receiver bandwidth B. Without it no SNR is known.
+        Receiver bandwidth B, which an SNR requires.
     noise_figure_db : float
         Noise figure F of the receiver.
     threshold_dbm, threshold_snr_db : float, optional
@@ -613,7 +610,7 @@ class LinkBudget:
             raise UsageError(
                 f"a threshold of {level_dbm:g} dBm below the noise floor of {noise_dbm:.1f} dBm",
                 expected="a level above the noise, or threshold_snr_db (--threshold-snr-db) with a negative SNR",
-                cause="a threshold that holds for a narrower band",
+                cause="a threshold that is valid for a narrower band",
             )
 
     @property
@@ -651,5 +648,5 @@ class LinkBudget:
         return f"Transmit power {self.tx_power_dbm:g} dBm; {noise}; {threshold}."
 
 
-# 10 W, and every path counts.
+# The link budget of the paper: 10 W, and every path counts.
 PAPER_BUDGET = LinkBudget()

@@ -10,9 +10,9 @@ depend on ``v^2``, and ``v^2 = 0`` would make the textbook system singular. The 
 Rules, each with a test:
 
 nugget
-    ``1 - Phi(0+)``. It is a jump, not a smoothing: gamma of a sample with itself is 0. A target at the position of a
-    sample therefore takes its value with variance 0.
-places
+    ``1 - Phi(0+)``, a jump of the semivariogram at distance 0. The semivariance of a sample with itself is still 0, so
+    a target at the position of a sample takes its value with variance 0.
+positions
     Samples at the same position (to a micrometre) become one sample, their mean. Leave-one-out holds out the position.
 near-singular systems
     A system that may be near-singular is solved by an eigenvalue decomposition in the space of weights that sum to 1.
@@ -29,8 +29,7 @@ An interpolator may use the M nearest samples within a radius, or M random sampl
 
 The tie rule: distances that agree to a micrometre are tied. Tied samples are ordered by their offset from the target:
 lower first, then southern, then western. On a regular grid every inner target therefore has the same pattern of
-neighbours. The pattern does not depend on the order in which samples were given, except for samples at the same
-position.
+neighbours, in whatever order the samples were given.
 """
 
 from __future__ import annotations
@@ -46,26 +45,26 @@ from numpy.typing import ArrayLike
 from ..common.errors import UsageError, from_python
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 
-# Targets per query; bounds the memory.
+# Targets per query, which limits the memory.
 QUERY_CHUNK = 4096
 
-# Targets per query of all samples within a radius; bounds the memory and does not change a random draw.
+# Targets per query of all samples within a radius. It limits the memory and does not change a random draw.
 AT_ONCE = 256
 
-# Distances closer than this are tied; a sample closer than this to a target is at its place.
+# Distances that differ by less are tied, and a sample closer than this to a target is at its position.
 TIE_M = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Neighbours:
-    """Chosen samples of each target, in the order of the tie rule (random choice: by index).
+    """The chosen samples of each target, in the order of the tie rule. Random samples are in the order of their draw.
 
     Parameters
     ----------
     index : (targets, M) int
-        Sample numbers, -1 past the last one.
+        Numbers of the samples; -1 after the last one.
     distance_m : (targets, M)
-        Infinite past the last one.
+        Distances of the samples [m]; infinite after the last one.
     """
 
     index: IntArray
@@ -73,27 +72,27 @@ class Neighbours:
 
     @property
     def count(self) -> IntArray:
-        """Number of samples of each target (targets,)."""
+        """The number of samples of each target (targets,)."""
         return np.asarray((self.index >= 0).sum(axis=1), dtype=np.int64)
 
 
 def nearest(
     samples_m: FloatArray, targets_m: FloatArray, m: int, radius_m: float, skip: IntArray | None = None
 ) -> Neighbours:
-    """The M nearest samples within the radius (inclusive, to the micrometre), ties by the rule above.
+    """Return the M nearest samples within the radius (inclusive, to the micrometre), ordered by the tie rule.
 
     Parameters
     ----------
     samples_m : (samples, dims)
         Distinct positions in a metric frame (anisotropy already applied).
     targets_m : (targets, dims)
-        The same frame.
+        Positions in the same frame.
     m : int
         Largest number of samples per target.
     radius_m : float
         Search radius, may be infinite.
     skip : (targets,) int, optional
-        One sample per target that is excluded (leave-one-out). -1 means none.
+        The sample that each target must not use (leave-one-out); -1 if it may use all.
 
     Returns
     -------
@@ -115,7 +114,7 @@ def nearest(
 
 
 class Rule(Protocol):
-    """Settings of a predictor that decide which samples a target has."""
+    """The settings of a predictor that determine which samples a target uses."""
 
     neighbours: int
     radius_m: float
@@ -124,7 +123,7 @@ class Rule(Protocol):
 
 
 def by_rule(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, skip: IntArray | None = None) -> Neighbours:
-    """The samples of each target that a predictor uses: its nearest ones, or some at random.
+    """Return the samples of each target that a predictor uses: the nearest ones, or random ones.
 
     Parameters
     ----------
@@ -142,12 +141,12 @@ def by_rule(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, skip: IntA
 
 
 def renumbered(taken: BoolArray) -> IntArray:
-    """Return the number of each sample among those of a mask (samples,). -1 for samples outside the mask."""
+    """Return the number of each sample among the samples of a mask (samples,), -1 outside the mask."""
     return np.where(taken, np.cumsum(taken) - 1, -1)
 
 
 def in_strips(places_m: FloatArray, together: int) -> IntArray:
-    """Return an order of positions in which ``together`` of them in a row fill a square: strips from south to north."""
+    """Return an order of positions in strips, in which ``together`` consecutive positions fill about a square."""
     if not len(places_m):
         return np.empty(0, dtype=np.int64)
     east, north = (places_m - places_m.min(axis=0)).T[:2]
@@ -167,12 +166,12 @@ def _fill_nearest(
     """Fill the rows ``todo`` from ``candidates`` per target. Return the rows whose tie reaches the last candidate."""
     samples_m, m = tree.data, chosen.index.shape[1]
     candidates = min(candidates, len(samples_m))
-    # a list of ranks, because a plain 1 would drop an axis; the tree excludes the bound itself
+    # a list of ranks, because a plain 1 would drop an axis; the tree does not include the bound itself
     distance, who = tree.query(targets_m[todo], k=np.arange(1, candidates + 1), distance_upper_bound=radius_m + TIE_M)
     last = _in_micrometres(distance[:, -1])
     exhausted = (candidates == len(samples_m)) | ~np.isfinite(last)
     if skip is not None:
-        # queried and then removed: a tree without this sample would have to be built for every target
+        # remove it after the query, because a tree without this sample would have to be built for every target
         distance[who == skip[todo, None]] = np.inf
     ring = _in_micrometres(distance)
     rows = np.flatnonzero(((ring[:, 1:] <= ring[:, :-1]) & np.isfinite(ring[:, 1:])).any(axis=1))
@@ -201,7 +200,7 @@ def _tie_order(distance: FloatArray, who: IntArray, samples_m: FloatArray, targe
 
 
 def _random_within(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, skip: IntArray | None) -> Neighbours:
-    """M samples drawn without replacement among those within the radius, as the paper's Step 1 may be read."""
+    """Return M samples drawn without replacement within the radius, a possible reading of the paper's Step 1."""
     from scipy.spatial import cKDTree
 
     m, radius_m = rule.neighbours, rule.radius_m
@@ -214,17 +213,17 @@ def _random_within(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, ski
     for start in range(0, len(targets_m), AT_ONCE):
         part = slice(start, start + AT_ONCE)
         pairs = cKDTree(targets_m[part]).sparse_distance_matrix(tree, radius_m + TIE_M, output_type="ndarray")
-        # the tree's own order may change with its version, and a draw must not
+        # sort the pairs, because the order of the tree may change with its version, and a draw must not
         pairs = pairs[np.lexsort((pairs["j"], pairs["i"]))]
         target, sample, far = pairs["i"], pairs["j"], pairs["v"]
-        # one number per pair in a fixed order: the stream does not depend on the chunk
+        # one number per pair in a fixed order, so that the draw does not depend on the size of the parts
         draw = generator.random(len(pairs))
         if skip is not None:
             keep = sample != skip[part][target]
             target, sample, far, draw = target[keep], sample[keep], far[keep], draw[keep]
         order = np.lexsort((draw, target))
         target, sample, far = target[order], sample[order], far[order]
-        # the place of each pair in the run of its target
+        # the number of each pair among those of its target
         rank = np.arange(len(target)) - np.searchsorted(target, target)
         drawn = rank < m
         index[start + target[drawn], rank[drawn]] = sample[drawn]
@@ -232,39 +231,39 @@ def _random_within(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, ski
     return Neighbours(index, distance)
 
 
-# Correlation as a function of distance [m]; vectorised.
+# Correlation as a function of an array of distances [m].
 Correlation = Callable[[FloatArray], FloatArray]
 
-# A solution then keeps six of float64's sixteen digits.
+# With this condition number a solution keeps six of the sixteen digits of float64.
 CONDITION_LIMIT = 1e10
-# Sum of magnitudes above which an estimate is reported as doubtful. Correlations that fall from 0 on stay below 3.
+# Sum of magnitudes of weights above which a warning is given. With correlations that fall steadily it is below 3.
 LARGEST_WEIGHTS = 100.0
-# Targets whose neighbours' offsets agree to this share one set of weights.
+# Targets share one set of weights if the offsets of their neighbours agree to this distance [m].
 _SHARE_M = 1e-9
-# Below this bound of the condition number a Cholesky solution has at least 9 digits, so no second solution is needed.
+# Below this condition number a Cholesky solution has at least 9 digits, so no second solution is needed.
 SOUND_CONDITION = 1e6
-# Pivots alone are not a bound. But among 40 000 systems of six correlations, including samples in lines and clusters,
-# no system with a pivot ratio below this had a bound above 1e5. The bound takes as long as the solution.
+# Bound by the pivots below which the condition number is not computed, which would take as long as the solution. Among
+# 40 000 systems of six correlations, including samples in lines and clusters, such systems stayed below 1e5.
 PLAINLY_SOUND = 3e3
-# Number of targets that may share weights and whose systems are factored together, large enough to hide the calls. It
-# is smaller for systems of many neighbours, so that a factor has at most this many numbers.
+# Number of targets that may share weights and whose systems are factored together. It is smaller for systems with many
+# neighbours, so that a factor has at most the second number of elements.
 CHUNK, FACTOR_NUMBERS = 2048, 2**20
 
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """The linear rule of each target: estimate = sum of weight * sample.
+    """The weights of the samples of each target: an estimate is the sum of weight times sample.
 
     Parameters
     ----------
     index : (targets, M) int
-        Places used, -1 past the last.
+        Numbers of the positions used; -1 after the last one.
     weight : (targets, M)
-        Sums to 1 in each row with a sample; 0 past the last.
+        Weights, which sum to 1 for a target with samples; 0 after the last one.
     variance : (targets,)
-        Kriging variance for ``v^2 = 1``; NaN without a sample.
+        Kriging variance for ``v^2 = 1``; NaN if there is no sample.
     regularised : (targets,) bool
-        True where the near-singular rule was used.
+        True if directions were dropped from a near-singular system.
     """
 
     index: IntArray
@@ -288,13 +287,13 @@ class OrdinaryKriging:
     neighbours : int
         M, the largest number of samples per target.
     radius_m : float
-        r0; samples at larger distance do not count. May be infinite.
+        r0, the search radius [m]. It may be infinite.
     selection : {"nearest", "random"}
         The M nearest (ties by the rule of :mod:`~aerpaw_cmp.maps.kriging`), or M drawn within the radius.
     seed : int
         Seed of the random selection.
     outside : {"nan", "nearest"}
-        Result where no sample lies within the radius.
+        Result if no sample is within the radius.
     bounds : (low, high), optional
         Limits of the estimates, such as (1, 4) for ranks.
 
@@ -303,11 +302,11 @@ class OrdinaryKriging:
     points_m_ : (places, dims)
         Distinct sample positions.
     values_ : (places, fields)
-        Their values.
+        Values at these positions.
     place_ : (samples,) int
-        Place of each sample.
+        Number of the position of each sample.
     sill_ : (fields,)
-        v^2 of the variance: the sample variance of each field.
+        Sample variance of each field, v^2.
 
     Notes
     -----
@@ -340,12 +339,12 @@ class OrdinaryKriging:
         points_m : (n, 2) or (n, 3)
             East, north (, up) [m].
         values : (n,) or (n, fields)
-            NaN where out of coverage.
+            Values; NaN out of coverage.
 
         Raises
         ------
         UsageError
-            If a setting or a shape does not make sense; the message names it.
+            If a setting or a shape is not valid.
         """
         self._check_settings()
         points = _as_points(points_m)
@@ -371,7 +370,7 @@ class OrdinaryKriging:
         return self._shaped(*self._estimate(targets, None))
 
     def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
-        """Return estimate and variance at every sample from the others, in the shape of the values of ``fit``."""
+        """Return estimate and variance at every sample from the other samples, in the shape of the fitted values."""
         place = np.arange(len(self.points_m_))
         estimate, variance = self._estimate(self.points_m_, place)
         return self._shaped(estimate[self.place_], variance[self.place_])
@@ -398,7 +397,7 @@ class OrdinaryKriging:
     def _sill_of(self, values: FloatArray) -> FloatArray:
         finite = np.isfinite(values)
         count = finite.sum(axis=0)
-        # subtract a value of the field, so that a constant field has variance 0 and not 1e-32
+        # subtract one value of the field, so that a constant field has a variance of exactly 0
         centred = np.where(finite, values - _reference(values), 0.0)
         mean = centred.sum(axis=0) / np.maximum(count, 1)
         squares = np.where(finite, centred - mean, 0.0) ** 2
@@ -442,7 +441,7 @@ class OrdinaryKriging:
             step = min(CHUNK, max(1, FACTOR_NUMBERS // int(m) ** 2))
             for start in range(0, len(same), step):
                 rows = same[start : start + step]
-                # targets on the last axis: each operation runs along many systems at once
+                # targets are on the last axis, so that each operation runs along many systems at once
                 near = np.ascontiguousarray(chosen.index[rows, :m].T)
                 offset = coordinates[:, near]
                 offset -= targets[rows].T[:, None]
@@ -460,9 +459,9 @@ class OrdinaryKriging:
         return chosen
 
     def _semivariance(self, offset_m: FloatArray) -> FloatArray:
-        """1 - Phi of offsets (dims, ...) between different places.
+        """Return 1 - Phi at offsets (dims, ...) between different positions.
 
-        Source: arXiv 2502.10324 eq. 17; ``v^2`` scales the variance afterwards.
+        Source: arXiv 2502.10324 eq. 17; ``v^2`` scales the variance later.
         """
         square = offset_m[0] ** 2 + offset_m[1] ** 2
         for more in offset_m[2:]:
@@ -470,24 +469,24 @@ class OrdinaryKriging:
         gamma = 1.0 - np.asarray(self.correlation(np.sqrt(square)), dtype=np.float64)
         if not np.isfinite(gamma).all():
             raise UsageError("the correlation is not finite at some distance", expected="a number at every distance")
-        # a correlation above 1, by rounding or by its author, counts as 1
+        # rounding, or the function of a user, may exceed a correlation of 1
         return np.asarray(np.maximum(gamma, 0.0))
 
     def _between(self, samples: FloatArray, near: IntArray) -> FloatArray:
-        """Semivariances (pairs, t) between the neighbours ``near`` (m, t), in the order of a lower triangle by columns.
+        """Return semivariances (pairs, t) of the neighbours ``near`` (m, t), as a lower triangle by columns.
 
-        Targets close together share neighbours: there each distance between two samples is taken once.
+        Nearby targets share neighbours, so the semivariance of two samples is computed once.
         """
         first, second = np.triu_indices(len(near), 1)
         number = np.zeros(len(samples), dtype=np.int64)
         number[near] = 1
         used = np.flatnonzero(number)
-        # a table of all pairs would be larger than what is asked of it
+        # a table of all pairs of samples would be larger than the pairs of neighbours
         if len(used) ** 2 > len(first) * near.shape[1]:
             return self._semivariance(samples.T[:, near[second]] - samples.T[:, near[first]])
         number[used] = np.arange(len(used))
         offset = samples[used].T[:, :, None] - samples[used].T[:, None]
-        np.fill_diagonal(offset[0], 1.0)  # not asked for, and a correlation need not be finite at 0
+        np.fill_diagonal(offset[0], 1.0)  # these values are not used, and a correlation need not be finite at 0
         table = self._semivariance(offset).ravel()
         column, row = number[near], number[near] * len(used)
         return np.asarray(table[row[first] + column[second]])
@@ -495,7 +494,7 @@ class OrdinaryKriging:
     def _solve(
         self, offset_m: FloatArray, samples: FloatArray, near: IntArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Weights (m, t), normalised variance (t,), near-singular flag (t,) of neighbours at offsets (dims, m, t)."""
+        """Return weights (m, t), normalised variance (t,) and near-singular flag (t,) for offsets (dims, m, t)."""
         m, t = offset_m.shape[1:]
         to_target = self._semivariance(offset_m)
         here = np.einsum("dmt,dmt->mt", offset_m, offset_m) < TIE_M**2
@@ -505,15 +504,15 @@ class OrdinaryKriging:
         if len(hard := np.flatnonzero(~sound)):
             w, variance[hard], regularised[hard] = _solve_doubtful(_square(between[:, hard], m), to_target.T[hard])
             weight[:, hard] = w.T
-        # next to a sample the true variance is 0, and rounding can make it negative
+        # next to a sample the variance is nearly 0, and rounding can make it negative
         variance = np.maximum(variance, 0.0)
-        at = here.any(axis=0)  # the solution is known there; rounding must not change it
+        at = here.any(axis=0)  # the exact solution is known, and rounding must not change it
         weight[:, at], variance[at] = here[:, at], 0.0
         return weight, variance, regularised
 
 
 def _square(pairs: FloatArray, m: int) -> FloatArray:
-    """Symmetric matrices (t, m, m) with zeros on the diagonal, of the pairs of a lower triangle by columns."""
+    """Return symmetric matrices (t, m, m) with zero diagonals from the pairs of a lower triangle by columns."""
     first, second = np.triu_indices(m, 1)
     gamma = np.zeros((pairs.shape[1], m, m))
     gamma[:, first, second] = gamma[:, second, first] = pairs.T
@@ -521,22 +520,23 @@ def _square(pairs: FloatArray, m: int) -> FloatArray:
 
 
 def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Weights (m, t), variance (t,) and whether both are beyond doubt, of systems with a covariance ``1 - gamma``.
+    """Return weights (m, t), variance (t,) and whether both are reliable, for the covariance ``1 - gamma``.
 
     Parameters
     ----------
     gamma : (m (m - 1) / 2, t)
-        Semivariances between samples: 1 to 0, 2 to 0, ..., 2 to 1, ...
+        Semivariances between samples 1 and 0, 2 and 0, ..., 2 and 1, ...
     to_target : (m, t)
+        Semivariances between samples and target.
 
     Notes
     -----
     With ``C = 1 - gamma = L L'`` and ``c = 1 - gamma_0`` the bordered system is ``C w = c + mu 1``. A Cholesky factor
     solves it, with the Lagrange multiplier ``mu`` from the Schur complement ``1' C^-1 1``. The trace of ``C^-1`` bounds
-    the condition number of C by ``m trace``. It is computed unless the pivots rule out a large bound.
+    the condition number of C by ``m trace``. The trace is computed only if the pivots do not exclude a large bound.
     """
     m, t = to_target.shape
-    # by columns, so that a step adds up planes that lie in a row in memory; two rows more: L^-1 c and L^-1 1
+    # by columns, so that a step adds contiguous planes of memory; the two additional rows are L^-1 c and L^-1 1
     factor, weight, inverse_pivot = np.empty((m, m + 2, t)), np.empty((m, t)), np.empty((m, t))
     # a slice of ``gamma`` is one column of the lower triangle, in the order of _between
     end = 0
@@ -557,7 +557,7 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
         for j in reversed(range(m)):
             weight[j] = known[j] - np.einsum("it,it->t", factor[j, j + 1 : m], weight[j + 1 :])
             weight[j] *= inverse_pivot[j]
-        # they add up to 1 by construction: this removes rounding errors only
+        # weights sum to 1 by construction: remove rounding errors
         weight /= weight.sum(axis=0)
         sound = m * (inverse_pivot**2).sum(axis=0) < PLAINLY_SOUND
         if len(unclear := np.flatnonzero(~sound)):
@@ -604,9 +604,9 @@ def _apply(rule: Weights, values: FloatArray) -> FloatArray:
 
     used = rule.index >= 0
     start = np.concatenate([[0], np.cumsum(used.sum(axis=1))])
-    # sparse: each target uses some 20 of thousands of samples
+    # sparse, because each target uses about 20 of thousands of samples
     matrix = csr_array((rule.weight[used], rule.index[used], start), shape=(len(used), len(values)))
-    # relative to one value of the field: a constant field comes back exactly although weights sum to 1 +- 1e-16
+    # relative to one value of the field, so that a constant field is exact although weights sum to 1 within 1e-16
     reference = _reference(values)
     estimate = reference + matrix @ (values - reference)
     target, column = np.nonzero(rule.weight == 1.0)
@@ -617,7 +617,7 @@ def _apply(rule: Weights, values: FloatArray) -> FloatArray:
 
 
 def _reference(values: FloatArray) -> FloatArray:
-    """Return the first finite value of each field (fields,). 0 for a field without finite values."""
+    """Return the first finite value of each field (fields,), 0 for a field without finite values."""
     finite = np.isfinite(values)
     if not len(values):
         return np.zeros(values.shape[1])
@@ -626,7 +626,7 @@ def _reference(values: FloatArray) -> FloatArray:
 
 
 def coverage_patterns(values: FloatArray) -> Iterator[tuple[BoolArray, IntArray]]:
-    """Fields grouped by where they have values: (kept places, field numbers)."""
+    """Yield groups of fields with values at the same positions: mask of the positions, numbers of the fields."""
     patterns: dict[bytes, list[int]] = {}
     for number, covered in enumerate(np.isfinite(values.T) if values.size else ()):
         patterns.setdefault(covered.tobytes(), []).append(number)  # np.unique along an axis takes ten times as long
@@ -635,16 +635,16 @@ def coverage_patterns(values: FloatArray) -> Iterator[tuple[BoolArray, IntArray]
 
 
 def _merge_places(points: FloatArray, fields: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Distinct places in order of appearance, mean of their values, and the place of each sample."""
+    """Return distinct positions in order of appearance, the mean of their values, and the position of each sample."""
     _, first, place = np.unique(np.round(points / TIE_M), axis=0, return_index=True, return_inverse=True)
-    # np.unique sorts by coordinate; keep the positions in the order of their samples
+    # restore the order of the samples, because np.unique sorts by coordinate
     order = np.argsort(first)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     place = rank[place.ravel()]
     if len(first) == len(points):
         return points, fields, place
-    # sums relative to one sample of the place, so that equal values stay exactly equal
+    # sums relative to one sample of the position, so that equal values have exactly the same mean
     base = fields[first[order]]
     base = np.where(np.isfinite(base), base, 0.0)
     finite = np.isfinite(fields)
@@ -656,18 +656,18 @@ def _merge_places(points: FloatArray, fields: FloatArray) -> tuple[FloatArray, F
 
 
 def _same_geometry(offset_m: FloatArray) -> tuple[IntArray | slice, IntArray | slice]:
-    """Targets whose neighbours lie at the same offsets (dims, m, t): (one of each group, group of each target)."""
+    """Return one target of each group with equal offsets (dims, m, t) of neighbours, and the group of each target."""
     t = offset_m.shape[2]
     alone = slice(None), slice(None)
     if len(np.unique(np.round(offset_m[:, 0].sum(axis=0) / TIE_M))) == t:
-        return alone  # scattered samples: detected at a tenth of the cost
+        return alone  # scattered samples, which this test detects in a tenth of the time
     # integers compare exactly, and a nanometre covers the rounding of coordinates of kilometres
     offset = np.round(offset_m.reshape(-1, t) / _SHARE_M).astype(np.int64)
-    # one number identifies a target: the sum with random odd factors, modulo 2^64
+    # the sum of the offsets with random odd factors, modulo 2^64, identifies a target
     factors = np.random.default_rng(0).integers(1, 2**62, len(offset), dtype=np.int64) | 1
     _, example, group = np.unique(factors @ offset, return_index=True, return_inverse=True)
     if not (offset[:, example[group]] == offset).all():
-        return alone  # two targets with the same number: nothing is shared, and the result is the same
+        return alone  # two different targets have one number: share nothing, which does not change the result
     return example, group
 
 
@@ -687,7 +687,7 @@ _FEWEST_FOR_TREND = 3
 @from_python
 @dataclass(eq=False)
 class TrendKriging:
-    """Universal Kriging whose trend is a known field, such as a replayed level or rank (external drift).
+    """Universal Kriging with a known field as trend, such as a replayed level or rank (external drift).
 
     Source: Wackernagel, Multivariate Geostatistics (2003), doi:10.1007/978-3-662-05294-5, chapter 37.
 
@@ -696,15 +696,15 @@ class TrendKriging:
     correlation : callable
         Phi(distance [m]) of the residual.
     neighbours, radius_m : int, float
-        The same as in :class:`OrdinaryKriging`; with fewer than three samples in the radius the nearest are used.
+        The same as in :class:`OrdinaryKriging`. With fewer than three samples in the radius the nearest are used.
     bounds : (low, high), optional
         Limits of the estimates, such as (1, 4) for ranks.
 
     Notes
     -----
-    The estimate is ``w . z`` with the weights of the system of :class:`OrdinaryKriging` and one more condition: the
-    trend f must be reproduced, ``w . f = f_0``. The condition is omitted if the trend is nearly constant among the
-    neighbours, or if fewer than three are known.
+    The estimate is ``w . z``. The weights solve the system of :class:`OrdinaryKriging` with one more condition: they
+    reproduce the trend f, ``w . f = f_0``. The condition is omitted if the trend is nearly constant among the
+    neighbours, or if there are fewer than three neighbours.
 
     Examples
     --------
@@ -763,7 +763,7 @@ class TrendKriging:
         points, f = self.points_m_[used], self.trend_[used]
         conditions, aim = [np.ones(len(used))], [1.0]
         if len(used) >= _FEWEST_FOR_TREND and np.ptp(f) > 1e-6 * max(float(np.abs(f).max()), 1.0):
-            # scale the conditions equally: a trend in dBm next to a one makes the system ill-conditioned
+            # scale the conditions equally, because a trend of -100 dBm next to ones makes the system ill-conditioned
             scale = float(np.ptp(f))
             conditions, aim = [*conditions, (f - f.mean()) / scale], [*aim, (trend - float(f.mean())) / scale]
         n, extra = len(used), len(conditions)

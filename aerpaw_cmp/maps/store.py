@@ -1,20 +1,18 @@
-"""Tiles of a map: a file for each finished tile, and a Zarr store that is written from the files at the end.
+"""Tiles of a map: what can reach each tile, a file for each finished tile, and a Zarr store of all tiles.
 
-A killed run loses the tiles that were being computed; the same command computes only these. A tile file has no format
-that could run code: its SHA-256, the number of paths, and the planes of :data:`PLANES` as 32-bit floats. A file with
-another length or digest is computed again.
+A killed run loses only the tiles that were being computed; the same command computes them and continues. A tile file
+contains its SHA-256, the number of paths, and the planes of :data:`PLANES` as 32-bit floats, and nothing that could run
+code. A tile whose file has a different length or digest is computed again.
 
-The module also determines what can reach each tile, and joins the values of tiles.
-
-A tile is evaluated with the towers and buildings that can reach it. No relevant building is omitted if at most one
-reflection is followed over level ground: seen from above, a path then lies on the line between its ends, or on the two
-lines from a tower to a wall and on to the tile. A building therefore counts if it comes near
+A tile is evaluated with the towers and buildings that can reach it. With at most one reflection over level ground, a
+path seen from above is the line between its ends, or two lines from a tower to a wall and on to the tile. No relevant
+building is therefore omitted if a building counts that comes near
 
 - the convex hull of tower and tile (which also contains the reflections off ground and roofs), or
-- the hull of tower and wall, or of wall and the part of the tile in its beam. This holds for each wall whose beam from
-  the mirrored tower may meet the tile.
+- the hull of tower and wall, or the hull of wall and the part of the tile in its beam, for each wall whose beam from
+  the mirrored tower may reach the tile.
 
-With more reflections, terrain or a scene of triangles every building is included.
+With more reflections, terrain or a scene of triangles, every building counts.
 """
 
 from __future__ import annotations
@@ -44,10 +42,10 @@ from ..site.site import Site, Tower
 from .export import maps_dataset
 from .grid import Grid, MapResult, serving_tower, voronoi_borders
 
-# A building this close to a hull counts [m]: far above the rounding of any plane.
+# A building within this distance of a hull counts [m]. It is far above rounding errors.
 NEAR_M = 0.01
 
-# How far several paths may lift a level over that of free space [dB]: ten as strong as the direct one, in phase.
+# Largest level above free space [dB], that of ten paths in phase, each as strong as the direct one.
 _IN_PHASE_DB = 20.0
 
 # Fields of a :class:`~aerpaw_cmp.maps.grid.MapResult` with a value per position.
@@ -63,7 +61,7 @@ class Tiling:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """The rows and columns of tiles."""
+        """The numbers of rows and columns of tiles."""
         rows, columns = self.grid.shape
         return -(-rows // self.cells), -(-columns // self.cells)
 
@@ -71,7 +69,7 @@ class Tiling:
         return self.shape[0] * self.shape[1]
 
     def part(self, number: int) -> tuple[slice, slice]:
-        """Rows and columns of the grid that are one tile."""
+        """Return the rows and columns of the grid that are one tile."""
         row, column = divmod(number, self.shape[1])
         rows, columns = self.grid.shape
         return (
@@ -80,12 +78,12 @@ class Tiling:
         )
 
     def grid_of(self, number: int) -> Grid:
-        """Positions of one tile."""
+        """Return the positions of one tile."""
         rows, columns = self.part(number)
         return Grid(self.grid.east_m[columns], self.grid.north_m[rows], self.grid.spacing_m)
 
     def joined(self, parts: Mapping[int, MapResult]) -> MapResult:
-        """The map of the whole grid from those of all tiles."""
+        """Return the map of the complete grid from the maps of all tiles."""
         first = next(iter(parts.values()))
         values = {}
         for name in PLANES:
@@ -99,7 +97,7 @@ class Tiling:
 
 
 def over_grid(like: MapResult, grid: Grid, values: Mapping[str, Any]) -> MapResult:
-    """A map over another grid, with its values of :data:`PLANES`, serving towers and their borders."""
+    """Return a map over another grid, with its values of :data:`PLANES`, serving towers and their borders."""
     return replace(
         like,
         grid=grid,
@@ -111,7 +109,7 @@ def over_grid(like: MapResult, grid: Grid, values: Mapping[str, Any]) -> MapResu
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Budget:
-    """Limits of what a tower reaches.
+    """The link budget that limits the range of a tower.
 
     Parameters
     ----------
@@ -129,20 +127,20 @@ class Budget:
 
     @property
     def range_m(self) -> float:
-        """Distance beyond which no sum of paths reaches the floor: free space and :data:`_IN_PHASE_DB`."""
+        """The distance beyond which free space plus :data:`_IN_PHASE_DB` is below the floor [m]."""
         spare_db = self.transmit_power_dbm + self.gain_db + _IN_PHASE_DB - self.floor_dbm
         return float(wavelength_m(self.carrier_hz) / (4 * np.pi) * 10 ** (spare_db / 20))
 
 
 class Reach:
-    """Index over the towers and buildings of a site: those that can reach a tile.
+    """An index of the towers and buildings of a site that can reach a tile.
 
     Parameters
     ----------
     site : Site
     budget : Budget
     max_depth : int
-        Reflections that are followed.
+        Largest number of reflections.
     """
 
     def __init__(self, site: Site, budget: Budget, *, max_depth: int) -> None:
@@ -152,19 +150,19 @@ class Reach:
         places = [tower.position_m[:2] for tower in site.towers.values()]
         spans = (site.area_m, np.ravel(places), shapely.bounds(footprints).ravel())
         farthest = np.nanmax(np.abs(np.concatenate(spans)))
-        # corners (2, 3) of a box round everything, however the site is turned: it sets the tolerances of all tiles
+        # corners (2, 3) of a box around the site in any rotation, which sets equal tolerances for all tiles
         self.extent_m = np.sqrt(2.0) * farthest * np.array([[-1.0] * 3, [1.0] * 3])
         if self._every:
             return
         faces = self._faces = site_faces(site)
         bounds = shapely.bounds(footprints) + NEAR_M * np.array([-1.0, -1.0, 1.0, 1.0])
         self._near = shapely.STRtree(shapely.box(*bounds.T))
-        self._ends = corners(faces, 1e9)[:, :2, :2]  # along the foot of a wall
+        self._ends = corners(faces, 1e9)[:, :2, :2]  # ends of the lower edge of a wall
         self._is_wall = (faces.solid >= 0) & (faces.normal[:, 2] == 0.0)
         self._mirrors = Mirrors(faces, self.extent_m)
 
     def of(self, box_m: FloatArray) -> Site:
-        """The site as it reaches a box (lowest and highest corner, 3)."""
+        """Return the site with the towers and buildings that reach a box (lowest and highest corner, 3)."""
         every, reach = self.site.towers.items(), self._range_m
         towers = {name: tower for name, tower in every if np.linalg.norm(_apart(tower, box_m)) <= reach}
         if not any(_apart(tower, box_m).max() <= REACH_M for tower in towers.values()):
@@ -178,12 +176,12 @@ class Reach:
         return replace(self.site, towers=towers, buildings=buildings)
 
     def _buildings_in_reach(self, tower: Tower, box_m: FloatArray) -> BoolArray:
-        """Buildings (buildings,) that can mirror or shade what one tower sends into a box."""
+        """Check which buildings (buildings,) can reflect or block paths from one tower into a box."""
         at, (west, south), (east, north) = tower.position_m[:2], *box_m[:, :2]
         tile = np.array([[west, south], [east, south], [east, north], [west, north]])
         lines = [shapely.linestrings(np.vstack([at, tile])[None])]
         if self._depth:
-            # only walls: seen from above, a path over ground or roof is on the line between its ends
+            # only walls, because a path over ground or roof is on the line between its ends, seen from above
             lit = self._mirrors.toward(tower.position_m, box_m)
             lit = lit[self._is_wall[lit]]
             lines += [self._way_in(at, lit), self._way_out(at, lit, tile)]
@@ -193,12 +191,12 @@ class Reach:
         return near
 
     def _way_in(self, at: FloatArray, walls: IntArray) -> AnyArray:
-        """Shapes that hold all ways from a tower to each wall."""
+        """Return shapes that contain all lines from a tower to each wall."""
         ends = self._ends[walls]
         return np.asarray(shapely.linestrings(np.insert(ends, 2, at, axis=1)))
 
     def _way_out(self, at: FloatArray, walls: IntArray, tile: FloatArray) -> AnyArray:
-        """Shapes that hold all ways from each wall, as a mirror of a tower, to the corners (4, 2) of a tile."""
+        """Return shapes that contain all lines from each wall, as a mirror of a tower, to the corners of a tile."""
         ends, normal = self._ends[walls], self._faces.normal[walls, :2]
         along = ends[:, 1] - ends[:, 0]
         length = np.linalg.norm(along, axis=1)
@@ -206,7 +204,7 @@ class Reach:
         image = at - 2.0 * height[:, None] * normal
         slack = along * (NEAR_M / length)[:, None]
         ray = np.stack([ends[:, 0] - slack, ends[:, 1] + slack], axis=1) - image[:, None]
-        # far behind the tile's farthest corner: the beam's far end must not cut into it
+        # far behind the farthest corner of the tile, so that the end of the beam does not cut the tile
         far = 100.0 * np.abs(image[:, None] - tile).sum(axis=2).max(initial=0.0)
         reach = far / np.maximum(np.linalg.norm(ray, axis=2, keepdims=True), NEAR_M)
         beam = shapely.polygons(np.concatenate([image[:, None] + ray, (image[:, None] + ray * reach)[:, ::-1]], axis=1))
@@ -217,12 +215,12 @@ class Reach:
 
 
 def _apart(tower: Tower, box_m: FloatArray) -> FloatArray:
-    """Distances (2,) from a tower to the nearest point of a box, east and north."""
+    """Return the distances (2,) from a tower to the nearest point of a box, east and north."""
     at = tower.position_m[:2]
     return np.maximum(np.maximum(box_m[0, :2] - at, at - box_m[1, :2]), 0.0)
 
 
-# Names of tile files, also those of other runs: a finished run removes them.
+# Names of tile files of this and of other runs, which a finished run removes.
 _TILE_FILE = re.compile(r"tile-[0-9a-f]{16}-\d+|\.tile-[0-9a-f]{16}-\d+\.\w+\.part")
 
 
@@ -232,12 +230,12 @@ class TileStore:
     Parameters
     ----------
     folder : Path
-        Created with the first tile. Files of others in it are neither read nor removed.
+        Created with the first tile. Files that are not tiles are neither read nor removed.
     tiling : Tiling
     job : mapping
         All inputs of the values, as JSON values. Tiles of a different job are not used.
     empty : mapping of str to MapResult
-        Maps of any tile, by foliage mode: their form.
+        Maps by foliage mode, from which the shapes of all tiles are taken.
 
     Attributes
     ----------
@@ -275,14 +273,14 @@ class TileStore:
         ----------
         number : int
         maps : mapping of str to MapResult
-            By foliage mode.
+            Maps by foliage mode.
         paths : int
             Number of paths to all positions of the tile.
 
         Raises
         ------
         OutputError
-            The disk does not take the file.
+            If the file cannot be written.
         """
         planes = (getattr(maps[mode], name).astype("<f4").tobytes() for mode in self._empty for name in PLANES)
         content = paths.to_bytes(8, "little") + b"".join(planes)
@@ -291,7 +289,13 @@ class TileStore:
             write_whole(self._file(number), hashlib.sha256(content).digest() + content)
 
     def read(self, number: int) -> tuple[dict[str, MapResult], int]:
-        """Return the maps of one tile by foliage mode, and its number of paths; InputError if its file is damaged."""
+        """Return the maps of one tile by foliage mode, and its number of paths.
+
+        Raises
+        ------
+        InputError
+            If the file of the tile is missing or damaged.
+        """
         with explained_os_errors(self.folder):
             content = self._content(number)
         if content is None:
@@ -315,7 +319,7 @@ class TileStore:
         return maps, int.from_bytes(content[:8], "little")
 
     def every_nth(self, step: int) -> tuple[dict[str, MapResult], int]:
-        """Return maps of every ``step``-th position along either axis, by foliage mode, and all tiles' paths."""
+        """Return maps of every ``step``-th position along either axis, by foliage mode, and the paths of all tiles."""
         full, paths = self.tiling.grid, 0
         grid = Grid(full.east_m[::step], full.north_m[::step], full.spacing_m * step)
         rasters = {
@@ -346,7 +350,7 @@ class TileStore:
         Parameters
         ----------
         path : Path
-            New file. It must not exist.
+            New file, which must not exist.
         frame : SiteFrame
         about : mapping of str to str
             Attributes of the store.
@@ -384,7 +388,7 @@ class TileStore:
 
     def remove(self) -> None:
         """Remove all tile files, those of killed runs with other settings too, and the folder if it is then empty."""
-        with suppress(OSError):  # the results are complete; the next run tries again
+        with suppress(OSError):  # the results are complete, and the next run removes the files
             for place in self.folder.iterdir():
                 if _TILE_FILE.fullmatch(place.name):
                     place.unlink()

@@ -1,22 +1,20 @@
-"""Similarity of the channel at two positions: correlation against distance.
+"""Correlation of the channel at two positions against their distance, and the paper's curve that is fitted to it.
 
-Three correlations, all averaged over pairs of positions in bins of distance:
+Three correlations are averaged over pairs of positions in bins of distance:
 
-- :func:`vector_correlation`: the paper's (arXiv 2502.10324, section VI-A). Each position carries the vector of its
-  ranks over all altitudes and K; Pearson correlation of two vectors. It mixes horizontal and vertical.
-- :func:`field_correlation`: horizontal only. Each field (one altitude, one K) is standardised over the positions,
-  and the mean product of two positions is taken.
-- :func:`vertical_correlation`: vertical only. Pearson correlation over the positions of two altitudes' maps.
+- :func:`vector_correlation` is that of the paper (arXiv 2502.10324, section VI-A): the Pearson correlation of the
+  vectors of two positions, which contain the ranks of all altitudes and K. It mixes horizontal and vertical changes.
+- :func:`field_correlation` is horizontal: each field (one altitude, one K) is standardised over the positions, and the
+  values of two positions are multiplied.
+- :func:`vertical_correlation` is the Pearson correlation of the maps of two altitudes over the positions.
 
-All three can be used for RSS and rank. NaN is out of coverage; whether a rank of 0 is a number or NaN is the caller's
-choice.
-
-The fitted curve, :func:`fit_biexponential`, is in :mod:`~aerpaw_cmp.maps.variogram`.
+All three can be used for RSS and rank. NaN is out of coverage. The caller decides whether a rank of 0 is a number or
+NaN.
 
 Bins follow the paper. Bin ``n`` contains the pairs whose distance is nearest to ``n`` times the width; half-way values
 go up. Bin 0 contains each position with itself, where the correlation is 1 by definition.
 
-The paper's correlation curve (arXiv 2502.10324, section VI-A) and its fit by variable projection.
+:func:`fit_biexponential` fits the paper's curve by variable projection.
 """
 
 from __future__ import annotations
@@ -46,12 +44,12 @@ class BiExponential:
     c1, c2, c3, c4 : float
         Amplitudes c1, c3 and rates c2 <= c4 <= 0 [1/m].
     rmse : float
-        Root of the mean squared residual of the fit.
+        Root mean square residual of the fit.
     degenerate : bool
-        True when the data do not hold two exponentials; the curve is still the best found, the four numbers are
-        then no property of the data.
+        True if the data do not determine two exponentials. The curve is still the best one, but its coefficients are
+        not reliable.
     message : str
-        Why, as a sentence; empty when not degenerate.
+        The reasons if ``degenerate``, otherwise empty.
 
     Examples
     --------
@@ -69,13 +67,13 @@ class BiExponential:
     message: str = ""
 
     def __call__(self, distance_m: ArrayLike) -> FloatArray:
-        """Correlation at distances [m]."""
+        """Return the correlation at distances [m]."""
         d = unmasked(distance_m)
         return np.asarray(self.c1 * np.exp(self.c2 * d) + self.c3 * np.exp(self.c4 * d))
 
     @property
     def nugget(self) -> float:
-        """1 - Phi(0+)."""
+        """The nugget, 1 - Phi(0+)."""
         return 1.0 - self.c1 - self.c3
 
 
@@ -83,29 +81,28 @@ class BiExponential:
 PAPER_BIEXPONENTIAL = BiExponential(0.2932, -0.0508, 0.7057, -0.001, 0.0153)
 
 
-# Trust-region searches of a fit.
+# Number of starting points of the search.
 STARTS = 6
 
 
 def fit_biexponential(distance_m: ArrayLike, correlation: ArrayLike) -> BiExponential:
-    """Least-squares bi-exponential by variable projection, with c1 and c3 of at least 0 and c1 + c3 of at most 1.
+    """Fit a bi-exponential by least squares, with c1 and c3 of at least 0 and c1 + c3 of at most 1.
 
     Source: arXiv 2502.10324 eq. 14.
 
-    For given rates the best amplitudes are a bounded linear problem of two unknowns with a closed form. Only the
-    logarithms of the two rates are searched: a grid over the bounds, then a trust-region search from its :data:`STARTS`
-    best cells.
+    For given rates the best amplitudes have a closed form (variable projection). Only the logarithms of the two rates
+    are searched: on a grid, then by a trust-region search from its :data:`STARTS` best cells.
 
     Parameters
     ----------
     distance_m, correlation : (n,)
-        The points. NaN pairs are ignored.
+        The points of the curve. NaN values are ignored.
 
     Returns
     -------
     BiExponential
-        ``degenerate`` is True if one exponential fits as well, an amplitude vanishes, the rates coincide, or one of
-        them lies at a bound.
+        ``degenerate`` is True if one exponential fits as well, an amplitude is 0, the rates are equal, or a rate is at
+        a bound.
 
     Raises
     ------
@@ -114,8 +111,8 @@ def fit_biexponential(distance_m: ArrayLike, correlation: ArrayLike) -> BiExpone
 
     Notes
     -----
-    Amplitudes of at least 0 keep the curve a valid covariance in any dimension. A correlation is at most 1: without
-    this limit, an exponential with a fast rate could exceed 1 between distance 0 and the first point.
+    With amplitudes of at least 0 the curve is a valid covariance in any dimension. Without the upper limit, an
+    exponential with a fast rate could exceed a correlation of 1 between distance 0 and the first point.
 
     References
     ----------
@@ -139,7 +136,7 @@ class _Projection:
 
     @classmethod
     def of(cls, distance_m: ArrayLike, correlation: ArrayLike) -> _Projection:
-        """The problem of one curve: pairs without a number take no part."""
+        """Return the problem of one curve, without the points that are NaN."""
         d = unmasked(distance_m).ravel()
         y = unmasked(correlation).ravel()
         if d.shape != y.shape:
@@ -150,11 +147,12 @@ class _Projection:
             raise UsageError(
                 f"{counted(len(d), 'usable point')} for a curve", expected="at least two, at different distances"
             )
-        slow, fast = 1e-6 / d.max(), 10.0 / d[d > 0].min()  # flat over the data; gone at the first bin
+        # the slowest exponential is constant over the data, and the fastest has vanished at the first bin
+        slow, fast = 1e-6 / d.max(), 10.0 / d[d > 0].min()
         return cls(d, y, (float(np.log(slow)), float(np.log(fast))))
 
     def amplitudes(self, log_rates: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Best bounded amplitudes (..., 2) and residuals (..., n) for logarithms of rates (..., 2)."""
+        """Return the best bounded amplitudes (..., 2) and the residuals (..., n) for logarithms of rates (..., 2)."""
         basis = np.exp(-np.exp(log_rates)[..., None, :] * self.d[:, None])
         candidates = _candidate_amplitudes(basis, self.y)
         residual = (basis[..., None, :, :] @ candidates[..., :, :, None])[..., 0] - self.y
@@ -164,18 +162,18 @@ class _Projection:
 
     def double(self) -> FloatArray:
         """Return logarithms of the two best rates, the faster first."""
-        # on the paper's bins neighbouring rates differ by a factor of 1.5
+        # with the bins of the paper, neighbouring rates differ by a factor of 1.5
         axis = np.linspace(*self.log_rates, 48)
         first, second = np.triu_indices(len(axis), 1)
         grid = np.column_stack([axis[second], axis[first]])
         cost = (self.amplitudes(grid)[1] ** 2).sum(axis=1)
-        # fit roughly from each start, and exactly from the best start only
+        # search roughly from each start, and exactly only from the best result
         refined = np.stack([self._search(grid[cell], 1e-5) for cell in np.argsort(cost)[:STARTS]])
         valley = refined[np.argmin((self.amplitudes(refined)[1] ** 2).sum(axis=1))]
         return np.sort(self._search(valley, 1e-15))[::-1]
 
     def _search(self, start: FloatArray, tolerance: float) -> FloatArray:
-        """Return the bottom of the valley that a start lies in."""
+        """Return the local minimum that is reached from a start."""
         from scipy.optimize import least_squares
 
         fit = least_squares(
@@ -190,14 +188,14 @@ class _Projection:
         return np.asarray(fit.x)
 
     def _slopes(self, log_rates: FloatArray) -> FloatArray:
-        """Central differences (n, 2) of the residuals over the logarithms of the rates, all at once."""
-        # about the cube root of float64's precision: the step of least error of a central difference
+        """Return central differences (n, 2) of the residuals over the logarithms of the rates."""
+        # the cube root of the precision of float64 is the step with the smallest error
         steps = 1e-5 * np.eye(2)
         ahead, behind = self.amplitudes(log_rates + np.stack([steps, -steps]))[1]
         return np.asarray((ahead - behind).T / 2e-5)
 
     def single(self) -> float:
-        """Logarithm of the rate of the best single exponential: the best of 200, refined between its neighbours."""
+        """Return the logarithm of the rate of the best single exponential: the best of 200, refined."""
         from scipy.optimize import minimize_scalar
 
         axis = np.linspace(*self.log_rates, 200)
@@ -216,8 +214,8 @@ class _Projection:
         return float(((curve - self.y) ** 2).sum())
 
     def result(self, log_rate: float, message: str) -> BiExponential:
-        """One exponential as a degenerate pair: c1 = 0."""
-        # with c1 = 0 any c2 gives the same curve; this one keeps c2 <= c4
+        """Return a single exponential as a degenerate pair with c1 = 0."""
+        # with c1 = 0 any c2 yields the same curve; this one satisfies c2 <= c4
         rate = -float(np.exp(log_rate))
         rmse = float(np.sqrt(self._single_cost(log_rate) / len(self.d)))
         return BiExponential(
@@ -225,23 +223,23 @@ class _Projection:
         )
 
     def judge(self, log_rates: FloatArray) -> BiExponential:
-        """The fit with a verdict on whether two exponentials are in the data."""
+        """Return the fitted curve, and whether the data determine its two exponentials."""
         amplitude, residual = self.amplitudes(log_rates)
         cost, n = float((residual**2).sum()), len(self.d)
         single = self.single()
         cost_single = self._single_cost(single)
         c1, c3 = (float(a) for a in amplitude)
         c2, c4 = (-float(rate) for rate in np.exp(log_rates))
-        # if both curves meet every point the ratio must be 1, not 0 / 0
+        # if both curves are exact, the ratio must be 1 and not 0 / 0
         scale = 1e-20 * float((self.y**2).sum())
-        # Bayesian information criterion: two more coefficients must improve the fit enough
+        # Bayesian information criterion with a penalty for two more coefficients
         gain = n * np.log((cost_single + scale) / (cost + scale)) - 2 * np.log(n)
         reasons = []
         if gain <= 0:
             reasons.append("one exponential fits as well")
         if min(abs(c1), abs(c3)) < 1e-3 * max(abs(c1), abs(c3), 1e-300):
             reasons.append("one of the two exponentials has no amplitude")
-        # rates within 5 %: one exponential in two parts
+        # rates within 5 % are one exponential in two parts
         if log_rates[0] - log_rates[1] < 0.05:
             reasons.append("both exponentials decay at the same rate")
         if log_rates[0] > self.log_rates[1] - 1e-3:
@@ -255,10 +253,10 @@ class _Projection:
 
 
 def _candidate_amplitudes(basis: FloatArray, target: FloatArray) -> FloatArray:
-    """Best points (..., 4, 2) of a two-column least-squares problem inside its bounds and on each edge.
+    """Return the best points (..., 4, 2) of a two-column least-squares problem inside its bounds and on each edge.
 
-    The bounds are ``c1, c3 >= 0`` and ``c1 + c3 <= 1``; the least cost among the candidates is the bounded optimum,
-    because a convex cost has it inside or on an edge.
+    The bounds are ``c1, c3 >= 0`` and ``c1 + c3 <= 1``. The cost is convex, so the best of these candidates is the
+    bounded optimum.
     """
     gram = np.swapaxes(basis, -1, -2) @ basis
     right = (np.swapaxes(basis, -1, -2) @ target[:, None])[..., 0]
@@ -277,20 +275,20 @@ def _candidate_amplitudes(basis: FloatArray, target: FloatArray) -> FloatArray:
 
 
 def _clipped(right: FloatArray, square: FloatArray) -> FloatArray:
-    """Minimum over [0, 1] of square * x^2 - 2 * right * x."""
+    """Return the x in [0, 1] with the smallest square * x^2 - 2 * right * x."""
     return np.asarray(np.clip(right / np.maximum(square, TINY), 0.0, 1.0))
 
 
-# Positions per block of the pair products; bounds the memory to BLOCK x positions.
+# Positions per block of pairs. The memory is BLOCK times the number of positions.
 BLOCK = 256
 
-# Bins as wide as d_rx (section VI-A), and distances up to 500 m (section VII-C).
+# Bins are as wide as d_rx (section VI-A), and distances reach 500 m (section VII-C).
 _PAPER_WIDTH_M = 30.0
 _PAPER_MAXIMUM_M = 500.0
 # The paper's step between altitudes.
 _HEIGHT_BIN_M = 10.0
-# Fewest components that a pair of positions must share if some are missing. Two components always correlate by plus or
-# minus 1.
+# Smallest number of components that both positions of a pair must have. With two, the correlation would always be +1
+# or -1.
 _MINIMUM_COMMON = 3
 
 
@@ -303,17 +301,17 @@ class BinnedCorrelation:
     Parameters
     ----------
     distance_m : (bins,)
-        Nominal distance of each bin: whole multiples of the width.
+        Nominal distance of each bin, a multiple of the width.
     mean_distance_m : (bins,)
-        Mean distance of its pairs.
+        Mean distance of the pairs of each bin.
     correlation : (bins,)
         Mean over the pairs. NaN in a bin without pairs.
     pairs : (bins,) int
-        Number of pairs. A position with itself counts once.
+        Number of pairs, including each position with itself.
     positions : int
         Number of positions used.
     excluded_constant : int
-        Positions (or fields) excluded because all their values are equal: their correlation is undefined.
+        Number of positions or fields without variation, which have no correlation.
     """
 
     distance_m: FloatArray
@@ -331,7 +329,7 @@ def vector_correlation(
     width_m: float = _PAPER_WIDTH_M,
     maximum_m: float = _PAPER_MAXIMUM_M,
 ) -> BinnedCorrelation:
-    """Pearson correlation of the positions' vectors, binned by horizontal distance (the paper's Steps 1 to 4).
+    """Return the Pearson correlation of the vectors of two positions by distance (the paper's Steps 1 to 4).
 
     Source: arXiv 2502.10324 eq. 9; arXiv 2502.10324 eq. 10.
 
@@ -340,7 +338,7 @@ def vector_correlation(
     points_m : (n, 2+)
         East, north [m].
     vectors : (n, ...)
-        Rank or RSS over altitudes and K, flattened per position. With NaN, a pair uses the components that both have.
+        Rank or RSS over altitudes and K at each position. A pair uses the components that both positions have.
     width_m, maximum_m : float
         Bin width (the paper's d_rx) and the largest distance [m].
 
@@ -400,8 +398,8 @@ def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorre
     altitudes_m : (altitudes,)
         Heights [m].
     maps : (altitudes, n) or (altitudes, fields, n)
-        Rank or RSS at the same positions. A field is one K. The Pearson correlation of a pair of altitudes is computed
-        over the positions that both have, per field, and averaged over the fields.
+        Rank or RSS at the same positions, with a field per K. The Pearson correlation of two altitudes is computed for
+        each field over the positions with both values, and averaged over the fields.
 
     Returns
     -------
@@ -426,7 +424,7 @@ def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorre
         excluded += int((~usable).sum())
         table = _PairwisePearson(np.where(usable[:, None], rows, np.nan), 2)(np.arange(levels), np.arange(levels))
         value[:, field] = table[first, second]
-    # half-way goes up, as in every bin
+    # half-way values go up
     n = int(np.floor(gap.max(initial=0.0) / _HEIGHT_BIN_M + 0.5)) + 1
     sums = _sums(np.repeat(gap, fields), value.ravel(), _HEIGHT_BIN_M, n)
     return BinnedCorrelation(*_means(sums, _HEIGHT_BIN_M), levels, excluded)
@@ -434,30 +432,31 @@ def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorre
 
 # --- pairs ----------------------------------------------------------------------------------------------------------
 
-# Value of each pair of two sets of positions: (rows,), (columns,) -> (rows, columns); NaN where undefined.
+# Function that returns the value of each pair of two sets of positions: (rows,), (columns,) -> (rows, columns). Pairs
+# without a value are NaN.
 Block = Callable[[IntArray, IntArray], FloatArray]
 
 
 @from_python
 class Variogram:
-    """Correlation of a field against horizontal distance, binned and fitted.
+    """The correlation of a field against horizontal distance, binned and fitted.
 
     Parameters
     ----------
     width_m, maximum_m : float
-        Bins of the distance.
+        Width of the bins of distance, and largest distance [m].
 
     Attributes
     ----------
     binned_ : BinnedCorrelation
-        What :func:`field_correlation` gives for the samples.
+        Result of :func:`field_correlation` for the samples.
     model_ : BiExponential
-        The curve through it; callable on distances.
+        The fitted curve, callable on distances.
 
     Notes
     -----
     ``gamma(d) = v^2 (1 - Phi(d))`` with ``Phi(d) = c1 exp(c2 d) + c3 exp(c4 d)`` (arXiv 2502.10324, section VI).
-    :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging` takes a fitted one as its correlation.
+    :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging` accepts a fitted variogram as its correlation.
 
     Examples
     --------
@@ -477,27 +476,27 @@ class Variogram:
         Raises
         ------
         UsageError
-            Fewer than the samples or bins that a fit needs.
+            If there are fewer samples or bins than a fit requires.
         """
         self.binned_ = field_correlation(points_m, values, width_m=self.width_m, maximum_m=self.maximum_m)
         pairs = np.isfinite(self.binned_.correlation)
-        # at the mean distance of a bin's pairs: on a grid it lies up to a fifth of the width beyond the bin's middle
+        # fit at the mean distance of the pairs, which may be a fifth of the width from the middle of the bin
         self.model_ = fit_biexponential(self.binned_.mean_distance_m[pairs], self.binned_.correlation[pairs])
         return self
 
     def __call__(self, distance_m: ArrayLike) -> FloatArray:
-        """Fitted correlation at distances [m]."""
+        """Return the fitted correlation at distances [m]."""
         return self.model_(distance_m)
 
 
 class _PairwisePearson:
-    """Pearson correlation over the components that both vectors have, by matrix products of masked vectors."""
+    """The Pearson correlation over the components that both vectors have, by matrix products of masked vectors."""
 
     def __init__(self, data: FloatArray, minimum_common: int) -> None:
         self.present = np.isfinite(data).astype(np.float64)
         count = self.present.sum(axis=1, keepdims=True)
         filled = np.where(self.present > 0, data, 0.0)
-        # centred on each vector's own mean first: the sums below must not cancel
+        # subtract the mean of each vector first, so that the differences below do not lose digits
         mean = filled.sum(axis=1, keepdims=True) / np.maximum(count, 1)
         self.value = np.where(self.present > 0, data - mean, 0.0)
         self.square = self.value**2
@@ -513,10 +512,10 @@ class _PairwisePearson:
         vary_x = square_x - sum_x**2 / safe
         vary_y = square_y - sum_y**2 / safe
         covary = x @ y - sum_x * sum_y / safe
-        # a variance this small, compared with the squares that it is a difference of, is their rounding
+        # a smaller variance is the rounding error of the difference
         good = (n >= self.minimum_common) & (vary_x > 1e-12 * square_x) & (vary_y > 1e-12 * square_y)
         scale = np.sqrt(np.where(good, vary_x * vary_y, 1.0))
-        # rounding can take equal vectors above 1
+        # rounding can bring the correlation of equal vectors above 1
         return np.where(good, np.clip(covary / scale, -1.0, 1.0), np.nan)
 
 
@@ -553,17 +552,17 @@ def _means(sums: FloatArray, width_m: float) -> tuple[FloatArray, FloatArray, Fl
 def _bin_pairs(
     points: FloatArray, value_of: Block, width_m: float, maximum_m: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Bin means over all pairs i <= j up to ``maximum_m``, in blocks."""
+    """Return the means of each bin over all pairs of positions up to ``maximum_m``."""
     if not (width_m > 0 and maximum_m >= width_m and np.isfinite(maximum_m)):
         raise UsageError(f"bins of {width_m} m up to {maximum_m} m", expected="0 < width <= maximum, both finite")
     sums = np.zeros((3, int(np.floor(maximum_m / width_m + 1e-9)) + 1))
-    # half a bin beyond the centre of the last bin; the micrometre includes pairs at exactly that distance
+    # the last bin ends half a width beyond its centre; a micrometre more includes pairs at exactly this distance
     reach = min(maximum_m, width_m * (sums.shape[1] - 0.5)) + 1e-6
     for rows, columns in _blocks_within(points, reach):
         distance = np.hypot(
             points[rows, None, 0] - points[None, columns, 0], points[rows, None, 1] - points[None, columns, 1]
         )
-        # each pair once; a position with itself once
+        # count each pair once
         once = (columns[None, :] >= rows[:, None]) & (distance <= maximum_m + 1e-6)
         sums += _sums(distance[once], value_of(rows, columns)[once], width_m, sums.shape[1])
     return _means(sums, width_m)
@@ -575,14 +574,14 @@ def _blocks_within(points: FloatArray, reach_m: float) -> Iterator[tuple[IntArra
     north = points[order, 1]
     for start in range(0, len(order), BLOCK):
         rows = order[start : start + BLOCK]
-        # rows of a block are adjacent in north, so their columns are one run
+        # the rows of a block are adjacent in north, so their columns are contiguous
         low = np.searchsorted(north, points[rows, 1].min() - reach_m)
         high = np.searchsorted(north, points[rows, 1].max() + reach_m, side="right")
         yield rows, order[low:high]
 
 
 def _is_constant(data: FloatArray, present: BoolArray) -> BoolArray:
-    """Rows whose present values are all equal (to 1e-12 of their size)."""
+    """Check which rows have equal values (to 1e-12 of their size) or no value."""
     high = np.where(present, data, -np.inf).max(axis=1)
     low = np.where(present, data, np.inf).min(axis=1)
     size = np.maximum(np.abs(high), np.abs(low))

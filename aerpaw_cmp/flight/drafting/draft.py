@@ -220,7 +220,8 @@ def draft(
 
     def text_with(known: Proposal) -> str:
         logs = [line.with_receiver(known.receivers.get(number)) for number, line in enumerate(used)]
-        parts = _first_lines(name, logs, out, context)
+        # a log that is not used may have the place of a node of other logs
+        parts = _first_lines(name, [*(line for line in lines if not line.entry), *logs], out, context)
         learned_lines = _learned_lines(known, link) if "rss" in kinds else []
         rank = [RANK] if "rank" in kinds else []
         return "".join([*parts, *learned_lines, *rank, *_settings(lines, context, known)])
@@ -422,18 +423,14 @@ def _learned_lines(known: Proposal, link: str) -> list[str]:
     ]
 
 
-def _highest_m(lines: Sequence[_Line], flown: tuple[Stream, Span] | None) -> float:
-    """Return the greatest height [m] of the track, or of the logs with their own positions if there is no track."""
-    if flown is not None:
-        return _top_m(flown[0])
-    return max((_top_m(s) for line in lines for s in line.compared if _has_positions(s)), default=-np.inf)
-
-
 def _settings(lines: Sequence[_Line], context: _Context, known: Proposal) -> list[str]:
     """Return the lines for ``rt``, ``rss`` and ``rank``."""
     kinds = {stream.kind for line in lines for stream in line.compared}
     written = _replay_lines(lines, context, known)
-    flown_high = _highest_m(lines, context.flown) > _FLOWN_ABOVE_M
+    placed = [s for line in lines for s in line.compared if _has_positions(s)]
+    flown_high = (
+        max(map(_top_m, placed if context.track is None else [context.track]), default=-np.inf) > _FLOWN_ABOVE_M
+    )
     low: dict[str, Any] = {"minimum_height_m": MINIMUM_HEIGHT_M} if flown_high else {}
     for kind in sorted(kinds & {"rss", "rank"}, reverse=True):
         chosen: dict[str, Any] = dict(low)
@@ -678,8 +675,12 @@ class _Line:
 def _lines(files: Sequence[IngestedFile], context: _Context) -> list[_Line]:
     """Return a line per log: telemetry first, then in the order of the files."""
     lines: list[_Line] = []
+
+    def samples(file: IngestedFile) -> int:
+        return sum(len(s.frame) for s in file.result.streams if s.kind != "telemetry")
+
     # copies of a log: use the one on the telemetry's clock, then the one with the most samples
-    for file in sorted(files, key=lambda f: (not context.leads(f), context.is_utc(f), -_samples(f))):
+    for file in sorted(files, key=lambda f: (not context.leads(f), context.is_utc(f), -samples(f))):
         lines.append(_line(file, context, lines))
     order = {file.path: number for number, file in enumerate(files)}
     return sorted(lines, key=lambda line: (not context.leads(line.file), order[line.file.path]))
@@ -789,7 +790,11 @@ def _with_node(
     if not comment:
         return entry, _doubt(entry, levels, placer, context), ()
     places: list[Placement] = []
-    for cell, level in _levels_of_nodes(entry, levels):
+    for cell in entry.get("cells", [None]):
+        # receivers of one node are at one position, so the first level suffices
+        level = next((s for s in levels if cell is None or _cell_of(s) == cell), None)
+        if level is None:
+            continue
         nodes = _nodes([*earlier, _Line(file=file, shown="", places=tuple(places))])
         place = _placement(file, level, placer, context, nodes)
         if place is None:
@@ -801,16 +806,6 @@ def _with_node(
         else:
             entry["cells"][cell] = place.node
     return entry, comment, tuple(places)
-
-
-def _levels_of_nodes(entry: Mapping[str, Any], levels: Sequence[Stream]) -> list[tuple[int | str | None, Stream]]:
-    """Return the first level of each cell of a log, or of the log if it has no cells (None).
-
-    Receivers of one node are at one position, so the first level suffices.
-    """
-    cells = entry.get("cells", [None])
-    first = {cell: next((s for s in levels if cell is None or _cell_of(s) == cell), None) for cell in cells}
-    return [(cell, level) for cell, level in first.items() if level is not None]
 
 
 def _placement(
@@ -1007,10 +1002,6 @@ def _has_level(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None)
     levels = [s for s in proper if s.kind == "rss" and not is_ratio(s)]
     spans = [span for s in levels if (span := stream_span(s))]
     return any(flown is None or meet(span, flown[1]) for span in spans)
-
-
-def _samples(file: IngestedFile) -> int:
-    return sum(len(s.frame) for s in file.result.streams if s.kind != "telemetry")
 
 
 def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:

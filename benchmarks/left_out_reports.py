@@ -3,11 +3,12 @@
 Each flight that the packaged site learned from is held out, the site is learned again from the others, the flight's log
 is drafted and reported with no line edited, and the first sentence of the page and its numbers are printed: RMSE as
 logged and over 4 s, share inside the 90 % interval, all samples with the receiver's floor, P(locked), rank.
-With ``--thirds`` the flights at LW1 are cut in three, and each third is drafted and reported alone.
+With ``--thirds`` the flights at LW1 are cut in three, and each third is drafted and reported alone. With ``--raw`` the
+flights of dataset 12 are written as AERPAW writes them: a power log per channel, and a vehicle log.
 Then, or alone with ``--joint``: the calibration of all campaigns of one airframe on held-out campaigns, flights,
 heights, sectors and headings, with and without the one flight of AADM, next to rotated copies; with the goals.
 
-    python benchmarks/left_out_reports.py FIELD [--only TEXT] [--keep FOLDER] [--thirds | --joint]
+    python benchmarks/left_out_reports.py FIELD [--only TEXT] [--keep FOLDER] [--thirds | --joint | --raw]
 """
 
 import argparse
@@ -28,6 +29,7 @@ import numpy as np
 import yaml
 from scipy.io import loadmat, savemat
 
+import aerpaw_cmp
 from aerpaw_cmp.compare.calibration import (
     SPLITS,
     Learned,
@@ -57,6 +59,7 @@ from aerpaw_cmp.jobs.calibrate import (
 )
 from aerpaw_cmp.jobs.calibrate_rank import fit_rank, samples_by_tower
 from aerpaw_cmp.jobs.calibration_files import Calibrated, site_entries
+from aerpaw_cmp.logs.writers import format_power_log, format_vehicle_out
 from aerpaw_cmp.site.learned import folder_of, remember
 
 RECIPES = Path(__file__).parents[1] / "tests" / "field" / "learned"
@@ -115,6 +118,22 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
     for name, made in site_entries(calibrated).items():
         remember(site, name, *made)
     return site
+
+
+def as_raw(log: Path, folder: Path) -> Path:
+    """Write the streams of a log into a folder as raw logs of AERPAW, and return the folder."""
+    streams = {
+        name: frame.assign(time=frame["time"].dt.tz_localize(None))
+        for name, frame in aerpaw_cmp.read(log, timezone=TIMEZONE).items()
+    }
+    for name, frame in streams.items():
+        (folder / "LW1" / name).mkdir(parents=True, exist_ok=True)
+        if name == "vehicle":
+            (folder / "vehicleOut.txt").write_bytes(format_vehicle_out(frame, TIMEZONE))
+        else:
+            content = format_power_log(frame["time"], frame["rss_db"], TIMEZONE)
+            (folder / "LW1" / name / "2024-07-15_14_47_39_power_log.txt").write_bytes(content)
+    return folder
 
 
 def reported(log: Path, site: Path, folder: Path) -> tuple[str, dict[str, Any]]:
@@ -219,10 +238,12 @@ def main() -> None:
     parser.add_argument("--only", default="", help="flight files whose path holds this")
     parser.add_argument("--keep", type=Path, help="folder that holds what was learned, for the next run")
     parser.add_argument("--thirds", action="store_true", help="of the flights at LW1, each third alone")
+    parser.add_argument("--raw", action="store_true", help="dataset 12 as raw sounder and vehicle logs")
     parser.add_argument("--joint", action="store_true", help="the joint calibration alone")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        for name in () if asked.joint else NAMES[: 2 if asked.thirds else None]:
+        names = NAMES[: 1 if asked.raw else 2 if asked.thirds else None]
+        for name in () if asked.joint else names:
             recipe, means = recipe_of_campaign(name), dict[str, list[float]]()
             content = yaml.safe_load(recipe.read_text(encoding="utf-8"))
             for flight in content.get("campaigns", {}).get(name, content)["flights"]:
@@ -234,12 +255,13 @@ def main() -> None:
                     folder.mkdir(parents=True, exist_ok=True)
                     site_without(recipe, flight, asked.field, folder)
                 log = asked.field / load_flight(recipe.parent / flight).logs[0].path
+                log = as_raw(log, folder / "raw") if asked.raw else log
                 for part in thirds(log, folder) if asked.thirds else [log]:
                     show(part, *reported(part, site, folder), means)
             if means:
                 text = ", ".join(f"{key} {sum(each) / len(each):.3f}" for key, each in means.items())
                 print(f"{name}, means over series: {text}", flush=True)
-        if not asked.thirds and not asked.only:
+        if not (asked.thirds or asked.raw or asked.only):
             joint(asked.field, Path(scratch))
 
 

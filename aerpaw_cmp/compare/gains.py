@@ -5,9 +5,9 @@ The gain over direction at both ends of a link is learned from the residuals of 
 ``residual = offset + g_uav(body) + g_tower(mast) + g_pair(body, mast) + own + noise``
 
 ``offset`` is free per flight, tower and channel. ``own`` is a nuisance of each flight and channel that is correlated
-over place, so that the shadowing of one flight is not learned as antenna. The gains are Gaussian processes over
-directions: of the tower in the body frame, of the UAV at the mast, and of both together per channel (the part that the
-gains at the two ends do not explain).
+over place, so that the shadowing of one flight is not learned as antenna. The gains are Gaussian processes. That of
+the UAV depends on the direction of the tower in the body frame, that of the tower on the direction of the UAV at the
+mast. The third depends on both directions, per channel, and contains the part that the first two do not explain.
 
 Mounts of antennas with a known pattern are azimuths of all ends, fitted on several flights at once.
 
@@ -18,9 +18,9 @@ The error model of a level with learned antennas has parts for gain, nuisance of
 
 Evidence from the levels of a flight shows whether antennas learned on other flights apply to it.
 
-The log likelihood of the levels with the learned gain is compared with that of an unknown gain under the prior of a
-calibration, and with that of the learned gain of the UAV rotated by 90, 180 and 270 deg. Offset, nuisance, noise and
-all gains that are not compared are equal in each. Names of readers, files and channels have no effect.
+The levels must be more likely with the learned gain than with an unknown gain under the prior of a calibration, and
+more likely than with the learned gain of the UAV rotated by 90, 180 and 270 deg. Offset, nuisance, noise and all gains
+that are not compared are equal in each. Names of readers, files and channels have no effect.
 """
 
 from __future__ import annotations
@@ -622,7 +622,10 @@ def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
 
 
 def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[GainModel, list[LinkSamples]]:
-    """Return the model with its bins, and means over bins of each series; raise InputError if there are none."""
+    """Return the model with its bins, and means over bins of each series.
+
+    InputError if there are none.
+    """
     binned = [s.binned(model.bin_s) for s in series]
     longer = math.ceil(sum(map(len, binned)) / MOST_ROWS)
     if longer > 1:
@@ -787,8 +790,8 @@ def student_factor(flights: int) -> float:
 
     Notes
     -----
-    The offset of a new flight has this distribution about the mean of n flights, because the variance between flights
-    is estimated from n - 1 differences and a prior that counts as two (Gelman et al., Bayesian Data Analysis, 3.3).
+    The offset of a new flight has this distribution about the mean of n flights. The variance between flights comes
+    from n - 1 differences and a prior that counts as two (Gelman et al., Bayesian Data Analysis, 3.3).
     Student's t with two degrees of freedom has no variance.
     """
     from scipy.special import ndtri, stdtrit
@@ -836,9 +839,9 @@ class Spread:
 
         Notes
         -----
-        The quantile of ``|x|`` for a sum of a normal part and of fading follows from the even terms of the Edgeworth
-        series in the excess kurtosis k and the skewness s of the sum: q = z + He3(z) k / 24 + He5(z) s^2 / 72 (Cornish
-        and Fisher, Rev. Inst. Int. Stat. 5, 1938). Without the second term, the 50 % interval contains 40 % of the
+        The quantile of ``|x|`` of a normal part plus fading follows from the even terms of the Edgeworth series, with
+        the excess kurtosis k and the skewness s of the sum: ``q = z + He3(z) k / 24 + He5(z) s^2 / 72`` (Cornish and
+        Fisher, Rev. Inst. Int. Stat. 5, 1938). Without the second term, the 50 % interval contains 40 % of the
         samples.
         """
         from scipy.special import ndtri
@@ -1088,9 +1091,9 @@ class KnownProcess:
 
         Notes
         -----
-        With ``A = K(at, G) K(G, G)^-1`` over the directions G of covariance S, the process is ``A g`` and an
-        independent rest: ``A S A'`` and ``K - A K(G, at)`` of the prior, scaled so that the diagonal is the variance of
-        the table.
+        The process is ``A g`` and an independent rest, with ``A = K(at, G) K(G, G)^-1`` over the directions G of
+        covariance S. Their covariances are ``A S A'`` and ``K - A K(G, at)`` of the prior. The rest is scaled so that
+        the diagonal is the variance of the table.
         """
         across = term_kernel(self.term, at, self.directions)
         weights = self._factor.solve(across.T).T

@@ -702,9 +702,8 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
 
     It is None if there is no such time, or more than one.
 
-    Both logs contain positions of the aircraft: the log at relative times t, the track at UTC. The search finds the
-    shift s with the smallest median of |p_log(t) - p_track(t + s)|. Its steps are a second, then 0.1 s around the best
-    shift.
+    Both logs contain positions of the aircraft, the log at relative times t and the track at UTC. The search minimises
+    the median of ``|p_log(t) - p_track(t + s)|`` over shifts s, in steps of a second, then of 0.1 s near the best one.
 
     Parameters
     ----------

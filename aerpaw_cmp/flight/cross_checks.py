@@ -374,8 +374,8 @@ def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
         )
     if near:
         return (
-            f"the lowest height above take-off is {low_m:.0f} m, about the ground of the site above the sea "
-            f"({sea_m:.0f} m): if the heights count from the sea, write 'takeoff_ground_m: {-(sea_m or 0.0):.0f}' "
+            f"the lowest height above take-off is {low_m:.0f} m, about the height of the ground above the sea "
+            f"({sea_m:.0f} m): if heights count from the sea, write 'takeoff_ground_m: {-(sea_m or 0.0):.0f}' "
             "under 'origin:' of the site file",
         )
     return ()

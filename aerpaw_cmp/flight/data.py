@@ -53,14 +53,14 @@ def idle_log_keys(log: LogSettings, file: IngestedFile) -> list[str]:
     if not kinds & {"rss", "rank"}:
         keys["it has neither levels nor ranks"] = ["node"]
     if file.result.reader != "generic_csv":
-        keys[f"the reader {file.result.reader} knows its columns"] = ["columns", "kind"]
+        keys[f"the reader {file.result.reader} finds its columns itself"] = ["columns", "kind"]
     bases = {str(stream.attributes["ri_base"]) for stream in streams if "ri_base" in stream.attributes}
     if log.ri_base is not None and log.ri_base not in bases:
         keys[f"the log counts from {' and '.join(bases)}" if bases else "it has no ranks"] = ["ri_base"]
     if log.time_origin is not None and not _starts_near(log.time_origin, file):
         keys["its times are absolute"] = ["time_origin"]
     return [
-        f"{log.path}: {', '.join(stated)} {'has' if len(stated) == 1 else 'have'} no effect: {why}"
+        f"{', '.join(stated)} {'has' if len(stated) == 1 else 'have'} no effect: {why}"
         for why, names in keys.items() if (stated := [name for name in names if _differs(log, name)])
     ]  # fmt: skip
 
@@ -157,7 +157,7 @@ class RankSeries:
     position_m: FloatArray | None
     log: IntArray
     flagged: Mapping[str, int] = field(default_factory=dict)
-    """As in :class:`RssSeries`."""
+    """Numbers of rows of the log that are excluded because of a flag, by flag."""
 
     @property
     def channel(self) -> str:
@@ -277,73 +277,56 @@ def ground_nodes(
     for name, node in settings.towers.items():
         if name in site.towers:
             raise UsageError(f"towers.{name}: site {site.name!r} has a tower of this name", expected="another name")
-        place = _node_place(name, node, folder, settings, site)
-        if place.track is not None:
-            nodes[name] = place.track
-        if warnings is not None:
-            warnings += [f"towers.{name}: {text}" for text in place.remarks]
-        east, north = site.frame.to_local(np.array([place.latitude_deg]), np.array([place.longitude_deg]))
+        if node.track is None:
+            assert node.latitude_deg is not None
+            assert node.longitude_deg is not None
+            latitude, longitude, height_m = node.latitude_deg, node.longitude_deg, node.antenna_height_m
+        else:
+            (latitude, longitude, height_m), track, remarks = _tracked_node(name, node, folder, settings, site)
+            nodes |= {} if track is None else {name: track}
+            if warnings is not None:
+                warnings += [f"towers.{name}: {text}" for text in remarks]
+        east, north = site.frame.to_local(np.array([latitude]), np.array([longitude]))
         towers[name] = Tower(
             name=name,
-            latitude_deg=place.latitude_deg,
-            longitude_deg=place.longitude_deg,
+            latitude_deg=latitude,
+            longitude_deg=longitude,
             east_m=float(east[0]),
             north_m=float(north[0]),
-            antenna_height_m=place.height_m,
+            antenna_height_m=height_m,
             source="flight.yaml" if node.track is None else node.track.path,
         )
     return dataclasses.replace(site, towers=towers), nodes
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _NodePlace:
-    """The middle of the positions of a node, and its track if it moves."""
+def _tracked_node(
+    name: str, node: GroundNode, folder: Path, settings: FlightFile, site: Site
+) -> tuple[tuple[float, float, float], Track | None, Sequence[str]]:
+    """Return the middle of the positions of a node (latitude, longitude, height), its track if it moves, and remarks.
 
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-    track: Track | None = None
-    remarks: tuple[str, ...] = ()
-
-
-def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile, site: Site) -> _NodePlace:
-    """Return the position of a node, or its track if it moves."""
-    if node.track is None:
-        assert node.latitude_deg is not None
-        assert node.longitude_deg is not None
-        return _NodePlace(
-            latitude_deg=node.latitude_deg, longitude_deg=node.longitude_deg, height_m=node.antenna_height_m
-        )
+    Latitude and longitude are in degrees, the height in metres.
+    """
+    assert node.track is not None
     path, logged = folder / node.track.path, node.height == "logged"
     frame = _node_positions(name, node.track, path, settings.timezone)
-    latitude, longitude = (frame[key].to_numpy(np.float64) for key in ("latitude_deg", "longitude_deg"))
+    places = frame[["latitude_deg", "longitude_deg"]].to_numpy(np.float64)
     # use the median, because a single position without a fix must not move the node
-    middle = float(np.median(latitude)), float(np.median(longitude))
-    east, north = site.frame.to_local(latitude, longitude)
-    centre = site.frame.to_local(np.array([middle[0]]), np.array([middle[1]]))
-    reach_m = float(np.hypot(east - centre[0], north - centre[1]).max())
+    middle = np.median(places, axis=0)
+    east, north = site.frame.to_local(*np.vstack([middle, places]).T)
+    reach_m = float(np.hypot(east - east[0], north - north[0]).max())
     # GNSS heights of a node on the ground are as often below the ground as above
     up = np.maximum(frame["altitude_m"].to_numpy(np.float64) + site.takeoff_ground_m, MINIMUM_HEIGHT_M)
-    height = float(np.nanmedian(up)) if logged and np.isfinite(up).any() else float("nan")
-    if logged and not np.isfinite(height):
+    if logged and not np.isfinite(up).any():
         raise InputError(
             "no heights in this log", expected=f"those of towers.{name}, which has height: logged", path=path
         )
+    height_m = float(np.nanmedian(up)) if logged else node.antenna_height_m
+    at = float(middle[0]), float(middle[1]), height_m
     # a height that is taken from the ground does not change
-    rises = float(np.nanmax(np.abs(up - height))) if logged else 0.0
-    stands = _NodePlace(
-        latitude_deg=middle[0], longitude_deg=middle[1], height_m=height if logged else node.antenna_height_m
-    )
-    if max(reach_m, rises) <= STANDS_STILL_M:
-        return stands
-    track = Track(
-        # the heights of a node on the ground are not used and may be missing
-        frame if logged else frame.assign(altitude_m=0.0),
-        site.frame,
-        maximum_gap_s=settings.rt.advanced.maximum_gap_s,
-        ground_m=site.takeoff_ground_m,
-        ground=site.ground_under_m,
-    )
+    if max(reach_m, float(np.nanmax(np.abs(up - height_m))) if logged else 0.0) <= STANDS_STILL_M:
+        return at, None, ()
+    # the heights of a node on the ground are not used and may be missing
+    track = _track_of(site, frame if logged else frame.assign(altitude_m=0.0), settings)
     if not len(track):
         raise InputError(
             f"towers.{name} moves and no position of its track has a time",
@@ -353,8 +336,13 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
         )
     remarks = [f"moves {reach_m:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
     # the attitude of a node is not used
-    remarks += dataclasses.replace(track.account, unknown_attitude=0, heading_alone=0).warnings
-    return dataclasses.replace(stands, track=track, remarks=tuple(remarks))
+    return at, track, [*remarks, *dataclasses.replace(track.account, unknown_attitude=0, heading_alone=0).warnings]
+
+
+def _track_of(site: Site, frame: pd.DataFrame, settings: FlightFile) -> Track:
+    """Return the track of telemetry rows at a site."""
+    gap_s, ground = settings.rt.advanced.maximum_gap_s, site.ground_under_m
+    return Track(frame, site.frame, maximum_gap_s=gap_s, ground_m=site.takeoff_ground_m, ground=ground)
 
 
 def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | None) -> pd.DataFrame:
@@ -484,42 +472,12 @@ def gather(
     """
     files = [at_height(log, file) for log, file in zip(settings.logs, files, strict=True)]
     data = unread(settings, folder, logs_root)
-    site, warnings = data.site, [*data.warnings]
-    telemetry, placed = list[tuple[str, Stream]](), list[tuple[str, Stream]]()
-    void: list[InputError] = []
-    rss: list[tuple[str, RssSeries]] = []
-    rank: list[tuple[str, RankSeries]] = []
-    for number, (log, file) in enumerate(zip(settings.logs, files, strict=True)):
-        warnings += [f"{log.path}: {text}" for text in file.result.warnings]
-        streams = [stream for stream in file.result.streams if stream.name not in log.skip]
-        measured = (s for s in streams if s.kind in ("rss", "rank"))
-        errors = {s.name: error for s in measured if (error := without_values(s, log.path)) is not None}
-        streams = [s for s in streams if s.kind not in ("rss", "rank") or s.name not in errors]
-        warnings += [f"{log.path}: {error.found}: it is ignored" for error in errors.values()]
-        void += errors.values()
-        telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
-        heard = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
-        for stream in (s for s in heard if log.node or not is_own_radio(s)):
-            # the sounder writes power and quality to separate files
-            elsewhere = (candidate for source in files if source is not file for candidate in source.result.streams)
-            locked, remark = lock_of(stream, [*file.result.streams, *elsewhere])
-            warnings += [f"{log.path}: {remark}"] if remark else []
-            rss.append((log.path, _rss_series(settings.link, log, stream, site, number=number, locked=locked)))
-        tower = log.node or settings.rank.tower
-        ranked = [stream for stream in streams if stream.kind == "rank"]
-        placed += [(log.path, stream) for stream in ranked if "latitude_deg" in stream.frame]
-        rank += [(log.path, _rank_series(log, stream, site, tower=tower, number=number)) for stream in ranked]
-        if unnamed := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
-            warnings.append(f"{log.path}: {counted(len(unnamed), 'cell')} ignored: not listed in 'cells'")
-        names = [s.name for s in file.result.streams]
-        keys = [*log.skip, *(key for key in log.cells if isinstance(key, str))]
-        if unknown := [name for name in keys if name not in names]:
-            warnings.append(f"{log.path}: no stream is named {', '.join(unknown)}: its streams are {', '.join(names)}")
-        warnings += idle_log_keys(log, file)
-        warnings += _of_ratios(settings.link, log, file.result.streams)
-        warnings += _of_carriers(settings.link, log, streams)
-    if void and not rss and not rank:
-        raise void[0]
+    site, found = data.site, _Found(warnings=[*data.warnings])
+    for number in range(len(files)):
+        _sort_log(found, settings, site, files, number)
+    rss, rank, warnings = found.rss, found.rank, found.warnings
+    if found.void and not rss and not rank:
+        raise found.void[0]
     warnings += idle_settings(settings, {*(["rss"] if rss else []), *(["rank"] if rank else [])})
     if settings.rank.tower not in {RankSettings().tower, *(series.tower for _, series in rank)}:
         warnings.append("rank.tower has no effect: no log has ranks without its own 'node'")
@@ -528,15 +486,16 @@ def gather(
             "link.rank: no bandwidth_hz: ranks count as in coverage down to the thermal noise of 1 Hz (-174 dBm)"
         )
     cautions = check_names(settings, site, [(series.tower, series.channel) for _, series in rss])
-    if len(telemetry) > 1:
-        warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
-    track = (
-        _track(site, *telemetry[0], warnings, maximum_gap_s=settings.rt.advanced.maximum_gap_s) if telemetry else None
-    )
-    if track is not None:
-        rss = [(path, _moving(path, series, track, warnings)) for path, series in rss]
+    track = None
+    if found.telemetry:
+        path, telemetry = found.telemetry[0]
+        if len(found.telemetry) > 1:
+            warnings.append(f"{len(found.telemetry)} telemetry logs; the track is that of {path}")
+        track = _flown_track(site, path, telemetry, settings)
+        warnings += [f"{path}: {text}" for text in track.account.warnings]
+        rss = [(place, _moving(place, series, track, warnings)) for place, series in rss]
     # without any position, the message about the overlap is better
-    if track is None and rss and any(series.position_m is not None for _, series in rank):
+    elif rss and any(series.position_m is not None for _, series in rank):
         levels = ", ".join(dict.fromkeys(f"{series.tower} {series.channel}" for _, series in rss))
         warnings.append(f"no telemetry log: the levels of {levels} have no positions and are ignored")
         rss = []
@@ -546,19 +505,64 @@ def gather(
         track=track,
         rss=_records(rss, lambda s: f"RSS of {s.tower} {s.channel}"),
         rank=_records(rank, lambda s: f"rank of {s.tower}"),
-        warnings=tuple(warnings),
     )
-    for path, stream in (*telemetry[:1], *placed):
-        check_place(site, path, stream)
+    for place, stream in (*found.telemetry[:1], *found.placed):
+        check_place(site, place, stream)
     _check_overlap(data)
-    asked = tuple(site.cautions([*(series.tower for series in data.rss), *(series.tower for series in data.rank)]))
+    asked = tuple(site.cautions([series.tower for _, series in data.series]))
     if track is not None:
-        undated = _undated(data, telemetry[0][0])
-        asked += doubts(track, telemetry[0][1], _times_on_track(data), undated, site.takeoff_ground_m)
-        asked += check_heights(site, *telemetry[0])
+        asked += doubts(track, telemetry, _times_on_track(data), _undated(data, path), site.takeoff_ground_m)
+        asked += check_heights(site, path, telemetry)
     # after the check of the overlap, so that a flight without common times has its own message
-    every = (*cautions, *_idle_attitude(data), *data.warnings, *(f"{text}." for text in asked))
+    every = (*cautions, *_idle_attitude(data), *warnings, *(f"{text}." for text in asked))
     return dataclasses.replace(data, doubts=asked, warnings=every, cautions=cautions)
+
+
+@dataclass(slots=True, kw_only=True)
+class _Found:
+    """Streams of the logs with their paths, sorted by use, and warnings.
+
+    ``placed`` are ranks with their own positions. ``void`` are the errors of series without any value.
+    """
+
+    warnings: list[str]
+    telemetry: list[tuple[str, Stream]] = field(default_factory=list)
+    placed: list[tuple[str, Stream]] = field(default_factory=list)
+    rss: list[tuple[str, RssSeries]] = field(default_factory=list)
+    rank: list[tuple[str, RankSeries]] = field(default_factory=list)
+    void: list[InputError] = field(default_factory=list)
+
+
+def _sort_log(found: _Found, settings: FlightFile, site: Site, files: Sequence[IngestedFile], number: int) -> None:
+    """Add the streams of one log, by its number, and warnings about it."""
+    log, file = settings.logs[number], files[number]
+    streams = [stream for stream in file.result.streams if stream.name not in log.skip]
+    measured = (s for s in streams if s.kind in ("rss", "rank"))
+    errors = {s.name: error for s in measured if (error := without_values(s, log.path)) is not None}
+    streams = [s for s in streams if s.kind not in ("rss", "rank") or s.name not in errors]
+    texts = [*file.result.warnings, *(f"{error.found}: it is ignored" for error in errors.values())]
+    found.void += errors.values()
+    found.telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
+    heard = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
+    for stream in (s for s in heard if log.node or not is_own_radio(s)):
+        # the sounder writes power and quality to separate files
+        elsewhere = (candidate for source in files if source is not file for candidate in source.result.streams)
+        locked, remark = lock_of(stream, [*file.result.streams, *elsewhere])
+        texts += [remark] if remark else []
+        found.rss.append((log.path, _rss_series(settings.link, log, stream, site, number=number, locked=locked)))
+    ranked = [stream for stream in streams if stream.kind == "rank"]
+    found.placed += [(log.path, stream) for stream in ranked if "latitude_deg" in stream.frame]
+    tower = log.node or settings.rank.tower
+    found.rank += [(log.path, _rank_series(log, stream, site, tower=tower, number=number)) for stream in ranked]
+    if unnamed := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
+        texts.append(f"{counted(len(unnamed), 'cell')} ignored: not listed in 'cells'")
+    names = [s.name for s in file.result.streams]
+    keys = [*log.skip, *(key for key in log.cells if isinstance(key, str))]
+    if unknown := [name for name in keys if name not in names]:
+        texts.append(f"no stream is named {', '.join(unknown)}: its streams are {', '.join(names)}")
+    texts += [*idle_log_keys(log, file), *_of_ratios(settings.link, log, file.result.streams)]
+    texts += _of_carriers(settings.link, log, streams)
+    found.warnings += [f"{log.path}: {text}" for text in texts]
 
 
 def check_names(settings: FlightFile, site: Site, series: Sequence[tuple[str, str]]) -> tuple[str, ...]:
@@ -669,7 +673,7 @@ def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]
         return []
     shown = ", ".join(map(repr, blind)) + (" is a ratio" if len(blind) == 1 else " are ratios")
     return [
-        f"{log.path}: {shown} to the noise and not a level: compared as RSS over constant noise ('bandwidth_hz' "
+        f"{shown} to the noise and not a level: compared as RSS over constant noise ('bandwidth_hz' "
         f"and 'noise_figure_db' of link.rss make an SNR absolute; 'skip: [{', '.join(blind)}]' next to the path "
         "excludes it)"
     ]
@@ -682,7 +686,7 @@ def _of_carriers(links: LinksSettings, log: LogSettings, streams: Sequence[Strea
         for s in streams if s.kind == "rss" and isinstance(s.attributes.get("frequency_hz"), float)
     ]  # fmt: skip
     return [
-        f"{log.path}: {name!r} was measured at {log_hz / 1e6:g} MHz and is replayed at carrier_hz {hz / 1e6:g} MHz"
+        f"{name!r} was measured at {log_hz / 1e6:g} MHz and is replayed at carrier_hz {hz / 1e6:g} MHz"
         for name, log_hz, hz in carriers if abs(log_hz / hz - 1.0) > _CARRIER_SHARE
     ]  # fmt: skip
 
@@ -695,10 +699,9 @@ def _channel_of(log: LogSettings, stream: Stream) -> str:
     return log.channel or stream.channel
 
 
-def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximum_gap_s: float) -> Track:
-    frame, _ = scored_rows(stream, path)
-    takeoff_m, ground = site.takeoff_ground_m, site.ground_under_m
-    track = Track(frame, site.frame, maximum_gap_s=maximum_gap_s, ground_m=takeoff_m, ground=ground)
+def _flown_track(site: Site, path: str, stream: Stream, settings: FlightFile) -> Track:
+    """Return the track of the UAV. InputError if no row has a position or a height."""
+    track = _track_of(site, scored_rows(stream, path)[0], settings)
     if not len(track) and lacks_height(stream):
         raise InputError(
             f"no altitude in {counted(len(stream.frame), 'telemetry row')}",
@@ -713,7 +716,6 @@ def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximu
             cause="a receiver without a fix, or swapped columns",
             path=path,
         )
-    warnings += [f"{path}: {text}" for text in track.account.warnings]
     return track
 
 

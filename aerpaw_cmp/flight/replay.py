@@ -342,7 +342,10 @@ def _levels_along(
 
 
 def _clock_levels(data: FlightData, series: RssSeries) -> FloatArray:
-    """Return the levels (n,) for the clock, NaN below ``rss.minimum_height_m``; those of a sounder end at its floor."""
+    """Return the levels (n,) for the clock, NaN below ``rss.minimum_height_m``.
+
+    Levels of a sounder below its lock limit are at this limit.
+    """
     levels, least = series.measured_db, data.settings.rss.minimum_height_m
     if least is not None:
         with np.errstate(invalid="ignore"):

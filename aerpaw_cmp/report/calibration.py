@@ -49,7 +49,7 @@ class AntennaMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationData(Made):
-    """The record of a calibration; ``scores`` and ``controls`` contain rows with flight, tower, channel, RMSE."""
+    """The record of a calibration. Each row of ``scores`` and ``controls`` has a flight, tower, channel and RMSE."""
 
     name: str
     flights: Sequence[str]

@@ -1,11 +1,11 @@
 """Calibrations of a site from flights, in the folder of its file: ``NAME.learned/learned.yaml`` and its tables.
 
-Each entry is a campaign: learned antennas by tower and channel, their airframe, or a rank receiver, with the band and
-the logs (SHA-256) that they were learned from, errors on held-out flights, the source of the flights and the command
-that learns them again. Every table and every entry is verified by its SHA-256 when it is read.
+Each entry is a campaign: learned antennas by tower and channel, their airframe, or a rank receiver. It has their band,
+their training logs (SHA-256), errors on held-out flights, the source of the flights and the command that learns them
+again. Every table and every entry is verified by its SHA-256 when it is read.
 
-There are tables of the gain over the full sphere with its standard deviation (also as cuts for planning tools), of the
-gain towards both ends at once, and of directions that determine a gain, with its covariance.
+There are three kinds of tables: the gain over the full sphere with its standard deviation (also as cuts for planning
+tools), the gain towards both ends at once, and the directions that determine a gain, with its covariance.
 """
 
 from __future__ import annotations
@@ -105,11 +105,11 @@ _SAME_HEIGHT_M = 5.0
 class LearnedLock(StrictModel):
     """The lock probability of a receiver: P = 1 / (1 + exp(-per_db (path gain - gain_db))) [path gain in dB].
 
-    Levels in lock have mean ``locked_db`` at ``gain_db``, increase by ``locked_per_db`` for each dB of path gain (less
-    than 1, because of weak levels only the stronger ones have lock), and have the SD ``locked_sd_db`` in a flight.
-    Levels without lock have mean ``lost_db`` and so on [unit of the measurement]. The scores are means over held-out
-    flights: Brier and log score (nat), those of a constant share, and the RMSE of all samples with levels below the
-    floor counted as the floor [dB].
+    Levels in lock have mean ``locked_db`` at ``gain_db`` and the SD ``locked_sd_db`` in a flight. They increase by
+    ``locked_per_db`` for each dB of path gain, which is less than 1, because only the stronger of weak levels have
+    lock. Levels without lock have mean ``lost_db`` and so on [unit of the measurement]. The scores are means over
+    held-out flights. They are the Brier and the log score (nat), those of a constant share, and the RMSE of all samples
+    with the floor in place of levels below it [dB].
     """
 
     gain_db: float
@@ -174,9 +174,9 @@ class LearnedAntenna(StrictModel):
 class LearnedHealth(StrictModel):
     """Errors of held-out flights of one channel, with which a later flight is compared.
 
-    ``rmse_db`` is the mean RMSE of 1-s means over flights, with its SD. Means over 4 s have a correlated part
-    (``slow_sd_db``, with its correlation time and length) and a white part (``white_sd_db``). The usual offset is that
-    of :class:`LearnedLevel`.
+    ``rmse_db`` is the mean over flights of the RMSE of 1-s means, with its SD. The error of 4-s means has two parts.
+    ``slow_sd_db`` is correlated over a time and a length, and ``white_sd_db`` is not. The usual offset is that of
+    :class:`LearnedLevel`.
     """
 
     flights: int
@@ -224,7 +224,7 @@ class LearnedSeries(StrictModel):
     """False if the gain of the UAV does not predict held-out flights of its campaign. It is then not used elsewhere."""
     lock: LearnedLock | None = None
     level: LearnedLevel | None = None
-    """Level. For receivers that lose their lock, the level in lock."""
+    """Level above free space, or the level in lock for receivers that lose it."""
     health: LearnedHealth | None = None
 
     @property
@@ -643,8 +643,8 @@ class PairGain:
 
         Notes
         -----
-        The variance is a mean of that of the record and of the sum of the variances of antennas and prior, weighted by
-        the share of the process that known directions determine.
+        The variance is a weighted mean of that of the record and of the sum of the variances of antennas and prior. The
+        weight of the record is the share of the process that known directions determine.
         """
         gain, sd = np.empty(len(directions)), np.empty(len(directions))
         white = self._factor.whiten(self.gain_db)

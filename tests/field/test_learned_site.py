@@ -12,9 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-import aerpaw_cmp
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.logs.writers import format_power_log, format_vehicle_out
 from aerpaw_cmp.site.learned import folder_of, read_learned, read_sphere_csv, read_table
 from tests.real_logs import REAL
 
@@ -77,19 +75,8 @@ def test_a_drafted_flight_opens_with_what_other_flights_taught(tmp_path: Path) -
 
 def test_an_unseen_flight_as_raw_logs_has_the_error_of_its_mat(tmp_path: Path) -> None:
     site = LEFT_OUT["site_without"](HERE / "joint.yaml", "ds12_70m_fs20MHz.yaml", REAL, tmp_path)
-    log, raw, zone = REAL / "dataset12" / "70m_fs20MHz.mat", tmp_path / "raw", "America/New_York"
-    streams = {
-        name: frame.assign(time=frame["time"].dt.tz_localize(None))
-        for name, frame in aerpaw_cmp.read(log, timezone=zone).items()
-    }
-    (raw / "LW1").mkdir(parents=True)
-    for name, frame in streams.items():
-        if name == "vehicle":
-            (raw / "vehicleOut.txt").write_bytes(format_vehicle_out(frame, zone))
-        else:
-            (raw / "LW1" / name).mkdir()
-            content = format_power_log(frame["time"], frame["rss_db"], zone)
-            (raw / "LW1" / name / "2024-07-15_14_47_39_power_log.txt").write_bytes(content)
+    log = REAL / "dataset12" / "70m_fs20MHz.mat"
+    raw = LEFT_OUT["as_raw"](log, tmp_path / "raw")
     errors = []
     for path, folder in ((log, tmp_path / "of_mat"), (raw, tmp_path / "of_raw")):
         folder.mkdir()

@@ -661,7 +661,7 @@ class _Line:
 
     @property
     def text(self) -> str:
-        """The line with its questions; empty if the log is not used."""
+        """The line with its questions, or an empty text if the log is not used."""
         return f"  - {_flow(dict(self.entry))}{self.comment}\n" if self.entry else ""
 
     def with_receiver(self, receiver: Receiver | None) -> _Line:
@@ -875,7 +875,7 @@ def _refused(
         if span is None:
             why: str | None = "no samples"
         elif stream.name in leading:
-            why = f"of the same receiver and cell as {leading[stream.name]}, which is compared"
+            why = f"it has the receiver and cell of {leading[stream.name]}, which is compared"
         else:
             why = _reason(stream, span, context, dated=dated)
         if not why and stream.kind != "telemetry":
@@ -1054,7 +1054,7 @@ def _carrier(
     levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
     evidence = [max((Placer(site, s).evidence(level) for level in levels), default=-np.inf) for s, _ in tracks]
     order = np.argsort(evidence)
-    # all must have evidence: a track without levels is no evidence against another
+    # all must have evidence, because a track without levels does not exclude another
     sure = np.isfinite(evidence).all() and evidence[order[-1]] - evidence[order[-2]] > _SURE_OF_VEHICLE
     best = tracks[order[-1]] if sure else flown
     named = " and ".join(stream.name for stream, _ in tracks)

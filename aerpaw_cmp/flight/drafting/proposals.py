@@ -61,7 +61,7 @@ from ..settings import FlightFile
 from ..track import Track
 from ..training import among, flight_logs, logs_of, marks_of, series_mark
 
-# Smallest log odds of a tower, and of a listed position. Of 20 real flights and thirds at LW1, 18 have more than -0.5
+# Smallest log odds of a tower, and of a listed position. At LW1, 18 of 20 real flights and thirds have more than -0.5
 # and all have more than -3. For six rovers, towers have -11 and less, and the listed positions have -3 and more.
 _TOWER_ODDS, _LISTED_ODDS = -0.5, -5.0
 
@@ -69,16 +69,16 @@ _TOWER_ODDS, _LISTED_ODDS = -0.5, -5.0
 # 158 of 165 positions elsewhere have less than the 5 that a tower needs.
 _TAUGHT_MORE = 5.5
 
-# Log evidence by which another tower must explain the levels better than the tower in a name.
+# Log evidence by which the levels must fit another tower better than the one that a name specifies.
 CONTRADICTED = 8.0
 
-# Fewest bins of a level that show which of two vehicles carried the radio, and the model of the level.
+# Smallest number of bins of a level by which the vehicle that carried the radio is chosen, and the model of the level.
 _FEWEST_OF_VEHICLE = 8
 _NEAR_FREE_SPACE = LevelModel(
     slope=2.0, slope_sd=0.3, elevation_sd_db=2.0, cases=(Case(shadow_db=2.0, scatter_db=1.5, time_s=30.0),)
 )
 
-# Name all listed positions and towers whose log odds differ by less.
+# Positions and towers whose log odds differ by less are all named.
 _UNDECIDED = 3.0
 
 # Carrier and power of the link that a draft proposes.
@@ -133,9 +133,9 @@ class Placement:
     question : str
         Question about the proposal.
     radius_m : float
-        Radius of the 90 % region of an estimated position; 0 for a known position.
+        Radius of the 90 % region of an estimated position, or 0 for a known position [m].
     position_m : (3,), optional
-        East, north and up of a node that the site does not have [m]; None if an earlier log has it.
+        East, north and up of a node that the site does not have [m]. None if an earlier log has it.
     """
 
     node: str
@@ -221,7 +221,7 @@ class Placer:
         at = [np.asarray(tower.position_m) for tower in towers] + [self._local(place) for place in listed]
         odds = place_odds(track, np.array(at))
         odds_tower, odds_listed = odds[: len(towers)].copy(), odds[len(towers) :]
-        # the search is the slowest step: only for learned antennas, or if no tower fits
+        # only for learned antennas, or if no tower fits, because the search is the slowest step
         estimate = locate(track) if any(taught.values()) or odds_tower.max() < _TOWER_ODDS else None
         known = np.full(len(towers), -np.inf)
         for i, tower in enumerate(towers):
@@ -503,7 +503,7 @@ class Receiver:
     Parameters
     ----------
     name : str
-        Name for ``receiver:`` of the log; empty if no receiver fits.
+        Name for ``receiver:`` of the log, or an empty text if no receiver fits.
     about : str
         Its odds, or the question, as the end of a comment.
     """
@@ -540,9 +540,8 @@ def propose(
 ) -> Proposal:
     """Return the learned antennas that the levels of a flight support, and the rank receiver of its tower.
 
-    Antennas of both ends are compared with the levels of each series; if no pair fits, airframes only are compared with
-    all series together. The antenna of a node that was located from other flights is compared at any node with a
-    well-known position.
+    Antennas of both ends are compared with the levels of each series. If no pair fits, airframes alone are compared
+    with all series together. The antenna of a node of other flights is compared at any node with a well-known position.
 
     Parameters
     ----------
@@ -708,18 +707,17 @@ def _receiver_odds(
     series: RssSeries, observed: Observed, item: Remembered, antenna: Remembered | None
 ) -> tuple[float, str]:
     """Return the log odds that levels are those of the receiver of an item, and the words for its level."""
-    level, lock = item.level, item.series.lock
-    locked = np.ones(len(observed.samples)) if observed.locked is None else observed.locked
-    lost = float(np.mean(locked == 0.0))
-    samples = observed.samples.part(np.asarray(locked != 0.0)).binned(4.0)
+    level, lock, samples = item.level, item.series.lock, observed.samples
+    if observed.locked is not None:
+        samples = samples.part(np.asarray(observed.locked != 0.0))
+    if not np.isfinite(samples.residual_db).any():
+        return -math.inf, ""
+    lost, samples = 1.0 - len(samples) / len(observed.samples), samples.binned(4.0)
     its_antenna = antenna is not None and antenna.name == item.name
     gain_db = antenna.gain_db(samples)[0] if its_antenna and antenna is not None else np.zeros(len(samples))
     sent_db = series.link.transmit_power_dbm - level.transmit_power_dbm
     at_carrier_db = 20.0 * math.log10(item.series.carrier_hz / series.link.carrier_hz)
-    error_db = samples.residual_db - gain_db + sent_db + at_carrier_db
-    if not np.isfinite(error_db).any():
-        return -math.inf, ""
-    offset_db = float(np.nanmean(error_db))
+    offset_db = float(np.nanmean(samples.residual_db - gain_db)) + sent_db + at_carrier_db
     sd_db = level.sd_db if its_antenna else math.hypot(level.sd_db, _UNKNOWN_GAINS_DB)
     nat = math.log(_UNKNOWN_LEVEL_DB / sd_db) - 0.5 * ((offset_db - level.offset_db) / sd_db) ** 2
     nat += _OTHER_UNIT if level.unit != series.unit else 0.0
@@ -755,9 +753,9 @@ def _airframe_for(
     )
 
 
-# Prior log odds of antennas of both ends: with the same tower and channel or the same receiver, and with another unit
-# of level, which means another receiver. Levels of field flights add 13 and more, so they can refuse antennas of the
-# same name. A short or smooth flight cannot.
+# Prior log odds of antennas of both ends, with the same names of tower and channel or the same receiver, and with
+# levels in another unit, which means another receiver. Levels of field flights add 13 and more, so they can outweigh
+# equal names. Those of a short or smooth flight cannot.
 _SAME_NAME, _OTHER_UNIT = 10.0, -3.0
 
 # Prior log odds that known antennas are mounted as before, and not rotated by a quarter turn or more.
@@ -807,7 +805,7 @@ _SCATTERS = tuple(
     for shadow, scatter in ((8.0, 4.0), (2.5, 2.0))
 )
 
-# The places at which airframes are compared: the likeliest of a grid that reaches this far beyond the track [m], each
+# Airframes are compared at the likeliest places of a grid that reaches this far beyond the track [m]. Each place is
 # divided by three to the east and to the north.
 _BEYOND_M, _PER_SIDE, _LIKELIEST = 400.0, 24, 20
 
@@ -852,7 +850,7 @@ def searching_airframe(
         return float(evidence.max() + np.log(np.exp(evidence - evidence.max()).mean()))
 
     best = max(known.values(), key=likelihood)
-    # the copies of the best airframe only, because they take most of the time
+    # only the best airframe is compared with its copies, because they take most of the time
     return best if judged(likelihood(None), lambda turn_deg: likelihood(best, turn_deg)).fits else None
 
 
@@ -924,7 +922,7 @@ def errors_elsewhere(
 ) -> tuple[learned.Errors | None, str]:
     """Return the errors of learned antennas on held-out flights like that of a series, and a phrase for their kind.
 
-    The errors are None without such antennas.
+    Without such antennas the errors are None.
 
     Parameters
     ----------

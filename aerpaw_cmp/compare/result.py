@@ -312,7 +312,7 @@ class RankResult:
         Reported rank; NaN without CSI.
     sinr_db : (n,), optional
     sigma : (n, min(n_rx, n_tx))
-        Singular values of the simulated channels in falling order, relative to a scale of each channel.
+        Singular values of the simulated channels, descending.
     level_dbm : (n,)
         Simulated level; NaN without a path.
     probability : (n, 4), optional

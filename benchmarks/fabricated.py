@@ -115,7 +115,6 @@ def rss_result(
     score = compare_rss(time, measured, simulated, baselines=baselines)
     further = RssFurther(
         n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out,
-        identifiable_db=score.identifiable_db,
         n_too_low=0, n_no_pose=0, n_outliers=0, rmse_without_outliers_db=score.rmse_db, n_flagged={}, clock=None,
         baseline_rmse_ci95_db=score.baseline_intervals, compared_with={}, averaged={},
     )  # fmt: skip

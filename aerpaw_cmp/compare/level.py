@@ -22,7 +22,7 @@ from scipy.special import ndtr, ndtri  # every report loads this module, and sci
 
 from ..common.geodesy import azimuth_rad, bearing_deg, elevation_rad
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
-from .offset import SPAN_DB, OffsetFit, difference_moments, grid_offset, identifiable_range, offset_grid
+from .offset import SPAN_DB, OffsetFit, grid_offset, offset_grid
 from .receiver import brier_losses, log_losses, out_of_group
 from .statistics import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals, rmse_interval
 
@@ -63,8 +63,6 @@ class RssComparison:
         Pearson; NaN for constant series.
     intervals : ErrorIntervals
         95 % intervals, and the correlation of the residual.
-    identifiable_db : (low, high)
-        Offsets whose RMSE is within 0.1 dB of the smallest RMSE.
     baselines : mapping of str to OffsetFit
         Free space, two-ray and others, each with its own offset, over the same pairs.
     baseline_intervals : mapping of str to (low, high)
@@ -87,7 +85,6 @@ class RssComparison:
     at_edge: bool
     correlation: float
     intervals: ErrorIntervals
-    identifiable_db: Interval
     baselines: Mapping[str, OffsetFit]
     baseline_intervals: Mapping[str, Interval]
     residual_db: FloatArray = field(repr=False)
@@ -153,7 +150,6 @@ def compare_rss(
         n_no_pose=int((~has_pose).sum()),
         correlation=correlation(m, s),
         intervals=replace(error_intervals(m, s, place), rmse_db=_rmse_interval(m - s, fit, place)),
-        identifiable_db=identifiable_range(difference_moments(m, s), span_db=span_db),
         baselines=fits,
         baseline_intervals={name: _rmse_interval(m - level, fits[name], place) for name, level in simple.items()},
         residual_db=np.where(use, measured + fit.offset_db - simulated, np.nan),
@@ -172,7 +168,6 @@ def without_errors(score: RssComparison) -> RssComparison:
         rmse_db=float("nan"),
         correlation=float("nan"),
         intervals=replace(score.intervals, rmse_db=none, correlation=none),
-        identifiable_db=none,
         fitted_on_scored=(*score.fitted_on_scored, LEARNED_HERE),
     )
 

@@ -177,18 +177,6 @@ def grid_offset(
     return moments.fit_at(grid, nearest_offset(grid, moments.mean_db, step_db))
 
 
-def identifiable_range(
-    moments: Moments, *, excess_db: float = 0.1, step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB
-) -> tuple[float, float]:
-    """Return the lowest and highest offset whose RMSE is within ``excess_db`` of the best one [dB], NaN if no pairs."""
-    if not moments.n:
-        return float("nan"), float("nan")
-    grid = offset_grid(step_db, span_db)
-    rmse = moments.rmse_db(grid)
-    near = grid[rmse <= rmse.min() + excess_db]
-    return float(near[0]), float(near[-1])
-
-
 Pooling = Literal["link", "tower", "channel", "flight", "all"]
 
 _GROUP: dict[str, tuple[int, ...]] = {"link": (0, 1, 2), "tower": (1,), "channel": (2,), "flight": (0,), "all": ()}

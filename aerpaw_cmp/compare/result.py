@@ -147,13 +147,11 @@ class RssFurther:
     is by reason. ``compared_with`` contains, by the name of each baseline and other assumption, whether the replay is
     better or worse on the same samples. ``averaged`` is by simulation and window. ``n_outliers`` samples are far
     outside the distribution of the levels of the channel; only ``rmse_without_outliers_db`` excludes them.
-    ``identifiable_db`` and the other counts are those of
-    :class:`~aerpaw_cmp.compare.level.RssComparison`.
+    The other counts are those of :class:`~aerpaw_cmp.compare.level.RssComparison`.
     """
 
     n_measured_out: int
     n_simulated_out: int
-    identifiable_db: Interval
     n_too_low: int
     n_no_pose: int
     n_outliers: int

@@ -311,7 +311,6 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
     error_db = None if case.trained else _stated_error_db(case, score, stated, detection)
     further = RssFurther(
         n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out,
-        identifiable_db=score.identifiable_db,
         n_too_low=int((replayed.valid & ~levels.posed).sum()),
         n_no_pose=int((~replayed.valid).sum()),
         n_outliers=int(wild.sum()),

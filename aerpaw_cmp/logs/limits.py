@@ -328,6 +328,8 @@ def check(result: ReadResult) -> ReadResult:
 
 # AERPAW's sites, Lake Wheeler and Centennial Campus: latitude, longitude, and the radius of a site, all in degrees.
 SITES_DEG, NEAR_DEG = ((35.727, -78.696), (35.773, -78.677)), 0.3
+# Few take-offs are on a hill with most of the flight this far below [m].
+_BELOW_M = 15.0
 # Highest level that is possible in flight: reports of RSRP end at -31 dBm (3GPP TS 38.133, 10.1.6), those of RSRQ and
 # SINR do not.
 _MOST_DBM = {"RSRP": -20.0}
@@ -363,6 +365,8 @@ class _Check:
             self._within(limit)
         if kind == "rank":
             self._within_ports()
+        if kind == "telemetry":
+            self._mostly_above_zero()
         self._near_in_time()
         if kind == "rss":
             self._all_silent()
@@ -446,6 +450,15 @@ class _Check:
         known = "another unit, an RSRQ, or an index?" if quantity in _MOST_DBM else "another unit, or an index?"
         first = f"{level[int(np.argmax(bad))]:g} dBm"
         self._flag(bad, "level_out_of_range", first, f"which is received nowhere ({known})", ["rss_db"])
+
+    def _mostly_above_zero(self) -> None:
+        """Report heights that are mostly below the take-off, as those that count downwards are."""
+        height = self._values("altitude_m")
+        if np.isfinite(height).any() and (middle := float(np.nanmedian(height))) < -_BELOW_M:
+            self._said.append(
+                f"{self._what}: half of its heights are more than {-middle:.0f} m below the take-off: do they count "
+                "downwards, or from another datum?"
+            )
 
     def _all_silent(self) -> None:
         """Report a series without any level, because another unit can put all levels below the floor of the reader."""

@@ -811,6 +811,8 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         texts = [" ".join(pair) for pair in zip(texts, sheet.texts(half[0]), strict=True)]
     name, unit = dictionary.plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", sheet.names[column])), sheet.unit(column)
     count = next((short for short, c in _text.COUNTS.items() if c.said.search(unit) or c.said.search(name)), None)
+    if _ELAPSED.search(name):
+        texts, count = [_stamps.in_seconds(text) for text in texts], count or "s"
     # plain names have no letter for micro: 'Time [\u00b5s]' becomes 'time s'
     if unit in ("\u00b5s", "\u03bcs") or (unit and count is None):
         count = "us" if unit in ("\u00b5s", "\u03bcs") else "s"
@@ -860,6 +862,8 @@ def _zone_column(sheet: Sheet, column: int, zone: str, texts: list[str], options
     return "", [text if _NUMBER.fullmatch(text) else f"{text} {own}".strip() for text, own in both]
 
 
+# Names of times since the start of a log, which may be written like times of the day.
+_ELAPSED = re.compile(r"^(rel|relative|elapsed|up) ?time")
 # Epochs, and times with an offset.
 _DATED = re.compile(r"\d{9,}[.,]?\d*|.*\d(?:Z|[+-]\d\d:?\d\d)")
 _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")

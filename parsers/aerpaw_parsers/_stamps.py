@@ -311,6 +311,18 @@ def header_zone(name: str, brackets: str) -> str:
     return next((word for word in (*words, last) if word in {*_HOURS, *_text.WINTER, *_WITH_SUMMER}), "")
 
 
+def in_seconds(text: str) -> str:
+    """Return a duration as seconds, and other text unchanged.
+
+    Examples
+    --------
+    >>> in_seconds("0:01:05.5"), in_seconds("12.5")
+    ('65.5', '12.5')
+    """
+    clock = _OF_DAY.fullmatch(text)
+    return text if clock is None else f"{_seconds(clock.groupdict()):.9g}"
+
+
 def zone_of_cell(text: str) -> str:
     """Return the zone in a cell of a column of zones, also from hours, minutes or seconds east of UTC.
 

@@ -472,11 +472,14 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
 def _rank(rows: Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     ri = sheet.numbers(column)
     flag, zero = rows.flag.copy(), _FROM_ZERO.search(sheet.plain[column]) is not None
-    values = {"rank": checked_ranks(ri + zero, flag, none=(ri == 0) & (not zero), means=True), "ri_raw": ri}
+    none = (ri == 0) & (not zero)
+    values = {"rank": checked_ranks(ri + zero, flag, none=none, means=True), "ri_raw": ri}
     name, cqi = re.sub(r"\W+", "_", sheet.plain[column]), sheet.find("CQI")
-    idle = 0 if cqi is None or zero else int(((ri == 0) & (sheet.numbers(cqi) > 0)).sum())
-    if 2 * idle > len(ri):
-        text = f"0 with a CQI in {counted(idle, 'row')}, read as no report: do its ranks count from 0?"
+    # a row without a report has no CQI either, and such rows are few; ranks that count from 0 have many zeros
+    doubtful = none if cqi is None else none & (sheet.numbers(cqi) > 0)
+    few = _MOST_IDLE * len(ri) if cqi is None else none.sum() / 2
+    if doubtful.sum() > max(few, 2) and np.nanmax(ri, initial=0) < _MOST_PORTS:
+        text = f"0 in {counted(int(doubtful.sum()), 'row')}, read as no report: do its ranks count from 0?"
         rows.warnings.append(f"column {sheet.names[column]!r}: {text} Then use --map and --ri-base zero")
     source = "scheduled PDSCH rank" if "pdsch" in name else "CSI report"
     return rows.stream(
@@ -484,6 +487,8 @@ def _rank(rows: Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     )
 
 
+# Largest share of rows without a report, and the receive ports of a phone or modem.
+_MOST_IDLE, _MOST_PORTS = 0.1, 4
 _FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero)\b")
 
 

@@ -372,3 +372,11 @@ def test_the_proposed_map_of_a_table_with_a_row_of_units_works(tmp_path: Path) -
     options = ReadOptions(columns=columns, kind="rss", unit="dBm")
     (file,) = ingest([path], options=options, reader="generic_csv")
     assert file.result.streams[0].frame["rss_db"].tolist() == pytest.approx([-80.1])
+
+
+def test_heights_that_count_downwards_are_reported(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = [f"2025-03-02T15:00:{10 * i}Z,35.73,-78.700{i},{-20 * i},-80" for i in range(1, 4)]
+    path.write_text("\n".join(["time,lat,lon,height_above_takeoff_m,rsrp", *rows]) + "\n")
+    (file,) = ingest([path])
+    assert any("40 m below the take-off: do they count downwards" in text for text in file.result.warnings)

@@ -122,8 +122,8 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
     """Make a NetCDF-4 file of a :class:`Dataset` in memory: HDF5 ends the process where a disk is full.
 
     Arrays are deflated; text becomes characters in UTF-8, which every reader of CF takes. NetCDF has no complex
-    numbers: ``NAME_real`` and ``NAME_imag`` are written instead of ``NAME``. A variable with NaN has it as
-    ``_FillValue``; another variable has no ``_FillValue``, unless its ``encoding`` contains one. ``grows`` are
+    numbers: ``NAME_real`` and ``NAME_imag`` are written instead of ``NAME``. The ``_FillValue`` of a variable
+    with NaN is NaN. Other variables have a ``_FillValue`` only if their ``encoding`` contains one. ``grows`` are
     dimensions without a limit; :class:`GrowingNetcdf` appends along the first of them.
 
     Raises

@@ -1,13 +1,13 @@
 """Commands that the tap may send to a Quectel RM5xxQ, and the meaning of its answers.
 
-Commands go out only if :data:`QUERIES` lists them; all of them read. The one that writes, ``csi_ctrl``, needs
-``allow_csi=True``. Nothing here asks for IMEI, IMSI, ICCID or numbers, and :class:`Redactor` removes them from
-whatever comes in unasked.
+Only commands in :data:`QUERIES` are sent, and all of these only read. The one command that writes, ``csi_ctrl``, needs
+``allow_csi=True``. No command requests IMEI, IMSI, ICCID or telephone numbers. :class:`Redactor` removes them if the
+modem sends them unasked.
 
 Layouts: Quectel RG520N&RG525F&RG5x0F&RM5x0N Series AT Commands Manual, section 5.20 (QENG); ``nr5g_csi`` as quoted
-at community.teltonika.lt/t/read-csi-information/5568. SA and EN-DC order RSRQ and SINR differently, so fields are
-named after the token of the radio access technology, never after their place in the answer as a whole. A field
-outside its physical range becomes None with a flag; the row and the raw line stay.
+at community.teltonika.lt/t/read-csi-information/5568. SA and EN-DC order RSRQ and SINR differently, so the meaning of a
+field depends on the line's radio access technology, not on its position alone. A field outside its physical range
+becomes None with a flag. The other fields and the raw line are kept.
 
 The module converts bytes of an AT port to answers and unsolicited lines, without file, port or clock.
 
@@ -43,7 +43,7 @@ class Query:
     text : str
         The command, without its end.
     prefixes : tuple of str, or None
-        Starts of its information lines without blanks; None: any line.
+        Prefixes of its information lines, without blanks. None: any line.
     decode : callable
         ``decode(lines, flags) -> values``; appends to ``flags``.
     """
@@ -56,7 +56,7 @@ class Query:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Values of one answer and what was wrong with them."""
+    """The values of one answer, and flags for invalid fields."""
 
     values: Values = field(default_factory=dict)
     flags: tuple[str, ...] = ()
@@ -91,7 +91,7 @@ def _split_fields(payload: str) -> list[str | None]:
 
 
 def _payload_of(line: str, prefix: str) -> str | None:
-    """Text after ``prefix`` if the line starts with it, blanks and case of the colon aside."""
+    """Return the text after ``prefix``, without colon and blanks. None if the line starts otherwise."""
     if not line.startswith(prefix):
         return None
     return line[len(prefix) :].lstrip(": ")
@@ -120,7 +120,7 @@ _RANGES: Mapping[str, tuple[int, int]] = {
     "uplink_bandwidth_code": (0, 16),
     "tx_power_tenth_dbm": (-600, 300),
 }
-# Quectel's "no value", the same after a division by ten, and the values that mean it in single fields.
+# Quectel's value for "unknown", the same divided by ten, and other such values of single fields.
 _MISSING = (-32768, -3276)
 _MISSING_OF = {"cqi": 255, "pcid": 65_535}
 
@@ -140,7 +140,7 @@ def number(name: str, text: str | None, flags: list[str], *, prefix: str = "") -
     flags : list of str
         Receives the reason for a missing value.
     prefix : str
-        Before the field in the flag.
+        Text before the name of the field in the flag.
 
     Returns
     -------
@@ -272,7 +272,7 @@ def _decode_servingcell(lines: Sequence[str], flags: list[str]) -> Values:
 
 
 def _decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind: str) -> Values:
-    """``+QRSRP: <PRX>,<DRX>,<RX2>,<RX3>[,<sysmode>]``, one line per radio access technology.
+    """Decode ``+QRSRP: <PRX>,<DRX>,<RX2>,<RX3>[,<sysmode>]``, one line per radio access technology.
 
     Parameters
     ----------
@@ -286,8 +286,8 @@ def _decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind:
     Returns
     -------
     dict
-        By radio access technology: ``{kind: [level of each receiver, None where not known]}`` [dBm or dB], and
-        ``extra`` fields.
+        By radio access technology: ``{kind: [level of each receiver, None if unknown]}`` [dBm or dB], and ``extra``
+        fields.
     """
     values: Values = {}
     for fields in _fields_of(lines, command, flags):

@@ -402,7 +402,7 @@ class TapSettings:
 
 @dataclass(frozen=True, slots=True)
 class TapStatus:
-    """Status that the terminal shows.
+    """The status that the terminal shows.
 
     Parameters
     ----------
@@ -410,7 +410,7 @@ class TapStatus:
     rank : int or None
         Rank of the last answer. None: no CSI.
     rsrp_dbm, sinr_db : int or None
-        Last known values of NR.
+        Last known values of the NR cell.
     ri_rate_hz : float
         Rate of answers with status ok over the last 10 s.
     gaps, records, bytes_written : int
@@ -422,11 +422,11 @@ class TapStatus:
     predicted_rank : int or None
         Rank that the replay predicts at the present pose.
     predicts : bool
-        Whether predictions are made at all.
+        True if the tap makes predictions.
     alarm : bool
         True if there was no CSI for longer than the limit: the bell rings.
     message : str
-        Something to be read once (a loss, a fault, an advice); empty on regular calls.
+        Text to be shown once (a loss, a fault, a hint). Empty on regular calls.
     """
 
     connected: bool
@@ -489,7 +489,7 @@ class StatusNotifier:
 
 @dataclass(frozen=True, slots=True)
 class TapSummary:
-    """Summary of a session that ended.
+    """The summary of a session that has ended.
 
     Parameters
     ----------
@@ -552,15 +552,15 @@ _CATCH_UP = 2
 
 
 class Schedule:
-    """The order and times of the queries. The first name has priority whenever it is due, then the longest due.
+    """The order and times of the queries. If several are due, the first query has priority, then the longest waiting.
 
     After a short stall the missed polls follow each other immediately, with their true times in the records, so no
     answer is lost. After a long stall the schedule starts from now.
 
     Parameters
     ----------
-    Period of each query by name.
-        Name to period.
+    periods_ns : dict of str to int
+        Period of each query [ns].
     """
 
     def __init__(self, periods_ns: dict[str, int]) -> None:
@@ -594,7 +594,7 @@ class Schedule:
 
 
 class Stop:
-    """A request to end, from a signal or another thread, which wakes the waiting tap.
+    """A request to end, from a signal or another thread. It wakes the waiting tap.
 
     As a context it reacts to SIGINT, SIGTERM and SIGHUP, and is closed at the end. Only the main thread receives
     signals, and an ignored signal (nohup) stays ignored.
@@ -618,7 +618,7 @@ class Stop:
         self.close()
 
     def __call__(self, reason: str = "stop") -> None:
-        """Request the end. A second request means at once."""
+        """Request the end. A second request means that the tap ends immediately."""
         self.reason = self.reason or reason
         self.count += 1
         with contextlib.suppress(OSError):

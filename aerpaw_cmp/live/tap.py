@@ -42,7 +42,7 @@ _NMEA = re.compile(rb"\$[A-Z]{4,5},[^\r\n]*\*[0-9A-F]{2}")
 
 
 def _not_a_modem(path: Path, received: bytes) -> InputError:
-    """The error for a port that does not answer ``AT``, by what was received on it."""
+    """Return the error for a port that does not answer ``AT``. The cause depends on the received bytes."""
     expected = "an answer to 'AT' (interface 02 or 03 of the modem)"
     if _NMEA.search(received):
         sign, cause = "the port speaks NMEA: it is a GPS port", "interface 01 was given, or the numbers moved"
@@ -60,7 +60,7 @@ def _not_a_modem(path: Path, received: bytes) -> InputError:
 
 
 class Tap:
-    """One session of the tap: the modem is polled until ``stop`` or the set time ends it.
+    """One session of the tap, which polls the modem until ``stop`` or the set time ends it.
 
     Parameters
     ----------
@@ -68,12 +68,12 @@ class Tap:
     stop : Stop
         Ends the session when called (from any thread, or by a signal).
     on_status : callable, optional
-        Called about once per ``settings.status_s`` and at once when there is a message; :func:`format_status`
-        makes a line of it.
+        Called about once per ``settings.status_s``, and immediately with a message. :func:`format_status` formats the
+        status as a line.
     watch : callable, optional
-        Gets each record once the log has it, and each status; it must neither wait nor raise.
+        Receives each logged record and each status. It must neither wait nor raise.
     predict : callable, optional
-        ``predict(utc_ns) -> Prediction or None`` of the replay at the pose of that moment; runs in its own thread.
+        ``predict(utc_ns)`` returns the Prediction at the pose of that time, or None. It runs in a separate thread.
     clock : Clock, optional
     """
 
@@ -126,12 +126,11 @@ class Tap:
     # the session ------------------------------------------------------------------------------------------
 
     def run(self) -> ports.TapSummary:
-        """Connect, poll until asked to stop, end cleanly.
+        """Connect, poll until a stop is requested, and end cleanly.
 
         Returns
         -------
         TapSummary
-            With the exit code.
 
         Raises
         ------
@@ -263,7 +262,7 @@ class Tap:
         raise first_error
 
     def _ports_to_try(self) -> list[ports.PortInfo]:
-        """Return the named port or every AT port at the start, and the same interface after a loss."""
+        """Return the ports to try: at the start the named port or all AT ports, later first the same interface."""
         roots, last = self._settings.roots, self._info
         if last is None:
             if self._settings.port is not None:
@@ -299,7 +298,7 @@ class Tap:
         self._last_final_ns = self._last_csi_ns = self._clock.mono_ns()
 
     def _probe(self) -> bool:
-        """Send a bare ``AT``. An answer synchronises the modem, so that a late answer is not taken for the next."""
+        """Send a bare ``AT``. Its answer shows that all earlier commands were answered, so that none is mixed up."""
         answer, _ = self._exchange("sync", timeout_s=self._settings.probe_timeout_s)
         if answer.status in ("timeout", "lost"):
             return False
@@ -314,7 +313,7 @@ class Tap:
             self._port = None
 
     def _leave_framer(self) -> None:
-        """Record what came and was finished by nothing, before it is forgotten."""
+        """Record lines and a partial line that belong to no answer, before the framer is replaced."""
         lines, partial = self._left()
         if lines or partial:
             self._event("unsolicited", lines=lines, partial=partial, dropped_bytes=0)
@@ -378,7 +377,7 @@ class Tap:
     # the modem --------------------------------------------------------------------------------------------
 
     def _initialise(self) -> None:
-        """Identity and CSI switch, at the start and after every return of the modem."""
+        """Query identity and CSI switch, at the start and whenever the modem comes back."""
         self._initialise_again = False
         self._exchange("identity")
         self._exchange("firmware")
@@ -407,7 +406,7 @@ class Tap:
         Raises
         ------
         PortGoneError
-            After recording the bytes that had come.
+            If the port disappears. The received bytes are recorded first.
         """
         assert self._port is not None
         query = modem.QUERIES[name]
@@ -430,17 +429,16 @@ class Tap:
         return answer, decoded
 
     def _await(self, deadline: int) -> tuple[modem.Answer, int]:
-        """The answer in flight, and the monotonic time of its last byte."""
+        """Return the answer to the command in flight, and the monotonic time of its last byte."""
         stopped_at = 0
         while True:
             now = self._clock.mono_ns()
             if self._stop.count and not stopped_at:
                 stopped_at = now
-                # wait one second for the pending answer, so that its record is complete; after a second stop do not
-                # wait
+                # wait one second for the pending answer, so that its record is complete; a second stop ends this wait
                 deadline = min(deadline, now + 1_000_000_000)
             if now >= deadline or self._stop.count > 1:
-                # its answer may still arrive: send no other query until a bare AT is answered
+                # the answer may still arrive: send no other query until a bare AT is answered
                 self._in_step = False
                 return self._framer.give_up(), now
             if self._select((deadline - now) / 1e9):
@@ -468,7 +466,7 @@ class Tap:
         return answer
 
     def _drain(self) -> None:
-        """Read what came while nothing was in flight, which is not part of the next answer."""
+        """Read bytes that arrived without a command in flight, because they do not belong to the next answer."""
         while self._select(0.0) and self._port is not None:
             self._read()
 
@@ -502,7 +500,7 @@ class Tap:
         return decoded
 
     def _note(self, name: str, answer: modem.Answer, decoded: modem.Decoded, record: Record) -> None:
-        """Keep what the status line shows, and ask for a prediction."""
+        """Store the values of the status line, and request a prediction."""
         if name == modem.RI_QUERY:
             self._last["rank"] = decoded.values.get("rank")
             if answer.status == "ok":
@@ -526,14 +524,14 @@ class Tap:
             self._event("late", lines=lines, status=event.status, code=event.code)
         elif isinstance(event, modem.Unsolicited):
             self._noise["lines"] += 1
-            # drop lines above this rate, because a wrong port could fill the disk; lines of a modem are always logged
+            # above this rate, log only lines that a modem sends: a wrong port could fill the disk
             if self._noise["lines"] > _NOISE_LINES_PER_S and not modem.is_unsolicited(event.text):
                 self._noise["bytes"] += len(event.text) + event.dropped
                 self._noise["not_kept"] += 1
                 return
             text = self._redactor.clean(event.text, cut=event.dropped > 0)
             self._event("unsolicited", lines=[text], dropped_bytes=event.dropped)
-            # the modem restarted behind the same port: its CSI switch is as after power-on
+            # the modem restarted behind the same port, so its CSI switch has the state after power-on
             if event.text in ("RDY", "APP RDY"):
                 self._initialise_again = True
 
@@ -551,7 +549,7 @@ class Tap:
         return any(fd != self._stop.fileno() for fd, _ in ready)
 
     def _wait(self, duration_s: float) -> None:
-        """Wait, and record unsolicited lines of the modem meanwhile."""
+        """Wait. Record unsolicited lines of the modem that arrive in this time."""
         deadline = self._clock.mono_ns() + int(duration_s * 1e9)
         while not self._stop.count:
             remaining_ns = deadline - self._clock.mono_ns()
@@ -562,7 +560,7 @@ class Tap:
             self._tick()
 
     def _tick(self) -> None:
-        """Regular duties: clock, disk, alarm, status, end of the set time."""
+        """Do the periodic tasks: clock, disk, alarm, status, end of the set time."""
         now = self._clock.mono_ns()
         if self._early is None:
             for text in self._log.messages():
@@ -612,7 +610,7 @@ class Tap:
                 self._say_once(f"the prediction failed: {result['error']}")
             self._record({"kind": "prediction", **result})
 
-    # telling ----------------------------------------------------------------------------------------------
+    # messages ---------------------------------------------------------------------------------------------
 
     def _say_once(self, text: str) -> None:
         # limited, because messages of other programs may differ every time

@@ -1,10 +1,12 @@
 """The tap's page for browsers: one page and one stream of events, with the standard library.
 
-It only answers GET requests for ``/`` and ``/events``, reads no file, and refuses requests from other sites (Host,
-Origin, Sec-Fetch-Site), so that a page on the Internet cannot read it by DNS rebinding. Every request needs the token
-of the printed address, or the cookie that the first visit with it set, because all users of a machine share the
-loopback. Each browser has a thread that only reads the :class:`~aerpaw_cmp.live.feed.Feed`. A browser that accepts no
-data for some seconds is disconnected and refilled when it comes back. The tap never waits for it.
+The server only answers GET requests for ``/`` and ``/events``, and reads no file. It refuses requests from other sites
+(Host, Origin, Sec-Fetch-Site), so that a page on the Internet cannot read it by DNS rebinding. Every request needs the
+token of the printed address, because all users of a machine share the loopback. The first visit with the token sets a
+cookie that replaces it.
+
+Each browser has a thread that only reads the :class:`~aerpaw_cmp.live.feed.Feed`. A browser that does not read for some
+seconds is disconnected. When it comes back, it gets the data that it missed. The tap never waits for it.
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ from .feed import Feed
 
 DEFAULT = "127.0.0.1:8765"
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")
-# Bytes written to a browser's socket at once. Each piece has its time limit, so a slow connection is not closed as a
-# dead one.
+# Bytes written to a browser's socket at once. The time limit applies to each piece, so that a slow connection is not
+# closed like a broken one.
 _PIECE = 16_384
 # Limit of connections, of all addresses, that wait for their request.
 _MOST_WAITING = 256
@@ -62,13 +64,13 @@ class Limits:
     Parameters
     ----------
     connections : int
-        Open at once, of browsers with the token.
+        Largest number of connections of browsers with the token.
     request_s : float
         Longest time between a connection and the end of its request [s].
     send_s : float
-        A browser that takes nothing for so long is dropped [s].
+        A browser that does not read for this time is disconnected [s].
     tick_s : float
-        Interval between looks at the tap's queue, and between messages to one browser [s].
+        Interval at which the tap's queue is processed, and between messages to one browser [s].
     """
 
     connections: int = 24
@@ -359,7 +361,7 @@ class _Handler(BaseHTTPRequestHandler):
         return any(hmac.compare_digest(text.encode(), secret.encode()) for text, secret in given)
 
     def _events(self, cursor: str) -> None:
-        """Send what is new until the browser goes, takes nothing, or the session ends."""
+        """Send new data until the browser leaves or stops reading, or the session ends."""
         web, page = self.server, self.server.page.digest
         self._pieces(b"retry: 1000\n\n")
         while True:
@@ -386,7 +388,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def end_headers(self) -> None:
-        """Close the head with what every answer carries."""
+        """End the head with the headers that every answer has."""
         for name, value in (
             ("Content-Security-Policy", self.server.page.policy),
             ("X-Content-Type-Options", "nosniff"),

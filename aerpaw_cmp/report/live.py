@@ -36,6 +36,10 @@ def live_map(
     grid : Grid
     values : (heights, north, east) int, (heights, north, east) float
         Rank, 0 without a path, and level [dBm], NaN without a path.
+
+    Returns
+    -------
+    dict
     """
     arrays = PackedArrays()
     rank, level = arrays.add(np.clip(values[0], 0, 4), "u1"), arrays.add_steps(values[1], 0.1)

@@ -11,8 +11,6 @@ position.
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
 import platform
 import time
 import traceback
@@ -28,8 +26,7 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 
-from ..common.errors import AerpawCmpError, InputError, UsageError, one_line, parsing
-from ..common.files import LARGEST_TABLE, read_bounded
+from ..common.errors import AerpawCmpError, InputError, UsageError, one_line
 from ..common.stages import PlannedStage, Progress, Stages
 from ..common.text import counted
 from ..common.units import FloatArray, finite_mean
@@ -866,37 +863,11 @@ def _place_map(rows: Sequence[RssRow], cell_m: float) -> PlaceMap | None:
 # --- reports of the flights -------------------------------------------------------------------------------------------
 
 
-def find_reports(flights: Iterable[str], folder: Path, places: Sequence[Path]) -> dict[str, str]:
-    """Return relative addresses of the reports of flights in the folders ``places``.
+def find_reports(flights: Iterable[str], folder: Path) -> dict[str, str]:
+    """Return the address of the report of each flight, relative to the folder of the campaign's page, if it exists.
 
-    Parameters
-    ----------
-    flights : iterable of str
-    folder : Path
-        Folder of the campaign's page.
-    places : sequence of Path
-        Folders that may contain ``NAME/report.html`` of ``aerpaw-cmp report``.
-
-    Returns
-    -------
-    dict
-        Address by flight, if metrics.json in the same folder names that flight.
+    Reports are in folders with the names of their flights next to that folder.
     """
-    reports: dict[str, str] = {}
-    for name in flights:
-        for place in places:
-            page = place / name / "report.html"
-            if page.is_file() and _flight_of(page.with_name("metrics.json")) == name:
-                relative = Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix()
-                reports[name] = quote(relative)
-                break
-    return reports
-
-
-def _flight_of(path: Path) -> str | None:
-    try:
-        with parsing(path, any_shape=True):
-            name = json.loads(read_bounded(path, LARGEST_TABLE)).get("flight")
-    except InputError:
-        return None
-    return name if isinstance(name, str) else None
+    return {
+        name: quote(f"../{name}/report.html") for name in flights if (folder.parent / name / "report.html").is_file()
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,7 @@ def _drafted(file: Path, flight: str | None) -> FlightFile:
 
 
 @from_python
+@dataclass(repr=False, eq=False)
 class Flight:
     """A checked flight.yaml with its logs. It is replayed only on request.
 
@@ -106,25 +108,16 @@ class Flight:
     logs_root : Path, optional
         Folder for the paths of logs.
     written : FlightFile, optional
-        Settings of the flight file, before learned antennas are added. Default: those of ``data``.
+        Settings of the flight file before learned antennas are added. Default: those of ``data``.
     changed : tuple of str
         Keys whose settings differ from the file.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        data: FlightData,
-        logs_root: Path | None = None,
-        *,
-        written: FlightFile | None = None,
-        changed: tuple[str, ...] = (),
-    ) -> None:
-        self.path = path
-        self.data = data
-        self.logs_root = logs_root
-        self._written = data.settings if written is None else written
-        self.changed = changed
+    path: Path
+    data: FlightData
+    logs_root: Path | None = None
+    written: FlightFile | None = None
+    changed: tuple[str, ...] = ()
 
     @property
     def settings(self) -> FlightFile:
@@ -198,7 +191,7 @@ class Flight:
         if engine is not None:
             keys["rt.engine"] = engine
         # overrides first, because learned antennas must fit their carrier
-        settings = with_learned(overridden(self._written, keys), self.path.parent)
+        settings = with_learned(overridden(self.written or self.data.settings, keys), self.path.parent)
         data = gather(settings, self.path.parent, self.data.files, self.logs_root) if keys else self.data
         return ReplayedFlight(data, replay_flight(data))
 
@@ -284,6 +277,7 @@ class Flight:
 
 
 @from_python
+@dataclass(repr=False, eq=False)
 class ReplayedFlight:
     """A flight, ray-traced at its samples.
 
@@ -294,9 +288,8 @@ class ReplayedFlight:
         Poses, paths and fields of every series.
     """
 
-    def __init__(self, data: FlightData, replays: FlightReplay) -> None:
-        self.data = data
-        self.replays = replays
+    data: FlightData
+    replays: FlightReplay
 
     @property
     def series(self) -> dict[Series, Replayed]:
@@ -350,6 +343,7 @@ class ReplayedFlight:
 
 
 @from_python
+@dataclass(repr=False, eq=False)
 class Comparison:
     """The numbers of the comparison of a flight.
 
@@ -359,8 +353,7 @@ class Comparison:
         All numbers as records (:mod:`aerpaw_cmp.compare.result`).
     """
 
-    def __init__(self, result: FlightResult) -> None:
-        self.result = result
+    result: FlightResult
 
     def to_frame(self) -> pd.DataFrame:
         """Return one row per RSS series, with its baselines.

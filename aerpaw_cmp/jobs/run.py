@@ -539,8 +539,7 @@ def run_campaign(
     note = f"finished tasks are stored in {store}; the same command computes the rest" if store else "nothing is stored"
     with OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output, noting_interrupts(note):
         data = run_all(campaign, path.parent, options, keep=store, stages=stages)
-        reports = find_reports(data.flights, folder, [folder.parent, Path("reports")])
-        data = with_season(data, reports, nodes)
+        data = with_season(data, find_reports(data.flights, folder), nodes)
         with stages("report"), output.filling() as place:
             finished = replace(data, stages_s=dict(stages.seconds))
             write_campaign(finished, place)

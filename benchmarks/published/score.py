@@ -10,17 +10,102 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.special import ndtri
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.files import read_input
 from aerpaw_cmp.common.jsonable import fields_of
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.level import LevelSeries, level_scores
+from aerpaw_cmp.compare.level import crps_normal, local_mean_db
 from aerpaw_cmp.compare.receiver import constant_forecast, score_forecast
 from aerpaw_cmp.jobs.options import AGAINST_DISTANCE_M
 from aerpaw_cmp.jobs.referee import predicted_at, read_foreign, split_by_series
 
 from .tasks import KEY, RANKS, SERIES, Bench
+
+# Averaging window of ``rmse_4s_db`` [s].
+WINDOW_S = 4.0
+
+# Nominal coverage of the interval that is checked.
+COVERAGE = 0.9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelSeries:
+    """Measured and predicted levels of one flight, tower and channel, in time order.
+
+    Parameters
+    ----------
+    name : str
+        ``flight tower.channel``.
+    time_s : (n,)
+    measured_db, level_db : (n,)
+        Measured and predicted median [dB].
+    sd_db : (n,), optional
+        Standard deviation of the prediction [dB]. Without it no distribution is scored.
+    own_offset : bool
+        True if the series is scored after its mean error is subtracted.
+    """
+
+    name: str
+    time_s: FloatArray
+    measured_db: FloatArray
+    level_db: FloatArray
+    sd_db: FloatArray | None = None
+    own_offset: bool = True
+
+    @property
+    def bias_db(self) -> float:
+        """Mean of measured minus predicted [dB]."""
+        return float(np.mean(self.measured_db - self.level_db))
+
+    @property
+    def error_db(self) -> FloatArray:
+        """Measured minus predicted (n,), without the bias if the series has its own offset [dB]."""
+        error = self.measured_db - self.level_db
+        return np.asarray(error - error.mean() if self.own_offset else error)
+
+
+def level_scores(series: Sequence[LevelSeries]) -> dict[str, float]:
+    """Return the scores of one task: means over its series, so that long and short flights have the same weight.
+
+    Parameters
+    ----------
+    series : sequence of LevelSeries
+        At least one.
+
+    Returns
+    -------
+    dict of str to float
+        ``rmse_db, rmse_4s_db, bias_db`` (mean size of the offsets), ``crps_db, log_score, coverage_90`` (NaN without
+        ``sd_db``), ``n``.
+    """
+    rows = [_series_scores(item) for item in series]
+    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if key != "n"} | {
+        "n": float(sum(row["n"] for row in rows))
+    }
+
+
+def _series_scores(s: LevelSeries) -> dict[str, float]:
+    error = s.error_db
+    slow = local_mean_db(s.time_s, s.measured_db, WINDOW_S) - local_mean_db(s.time_s, s.level_db, WINDOW_S)
+    # the mean of local means differs from that of the samples and needs its own offset
+    slow = slow - slow.mean() if s.own_offset else slow
+    scores = {
+        "rmse_db": float(np.sqrt(np.mean(error**2))),
+        "rmse_4s_db": float(np.sqrt(np.mean(slow**2))),
+        "bias_db": abs(s.bias_db),
+        "crps_db": np.nan,
+        "log_score": np.nan,
+        "coverage_90": np.nan,
+        "n": float(len(error)),
+    }
+    if s.sd_db is not None:
+        scores["crps_db"] = float(crps_normal(error, s.sd_db).mean())
+        scores["log_score"] = float(np.mean(0.5 * (error / s.sd_db) ** 2 + np.log(np.sqrt(2.0 * np.pi) * s.sd_db)))
+        scores["coverage_90"] = float(np.mean(np.abs(error) <= ndtri(0.5 + COVERAGE / 2) * s.sd_db))
+    return scores
+
 
 LARGEST_ENTRY = 2**30
 

@@ -7,7 +7,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from aerpaw_cmp.compare.level import LevelSeries, crps_normal, level_scores
+from aerpaw_cmp.compare.level import crps_normal
+from benchmarks.published.score import LevelSeries, level_scores
 
 RNG = np.random.default_rng(2)
 LONG = LevelSeries(

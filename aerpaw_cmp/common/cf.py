@@ -21,7 +21,7 @@ from .versions import tool_version, utc_now
 
 CONVENTIONS = "CF-1.11"
 
-# dBm and dB as UDUNITS has them: tenths of the decimal logarithm of a power over 1 mW, of a ratio.
+# Units of dBm and dB in the syntax of UDUNITS: tenths of the decimal logarithm of a power over 1 mW, or of a ratio.
 DBM, DB = "0.1 lg(re 1 mW)", "0.1 lg(re 1)"
 
 
@@ -40,7 +40,7 @@ def flags(meanings: Sequence[str], dtype: type[np.integer[Any]] = np.int8, first
 
 
 def site_crs(frame: SiteFrame) -> Any:
-    """The site frame as a named reference system (pyproj): azimuthal equidistant about the origin, WGS 84."""
+    """Return the site frame as a named reference system of pyproj: azimuthal equidistant about the origin, WGS 84."""
     from pyproj.crs import GeographicCRS, ProjectedCRS
     from pyproj.crs.coordinate_operation import AzimuthalEquidistantConversion
 
@@ -85,7 +85,7 @@ class Variable:
 
 
 class Dataset:
-    """The variables by name and the attributes of a file, like ``xarray.Dataset``. It avoids a second to load xarray.
+    """The variables and attributes of a file, like ``xarray.Dataset``, whose import takes a second.
 
     Parameters
     ----------
@@ -119,9 +119,9 @@ class Dataset:
 
 
 def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
-    """Make a NetCDF-4 file of a :class:`Dataset` in memory: HDF5 ends the process where a disk is full.
+    """Return a NetCDF-4 file of a :class:`Dataset`. It is made in memory, because HDF5 ends the process on a full disk.
 
-    Arrays are deflated; text becomes characters in UTF-8, which every reader of CF takes. NetCDF has no complex
+    Arrays are deflated. Text becomes characters in UTF-8, which every reader of CF files accepts. NetCDF has no complex
     numbers: ``NAME_real`` and ``NAME_imag`` are written instead of ``NAME``. The ``_FillValue`` of a variable
     with NaN is NaN. Other variables have a ``_FillValue`` only if their ``encoding`` contains one. ``grows`` are
     dimensions without a limit; :class:`GrowingNetcdf` appends along the first of them.
@@ -139,7 +139,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
             if dim not in book.dimensions:
                 book.createDimension(dim, None if dim in grows else size)
         encoding: dict[str, Any] = (
-            # shuffling sorts the bytes of numbers by their weight; single bytes have none
+            # shuffling sorts the bytes of numbers by significance, which single bytes do not have
             {"zlib": True, "complevel": 4, "shuffle": values.dtype.itemsize > 1} if values.ndim else {}
         )
         attributes = dict(variable.attrs)
@@ -151,7 +151,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
         if {*dims} & {*grows}:
             encoding["chunksizes"] = (64,) * len(dims) if values.dtype.kind == "S" else _chunk(dims, values, grows)
         made = book.createVariable(name, values.dtype, dims, fill_value=encoding.pop("_FillValue", None), **encoding)
-        # the values are packed already: netCDF4 would treat them as physical values and scale them
+        # the values are already packed, and netCDF4 would scale them again
         made.set_auto_maskandscale(False)
         made.setncatts(attributes)
         made[...] = values
@@ -203,14 +203,14 @@ class GrowingNetcdf:
                 self._stream.close()
 
     def append(self, data: Any) -> None:
-        """Write the next :class:`Dataset`: variables and dimensions as the first."""
-        with held():  # an interrupt inside a call of HDF5 would leave it with a half-made file
+        """Write the next :class:`Dataset`, with the same variables and dimensions as the first."""
+        with held():  # an interrupt inside a call of HDF5 would leave an incomplete file
             self._append(data)
 
     def _append(self, data: Any) -> None:
         if self._book is None:
             self._sink.write(netcdf_bytes(data, self._grows))
-            # h5py goes on where netCDF4 began, because netCDF4 cannot append to a stream
+            # h5py continues the file that netCDF4 began, because netCDF4 cannot write to a stream
             self._book = library("h5py").File(self._sink, "r+")
             for variable in self._book.values():
                 if "_FillValue" in variable.attrs and not np.isnan(variable.attrs["_FillValue"][0]):
@@ -239,7 +239,7 @@ class GrowingNetcdf:
 
 
 def _parts(data: Any) -> dict[str, Variable]:
-    """Return the variables as a file has them: text as characters, complex numbers as two variables."""
+    """Return the variables in the form of a file: text as characters, complex numbers as two variables."""
     parts = {}
     for name, variable in data.variables.items():
         dims, values, about = variable.dims, np.asarray(variable.values), dict(variable.attrs)
@@ -256,7 +256,7 @@ def _parts(data: Any) -> dict[str, Variable]:
 
 
 def library(name: str) -> Any:
-    """A module of the extra ``geo``.
+    """Import a module of the extra ``geo``.
 
     Raises
     ------

@@ -46,7 +46,7 @@ _UNFINISHED = ".unfinished"
 _Identity = tuple[int, int]
 
 
-# --- what is this tool's own ----------------------------------------------------------------------
+# --- outputs of this tool --------------------------------------------------------------------------
 
 
 def sealed(text: str) -> bytes:
@@ -93,7 +93,7 @@ def check_seal(path: Path) -> None:
 
 
 def read_sums(folder: Path) -> dict[str, str] | None:
-    """Return the SHA-256 of each file of a result folder by relative name. None without a valid list of this tool.
+    """Return the SHA-256 of each file of a result folder by relative name. None if there is no valid list.
 
     A list that names a file outside the folder is not valid, because the listed files may be removed.
     """
@@ -130,7 +130,7 @@ def _digest(stream: BinaryIO) -> str:
     return digest.hexdigest()
 
 
-# --- what is an input -----------------------------------------------------------------------------
+# --- inputs ---------------------------------------------------------------------------------------
 
 
 def _identity(path: Path) -> _Identity | None:
@@ -478,7 +478,7 @@ def _remove_folders(created: list[Path]) -> None:
             place.rmdir()
 
 
-# --- the place beside -----------------------------------------------------------------------------
+# --- the hidden path ------------------------------------------------------------------------------
 
 
 def hidden_name(target: Path, suffix: str) -> Path:

@@ -89,7 +89,7 @@ def nearest(name: object, choices: Iterable[str]) -> str | None:
 
 
 def nearest_zone(name: str) -> str | None:
-    """The IANA time zone most like a wrong name, by its city where it names no region.
+    """Return the IANA time zone most similar to a wrong name. A name without a region is compared with cities.
 
     Examples
     --------
@@ -104,7 +104,7 @@ def nearest_zone(name: str) -> str | None:
 
 
 def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
-    """A YAML file as a checked model.
+    """Read a YAML file and return it as a checked model.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def _dumper() -> Any:
     base: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
     class Dumper(base):  # type: ignore[misc]
-        """Quotes what our reader would not take for a word."""
+        """A dumper that quotes words which this reader would read as another type."""
 
         def ignore_aliases(self, _: Any) -> bool:
             return True  # equal lists are written out: '&id001' does not help a reader
@@ -214,7 +214,7 @@ class _Document:
     lines: dict[Location, int] = field(default_factory=dict)
 
     def line(self, location: Location) -> int | None:
-        """Line of the longest known beginning of a location (pydantic mixes names of union members in)."""
+        """Return the line of a location. Unknown last parts are ignored: pydantic inserts names of union members."""
         known: Location = ()
         for part in location:
             if (*known, part) in self.lines:
@@ -250,7 +250,7 @@ def _tab_indents(text: str, mark: Any) -> bool:
 
 
 class _Builder:
-    """A builder of values from parser events. :data:`_MAX_DEPTH` bounds the recursion, to avoid a stack overflow."""
+    """A builder of values from parser events. :data:`_MAX_DEPTH` limits the recursion."""
 
     def __init__(self, path: str | Path | None) -> None:
         self.path = path
@@ -351,7 +351,7 @@ def _plain_value(text: str) -> Any:
     return text
 
 
-# ---------------------------------------------------------------- pydantic's findings in our words
+# ---------------------------------------------------------------- errors of pydantic as messages
 
 
 def _explain(
@@ -393,7 +393,7 @@ def _kind(keys: Iterable[str]) -> str | None:
     return next((kind for kind, signs in _SIGNS.items() if signs.issubset(keys)), None)
 
 
-# Parts of a location that say which member of a union was tried. No key of this package has such a name.
+# Parts of a location that name the tried member of a union. No key of this package has such a name.
 _MEMBER = re.compile(r"literal\[.*\]|float|int|str|bool")
 
 # What is expected, by pydantic's name of the error.

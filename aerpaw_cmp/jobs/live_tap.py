@@ -79,9 +79,9 @@ def tap_modems(
         if shown.web is not None:
             feed = Feed(names)
             _serve(stack, feed, twin, shown, ", ".join(names))
-        stop = stack.enter_context(Stop())  # no log is open before, so an earlier stop needs no care
+        stop = stack.enter_context(Stop())  # an earlier signal ends the process: no log is open yet
         alone = len(ports) == 1
-        # one after the other, because each replays the planned route
+        # not in parallel, because each predictor replays the planned route
         predictors = [None if twin is None else twin.predictor() for _ in ports]
 
         def session(number: int) -> TapSummary:

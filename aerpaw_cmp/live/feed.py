@@ -25,10 +25,10 @@ from ..logs.files import Record
 from .modem import RI_QUERY
 from .ports import TapStatus
 
-# Rows that stay: two hours at 10 Hz, ten at 2 Hz.
+# Number of rows that are stored: two hours at 10 Hz, ten hours at 2 Hz.
 ROWS = 72_000
 _PENDING = 20_000
-# Rows in one message, so that a slow link refills step by step.
+# Largest number of rows in one message, so that a slow connection gets a long history in parts.
 CHUNK = 4_000
 _ALARMS = 300
 _LONGEST_TEXT = 300
@@ -46,7 +46,7 @@ PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_lo
 # Errors that a record of unexpected content can raise. Such a record is not shown on the page, and polls do not wait
 # for it.
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
-# a version, then two rows for each of at most sixteen modems; a longer text is not a cursor of this page
+# a version, then two row numbers for each of at most sixteen modems
 _CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
 
 
@@ -58,7 +58,7 @@ _STATUS = (
 
 
 class Rows:
-    """The last rows of a table of 32-bit floats. Row numbers count from zero for ever."""
+    """The last rows of a table of 32-bit floats. Rows are numbered from zero over the whole session."""
 
     def __init__(self, size: int = ROWS) -> None:
         self._rows: deque[bytes] = deque(maxlen=size)
@@ -71,7 +71,7 @@ class Rows:
 
     def after(self, first: int, most: int = CHUNK) -> tuple[int, str]:
         """Return the number of the first row, and the rows from there on as little-endian floats in base64."""
-        # overwritten rows are lost; a cursor beyond the end can only be crafted, and gets no rows
+        # rows before the oldest are lost; a cursor beyond the end was not made by this page, and gets no rows
         oldest = self.count - len(self._rows)
         first = min(max(first, oldest), self.count)
         part = itertools.islice(self._rows, first - oldest, first - oldest + most)
@@ -131,19 +131,19 @@ class _Modem:
     _SHOWN = (*_STATUS, "name", "port", "rank", "rsrp_dbm", "sinr_db", "offset_db", "inside", "ahead", "ended")
 
     def shown(self) -> dict[str, Any]:
-        """Values of the moment, as the page shows them."""
+        """Return the present values that the page shows."""
         return {name: getattr(self, name) for name in self._SHOWN}
 
 
 class Feed:
-    """The state of the page. See the head of this module.
+    """The state of the page, which one thread writes and the threads of browsers read.
 
     Parameters
     ----------
     names : sequence of str
         Names of the modems.
     mono_ns, utc_ns : callable
-        The clocks that time the records [ns].
+        The clocks of the time stamps in records [ns].
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class Feed:
     # the server's thread ----------------------------------------------------------------------------------
 
     def digest(self) -> None:
-        """Take in what waits, look at the alarms, wake the browsers' threads if anything is new."""
+        """Process the waiting records, update the alarms, and wake the browsers' threads if anything is new."""
         items = [self._pending.popleft() for _ in range(len(self._pending))]
         with self._changed:
             for number, item in items:
@@ -219,7 +219,7 @@ class Feed:
                 "alarms": [asdict(alarm) for alarm in self._alarms if alarm.version > version],
                 "ended": self._ended,
             }
-            # a message that was cut at CHUNK rows leaves the version behind, so that the next poll does not wait
+            # if rows remain, keep the old version, so that the next request does not wait
             reached_version = self._version if complete else version
             return message, "-".join(map(str, [self.epoch, reached_version, *following]))
 
@@ -244,7 +244,7 @@ class Feed:
         for name in _STATUS:
             setattr(modem, name, getattr(status, name))
         if status.message and status.message not in _alarms_of(modem, self.now()).values():
-            self._raise(modem, "message", status.message).end_s = self.now()  # a line without duration
+            self._raise(modem, "message", status.message).end_s = self.now()  # a message has no duration
 
     def _take(self, modem: _Modem, item: Record | TapStatus) -> None:
         if isinstance(item, TapStatus):
@@ -280,7 +280,7 @@ class Feed:
             modem.rank = None if rank is None else int(rank)
             if modem.rank is not None:
                 modem.rank_s = t
-            # levels come from another query, at a slower rate: store the last known levels next to each rank
+            # levels come from another query at a slower rate: store the last known levels with each rank
             modem.measured.add((t, modem.rank, modem.rsrp_dbm, modem.sinr_db))
             modem.sent.append((record["sent_utc_ns"], t))
 

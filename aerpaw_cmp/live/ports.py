@@ -166,20 +166,19 @@ def holders(path: Path, *, others_only: bool = True) -> list[Holder]:
     except OSError:
         return []
     holding = []
-    for process in _processes():
+    for folder, holder in _processes():
         with contextlib.suppress(OSError):
             # the master of a pseudo-terminal has another device number, so only openers of the port count
-            if any(stat.S_ISCHR(file.st_mode) and file.st_rdev == wanted for file in _open_files(process)):
-                holding.append(_holder(process))
+            if any(stat.S_ISCHR(file.st_mode) and file.st_rdev == wanted for file in _open_files(folder)):
+                holding.append(holder)
     return sorted((h for h in holding if not others_only or h.pid != os.getpid()), key=lambda h: h.pid)
 
 
-def _processes() -> Iterator[Path]:
-    return (folder for folder in Path("/proc").iterdir() if folder.name.isdigit())
-
-
-def _holder(process: Path) -> Holder:
-    return Holder(int(process.name), (process / "comm").read_text().strip())
+def _processes() -> Iterator[tuple[Path, Holder]]:
+    """Yield the folder in ``/proc`` and the name of each process."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # the process has ended
+            yield folder, Holder(int(folder.name), (folder / "comm").read_text().strip())
 
 
 def _open_files(process: Path) -> Iterator[os.stat_result]:
@@ -190,11 +189,7 @@ def _open_files(process: Path) -> Iterator[os.stat_result]:
 
 def modem_manager() -> Holder | None:
     """Return ModemManager if it runs. Its name is visible even if its open files are not."""
-    for process in _processes():
-        with contextlib.suppress(OSError):
-            if (holder := _holder(process)).name == "ModemManager":
-                return holder
-    return None
+    return next((holder for _, holder in _processes() if holder.name == "ModemManager"), None)
 
 
 def _busy(path: Path, others: list[Holder]) -> InputError:

@@ -41,9 +41,9 @@ class Prediction:
     east_m, north_m, up_m : float or None
         Position in the site frame. None: no pose for that time.
     fix : float or None
-        Kind of the GPS fix; below 3 it gives no position.
+        Kind of the GPS fix. Below 3 there is no position.
     telemetry_age_s : float or None
-        Age of the newest line of the telemetry log; None: no line so far.
+        Age of the newest line of the telemetry log. None: there is no line yet.
     telemetry_delay_s : float or None
         Smallest recent delay of the telemetry lines. Negative if the telemetry's clock is ahead of ours.
     learn : callable, optional
@@ -66,12 +66,12 @@ Predict = Callable[[int], "Prediction | None"]
 
 
 class RunningInterval:
-    """Interval of the next residual, from the residuals before it.
+    """An interval for the next residual, computed from the residuals before it.
 
     Parameters
     ----------
     share : float
-        Share of residuals that must lie inside.
+        Share of residuals that the interval should contain.
     least : int
         Smallest number of residuals for an interval.
     keep : int
@@ -112,7 +112,7 @@ class RunningInterval:
         n = len(self._sorted)
         if n < self._least or self._tails <= 0.0:
             return None
-        # the two order statistics must not cross, however wide the tails are
+        # the two order statistics must not cross, even for wide tails
         beyond = min((n - 1) // 2, max(0, math.floor(0.5 * self._tails * (n + 1)) - 1))
         return self._sorted[beyond], self._sorted[n - 1 - beyond]
 
@@ -134,7 +134,7 @@ class RunningInterval:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """One answer of the modem for which a prediction is wanted: its time, its command's time, what it measured."""
+    """A request for the prediction at an answer of the modem: its time, the time of its command, its values."""
 
     utc_ns: int
     sent_utc_ns: int
@@ -165,11 +165,11 @@ class PredictionWorker:
             self._wanted.put_nowait(asked)
 
     def results(self) -> list[dict[str, Any]]:
-        """Finished predictions, each with measured rank and residual (measured minus predicted)."""
+        """Return finished predictions, each with measured rank and residual (measured minus predicted)."""
         return [self._done.popleft() for _ in range(len(self._done))]
 
     def close(self) -> None:
-        """Finish what is asked for, at most 2 s long."""
+        """Finish the pending request, and wait for it at most 2 s."""
         try:
             self._wanted.put(None, timeout=2.0)
         except queue.Full:
@@ -188,7 +188,7 @@ class PredictionWorker:
                 prediction = self._predict(asked.utc_ns)
                 if prediction is not None:
                     result |= self._compared(asked, prediction)
-            except Exception as error:  # a fault of the replay must not end the log
+            except Exception as error:  # an error of the replay must not end the log
                 result["error"] = f"{type(error).__name__}: {error}"[:300]
             self._done.append(result)
 

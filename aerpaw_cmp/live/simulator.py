@@ -1,4 +1,4 @@
-"""A modem that is not there: a pseudo-terminal that answers like an RM502Q-AE over a simulated flight.
+"""A simulated modem: a pseudo-terminal that answers like an RM502Q-AE during a simulated flight.
 
 It speaks to whatever opens the port, so the tap, a terminal program and the tests all use the same thing.
 """
@@ -26,14 +26,14 @@ _LATENCY_S = 0.02
 
 
 def flight_rank(seconds: float) -> int:
-    """Return the rank of the built-in flight: 1 to 4 in slow turns, now and then no CSI."""
+    """Return the rank of the built-in flight. It varies slowly between 1 and 4, and is sometimes 0 (no CSI)."""
     if seconds % 120.0 > 118.0:
         return 0
     return 1 + round(1.5 + 1.5 * math.sin(seconds / 20.0))
 
 
 def _flight_rsrp(seconds: float) -> float:
-    """RSRP of the built-in flight [dBm]."""
+    """Return the RSRP of the built-in flight [dBm]."""
     return -85.0 - 12.0 * (1.0 + math.sin(seconds / 31.0))
 
 
@@ -136,7 +136,7 @@ class ModemSimulator:
 
     @property
     def port(self) -> Path:
-        """Path to open: the link if there is one, else the node."""
+        """The path to open: the link if there is one, else the node."""
         return self.link or self._node
 
     def _plug(self) -> Path:

@@ -1,4 +1,4 @@
-"""campaign.html, campaign.json and campaign.csv: records of many flights and settings, sentences, figures, files."""
+"""The records of many flights and settings, and campaign.html, campaign.json and campaign.csv made from them."""
 
 from __future__ import annotations
 
@@ -32,13 +32,14 @@ from .texts import interval, k_key, minute, more, number
 class RssRow:
     """The RSS of one flight, setting, tower and channel.
 
-    ``offset_db`` and ``rmse_db`` come from the samples of this row. ``pooled_offset_db`` is shared as the
-    ``calibration`` of the campaign specifies, and ``pooled_rmse_db`` is the RMSE with it. ``held_out_offset_db`` comes
-    from the other flights of the same setting, tower and channel, and ``held_out_rmse_db`` is the RMSE with it (NaN
-    without another flight).
+    ``offset_db`` and ``rmse_db`` are fitted on the samples of this row. ``pooled_offset_db`` is the offset of its group
+    of ``calibration:``, and ``pooled_rmse_db`` is the RMSE with it. ``held_out_offset_db`` is fitted on the other
+    flights of the same setting, tower and channel, and ``held_out_rmse_db`` is the RMSE with it. Both are NaN if there
+    is no other flight.
+
     ``baselines`` are RMSE by name [dB], each with its own offset. ``span_db`` is the search range of the offset. Arrays
-    (n,) are at the samples, NaN if a side is missing. They are stored for the first setting only; for others they are
-    empty and ``difference`` replaces them.
+    (n,) have a value per sample, NaN if one side is missing. Only rows of the first setting have them; other rows have
+    ``difference`` instead.
     """
 
     flight: str
@@ -80,22 +81,22 @@ class RssRow:
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """Flight, tower, channel."""
+        """The flight, tower and channel."""
         return self.flight, self.tower, self.channel
 
     @property
     def moments(self) -> Moments:
-        """Moments of simulated minus measured level over the scored samples."""
+        """The moments of simulated minus measured level over the scored samples."""
         return self.difference or difference_moments(self.measured_db, self.simulated_dbm)
 
     @property
     def link(self) -> str:
-        """Tower and channel as one label."""
+        """The tower and channel as one label."""
         return f"{self.tower} {self.channel}".strip()
 
     @property
     def residual_db(self) -> FloatArray:
-        """Measured level plus the offset of this row, minus the simulated level (n,)."""
+        """The measured level plus the offset of this row, minus the simulated level (n,) [dB]."""
         return self.measured_db + self.offset_db - self.simulated_dbm
 
 
@@ -118,7 +119,7 @@ class RankRow:
     best_k: float
     best_k_ci95: Interval | None
     commonest_agreement: float = float("nan")
-    """Agreement of always guessing the most frequent rank, the baseline of a model."""
+    """Agreement if the most frequent rank is always predicted, the baseline of a model."""
     logs: tuple[str, ...] = ()
     """SHA-256 of the logs that contain the reports."""
     mark: str = field(repr=False, default="")
@@ -126,7 +127,7 @@ class RankRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
-    """A flight and setting without numbers, and the reason; ``traceback`` is for developers and never on the page."""
+    """A flight and setting without numbers, and the reason. ``traceback`` is for developers and not on the page."""
 
     flight: str
     setting: str
@@ -138,8 +139,8 @@ class Failure:
 class PooledOffset:
     """An offset that several rows share.
 
-    ``spread_db`` is the standard deviation of the offsets of the members (NaN for one member), ``range_db`` their
-    extremes; ``own_rmse_db`` and ``pooled_rmse_db`` are means over the members.
+    ``spread_db`` is the standard deviation of the offsets of the members (NaN for one member), and ``range_db`` their
+    range. ``own_rmse_db`` and ``pooled_rmse_db`` are means over the members.
     """
 
     setting: str
@@ -156,24 +157,24 @@ class PooledOffset:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Repeat:
-    """Two flights over the same area, one tower and channel.
+    """The difference between two flights at the same positions, for one tower and channel.
 
     Parameters
     ----------
     rmse_db : float
         RMS difference of the two measurements after the best constant ``offset_db`` (second minus first) [dB].
     share : float
-        Pairs divided by samples of the first flight. A few pairs near the launch pad represent only that position.
+        Number of pairs divided by the number of samples of the first flight.
     single_db : float
-        ``rmse_db / sqrt(2)``: the error of one pass, if both have equal and independent errors.
+        ``rmse_db / sqrt(2)``, the error of one flight if both have equal and independent errors.
     residual_rmse_db : float
-        The same difference after the difference of the simulation has been subtracted.
+        RMS difference of the residuals of the two flights [dB].
     place_rmse_db : float
         RMS difference of the mean residuals per cell of the plan, at all heights.
     place_correlation : float
         Correlation of the mean residuals per cell of the plan. Near 1, the model has the same errors on both flights.
     cells : int
-        Cells that both flights visit.
+        Number of cells that both flights visit.
     height_difference_m : float
         Median height difference over these cells [m].
     """
@@ -216,23 +217,24 @@ class RankTransfer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettingRank:
-    """One setting compared with the setting of smallest mean error, over flights.
+    """One setting, compared with the setting of smallest mean error over flights.
 
     Parameters
     ----------
     setting : str
     link : str
-        Tower and channel; empty for all.
+        Tower and channel; empty for all links.
     n_flights : int
-        Flights with an error under this setting.
+        Number of flights with an error under this setting.
     mean_db : float
-        Mean over flights of the mean error over towers and channels [dB]. It is held out if there is another flight.
+        Mean over flights of the mean error over towers and channels [dB], held out if there is another flight.
     quantiles_db : tuple of float
         Quantiles of 0, 10, 25, 50, 75, 90 and 100 % over flights.
     difference_db, difference_ci95_db : float, Interval or None
-        Mean over flights of this minus the first setting, on links that both scored; None for the first setting.
+        Mean over flights of the error minus that of the first setting on the same links, and its interval, which is
+        None for the first setting.
     n_paired : int
-        Flights in that difference.
+        Number of flights in that difference.
     verdict : str
         "first", "worse", "not significant" or "no interval".
     """
@@ -252,8 +254,8 @@ class SettingRank:
 class PlaceMap:
     """The mean residual of cells of the plan over flights, towers and channels.
 
-    ``cells`` (n, 2) are column and row in multiples of the cell from the origin; ``mean_db`` (n,) is the mean over
-    flights, towers and channels of the mean residual of each in the cell.
+    ``cells`` (n, 2) are the column and row of each cell, counted from the origin of the site. ``mean_db`` (n,) is the
+    mean of the mean residuals of all flights, towers and channels in the cell [dB].
     """
 
     cells: IntArray
@@ -267,11 +269,11 @@ class Season:
     Parameters
     ----------
     held_out : bool
-        True if the errors are held out. With one flight they are its own.
+        True if the errors are held out. The errors of a single flight are not.
     started : mapping of str to str
         First time of each flight (UTC, ISO 8601); missing for logs with relative times.
     ranking : tuple of SettingRank
-        Over all links, best first, then for each link if there are several.
+        Rankings over all links and, if there are several, of each link. The best setting is first.
     nodes : tuple of NodeOffset
         Offsets of nodes under the first setting, or of soundings between towers.
     places : PlaceMap, optional
@@ -294,7 +296,7 @@ class Season:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignData(Made):
-    """The content of the page. ``settings`` are overrides by label; ``flights`` are names in order.
+    """The content of the page. ``settings`` are the changes of each setting by its label.
 
     Two samples have the same position if they are within ``radius_m`` and their headings agree within
     ``heading_within_deg``. Residuals are averaged in cells of ``cell_m``.
@@ -322,12 +324,12 @@ class CampaignData(Made):
 
     @property
     def reference(self) -> str:
-        """The first setting, for which repeatability and figures of the campaign are drawn."""
+        """The first setting, to which repeatability, steps and places belong."""
         return next(iter(self.settings), "")
 
     @property
     def reference_rows(self) -> tuple[RssRow, ...]:
-        """RSS rows of that setting."""
+        """The RSS rows of the first setting."""
         return tuple(row for row in self.rss if row.setting == self.reference)
 
 
@@ -357,12 +359,12 @@ CAUSES: dict[str, tuple[str, str]] = {
 # Largest number of settings in a sentence.
 _FEW_SETTINGS = 4
 
-# Below this share of samples with a pair, repeatability is that of a few positions.
+# Below this share of samples with a pair, the repeatability is valid for a few positions only.
 _FEW_PAIRS = 0.25
 
 
 def rss_flights(data: CampaignData) -> list[str]:
-    """Return the flights that have RSS or failed. Flights with rank alone have no RMSE."""
+    """Return the flights with RSS, and those that failed. Flights with rank only have no RMSE."""
     ranked = {row.flight for row in data.rank} - {row.flight for row in data.rss}
     return [name for name in data.flights if name not in ranked]
 
@@ -402,7 +404,7 @@ def headline(data: CampaignData) -> list[str]:
 
 
 def step_words(data: CampaignData) -> list[str]:
-    """Return a sentence per step of an offset, the latest first, and how small a step the last date can show."""
+    """Return a sentence per step of an offset, the latest first, and the smallest step that the last date can show."""
     judged = [node for node in data.season.nodes if np.isfinite(node.smallest_db)]
     if not judged:
         return []
@@ -464,7 +466,7 @@ def warnings(data: CampaignData) -> list[str]:
 
 
 def edge_warnings(data: CampaignData) -> list[str]:
-    """Return a warning per row whose best offset is at the end of its search range, which is a failed check."""
+    """Return a warning for each row whose best offset is at the end of its search range, which is a failed check."""
     return [
         f"{row.flight}, {row.setting}, {row.link}: the best offset is at the end of its search range."
         for row in data.rss
@@ -519,7 +521,7 @@ def cause(data: CampaignData) -> Verdict:
 
 
 def against_baselines(row: RssRow) -> str:
-    """Return the baselines that ray tracing is significantly better and worse than, in one cell."""
+    """Return the text of a cell: the baselines that ray tracing is significantly worse and better than."""
     parts = [
         f"{word} than " + ", ".join(pretty(name) for name, decision in row.verdicts.items() if decision == word)
         for word in ("worse", "better")
@@ -528,7 +530,7 @@ def against_baselines(row: RssRow) -> str:
     return "; ".join(parts) or ("not significant" if row.verdicts else "\u2013")
 
 
-# Number of nodes in the chart: those with steps first, then those that vary most.
+# Number of nodes in the chart. Nodes with steps are first, then those that vary most.
 _NODES_SHOWN = 12
 
 
@@ -588,7 +590,7 @@ def _entries(items: Iterable[Any], without: Sequence[str]) -> list[dict[str, Any
 
 
 def campaign_metrics(data: CampaignData) -> dict[str, Any]:
-    """Return the numbers of the page under stable names. Missing numbers are None."""
+    """Return the numbers of campaign.json. A missing number is null in the file."""
     failed = {f.flight for f in data.failures}
     result = {
         "campaign": data.name,
@@ -648,7 +650,7 @@ _CSV_COLUMNS = [
 
 
 def result_card(data: CampaignData) -> Card:
-    """Return the card of the result: settings in order of their error, the worst flights, K of other flights."""
+    """Return the card of the result: settings by error, flights with the largest error, and rank."""
     tables = [_ranking(data), _worst(data), _mean_errors(data), _transfers(data)]
     return Card(title="Result", id="result", link="Result", text=headline(data), tables=tables)
 
@@ -777,7 +779,7 @@ def _pairs(data: CampaignData) -> Table:
 
 
 def rows_card(data: CampaignData) -> Card:
-    """Return the card of all numbers: a row per flight, setting and link, or K."""
+    """Return the card of all numbers, with a row per flight, setting and link, or K."""
     return Card(title="All numbers", id="rows", link="All numbers", fold=True, tables=[_levels(data), _ranks(data)])
 
 
@@ -836,7 +838,7 @@ def settings_of(data: CampaignData, files: Sequence[str]) -> Card:
     return replace(settings_card(data, {"workers": data.workers}), tables=[table], text=[beside])
 
 
-# Cards in the order of the page, after the figures. A new card is a further function.
+# Cards in the order of the page, after its chart and map. A new card is another function here.
 CARDS = (failures_card, offsets_card, rows_card)
 
 
@@ -866,7 +868,8 @@ def campaign_page(data: CampaignData, files: Sequence[str]) -> str:
 def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     """Write ``campaign.html``, ``campaign.json`` and the tables. Return the files, the page first.
 
-    ``pairs.csv`` contains all pairs of flights at the same positions; campaign.json those with the most cells.
+    ``pairs.csv`` contains all pairs of flights at the same positions, and campaign.json those with the most pairs of
+    samples.
     """
     folder = Path(folder)
     indent = 2 if len(data.rss) + len(data.rank) < _COMPACT_ROWS else None
@@ -883,9 +886,9 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     return [write_file(folder / "campaign.html", campaign_page(data, [path.name for path in written])), *written]
 
 
-# --- pairs of flights at the same places -----------------------------------------------------------------------------
+# --- pairs of flights at the same positions ---------------------------------------------------------------------------
 
-# Largest number of pairs in campaign.json. If there are more, those with the most cells are listed.
+# Largest number of pairs of flights in campaign.json.
 LISTED_PAIRS = 1000
 
 # File with all pairs.
@@ -893,13 +896,13 @@ _PAIR_TABLE = "pairs.csv"
 
 
 def telling(pairs: Sequence[Repeat], most: int = LISTED_PAIRS) -> list[Repeat]:
-    """Return all pairs, or the ``most`` pairs with the most cells, in their order."""
+    """Return the ``most`` pairs of flights with the most pairs of samples, in their order."""
     chosen = sorted(range(len(pairs)), key=lambda i: (-pairs[i].n, i))[:most]
     return [pairs[i] for i in sorted(chosen)]
 
 
 def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
-    """Return numbers of pairs of flights and common cells per tower and channel, and their differences [dB]."""
+    """Return the numbers of pairs per tower and channel, and their differences [dB]."""
     groups: dict[tuple[str, str], list[Repeat]] = {}
     for pair in pairs:
         groups.setdefault((pair.tower, pair.channel), []).append(pair)

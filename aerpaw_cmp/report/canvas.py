@@ -1,9 +1,9 @@
 """Matplotlib figures of a report, drawn from finished arrays.
 
-There is no pyplot and no global state: every figure is a separate :class:`matplotlib.figure.Figure`, drawn inside
-:func:`style`. Colours also differ in lightness, line style, marker or hatch, so that they can be distinguished in
-grey. Clouds of points are rasterised and long lines thinned (extremes are retained), so that an SVG of a long flight
-stays small.
+Every figure is a separate :class:`matplotlib.figure.Figure`, drawn inside :func:`style` without pyplot and global
+state. Colours also differ in lightness, line style, marker or hatch, so that they can be distinguished in grey. Clouds
+of points are rasterised, and long lines are thinned with their extremes retained. An SVG of a long flight is
+therefore small.
 """
 
 from __future__ import annotations
@@ -68,8 +68,7 @@ _IEEE_WIDTH_IN = 7.16
 def style(kind: str = "screen") -> Iterator[None]:
     """Apply the look of every figure without changing the settings of the user.
 
-    The style ``paper`` embeds fonts and has Times-like letters of the right size when a figure is scaled to the width
-    of an IEEE page.
+    The style ``paper`` embeds fonts, and its serif letters have 8 pt after scaling to the width of an IEEE page.
     """
     import matplotlib
 
@@ -78,11 +77,11 @@ def style(kind: str = "screen") -> Iterator[None]:
         "font.sans-serif": ["DejaVu Sans"],
         "font.size": 9.0,
         "text.usetex": False,  # a third-party matplotlibrc in the working folder could run LaTeX
-        "text.parse_math": False,  # a waypoint may be called A_$
+        "text.parse_math": False,  # the name of a waypoint may contain $
         "axes.titlesize": 10.0,
         "axes.titleweight": "bold",
         "axes.titlelocation": "left",
-        "axes.titley": 1.0,  # otherwise every axis is measured for the position of its title
+        "axes.titley": 1.0,  # otherwise matplotlib measures every axis to place its title
         "axes.spines.top": False,
         "axes.spines.right": False,
         "axes.axisbelow": True,
@@ -97,9 +96,9 @@ def style(kind: str = "screen") -> Iterator[None]:
         "figure.dpi": 100.0,
         "savefig.dpi": _RASTER_DPI,
         "svg.fonttype": "path",  # the page must look the same if the font is missing
-        "svg.hashsalt": "aerpaw-cmp",  # the same numbers give the same bytes
+        "svg.hashsalt": "aerpaw-cmp",  # the same numbers produce the same bytes
         "path.simplify": True,
-        "figure.autolayout": False,  # the layout is set here, and is switched off when it is done
+        "figure.autolayout": False,  # subplots() sets the layout
         "figure.constrained_layout.use": False,
     }
     if kind == "paper":
@@ -116,7 +115,7 @@ def style(kind: str = "screen") -> Iterator[None]:
 
 
 def subplots(size: tuple[float, float], *shape: int, **options: Any) -> tuple[Figure, Any]:
-    """Return a figure whose parts do not overlap, and its axes; ``size`` is in inches."""
+    """Return a figure whose parts do not overlap, and its axes. ``size`` is width and height in inches."""
     from matplotlib.figure import Figure
 
     fig = Figure(figsize=size, layout="constrained")
@@ -129,7 +128,7 @@ def placed(
 ) -> tuple[Figure, Any]:  # fmt: skip
     """Return a figure and its axes (rows, columns) at fixed positions.
 
-    Measuring a grid of axes takes as long as drawing it, so all positions are in inches.
+    An automatic layout of a grid of axes takes as long as drawing it, so all positions are given in inches.
 
     Parameters
     ----------
@@ -175,7 +174,7 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
     images = {name: io.BytesIO() for name in formats}
     # use the canvases, because Figure.savefig draws an additional, hidden figure before each file
     agg = FigureCanvasAgg(fig)
-    agg.draw()  # the layout is made here
+    agg.draw()  # this computes the layout
     if "png" in images:
         from PIL import Image
 
@@ -241,7 +240,7 @@ def _clock_ticks(low_s: float, high_s: float, start: np.datetime64, most: int = 
 
 
 def time_axis(ax: Axes, start: np.datetime64) -> None:
-    """Set label and ticks of a time axis in seconds after ``start``, in UTC if the logs have it."""
+    """Set label and ticks of an axis in seconds after ``start``. Ticks are times of day if the logs have UTC."""
     if not has_wall_clock(start):
         ax.set_xlabel("Time after the first sample [s]")
         return
@@ -264,7 +263,7 @@ def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
     Returns
     -------
     (m,) int
-        Indices in rising order; all of them if n <= limit.
+        Indices in rising order, all of them if n <= limit.
 
     Examples
     --------
@@ -277,7 +276,7 @@ def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
     # each segment yields two samples per array, its smallest and its largest
     per = -(-n // max(1, limit // (2 * len(values))))
     starts = np.arange(0, n, per)
-    # a thinned line must end where the flight ends
+    # the thinned line ends where the flight ends
     rows = [np.array([0, n - 1])]
     for array in values:
         table = np.pad(np.asarray(array, dtype=np.float64), (0, -n % per), constant_values=np.nan).reshape(-1, per)
@@ -288,9 +287,9 @@ def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
 
 
 def thinned(at: FloatArray, values: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
-    """Return a line (n,) with about ``limit`` points that looks the same.
+    """Return a line with about ``limit`` points that looks like the line (n,).
 
-    The extremes of each segment are retained. NaN in the values breaks the line, and breaks are retained.
+    The extremes of each segment and its gaps (NaN) are retained.
 
     Examples
     --------
@@ -303,14 +302,14 @@ def thinned(at: FloatArray, values: FloatArray, limit: int = POINTS_PER_LINE) ->
 
 
 def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
-    """Return the rows of a cloud of points that are drawn.
+    """Return the indices of the points of a cloud that are drawn.
 
-    All are drawn up to ``limit``. Larger clouds are thinned evenly, and all extremes are retained.
+    Clouds with more than ``limit`` points are thinned evenly, and their extremes are retained.
 
     Parameters
     ----------
     values : (n,)
-        Ordinate in the order of the abscissa; NaN is ignored.
+        Ordinates in the order of the abscissa; NaN is ignored.
     limit : int
         Number of points.
 
@@ -324,7 +323,7 @@ def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
     """
     if len(values) <= limit:
         return np.arange(len(values))
-    return np.union1d(spread_out(len(values), limit), keep_extremes([values], 1200))  # an extreme in every two pixels
+    return np.union1d(spread_out(len(values), limit), keep_extremes([values], 1200))  # extremes for every two pixels
 
 
 def dots(ax: Axes, at: FloatArray, values: FloatArray, size: float = 2.0, **options: Any) -> None:
@@ -357,7 +356,7 @@ def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
     return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
 
 
-# More than the pixels of a time axis.
+# Number of segments that a time axis can show, which is larger than its number of pixels.
 _SPANS = 2000
 
 
@@ -382,7 +381,7 @@ def draw_out_of_coverage(
     """
     if not mask.any():
         return
-    # a sample covers half a step on each side, because a single lost sample would have no width
+    # a sample covers half a step on each side, so that a single sample has a width
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
     first, last = runs(mask)
     # join segments closer than a pixel
@@ -410,7 +409,7 @@ def draw_waypoints(
     start : datetime64
         Zero of the x axis.
     names : bool
-        Write the labels, too.
+        True if the labels are written, too.
     """
     for number, (label, time) in enumerate(waypoints):
         at = float((time - start) / np.timedelta64(1, "s"))
@@ -423,7 +422,7 @@ def draw_waypoints(
 
 
 def legend_below(ax: Axes, columns: int = 4) -> None:
-    """Draw a legend below the axes, where it hides no data."""
+    """Draw a legend below the axes, where it does not hide data."""
     handles, labels = ax.get_legend_handles_labels()
     if handles:
         ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns, borderaxespad=0.0)
@@ -468,7 +467,7 @@ def draw_site(ax: Axes, site: Site) -> None:
     }  # fmt: skip
     for label, (polygons, look) in areas.items():
         for number, polygon in enumerate(polygons):
-            # one path with all rings, so that holes stay empty
+            # one path with all rings, so that holes are not filled
             rings = [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
             outline = Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
             ax.add_patch(PathPatch(outline, **look, label=label if number == 0 else None))
@@ -536,25 +535,25 @@ def frame_around(
     east, north = east[good], north[good]
     width = max(float(np.ptp(east)) * (1 + 2 * margin), least_m)
     height = max(float(np.ptp(north)) * (1 + 2 * margin), least_m)
-    # scales are equal, so the other axis grows in proportion
+    # equal scales require the shape of the plan
     width, height = max(width, height * shape), max(height, width / shape)
     middle_east, middle_north = (east.min() + east.max()) / 2, (north.min() + north.max()) / 2
     ax.set_xlim(middle_east - width / 2, middle_east + width / 2)
     ax.set_ylim(middle_north - height / 2, middle_north + height / 2)
     for name in (text for text in ax.texts if isinstance(text, Annotation)):
-        # names are to the right of and above their towers, and would cross these two edges
+        # names are to the right of their towers and above them, and would cross the right and upper edge
         if name.xy[0] > middle_east + width / 4:
             name.set(x=-6, ha="right")
         if name.xy[1] > middle_north + 0.4 * height:
             name.set(y=-4, va="top")
         if name.xy[0] > middle_east and name.xy[1] < middle_north - 0.4 * height:
-            # that corner contains the credit of the map
+            # the attribution of the map is in that corner
             for credit in (text for text in ax.texts if text.get_gid() == "credit"):
                 credit.set(x=0.005, ha="left")
 
 
 def plan_shape(east: FloatArray, north: FloatArray) -> float:
-    """Return width over height of the area of points, clipped to 0.8 to 2."""
+    """Return width over height of the area of points, limited to 0.8 to 2."""
     good = np.isfinite(east) & np.isfinite(north)
     if not good.any():
         return 1.0
@@ -562,7 +561,7 @@ def plan_shape(east: FloatArray, north: FloatArray) -> float:
 
 
 def beyond(values: FloatArray, low: float, high: float) -> str:
-    """Return the ends of a colour scale that values exceed, where a colour means "or more".
+    """Return the ends of a colour scale that values exceed, as the option ``extend`` of a colour bar.
 
     Examples
     --------
@@ -574,9 +573,7 @@ def beyond(values: FloatArray, low: float, high: float) -> str:
 
 
 def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither", cax: Any = None) -> Any:
-    """Return a colour bar that an SVG stores as one picture, without seams.
-
-    It has arrows at ends that values exceed.
+    """Return a colour bar with arrows at ends that values exceed. An SVG contains its colours as one picture.
 
     Parameters
     ----------
@@ -589,7 +586,7 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
     extend : {"neither", "min", "max", "both"}
         Ends that values exceed.
     cax : Axes, optional
-        Axes of the bar in a figure that is :func:`placed`.
+        Axes of the bar, for a figure of :func:`placed`.
 
     Returns
     -------
@@ -610,7 +607,7 @@ def legend_of(ax: Axes, shown: Callable[[str], bool]) -> tuple[list[Any], list[s
 
 
 def robust_limits(ax: Axes, levels: Sequence[FloatArray], around: float | None = None) -> None:
-    """Set ordinate limits to the 0.2 to 99.8 % range and a margin, so that a few two-ray nulls do not widen them."""
+    """Set the ordinate to the 0.2 to 99.8 % range with a margin, so that a few nulls of two-ray do not extend it."""
     values = np.concatenate([level[np.isfinite(level)] for level in levels])
     if not len(values):
         ax.set_ylim(-1.0, 1.0)

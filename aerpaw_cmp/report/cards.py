@@ -1,7 +1,7 @@
-"""A page as a list of cards: a page is a function that returns cards, and a new card is one function.
+"""A page as a list of cards, each of which is returned by one function.
 
-A :class:`Card` has a heading, paragraphs, tables, charts and positions; ``page.html.jinja`` shows every card of every
-page in the same way. A card or table without content is not shown, so the functions need no conditions.
+A :class:`Card` has a heading, paragraphs, tables, charts and positions, and ``page.html.jinja`` shows the cards of all
+pages in the same way. A card or table without content is not shown, so the functions need no conditions.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from ..compare.statistics import Interval
 from .page import json_text, rendered, write_file
 from .texts import flat, interval, number, percent, short
 
-# Forms of a column: text, the head of a row, right-aligned text, a percentage. A number is a number of decimals.
+# Forms of a column: text, the head of a row, right-aligned text, a percentage. A column of numbers has the number of
+# its decimals instead.
 TEXT, HEAD, RIGHT, SHARE = "text", "head", "right", "share"
 
 # Scripts of a page, by the view of its positions.
@@ -29,7 +30,7 @@ _SCRIPTS = {
 
 
 def cell(value: Any, form: str | int) -> Any:
-    """Return the text of a table's cell: text as it is, an interval in brackets, a number with the column's decimals.
+    """Return the text of a cell: an interval in brackets, a number with the decimals of its column, or the given text.
 
     Examples
     --------
@@ -57,7 +58,7 @@ def estimate(value: float | None, ends: Interval | None, decimals: int = 2, mark
     ends : Interval, optional
     decimals : int
     mark : str
-        HTML around the number, as ``<b>{}</b>``.
+        HTML around the number, such as ``<b>{}</b>``.
 
     Returns
     -------
@@ -103,7 +104,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Positions:
-    """The data of the canvas that shows positions. ``view`` is explorer, map_explorer or places."""
+    """The data of a map or sphere. ``view`` is the name of its script: explorer, map_explorer or places."""
 
     view: str
     data: Mapping[str, Any]
@@ -117,7 +118,7 @@ class Card:
     ----------
     title : str
     text : sequence
-        A string is a paragraph with commands between backquotes, a list is a list, and Markup is unchanged.
+        Paragraphs (strings, with commands between backquotes), lists, and Markup, which is not changed.
     tables : sequence of Table
     chart : str
         Section of the charts of this card (:class:`~aerpaw_cmp.report.charts.Chart`).
@@ -125,11 +126,11 @@ class Card:
     id, link : str
         Anchor of a section, and its name in the navigation.
     fold : bool
-        Closed until a reader opens it.
+        True if the card is closed until a reader opens it.
     group : str
-        Name of folds of which one is open at a time.
+        Name of a group of cards of which one is open at a time.
     grid : bool
-        Charts stand side by side.
+        True if charts are side by side.
     parts : sequence of Card
     """
 
@@ -147,14 +148,14 @@ class Card:
 
     @property
     def empty(self) -> bool:
-        """True if there is nothing to show below the heading."""
+        """True if there is no content below the heading."""
         filled = any(self.text) or any(table.rows for table in self.tables) or self.chart or self.positions
         return not (filled or any(not part.empty for part in self.parts))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Page:
-    """A page: its head, and cards below it.
+    """A page with its head and its cards.
 
     Parameters
     ----------
@@ -163,15 +164,15 @@ class Page:
     verdict : str
         The result in a paragraph.
     cautions : sequence of str
-        What a reader must know before believing a number: three are shown, the others unfold.
+        Limits of the numbers. Three are shown, and the others can be unfolded.
     about : sequence of str
         Lines in small type.
     numbers : sequence
-        Records with ``label``, ``value``, ``interval`` and ``reference``.
+        Records with ``label``, ``value``, ``interval`` and ``reference`` for the boxes of main numbers.
     first, cards : sequence of Card
-        Above the navigation and below it.
+        Cards above the navigation and below it.
     charts : sequence of Chart
-        Charts in the order of the script's data.
+        Charts in the order of the data of the script.
     """
 
     kind: str
@@ -187,7 +188,7 @@ class Page:
 
     @property
     def view(self) -> str:
-        """The view of the page's positions, or an empty text if no card has positions."""
+        """The view of the positions of the page, empty if no card has positions."""
         return next((card.positions.view for card in (*self.first, *self.cards) if card.positions), "")
 
     def html(self) -> str:
@@ -198,7 +199,7 @@ class Page:
 
 
 def settings_card(made: Any, *settings: Mapping[str, Any], fold: bool = False) -> Card:
-    """Return the card of nested settings, versions and seconds. ``made`` has the fields of :class:`Made`."""
+    """Return the card of settings, versions and seconds. ``made`` has the fields of :class:`~.page.Made`."""
     rows = [row for part in settings for row in flat(part)]
     checked = Table(caption="The checked settings.", columns={"Key": HEAD, "Value": TEXT}, rows=rows)
     software = Table(caption="Software.", columns={"Name": HEAD, "Version": TEXT}, rows=list(made.versions.items()))
@@ -218,7 +219,7 @@ def write_page(folder: Path, name: str, page: Page, numbers: Mapping[str, Any]) 
     ----------
     folder : Path
     name : str
-        The page is written as NAME.html.
+        Name of the file without ``.html``.
     page : Page
     numbers : mapping
         Content of metrics.json.

@@ -1,4 +1,4 @@
-"""Channel along a route as files: NetCDF, arrays for Sionna, a DeepMIMO scenario, and a table for an emulator."""
+"""The channel along a route as files: NetCDF, arrays for Sionna, a DeepMIMO scenario, and a table for an emulator."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from ..propagation.replay import PathTable, Replay, frequency_responses, impulse
 _LINK, _PORTS = ("time", "tower"), ("rx", "tx")
 _PATH = ("path", *_LINK)
 _SITE, _ARRAY = "site frame, azimuth from east, counter-clockwise", "array frame, from the boresight, counter-clockwise"
-# Dimensions along which the file grows with each part, and with the link with most paths.
+# Dimensions along which the file grows: with each part, and with a link that has more paths.
 _GROWS = ("time", "path")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Along:
-    """Poses of the UAV at equal steps of a flight or a route.
+    """The poses of the UAV at equal steps of a flight or a route.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Along:
     towers_m : (poses, 3), optional
         Positions of a tower that moves [m].
     velocity_mps, tower_mps : (poses, 3), optional
-        Velocity of the UAV, if it follows from the times, and of a tower that moves [m/s].
+        Velocities of the UAV and of a tower that moves [m/s]; None if the times do not determine them.
     remarks : tuple of str
     """
 
@@ -71,7 +71,7 @@ class Along:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Channel:
-    """Channel of towers along a route.
+    """The channel of towers along a route.
 
     Parameters
     ----------
@@ -104,22 +104,22 @@ class Channel:
 
     @property
     def carrier_hz(self) -> float:
-        """Carrier of the link [Hz]."""
+        """The carrier of the link [Hz]."""
         return self.replay.ends.link.carrier_hz
 
     @property
     def doppler_hz(self) -> FloatArray | None:
-        """Doppler shift (paths,) [Hz]. None without a velocity."""
+        """The Doppler shift (paths,) [Hz], None if the velocity is not known."""
         own, other = self.along.velocity_mps, self.along.tower_mps
         return None if own is None else self.table.doppler_hz(self.carrier_hz, own, 0.0 if other is None else other)
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences about limits of the numbers."""
+        """The sentences about limits of the numbers."""
         return [*self.along.remarks, *self.replay.left_out]
 
     def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
-        """Return values per path (paths, ...) as (most paths of a link, poses, towers, ...). None remains None."""
+        """Return values per path (paths, ...) as (most paths of a link, poses, towers, ...), and None as None."""
         return None if values is None else self.table.by_link(values, self.replay.ends, fill)
 
 
@@ -150,7 +150,7 @@ def channel_dataset(channel: Channel) -> Dataset:
         described["time"] |= {"long_name": "number of the pose: the route has no times", "units": "1"}
     if channel.level_db is not None:
         described["level_db"]["comment"] = f"unit: {channel.level_unit}; the paths and H do not use what was learned"
-        # only the levels are learned from logs, no other variable of the file
+        # only the levels are learned from logs
         for name in ("level_db", "level_sd_db"):
             described[name][KEY] = " ".join(channel.trained_on)
     return data
@@ -184,8 +184,8 @@ def _quantities(channel: Channel) -> Iterator[tuple[str, AnyArray | None, tuple[
         angle, end, *array, _ = name.split("_")
         meaning = f"{angle} towards the path at its {end}: {_ARRAY if array else _SITE}"
         yield name, of(values), _PATH, "degree", meaning
-    yield "level_db", channel.level_db, _LINK, "1", "level that the receiver would log, of antennas that flights taught"
-    yield "level_sd_db", sd, _LINK, "1", "standard deviation of level_db [dB], larger where no flight taught"
+    yield "level_db", channel.level_db, _LINK, "1", "level that the receiver would log, with learned antennas"
+    yield "level_sd_db", sd, _LINK, "1", "standard deviation of level_db [dB], larger far from the training samples"
     yield "cfr", cfr, (*ports, "subcarrier"), "1", "channel matrix at the subcarriers"
     yield "subcarrier_hz", offsets, ("subcarrier",), "Hz", "offset of a subcarrier from the carrier"
     yield "time", _times(channel.along), ("time",), "s", "seconds since the start of the route, whose date is not known"
@@ -212,7 +212,7 @@ def _variable(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: st
     """Return dimensions, values, attributes and encoding of a variable."""
     about = {"long_name": meaning, **({"units": unit} if unit else {})}
     if np.iscomplexobj(values):
-        # digits of a phase cannot be compressed, and level 1 removes the zeros
+        # the digits of a phase cannot be compressed, and level 1 is enough for the zeros
         return dimensions, values, about, {"complevel": 1, **({"_FillValue": 0.0} if name == "gain" else {})}
     missing: Any = {"i": values.dtype.type(-1), "f": np.nan}.get(values.dtype.kind)
     of_links = dimensions[: len(_PATH)] == _PATH or dimensions == _LINK
@@ -225,12 +225,12 @@ def _variable(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: st
 def write_channel(
     parts: Iterable[Channel], folder: Path, formats: Sequence[str], stages: Stages
 ) -> tuple[list[Path], dict[str, Any]]:
-    """Write consecutive parts of a channel as they come.
+    """Write the consecutive parts of a channel.
 
     Parameters
     ----------
     parts : iterable of Channel
-        A single part if a format is not in :data:`STREAMED`.
+        Parts of the channel; one part if a format is not in :data:`STREAMED`.
     folder : Path
     formats : sequence of str
         Names of :data:`FORMATS`.
@@ -352,7 +352,7 @@ def _write_deepmimo(channel: Channel, folder: Path) -> Path:
 
 
 def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    """Return the part of params.json that the loader requires. Other settings of its device sets have defaults."""
+    """Return the entries of params.json that the loader of DeepMIMO requires."""
     sets = {
         f"txrx_set_{number}": {"name": name, "id": number, f"is_{name}": True, "num_points": every,
                                "num_active_points": active, f"is_{'rx' if name == 'tx' else 'tx'}": False}
@@ -363,7 +363,7 @@ def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]
     return {"version": "4.0", "rt_params": rays, "scene": {"num_scenes": 1}, "materials": {}, "txrx_sets": sets}
 
 
-# Writers of a part by the name of their format, which return the main file. A NetCDF file grows.
+# Writers of a part by format, which return the main file.
 _WRITERS = {"npz": _write_npz, "deepmimo": _write_deepmimo, "csv": _write_csv}
 FORMATS = ("netcdf", *_WRITERS)
 

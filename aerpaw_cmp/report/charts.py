@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Number of means of a forecast along the flight, about one per pixel.
+# Number of means along the flight, about one per pixel.
 _FORECAST_COLUMNS = 600
 
-# Line styles, so that curves can be distinguished in grey.
+# Line styles that distinguish curves in grey.
 _LINES = ("-", (0, (5, 2)), (0, (1, 1.3)), (0, (6, 2, 1, 2)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
 COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")
 
@@ -197,16 +197,16 @@ def _forecast(data: ReportData, panel: RankResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# The cells with most samples get a row each. The remaining cells share one row.
+# The cells with the most samples have a row each. The other cells share one row.
 MOST_CELLS = 16
 OTHER = "others"
 
 
 def shown_confusion(serving: ServingComparison, most: int = MOST_CELLS) -> tuple[list[str], AnyArray]:
-    """Return names and counts of a readable matrix, shape (cells, cells + 1). The last column has no predicted cell.
+    """Return names and counts of a readable matrix, shape (cells, cells + 1). Its last column is "no path".
 
-    Cells that neither served nor were predicted are not shown. If there are more than ``most``, the cells with fewest
-    samples are added up as "others". That row and column contain hits and misses, so their cell has no frame.
+    Cells that neither served nor were predicted are not shown. If there are more than ``most``, the cells with the
+    fewest samples are added up as "others".
     """
     counts = np.asarray(serving.confusion)
     weight = counts.sum(axis=1) + counts[:, :-1].sum(axis=0)

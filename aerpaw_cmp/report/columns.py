@@ -18,7 +18,7 @@ from ..compare.result import RankResult, RssResult
 from ..logs.records import has_wall_clock
 from .texts import iso_time, k_key
 
-# 0.1 mm and 1e-4 dB: finer than any log, and the files stay readable.
+# Positions to 0.1 mm and levels to 1e-4 dB, which is finer than any log.
 DECIMALS = 4
 
 _RANKS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
@@ -27,7 +27,7 @@ _NO_YES = ("no", "yes")
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column, or a family of columns whose name and meaning have a gap for a model, K or rank.
+    """A column, or a family of columns. The name and meaning of a family have a gap ({}) for a model, K or rank.
 
     Parameters
     ----------
@@ -36,12 +36,12 @@ class Column:
         Unit in the usual notation. Empty for text, codes and shares.
     meaning : str
     values : callable, optional
-        Returns the values (n,) of a series, or one value for all its rows. A family returns a mapping by model, K or
-        rank; a series without the column returns None. The columns of times have no function.
+        Function that returns the values (n,) of a series, one value for all its rows, or None if the series does not
+        have the column. For a family it returns a mapping by model, K or rank. Columns of times have no function.
     flags : tuple of str
-        Meanings of 0, 1, ...; empty for a number.
+        Meanings of the values 0, 1, ...; empty for a number.
     optional : bool
-        Missing in a file without any series that has it.
+        True if the column is missing in a file in which no series has it.
     """
 
     name: str
@@ -72,7 +72,7 @@ _PLACES = (
     Column("up_m", "m", "metres above the ground at the origin", _place(2)),
 )
 _TOWER_PLACES = (
-    Column("tower_east_m", "m", "place of a tower that moves, metres east", _tower_place(0), optional=True),
+    Column("tower_east_m", "m", "position of a tower that moves, metres east", _tower_place(0), optional=True),
     Column("tower_north_m", "m", "metres north", _tower_place(1), optional=True),
     Column("tower_up_m", "m", "metres above the ground at the origin", _tower_place(2), optional=True),
 )
@@ -112,7 +112,7 @@ RSS: tuple[Column, ...] = (
 
 
 def _integers(values: Any) -> Any:
-    """Return whole numbers of which NaN becomes an empty cell and 2.0 becomes 2."""
+    """Return values as integers, which are written without decimals, and as empty cells if NaN."""
     import pandas as pd
 
     return pd.Series(values, dtype="float64").astype("Int64").array
@@ -164,7 +164,7 @@ def tables(columns: Sequence[Column], series: Sequence[Any]) -> tuple[list[Colum
     Returns
     -------
     columns : list of Column
-        Those that any series has, each family as its members.
+        Columns that any series has, with the members of each family.
     tables : list of (times, mapping)
         Times (n,) of each series, and its further columns by name: arrays (n,), or one value for all rows.
     """
@@ -189,12 +189,12 @@ def _members(values: Any) -> Mapping[Any, Any]:
     return values if isinstance(values, Mapping) else {} if values is None else {"": values}
 
 
-# Rows that are text at once.
+# Number of rows per part.
 _ROWS = 50_000
 
 
 def csv_text(columns: Sequence[Column], series: Sequence[Any]) -> Iterator[str]:
-    """Yield the text of rss.csv or rank.csv some rows at a time: a day of samples as text would not fit into memory."""
+    """Yield the text of rss.csv or rank.csv in parts, because a day of samples as text may not fit into memory."""
     import pandas as pd
 
     head = True
@@ -210,12 +210,12 @@ def csv_text(columns: Sequence[Column], series: Sequence[Any]) -> Iterator[str]:
 
 
 def _times(time: Any, part: slice) -> dict[str, Any]:
-    """Return the columns ``time_utc`` and ``time_s`` of some rows. Seconds count from the table's first instant."""
+    """Return the columns ``time_utc`` and ``time_s`` of some rows. Seconds count from the first time of the table."""
     instants = np.asarray(time, dtype="datetime64[ns]")
     known = instants[~np.isnat(instants)]
     if not len(known):
         return {"time_utc": "", "time_s": np.full(len(instants[part]), np.nan)}
-    # the first instant of the whole table: each part must count from the same instant
+    # the first time of the complete table, because all parts count from the same time
     first = known.min()
     seconds = (instants[part] - first) / np.timedelta64(1, "s")
     return {"time_utc": iso_time(instants[part]) if has_wall_clock(first) else "", "time_s": seconds}

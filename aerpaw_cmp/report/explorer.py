@@ -1,7 +1,7 @@
-"""Data of the linked views of a report, as one block of packed arrays for the script of the page.
+"""The data of the linked views of a report, as one block of packed arrays for the script of the page.
 
-The script computes only numbers that depend on a selection (offset, RMSE, correlation and histograms of the selected
-samples), by the formulas of :mod:`aerpaw_cmp.compare`.
+The script computes only numbers of a selected segment (offset, RMSE, correlation and histograms), by the formulas of
+:mod:`aerpaw_cmp.compare`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .flight_words import instants, nearest_k, pretty
 from .packed import PackedArrays, packed, scene
 from .texts import k_key
 
-# Largest number of samples of all series on a page. Longer series are thinned; extremes are retained.
+# Largest number of samples of all series on a page. Longer series are thinned, and extremes are retained.
 POINTS = 50_000
 
 TRACK_POINTS = 4000
@@ -80,7 +80,7 @@ AXES = ("east", "north", "up")
 def _rss(
     panel: RssResult, source: Source | None, start: np.datetime64, arrays: PackedArrays, limit: int
 ) -> dict[str, Any]:
-    # retain the extremes of the residual, too, because readers look for the largest errors
+    # retain the extremes of the residual, too, because a reader looks for the largest errors
     pick = keep_extremes([panel.measured_db, panel.residual_db], limit) if len(panel.time) else np.arange(0)
     models = [{"name": "ray tracing", **_fit(panel.score), "level": arrays.add(panel.simulated_dbm[pick]),
                "learned_here": panel.training}]  # fmt: skip

@@ -1,11 +1,12 @@
 """Samples along a flight as files for other programs: ``write_exports(export, folder, formats)``.
 
-An :class:`Export` contains one table of points per kind (``rss``, ``rank``): one row per sample with its link, time,
-position and values, and the unit and meaning of each column. The values are those of ``rss.csv`` and ``rank.csv`` with
-the same rounding, and latitude and longitude. A missing number is NaN; a rank of 0 means "no path". Each format is
-one function ``write_X(export, folder)``: NetCDF after CF-1.11, and tracks for Google Earth coloured by level, residual
-and rank, with one folder per link and quantity, of which the first is visible. Samples out of coverage are grey.
-Maps over a grid are written by :mod:`aerpaw_cmp.maps.export`.
+An :class:`Export` contains one table of points per kind (``rss``, ``rank``), with a row per sample: its link, time,
+position and values. The values are those of ``rss.csv`` and ``rank.csv`` with the same rounding, and latitude and
+longitude. A missing number is NaN, and a rank of 0 means that there is no path.
+
+Each format is one function ``write_X(export, folder)``. NetCDF follows CF-1.11. The KMZ has tracks for Google Earth
+coloured by level, residual and rank, in one folder per link and quantity, of which the first is visible. Samples out
+of coverage are grey. Maps over a grid are written by :mod:`aerpaw_cmp.maps.export`.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Points:
     kind : str
         Name of files and layers: ``"rss"``, ``"rank"``.
     table : pandas.DataFrame
-        ``time`` (UTC), :data:`LINK`, unit, :data:`PLACES`, ``columns``; links follow each other, each in time order.
+        ``time`` (UTC), :data:`LINK`, unit, :data:`PLACES` and ``columns``. Each link is contiguous and in time order.
     columns : tuple of Column
     """
 
@@ -89,7 +90,7 @@ class Export:
 
     @property
     def remarks(self) -> list[str]:
-        """Remarks for every user of a file."""
+        """The remarks in every file."""
         texts = [
             "Heights (up_m) are metres above the ground at the site origin.",
             "A missing number is out of coverage or unknown; a simulated rank of 0 means that there is no path.",
@@ -228,7 +229,7 @@ _AIR = "<altitudeMode>relativeToGround</altitudeMode>"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Shown:
-    """A link coloured by one quantity."""
+    """A link with the quantity that colours it."""
 
     name: str
     column: Column
@@ -261,7 +262,7 @@ def _shown(points: Points) -> Iterator[_Shown]:
     scales = _scales_of(points)
     columns = {c.name: c for c in points.columns if c.name in scales}
     for (_, tower, channel, rows), (name, column) in itertools.product(points.links(), columns.items()):
-        if name.startswith("simulated_rank") and rows[name].isna().all():  # that K belongs to other links
+        if name.startswith("simulated_rank") and rows[name].isna().all():  # only other links have this K
             continue
         shown = f"{tower} {channel}".strip() + f", {_LEVELS.get(name, column.meaning)}"
         yield _Shown(name=shown, column=column, scale=scales[name], rows=rows)
@@ -286,7 +287,7 @@ def _towers(export: Export) -> str:
 
 
 def _flown(export: Export) -> str:
-    """Return the track: with a clock as a track for the time slider, and empty with fewer than two positions."""
+    """Return the track, with times if they are known. Empty if there are fewer than two positions."""
     if (line := export.data.track) is None:
         return ""
     known = np.flatnonzero(np.isfinite(line.east_m) & np.isfinite(line.north_m) & ~np.isnat(line.time))
@@ -316,7 +317,7 @@ def _lines(shown: _Shown, budget: int, *, clock: bool, visible: bool) -> Iterato
     times, bins = iso_time(rows["time"].to_numpy()), shown.scale.bin_of(values)
     starts = np.flatnonzero(np.concatenate([[True], bins[1:] != bins[:-1]]))
     for first, after in zip(starts, [*starts[1:], len(rows) - 1], strict=True):
-        last = int(after)  # a line ends where the next one begins, so that there is no gap
+        last = int(after)  # a line ends at the beginning of the next one, so that there is no gap
         if last <= first:
             continue
         number = int(bins[first])
@@ -344,7 +345,7 @@ def _legend(scale: Scale) -> bytes:
 
 # Number of colours of a scale of numbers.
 LEVELS = 10
-# Grey: no value.
+# Colour of samples without a value (grey).
 OUT = CLASS_COLOURS[0]
 
 
@@ -360,7 +361,7 @@ class Scale:
 
     @property
     def legend(self) -> str:
-        """Name of the picture of the scale in the archive."""
+        """The name of the picture of the scale in the archive."""
         return f"legends/{self.key}.png"
 
     def bin_of(self, values: FloatArray) -> IntArray:
@@ -426,7 +427,7 @@ FOLDER = "exports"
 
 
 def chosen_formats(names: Iterable[str], known: Iterable[str] = FORMATS) -> tuple[str, ...]:
-    """Return the formats that a user names, also joined by commas; ``all`` names every format.
+    """Return the formats that a user names. Names may be joined by commas, and ``all`` names every format.
 
     Raises
     ------
@@ -462,7 +463,7 @@ def write_exports(export: Export, folder: Path, formats: Iterable[str], progress
     ----------
     export : Export
     folder : Path
-        Folder of the results; the folder of the exports is created inside.
+        Folder of the results, in which the folder of the exports is created.
     formats : iterable of str
         Names of :data:`FORMATS`.
     progress : Progress

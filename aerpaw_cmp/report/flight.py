@@ -44,10 +44,7 @@ FIGURES = ("none", "svg", "png", "pdf", "all")
 
 
 def metrics(data: ReportData) -> dict[str, Any]:
-    """Return the numbers of a report under their stable names, as plain JSON values.
-
-    ``extra_metrics`` of the data is merged last, key by key.
-    """
+    """Return the content of metrics.json as plain values. ``extra_metrics`` of the data is merged last, key by key."""
     rss: dict[str, dict[str, Any]] = {}
     for item in data.rss:
         rss.setdefault(item.tower, {})[item.channel] = _rss_metrics(item)
@@ -367,7 +364,7 @@ def models_card(data: ReportData) -> Card:
 
 
 def serving_card(data: ReportData) -> Card:
-    """Return the card that compares the cells that served with those predicted strongest."""
+    """Return the card that compares serving cells with the cells predicted strongest."""
     serving = data.serving
     if serving is None or not serving.n:
         return Card()
@@ -478,9 +475,9 @@ def _audited_fields(f: FieldAudit | None) -> list[Table]:
 
 
 def inputs_card(data: ReportData) -> Card:
-    """Return the card of all input files with the account of their lines."""
+    """Return the card of all input files, with the numbers of accepted and rejected lines."""
     table = Table(
-        caption="Every line is accepted, rejected with a reason, or blank (comments and headers count as blank).",
+        caption="Every line is accepted, rejected with a reason, or blank. Comments and headers count as blank.",
         columns={"File": HEAD, "Reader": TEXT, "Lines": 0, "Accepted": 0, "Rejected": 0, "Blank": 0, "SHA-256": "hash"},
         rows=[
             (Markup('{} <span class="small">{}</span>').format(f.path, f"({f.role})" if f.role else ""),
@@ -512,7 +509,7 @@ def _rejected(f: InputFile) -> Table:
 
 def method_card(data: ReportData, files: Sequence[str]) -> Card:
     """Return the card of the method, the notes of site and flight, and the columns of the files."""
-    notes = list(dict.fromkeys([*data.site.notes, *data.notes]))  # a flight repeats the notes of its site
+    notes = list(dict.fromkeys([*data.site.notes, *data.notes]))  # notes of the flight may repeat notes of the site
     heads = {"Column": HEAD, "Unit": TEXT, "Meaning": TEXT}
     tables = [
         Table(caption=f"Columns of {name}.", columns=heads, rows=described(columns))
@@ -527,7 +524,7 @@ def method_card(data: ReportData, files: Sequence[str]) -> Card:
     )  # fmt: skip
 
 
-# Cards in the order of the page. A new card is a further function.
+# Cards in the order of the page. A new card is another function here.
 CARDS = (
     result_card, channels_card, referee_card, models_card, serving_card, ranks_card, engine_card,
     inputs_card,
@@ -564,7 +561,7 @@ def page(data: ReportData, files: Sequence[str]) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WrittenReport:
-    """The files, ``report.html`` first, and the record with the seconds of all stages."""
+    """The files of a report, ``report.html`` first, and its record with the seconds of all stages."""
 
     files: tuple[Path, ...]
     data: ReportData
@@ -592,7 +589,7 @@ def write_report(
     exports : sequence of str
         Formats of :data:`aerpaw_cmp.report.exports.FORMATS` for the samples, in addition to CSV.
     stages : Stages, optional
-        Times the stage "report"; its seconds are stored in the record.
+        Clock of the stages. The seconds of the stage "report" are stored in the record.
 
     Returns
     -------
@@ -610,7 +607,7 @@ def write_report(
         specs = [] if drawn == "none" else figures.figure_specs(data)
         formats = FORMATS if drawn == "all" else (drawn,)
         for name, text in (("rss.csv", csv_text(RSS, data.rss)), ("rank.csv", csv_text(RANK, data.rank))):
-            # write it without rows, too, so that every report has the same files
+            # write a table without rows, too, so that every report has the same files
             written.append(write_file(folder / name, text))
         pictures = write_figures(specs, folder / "figures", formats, style, stages.progress)
     written += pictures
@@ -622,7 +619,7 @@ def write_report(
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
     offered = (folder, folder / FOLDER)
     files = ["metrics.json", *(path.relative_to(folder).as_posix() for path in written if path.parent in offered)]
-    # a page names the folder of pictures only if it was written
+    # the page names the folder of figures only if it was written
     files += ["figures/"] * bool(pictures)
     with stages("report"):
         html = write_file(folder / "report.html", page(data, files))

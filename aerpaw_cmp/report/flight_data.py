@@ -1,7 +1,7 @@
-"""The record that a flight's report shows: the numbers of :mod:`aerpaw_cmp.compare.result` and their context.
+"""The content of a report: the numbers of :mod:`aerpaw_cmp.compare.result` and their context.
 
-Parts that a flight may not have are optional: a flight with rank only has ``rss=()``, and a flight without any path has
-NaN numbers. Times are naive ``datetime64[ns]`` in UTC. A missing number is NaN (in ``metrics.json``: ``null``).
+A flight with rank only has ``rss=()``. A missing number is NaN, and ``null`` in ``metrics.json``. Times are naive
+``datetime64[ns]`` in UTC.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ..flight.gains import antennas_used
 from ..logs.records import RejectedLine
 from ..site.site import Site
 
-if TYPE_CHECKING:  # the logs and the replay load pandas; a prediction loads how it is scored
+if TYPE_CHECKING:  # the modules of logs and replay load pandas
     from ..flight.data import FlightData
     from ..flight.replay import FlightReplay, Replayed
     from ..flight.settings import LogSettings
@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # the logs and the replay load pandas; a prediction loads how
 # Ranks of a 4 x 4 channel, the bars of every histogram.
 RANKS = (1, 2, 3, 4)
 
-# Quantities that residuals are drawn against, and their axis labels.
+# Quantities against which residuals are drawn, and their axis labels.
 GEOMETRY = {
     "distance_m": "Distance tower to UAV [m]",
     "elevation_deg": "Elevation of the UAV seen from the tower [deg]",
@@ -67,7 +67,7 @@ class InputFile:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """The track of the UAV: ``time`` (n,), positions (n,) in the site frame [m]."""
+    """The track of the UAV, with ``time`` (n,) and positions (n,) in the site frame [m]."""
 
     time: AnyArray
     east_m: FloatArray
@@ -88,14 +88,14 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """The origin of samples in the logs: names of the files, and the number of file and line of each sample, (n,)."""
+    """The origin of samples in the logs: names of the files, and the numbers of file and line of each sample (n,)."""
 
     files: tuple[str, ...]
     file: IntArray
     line: IntArray
 
 
-# Kind of a path that is not a number of reflections, such as a diffracted path.
+# Kind of a path other than reflections, such as a diffracted path.
 FURTHER = -1
 
 
@@ -176,7 +176,7 @@ class ReportData(FlightResult):
 
     @property
     def moments(self) -> list[tuple[str, np.datetime64]]:
-        """Label and time of each waypoint."""
+        """The label and time of each waypoint."""
         return [(waypoint.label, waypoint.time) for waypoint in self.waypoints]
 
 
@@ -198,7 +198,7 @@ def used_towers(data: ReportData) -> list[str]:
 # Poses per tower whose paths are drawn.
 POSES = 300
 
-# Paths of other kinds that are drawn for a pose.
+# Largest number of paths of other kinds than reflections that are drawn for a pose.
 SHORTEST = 8
 
 
@@ -258,7 +258,7 @@ def report_data(
         doubts=data.doubts,
         cautions=data.cautions,
         antennas=antennas_used([(s.tower, s.channel, s.link) for s in data.rss]),
-        notes=(*settings.flight.notes, *notes),  # the page adds those of the site
+        notes=(*settings.flight.notes, *notes),  # the page adds the notes of the site
         settings=settings.model_dump(mode="json"),
     )
 
@@ -269,8 +269,8 @@ def report_data(
 def clock_warnings(clocks: Mapping[str, ClockResult], cause: Cause | None = None) -> tuple[str, ...]:
     """Return sentences about clocks that were or should be corrected, or could not be checked.
 
-    Corrections that were not made come first. Receivers of one computer share a clock and a sentence. A clock that is
-    the likely cause has its sentence in the summary, perhaps with a drift instead of a constant lag.
+    Requested corrections that were not made come first. Receivers of one computer share a clock and a sentence. A clock
+    that is the likely cause is omitted, because the summary contains it.
     """
     named = cause.channels if cause is not None and "clock" in cause.name.split(" or ") else ()
     late = {channel.partition(" ")[0] for channel in named}
@@ -328,7 +328,7 @@ def rank_warnings(result: RankResult) -> tuple[str, ...]:
 
 
 def _inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tuple[InputFile, ...]:
-    """Return the account of every log."""
+    """Return the record of every log, with its numbers of lines."""
     return tuple(
         InputFile(
             path=log.path,
@@ -397,7 +397,7 @@ def pose_paths(data: FlightData, replays: FlightReplay) -> tuple[PosePaths, ...]
 
 
 def _lines(replayed: Replayed, pose: int, tower_m: FloatArray) -> Iterator[tuple[FloatArray, int]]:
-    """Polylines of a pose with their kind: number of reflections, or FURTHER."""
+    """Yield the lines of a pose with their kind: the number of reflections, or FURTHER."""
     replay, target_m = replayed.replay, replayed.poses.position_m[pose]
     for number, some in enumerate(replay.contributions):
         paths, kind = some.lines(), FURTHER if number else None

@@ -1,4 +1,4 @@
-"""Figures of a flight as files, and both channels of a tower, which the page of a map shows, too."""
+"""Figures of a flight as files. ``map --with`` writes the figures of two channels, too."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
 def trajectory(data: ReportData, track: Track) -> Figure:
     """Draw the flight on the plan of the site, and enlarged with the height as colour."""
     fig, (site_plan, close) = subplots((9.2, 5.4), 1, 2, width_ratios=(1.0, 1.35))
-    # tracks of towers that move; their symbols are at the middle of the track
+    # tracks of towers that move, whose symbols are at the middle of the track
     ways = {item.tower: item.tower_m[:, :2] for item in data.series if item.tower_m is not None}
     for ax in (site_plan, close):
         draw_site(ax, data.site)
@@ -100,7 +100,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
             line = way[spread_out(len(way), POINTS_PER_LINE)].T
             ax.plot(*line, color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5, label=f"track of {name}")
     flown = np.column_stack([track.east_m, track.north_m])
-    some = spread_out(len(flown), POINTS_PER_LINE)  # the shape of a plan matters, not its extremes
+    some = spread_out(len(flown), POINTS_PER_LINE)  # evenly spaced points show the shape of the track
     site_plan.plot(*flown[some].T, color="#0072B2", linewidth=1.0, label="flight", zorder=4)
     points = close.scatter(
         track.east_m, track.north_m, c=track.up_m, cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,
@@ -110,7 +110,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     frame_around(site_plan, *np.concatenate([flown, *places.values()]).T, least_m=200.0, shape=0.75)
     extent, centre = np.nanmax([*np.ptp(flown, axis=0), 100.0]), np.nanmean(flown, axis=0)
     used = (places[name] for name in used_towers(data))
-    # a tower far from the flight would reduce the flight to a dot
+    # next to a distant tower the flight would be a dot
     near = [place for place in used if np.linalg.norm(place - centre) < extent]
     frame_around(close, *np.concatenate([flown, *near, *ways.values()]).T)
     for waypoint in data.waypoints:
@@ -238,7 +238,7 @@ def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: F
     east, north : (n,)
         Positions [m].
     rank : (n,)
-        Rank 0 to 4; 0 has no path, NaN is unknown.
+        Ranks 1 to 4; 0 if there is no path, NaN if unknown.
     title : str
     """
     draw_site(ax, site)
@@ -249,7 +249,7 @@ def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: F
         ax.scatter(
             east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **style,
             label=f"{f'rank {value}' if value else 'no path'} ({count(int(at.sum()))})",
-            zorder=3.0 + 1.0 / at.sum(),  # rare ranks lie on top, so that a few points are visible among many
+            zorder=3.0 + 1.0 / at.sum(),  # rare ranks are on top, so that few points are visible among many
         )  # fmt: skip
     ax.set_title(title)
     ax.legend(

@@ -1,8 +1,8 @@
-"""map.html of the `map` job with metrics.json: maps and tables, sentences, figures, data of the script.
+"""map.html and metrics.json of the command ``map``: maps, tables, sentences, figures, and the data of the script.
 
-All maps of a page have one grid. Row 0 is the south, column 0 the west. A position without any path is NaN in a map of
-levels and 0 in a map of ranks. The script computes the numbers of a layer (share in coverage, median, shares of ranks)
-from integers with a step. :func:`layer_numbers` returns the same numbers for metrics.json from the maps.
+All maps of a page have one grid, with row 0 in the south and column 0 in the west. The script computes the numbers of
+a layer (share in coverage, median, shares of ranks) from rounded values, and :func:`layer_numbers` returns the same
+numbers for metrics.json.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Name of the map of the nearest tower.
+# Name of the nearest tower, which serves each position of a joint map.
 JOINT = "joint"
 
 
-# Names of the values of a map of ranks. Positions out of coverage have the value 0 in files, and NaN here.
+# Names of the values of a map of ranks. Positions out of coverage are 0 in files, and NaN in a layer.
 _RANK_CLASSES = ("Z", *map(str, RANKS))
 
 
@@ -67,7 +67,7 @@ class MapLayer:
     difference : bool
         True for a colour scale centred on zero.
     version, link, tower, antennas, foliage : str
-        What distinguishes layers of a quantity, as far as it applies. The tower "joint" is the nearest one.
+        Properties that distinguish layers of a quantity; empty if they do not apply. The tower "joint" is the nearest.
     k : float, optional
         Singular-value ratio of a rank.
     height_m : float
@@ -89,7 +89,7 @@ class MapLayer:
 
     @property
     def axes(self) -> dict[str, str]:
-        """What distinguishes this layer from others of its quantity, by the label of its choice on the page."""
+        """The properties of this layer as texts, by the label of their choice on the page."""
         k = "" if self.k is None else k_key(self.k)
         height = "" if math.isnan(self.height_m) else f"{self.height_m:g} m"
         axes = {"Version": self.version, "Link": self.link, "Tower": self.tower, "Antennas": self.antennas, "K": k,
@@ -97,13 +97,13 @@ class MapLayer:
         return {name: value for name, value in axes.items() if value}
 
     def place(self, axis: str) -> float:
-        """Return the order among values of an axis: all towers together first, K and heights rising, else as given."""
+        """Return a number that orders the choices of an axis: the joint map first, then rising K and heights."""
         return {"Tower": float(self.tower != JOINT), "K": self.k, "Height": self.height_m}.get(axis) or 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RssMap(MapLayer):
-    """The RSS of one tower, or of the nearest tower; ``coverage`` is the share of covered positions."""
+    """The RSS of one tower, or of the nearest tower. ``coverage`` is the share of covered positions."""
 
     quantity: str = "RSS"
     unit: str = "dBm"
@@ -112,9 +112,9 @@ class RssMap(MapLayer):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankMap(MapLayer):
-    """The rank for one K; ``share`` (5,) contains the shares of positions out of coverage and of ranks 1 to 4.
+    """The rank for one K. ``share`` (5,) contains the shares of positions out of coverage and of ranks 1 to 4.
 
-    Without K, the rank is the most probable rank of a learned receiver, and ``share`` its mean probabilities.
+    If K is None, the rank is the most probable rank of a learned receiver, and ``share`` contains mean probabilities.
     """
 
     quantity: str = "Rank"
@@ -125,16 +125,13 @@ class RankMap(MapLayer):
 
     @property
     def source(self) -> str:
-        """K, or the name of the learned receiver."""
+        """The text of K, or "learned receiver"."""
         return "learned receiver" if self.k is None else f"K = {k_key(self.k)}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapError:
-    """The mean absolute error of one method for one K and height, in one kind of evaluation.
-
-    ``evaluation`` is ``"leave one out"``, ``"blocks"``, ``"altitude held out"`` or ``"along a flight"``.
-    """
+    """The mean absolute error of one method for one K and height, in one kind of evaluation."""
 
     evaluation: str
     method: str
@@ -146,7 +143,7 @@ class MapError:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperRow:
-    """A number of the paper next to ours, and where ours is shown."""
+    """A number of the paper, the same number of this run, and the figure that shows it."""
 
     where: str
     what: str
@@ -157,7 +154,7 @@ class PaperRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapsData(Made):
-    """The content of the page of the `map` job.
+    """The content of the page of ``map``.
 
     Parameters
     ----------
@@ -169,11 +166,11 @@ class MapsData(Made):
     borders_m : tuple of (2, 2) arrays
         Lines between the areas of two towers (Voronoi), east and north [m].
     rank : tuple of RankMap
-        Ranks of the nearest tower; ``rank_by_tower`` has those of each tower, for the linked map.
+        Ranks of the nearest tower. ``rank_by_tower`` contains the ranks of each tower, for the map of the page.
     corrected : tuple of RssMap
-        Levels of each link, raw and corrected by flights (``antennas``), for figures; ``layers`` has them for the map.
+        Levels of each link for figures, raw and corrected by flights (in the field ``antennas``).
     corrected_rank : tuple of RankMap
-        Ranks of each tower with a learned receiver: traced ranks of every K, and those of the receiver.
+        Ranks of each tower with a learned receiver: traced ranks for every K, and the ranks of the receiver.
     flown_m : tuple of (n, 2)
         Tracks of the correcting flights, east and north [m].
     outside_flown : float
@@ -189,7 +186,7 @@ class MapsData(Made):
     correlation : mapping of str to (BinnedCorrelation, BiExponential)
         Correlation against distance and its fitted curve, if any, by title.
     metrics : mapping
-        Content of ``metrics.json`` that follows the tables of this page.
+        Further content of ``metrics.json``.
     """
 
     title: str
@@ -250,7 +247,7 @@ def first_words(data: MapsData) -> str:
 
 
 def coverage(data: MapsData) -> list[Coverage]:
-    """Return the coverage of the nearest tower at each height, with most of the mapped trees."""
+    """Return the coverage of the nearest tower at each height, for the first foliage mode and without foliage."""
     shown = [item for item in data.rss if item.tower == JOINT] or list(data.rss)
     if not shown:
         return []
@@ -314,7 +311,7 @@ def grouped(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
 
 
 def half_width(at_m: FloatArray) -> float:
-    """Return half of the spacing of cell centres [m], or 15 for a single cell."""
+    """Return half of the spacing of cell centres [m], and 15 for a single cell."""
     return float(at_m[1] - at_m[0]) / 2 if len(at_m) > 1 else 15.0
 
 
@@ -336,7 +333,7 @@ def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | N
     values : (rows, columns)
         Values of the cells from south to north; NaN out of coverage.
     highlight : str, optional
-        The only tower of the map, without borders.
+        Name of the only tower that is drawn. Borders are then omitted.
     options
         Options of :meth:`matplotlib.axes.Axes.imshow`.
 
@@ -393,7 +390,7 @@ def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
 
 
 def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure, list[Axes]]:
-    """Return a figure with ``count`` maps, a legend and a margin on the right [inch], and labels on outer axes."""
+    """Return a figure with ``count`` maps with labels on its outer axes, and a margin on the right [inch]."""
     west, east, south, north = extent_m(data)
     columns = min(count, COLUMNS)
     rows = -(-count // columns)
@@ -417,7 +414,7 @@ def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure
 
 
 def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]) -> Figure:
-    """Draw the maps of each tower and of all together, for one antenna choice and height, on one colour scale [dBm]."""
+    """Draw the maps of each tower and the joint map, for one choice of antennas and height, with limits [dBm]."""
     fig, axes = map_axes(data, len(maps), 1.0)
     image = None
     for ax, shown in zip(axes, maps, strict=True):
@@ -450,9 +447,9 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
 
 
 def distribution(members: Sequence[RssMap]) -> dict[str, Any]:
-    """Return the distribution of RSS of each tower and of all together at one height.
+    """Return the distribution of RSS of each tower and of the joint map at one height.
 
-    Positions out of coverage count as below all levels.
+    Positions out of coverage count as positions below all levels.
     """
     marks = []
     for shown in members:
@@ -489,7 +486,7 @@ def correlation(binned: BinnedCorrelation, fit: BiExponential | None) -> dict[st
 
 
 def error_curves(members: Sequence[MapError], worst: float) -> dict[str, Any]:
-    """Return MAE against height for every method; ``worst`` of all panels sets the scale."""
+    """Return MAE against height for every method. ``worst`` is the largest error of all panels, for an equal scale."""
     marks = []
     for method, rows in grouped(sorted(members, key=lambda e: e.altitude_m), lambda e: e.method).items():
         at, mae = np.array([[row.altitude_m, row.mae] for row in rows]).T
@@ -500,7 +497,7 @@ def error_curves(members: Sequence[MapError], worst: float) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plate:
-    """Panels of one kind, by title: a figure as a file, and a chart of the page each."""
+    """The panels of one kind, by title. They are one figure as a file, and one chart each on the page."""
 
     name: str
     section: str
@@ -524,7 +521,7 @@ class Plate:
 
 
 def plates(data: MapsData) -> Iterator[Plate]:
-    """Yield distributions, shares, correlation and errors: all figures other than maps."""
+    """Yield the distributions, shares, correlations and errors."""
     for words, maps in grouped((*data.rss, *data.corrected), lambda m: f"{m.antennas}{_under(m.foliage)}").items():
         yield Plate(
             name=f"rss_cdf_{safe_name(words)}", section="rss", title=f"Distribution of RSS, {words}",
@@ -604,7 +601,7 @@ def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
         yield FigureSpec(f"rank_map_learned_{safe_name(tower)}", partial(rank_grid, data, learned))
 
 
-# Limit of base64 for the layers. Above it, layers of single towers are not included, then cells are thinned.
+# Limit of the layers as base64 [bytes]. Above it, layers of single towers are omitted, then cells are thinned.
 MOST_BYTES = 4_000_000
 
 _LATTICE = 9
@@ -646,7 +643,7 @@ def layer_numbers(layer: MapLayer) -> dict[str, Any]:
     return result | {"mean": finite.mean() if len(finite) else np.nan, **dict(zip(names, levels, strict=True))}
 
 
-# --- what the script gets ---------------------------------------------------------------------------------------------
+# --- data of the script ---------------------------------------------------------------------------------------------
 
 
 def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST_BYTES) -> dict[str, Any]:
@@ -657,8 +654,8 @@ def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST
     data : MapsData
     charts : sequence of Chart
     most_bytes : int
-        If all layers need more, layers of single towers other than RSS are not included, then all of single towers.
-        Then every second (third, ...) cell of each row and column is retained. ``left_out`` names the missing layers.
+        If all layers need more, layers of single towers other than RSS are omitted, then all layers of single towers.
+        Then only every second (third, ...) cell of each row and column is included. ``left_out`` names what is missing.
     """
     layers = page_layers(data)
     joint = [item for item in layers if item.tower in ("", JOINT)]
@@ -695,7 +692,7 @@ def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer],
 
 
 def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, stride: int) -> dict[str, Any]:
-    """Return one quantity: its axes, and the number of its array for each combination of their values."""
+    """Return one quantity: its axes, and the number of the array for each combination of their values."""
     places: dict[str, dict[str, float]] = {}
     for layer in layers:
         for axis, value in layer.axes.items():
@@ -719,7 +716,7 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
 
 
 def _range(values: FloatArray, kind: str) -> list[float]:
-    """Return the colour scale of a quantity: 1 and 99.5 %, symmetric for differences."""
+    """Return the colour scale of a quantity, from 1 to 99.5 % of its values, symmetric for differences."""
     if kind == DIFFERENCE and len(values):
         reach = float(np.percentile(np.abs(values), 99)) or float(np.abs(values).max()) or 1.0
         return [-reach, reach]
@@ -748,12 +745,12 @@ def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dic
 
     Notes
     -----
-    Least squares on a lattice of 9 x 9 points. Over 10 km the error is below a millimetre; the projection's inverse
-    itself is :meth:`aerpaw_cmp.common.geodesy.SiteFrame.to_geographic`.
+    Least squares on a lattice of 9 x 9 points of :meth:`aerpaw_cmp.common.geodesy.SiteFrame.to_geographic`. Over 10 km
+    the error is below a millimetre.
     """
     ends = np.array([[east_m[0], east_m[-1]], [north_m[0], north_m[-1]]], dtype=np.float64)
     middle = ends.mean(axis=1)
-    # for one row of cells the reach is 0, and the script divides by it
+    # at least 100 m, because the script divides by the reach, which is 0 for one row of cells
     reach = np.maximum(np.ptp(ends, axis=1) / 2, 100.0)
     u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, _LATTICE), np.linspace(-1, 1, _LATTICE)))
     east, north = middle[0] + u * reach[0], middle[1] + v * reach[1]
@@ -770,7 +767,7 @@ def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dic
 
 
 def maps_metrics(data: MapsData) -> dict[str, Any]:
-    """Return the numbers of the page under stable names; ``data.metrics`` is merged last."""
+    """Return the numbers of metrics.json. ``data.metrics`` is merged last."""
     columns, rows = len(data.east_m), len(data.north_m)
     numbers = json_object(
         name=data.name,
@@ -795,7 +792,7 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
 
 
 def result_card(data: MapsData) -> Card:
-    """Return the card of the shares in coverage, and of the numbers of the paper next to ours."""
+    """Return the card of the shares in coverage, and of the numbers of the paper."""
     paper = Table(
         caption="What the paper (arXiv 2502.10324) states, and the results of this run.",
         columns={"Where": HEAD, "What": TEXT, "Paper": TEXT, "Here": TEXT, "Figure": TEXT},
@@ -874,7 +871,7 @@ def error_tables(errors: Sequence[MapError]) -> list[Table]:
     return tables
 
 
-# Cards in the order of the page. A new card is a further function.
+# Cards in the order of the page. A new card is another function here.
 CARDS = (result_card, levels_card, flights_card, ranks_card, interpolation_card)
 
 

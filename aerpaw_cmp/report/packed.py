@@ -18,11 +18,11 @@ from ..site.site import Building, Site
 # Value that represents NaN in an array of each integer kind.
 NONE = {"u1": 255, "u2": 65_535, "i2": -32_768}
 
-# The most negative number represents NaN, so the range is symmetric.
+# Largest magnitude in 16 bits. The most negative number represents NaN, so the range is symmetric.
 LARGEST = 32_767
 
 
-# Trees that a page draws.
+# Largest number of trees that a page draws.
 _TREES = 1500
 
 
@@ -51,7 +51,7 @@ class PackedArrays:
         if key not in self._known:
             self._known[key] = len(self._table)
             self._table.append((kind, self._size, np.size(values)))
-            # a typed array of JavaScript must begin at a multiple of its own size
+            # a typed array of JavaScript must begin at a multiple of the size of its elements
             padded = raw + bytes(-len(raw) % 8)
             self._parts.append(padded)
             self._size += len(padded)
@@ -92,13 +92,13 @@ def step_for(values: FloatArray, finest: float = 0.01) -> float:
     """
     array = np.asarray(values, dtype=np.float64)
     reach = float(np.abs(array[np.isfinite(array)]).max(initial=0.0))
-    # subtract a rounding error of the logarithm, or a value at the limit would get a step ten times as coarse
+    # subtract a rounding error of the logarithm, because a value at the limit must not have a larger step
     tens = int(np.ceil(np.log10(max(reach / (LARGEST * finest), 1.0)) - 1e-12))
     return float(finest * 10.0**tens)
 
 
 def outline(area: Polygon) -> FloatArray:
-    """Return the corners (n, 2) of an area as one line that includes its holes, so that a fill leaves them empty."""
+    """Return the corners (n, 2) of an area as one line that includes its holes, so that holes are not filled."""
     area = shapely.orient_polygons(area)
     outer = np.asarray(area.exterior.coords)[:, :2]
     holes = [part for ring in area.interiors for part in (np.asarray(ring.coords)[:, :2], outer[:1])]
@@ -130,7 +130,7 @@ def at_height(line_m: FloatArray, up_m: float) -> FloatArray:
 def ends_of_scale(values: FloatArray, most: float) -> list[float]:
     """Return the ends of a colour scale: the 1 % and ``most`` % quantiles of finite values.
 
-    The ends are half a unit around a constant, and 0 and 1 without values.
+    For equal values the ends are half a unit below and above. Without values they are 0 and 1.
     """
     low, high = (float(v) for v in np.percentile(values, [1.0, most])) if len(values) else (0.0, 1.0)
     return [low, high] if high > low else [low - 0.5, low + 0.5]
@@ -139,7 +139,7 @@ def ends_of_scale(values: FloatArray, most: float) -> list[float]:
 def packed(value: Any, arrays: PackedArrays) -> Any:
     """Return a chart whose arrays are replaced by their numbers in the block of the page."""
     if isinstance(value, np.ndarray):
-        # 32-bit floats have seven digits: beyond 1e5 a time would lose hundredths of a second
+        # 32-bit floats have seven digits, so a time beyond 1e5 s would lose hundredths of a second
         return arrays.add(value, "f8" if value.max(initial=0.0) > 1e5 else "f4")
     if isinstance(value, dict):
         return {key: packed(each, arrays) for key, each in value.items()}
@@ -164,6 +164,6 @@ def scene(site: Site, most_trees: int = _TREES) -> dict[str, Any]:
 
 
 def plan_of(site: Site) -> dict[str, Any]:
-    """Return :func:`scene` for a plan: no trees, because levels include foliage, and only the roofs of buildings."""
+    """Return :func:`scene` for a plan, with the roofs of buildings and without trees, whose loss the levels contain."""
     solid = scene(site)
     return {**solid, "trees": [], "buildings": [faces[-1:] for faces in solid["buildings"]]}

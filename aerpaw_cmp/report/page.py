@@ -1,7 +1,7 @@
 """The base of every page: template engine, files of a folder of results, and figures.
 
-A page is one file that needs no other file and no network; its figures are shown without scripts, too. The template
-engine escapes every text that comes from a log or a configuration.
+A page is one file that needs no other file and no network. The template engine escapes every text from a log or a
+configuration.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Made:
 
 
 def about(page: Any) -> dict[str, Any]:
-    """Return the entries of metrics.json on time, versions and stages; ``page`` has the fields of :class:`Made`."""
+    """Return time, versions and stages for metrics.json. ``page`` has the fields of :class:`Made`."""
     return {
         "generated": page.generated,
         "commit": commit(),
@@ -77,8 +77,8 @@ def about(page: Any) -> dict[str, Any]:
     }
 
 
-# ``script`` is 'none' or the digest of the script of the page. The browser then refuses any other script or file, if a
-# hostile log should ever pass the escaping.
+# ``script`` is 'none' or the digest of the script of the page. If a hostile text passed the escaping, the browser would
+# still refuse any other script or file.
 _CONTENT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {script}"
 
 
@@ -122,12 +122,12 @@ def rendered(template: str, scripts: Sequence[str] = (), **content: Any) -> str:
 
 
 def as_json(content: Mapping[str, Any]) -> str:
-    """Return JSON text for a script element, which no text inside can close."""
+    """Return JSON text for a script element. No text inside can end the element."""
     return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def embedded(content: Mapping[str, Any] | None) -> Markup:
-    """Return the data of the script of a page. Empty if there are none."""
+    """Return the data of the script of a page, empty if there are no data."""
     return Markup(as_json(content)) if content else Markup("")
 
 

@@ -1,4 +1,4 @@
-"""Data of the canvas of predict, plan, locate and calibrate: values at positions, or over a sphere."""
+"""The data of maps and spheres of predict, plan, locate, calibrate and campaign: values at positions or directions."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from .charts import Chart
 from .flight_data import RANKS
 from .packed import PackedArrays, ends_of_scale, listed, packed, plan_of, step_for
 
-# Largest number of values on a page; larger groups are thinned.
+# Largest number of values on a page. Larger groups are thinned.
 MOST_VALUES = 1_500_000
 
-# Name of a layer of ranks, and names of the ends of its interval.
+# Name of a layer of ranks, and names of the layers of the ends of an interval.
 LIKELIEST = "likeliest rank"
 BAND = ("low", "high")
 
@@ -33,7 +33,7 @@ BODY = ("forward", "left", "aft", "right")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Places:
-    """A group of values at positions, which the reader selects.
+    """A group of values at positions, one of the choices of a reader.
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ class Places:
     at : (n, 3)
         East, north, up [m]; unit vectors if ``around`` is given.
     values : mapping of str to (n,)
-        Values by name with unit. :data:`BAND` is the interval of the first over time and is not listed.
+        Values by name with unit. :data:`BAND` are the ends of the interval of the first, drawn over time.
     around : tuple of str
-        Names of the directions 0, 90, 180, 270 degrees of a sphere.
+        Names of the azimuths 0, 90, 180, 270 degrees of a sphere; empty for positions.
     cell_m : float
         Side of the cells of a grid [m].
     time_s : (n,), optional
@@ -128,7 +128,7 @@ def _group(
     layers = []
     for name, column in group.values.items():
         values = np.asarray(column, dtype=np.float64)[pick]
-        # probabilities lie between 0 and 1, where steps of 0.01 would be visible
+        # steps of 0.01 would be visible in probabilities, which are between 0 and 1
         step = step_for(values, 1e-4 if "probability" in name else 0.01)
         scale = {"range": ranges[_scale(group.name, name)], "step": step}
         layers.append({"name": name, **scale, "values": arrays.add_steps(values, step)})

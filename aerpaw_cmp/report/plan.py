@@ -24,10 +24,10 @@ from .texts import minute, number
 class PlanPage(Made):
     """The content of the page of ``plan``.
 
-    ``candidates`` and ``curve`` are rows of metrics.json. ``outline_m`` (k, 2) and ``holes_m`` bound the area in which
-    a route may run [m]. ``track_m`` (n, 3) is the recommended route. ``place_m`` (m, 3) are the points of the target
-    with their standard deviations ``before_db`` and ``after_db`` (m,). If the target is all directions, they are
-    directions from ``seen_from_m`` (3,).
+    ``candidates`` and ``curve`` are rows of metrics.json. ``outline_m`` (k, 2) and ``holes_m`` are the limits of the
+    area in which a route may run [m]. ``track_m`` (n, 3) is the recommended route. ``place_m`` (m, 3) are the points
+    of the target with their standard deviations ``before_db`` and ``after_db`` (m,). If the target is all directions,
+    they are directions from ``seen_from_m`` (3,).
     """
 
     target: str
@@ -54,7 +54,7 @@ def _sd_now_db(data: PlanPage) -> float:
 
 
 def plan_metrics(data: PlanPage) -> dict[str, Any]:
-    """Return the numbers of the page under stable names."""
+    """Return the numbers of metrics.json."""
     return json_object(
         target=data.target, sentence=data.sentence, antennas=data.antennas, flights=data.flights,
         candidates=data.candidates, warnings=data.warnings,
@@ -65,7 +65,7 @@ def plan_metrics(data: PlanPage) -> dict[str, Any]:
 
 
 def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
-    """Return the page; ``shown`` is the data of its map."""
+    """Return the page. ``shown`` is the data of its map."""
     candidates = Table(
         caption="Expected standard deviation (SD) over the target after each flight, best first; now "
         f"{number(_sd_now_db(data), 1, 'dB')}.",
@@ -113,7 +113,7 @@ def write_plan(data: PlanPage, folder: Path) -> list[Path]:
 def _groups(data: PlanPage) -> Iterator[Places]:
     """Yield the proposed route, which the page shows first, and the target: positions, or directions from a tower.
 
-    Each point of the target is one value over all headings.
+    The values of each point of the target are averaged over all headings.
     """
     yield Places(name="proposed route", at=data.track_m, values={"height [m]": data.track_m[:, 2]})
     _, first, member = np.unique(data.place_m.round(1), axis=0, return_index=True, return_inverse=True)

@@ -1,4 +1,4 @@
-"""prediction.html with metrics.json, prediction.csv and prediction.nc, and sentences before and after the flight."""
+"""prediction.html with metrics.json, prediction.csv and prediction.nc, and their sentences."""
 
 from __future__ import annotations
 
@@ -208,12 +208,12 @@ def _inside_share(error: FloatArray, sd: FloatArray) -> float:
 
 
 def _against_free_space(correction: Correction) -> Verdict:
-    """Compare the chosen model with free space on what was held out: by flight, or by the blocks of one flight."""
+    """Compare the chosen model with free space on held-out data: by flight, or by the blocks of one flight."""
     error, free_space = (
         correction.held_out[key][0] for key in ((correction.base, correction.title), ("free space", OFF))
     )
     if len(correction.flights) > 1:
-        # compare by flight, as calibrate does, because samples of one flight share its offset and its weather
+        # compare by flight, like calibrate, because samples of one flight share its offset and its weather
         parts = correction.held_out_parts
         verdict = by_flight(_by_part(error, parts), _by_part(free_space, parts))
         return replace(verdict, cause="two flights") if verdict.cause == "no interval" else verdict
@@ -240,7 +240,7 @@ def field(correction: Correction) -> Verdict:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictionPage(Made):
-    """The content of the page of ``predict``; ``table`` has the columns of prediction.csv."""
+    """The content of the page of ``predict``. ``table`` has the columns of prediction.csv."""
 
     name: str
     kind: str
@@ -261,13 +261,13 @@ class PredictionPage(Made):
 
     @property
     def levels(self) -> pd.DataFrame:
-        """Rows with a level, of all towers and channels."""
+        """The rows with a level, of all towers and channels."""
         levels: pd.DataFrame = self.table[self.table["channel"] != "rank"]
         return levels
 
     @property
     def series(self) -> list[tuple[str, pd.DataFrame]]:
-        """Name and rows of each tower and channel with levels."""
+        """The name and rows of each tower and channel with levels."""
         each = self.levels.groupby(["tower", "channel"], sort=False, observed=True)
         return [(f"{t} {c}", part) for (t, c), part in each]
 
@@ -279,7 +279,7 @@ def outside_share(table: pd.DataFrame) -> float:
 
 
 def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
-    """Return the numbers of the page under stable names."""
+    """Return the numbers of metrics.json."""
     series = {
         name: {
             "unit": data.units.get(name, ""),
@@ -309,7 +309,7 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
 
 
 def prediction_page(data: PredictionPage, numbers: Mapping[str, Any], shown: Mapping[str, Any]) -> Page:
-    """Return the page from its numbers; ``shown`` is the data of its map."""
+    """Return the page from its numbers. ``shown`` is the data of its map."""
     about = f"Learned from {', '.join(data.flights)}. " if data.flights else ""
     about += f"Made {minute(data.generated)}. prediction.csv in the same folder contains every point."
     return Page(
@@ -375,6 +375,7 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
     files : list of Path
         The page first.
     said : list of str
+        Reasons.
     """
     numbers = prediction_metrics(data)
     flown = [np.asarray(line).T for line in data.flown.values()]
@@ -430,7 +431,7 @@ def _dataset(data: PredictionPage) -> Dataset:
 
 
 def _groups(data: PredictionPage) -> Iterator[Places]:
-    """Yield each tower and channel, and each receiver of ranks, at each height of a grid or at all points."""
+    """Yield the values of each tower and channel, and of ranks, at each height of a grid or at all points."""
     groups: list[tuple[str, dict[str, ArrayLike], pd.DataFrame]] = []
     for name, part in data.series:
         level = {f"level [{data.units.get(name, 'dB')}]": part["level_db"], "standard deviation [dB]": part["sd_db"]}

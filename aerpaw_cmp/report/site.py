@@ -40,7 +40,7 @@ def view_limits(site: Site) -> FloatArray:
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     margin = 0.05 * max(high[0] - low[0], high[1] - low[1], 100.0)
-    # a site may lie below its origin
+    # objects of a site may be below its origin
     ground = min(0.0, float(low[2]))
     return np.array(
         [[low[0] - margin, high[0] + margin], [low[1] - margin, high[1] + margin], [ground, max(high[2] * 1.1, 30.0)]]
@@ -48,7 +48,7 @@ def view_limits(site: Site) -> FloatArray:
 
 
 def plan(site: Site) -> Figure:
-    """Return the plan of all objects, to scale."""
+    """Return the plan of all objects with equal scales."""
     limits = view_limits(site)
     width, height = np.ptp(limits[:2], axis=1)
     shape = float(np.clip(width / height, 0.45, 2.2))

@@ -1,4 +1,4 @@
-"""Text of pages for numbers, intervals and times, and names of keys and files."""
+"""Texts of pages for numbers, intervals and times, and names of keys and files."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ k_key = number_key
 def iso_time(time: Any) -> Any:
     """Return times as ISO 8601 text with milliseconds and ``Z``. The text is empty for NaT."""
     instants = np.asarray(time, dtype="datetime64[ns]")
-    # add half a unit, because numpy truncates and a stored 0.9999999 s must not lose a millisecond
+    # add half a millisecond, because NumPy truncates instead of rounding
     text = np.datetime_as_string((instants + np.timedelta64(500_000, "ns")).astype("datetime64[ms]"), timezone="UTC")
     return np.where(np.isnat(instants), "", text)
 
 
 def safe_name(text: str) -> str:
-    """Return a part of a file name from any text.
+    """Return a text that is safe as part of a file name.
 
     Examples
     --------
@@ -98,9 +98,9 @@ def duration(seconds: float | None) -> str:
 
 
 def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Yield nested settings as dotted names and plain text, without settings that are None.
+    """Yield nested settings as dotted names and plain text, without settings that are not set.
 
-    A bound is ``≥ low``. Each entry of a list of records, such as the logs of a flight, has a numbered row.
+    An interval without an upper end is ``≥ low``. The records of a list, such as the logs of a flight, have numbers.
 
     Examples
     --------
@@ -121,7 +121,7 @@ def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, st
 
 
 def _plain(name: str, value: Any) -> str | None:
-    """Return the text of one setting or number. None if it is not set or empty."""
+    """Return the text of one setting or number, None if it is not set or empty."""
     if "ci95" in name and isinstance(value, (list, tuple)) and None in value:
         return None if value[0] is None else f"≥ {short(value[0])}"
     if isinstance(value, (list, tuple)):

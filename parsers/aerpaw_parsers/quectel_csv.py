@@ -31,64 +31,45 @@ import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, IntArray
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.readers import Attribute, Reader, ReadOptions, ReadResult, Rows, Stream, built, checked_ranks
+from aerpaw_cmp.logs.rows import Rows, built, checked_ranks
+from aerpaw_cmp.readers import TIME, ZONE, Attribute, Reader, ReadOptions, ReadResult, Stream
 
 _C = rb"[^,\n]{0,80}"
-_V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
 # The logger's CSV, or a console whose lines carry a stamp (ts, a terminal program).
-_T = rb"^\[?(" + _text.TIME + _text.ZONE + rb")(?:,|\]?[ \t]{1,4})"
+_T = rb"^\[?(?P<time>" + TIME + ZONE + rb")(?:,|\]?[ \t]{1,4})"
 
 
-def _token(command: bytes, word: bytes) -> bytes:
-    return rb'"{0,3}(?:\+' + command + rb': ?)?"{0,3}' + word + rb'"{1,3}'
+def _answer(command: bytes, word: bytes, rat: bytes, names: str) -> bytes:
+    """Return the pattern of an answer: its command and word, and its fields, with a dot for one that is not read."""
+    return rb'"{0,3}(?:\+' + command + rb': ?)?"{0,3}' + word + rb'"{1,3}' + _fields(rat, names)
 
 
-def _skip(count: int) -> bytes:
-    return (_C + rb",") * count
+def _fields(rat: bytes, names: str) -> bytes:
+    """Return the pattern of fields, each with the comma in front of it and in a group such as ``lte_rsrp``."""
+    value = rb',"{0,3}(?P<%s_%s>-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
+    return b"".join(b"," + _C if name == "." else value % (rat, name.encode()) for name in names.split())
 
 
-_END = rb"[ \t]*\r?$"
-_VALUES = rb",".join([_V] * 4)
-_CSI = re.compile(
-    _T + rb"(?:" + _skip(4) + rb")?" + _token(b"QNWCFG", b"lte_csi") + rb"," + _VALUES
-    + rb"," + _token(b"QNWCFG", b"nr5g_csi") + rb"," + _VALUES
-    # a fifth value of newer firmware, then the four +QNWINFO columns of the first generation
-    + rb"(?:,-?\d{1,7})?(?:(?:," + _C + rb"){4})?" + _END,
-    re.MULTILINE,
-)  # fmt: skip
-_SERVING = _T + rb"(?:" + _token(b"QENG", b"servingcell") + rb"," + _C + rb",)?"
-_LTE = re.compile(
-    _SERVING + _token(b"QENG", b"LTE") + rb"," + _skip(4) + _V + rb"," + _V + rb"," + _skip(4) + _VALUES
-    + (rb"," + _C) * 3
-    + rb"(?:," + _token(b"QENG", b"NR5G-NSA") + rb"," + _skip(2) + _VALUES
-    + rb"(?:," + _V + rb"(?:," + _C + rb"){3})?)?" + _END,
-    re.MULTILINE,
-)  # fmt: skip
-_SA = re.compile(
-    _SERVING + _token(b"QENG", b"NR5G-SA") + rb"," + _skip(4) + _V + rb"," + _skip(1) + _V + rb"," + _skip(2)
-    + rb",".join([_V] * 3) + rb"(?:," + _C + rb"){0,3}" + _END,  # firmwares differ behind the SINR
-    re.MULTILINE,
-)  # fmt: skip
-_NSA = re.compile(
-    _T + _token(b"QENG", b"NR5G-NSA") + rb"," + _skip(2) + _VALUES + rb"(?:," + _V + rb"(?:," + _C + rb"){1,4})?"
-    + _END,
-    re.MULTILINE,
-)  # fmt: skip
-_CSI_ALONE = {
-    rat: re.compile(_T + _token(b"QNWCFG", rat + b"_csi") + rb"," + _VALUES + rb"(?:,-?\d{1,7})?" + _END, re.MULTILINE)
-    for rat in (b"lte", b"nr5g")
-}
-# Kinds of row, and the quantities of their groups; a dot stands for one that is not read.
-_FORMS = (
-    (_CSI, "time lte_mcs lte_ri lte_cqi lte_pmi nr5g_mcs nr5g_ri nr5g_cqi nr5g_pmi"),
-    (_LTE, "time lte_pci lte_arfcn lte_rsrp . . . nr_pci nr_rsrp nr_sinr . nr_arfcn"),
-    (_SA, "time nr_pci nr_arfcn nr_rsrp . nr_sinr"),
-    (_NSA, "time nr_pci nr_rsrp nr_sinr . nr_arfcn"),
-    *((form, f"time {rat.decode()}_mcs {rat.decode()}_ri {rat.decode()}_cqi {rat.decode()}_pmi")
-      for rat, form in _CSI_ALONE.items()),
+_CSI = {rat: _answer(b"QNWCFG", rat + b"_csi", rat, "mcs ri cqi pmi") for rat in (b"lte", b"nr5g")}
+_SERVING = rb"(?:" + _answer(b"QENG", b"servingcell", b"", ".") + rb",)?"
+_LTE = _SERVING + _answer(b"QENG", b"LTE", b"lte", ". . . . pci arfcn . . . . rsrp rsrq rssi sinr . . .")
+_SA = _SERVING + _answer(b"QENG", b"NR5G-SA", b"nr", ". . . . pci . arfcn . . rsrp rsrq sinr")
+_NSA = _answer(b"QENG", b"NR5G-NSA", b"nr", ". . pci rsrp sinr rsrq")
+_ARFCN = _fields(b"nr", "arfcn")
+# A fifth value of newer firmware; the four columns of +QNWINFO, which the first generation writes around the CSI.
+_FIFTH, _INFO = rb"(?:,-?\d{1,7})?", (_C + rb",") * 4
+# Kinds of row: those of the logger, then those of a console, with each radio access on a separate line.
+_FORMS = tuple(
+    re.compile(_T + form + rb"[ \t]*\r?$", re.MULTILINE) for form in (
+        rb"(?:" + _INFO + rb")?" + _CSI[b"lte"] + b"," + _CSI[b"nr5g"] + _FIFTH + rb"(?:(?:," + _C + rb"){4})?",
+        _LTE + rb"(?:," + _NSA + rb"(?:" + _ARFCN + rb"(?:," + _C + rb"){3})?)?",
+        _SA + rb"(?:," + _C + rb"){0,3}",  # firmwares differ behind the SINR
+        _NSA + rb"(?:" + _ARFCN + rb"(?:," + _C + rb"){1,4})?",
+        _CSI[b"lte"] + _FIFTH, _CSI[b"nr5g"] + _FIFTH,
+    )
 )  # fmt: skip
 _ANY = re.compile(_T + rb'"?\+(?:QNWCFG|QENG|QENDC)')
-_TALK = re.compile(_T + rb'(?!"?\+(?:QNWCFG|QENG|QENDC))|^\[?' + _text.TIME + rb"\]?[ \t]*\r?$")
+_TALK = re.compile(_T + rb'(?!"?\+(?:QNWCFG|QENG|QENDC))|^\[?' + TIME + rb"\]?[ \t]*\r?$")
 # 3GPP TS 38.133 table 10.1.6.1-1: reported SS-RSRP lies between -156 and -31 dBm.
 _RSRP_RANGE = (-156.0, -31.0)
 # 3GPP TS 38.133 table 10.1.16.1-1: reported SS-SINR lies between -23 and 40 dB.
@@ -108,7 +89,7 @@ def _reason(line: bytes) -> str | None:
         return "NUL bytes in the line (the file system was not synced when the power failed)"
     if line.startswith(b"[") and _TALK.match(line):
         return None  # commands and other answers of a console
-    if not re.match(rb"\[?" + _text.TIME, line):
+    if not re.match(rb"\[?" + TIME, line):
         return "no time stamp in front (torn or stray modem line)"
     if b"neighbourcell" in line:
         return "neighbour-cell row: not read"
@@ -124,13 +105,13 @@ def _table(lines: _text.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
     # searching a log of CSI for other kinds would be slow and find nothing
     serving = b"servingcell" in lines.data or lines.data.startswith(b"[")
     tables: list[tuple[IntArray, dict[str, AnyArray]]] = []
-    for i, (pattern, names) in enumerate(_FORMS if serving else _FORMS[:1]):
+    for i, pattern in enumerate(_FORMS if serving else _FORMS[:1]):
         row, groups = _text.match(lines, pattern)
-        column = dict(zip(names.split(), _text.columns(groups, pattern.groups), strict=True))
+        column = dict(zip(pattern.groupindex, _text.columns(groups, pattern.groups), strict=True))
         tables.append((row, {**column, "form": np.full(len(row), float(i))}))
     row = np.concatenate([row for row, _ in tables])
     order = np.argsort(row, kind="stable")
-    every = dict.fromkeys(name for _, names in _FORMS for name in ("form", *names.split()) if name != ".")
+    every = dict.fromkeys(name for form in _FORMS for name in ("form", *form.groupindex))
     table = {
         name: np.concatenate([column.get(name, np.zeros(len(row), dtype="S1")) for row, column in tables])[order]
         for name in every

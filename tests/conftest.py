@@ -50,7 +50,7 @@ else:
             os.kill(int(_left.name.removeprefix(_NAME).partition("-")[0]), 0)
         except ProcessLookupError:
             shutil.rmtree(_left, ignore_errors=True)
-        except (PermissionError, ValueError):  # somebody else's, or of another name
+        except (PermissionError, ValueError):  # of another user, or with another name
             continue
 
 
@@ -66,7 +66,7 @@ DEAREST = (
     "jobs/test_training_logs.py",
     "flight/test_clock.py",
     "flight/test_draft.py",
-    "jobs/test_map_store.py",  # runs compiled, too: no earlier, or it compiles beside the first
+    "jobs/test_map_store.py",  # also runs compiled code: not earlier, or it would compile at the same time as the first
     "propagation/test_compiled.py",
     "jobs/test_plan.py",
     "test_published.py",

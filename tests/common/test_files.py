@@ -63,7 +63,7 @@ def test_what_a_killed_run_left_is_removed_after_an_hour(tmp_path: Path) -> None
     assert {p.name for p in tmp_path.iterdir()} == {"a", new.name, other.name}
 
 
-# Functions that read a whole file, by their place in the package, with what they want beside its path.
+# Functions that read a complete file, by module, with the arguments that they need besides its path.
 READERS_OF_WHOLE_FILES: dict[str, dict[str, Any]] = {
     "flight.settings.load_flight": {},
     "site.mapfiles.read_map_file": {},

@@ -363,7 +363,7 @@ def test_two_renames_where_the_system_cannot_exchange(
         finally:
             os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
-    with OutputFolder(target, job="test"):  # any next run mends
+    with OutputFolder(target, job="test"):  # the next run repairs it
         files = content(target)
     assert files["a"] == (b"2" if step == 2 else b"1")
     assert set(files) == {"a", SUMS}

@@ -40,7 +40,7 @@ def test_a_share_is_a_line_per_quarter_where_there_is_no_terminal(capsys: pytest
     progress = shown.ProgressLines()
     for i in range(101):
         progress("sionna LW1", i / 100)
-    progress("50 %")  # a text is a text, whatever it ends with
+    progress("50 %")  # a text without a share is printed as a line, even if it ends like a share
     out = capsys.readouterr()
     assert out.out == ""
     assert out.err.splitlines() == [f"sionna LW1 {q} %" for q in (25, 50, 75, 100)] + ["50 %"]

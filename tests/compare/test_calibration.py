@@ -47,7 +47,7 @@ def test_an_offset_of_one_flight_shows_only_where_offsets_are_shared() -> None:
     assert scores["a"].rmse_shared_offset_db == pytest.approx(np.hypot(scores["a"].rmse_db, 3.0), abs=0.3)
     assert all(s.constant_rmse_db == pytest.approx(s.free_space_rmse_db) for s in scores.values())  # one distance
     assert all(np.isfinite([s.inside_50, s.inside_95]).all() for s in scores.values())
-    unasked = ("inside_50", "inside_95", "rmse_shared_offset_db")  # what nobody asks is not computed
+    unasked = ("inside_50", "inside_95", "rmse_shared_offset_db")  # values that are not needed are not computed
     assert all(np.isnan([getattr(s, name) for name in unasked]).all() for s in flight_left_out(flights, RECIPE))
     series = [o.samples for o in flights]
     assert (

@@ -272,7 +272,7 @@ LOADED = autopilots.VOLTS
 SAGGING = tuple(np.round(np.linspace(50.3, 44.1, 40), 3))
 
 
-# As vehicleOut has it, and as somebody's own table.
+# In the form of vehicleOut, and in the form of a user's own table.
 @pytest.mark.parametrize(("title", "row"), [
     ("", "{i},-78.6962747,35.7274823,{i}.1,{volt},2026-05-22 10:05:{i:02d}.5,{fix},{satellites}\n"),
     ("time,lat,lon,altitude,battery voltage,gps fix type,num sat\n",

@@ -128,7 +128,7 @@ def test_a_field_is_added_where_one_was_planted_and_the_nearer_base_wins() -> No
     assert np.corrcoef(level, asked.residual_db)[0, 1] > 0.8
     channel = waves.channels["T.A"]
     assert len(channel.left_db) == 240
-    # of a flown flight its offset is known; of a new one it is not, unless samples count about their own mean
+    # the offset of a known flight is known; that of a new flight is not, unless samples are about their own mean
     new, own = waves.predict(asked, "b")[1], waves.predict(asked, own_mean=True)[1]
     assert (new < sd).all()
     assert (own < sd).all()

@@ -129,7 +129,7 @@ def test_every_score_is_that_by_hand(learned: bool) -> None:
     seen, level = detected[ok], simulated[ok]
     if learned:
         forecast_p = 1.0 / (1.0 + np.exp(-0.25 * (level + 56.0)))
-    else:  # tenths of the time, each told by the others
+    else:  # tenths of the time, each predicted by the others
         tenth = np.minimum((time[ok] - 5.0) / 39.9 * 10.0, 9.0).astype(int)
         p = out_of_group(level[:, None], seen.astype(int) + 1, tenth, 1.0)
         forecast_p = p[:, 1] / (p[:, 0] + p[:, 1])
@@ -159,7 +159,7 @@ def test_fifty_of_either_outcome_are_enough(rare: int) -> None:
         assert (scored is not None) == (rare == 50)
     learned = learn_detection([(level, few), (level[:0], few[:0])])
     assert (learned is not None) == (rare == 50)
-    if learned is not None:  # all is told apart: only the penalty of a thousandth keeps the slope finite
+    if learned is not None:  # everything is separable: only the penalty of a thousandth keeps the slope finite
         slope, unit = learned.per_db * level.std(), (level - level.mean()) / level.std()
         over = learned.probability(level) - few
         assert over.mean() == pytest.approx(0.0, abs=1e-4)

@@ -142,7 +142,7 @@ def test_planted_gains_lie_within_their_own_sd_where_flights_have_looked(learned
         inside += (np.abs(error) < 2.0 * sd).sum()
         count += len(seen)
         assert rmse(error) < 0.5 * rmse(truth(seen))
-    assert inside / count > 0.90  # of the directions seen, within two of its own standard deviations
+    assert inside / count > 0.90  # share of the directions seen that are within two standard deviations
     assert inside / count < 0.999  # and the sd is not simply large
 
 

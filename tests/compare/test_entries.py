@@ -44,7 +44,7 @@ def test_scores_are_those_by_hand(own: bool) -> None:
     assert both["rmse_db"] == pytest.approx((scores["rmse_db"] + SHORT.error_db.std()) / 2)
     assert both["n"] == 85.0
     assert np.isnan(both["crps_db"])
-    fast = np.tile([3.0, -3.0], 400)  # a tenth of a second: gone in the mean of four seconds
+    fast = np.tile([3.0, -3.0], 400)  # a tenth of a second disappears in a mean over four seconds
     ripple = LevelSeries(name="r", time_s=np.arange(800) / 10.0, measured_db=fast, level_db=np.zeros(800))
     assert level_scores([ripple])["rmse_4s_db"] < 0.1
     assert level_scores([ripple])["rmse_db"] == pytest.approx(3.0)

@@ -150,7 +150,7 @@ def test_headings_that_count_alike_are_the_mean_of_single_headings_and_hold_thei
     single = [fit.predict(dataclasses.replace(targets, direction=np.tile(n, (40, 1)))) for n in nose]
     mean, sd = fit.predict(alike)
     np.testing.assert_allclose(mean, np.mean([m for m, _ in single], axis=0), atol=1e-9)
-    # the variance of a heading drawn at random is, in expectation over fields, that of all headings together
+    # on average over fields, the variance for a random heading equals the variance for all headings together
     together = np.mean([s**2 for _, s in single], axis=0)
     square = np.zeros(40)
     for _ in range(60):

@@ -63,7 +63,7 @@ def test_held_out_flights_store_the_parts_of_their_error() -> None:
     assert HEALTH.slow_sd_db == pytest.approx(2.5, abs=0.5)
     assert 6.0 < HEALTH.correlation_s < 18.0
     assert HEALTH.correlation_m == pytest.approx(5.0 * HEALTH.correlation_s, rel=0.3)  # flown at 5 m/s
-    assert 0.3 < HEALTH.white_sd_db < 1.3  # of 4-s means: 2 dB over the root of 8
+    assert 0.3 < HEALTH.white_sd_db < 1.3  # the noise of 4 s means: 2 dB over the root of 8
     assert HEALTH.rmse_db == pytest.approx(np.hypot(2.45, 2.0 / np.sqrt(2.0)), abs=0.4)
     assert HEALTH.step_chi2 < 20.0
     assert HEALTH.run_s == 0.0

@@ -117,7 +117,7 @@ def test_a_place_that_is_visited_twice_is_left_out_as_a_whole():
     everywhere = np.ones(800, bool)
     here = held_out_error_db(level, np.zeros(800), everywhere, place)[level > 0]
     assert here == pytest.approx(8.0)
-    # in stretches of time the way back tells the way out
+    # in segments of time, the way back predicts the way out
     in_time = np.repeat(np.arange(8), 100)
     assert held_out_error_db(level, np.zeros(800), everywhere, in_time)[level > 0].mean() < 7.5
     ladder = climb([level], [np.arange(800.0)], [Rung(model="m", level_db=(np.zeros(800),), seconds=0.0)], [position])

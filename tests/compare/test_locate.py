@@ -208,7 +208,7 @@ def test_the_grid_reaches_400_m_beyond_the_flight_and_the_region_a_tenth_of_the_
     ):
         assert locating._on_edge(np.array([[*place, 1.5]]), grid, spacing).tolist() == [bool(edge)]
     far = np.array([[0.0, 0.0], [500.0, 0.0]])
-    # all here; five percent far away: of the rest 18 in 19 are within; twenty percent: half of those far away
+    # all here; five percent far away: 18 in 19 of the others are within; twenty percent: half of those far away
     for shares, radius in (((1, 0), 20 * np.sqrt(-2 * np.log(0.1))), ((0.95, 0.05), 20 * np.sqrt(-2 * np.log(1 / 19))),
                            ((0.8, 0.2), 500.0)):  # fmt: skip
         regions = locating.Regions.of(far, np.array(shares))

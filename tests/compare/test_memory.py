@@ -115,7 +115,7 @@ def test_a_stretch_moves_the_ends_of_an_interval_and_leaves_every_draw_in_its_pl
 @pytest.mark.parametrize("n", [20, 60, 300, 3000])
 def test_the_ends_of_any_interval_lie_between_the_outer_thousandth_and_tenth_of_its_draws(n: int) -> None:
     for keep in (0.0, 0.5, 0.9, 0.99, 1.0):
-        for seed in (n, 22):  # of 60 steps, the second walk would lie outside by its shares
+        for seed in (n, 22):  # after 60 steps, the second walk would be outside by its shares
             values = lfilter([1.0], [1.0, -keep], np.random.default_rng(seed).normal(size=n))
             slow = cosine_terms(values).slow
             known = [statistics.known_memories(kind, len(slow)) for kind in ("mean", "power")]

@@ -219,7 +219,7 @@ def test_means_in_time_are_those_of_a_loop() -> None:
     time[40:] += 30.0  # a gap
     order = rng.permutation(80)
     power = rng.exponential(size=(2, 80, 3))
-    rows = np.arange(80) * 0.1  # both ends of a window count, whatever the rounding
+    rows = np.arange(80) * 0.1  # both ends of a window are included, regardless of rounding
     ends = time_means(power, rows, 0.0, 0.6)[0, :, 0]
     np.testing.assert_allclose(ends, [power[0, max(i - 3, 0) : i + 4, 0].mean() for i in range(80)])
     for shift, average in ((0.0, 0.0), (3.0, 8.0), (-4.0, 5.0)):

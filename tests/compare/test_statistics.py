@@ -119,7 +119,7 @@ def test_a_given_interval_holds_and_one_is_given(neighbours):
         pair = paired_difference(error, 0.5 * error + np.sqrt(0.75) * other)
         bounds = np.array([fit.offset_db, fit.rmse_db, fit.correlation, pair.difference_ci95_db])
         assert np.isfinite(bounds[:3]).all()
-        covered += ~((bounds[:, 0] > truth) | (truth > bounds[:, 1]))  # of few memories a pair may have none
+        covered += ~((bounds[:, 0] > truth) | (truth > bounds[:, 1]))  # with few correlations, a pair may have none
     assert (covered >= 0.90 * runs).all()  # 0.3: offset 49 %, RMSE 11 % of those given at 0.98
     assert covered[[0, 1, 3]].sum() < 3 * runs - 6  # and intervals that always hold say nothing
 

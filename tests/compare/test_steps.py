@@ -70,7 +70,7 @@ def test_the_smallest_step_that_is_stated_shows_nine_times_in_ten() -> None:
         last = before[-1 - len(quiet.steps) :].mean() if quiet.steps else before.mean()
         after = _one(np.append(before, last + quiet.smallest_db + rng.normal(0.0, 0.2)))
         shown += any(s.shown == "050" for s in after.steps)
-    assert 0.84 < shown / 120 < 0.96  # of 120 shares of .9 vary by .027
+    assert 0.84 < shown / 120 < 0.96  # 120 samples of a share of .9 vary by .027
     assert false < 8  # one node of ten, 40 nights each: five at one in a hundred
 
 
@@ -100,7 +100,7 @@ def test_intervals_of_a_step_cover_it_if_a_third_of_the_links_is_missing() -> No
         onset += sum(s.night == "030" for s in found)
     assert len(held) > 75
     assert np.mean(held) > 0.88
-    assert onset > 70  # of those that the last night did not show, too
+    assert onset > 70  # also among those that the last night did not show
 
 
 def seasons(count: int, link_sd_db: float, seed: int, step_db: float = 1.0) -> dict[str, float]:
@@ -131,7 +131,7 @@ def seasons(count: int, link_sd_db: float, seed: int, step_db: float = 1.0) -> d
 def test_steps_of_a_decibel_show_the_same_night_and_false_ones_are_rare() -> None:
     shares = seasons(8, 0.35, seed=4)
     assert shares["same night"] >= 0.9
-    assert shares["false in 100 nights"] < 1.5  # of 2 000 seasons: see the command above
+    assert shares["false in 100 nights"] < 1.5  # from 2 000 campaigns: see the command above
 
 
 if __name__ == "__main__":

@@ -106,7 +106,7 @@ KINDS: dict[Callable[[str, Generator], Verdict], tuple[str, ...]] = {
 }
 
 
-# Words that accuse nobody; of equal models a 95 % interval gives them in 2.5 %, like each of the other words.
+# Words without an accusation. For equal models, a 95 % interval leads to them in 2.5 %, like to the others.
 PRAISE = ("better", "antenna")
 
 
@@ -202,7 +202,7 @@ def test_every_shift_of_a_campaign_is_tried() -> None:
     rest = (c - 1.0 + 1.0 + 2.0 + 1.5) / 5
     assert tried[8].effect == pytest.approx(a - rest)
     low = [chance for chance, _ in verdicts._shifts(errors, {}, names)]
-    assert np.isnan(low).tolist() == [True, True, True, False, True]  # a small error accuses nobody
+    assert np.isnan(low).tolist() == [True, True, True, False, True]  # a small error accuses no model
 
 
 @pytest.mark.parametrize(
@@ -222,7 +222,7 @@ def test_stated_errors_by_their_limits(
     assert said.cause == cause
     if cause == "biased":
         assert said.interval == pytest.approx((mean - reach, mean + reach))
-        common = stated_errors(error, np.ones(40), 1.0)  # a shift that all samples share is no bias
+        common = stated_errors(error, np.ones(40), 1.0)  # a shift that all samples share is not a bias
         assert common.cause == "none"
     if cause == "none" and mean == 0.0:  # what a flight shares can hide a narrow interval
         low, high = stated_errors(error, np.full(40, 2.0), 0.5).interval

@@ -175,7 +175,7 @@ def test_a_flat_level_says_nothing_of_the_clock():
     assert "is constant although" in clock.reason
     other = channel(3.0, 5, name="other")
     dead = dataclasses.replace(lone, measured_db=np.full(len(lone.time_s), -120.0))
-    for silent in (floor, dead):  # of a channel that varies they take nothing away
+    for silent in (floor, dead):  # they do not change a channel that varies
         assert judge_clock([silent, other]) == judge_clock([other])
 
 

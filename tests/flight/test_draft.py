@@ -85,7 +85,7 @@ def test_a_radio_clock_in_utc_is_asked_about_and_compared(logs: Path) -> None:
     """The telemetry is local; the log of LW1 was written in UTC, that of LW2 an hour late."""
     for name, hour in (("LW1/USRP1_power_log.txt", "2025-06-01 14:"), ("LW2/USRP1_power_log.txt", "2025-06-01 11:")):
         (logs / name).write_text((logs / name).read_text().replace("2025-06-01 10:", hour))
-    text = (logs / "LW3/USRP1_power_log.txt").read_text()  # of another flight, four hours later
+    text = (logs / "LW3/USRP1_power_log.txt").read_text()  # from another flight, four hours later
     (logs / "LW3/USRP1_later_power_log.txt").write_text(text.replace("2025-06-01 10:", "2025-06-01 14:") + text[-40:])
     text, remarks = draft(ingest(logs, options=OPTIONS), logs, DraftOptions(timezone=ZONE))
     (line,) = [line for line in text.splitlines() if "LW1/USRP1" in line]

@@ -74,7 +74,7 @@ def test_legs_of_a_rectangle_are_those_by_hand():
     np.testing.assert_allclose(lying[0][:, 0], lying[1][::-1, 0], atol=1e-9)
     assert sorted(lying[0][:, 0]) == pytest.approx([0, 230])
     np.testing.assert_allclose(lawnmower(area, 0.0, 1000.0), [[(115, 0), (115, 300)]], atol=1e-9)
-    notched = area.difference(shapely.box(0, 39, 300, 200))  # 39 m is no leg, 100 m are
+    notched = area.difference(shapely.box(0, 39, 300, 200))  # 39 m are not a leg, 100 m are
     assert [leg[:, 1].tolist() for leg in lawnmower(notched, 0.0, 115.0)] == [[200, 300], [300, 200]]
     split = area.difference(shapely.box(0, 100, 300, 200))
     assert [leg[:, 1].tolist() for leg in lawnmower(split, 0.0, 115.0)] == [[0, 100], [200, 300], [300, 200], [100, 0]]

@@ -15,7 +15,7 @@ from aerpaw_cmp.flight.settings import ArraySettings, FlightFile
 POINT = {"east_m": 0, "north_m": 0, "height_m": 5}
 PLAN = {"start": "2025-06-01T10:00:00", "waypoints": [POINT, POINT]}
 TINY = 1e-9
-# Numbers above 0, by the part of a flight file that they stand in.
+# Numbers above 0, by their section of a flight file.
 POSITIVE = {
     "link.rss": "bandwidth_hz",
     "flight.plan": "speed_mps climb_mps telemetry_interval_s rss_interval_s rank_interval_s fading_correlation_s rank_k",

@@ -57,7 +57,7 @@ def on_a_cluster(folder: Path) -> dict[str, Any]:
         out["other"] = message(lambda: check_workers(crew._client, []))
         workers.code_digest = real
         out |= scenarios(crew, folder)
-        # Dask cannot close a cluster while it starts a worker anew ("can only join a started process")
+        # Dask cannot close a cluster while it restarts a worker ("can only join a started process")
         crew._client.wait_for_workers(2, timeout=60)
     return out
 

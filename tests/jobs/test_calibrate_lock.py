@@ -56,7 +56,7 @@ def locks_of(observed: list[Observed]) -> dict[str, LearnedLock]:
 def test_the_planted_lock_is_recovered_and_beats_the_share_on_flights_left_out() -> None:
     locks = locks_of([flight(name, seed) for seed, name in enumerate("abc")])
     lock = locks["ROVER.power"]
-    assert lock.gain_db == pytest.approx(HALF_DB, abs=1.5)  # of the path gain: not of 40 dBm
+    assert lock.gain_db == pytest.approx(HALF_DB, abs=1.5)  # relative to the path gain, not to 40 dBm
     assert lock.per_db == pytest.approx(PER_DB, rel=0.35)
     assert lock.flights == 3
     assert 2.0 < lock.locked_sd_db < 3.0
@@ -66,7 +66,7 @@ def test_the_planted_lock_is_recovered_and_beats_the_share_on_flights_left_out()
     assert (lock.lost_db, lock.lost_per_db, lock.lost_sd_db) == pytest.approx((-28.0, 0.0, 0.5), abs=1e-6)
     assert lock.brier < 0.7 * lock.constant_brier
     assert lock.log_score < 0.7 * lock.constant_log_score
-    assert lock.floor_rmse_db < 0.8 * lock.free_space_floor_rmse_db  # 2 dB of noise; 4 dB of cosine beside it
+    assert lock.floor_rmse_db < 0.8 * lock.free_space_floor_rmse_db  # 2 dB of noise plus 4 dB of cosine
     assert f"{lock.brier:.3f}" in lock_words(lock)
 
 

@@ -397,7 +397,7 @@ def test_many_settings_are_held_in_the_memory_of_one() -> None:
         held.append(fitted_to(task, Outcome(rss=(row,))).rss[0])
     values = [getattr(row, field.name) for row in held for field in dataclasses.fields(row)]
     arrays = {id(value): value.nbytes for value in values if isinstance(value, np.ndarray)}
-    assert sum(arrays.values()) < 16 * 8 * n  # of one setting: at most sixteen numbers a sample
+    assert sum(arrays.values()) < 16 * 8 * n  # for one setting: at most sixteen numbers per sample
     done, groups = pool_offsets(held, "tower")
     pooled, same = pool_offsets(every, "tower")
     for a, b in zip(done, pooled, strict=True):

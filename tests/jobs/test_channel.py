@@ -286,7 +286,7 @@ def test_a_flown_flight_gives_the_same_in_a_notebook(tmp_path):
     flight = aerpaw_cmp.open_flight(SAMPLE)
     book = flight.channel(towers=("LW2",), step_s=20.0)
     assert book.sizes["time"] == 17
-    assert np.isfinite(book.doppler_hz[0]).sum() > 10  # steps of 20 s are no gaps
+    assert np.isfinite(book.doppler_hz[0]).sum() > 10  # steps of 20 s are not gaps
     assert abs(book.time.values[0] - flight.track.time.dt.tz_localize(None).to_numpy()[0]) < np.timedelta64(1, "us")
     assert np.abs(book.gain.sum("path") - book.h).max() <= 1e-12 * np.abs(book.h).max()
     # paths of a synthetic flight are not learned from logs of real flights; the calibrated levels are

@@ -361,7 +361,7 @@ def test_one_absurd_level_changes_no_number_and_is_told(
     (tmp_path / "USRP1.csv").write_text("\n".join(lines) + "\n")
     metrics = report_completes(path, capsys)
     channel = metrics["rss"]["LW1"]["USRP1"]
-    if absurd == "-inf":  # of decibels: no signal
+    if absurd == "-inf":  # a level in decibels that means no signal
         assert channel["n_out_of_coverage"] == 1
     else:
         flag = "level_out_of_range" if absurd[0].isdigit() else "no_number"

@@ -42,7 +42,7 @@ def test_the_replay_is_the_two_ray_form_of_that_roughness(sigma):
 
 def test_roofs_and_walls_stay_smooth_and_the_second_implementation_agrees():
     settings = rt(ground_roughness_m=0.05, max_depth=2)
-    few = Poses(POSES.position_m[::2], POSES.rotation[::2])  # buildings beside LW1 hide many ground reflections
+    few = Poses(POSES.position_m[::2], POSES.rotation[::2])  # buildings near LW1 hide many ground reflections
     replayed = replay_poses(SITE, settings, LINK, few)
     rough = path_losses(SITE, settings, LINK.carrier_hz)["rough ground"]
     assert rough is not None

@@ -73,7 +73,7 @@ def test_free_space_is_found_said_and_written(tmp_path: Path, capsys: pytest.Cap
     mine = path.read_text().splitlines()
     assert seal.startswith("# aerpaw-cmp wrote this file")
     changed = [line for line in mine if line not in lines]
-    assert all("max_depth" in line for line in changed)  # of all lines, with their comments and order
+    assert all("max_depth" in line for line in changed)  # all lines, with their comments and order
     assert [line for line in lines if line in mine] == [line for line in mine if line in lines]
     assert len(lines) == len(mine)
 

@@ -92,7 +92,7 @@ def test_a_damaged_entry_is_told_and_not_used(tmp_path: Path, place: int) -> Non
     assert "damaged" in store.warnings[0]
 
 
-# Stands where a part of a forged entry is empty: NumPy pickles it.
+# Used where a part of a forged entry is empty: NumPy pickles it.
 PICKLED = np.array([{}], dtype=object)
 
 

@@ -196,7 +196,7 @@ def test_masts_hide_nothing_and_meshes_of_trees_are_media(tmp_path: Path, capsys
     clear = replay(site, link, poses).rss_dbm[:, 0]
     assert np.isfinite(clear).all()
     depth = stand_depth_m(site, np.tile([0.0, 0.0, 10.0], (len(spots), 1)), spots)
-    np.testing.assert_allclose(depth[0], 6.0)  # of 3 + 3 m, at any slope none
+    np.testing.assert_allclose(depth[0], 6.0)  # 3 + 3 m of wood, at any slope
     np.testing.assert_allclose(depth[1:-1], 0.0)
 
 

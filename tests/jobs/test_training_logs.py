@@ -152,7 +152,7 @@ def test_an_export_of_learned_antennas_is_not_scored_on_its_training_log(folder:
     place = folder / "calibrated"
     ends = {}
     for end in ("tower", "uav"):
-        # no sphere results from cuts beside the lobe of the tower's antenna: such a copy is refused
+        # no sphere results from cuts next to the lobe of the tower's antenna: such a copy is refused
         sphere = how.startswith("a table") or (how != "as written" and end == "tower")
         source = place / f"LW1.USRP1.{end}{'.csv' if sphere else '.msi'}"
         target = source if how == "as written" else folder / f"mine_{how.replace(' ', '_')}_{end}{source.suffix}"

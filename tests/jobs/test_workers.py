@@ -119,7 +119,7 @@ def test_nothing_listens_while_workers_of_this_machine_work() -> None:
     with socket.socket() as door:  # what the test would see
         door.bind(("127.0.0.1", 0))
         door.listen()
-        # among those of tests that run beside this one
+        # among the processes of tests that run at the same time
         assert f"tcp 0100007F:{door.getsockname()[1]:04X}" in listening(0)
 
 

@@ -99,7 +99,7 @@ def test_late_answers_are_kept_and_taken_for_nothing(modem, tap, tools, tmp_path
     assert any(r["status"] == "timeout" for r in exchanges)
     assert any(r["kind"] == "late" and r["lines"] for r in records)
     tools.all_kept(sim, tmp_path / "log")
-    for r in exchanges:  # no answer stands under another question
+    for r in exchanges:  # no answer is recorded under another query
         if r["query"] == "nr5g_csi":
             assert all('"nr5g_csi"' in line for line in r["lines"])
             assert "no_csi_line" not in r["flags"]

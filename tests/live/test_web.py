@@ -391,7 +391,7 @@ def test_measurements_and_predictions_stand_in_rows():
     sent = hand.answer(rank=2)
     hand.predict(sent, east_m=10.0, north_m=20.0, up_m=40.0, level_dbm=-50.0, offset_db=-40.0, rsrp_dbm=-91,
                  rank_interval=[2, 4], level_interval_dbm=[-95.0, -85.0], inside=[1, 1, 0, 0])  # fmt: skip
-    hand.predict(sent + 1)  # of an answer that is not known
+    hand.predict(sent + 1)  # a prediction for an unknown answer
     message, _ = hand.feed.after("")
     assert rows_of(message).tolist() == [[1.0, 2.0, -91.0, 14.0]]
     assert rows_of(message, key="predictions").tolist() == [[1.0, 2, 3, 2, 4, -91, -90, -95, -85, 10, 20, 40]]

@@ -188,7 +188,7 @@ def test_the_map_shows_the_flight_over_the_prediction_and_is_linked(driver, fly)
     choose(driver, "layer", "level")
     frame(driver)
     assert "level predicted for tower" in text(driver, "map-words")
-    assert "at 90 m" in text(driver, "map-words")  # of 30 and 90 m the nearer to the UAV at 80 m
+    assert "at 90 m" in text(driver, "map-words")  # of 30 and 90 m, the height nearer to the UAV at 80 m
     # a pose under the pointer is marked in the charts, and named
     driver.execute_script("""const c = document.getElementById('map'), r = c.getBoundingClientRect();
         c.dispatchEvent(new PointerEvent('pointermove', {clientX: r.left + arguments[0], clientY: r.top + arguments[1], pointerId: 9, bubbles: true}))""", x, y)  # fmt: skip
@@ -240,7 +240,7 @@ def test_alarms_are_shown_kept_and_heard(driver, fly):
     assert text(driver, "alarms") == ""
     flight.record(kind="gap", state="open", reason="hung up")
     until(driver, "document.getElementById('alarms').textContent.includes('no modem: hung up')")
-    assert driver.execute_script("return live.state.beeps") == 0  # nobody asked for sound
+    assert driver.execute_script("return live.state.beeps") == 0  # sound was not switched on
     assert text(driver, "state") == "no modem"
     driver.find_element("id", "sound").click()
     assert text(driver, "sound") == "Sound on"

@@ -57,7 +57,7 @@ def test_a_short_part_of_the_run_has_no_violation(known: dict) -> None:
     reading = [name for name, target in known.items() if not target.refuses]
     assert len(reading) > 50
     dead = [name for name in reading if not read[name]]
-    # the cache of paths is refused by its seal, whatever changes
+    # the cache of paths is refused by its seal after any change
     assert "path_cache" in dead
     assert len(dead) <= 4, f"nothing is tested behind the first check of {dead}"
 

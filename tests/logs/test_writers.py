@@ -68,7 +68,7 @@ def test_sounder_levels_and_runs(levels: list[float]) -> None:
     back = identify(data).read(data, OPTIONS)
     frame = back.streams[0].frame
     assert np.array_equal(frame["rss_db"].astype(np.float32), np.array(levels, dtype=np.float32), equal_nan=True)
-    # od closes a log that ends inside a run with an offset, which is no record
+    # od ends a log inside a run with an offset, which is not a record
     ends_in_run = len(levels) > 1 and np.array_equal(np.float32(levels[-2:-1]), np.float32(levels[-1:]), equal_nan=True)
     assert len(back.rejected) == int(ends_in_run)
     if not ends_in_run:  # evenly spaced samples: the interpolated times of a run are the true ones

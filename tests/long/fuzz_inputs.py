@@ -53,15 +53,15 @@ from aerpaw_cmp.logs.records import ReadResult
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 2.0
 LIMIT_MIB = 300
-# A worker that spends so much of the processor on one input hangs in native code, where no alarm reaches it.
+# A worker that needs this processor time for one input hangs in native code, where no alarm reaches it.
 WATCHDOG_S = 20.0
 # One that finishes no input for so long sleeps for ever; long, so that a run may have the lowest priority.
 WATCHDOG_WALL_S = 600.0
 
 BLOCK = 1000
-# Every so many inputs meet the sniffers of all readers.
+# Every n-th input is given to the sniffers of all readers.
 SNIFF_EVERY = 32
-# Every so many inputs are several logs joined by hand.
+# Every n-th input consists of several logs joined by hand.
 JOINED_EVERY = 8
 SEED_BYTES = 1500
 MEDIUM_BYTES = 4000
@@ -322,7 +322,7 @@ def _read_log(reader: Reader, binary: bool, data: bytes, index: int) -> bool:
         options = replace(options, file_name="results_3320000000.0_2000000.0_2025_03_02_10_00_00_250.mat")
     result = limits.check(reader.read(data, options))
     check_law(result, data, binary)
-    if reader.read_pieces is not None and not data.startswith(b"\xef\xbb\xbf"):  # ingest takes it off
+    if reader.read_pieces is not None and not data.startswith(b"\xef\xbb\xbf"):  # ingest removes it
         _read_in_pieces(reader, data, options, result, (61, 400, 1200)[index % 3])
     return result.accepted > 0
 
@@ -649,7 +649,7 @@ REPORT = json.dumps({
 }).encode()  # fmt: skip
 WAYPOINT = b"%d\t0\t%d\t16\t0\t0\t0\t0\t35.7275\t-78.696\t100\t1\n"
 _ROUTE = _loader("logs.route", "read_route", height_m=40.0)
-# Files of one seed each: what the tool asks a stranger for beside logs and maps.
+# Files of one seed each: inputs other than logs and maps that may come from a third party.
 SMALL_FILES: dict[str, tuple[bytes, Callable[[Path], Any]]] = {
     "route:csv": (b"latitude,longitude,altitude\n35.7275,-78.696,40\n35.7285,-78.697,40\n", _ROUTE),
     "route:plan": (PLAN, _ROUTE),
@@ -709,7 +709,7 @@ def one_input(target: Target, seed: int, index: int, *, bounded: bool = True) ->
     if bounded:
         resource.setrlimit(resource.RLIMIT_AS, (_room() + LIMIT_MIB * 2**20, resource.RLIM_INFINITY))
         signal.signal(signal.SIGPROF, _alarm)
-        signal.setitimer(signal.ITIMER_PROF, LIMIT_S)  # of the processor: the machine may be shared
+        signal.setitimer(signal.ITIMER_PROF, LIMIT_S)  # in processor time, because the machine may be shared
     start = time.process_time()
     try:
         took = target.run(data, index)

@@ -73,7 +73,7 @@ _BEAMS = (
     f"{_GROWTH}a_site_of_prisms_as_a_scene_has_the_paths_of_the_prism_engine",
     f"{_GROWTH}prisms_by_beams_have_the_paths_of_the_image_engine[True]",
 )  # fmt: skip
-# Of compiled code no line is seen running: these tests call it, and it is interpreted for each mutant.
+# Lines of compiled code cannot be traced: these tests call it, and it is interpreted for each mutant.
 COMPILED = {
     "aerpaw_cmp/propagation/search/beams.py": _BEAMS,
     "aerpaw_cmp/propagation/search/merging.py": _BEAMS,
@@ -261,7 +261,7 @@ def in_child(work: Callable[[], str], limit_s: float) -> str:
             os.dup2(null, 2)
             test = work()
             os.write(there, f"killed by {test}".encode() if test else b"survived")
-        except Exception as error:  # of this script: no mutant is counted by it
+        except Exception as error:  # a line of this script does not count a mutant
             os.write(there, f"broken: {error!r}".encode())
         finally:
             os._exit(0)

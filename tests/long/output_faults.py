@@ -135,7 +135,7 @@ def _buildings(count: int) -> dict[str, Any]:
     }
 
 
-# Of the run that goes on.
+# Of the present run.
 _variant = ["a"]
 
 
@@ -263,7 +263,7 @@ class Runs:
         """Everything below the root that is neither target nor in it, and hidden places in it."""
         from aerpaw_cmp.site.learned import folder_of
 
-        memory = folder_of(self.target)  # of a site, copied from that of its base
+        memory = folder_of(self.target)  # copied from the base of a site
         own = (self.folder, self.target, *([memory, *memory.iterdir()] if (memory / "learned.yaml").exists() else []))
         names = [p for p in self.root.rglob("*") if p not in own]
         return sorted(

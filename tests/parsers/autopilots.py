@@ -8,7 +8,7 @@ START_US = 1_740_927_600_250_000
 COUNT = 5
 
 
-VOLTS = (12.587, 12.193, 12.242)  # of ArduPilot's simulated battery on the ground and in the air
+VOLTS = (12.587, 12.193, 12.242)  # voltages of ArduPilot's simulated battery on the ground and in the air
 
 
 def dataflash(count: int = COUNT, fix: int = 4, satellites: int = 14, *, radio: bool = False) -> bytes:

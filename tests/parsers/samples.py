@@ -138,7 +138,7 @@ for _row in csv.DictReader(FILES["accounts"].decode().splitlines()):
     _reader, _name = _row["sample"].split("/")
     _account = (FILES[_row["sample"]], int(_row["accepted"]), int(_row["rejected"]))
     SAMPLES.setdefault(_reader, {})[_name] = _account
-# A sample of each kind of file that is no log (the MATLAB ones aside).
+# A sample of each kind of file that is not a log (except MATLAB files).
 NO_LOGS = {name.removeprefix("no_logs/"): data for name, data in FILES.items() if name.startswith("no_logs/")}
 # Formats whose account counts rows, values or messages.
 BINARY = ("flight_mat", "iq_burst", "sigmf", "ardupilot_bin", "mavlink_tlog", "px4_ulog")

@@ -807,7 +807,7 @@ _SCATTERS = tuple(
 
 # Airframes are compared at the likeliest places of a grid that reaches this far beyond the track [m]. Each place is
 # divided by three to the east and to the north.
-_BEYOND_M, _PER_SIDE, _LIKELIEST = 400.0, 24, 20
+_BEYOND_M, _PER_SIDE, _LIKELIEST = 400.0, 24, 10
 
 
 def searching_airframe(

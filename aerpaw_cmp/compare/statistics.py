@@ -100,7 +100,8 @@ class Memories:
 
     ``whiten`` (m, terms, terms) makes the terms independent. ``log_det`` (m,) is the logarithm of its determinant.
     For known terms, ``slope`` (m, terms) and ``variance`` (m,) determine mean and variance of the mean of the sequence.
-    ``power`` (m,) is the power of all terms.
+    ``power`` (m,) is the power of all terms. For errors over place, ``beyond`` (m,) is their power in faster terms, and
+    ``freedom`` (m,) the number of independent squares in it. They are 0 and infinite for errors over time.
     """
 
     whiten: FloatArray
@@ -108,9 +109,11 @@ class Memories:
     slope: FloatArray
     variance: FloatArray
     power: FloatArray
+    beyond: FloatArray
+    freedom: FloatArray
 
     @classmethod
-    def of(cls, covariances: FloatArray) -> Memories:
+    def of(cls, covariances: FloatArray, beyond: ArrayLike = 0.0, freedom: ArrayLike = np.inf) -> Memories:
         """Return the record for covariances of mean and terms (m, terms + 1, terms + 1)."""
         whiten = np.linalg.inv(np.linalg.cholesky(covariances[:, 1:, 1:]))
         cross = covariances[:, 0, 1:]
@@ -121,6 +124,8 @@ class Memories:
             slope=slope,
             variance=covariances[:, 0, 0] - (cross * slope).sum(axis=1),
             power=np.trace(covariances[:, 1:, 1:], axis1=1, axis2=2),
+            beyond=np.broadcast_to(np.asarray(beyond, dtype=np.float64), len(covariances)),
+            freedom=np.broadcast_to(np.asarray(freedom, dtype=np.float64), len(covariances)),
         )
 
 
@@ -173,17 +178,23 @@ def _place_memories(positions: bytes, instants: bytes, terms: int) -> Memories:
     apart = np.sqrt(np.maximum(square[:, None] + square - 2.0 * place @ place.T, 0.0) / square.mean())
     cosines = np.cos(np.pi * np.outer(np.arange(terms + 1), instant)) * np.sqrt(2.0) / len(instant)
     cosines[0] = 1.0 / len(instant)
-    by_length = {}
+    by_length, (beyond, freedom) = {}, np.empty((2, len(LENGTHS)))
     for longest in (len(LENGTHS) - 1, len(LENGTHS) - 2):
         correlation = np.exp(-apart / LENGTHS[longest])
         for at in range(longest, -1, -2):
             by_length[at] = cosines @ correlation @ cosines.T
+            beyond[at] = max((1.0 - correlation.mean()) / np.trace(by_length[at][1:, 1:]) - 1.0, 0.0)
             correlation = np.square(correlation)
+            freedom[at] = 1.0 / correlation.mean()
     placed = np.array([_unit(by_length[at]) for at in range(len(LENGTHS))])
     white, fading = _unit(np.eye(terms + 1)), _unit(_exponential(_FADING_RATE, terms).real)
     noise = [(share, white) for share in PLACE_WHITE]
     noise += [(share, 0.9 * fading + 0.1 * white) for share in PLACE_FADING]
-    return Memories.of(np.concatenate([(1.0 - share) * placed + share * other for share, other in noise]))
+    return Memories.of(
+        np.concatenate([(1.0 - share) * placed + share * other for share, other in noise]),
+        np.concatenate([(1.0 - share) * beyond for share, _ in noise]),
+        np.tile(freedom, len(noise)),
+    )
 
 
 def _unit(covariance: FloatArray) -> FloatArray:
@@ -429,7 +440,9 @@ def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatA
     known = known_memories("power", len(terms.slow), place_m)
     index, scale, stretch = _picked(terms.slow, known)
     *_, normal, second_normal = _random(len(terms.slow))
-    third = 2.0 / (9.0 * terms.fast_freedom)
+    # errors over place repeat when the flight returns, so that their power has fewer independent squares
+    placed = np.minimum(scale * known.joined("beyond")[index] / max(terms.fast_power, 1e-300), 1.0)
+    third = 2.0 / 9.0 * np.maximum(1.0 / terms.fast_freedom, placed**2 / known.joined("freedom")[index])
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
     fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
     share, ratio = loud_part(values)

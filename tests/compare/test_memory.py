@@ -282,3 +282,19 @@ def test_a_loud_part_widens_the_rmse_and_is_named(keep: float) -> None:
     assert statistics.error_intervals(np.zeros(400), steady[0]).notes == ()
     (note,) = statistics.error_intervals(np.zeros(400), flights[0]).notes
     assert note.startswith("The error is not stationary: it is ")
+
+
+def test_a_track_that_is_flown_again_adds_little_to_what_is_known_of_the_rmse() -> None:
+    """Errors over place are equal on the second round, so twice as many samples do not narrow the interval by a third."""
+    corners = np.random.default_rng(8).uniform(0.0, 500.0, (30, 2))
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    track = np.column_stack([*(np.interp(np.arange(0.0, along[-1], 10.0), along, axis) for axis in corners.T)])
+    track = np.column_stack([track, np.full(len(track), 40.0)])
+    apart = np.linalg.norm(track[:, None] - track, axis=2)
+    root = np.linalg.cholesky(np.exp(-apart / 25.0) + 1e-9 * np.eye(len(track)))
+    ratios = []
+    for seed in range(12):
+        error = 4.0 * root @ np.random.default_rng(seed).normal(size=len(track))
+        once, twice = (np.ptp(statistics.spread_interval(np.tile(error, k), np.tile(track, (k, 1)))) for k in (1, 2))
+        ratios.append(twice / once)
+    assert 0.95 < np.median(ratios) < 1.35

@@ -1,4 +1,4 @@
-"""Every benchmark that has a short size and prints JSON, with its peers, in one run; the numbers join a history.
+"""Run every benchmark that has a short size and prints JSON, and append the numbers to a history.
 
     make bench-all                                    # or: python benchmarks/all.py && python benchmarks/performance.py
     python benchmarks/all.py [--only scaling ingest] [--history FILE] [--no-history]

@@ -1,4 +1,4 @@
-"""Power of the clock check: lags planted in every real flight of a folder that holds levels along a track.
+"""Measure the power of the clock test: inject lags into every real flight of a folder.
 
 Each flight is drafted as it comes and its radio times are shifted. A planted lag of a second and more is found (called
 shifted, the lag in the interval), wrong (the interval misses it) or undecided; a smaller one is found where nothing but

@@ -1,4 +1,4 @@
-"""Whether diffraction pays: flights with the site's buildings, without and with paths over one edge.
+"""Compare flights with the site's buildings, without and with paths over one edge.
 
 RMSE of levels, kappa and agreement of ranks at K = 10, and the interval of the paired difference (95 %).
 

@@ -1,4 +1,4 @@
-"""Drafts of a folder of logs: each file alone, each folder, and with --pairs each track with each radio log.
+"""Draft the logs of a folder: each file alone, each folder, and with --pairs each track with each radio log.
 
 Prints, per draft, the samples that a report would score, or the reason why none. Exit code 1 if a draft gives neither.
 Of the pairs all are drafted that share time, or of which one has a relative clock; of the others, which no user would

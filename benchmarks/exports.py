@@ -1,4 +1,4 @@
-"""Seconds, bytes and peak memory of each export of a long flight, each in a process of its own.
+"""Measure seconds, bytes and peak memory of each export of a long flight, each in a separate process.
 
     python benchmarks/exports.py [--samples 1000000] [--formats kmz,netcdf]
 

@@ -1,4 +1,4 @@
-"""Results that were never flown: the records of a season and of a flight, made up in numbers.
+"""Simulated results of a campaign and of a flight, without any replay.
 
 Nothing is replayed. What is put in is known (offsets that drift, settings that differ, a hill of residuals), so that a
 page made from it can be checked against it; the size is a season's.

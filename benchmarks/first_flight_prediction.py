@@ -1,4 +1,4 @@
-"""Predictions before any flight, scored on real flights as if nothing were known of them.
+"""Score predictions before any flight on real flights, without using their levels.
 
 Each flight's track is predicted by ray tracing with isotropic antennas and the stated prior of
 :class:`~aerpaw_cmp.jobs.sources.Prior`. One offset per flight is subtracted, because before a flight no

@@ -1,4 +1,4 @@
-"""Time and peak memory of reading a large log, beside pandas on the same file.
+"""Measure time and peak memory of reading a large log, compared with pandas on the same file.
 
     python benchmarks/ingest.py [--scale LINES] [--format READER ...] [--folder DIR]
 

@@ -1,4 +1,4 @@
-"""Learned antennas and their residual field on real flights: errors and intervals where nothing was learned.
+"""Measure errors and intervals of learned antennas and their residual field on held-out parts of real flights.
 
 ``flights``: dataset 12, each flight from the other two. ``blocks``: 300 m blocks (and 20 m around them) of each flight,
 the rest of it known and one other flight; the same, antennas learned on the third flight too; both others known.

@@ -1,4 +1,4 @@
-"""Size and time to use of the pages: report (sample, 50 000 samples), map (paper's grid), campaign (a season).
+"""Measure size and loading time of pages: report (sample, 50 000 samples), map (paper's grid), large campaign.
 
 Each page is opened in headless Chromium from the disk, cold. "usable" is the time from the start of the navigation to
 the second frame after the page's script is done; "main thread" is the processor time of the page's main thread, which

@@ -1,4 +1,4 @@
-"""Path search beside PathSolver, ingest beside pandas, ranks beside NumPy's SVD: how many times faster each is.
+"""Compare times with peers: path search with PathSolver, ingest with pandas, ranks with NumPy's SVD.
 
 Both sides run in one process; 1 000 places of the bench scene (61 faces, depth 2) and a power log. Kriging beside
 PyKrige is benchmarks/kriging.py.

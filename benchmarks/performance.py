@@ -1,4 +1,4 @@
-"""docs/performance.md and its figures from the history of benchmark runs; ``--measure`` runs them all before.
+"""Write docs/performance.md and its figures from the history of benchmark runs. ``--measure`` runs them first.
 
     python benchmarks/performance.py [--measure] [--history FILE] [--docs FOLDER]
 

@@ -1,4 +1,4 @@
-"""Planted troubles: is the cause of a flight's error named rightly, and is a sound flight left alone?
+"""Inject errors into simulated flights: is the cause named correctly, and is no cause named without an error?
 
     python benchmarks/planted_causes.py [--flights 300] [--seed 1] [--oracle]
 

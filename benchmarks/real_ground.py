@@ -1,4 +1,4 @@
-"""Each part of Lake Wheeler's map and ground, and its effect on every field flight: levels, rank agreement, variation.
+"""Measure the effect of each part of Lake Wheeler's map and ground on the levels and ranks of every field flight.
 
 Each part is added alone to free ground without buildings and woods, at one reflection. Levels: RMSE with it minus RMSE
 without it, each with its own offset, paired (95 %). Rank: agreement and total variation, paired, each eighth of the

@@ -1,4 +1,4 @@
-"""Cost against size of the parts that a season or a city would strain, each size in a process of its own.
+"""Measure cost against size for large campaigns and cities, with each size in a separate process.
 
 poses     replay of 5 towers, 4 x 4 elements, 12 buildings, depth 2
 towers    replay of 10 000 poses, 12 buildings, depth 2

@@ -1,4 +1,4 @@
-"""Scenes x engine x depth: seconds (wall and CPU), memory, paths, missing, extra; and how the cost grows.
+"""Compare engines on scenes at each depth: seconds (wall and CPU), memory, paths, missing and extra paths.
 
 python benchmarks/scenes.py [--scenes munich,etoile,florence] [--depths 1,2] [--receivers 200]
     [--prisms 1000,5000] [--sionna 100000,1000000] [--limits 1000000,10000000] [--slots 24,26]

@@ -1,4 +1,4 @@
-"""Wheel and sdist on every Python at hand: installed anew, the sample reported with Sionna RT and without it.
+"""Install wheel and sdist on every available Python, and report the sample with and without Sionna RT.
 
     python benchmarks/wheels.py [--pythons python3.10 /opt/py/bin/python3.13] [--keep FOLDER]
 

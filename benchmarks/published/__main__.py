@@ -1,4 +1,4 @@
-"""Score channel models on published AERPAW flights: python -m benchmarks.published VERB (README.md beside this file).
+"""Score channel models on published AERPAW flights: python -m benchmarks.published VERB (see README.md in this folder).
 
 tasks: what is known and what is scored; template: the table to fill; score: a predictions.csv; enter: our own models.
 Logs are looked for below --data and known by their SHA-256; nothing is fetched.

@@ -1,4 +1,4 @@
-"""Every file of the field data: its reader and counts, or what it is instead of a log.
+"""Every file of the field data, with its reader and counts, or with its kind if it is not a log.
 
 ``golden.csv`` holds a line per file: path, reader, lines, accepted, rejected, number of streams and of their rows;
 for a file that is none, ``no log`` and what it is. The counts of the text logs were taken by other means too (grep,

@@ -1,4 +1,4 @@
-"""Damaged inputs: whatever a file holds, the answer is a result that accounts for it, or one message of the package.
+"""Damaged inputs: each file gives a result that accounts for its lines, or one message of the package.
 
 Every reader of the catalogue, flight.yaml, site.yaml, campaign.yaml, map files, MATLAB files, flight files, antenna
 files, the path cache and elevation models are given mutated seeds. Seeds are the samples of the tests, pieces of a few

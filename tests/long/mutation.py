@@ -1,4 +1,4 @@
-"""Mutation testing of the rooms that hold physics, statistics and the rules of honesty.
+"""Mutation testing of the subpackages for physics, statistics and scoring.
 
 Each mutant changes one place of one module: an operator, a comparison, a sign, a constant, a condition. The tests that
 reach the changed statement run on it in a forked child, where nothing else is changed, and end at the first failure.

@@ -1,4 +1,4 @@
-"""Kill, fill and break the disk under every command that writes: is what stands under a final name whole?
+"""Kill each writing command, and fill or break its disk: is the output under its final name complete?
 
 Six commands (ingest, site import, simulate, report, campaign, map), on jobs made small: eight seconds of flight, a map
 of a few cells, two figures per page. Each run is a fork of this process, so that imports are paid for once; the

@@ -1,4 +1,4 @@
-"""Faults planted from outside, in the sources of a copy: which of them the checks from raw bytes see, which the tests.
+"""Inject faults into a copy of the sources: which do the checks from raw bytes detect, and which the tests?
 
 Each fault changes one line between the bytes of a log and a number of the report. The audit is that of the flight of
 tests/jobs/test_audit_raw.py (attitude that turns all the time, antennas with lobes, a take-off point above the origin,

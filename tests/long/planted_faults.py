@@ -1,4 +1,4 @@
-"""Faults planted one at a time into the replay, and whether the audit of a report sees them.
+"""Inject faults one at a time into the replay: does the audit of a report detect them?
 
 The flight is the sample flight with the aircraft's attitude and attenuating trees, thinned: nothing of the replay lies
 idle. Each fault is a change of one line of the package, made in memory and taken back; compiled code is

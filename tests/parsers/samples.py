@@ -1,4 +1,4 @@
-"""Synthetic samples of every format, several encodings each; written here, none taken from a real log.
+"""Synthetic samples of every format in several encodings. None is taken from a real log.
 
 ``sample_files/`` holds those in text, to the byte: a folder for each reader, and one of files that are no logs. What
 is to come of them, lines that are accepted and rejected, stands in ``accounts.csv``.

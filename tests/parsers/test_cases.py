@@ -1,4 +1,4 @@
-"""Logs that were read wrong once, reduced and invented: each stands for a kind, with cousins in other words and orders.
+"""Logs that were once read wrongly, reduced and invented, with variants in other words and orders.
 
 ``cases/`` holds the files; right values follow from what the files say, not from what a reader gives.
 """

@@ -1,4 +1,4 @@
-"""Made-up files with their truth beside them: what real programs vary, for each format.
+"""Synthetic files with known content: the variations of real programs, for each format.
 
 ``truth.yaml`` holds those in text. A case is a file's name, its bytes and, for each stream that it must give, columns as
 they must come out; ``time`` in seconds after 2025-03-02 15:00:00 UTC, which is 10:00:00 in New York.

@@ -1,4 +1,4 @@
-"""Specular paths among open triangles by plain enumeration: another code than the engine's, for small scenes.
+"""Specular paths among open triangles by plain enumeration, independent of the engine, for small scenes.
 
 Each triangle is a mirror of its own, in its own plane; every sequence of them is tried, and every triangle is asked
 whether it cuts a segment. Paths are told apart by where they reflect.

@@ -1,4 +1,4 @@
-"""From logged attitude to the angle at which an antenna is hit: aircraft frame, mount, array, worked out by hand.
+"""From logged attitude to the arrival angle at an antenna: aircraft frame, mount and array, computed by hand.
 
 The pattern writes down from where it is asked; the tower stands level with the UAV, so each case can be turned with a
 hand held flat: thumb up, fingers to the nose.

@@ -1,4 +1,4 @@
-"""Every sentence of the six pages with the condition under which it stands: tests/report/sentences.md.
+"""Every sentence of the six pages with its condition: tests/report/sentences.md.
 
     python -m tests.report.test_sentences        writes that table anew, to be read before it is committed
 

@@ -522,7 +522,7 @@ class Known:
             Standard deviation of antennas and field. The error and noise of a later flight are not included, because
             no route reduces them.
         """
-        # any levels serve: the standard deviation does not depend on them
+        # the levels can be arbitrary, because the standard deviation does not depend on them
         planned = [dataclasses.replace(s, flight=_PLANNED, residual_db=np.zeros(len(s))) for s in route]
         rows = [*self.series, *planned]
         fit = fit_gain(rows, self.model) if rows else None
@@ -697,7 +697,7 @@ def _moments(
     factor = Factor.of(_noisy(model, covariance(model, rows, rows)))
     middle = value.mean(axis=0)
     white = factor.whiten(value - middle)
-    # a level that has been constant so far would make every interval a point
+    # without a lower limit, a level that has been constant so far would make every interval a point
     scale = np.maximum((white**2).sum(axis=0) / len(bins), 1e-2)
     mean, explained = factor.condition(covariance(model, ends, rows), white)
     prior = float(covariance(model, ends.part([0]), ends.part([0]))[0, 0])

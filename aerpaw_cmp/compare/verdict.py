@@ -316,7 +316,7 @@ class Verdict:
 # --- campaign -------------------------------------------------------------------------------------------------------
 
 
-# The chance of a shift at least as large by accident, and its verdict.
+# The p-value of a shift, and its verdict.
 _Shift = tuple[float, Verdict]
 
 
@@ -465,10 +465,11 @@ def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
 
 # --- prediction -----------------------------------------------------------------------------------------------------
 
-# Ratio of the 99 % to the 95 % interval of a normal distribution: bias and spread are two tests, so each needs more.
+# Ratio of the 99 % to the 95 % interval of a normal distribution. Bias and spread are two tests, so the wider interval
+# is used for the bias.
 _TWO_TRIED = 1.3
 
-# Ratio of errors to their stated standard deviation up to which they count as stated, and its inverse.
+# Errors agree with their stated standard deviation if the ratio is between the inverse of this number and this number.
 _LEAST_RATIO = 1.15
 
 
@@ -505,7 +506,8 @@ def stated_errors(
     bias = Verdict(cause="biased", effect=mean, interval=(mean - reach, mean + reach))
     ratio = error / sd
     low, high = spread_interval(ratio, place)
-    # an error that the flight shares is not a spread within it: it can hide a narrow interval, not cause a wide one
+    # An error that is common to the flight does not spread the errors within it. It can hide that an interval is too
+    # narrow, but cannot make it look too wide.
     allowed = share / float(np.mean(sd**2))
     effect, within = float(np.sqrt(np.mean(ratio**2))), float(ratio.std())
     spread = Verdict(effect=effect, interval=(low, max(effect, math.sqrt(high**2 + allowed))))

@@ -106,7 +106,7 @@ def _antennas(
     An airframe that was learned from this log is not used.
     """
     file, level = log
-    # not by the name of a tower: antennas of the node are those of link.rss.tower
+    # the antennas of an unknown node are those of link.rss.tower, not those of a tower of the site
     known = settings.link.of(level.channel).build(["node"], logs_root or flight.parent)
     node, uav = (array.patterns[0] for array in (known.tower_arrays["node"], known.uav_array))
     if isinstance(uav, MeasuredPattern) and file.sha256 not in uav.trained_on:
@@ -132,7 +132,7 @@ def _cautions(settings: FlightFile, channel: str, uav: MeasuredPattern | None) -
 
 
 def _numbers(site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -> dict[str, Any]:
-    """Return numbers and sentences on the node for metrics.json and the page. ``ends`` is the one on the antennas."""
+    """Return numbers and sentences about the node for metrics.json and the page. ``ends`` is about the antennas."""
     parts, names = estimate.regions.modes(), ("latitude_deg", "longitude_deg", "east_m", "north_m")
     angles = site.frame.to_geographic(*np.array([mode.place_m for mode in parts]).T)
     modes = [

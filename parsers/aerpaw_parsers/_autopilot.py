@@ -1,4 +1,4 @@
-"""One pose from the messages of any autopilot.
+"""The pose of an aircraft, from the messages of any autopilot.
 
 Positions have their own times, and attitude and velocity are those of the nearest message. Heights count from the home
 at take-off, not from an earlier or later home.
@@ -18,7 +18,7 @@ from aerpaw_cmp.readers import NO_TIME, RELATIVE, ReadOptions, ReadResult, Rejec
 
 from . import _pose, _stamps
 
-# An attitude farther in time than this from a position is not that of the position.
+# An attitude that is farther in time from a position than this is not used for it [s].
 _NEAR_S = 0.5
 
 
@@ -188,7 +188,7 @@ def _track(rows: Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     return rows.stream("telemetry", flight.name, values, source=flight.source, system=flight.system)
 
 
-# The filter's position and the receiver's differ by less than this [m]; a filter follows within seconds.
+# Positions of the filter and of the receiver usually differ by less than this [m], because a filter follows in seconds.
 _APART_M, _APART_SHARE, _FIX_3D = 15.0, 0.05, 3
 
 

@@ -3,7 +3,7 @@
 The file is read by patterns and not as XML: a parser that resolves entities is a risk with a file from elsewhere.
 Elements and attributes inside a point, such as those of its extensions, are columns of a table: levels among them are
 read. Nemo Handy writes times of the day without a date (``T14:13:17.853Z``), local in spite of the Z: their date is
-that of the file name. Elevations are brought to heights above the first point.
+that of the file name. Elevations become heights above the first point.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from aerpaw_cmp.readers import InputError, Lines, Reader, ReadOptions, ReadResul
 
 from . import _pose, _sheet, drive_test
 
-_TAG = rb"(?:\w{1,20}:)?(?:trkpt|wpt|rtept)"  # also of a named space, as programs that use an XML library write it
+_TAG = rb"(?:\w{1,20}:)?(?:trkpt|wpt|rtept)"  # XML libraries write the prefix of a namespace
 _POINT = re.compile(rb"<" + _TAG + rb"\b([^<>]{0,200})>(.{0,2000}?)(?:</" + _TAG + rb">)", re.DOTALL)
 _INSIDE = re.compile(rb"<(?:[\w-]{1,20}:)?([\w-]{1,40})(?:\s[^<>]{0,80})?>\s{0,40}([^<>]{1,80}?)\s{0,40}</")
 # In the tag of a point or of an extension, or in the text of a remark: 'RSRP=-80, PCI: 11'.

@@ -24,7 +24,7 @@ _GAP = rb"[^\n]{0,60}?"
 _NAME = rb" ?([A-Za-z][A-Za-z0-9 /_.-]{1,40}(?:\([^()=\n]{1,30}\))?) = "
 _RECORD = re.compile(
     rb"rel_time = " + _N + rb" ms" + _GAP + _NAME + _N + rb" ?([A-Za-z/%]{0,8})" + _GAP
-    # the position is needed: the phone is on the aircraft
+    # a position is required, because the phone is on the aircraft
     + rb"\(lat, lon\) = \(" + _N + rb", ?" + _N + rb"\)" + _GAP + rb"altitude = " + _N + rb" m"
 )  # fmt: skip
 _HINT = re.compile(rb"rel_time = ")
@@ -85,7 +85,7 @@ def _in_seconds(time_ms: FloatArray, latitude: FloatArray, longitude: FloatArray
     return FASTEST_MPS < speed_mps <= 1e3 * FASTEST_MPS
 
 
-# The cell that is called ``nr`` in Nemo's CSV, where its RSRP is ``nr_rsrp``.
+# Nemo's KML writes this behind the quantities of the serving cell, its CSV writes ``nr`` before them (``nr_rsrp``).
 _SERVING = " (NR SpCell)"
 
 

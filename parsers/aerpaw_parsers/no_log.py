@@ -19,7 +19,7 @@ _LEVELS = rb"(?i)g-?net ?track|\b(?:rsrp|rssi|rxlev|rscp|level)\b(?:\W|</?[\w:]{
 _TIMED = rb"(?i)\btime|<when>|\b\d\d:\d\d:\d\d\b"
 _PATTERN_MAT = re.compile(r"(?i)(rad_?pat|gain|theta\d?|phi\d?|sa\d{4}|rmwb\d{4}\w*|g[rt]_\w+|pattern\w*|antenna\w*)")
 
-# A test of a file: a pattern in its first bytes, or a function of these.
+# A test of a file: a pattern in its first bytes, or a function of these bytes.
 _Test = bytes | Callable[[bytes], bool]
 
 
@@ -50,8 +50,8 @@ def _refuse(what: str) -> Callable[[bytes, ReadOptions], ReadResult]:
     return read
 
 
-# Name, description, and tests, which must all pass. The first such entry names the file, so that narrow kinds come
-# before wide ones.
+# Name, description, and tests. The first entry whose tests all pass names the file, so narrow kinds come before wide
+# ones.
 _KINDS: tuple[tuple[str, str, tuple[_Test, ...]], ...] = (
     ("antenna_pattern", "a measured antenna pattern (for 'antenna: {model: file}' in flight.yaml)",
      (rb"(?im)\A[^\0]{0,380}?(?:Frequency ?= ?\d{1,6} ?\(MHz\)|Phi ?= ?-?\d{1,3}(?:\.\d{1,6})? ?\(deg\))"

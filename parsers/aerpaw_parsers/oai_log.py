@@ -5,9 +5,9 @@ average RSRP -78 (16 meas)``. UE: ``RI = 2 i1 = 0.0.0, i2 = 1, SINR = 20 dB, CQI
 dBm,`` in front. All three add one to the index of the report before they print it: RI counts from one. A gNB prints
 the last report, not a mean.
 
-The first of these times is used: a stamp of ``ts`` or of srsRAN's form at the beginning of the line or of one above it;
-OAI's own seconds (``log_config ... time``), from an unknown origin unless they are an epoch. Otherwise a ``Frame.Slot``
-line, which comes every 128 frames, counts 1.28 s.
+The time is a stamp of ``ts``, or in srsRAN's form, at the beginning of the line or of a line above it. Without stamps
+it is OAI's own seconds (``log_config ... time``), which count from an unknown origin unless they are an epoch. Without
+these, each ``Frame.Slot`` line, which comes every 128 frames, counts 1.28 s.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _FRAMES_S = 1.28
 def sniff(head: bytes) -> bool:
     """Check whether it is output of OAI with CSI or levels."""
     if not any(word in head for word in (b"MAC]", b"PHY]", b"Frame.Slot", b"dlsch_rounds", b"i1 = ")):
-        return False  # a thousand times faster than the expressions
+        return False  # this test is a thousand times faster than the expressions
     return any(pattern.search(head) for pattern in (_CSI, _LEVEL, _UE)) and re.search(
         rb"\[(?:NR_)?(?:MAC|PHY)\]|Frame\.Slot|dlsch_rounds|\bi1 = ", head
     ) is not None  # fmt: skip

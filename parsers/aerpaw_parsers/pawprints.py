@@ -20,10 +20,10 @@ from . import _cells, _json, _pose
 
 _MARKS = (b'"cells"', b'"latitude"', b'"nr_signal_strength"', b'"connected_pci"', b'"companion_abs_time"')
 
-# A second START on a line belongs to the next reading after a truncated one, with another time.
+# A line with a second START has a truncated reading and one of another time.
 _TEXT = re.compile(rb"^CELL_LOG_START,(\d{13}),(?:(?!CELL_LOG_START).)*?,?CELL_LOG_STOP[ \t]*\r?$", re.MULTILINE)
 _BLOCK = re.compile(rb"BS_INFO_START,([^\n]*?),?BS_INFO_STOP")
-# Places in a block by its technology; LTE with all quantities switched on in the app, as by default.
+# Places of the fields in a block, by technology, if all quantities are switched on in the app (its default).
 _OF_TEXT = {
     b"4G_LTE": {"fields": 19, "connected": 1, "rsrp": 6, "rsrq": 7, "rssi": 8, "sinr": 5, "arfcn": 11, "pci": 12},
     b"5G_NR_SA": {"fields": 19, "connected": 2, "rsrp": 7, "rsrq": 8, "sinr": 9, "arfcn": 13, "pci": 14},

@@ -30,7 +30,7 @@ def sniff(head: bytes) -> bool:
 def _number(cell: bytes) -> float:
     text = cell.strip().strip(b'"')
     value = float(text) if re.fullmatch(rb"[-+]?\d{1,9}(\.\d{1,6})?", text) else np.nan
-    # missing: the least number of 16 bits, also after the firmware's division by ten, and the largest PCI field
+    # -32768 (-3276, where the firmware divides by ten) and 65535 mean a missing value
     return np.nan if value in (-32768, -3276, 65535) else value
 
 

@@ -1,4 +1,4 @@
-"""CSVs of AERPAW's Quectel logger (``csv_kpi``): rank indicator and serving-cell level, both generations.
+"""CSVs of AERPAW's Quectel logger (``csv_kpi``): rank indicator and serving-cell level, from both generations.
 
 A console of the modem (RM500Q to RM520N) with time stamps contains the same answers, with each radio access on a
 separate line.
@@ -18,7 +18,8 @@ LTE                       20      rss ``lte_rsrp``
 NR5G-SA                   18      rss ``nr_rsrp`` (order RSRP, RSRQ, SINR)
 ========================= ======= ============================================================
 
-RI counts data layers, from 1; 0 means no CSI. Times are naive local time, taken after the answer; an offset wins.
+RI counts data layers, from 1; 0 means no CSI. Times are naive local time, taken after the answer, unless they have an
+offset.
 Writer: AERPAW ``QuectelLogger`` (``no_pandas_at_rm500q.py``, ``at_rm500q2.py``).
 """
 
@@ -102,7 +103,7 @@ def _reason(line: bytes) -> str | None:
 
 def _table(lines: _text.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
     """Return the lines of all kinds of row, and their columns of text, with an index into ``_FORMS`` as ``form``."""
-    # searching a log of CSI for other kinds would be slow and find nothing
+    # a log of CSI has no other kinds of row, and the search for them is slow
     serving = b"servingcell" in lines.data or lines.data.startswith(b"[")
     tables: list[tuple[IntArray, dict[str, AnyArray]]] = []
     for i, pattern in enumerate(_FORMS if serving else _FORMS[:1]):

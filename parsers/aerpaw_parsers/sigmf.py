@@ -31,7 +31,7 @@ from . import _json, _pose, _stamps
 _BURST_S = 0.02
 # Part of full scale at which a value is clipped, and the share of such values that is reported.
 _FULL, _CLIPPED_SHARE = 0.999, 1e-3
-# A DC part this far above the rest is the level that is read [dB]; below it may be the signal's own carrier.
+# A DC part this far above the rest determines the level [dB]; a weaker one may be the signal's own carrier.
 _DC_DB = 10.0
 # Complex or real, float or integer, and the bits of a number.
 _DATATYPE = re.compile(r"([cr])(f(?=32|64)|[iu](?=8|16|32))(8|16|32|64)(?:_[lb]e)?")

@@ -1,8 +1,8 @@
 """GNU Radio channel sounder logs (``power_log``, ``quality_log``, ``snr_log``): ``od -f -w4`` through ``ts``.
 
 ``[2025-01-01 12:00:00.000000] 0000014      -35.401386``: arrival time, **octal** byte offset of the sample
-(four bytes each), value in dB re full scale. ``*`` stands for samples equal to the one before; a last line may
-hold an offset only. With no signal the power is 20 log10(FLT_MIN) minus the gain, about -790 dB.
+(four bytes each), value in dB re full scale. ``*`` stands for samples equal to the one before. The last line
+may contain only an offset. With no signal the power is 20 log10(FLT_MIN) minus the gain, about -790 dB.
 Writer: AERPAW ``startGNURadio-ChannelSounder-RX.sh``. Its nightly soundings between towers name the link in the file's
 name: ``LW1:LW2:3235751:3.32G:0:2026-06-01_02_00_05:power_log.txt`` (transmitter or ``null``, receiver, radio, channel).
 """
@@ -27,7 +27,7 @@ from . import _identity
 _STAMP = 28  # "[" + 26 characters of time + "]"
 _VALUE = 16  # od -f: right-aligned in sixteen columns
 _WIDTHS = range(7, 13)  # octal digits of the offset; seven until 2 MiB of samples, ten from 128 MiB on
-_MOST_REPEATS = 5_000_000  # two days at 30 samples a second: a damaged offset claims more
+_MOST_REPEATS = 5_000_000  # two days at 30 samples per second: a damaged offset implies more
 _HEAD = rb"^\[(" + _text.TIME + rb")\] "
 _ODD = re.compile(_HEAD + rb"+([0-7]{7,12}) +(" + _text.NUMBER + rb"|-?nan|-?inf)[ \t]*$")
 _STAR = re.compile(_HEAD + rb"+\*[ \t]*$")
@@ -61,7 +61,7 @@ class _Samples:
         return _Samples(self.line[order], self.wall[order], self.offset[order], self.value[order])
 
     def join(self, *others: _Samples) -> _Samples:
-        """Return all samples in the order of their lines, and in this order for one line."""
+        """Return all samples in the order of their lines, and samples of one line in the order of the parts."""
         parts = (self, *others)
         joined = _Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS))
         if np.all(joined.line[1:] > joined.line[:-1]):
@@ -201,7 +201,7 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     feet = marks.take(marks.offset >= 0)
     if not len(stars.line):
         return _Samples.none(), stars.line, []
-    # a foot line bounds a last run: it is an end without a value
+    # a foot line ends the last run, like a sample without a value
     near = np.unique(np.searchsorted(samples.line, stars.line).clip(max=len(samples.line) - 1))
     ends = (samples.take(near) if len(samples.line) else samples).join(feet)
     after = np.searchsorted(ends.line, stars.line)
@@ -292,7 +292,7 @@ def _stream(
     if len(repeats.line):
         samples = samples.join(repeats)
         repeated = np.isin(samples.line, repeats.line)  # lines of '*' contain no other samples
-    # logs may have 1 GB, so that memory is freed at once
+    # a log may have 1 GB: free each column as soon as it is not needed
     jump = samples.offset
     jump[1:] -= jump[:-1]
     jump[0] = 0

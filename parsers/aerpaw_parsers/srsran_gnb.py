@@ -68,7 +68,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 def sniff_json(head: bytes) -> bool:
     """Check whether the first object has a list of UEs with RI."""
     first = _json.first(head)
-    if first is None:  # a first line longer than what sniffers see
+    if first is None:  # the first line is longer than the bytes that sniffers see
         return head.lstrip()[:1] == b"{" and b'"ue_list"' in head and re.search(rb'"(dl_)?ri"\s*:', head) is not None
     return "timestamp" in first and (any(True for _ in _ues(first)) or b'"ue_list"' in head)
 
@@ -91,7 +91,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
         options = replace(options, clock="utc")
     clock, time, warnings = _stamps.read(texts, options)
     # an object without UEs is valid and not a truncated line
-    mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host: no record is made of them
+    mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host
     rows = built(
         lines, row[with_ue], {"time": time}, options, reader="srsran_json", reason=_json.bracket, clock=clock,
         extra=reports.rejected, markup=np.concatenate((mute, reports.more)), closed=reports.closed,

@@ -88,7 +88,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     pattern = _EITHER if mostly(data, _LONGER) and not mostly(data, _ROW) else _ROW
     rows = matched(data, pattern, options, reader="vehicle_out", reason=_reason)
     number = {name: _numbers(rows, name) for name in _NUMBERS}
-    for name in ("pitch_11", "yaw_11", "roll_11", "volt_11", "volt_9"):  # other places in other layouts
+    for name in ("pitch_11", "yaw_11", "roll_11", "volt_11", "volt_9"):  # fields with other places in other layouts
         own = name.partition("_")[0]
         number[own] = np.fmax(number[own], _numbers(rows, name))
     jumps = int((np.diff(number["index"]) != 1).sum())

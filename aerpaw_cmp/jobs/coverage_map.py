@@ -27,7 +27,6 @@ from ..common.units import (
     FloatArray,
     carrier_fault,
     db_from_power,
-    finite_mean,
     wavelength_m,
 )
 from ..compare.rank import singular_values
@@ -699,7 +698,7 @@ def _rank_versions(outcome: MapOutcome) -> Iterator[page.RankMap]:
 
 
 def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
-    """Yield layers for the linked map only: towers in coverage, coverage over heights, and the serving tower."""
+    """Yield layers for the linked map only: towers in coverage, and the serving tower."""
     kinds: tuple[job.Antennas, ...] = ("mimo", "siso")
     budget = outcome.settings.budget
     for mode, result in outcome.ordered():
@@ -710,12 +709,6 @@ def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
             for row, height in enumerate(result.rss_altitudes_m):
                 covering = raster(each[row].sum(axis=0))
                 yield layer(quantity="Towers in coverage", unit="towers", height_m=height, values=covering)
-            for tower in (None, *result.tower_names) if len(result.rss_altitudes_m) > 1 else ():
-                covered = budget.covered(result.rss(antennas, tower)).mean(axis=0)
-                yield layer(
-                    quantity="Probability of coverage over heights", unit="%", tower=tower or page.JOINT,
-                    values=raster(100.0 * covered),
-                )  # fmt: skip
     shown = outcome.shown
     if len(shown.tower_names) > 1:
         yield page.MapLayer(
@@ -739,7 +732,7 @@ def _budget_layers(outcome: MapOutcome) -> Iterator[cells.Layer]:
 
 
 def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
-    """Yield margin and SNR, singular-value spread and condition number, and the effects of foliage."""
+    """Yield margin and SNR, singular-value spread and condition number."""
     result, s = outcome.shown, outcome.settings
     raster = result.grid.raster
     for layer in _budget_layers(outcome):
@@ -752,27 +745,6 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
         for row, height in enumerate(result.rank_altitudes_m):
             shown = raster(np.minimum(joint[row], job.RATIO_LIMIT_DB))
             yield page.MapLayer(quantity=name, unit="dB", foliage=s.shown, height_m=height, values=shown)
-    for mode, maps, change in _foliage_changes(outcome):
-        for row, height in enumerate(maps.rss_altitudes_m):
-            yield page.MapLayer(
-                quantity="RSS lost by foliage", unit="dB", foliage=mode, height_m=height,
-                values=raster(change.rss_loss_db[row]), difference=True,
-            )  # fmt: skip
-        for column, k in enumerate(maps.ks if mode == s.shown else ()):
-            for row, height in enumerate(maps.rank_altitudes_m):
-                covered = maps.ranks()[row, column] > 0
-                yield page.MapLayer(
-                    quantity="Rank change by foliage", unit="", foliage=mode, k=k, height_m=height,
-                    values=raster(np.where(covered, change.rank_change[row, column], np.nan)), difference=True,
-                )  # fmt: skip
-
-
-def _foliage_changes(outcome: MapOutcome) -> Iterator[tuple[str, job.MapResult, job.FoliageDifference]]:
-    """Yield the effect of each foliage mode, if there is a map without foliage."""
-    if (clear := outcome.maps.get("none")) is not None:
-        yield from (
-            (mode, maps, job.foliage_difference(clear, maps)) for mode, maps in outcome.ordered() if mode != "none"
-        )
 
 
 def _correlations(outcome: MapOutcome) -> dict[str, tuple[BinnedCorrelation, BiExponential | None]]:
@@ -825,15 +797,9 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
             continue
         study = outcome.studies[key]
         result.setdefault("correlation", {})[f"z_{key}"] = {
-            "c1": study.fit.c1, "c2": study.fit.c2, "c3": study.fit.c3, "c4": study.fit.c4, "rmse": study.fit.rmse,
-            "degenerate": study.fit.degenerate, "message": study.fit.message,
-            "positions": study.correlation.positions, "excluded_constant": study.correlation.excluded_constant,
+            **asdict(study.fit), "positions": study.correlation.positions,
+            "excluded_constant": study.correlation.excluded_constant,
         }  # fmt: skip
-    for mode, maps, change in _foliage_changes(outcome):
-        result.setdefault("foliage", {})[mode] = [
-            {"altitude_m": height, "mean_rss_loss_db": finite_mean(loss_db), "lost": float(lost.mean())}
-            for height, loss_db, lost in zip(maps.rss_altitudes_m, change.rss_loss_db, change.lost, strict=True)
-        ]
     return result
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.errors import UsageError
-from ..common.units import THERMAL_NOISE_DBM_HZ, AnyArray, BoolArray, FloatArray, IntArray, db_from_power, unmasked
+from ..common.units import THERMAL_NOISE_DBM_HZ, AnyArray, FloatArray, IntArray, db_from_power, unmasked
 from ..compare.rank import rank_from_singular_values
 
 # Horizontal interval d_rx of the UAV positions.
@@ -481,37 +481,6 @@ def _ratios_db(singular_values: FloatArray) -> FloatArray:
     # a singular value of zero has an infinite ratio, which figures and files limit to RATIO_LIMIT_DB
     strongest = db_from_power(np.where(covered, sigma[..., 0], 1.0) ** 2)
     return np.stack([np.where(covered, strongest - db_from_power(sigma[..., i] ** 2), np.nan) for i in (1, -1)])
-
-
-@dataclass(frozen=True, slots=True)
-class FoliageDifference:
-    """The effect of foliage on the joint maps.
-
-    Parameters
-    ----------
-    rss_loss_db : (RSS altitudes, n)
-        RSS without foliage minus RSS with foliage (arrays); NaN if either is out of coverage.
-    lost : (RSS altitudes, n) bool
-        Positions that foliage takes out of coverage.
-    rank_change : (rank altitudes, K, n) int
-        Rank with foliage minus rank without foliage; 0 if either is out of coverage.
-    """
-
-    rss_loss_db: FloatArray
-    lost: BoolArray
-    rank_change: IntArray
-
-
-def foliage_difference(without: MapResult, foliage: MapResult) -> FoliageDifference:
-    """Compare two runs over the same grid, altitudes and K."""
-    clear, shaded = without.rss(), foliage.rss()
-    before, after = without.ranks().astype(np.int64), foliage.ranks().astype(np.int64)
-    return FoliageDifference(
-        clear - shaded,
-        np.isfinite(clear) & ~np.isfinite(shaded),
-        # a link that foliage removes is counted in ``lost``, and would count twice as a decrease to rank 0
-        np.where((before > 0) & (after > 0), after - before, 0),
-    )
 
 
 def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:

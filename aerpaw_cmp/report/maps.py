@@ -64,8 +64,6 @@ class MapLayer:
         Values from the south-west; NaN out of coverage.
     classes : tuple of str
         Names of the values 0, 1, ... of a layer of classes.
-    difference : bool
-        True for a colour scale centred on zero.
     version, link, tower, antennas, foliage : str
         Properties that distinguish layers of a quantity; empty if they do not apply. The tower "joint" is the nearest.
     k : float, optional
@@ -78,7 +76,6 @@ class MapLayer:
     unit: str
     values: FloatArray = field(repr=False, compare=False)
     classes: tuple[str, ...] = ()
-    difference: bool = False
     version: str = ""
     link: str = ""
     tower: str = ""
@@ -608,7 +605,7 @@ _LATTICE = 9
 _DEGREE = 4
 _FINEST_DB = 0.01
 
-LEVEL, _CLASSES, DIFFERENCE = "level", "classes", "difference"
+LEVEL, _CLASSES = "level", "classes"
 
 
 # --- layers ---------------------------------------------------------------------------------------------------------
@@ -698,7 +695,7 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
         for axis, value in layer.axes.items():
             places.setdefault(axis, {})[value] = layer.place(axis)
     axes = {axis: sorted(values, key=values.__getitem__) for axis, values in places.items()}
-    kind = _CLASSES if layers[0].classes else DIFFERENCE if layers[0].difference else LEVEL
+    kind = _CLASSES if layers[0].classes else LEVEL
     every = np.concatenate([layer.values[np.isfinite(layer.values)] for layer in layers])
     step = 1.0 if kind == _CLASSES else step_for(every, _FINEST_DB)
     stored = {}
@@ -708,19 +705,11 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
         classes = np.nan_to_num(cells, nan=NONE["u1"])
         stored[key] = arrays.add(classes, "u1") if kind == _CLASSES else arrays.add_steps(cells, step)
     return {
-        "name": name, "unit": layers[0].unit, "kind": kind, "step": step, "range": _range(every, kind),
+        "name": name, "unit": layers[0].unit, "kind": kind, "step": step, "range": ends_of_scale(every, 99.5),
         "classes": list(layers[0].classes), "colours": _class_colours(layers[0].classes),
         "axes": [{"name": axis, "values": values} for axis, values in axes.items()],
         "layers": stored,
     }  # fmt: skip
-
-
-def _range(values: FloatArray, kind: str) -> list[float]:
-    """Return the colour scale of a quantity, from 1 to 99.5 % of its values, symmetric for differences."""
-    if kind == DIFFERENCE and len(values):
-        reach = float(np.percentile(np.abs(values), 99)) or float(np.abs(values).max()) or 1.0
-        return [-reach, reach]
-    return ends_of_scale(values, 99.5)
 
 
 def _class_colours(classes: Sequence[str]) -> list[str]:

@@ -11,7 +11,6 @@ from aerpaw_cmp.maps.grid import (
     PAPER_RANK_ALTITUDES_M,
     Evaluation,
     Grid,
-    foliage_difference,
     layers_of,
     map_job,
     rank_of_singular_values,
@@ -128,17 +127,6 @@ def test_memory_grows_with_results_only():
 
     few, many = peak(range(10, 60, 10)), peak(range(10, 410, 10))
     assert many < few + 200_000
-
-
-def test_foliage_difference():
-    clear = map_job(GRID, TOWERS, Engine(), rss_altitudes_m=(30,), rank_altitudes_m=(30,))
-    shaded = map_job(
-        GRID, TOWERS, Engine(range_m=200.0, extra_loss_db=3.0), rss_altitudes_m=(30,), rank_altitudes_m=(30,)
-    )
-    difference = foliage_difference(clear, shaded)
-    assert np.nanmax(np.abs(difference.rss_loss_db - 3.0)) < 1e-9
-    assert difference.lost.sum() == np.isfinite(clear.rss()).sum() - np.isfinite(shaded.rss()).sum() > 0
-    assert (difference.rank_change == 0).all()
 
 
 def test_layers_are_named_once(result):

@@ -65,10 +65,9 @@
     if (state.scale === "shared" || !shown) return q.range;
     let low = Infinity, high = -Infinity;
     for (const v of shown) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
-    if (q.kind === "difference") { const reach = Math.max(Math.abs(low), Math.abs(high)) || 1; return [-reach, reach]; }
     return high > low ? [low, high] : Number.isFinite(low) ? [low - 0.5, low + 0.5] : [0, 1];
   }
-  const ramped = () => state.difference || quantity().kind === "difference" ? ramps.difference : ramps.level;
+  const ramped = () => state.difference ? ramps.difference : ramps.level;
   const rgb = hex => [1, 3, 5].map(k => parseInt(hex.slice(k, k + 2), 16));
   function colour(v, ends) {
     if (!Number.isFinite(v)) return null;

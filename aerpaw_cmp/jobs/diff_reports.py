@@ -182,7 +182,8 @@ def _same_flight(first: ReadReport, second: ReadReport) -> None:
 
 def _compare_reports(first: ReadReport, second: ReadReport) -> ReportDiff:
     """Return the differences between two reports."""
-    levels, residuals, places = _levels(first, second)
+    compared = list(_levels(first, second))
+    residuals, places = [item[1] for item in compared], [item[2] for item in compared]
     alone = [sorted(_links(a) - _links(b)) for a, b in ((first, second), (second, first))]
     return ReportDiff(
         first=_side(first),
@@ -190,7 +191,7 @@ def _compare_reports(first: ReadReport, second: ReadReport) -> ReportDiff:
         settings=tuple(_entries(first.metrics["settings"], second.metrics["settings"])),
         inputs=tuple(_inputs(first.metrics["inputs"], second.metrics["inputs"])),
         versions=tuple(_entries(first.metrics["versions"], second.metrics["versions"])),
-        levels=tuple(levels),
+        levels=tuple(item[0] for item in compared),
         ranks=tuple(_ranks(first, second)),
         pooled=pooled_difference(residuals, place_m=places) if residuals else None,
         links_first_only=tuple(alone[0]),
@@ -276,10 +277,6 @@ def _values(table: Any, name: str) -> FloatArray:
     return np.asarray(table[name], dtype=np.float64)
 
 
-# Times [s] of the common samples of a link, and the residuals of the second and of the first report.
-_Residuals = tuple[FloatArray, FloatArray, FloatArray]
-
-
 def _instants(table: Any) -> FloatArray:
     """Return seconds since 1970. For logs without times of day, seconds after the first sample of the link."""
     import pandas as pd
@@ -294,13 +291,12 @@ def _places_m(table: Any) -> FloatArray:
     return np.column_stack([_values(table, name) for name in ("east_m", "north_m", "up_m")])
 
 
-def _levels(
-    mine: ReadReport, theirs: ReadReport
-) -> tuple[list[verdict.LevelDifference], list[_Residuals], list[FloatArray]]:
-    """Return the differences of common links, and residuals and positions (n, 3) of their common samples."""
-    differences: list[verdict.LevelDifference] = []
-    residuals: list[_Residuals] = []
-    places: list[FloatArray] = []
+def _levels(mine: ReadReport, theirs: ReadReport) -> Iterator[tuple[verdict.LevelDifference, Any, FloatArray]]:
+    """Yield the difference of each common link.
+
+    With it are the times [s] and the residuals of the second and of the first report, and the positions (n, 3) of the
+    common samples.
+    """
     names = ("measured_db", "simulated_dbm", "residual_db")
     for (tower, channel), numbers in links_of(mine.metrics["rss"]).items():
         their_numbers = theirs.metrics["rss"].get(tower, {}).get(channel)
@@ -311,15 +307,12 @@ def _levels(
         first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))
         offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, their_numbers)]
         scored = [int(table["residual_db"].notna().sum()) for table in tables]
-        residuals.append((_instants(a), second[2], first[2]))  # second minus first
-        places.append(_places_m(a))
-        differences.append(
-            verdict.level_difference(
-                tower, channel, overlap, first, second,
-                scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]), place_m=places[-1],
-            )
+        place_m = _places_m(a)
+        difference = verdict.level_difference(
+            tower, channel, overlap, first, second,
+            scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]), place_m=place_m,
         )  # fmt: skip
-    return differences, residuals, places
+        yield difference, (_instants(a), second[2], first[2]), place_m
 
 
 def _ranks(first: ReadReport, second: ReadReport) -> Iterator[verdict.RankDifference]:

@@ -160,16 +160,7 @@ def _plan_flight(
         series = [o.samples for o in observed if o.samples.antenna in ends]
         area = _area(site, plan)
     with stages("candidates"):
-        candidates = [*_own_patterns(plan, area, site), *_file_routes(plan, area, site)]
-        if not candidates:
-            raise UsageError(
-                "no route fits: no pattern lies within the geofence", expected="a larger area, or --route FILE"
-            )
-        if all(candidate.refused for candidate in candidates):
-            raise UsageError(
-                f"no route fits: {candidates[0].route.name} {candidates[0].refused}",
-                expected="a candidate within the geofence, the battery and the distance to towers",
-            )
+        candidates = _candidates(plan, area, site)
         points = None if target == _SPHERE else find_targets(Path(target), site, plan.target)
         if points is not None:
             remarks += points.remarks
@@ -213,6 +204,20 @@ def _plan_flight(
     )
 
 
+def _candidates(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
+    """Return the tool's patterns and the routes of files. UsageError if none of them may be flown."""
+    candidates = [*_own_patterns(plan, area, site), *_file_routes(plan, area, site)]
+    if all(candidate.refused for candidate in candidates):
+        first = (
+            f"{candidates[0].route.name} {candidates[0].refused}" if candidates else "no pattern lies in the geofence"
+        )
+        raise UsageError(
+            f"no route fits: {first}",
+            expected="a route within geofence, battery and distance to towers: a larger area, or --route FILE",
+        )
+    return candidates
+
+
 def _sentence(best: Candidate, curve: Sequence[Mapping[str, float]], now_db: float) -> str:
     """Return the opening text of the page."""
     minutes = best.route.duration_s / 60.0
@@ -231,8 +236,7 @@ def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float]
     for number, candidate in enumerate(candidates):
         stages.progress(f"rank {candidate.route.name}", number / len(candidates))
         ranked.append(replace(candidate, sd_db=leaves_db(candidate.route)))
-    ranked.sort(key=lambda candidate: (bool(candidate.refused), candidate.sd_db))
-    return ranked
+    return sorted(ranked, key=lambda candidate: (bool(candidate.refused), candidate.sd_db))
 
 
 def _open_ends(site: Site, plan: PlanOptions) -> dict[str, tuple[str, str]]:
@@ -354,10 +358,8 @@ def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, s
             place, yaw = place[::step], yaw[::step]
             if np.isnan(yaw).any():
                 turns = np.arange(HEADINGS) * (360.0 / HEADINGS)
-                place, yaw = (
-                    np.repeat(place, HEADINGS, axis=0),
-                    np.where(np.isnan(np.repeat(yaw, HEADINGS)), np.tile(turns, len(yaw)), np.repeat(yaw, HEADINGS)),
-                )
+                place = np.repeat(place, HEADINGS, axis=0)
+                yaw = np.where(np.isnan(yaw)[:, None], turns, yaw[:, None]).ravel()
         out[antenna] = level_samples(end, tower, place, np.asarray(yaw, dtype=np.float64), np.zeros(len(yaw)))
     return out
 

@@ -444,22 +444,17 @@ def _table(
     channels = pd.CategoricalDtype(list(dict.fromkeys([*(s.channel for s in sources.values()), "rank"])))
 
     def rows(tower: str, channel: str, flag: IntArray, index: Any, values: Mapping[str, FloatArray]) -> pd.DataFrame:
-        names = {"tower": (tower, towers), "channel": (channel, channels)}
-        kinds = pd.CategoricalDtype(list(_FLAG_CODES))
-        frame: pd.DataFrame = pd.DataFrame(
-            {
-                "point": np.arange(len(targets), dtype=np.int32)[index],
-                "time_s": targets.time_s[index],
-                **dict(zip(("east_m", "north_m", "height_m"), targets.position_m[index].T, strict=True)),
-                "yaw_deg": targets.yaw_deg[index],
-                **{
-                    column: pd.Categorical.from_codes(np.full(len(flag), kind.categories.get_loc(text)), dtype=kind)
-                    for column, (text, kind) in names.items()
-                },
-                **{name: np.asarray(value, dtype=np.float32) for name, value in values.items()},
-                "flag": pd.Categorical.from_codes(flag, dtype=kinds),
-            }
-        )
+        at, flags = targets.position_m[index], pd.CategoricalDtype(list(_FLAG_CODES))
+        frame: pd.DataFrame = pd.DataFrame({
+            "point": np.arange(len(targets), dtype=np.int32)[index],
+            "time_s": targets.time_s[index],
+            **dict(zip(("east_m", "north_m", "height_m"), at.T, strict=True)),
+            "yaw_deg": targets.yaw_deg[index],
+            "tower": pd.Series(tower, range(len(at)), dtype=towers),
+            "channel": pd.Series(channel, range(len(at)), dtype=channels),
+            **{name: np.asarray(value, dtype=np.float32) for name, value in values.items()},
+            "flag": pd.Categorical.from_codes(flag, dtype=flags),
+        })  # fmt: skip
         return frame
 
     parts, nothing = [], np.full(len(targets), np.nan, dtype=np.float32)

@@ -1,18 +1,16 @@
-"""Drivers that rerun the stages of a replay: element pairs, a tower that moves, parts of a long flight.
+"""Replays in parts, replays of a tower that moves, and channels of many antenna geometries.
 
-A replay in parts of its poses, put together again: bounds the memory of long flights.
+A long flight is replayed in parts of its poses, which bounds the memory.
 
-A replay whose tower moves, too: a rover or a second UAV with its own place at every pose.
+A tower that moves is a rover or a second UAV with a separate position at every pose. Every position of the node is a
+separate source, so there is no approximation. The poses are processed in blocks of a few positions. Each position is a
+tower that has links only to its poses. Poses at the same position share a tower, so a node that does not move is
+replayed exactly as a fixed tower.
 
-Every position of the node is a separate source, so there is no approximation. The poses are processed in blocks of a
-few positions. Each position is a tower that has links only to its poses. Poses at the same position share a tower, so a
-node that does not move is replayed exactly as a fixed tower.
-
-Channels of many antenna geometries at once, on line of sight and ground reflection.
-
-The orientation of a modem's antennas and the slants of its ports are rarely documented. Thousands of geometries can be
-tried without a replay for each. The field of an element slanted by ``s`` is ``cos s`` times that of a vertical element
-plus ``sin s`` times that of a horizontal element at the same position. One evaluation with both at every port
+Channels of many antenna geometries are computed at once, for line of sight and ground reflection. The orientation of a
+modem's antennas and the slants of its ports are rarely documented. Thousands of geometries can be tried without a
+replay for each. The field of an element slanted by ``s`` is ``cos s`` times that of a vertical element plus ``sin s``
+times that of a horizontal element at the same position. One evaluation with both at every port
 (:func:`aerpaw_cmp.propagation.field.sum.of_one_depth`, float64, every pair of elements) therefore serves all slants.
 The ground reflection is one ray, which can be added at any strength.
 
@@ -36,8 +34,7 @@ from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
 from ..site.site import Site, Tower
 from .field.fresnel import face_table
-from .field.geometry import Elements, geometry
-from .field.sum import PAIRS_PER_CHUNK, of_one_depth, pattern_ends
+from .field.sum import PAIRS_PER_CHUNK, Elements, geometry, of_one_depth, pattern_ends
 from .geometry import Array, Faces, Link, PathSet, Poses, RowsT, joined, rotation_from_yaw_pitch_roll
 from .options import Field, Progress, Run, Search, extent_of
 from .replay import PER_LINK, Ends, Replay, replay
@@ -83,24 +80,19 @@ def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | 
         finished += len(at)
         if progress is not None:
             progress(finished / count)
-    return _put_together(replays, rows)
-
-
-def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
-    """Join parts into one replay, with the poses in order. The parts are consumed to save memory."""
-    first, count = parts[0], sum(map(len, rows))
+    first = replays[0]
     # planes of terrain are numbered in order of first use, so blocks have different planes
-    faces, shifted = _joined_faces(parts)
-    pieces = [shifted, *zip(*(part.further for part in parts), strict=True)]
+    faces, shifted = _joined_faces(replays)
+    pieces = [shifted, *zip(*(part.further for part in replays), strict=True)]
     further: dict[str, Any] = {
         "faces": faces,
-        "seconds": sum(part.seconds for part in parts),
-        "search_seconds": sum(part.search_seconds for part in parts),
-        "omitted": added_up(item for part in parts for item in part.omitted),
+        "seconds": sum(part.seconds for part in replays),
+        "search_seconds": sum(part.search_seconds for part in replays),
+        "omitted": added_up(item for part in replays for item in part.omitted),
         "contributions": tuple(_in_flight(piece, rows) for piece in pieces),
     }
-    columns = {name: [getattr(part, name) for part in parts] for name in PER_LINK}
-    parts.clear()
+    columns = {name: [getattr(part, name) for part in replays] for name in PER_LINK}
+    replays.clear()
     arrays: dict[str, Any] = {}
     # join one array at a time and free its parts: the peak is then one array more
     for name in PER_LINK:
@@ -164,7 +156,7 @@ LINKS_AT_ONCE = 16_384
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """Poses (rows of the flight) and their places: ``place`` (rows,) indexes ``places_m`` (places, 3)."""
+    """Some poses (rows of the flight) with the node's positions: ``place`` (rows,) indexes ``places_m`` (places, 3)."""
 
     rows: IntArray
     places_m: FloatArray
@@ -172,7 +164,7 @@ class _Block:
 
 
 def _blocks(sources_m: FloatArray) -> Iterator[_Block]:
-    """Poses in blocks, in the order in which their places first occur."""
+    """Yield the poses in blocks, in the order in which the positions of the node first occur."""
     unique, first, member = np.unique(sources_m, axis=0, return_index=True, return_inverse=True)
     # unique sorts places by coordinate; blocks follow the flight
     order = np.argsort(first)
@@ -318,7 +310,7 @@ _GROUND_MATERIAL = "itu_medium_dry_ground"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Geometry:
-    """One way the antennas may hang.
+    """One possible mounting of the antennas, and the strength of the ground reflection.
 
     Parameters
     ----------
@@ -395,7 +387,7 @@ def singular_values_of(
     poses: Poses,
     carrier_hz: float,
 ) -> Iterator[FloatArray]:
-    """Singular values (n, ports) of each geometry, absolute, descending.
+    """Yield the singular values (n, ports) of each geometry, in descending order.
 
     Parameters
     ----------
@@ -417,9 +409,8 @@ def singular_values_of(
 
     Notes
     -----
-    The values are over the receiving ports at the UAV. With the power sum they are the roots of the eigenvalues of
-    ``L L^H + g^2 G G^H``, the mean of ``H H^H`` over a band in which the phase of the ground ray against the direct ray
-    takes all values.
+    The UAV receives. With the power sum the values are the roots of the eigenvalues of ``L L^H + g^2 G G^H``. This is
+    the mean of ``H H^H`` over a band in which the phase between ground ray and direct ray takes all values.
     """
     runs = [(mount, list(run)) for mount, run in groupby(geometries, lambda g: g.mount_deg)]
     for mount, run in runs:
@@ -441,12 +432,12 @@ def _of_power_sum(los: ComplexArray, ground: ComplexArray) -> FloatArray:
 def basis_fields(
     tower: Array, tower_m: FloatArray, uav: Array, poses: Poses, carrier_hz: float, with_ground: bool = True
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Channel matrices of line of sight and of the ground reflection alone, ports vertical and horizontal.
+    """Return channel matrices of line of sight and of the ground reflection alone, for vertical and horizontal ports.
 
     Parameters
     ----------
     tower, uav : Array
-        Slants do not count.
+        Their slants are not used.
     tower_m : (3,)
         [m].
     poses : Poses
@@ -480,7 +471,7 @@ def basis_fields(
 
 
 def slanted(field: ComplexArray, uav_slant_deg: Sequence[float], tower_slant_deg: Sequence[float]) -> ComplexArray:
-    """Channel matrices (n, uav ports, tower ports) of :func:`basis_fields` for slants of the ports [deg]."""
+    """Return channel matrices (n, uav ports, tower ports) of :func:`basis_fields` for slants of the ports [deg]."""
     at_uav, at_tower = (np.radians(slant) for slant in (uav_slant_deg, tower_slant_deg))
     upright, level = field[:, 0] * np.cos(at_tower) + field[:, 1] * np.sin(at_tower)
     return np.asarray(np.cos(at_uav)[:, None] * upright + np.sin(at_uav)[:, None] * level)

@@ -1,16 +1,16 @@
 """Paths over one edge of a building: search, contribution to H, and description.
 
 An edge is where two faces of a building meet at an exterior angle above 180 degrees: the rim of a flat roof and its
-upright corners. A path runs from the source, or its image in the ground, to the point of the edge where both legs make
-the same angle with it (Keller's cone), and on to the target or its image in the ground. It exists when that point lies
-on the edge, both legs are free, and the point is on no other building's wall or inside one.
+upright corners. A path runs from the source, or its image in the ground, to a point of the edge, and on to the target
+or its image in the ground. At this point both legs make the same angle with the edge (Keller's cone). It exists when
+that point lies on the edge, both legs are free, and the point is on no other building's wall or inside one.
 
 A reflected leg is straight in the space of the mirrored end. The whole path is straight once both legs are rotated
 about the edge into one plane, and positions of elements in that plane determine the length of each pair. Directions,
 patterns and the diffraction matrix are those of the array centres, like the paths. The field is therefore continuous
 where a direct or reflected path between the centres ends.
 
-The uniform theory of diffraction at one edge: how a wedge passes a wave on.
+The field behind an edge is that of the uniform theory of diffraction.
 
 Angles are measured round the edge from face 0, through air, to face n: a wedge of exterior angle ``n pi`` fills the
 rest. ``e`` is the unit vector along the edge for which ``(t, normal, e)`` is right-handed, ``t`` lying in face 0 away
@@ -34,11 +34,10 @@ from scipy.special import wofz
 
 from ..common.errors import UsageError
 from ..common.geodesy import unit_vectors
-from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, wavelength_m
+from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
 from .field import dyads
 from .field.fresnel import coefficients, face_table
-from .field.geometry import parts_of, pattern_fields, plain, rows_of
-from .field.sum import Fields, Further, parts_between_poses
+from .field.sum import Fields, Further, parts_of, pattern_fields, plain, rows_of, summed
 from .geometry import Array, Faces, Link, PathSet, Poses, legs, sources_of
 from .scene import Scene
 from .search.mirror import Occlusion, scene_tolerance_m
@@ -48,7 +47,7 @@ def wedge(
     phi_in: FloatArray, phi_out: FloatArray, cos_beta: FloatArray, exterior: FloatArray, distance: FloatArray,
     face_0: Any, face_n: Any,
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:  # fmt: skip
-    """Diffraction matrix of a wedge in the edge-fixed basis.
+    """Return the diffraction matrix of a wedge in the edge-fixed basis.
 
     Source: Kouyoumjian and Pathak, Proc. IEEE 62 (1974), 1448-1461, doi:10.1109/PROC.1974.9651.
 
@@ -136,7 +135,7 @@ def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> 
 
 
 def edge_term(angle: FloatArray, exterior: FloatArray, distance: FloatArray) -> ComplexArray:
-    """``cot(angle / 2n) F(x)``, whose pole at a shadow boundary is cancelled by F.
+    """Return ``cot(angle / 2n) F(x)``. F cancels the pole of the cotangent at a shadow boundary.
 
     The angle repeats every 2 pi n round the edge. If it is measured from the nearest boundary, the argument of F is
     ``x = 2 distance sin^2(angle / 2)``, so the factor sin(angle / 2) cancels the pole in closed form.
@@ -162,7 +161,7 @@ def edge_term(angle: FloatArray, exterior: FloatArray, distance: FloatArray) -> 
 
 
 def transition(root: FloatArray) -> ComplexArray:
-    """Transition function of Kouyoumjian and Pathak at ``x = root^2``, over ``root``.
+    """Return the transition function of Kouyoumjian and Pathak at ``x = root^2``, divided by ``root``.
 
     Source: Abramowitz and Stegun 7.1.3 (the Faddeeva function w).
     """
@@ -183,9 +182,8 @@ _LEAST_WAVELENGTHS = 0.5
 # Far above the rounding of coordinates at 1 km, far below the gap between two walls of a map.
 _PROBE_M = 1e-3
 
-# Number of pairs of edge and pose that are examined together, and of paths whose fields are evaluated together. Both
-# limit the memory and do not change a result.
-LINKS_AT_ONCE, PATHS_AT_ONCE = 200_000, 4096
+# Number of pairs of edge and pose that are examined together. It limits the memory and does not change a result.
+LINKS_AT_ONCE = 200_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +218,7 @@ class EdgePaths(Further):
         return len(self.pose)
 
     def lines(self) -> PathSet:
-        """The same polylines without faces."""
+        """Return the same polylines without faces."""
         # legs() requires used corners first; the stable sort keeps their order
         used = np.isfinite(self.vertices_m).all(axis=2)
         first = np.argsort(~used, axis=1, kind="stable")
@@ -266,28 +264,19 @@ class EdgePaths(Further):
         -------
         Fields
         """
-        shape = (len(poses), len(link.tower_arrays))
-        h = np.zeros((shape[0] * shape[1], len(link.uav_array), len(next(iter(link.tower_arrays.values())))), complex)
-        path_power, key = np.zeros(len(self)), self.pose * shape[1] + self.tower
-        for part in parts_between_poses(self.pose, PATHS_AT_ONCE):
-            amplitude = amplitudes(self.select(part), faces, sources_m, poses, link)
-            if loss_db is not None:
-                amplitude *= amplitude_from_db(-loss_db[part])[:, None, None]
-            first = np.flatnonzero(np.diff(key[part], prepend=-1))
-            # paths are sorted by link, and a part ends between poses: no link is written twice
-            h[key[part][first]] = np.add.reduceat(amplitude, first, axis=0)
-            path_power[part] = (np.abs(amplitude) ** 2).mean(axis=(1, 2))
-        # the matrix is (receiver, transmitter): reciprocity makes the other direction its transpose
-        matrices = np.ascontiguousarray(h.swapaxes(1, 2)) if link.uav_transmits else h
-        power = np.bincount(key, weights=path_power, minlength=len(h)).astype(np.float64)
-        return Fields(matrices.reshape(*shape, *matrices.shape[1:]), path_power, power.reshape(shape))
+
+        def evaluated(part: slice) -> ComplexArray:
+            some = amplitudes(self.select(part), faces, sources_m, poses, link)
+            return some.reshape(len(some), -1)
+
+        return summed(evaluated, self, len(poses), link, loss_db)
 
 
 # ------------------------------------------------------------------------------------------------------- the search
 
 
 def over_edges(scene: Scene, poses: Poses, link: Link) -> EdgePaths:
-    """Paths over one edge of a building, with at most one reflection off the ground on either side.
+    """Find the paths over one edge of a building, with at most one reflection off the ground on either side.
 
     Parameters
     ----------
@@ -382,7 +371,7 @@ class Edges(NamedTuple):
 
 
 def wedge_axes(normal: FloatArray, normal_n: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Direction of edges, axes of their faces 0 (edges, 3) and exterior angles over pi, from both outward normals."""
+    """Return directions of edges, axes of their faces 0 (edges, 3) and exterior angles over pi, from both normals."""
     cross = np.cross(normal, normal_n)
     sine = np.linalg.norm(cross, axis=1)
     along = cross / sine[:, None]
@@ -554,7 +543,7 @@ class _End(NamedTuple):
 
 
 def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link) -> ComplexArray:
-    """Complex amplitudes (paths, uav elements, tower elements) of paths.
+    """Return the complex amplitudes (paths, uav elements, tower elements) of paths.
 
     Parameters
     ----------
@@ -638,7 +627,7 @@ def _ends(
 def _patterns(
     arrays: tuple[Array, ...], paths: EdgePaths, end: _End, toward: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """E_theta and E_phi (paths, elements) of one end's elements ``toward`` directions (paths, 3) of the centres."""
+    """Return E_theta and E_phi (paths, elements) of one end's elements ``toward`` directions (paths, 3)."""
     count = len(arrays[0])
     # shape (1, 1), which broadcasts against every path and element
     if all(plain(array.patterns) for array in arrays):
@@ -657,8 +646,8 @@ def _round_edge(
 ) -> tuple[ComplexArray, ComplexArray]:  # fmt: skip
     """Return fields (paths, elements) of an end's elements in the edge-fixed basis, times the sine with the edge.
 
-    ``way`` (paths, 3) is the direction of the wave at the edge's end of the leg; ``sign`` is 1 at the source and -1 at
-    the target, which radiates against it.
+    ``way`` (paths, 3) is the direction of the wave at the edge's end of the leg. ``sign`` is 1 at the source. It is -1
+    at the target, whose elements are evaluated in the opposite direction.
     """
     flat, cross = along - cosine[:, None] * way, np.cross(along, way)
     toward, normal = parts_of(way), parts_of(end.normal)

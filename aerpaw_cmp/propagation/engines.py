@@ -1,4 +1,4 @@
-"""Paths by the engine that is asked for, read from the cache where they were searched before.
+"""Path search by the requested engine, with a cache of earlier searches.
 
 The cache is content-addressed. Paths depend on the faces, the ends and the search, not on arrays, attitude or power:
 one entry serves every array.
@@ -55,19 +55,19 @@ def path_cache(search: Search, run: Run) -> PathCache | None:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Rays per tower and why."""
+    """A number of rays per tower with its reason."""
 
     samples: int
     reason: str
 
 
 def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) -> Choice:
-    """The number of rays at which two pilots agree.
+    """Find the number of rays at which two pilots agree.
 
     Parameters
     ----------
     pilot : callable
-        ``pilot(samples)`` gives the paths of the pilot's poses.
+        ``pilot(samples)`` returns the paths of the pilot's poses.
     faces : Faces
     poses : int
         Number of poses of the pilot, for the explanation.
@@ -92,7 +92,7 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
 
 
 def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache: PathCache | None) -> Choice | None:
-    """Rays per tower at which two pilots on a batch of poses, spread over the flight, find the same paths.
+    """Find the rays per tower at which two pilots on a batch of poses, spread over the flight, find the same paths.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache
 def search_or_read(
     scene: Scene, link: Link, poses: Poses, search: Search, run: Run, cache: PathCache | None
 ) -> tuple[PathSet, float, bool]:
-    """Paths, the seconds of their search, and whether they were read from the cache.
+    """Return paths, the seconds of their search, and whether they were read from the cache.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ class PathCache:
     Attributes
     ----------
     warnings : list of str
-        Entries that were damaged, for people.
+        Messages about damaged entries.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -1,7 +1,5 @@
 """Faces of a scene, paths, antenna arrays, poses and links, shared by search and field.
 
-Faces of a scene, and one path record for every engine, as columns.
-
 A path is an ordered list of reflecting faces between the source (tower) and the target (UAV). Lengths, phases
 and fields are not stored: :mod:`aerpaw_cmp.propagation.field.sum` evaluates them in float64 from the faces.
 
@@ -66,7 +64,7 @@ class Faces:
     """Planar reflecting faces of a scene.
 
     A point ``x`` on a face has the in-plane coordinates ``(along . x, across . x)`` [m]. Only the first four
-    columns decide fields; the others decide which points belong to a face. Left out, faces are whole planes.
+    columns determine fields. The others determine which points belong to a face; without them, faces are planes.
 
     Parameters
     ----------
@@ -103,8 +101,7 @@ class Faces:
         count = len(self.normal)
         if self.along.shape == (count, 3):
             return
-        # any axis that is not the normal will do for a whole plane
-        # the axis least along the normal: a product with one nearly along it would lose digits
+        # start from the axis that is least along the normal, because a nearly parallel axis would lose digits
         helper = np.eye(3)[np.argmin(np.abs(self.normal), axis=1)] if count else np.zeros((0, 3))
         along = np.cross(helper, self.normal)
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
@@ -127,14 +124,14 @@ class Faces:
         return np.asarray(points_m - 2.0 * self.height_m(face, points_m)[..., None] * self.normal[face])
 
     def select(self, rows: IntArray) -> Faces:
-        """Some of the faces."""
+        """Return some of the faces."""
         columns: dict[str, Any] = {name: tuple(getattr(self, name)[row] for row in rows) for name in _WORDS}
         columns |= {name: getattr(self, name)[rows] for name in _ARRAYS}
         return Faces(**columns)
 
 
 def joined(first: Faces, second: Faces) -> Faces:
-    """The faces of both, the first keeping their numbers."""
+    """Return the faces of both. The first faces keep their numbers."""
     columns: dict[str, Any] = {name: getattr(first, name) + getattr(second, name) for name in _WORDS}
     columns |= {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in _ARRAYS}
     return Faces(**columns)
@@ -143,8 +140,8 @@ def joined(first: Faces, second: Faces) -> Faces:
 class BoxTree(NamedTuple):
     """A tree of boxes as columns.
 
-    ``lower``, ``upper`` (nodes, 3) are bounds, ``child`` (nodes,) the first of two children or -1; leaves hold
-    ``many`` of the ``items`` from ``start`` on.
+    ``lower``, ``upper`` (nodes, 3) are bounds, ``child`` (nodes,) the first of two children or -1. A leaf
+    contains ``many`` of the ``items`` from ``start`` on.
     """
 
     lower: FloatArray
@@ -213,7 +210,7 @@ class Rows:
     tower: IntArray
 
     def select(self: RowsT, rows: AnyArray | slice) -> RowsT:
-        """The paths of a mask, of indices or of a slice."""
+        """Return the paths of a mask, of indices or of a slice."""
         return type(self)(**{column.name: getattr(self, column.name)[rows] for column in fields(self)})  # type: ignore[arg-type]
 
     @classmethod
@@ -238,7 +235,7 @@ class PathSet(Rows):
     vertices_m : (paths, max_depth, 3)
         Reflection points for array centres, NaN where unused.
     terrain_db : (paths,)
-        Loss at ground that is curved within the Fresnel zone; left out, none.
+        Loss at ground that is curved within the Fresnel zone. Default: 0.
     """
 
     pose: IntArray
@@ -249,7 +246,7 @@ class PathSet(Rows):
     terrain_db: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        # frozen, so the default of the right length is set behind its back
+        # the record is frozen, so set the default of the right length in this way
         if len(self.terrain_db) != len(self.pose):
             object.__setattr__(self, "terrain_db", np.zeros(len(self.pose)))
 
@@ -257,7 +254,7 @@ class PathSet(Rows):
         return len(self.pose)
 
     def lines(self) -> PathSet:
-        """The paths as polylines: themselves."""
+        """Return the paths, which are polylines."""
         return self
 
     @property
@@ -267,7 +264,7 @@ class PathSet(Rows):
 
     @property
     def turns(self) -> IntArray:
-        """A digit 1 for each reflection (paths,)."""
+        """One digit 1 per reflection (paths,)."""
         # 1, 11, 111
         return np.asarray((10**self.depth - 1) // 9)
 
@@ -311,7 +308,7 @@ def sources_of(paths: Rows, sources_m: FloatArray) -> FloatArray:
 
 
 def legs(source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Starts and ends (paths, 3) of the legs of polylines, leg by leg.
+    """Iterate over the starts and ends (paths, 3) of the legs of polylines, leg by leg.
 
     A vertex (paths, vertices, 3) that is not used (NaN) is the point after it: a leg that begins there has no length.
     """
@@ -385,20 +382,16 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
     return _faces(tuple(grounds), site.ground_material, site.buildings)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def _faces(grounds: tuple[float, ...], ground_material: str, buildings: tuple[Building, ...]) -> Faces:
     """Return the faces of ground planes and buildings. They are cached, because each part of a replay requests them."""
-    faces = [*(_ground(height, ground_material, len(grounds) > 1) for height in grounds), *_solids(buildings)]
+    faces = [_ground(height, ground_material, len(grounds) > 1) for height in grounds]
+    for solid, building in enumerate(buildings):
+        for part in _parts(building.footprint):
+            faces += [*_walls(building, part, solid), _roof(building, part, solid)]
     columns: dict[str, Any] = dict(zip(_Face._fields, zip(*faces, strict=True), strict=True))
     numbers = {name: np.array(columns[name]) for name in _Face._fields if name not in ("material", "label", "polygon")}
     return Faces(**(columns | numbers))
-
-
-@lru_cache(maxsize=1)
-def _solids(buildings: tuple[Building, ...]) -> list[_Face]:
-    """Return walls and roofs. They are cached, because the ground of each tower requests them."""
-    parts = [(building, part, at) for at, building in enumerate(buildings) for part in _parts(building.footprint)]
-    return [face for part in parts for face in (*_walls(*part), _roof(*part))]
 
 
 def _ground(height_m: float, material: str, several: bool) -> _Face:
@@ -416,7 +409,7 @@ def _ground(height_m: float, material: str, several: bool) -> _Face:
 
 
 def _parts(footprint: Polygon) -> list[Polygon]:
-    """Valid, counter-clockwise polygons (holes clockwise) without collinear vertices."""
+    """Return valid, counter-clockwise polygons (holes clockwise) without collinear vertices."""
     # a self-crossing ring becomes several polygons, and perhaps lines, which are not walls
     valid = footprint if footprint.is_valid else shapely.make_valid(footprint)
     polygons = [part for part in shapely.get_parts(valid) if part.geom_type == "Polygon" and part.area > 0.0]
@@ -678,7 +671,7 @@ class Link:
 
     ``tower_arrays`` maps tower names to arrays, in replay order. The channel matrix is always
     ``(n_rx, n_tx)``; ``uav_transmits`` decides which end is which. A link received below ``noise_floor_dbm`` is out of
-    coverage; by default that is the thermal noise of 1 Hz, which no receiver hears beneath.
+    coverage. The default is the thermal noise of 1 Hz, below which no receiver works.
     """
 
     carrier_hz: float
@@ -690,7 +683,7 @@ class Link:
 
 
 def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, roll_rad: FloatArray) -> FloatArray:
-    """Device-to-site rotation of 3GPP TR 38.901 eq. (7.1-4): ``Rz(yaw) Ry(pitch) Rx(roll)``.
+    """Return the device-to-site rotation of 3GPP TR 38.901 eq. (7.1-4): ``Rz(yaw) Ry(pitch) Rx(roll)``.
 
     Source: 3GPP TR 38.901 eq. 7.1-4.
 
@@ -729,7 +722,7 @@ def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, rol
 
 
 def rotation_from_aircraft(roll_deg: FloatArray, pitch_deg: FloatArray, yaw_deg: FloatArray) -> FloatArray:
-    """Body-to-site rotation of an aircraft attitude.
+    """Return the body-to-site rotation of an aircraft attitude.
 
     Parameters
     ----------
@@ -752,7 +745,7 @@ def rotation_from_aircraft(roll_deg: FloatArray, pitch_deg: FloatArray, yaw_deg:
 
 
 def rotation_from_axes(yaw_deg: FloatArray, up: FloatArray) -> FloatArray:
-    """Body-to-site rotation (n, 3, 3) of noses that head ``yaw_deg`` (n,) and upward axes ``up``, (3,) or (n, 3).
+    """Return body-to-site rotations (n, 3, 3) from headings ``yaw_deg`` (n,) and upward axes ``up``, (3,) or (n, 3).
 
     Examples
     --------
@@ -797,7 +790,7 @@ def _mounted(
 def tower_comparison_array(
     yaw_deg: float = 45.0, slant_deg: tuple[float, ...] = (45.0, -45.0, 45.0, -45.0), pattern: Pattern | None = None
 ) -> Array:
-    """Tower array of the comparison: 4 ports, 60 mm / 1.68 m / 60 mm, horizontal, ports slanted alternately."""
+    """Return the tower array of the comparison: 4 ports, 60 mm / 1.68 m / 60 mm, horizontal, slanted alternately."""
     return _mounted(_centred_line(np.array(_TOWER_PORTS_M)), slant_deg, pattern, yaw_deg)
 
 
@@ -811,8 +804,8 @@ def uav_comparison_array(
     """Return the UAV array of the comparison: 2 x 2 at half a wavelength, rolled by 90 degrees, numbered column first.
 
     Slants alternate between neighbours in both directions. The modem's mounting is not published. With the tower at 12
-    m this mounting has a total variation distance of 0.06 and 0.09 from the measured ranks of two flights at K = 10;
-    slants that alternate along the numbering have 0.07 and 0.11.
+    m, ranks of this mounting have a total variation distance of 0.06 and 0.09 from those measured in two flights (K =
+    10). Slants that alternate along the numbering have 0.07 and 0.11.
 
     Parameters
     ----------
@@ -859,5 +852,5 @@ def linear_array(elements: int, spacing_m: float, yaw_deg: float = 90.0, pattern
 
 
 def single_element(pattern: Pattern | None = None, mount: FloatArray | None = None) -> Array:
-    """One vertical element at the device centre."""
+    """Return one vertical element at the device centre."""
     return Array(np.zeros((1, 3)), np.zeros(1), (pattern or Isotropic(),), np.eye(3) if mount is None else mount)

@@ -93,7 +93,7 @@ llvm = list(dr.detail.llvm_version()) if "llvm" in sys.argv[1] else []
 print(json.dumps({"right": right, "found_m": found, "llvm": llvm}))
 """
 
-# The same for ``doctor`` and ``make setup``, which name a Sionna RT that cannot be loaded, too.
+# The same for ``doctor`` and ``make setup``, which also report a Sionna RT that cannot be loaded.
 _SIONNA_LOADS = f"""{TRIAL_PROGRAM}
 import typing, typing_extensions
 typing.__dict__.setdefault("Self", typing_extensions.Self)
@@ -171,9 +171,9 @@ def _system_paths() -> list[Path]:
 
 
 def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
-    """The libLLVM files in the order they are worth trying: newest first, unknown versions last.
+    """Return the libLLVM files in the order of trials: newest first, unknown versions last.
 
-    With ``DRJIT_LIBLLVM_PATH`` set, that file alone.
+    If ``DRJIT_LIBLLVM_PATH`` is set, only that file is returned.
 
     Raises
     ------
@@ -264,14 +264,14 @@ def try_library(library: Library, *, program: str = _SIONNA_LOADS, timeout_s: fl
     ----------
     library : Library
     program : str
-        What it runs: prints one JSON line.
+        Program that the child runs. It prints one JSON line.
     timeout_s : float
-        After it the child is ended and the trial has failed [s].
+        The child is ended after this time, and the trial has failed [s].
 
     Returns
     -------
     Trial
-        Whether it works, and why not.
+        Result of the trial.
     """
     if reason := _too_old(library.version):
         return Trial(library, False, reason)
@@ -336,12 +336,12 @@ def _remembered_trial(library: Library) -> Trial:
 
 @cache
 def _trials() -> tuple[Trial, ...]:
-    """The trials that led to this process's choice, made once."""
+    """Return the trials that led to this process's choice. They are made once."""
     return tuple(first_that_works(candidates(), _remembered_trial))
 
 
 class SionnaMissingError(CheckError):
-    """Sionna RT cannot be loaded on this machine: nothing but the audit and ``rt.engine: sionna`` needs it."""
+    """Sionna RT cannot be loaded on this machine: only the audit and ``rt.engine: sionna`` need it."""
 
 
 def prepare_llvm() -> Path:
@@ -355,7 +355,7 @@ def prepare_llvm() -> Path:
     Raises
     ------
     SionnaMissingError
-        If no usable LLVM is found; the message holds the line that installs one.
+        If no usable LLVM is found. The message contains the line that installs one.
     """
     trials = _trials()
     if not trials or not trials[-1].ok or trials[-1].library is None:
@@ -367,10 +367,9 @@ def prepare_llvm() -> Path:
 
 
 def let_sionna_load() -> None:
-    """Put ``Self`` into ``typing`` where Python 3.10 has none.
+    """Put ``Self`` into ``typing`` on Python 3.10, which does not have it.
 
-    Sionna RT 2.2.0 says that it runs there, and imports it from there; other names of 3.11 it takes from
-    typing_extensions.
+    Sionna RT 2.2.0 supports Python 3.10, but imports this name from ``typing``.
     """
     import typing
 
@@ -411,7 +410,7 @@ def os_families() -> set[str]:
 
 
 def apt_packages(search_output: str) -> list[str]:
-    """LLVM runtime packages new enough, newest first, from the output of ``apt-cache search``.
+    """Return LLVM runtime packages that are new enough, newest first, from the output of ``apt-cache search``.
 
     >>> apt_packages(os.linesep.join(["libllvm14 - x", "libllvm19 - x", "libllvm17t64 - x", "libllvm19-dbg - x"]))
     ['libllvm19', 'libllvm17t64']

@@ -1,4 +1,4 @@
-"""Options of a replay, in addition to site, link and poses: how to search, which losses to add, how to run."""
+"""Options of a replay, in addition to site, link and poses: path search, further losses, cache and progress."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ class Search:
         ``sionna`` only: poses per call.
     further : tuple of callable
         Searches ``(scene, poses, link)`` of further kinds of paths, such as
-        :func:`aerpaw_cmp.propagation.edges.over_edges`. In H, levels and ranks, whichever engine finds the reflections.
+        :func:`aerpaw_cmp.propagation.edges.over_edges`. They are part of H, levels and ranks for both engines.
     links : (towers, poses) bool, optional
-        Links that count; the others have no path and are not searched for.
+        Links to search. Other links have no path.
     """
 
     engine: Engine = "image"
@@ -92,7 +92,7 @@ class Run:
     ----------
     cache_dir : path, optional
         Folder that stores paths, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for
-        the ``sionna`` engine. The ``image`` engine is faster than a cache and only uses one that is named.
+        the ``sionna`` engine. The ``image`` engine is faster than a cache and uses one only if this folder is given.
     extent_m : (points, 3), optional
         Points that span all poses of a job, if the poses are a part of it. They set the tolerance of the path search,
         so that a part has the same paths as in one replay of all poses.

@@ -4,10 +4,10 @@ The path table of a replay contains delay, gain per element pair, directions and
 
 H is the sum of the gains. The field of one path is the sum over a path set of one path, so there is only one formula.
 
-Directions are unit vectors away from the ends: azimuth counter-clockwise from east and elevation above the horizon in
-the site frame, from the boresight and its plane in the array frame (:mod:`aerpaw_cmp.propagation.geometry`).
+Directions are unit vectors away from the ends. In the site frame, azimuth is counter-clockwise from east and elevation
+is above the horizon. In the array frame (:mod:`aerpaw_cmp.propagation.geometry`) they are measured from the boresight.
 
-For notebooks, ``trace(site, link, poses)`` does ray tracing with the inputs at hand and returns a :class:`Replay`.
+For notebooks, ``trace(site, link, poses)`` returns a :class:`Replay`.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Ends:
     field: Field = Field()
 
     def part(self, rows: slice) -> Ends:
-        """Those of some poses."""
+        """Return the ends of some poses."""
         return replace(self, poses=self.poses[rows], sources_m=self.sources_m[rows] if self.moving else self.sources_m)
 
     @property
@@ -134,14 +134,14 @@ class PathTable:
         return np.asarray(self.length_m / SPEED_OF_LIGHT_MPS)
 
     def by_link(self, values: AnyArray, ends: Ends, fill: Any = np.nan) -> AnyArray:
-        """Values per path (paths, ...) as (most paths of a link, poses, towers, ...)."""
+        """Return values per path (paths, ...) as (most paths of a link, poses, towers, ...)."""
         links = len(ends.poses), len(ends.link.tower_arrays)
         out = np.full((self.most, *links, *values.shape[1:]), fill, values.dtype)
         out[self.number, self.pose, self.tower] = values
         return out
 
     def doppler_hz(self, carrier_hz: float, velocity_mps: FloatArray, tower_mps: ArrayLike = 0.0) -> FloatArray:
-        """Doppler shift (paths,), positive while a path gets shorter.
+        """Return the Doppler shift (paths,), positive while a path gets shorter.
 
         ``f = f0 / c (v . k)``, k towards the first corner seen from each end.
 
@@ -188,7 +188,7 @@ def path_table(
     faces : Faces
     ends : Ends
     counts : (poses, towers) bool
-        Links that have a channel; paths of the others are left out.
+        Links that have a channel. Paths of other links are omitted.
     names : dict of str to int
         Faces of a path by number, those of earlier poses; new ones are added.
 
@@ -244,7 +244,7 @@ def _gains(item: Any, faces: Faces, ends: Ends, loss_db: FloatArray | None) -> C
     pieces, order = [], []
     for tower, (name, array) in enumerate(ends.link.tower_arrays.items()):
         rows = np.flatnonzero(item.tower == tower)
-        # give each path a separate pose: H of that pose is then its gain, by the same formula
+        # give each path a separate pose, so that H of that pose is its gain
         some, own, link = item.select(rows), np.arange(len(rows)), replace(ends.link, tower_arrays={name: array})
         places, lost = sources_of(some, ends.sources_m)[:, None], None if loss_db is None else loss_db[rows]
         alone = replace(some, pose=own, tower=0 * own)
@@ -256,7 +256,7 @@ def _gains(item: Any, faces: Faces, ends: Ends, loss_db: FloatArray | None) -> C
 def impulse_responses(
     table: PathTable, ends: Ends, velocity_mps: FloatArray | None = None, times_s: ArrayLike = (0.0,)
 ) -> tuple[ComplexArray, FloatArray]:
-    """Gains and delays in the axis order of Sionna RT's ``Paths.cir()``, poses as devices.
+    """Return gains and delays in the axis order of Sionna RT's ``Paths.cir()``. Each pose is a device.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ def impulse_responses(
 
 
 def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> ComplexArray:
-    """Channel matrices at frequencies about the carrier.
+    """Return channel matrices at frequencies about the carrier.
 
     Parameters
     ----------
@@ -317,7 +317,7 @@ def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> 
 
 
 def check_band(bandwidth_hz: float, carrier_hz: float) -> None:
-    """UsageError for a band wider than :data:`WIDEST_BAND` of the carrier."""
+    """Raise UsageError for a band wider than :data:`WIDEST_BAND` of the carrier."""
     if bandwidth_hz > WIDEST_BAND * carrier_hz:
         raise UsageError(
             f"a band of {bandwidth_hz / 1e6:g} MHz about {carrier_hz / 1e9:g} GHz",
@@ -338,10 +338,6 @@ def subcarriers_hz(bandwidth_hz: float, count: int) -> FloatArray:
     return np.asarray((np.arange(count) - count // 2) * (bandwidth_hz / count))
 
 
-# Number of poses whose levels are computed together. H of these poses stays in a processor's cache between its two
-# sums.
-LEVELS_AT_ONCE = 1024
-
 # Arrays (poses, towers, ...) of a replay.
 PER_LINK = ("rss_dbm", "rss_power_dbm", "h", "has_path")
 
@@ -360,8 +356,8 @@ class Replay:
         Zero without a path.
     has_path : (poses, towers) bool
     contributions : tuple
-        All that H and both levels are made of: the reflections and lines of sight, then the paths of each further kind
-        (:class:`~aerpaw_cmp.propagation.field.sum.Further`) that was asked for.
+        Paths that add up to H and both levels: reflections and lines of sight, then the paths of each requested further
+        kind (:class:`~aerpaw_cmp.propagation.field.sum.Further`).
     faces : Faces
     ends : Ends
         Link, poses, positions of the towers and further losses.
@@ -422,7 +418,7 @@ class Replay:
         return [str(item) for item in self.omitted if 0 not in item.counts[:1]]
 
     def __repr__(self) -> str:
-        """One line: the arrays are too large to be shown."""
+        """Return one line, because the arrays are too large to be shown."""
         return (
             f"Replay({counted(len(self.has_path), 'pose')}, towers {', '.join(self.towers)}, engine {self.engine!r}, "
             f"{counted(len(self.paths), 'path')}, coverage {100 * self.has_path.mean():.0f} %, {self.seconds:.2f} s)"
@@ -456,11 +452,11 @@ class Replay:
     def cir(
         self, velocity_mps: FloatArray | None = None, times_s: ArrayLike = (0.0,)
     ) -> tuple[ComplexArray, FloatArray]:
-        """Gains and delays in Sionna's axis order: :func:`aerpaw_cmp.propagation.replay.impulse_responses`."""
+        """Return gains and delays in Sionna's axis order (:func:`impulse_responses`)."""
         return impulse_responses(self.path_table(), self.ends, velocity_mps, times_s)
 
     def cfr(self, offsets_hz: ArrayLike) -> ComplexArray:
-        """H about the carrier: :func:`aerpaw_cmp.propagation.replay.frequency_responses`."""
+        """Return H at frequencies about the carrier (:func:`frequency_responses`)."""
         return frequency_responses(self.path_table(), self.ends, offsets_hz)
 
     def to_xarray(self) -> Any:
@@ -525,7 +521,7 @@ def replay(
         raise UsageError(f"unknown engine {search.engine!r}", expected="'image' or 'sionna'")
     poses, notes = within_reach(site, poses)
     scene = Scene.of(site, link, poses)
-    # links of a moving tower with its other places: excluded as if an end were buried
+    # a moving tower has links only with its own poses
     if search.links is not None:
         scene = replace(scene, excluded=scene.excluded | ~search.links)
     notes += buried_towers(site, link)
@@ -564,7 +560,7 @@ def replay(
 def passed(
     site: Site, scene: Scene, link: Link, poses: Poses, paths: PathSet, search: Search
 ) -> tuple[Scene, PathSet, list[Omission]]:
-    """Paths over terrain that it lets through.
+    """Return the paths that the terrain does not stop, and those that reflect off it.
 
     Parameters
     ----------
@@ -624,7 +620,7 @@ def further_paths(
 def _shaped_ground(
     site: Site, scene: Scene, link: Link, poses: Poses, paths: PathSet
 ) -> tuple[Scene, PathSet, PathSet, list[Omission]]:
-    """Scene with tangent planes of the terrain, paths that stay on level ground, paths over the planes, notes."""
+    """Return the scene with tangent planes of the terrain, paths over level ground and over the planes, and notes."""
     if site.dem is None or scene.surfaces is not None or not paths.faces.shape[1]:
         return scene, paths, paths.select(slice(0, 0)), []
     terrain = on_terrain(site.dem, scene.faces, scene.links_to(poses), paths, wavelength_m(link.carrier_hz))
@@ -638,8 +634,8 @@ def _shaped_ground(
 def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:
     """Return paths (paths,) that the elevation model lets through.
 
-    It is asked on the direct line between the ends, whose shadow a reflection off level ground shares; a path over
-    walls alone is asked on each of its segments.
+    For a line of sight or a reflection off level ground the direct line between the ends decides. For a path over walls
+    alone each of its segments decides.
     """
     if site.dem is None or len(paths) == 0:
         return np.ones(len(paths), dtype=np.bool_)
@@ -658,7 +654,7 @@ def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) ->
 def _channels(
     scene: Scene, link: Link, poses: Poses, paths: PathSet, further: Sequence[Fields], field: Field
 ) -> tuple[Fields, BoolArray]:
-    """H and powers of the paths with what further kinds of them add, and which links (poses, towers) have a path."""
+    """Return H and powers with the parts of further kinds, and which links (poses, towers) have a path."""
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
@@ -674,19 +670,13 @@ def _channels(
 
 def _levels(fields: Fields, has_path: BoolArray, link: Link) -> tuple[FloatArray, FloatArray]:
     """Return levels (poses, towers) of H and of the summed powers. Below the noise floor clear H and ``has_path``."""
-    h, sent, floor = fields.h, link.transmit_power_dbm, link.noise_floor_dbm
-    level_dbm, power_dbm = np.empty(has_path.shape), np.empty(has_path.shape)
-    # a block fits in the processor's cache; a second thread would not help
-    for first in range(0, len(h), LEVELS_AT_ONCE):
-        part = slice(first, first + LEVELS_AT_ONCE)
-        level_dbm[part] = rss_dbm(mean_pair_power(h[part]), sent, floor)
-        power_dbm[part] = rss_dbm(fields.power[part], sent, floor)
-        above_floor = np.isfinite(level_dbm[part])
-        if not above_floor.all():
-            # below the noise floor the channel is unknown, so there is no rank
-            h[part][~above_floor] = 0.0
-        has_path[part] &= above_floor
-    return level_dbm, power_dbm
+    sent, floor = link.transmit_power_dbm, link.noise_floor_dbm
+    level_dbm = rss_dbm(mean_pair_power(fields.h), sent, floor)
+    above_floor = np.isfinite(level_dbm)
+    # below the noise floor the channel is unknown, so there is no rank
+    fields.h[~above_floor] = 0.0
+    has_path &= above_floor
+    return level_dbm, rss_dbm(fields.power, sent, floor)
 
 
 def trace(
@@ -700,7 +690,7 @@ def trace(
     samples: Samples = "auto",
     diffraction: Diffraction = "none",
 ) -> Replay:
-    """Paths, channel matrices and received power of poses at a site.
+    """Trace paths, channel matrices and received power of poses at a site.
 
     Parameters
     ----------
@@ -709,8 +699,8 @@ def trace(
     link : Link
         Carrier, arrays and power. ``link.tower_arrays`` names towers of the site.
     poses : Poses or array_like, (poses, 3)
-        Where the UAV is, metres east, north and up of the site's origin; plain positions stand level, nose to the
-        east.
+        Poses, or positions east, north and up of the site's origin [m]. A UAV at a plain position is level, with its
+        nose to the east.
     engine : {"image", "sionna"}
         The exact image method, or Sionna RT's PathSolver as path finder; fields are float64 either way.
     max_depth : int

@@ -106,7 +106,7 @@ REACH_M = 100_000.0
 
 @dataclass(frozen=True, slots=True)
 class Omission:
-    """A part that a replay does not model. ``counts`` contains how many, and of how many, if it is counted."""
+    """A part that a replay does not model. ``counts`` is empty, or the number, or the number and the total."""
 
     what: str
     counts: tuple[int, ...] = ()
@@ -118,7 +118,7 @@ class Omission:
 
 
 def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[Omission]]:
-    """Poses with those that cannot be replayed as unknown (NaN): each alone, so that the others keep their paths.
+    """Return the poses with NaN for those that cannot be replayed, so that the others keep their paths.
 
     Tolerances grow with the size of the scene: one pose at 1e12 m would change the paths of all. A pose without a
     rotation has no field.

@@ -47,8 +47,7 @@ from .mapfiles import (
     read_map_file,
 )
 from .site import Building, Forest, Geofence
-from .siteyaml import SiteModel, build_site, extent_m, site_model
-from .trees import TALLEST_TREE_M, WIDEST_CROWN_M
+from .siteyaml import TALLEST_TREE_M, WIDEST_CROWN_M, SiteModel, build_site, extent_m, site_model
 
 # Storey height that OpenStreetMap suggests.
 _LEVEL_M = 3.0

@@ -16,10 +16,11 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -289,23 +290,6 @@ class TriangleScene:
         return len(self.triangles)
 
 
-@dataclass(slots=True)
-class _Reading:
-    """The data read so far."""
-
-    path: Path
-    folder: Path
-    radio: dict[str, str]
-    vertices: list[FloatArray] = field(default_factory=list)
-    triangles: list[IntArray] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
-    materials: list[str] = field(default_factory=list)
-    bent: int = 0
-    total: int = 0
-    skipped: dict[str, int] = field(default_factory=dict)
-    digest: hashlib._Hash = field(default_factory=hashlib.sha256)
-
-
 @parsed("a Mitsuba scene")
 def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> TriangleScene:
     """Read a Mitsuba scene.
@@ -334,31 +318,46 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
     for name in parameters.values():
         material(name)  # raises an error for an unknown material
     radio, unknown, notes = _materials(root, parameters)
-    reading = _Reading(path, path.parent.resolve(), radio)
-    reading.digest.update(data)
+    digest, parts, skipped = hashlib.sha256(data), list[_Part](), Counter[str]()
     for shape in root.findall("./shape"):
-        _add(reading, shape, unknown)
-    if not reading.triangles:
+        if (kind := shape.get("type", "?")) != "ply":
+            skipped[kind] += 1
+            continue
+        name = shape.get("id") or f"shape {len(parts) + 1}"
+        mesh, content = read_mesh(_file_of(shape, name, path))
+        # digests of digests, so that bytes cannot move from one file to the next
+        digest.update(hashlib.sha256(content).digest())
+        parts.append(_Part(name, _of_shape(shape, name, radio, unknown), mesh))
+        if sum(len(part.mesh.triangles) for part in parts) > _MOST_TRIANGLES:
+            raise InputError(
+                f"more than {_MOST_TRIANGLES} triangles",
+                expected="a scene that fits into memory",
+                cause="a terrain or scan that is finer than a wavelength asks for: simplify it first",
+            )
+    if not parts:
         raise InputError("the scene has no triangle", expected="shapes of type ply")
-    return _gathered(reading, notes)
-
-
-def _gathered(reading: _Reading, notes: list[str]) -> TriangleScene:
-    starts = np.cumsum([0, *(len(v) for v in reading.vertices)])
-    triangles = [t + start for t, start in zip(reading.triangles, starts, strict=False)]
-    if reading.bent:
-        notes.append(f"{reading.bent} polygons are not flat: they were cut into triangles from their first corner")
-    for kind, count in reading.skipped.items():
-        notes.append(f"warning: {counted(count, 'shape')} of type '{kind}' left out; read is ply")
+    meshes = [part.mesh for part in parts]
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    if bent := sum(mesh.bent for mesh in meshes):
+        notes.append(f"{bent} polygons are not flat: they were cut into triangles from their first corner")
+    notes += [f"warning: {counted(n, 'shape')} of type '{kind}' left out; read is ply" for kind, n in skipped.items()]
     return TriangleScene(
-        vertices_m=np.concatenate(reading.vertices),
-        triangles=np.concatenate(triangles),
-        shape=np.repeat(np.arange(len(triangles)), [len(t) for t in triangles]),
-        shapes=tuple(reading.names),
-        materials=tuple(reading.materials),
+        vertices_m=np.concatenate([mesh.vertices for mesh in meshes]),
+        triangles=np.concatenate([mesh.triangles + start for mesh, start in zip(meshes, starts, strict=False)]),
+        shape=np.repeat(np.arange(len(parts)), [len(mesh.triangles) for mesh in meshes]),
+        shapes=tuple(part.name for part in parts),
+        materials=tuple(part.material for part in parts),
         notes=tuple(notes),
-        sha256=reading.digest.hexdigest(),
+        sha256=digest.hexdigest(),
     )
+
+
+class _Part(NamedTuple):
+    """One shape of a scene with its radio material."""
+
+    name: str
+    material: str
+    mesh: RawMesh
 
 
 def _root(path: Path) -> tuple[ElementTree.Element, bytes]:
@@ -448,35 +447,7 @@ def _float(parent: ElementTree.Element, name: str, default: float) -> float:
 # ---------------------------------------------------------------- shapes
 
 
-def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, str]) -> None:
-    kind = shape.get("type", "?")
-    if kind != "ply":
-        reading.skipped[kind] = reading.skipped.get(kind, 0) + 1
-        return
-    name = shape.get("id") or f"shape {len(reading.names) + 1}"
-    # exporters write empty transforms, which have no effect
-    if len(shape.find("transform[@name='to_world']") or ()):
-        raise InputError(
-            f"the shape '{name}' is moved by a to_world",
-            expected="meshes in the coordinates of the scene, as Sionna RT's own",
-            cause="apply the transform where the scene was made (Blender: Object, Apply), and export it again",
-        )
-    mesh = _mesh(reading, shape, name)
-    reading.total += len(mesh.triangles)
-    if reading.total > _MOST_TRIANGLES:
-        raise InputError(
-            f"more than {_MOST_TRIANGLES} triangles",
-            expected="a scene that fits into memory",
-            cause="a terrain or scan that is finer than a wavelength asks for: simplify it first",
-        )
-    reading.vertices.append(mesh.vertices)
-    reading.triangles.append(mesh.triangles)
-    reading.names.append(name)
-    reading.materials.append(_of_shape(reading, shape, name, unknown))
-    reading.bent += mesh.bent
-
-
-def _of_shape(reading: _Reading, shape: ElementTree.Element, name: str, unknown: Mapping[str, str]) -> str:
+def _of_shape(shape: ElementTree.Element, name: str, radio: Mapping[str, str], unknown: Mapping[str, str]) -> str:
     """Return the radio material of a shape."""
     inner = shape.find("bsdf")
     # a shape may also refer to media and emitters
@@ -485,8 +456,8 @@ def _of_shape(reading: _Reading, shape: ElementTree.Element, name: str, unknown:
     # check before its material, because leaves often have a material without radio properties
     if _VEGETATION.search(f"{name} {which}".lower()):
         return CROWN
-    if which in reading.radio:
-        return reading.radio[which]
+    if which in radio:
+        return radio[which]
     if not which:
         raise InputError(f"the shape '{name}' has no material", expected='<ref id="..." name="bsdf"/>')
     if which in unknown:
@@ -498,23 +469,28 @@ def _of_shape(reading: _Reading, shape: ElementTree.Element, name: str, unknown:
         )
     raise InputError(
         f"the shape '{name}' names the material '{which}', which the scene has not",
-        expected="one of " + ", ".join([*reading.radio, *unknown][:20]),
+        expected="one of " + ", ".join([*radio, *unknown][:20]),
     )
 
 
-def _mesh(reading: _Reading, shape: ElementTree.Element, name: str) -> RawMesh:
-    item = shape.find("string[@name='filename']")
+def _file_of(shape: ElementTree.Element, name: str, path: Path) -> Path:
+    """Return the mesh file of a shape, which is in the folder of the scene."""
+    # exporters write empty transforms, which have no effect
+    if len(shape.find("transform[@name='to_world']") or ()):
+        raise InputError(
+            f"the shape '{name}' is moved by a to_world",
+            expected="meshes in the coordinates of the scene, as Sionna RT's own",
+            cause="apply the transform where the scene was made (Blender: Object, Apply), and export it again",
+        )
+    item, folder = shape.find("string[@name='filename']"), path.parent.resolve()
     wanted = "" if item is None else item.get("value", "")
     if not wanted:
         raise InputError(f"the shape '{name}' names no file", expected='<string name="filename" .../>')
-    place = inside(reading.folder, wanted, reading.path)
+    place = inside(folder, wanted, path)
     if not place.is_file():
         raise InputError(
             f"the shape '{name}' names '{wanted}', which is not there",
-            expected=f"a mesh below {reading.folder}",
+            expected=f"a mesh below {folder}",
             cause="the XML file was copied without its folder 'meshes'",
         )
-    mesh, data = read_mesh(place)
-    # digests of digests, so that bytes cannot move from one file to the next
-    reading.digest.update(hashlib.sha256(data).digest())
-    return mesh
+    return place

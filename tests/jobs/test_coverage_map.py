@@ -26,7 +26,7 @@ from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.relief import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
-from aerpaw_cmp.site.trees import join_trees
+from aerpaw_cmp.site.siteyaml import join_trees
 from tests.jobs.sent_by_pickle import SentByPickle
 from tests.json_page import unlisted
 

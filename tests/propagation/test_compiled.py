@@ -18,7 +18,6 @@ from shapely.geometry import box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation import compiled, engines
-from aerpaw_cmp.propagation import replay as replay_module
 from aerpaw_cmp.propagation.field import sum as field_sum
 from aerpaw_cmp.propagation.geometry import (
     Links,
@@ -134,7 +133,6 @@ def test_a_replay_on_three_threads_is_that_on_one_bit_by_bit(monkeypatch, case):
     """Search, joining of its pieces, field and levels, below the noise floor too."""
     monkeypatch.setenv(compiled.SWITCH, "never")
     monkeypatch.setattr(field_sum, "PATHS_PER_PART", 7)
-    monkeypatch.setattr(replay_module, "LEVELS_AT_ONCE", 7)
     site, link, poses, _ = case
     link = dataclasses.replace(link, noise_floor_dbm=-58.0)
     replays = []

@@ -146,8 +146,9 @@ def test_models_by_name() -> None:
 
 
 def test_the_index_of_equal_trees_is_made_once_and_of_others_anew():
-    index = crown_index(grove(20, 3))
-    assert crown_index(grove(20, 3)) is index
+    trees = grove(20, 3)
+    index = crown_index(trees)
+    assert crown_index(trees) is index
     taller = grove(20, 3)
     taller.height_m[7] += 1e-9
     assert crown_index(taller).trees is taller

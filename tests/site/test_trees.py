@@ -9,7 +9,7 @@ from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.site.site import Forest
-from aerpaw_cmp.site.trees import TreeSizes, _first_come, place_trees, wanted_trees
+from aerpaw_cmp.site.siteyaml import TreeSizes, _first_come, place_trees, wanted_trees
 
 SQUARE = Forest("wood", box(0, 0, 200, 200), 100.0, 4.0)
 

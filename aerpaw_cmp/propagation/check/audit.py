@@ -27,7 +27,7 @@ from ...compare.rank import channel_rank
 from ...site.site import Site
 from ..field.foliage import over_stands
 from ..field.sum import channel_matrices
-from ..geometry import Array, Faces, Isotropic, Link, Links, PathSet, Poses, joined, legs
+from ..geometry import Array, Faces, Isotropic, Link, PathSet, Poses, joined, legs
 from ..options import Engine, Field, Run, Search
 from ..replay import Replay
 from ..replay import replay as run_replay
@@ -418,6 +418,8 @@ def against_sionna(
     FieldAudit
         Counts and largest errors over the paths that both engines have.
     """
+    from ..search.sionna import own_coefficients
+
     few = poses[chosen]
     scene = Scene.of(site, link, few)
     probe, covered = _probe(link)
@@ -425,7 +427,13 @@ def against_sionna(
         np.array([expected.link.towers[name].mount for name in link.tower_arrays]),
         few.rotation @ np.array(expected.link.uav.mount),
     )
-    theirs = _own(scene, scene.links_to(few), probe, turns, search, {} if known is None else known)
+    links, known = scene.links_to(few), {} if known is None else known
+    patterns = [array.patterns[0].name for array in (*probe.tower_arrays.values(), probe.uav_array)]
+    asked = search.max_depth, search.samples, search.batch
+    key = content_digest(scene.faces, scene.surfaces, links, patterns, probe.carrier_hz, turns, asked)
+    if key not in known:
+        known[key] = own_coefficients(scene.faces, links, probe, turns, search, surfaces=scene.surfaces)
+    theirs: Coefficients = known[key]
     rows, ours = _of_chosen(replay.paths, chosen)
     ours = ours.select(~_over_terrain(replay)[rows])
     keys, their_keys = _keyed(ours, replay.faces, theirs.paths, scene.faces)
@@ -442,33 +450,11 @@ def against_sionna(
     return replace(total, not_covered=covered)
 
 
-def _own(
-    scene: Scene, links: Links, probe: Link, turns: tuple[FloatArray, FloatArray], search: Search, known: dict[str, Any]
-) -> Coefficients:
-    """Return Sionna's own coefficients in the slants of a probe. Sionna runs once, with crossed elements."""
-    from ..search.sionna import own_coefficients
-
-    arrays, cross = list(probe.tower_arrays.items()), np.array([0.0, np.pi / 2])
-    # the slant of an element is a rotation, so two crossed elements determine every slant
-    upright = replace(
-        probe,
-        tower_arrays={name: replace(array, slant_rad=cross) for name, array in arrays},
-        uav_array=replace(probe.uav_array, slant_rad=cross),
-    )
-    patterns = [array.patterns[0].name for array in (*probe.tower_arrays.values(), probe.uav_array)]
-    asked = search.max_depth, search.samples, search.batch
-    key = content_digest(scene.faces, scene.surfaces, links, patterns, probe.carrier_hz, turns, asked)
-    if key not in known:
-        known[key] = own_coefficients(scene.faces, links, upright, turns, search, surfaces=scene.surfaces)
-    slants = np.stack([array.slant_parts for _, array in arrays])[known[key].paths.tower]
-    gain = np.einsum("pab,au,pbv->puv", known[key].gain, probe.uav_array.slant_parts, slants)
-    return replace(known[key], gain=gain)  # type: ignore[no-any-return]
-
-
 def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
     """Return the link with two crossed elements at each array's centre, and the patterns that Sionna does not have.
 
-    The elements have the pattern and slant of the array's first element.
+    The elements have the pattern of the array's first element. The vertical and the horizontal element determine the
+    field of every slant.
     """
     unasked: list[str] = []
 
@@ -477,9 +463,7 @@ def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
         if first.name not in _SIONNA_PATTERNS:
             unasked.append(f"the antenna pattern '{first.name}' (Sionna is asked with isotropic elements)")
             first = Isotropic()
-        # two crossed elements contain all of the polarisation
-        slants = array.slant_rad[0] + np.array([0.0, np.pi / 2])
-        return Array(np.zeros((2, 3)), slants, (first,), array.mount)
+        return Array(np.zeros((2, 3)), np.array([0.0, np.pi / 2]), (first,), array.mount)
 
     towers = {name: centre(array) for name, array in link.tower_arrays.items()}
     return replace(link, tower_arrays=towers, uav_array=centre(link.uav_array), uav_transmits=False), tuple(

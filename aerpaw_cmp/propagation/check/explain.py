@@ -26,19 +26,18 @@ from ...common.units import (
     wavelength_m,
 )
 from ..field.fresnel import coefficients, face_table
-from ..field.geometry import Elements, geometry
-from ..field.sum import amplitudes, pattern_ends
+from ..field.sum import Elements, amplitudes, geometry, pattern_ends
 from ..geometry import Faces, Link, PathSet, Poses, Surfaces
 from ..replay import Replay
-from ..search.mirror import Occlusion, images_of, scene_tolerance_m, trace_back
+from ..search.mirror import Occlusion, retraced, scene_tolerance_m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bounce:
     """One reflection of a path.
 
-    ``te_db`` and ``tm_db`` are the magnitudes of its coefficients, ``loss_db`` is what it took; ``incidence_deg`` is
-    counted from the normal.
+    ``te_db`` and ``tm_db`` are the magnitudes of its coefficients, and ``loss_db`` is the loss of power.
+    ``incidence_deg`` is measured from the normal.
     """
 
     face: str
@@ -54,9 +53,10 @@ class Bounce:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExplainedPath:
-    """One path. Azimuths clockwise from north; ``arrival`` looks from the UAV towards where the wave comes from.
+    """One path with its geometry, losses and level.
 
-    ``level_dbm`` is the sum of ``terms_db`` and the transmit power; ``phase_deg`` that of the first element pair.
+    Azimuths are clockwise from north. ``arrival`` is the direction from the UAV to the last reflection or the tower.
+    ``level_dbm`` is the sum of ``terms_db`` and the transmit power. ``phase_deg`` is that of the first element pair.
     """
 
     depth: int
@@ -91,7 +91,7 @@ def explain_paths(
     link: Link,
     further_db: dict[str, FloatArray],
 ) -> tuple[ExplainedPath, ...]:
-    """The paths of one link, strongest first.
+    """Return the paths of one link, strongest first.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def explain_paths(
 
 
 def further_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link: Link) -> list[str]:
-    """Paths of further kinds of a replay of one link in words, strongest first, with their levels before foliage.
+    """Describe the paths of further kinds of one link, strongest first, with their levels before foliage.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def _explained(
     corners = np.concatenate([source_m[None], path.vertices_m[0, :depth], target_m[None]])
     legs = np.diff(corners, axis=0)
     lengths = np.linalg.norm(legs, axis=1)
-    # as seen from the UAV, towards where the wave comes from
+    # directions away from both ends
     departure, arrival = legs[0], -legs[-1]
     bounces = tuple(
         _bounce(faces, int(path.faces[0, i]), corners[i + 1], legs[i], link, terms[f"reflection {i + 1}"])
@@ -254,10 +254,9 @@ def why_not(
         return _why_not_there(surfaces, source_m, target_m, sequence)
     sequence = sequence[sequence >= 0]
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
-    images = images_of(faces, sequence[None], source_m[None])
     # on unbounded planes, so that the message can give the distance in metres by which a point misses its face
     planes = Faces(faces.normal, faces.offset_m, faces.material, faces.label)  # every face as an unbounded plane
-    points, ahead = trace_back(planes, sequence[None], images, target_m[None], tolerance)
+    points, ahead = retraced(planes, sequence[None], source_m[None], target_m[None], tolerance)
     if not ahead[0]:
         return "an end or an image lies behind a face: it has no reflection point"
     for step, face in enumerate(sequence):
@@ -313,7 +312,7 @@ def _outside_m(faces: Faces, face: int, point: FloatArray) -> float:
 
 
 def simple_paths(replay: Replay) -> list[tuple[str, IntArray]]:
-    """The paths one looks for first: line of sight and the reflection at each ground of the scene."""
+    """Return the simplest paths by name: the line of sight and the reflection at each ground of the scene."""
     # infinite planes only: planes of terrain are bounded and valid for one link
     grounds = np.flatnonzero((replay.faces.solid < 0) & np.isinf(replay.faces.lower).all(axis=1))
     return [

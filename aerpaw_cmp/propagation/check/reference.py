@@ -30,7 +30,7 @@ _Wave = tuple[complex, complex, complex]
 Pattern = Callable[[float, float], tuple[complex, complex]]
 
 C_MPS = 299_792_458.0
-# CODATA 2018, typed a second time as all constants of this file are.
+# CODATA 2018. All constants of this file are typed a second time.
 _EPS0 = 8.8541878128e-12
 
 # Paths that a change of the geometry by this much makes or breaks are not judged.
@@ -118,7 +118,7 @@ class ExpectedLoss:
 def layout_positions(
     layout: str, wavelength: float, elements: int = 4, positions_m: Sequence[Sequence[float]] | None = None
 ) -> tuple[Vector, ...]:
-    """Element positions of a layout of flight.yaml, in the device frame (x forward, y left, z up) [m].
+    """Return element positions of a layout of flight.yaml, in the device frame (x forward, y left, z up) [m].
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def layout_positions(
     -------
     tuple of (3,)
     """
-    # as written, in the order of the ports
+    # the positions are already in the order of the ports
     if layout == "custom":
         return tuple((float(p[0]), float(p[1]), float(p[2])) for p in positions_m or ())
     if layout == "tower_comparison":  # arXiv 2502.10324 VII-D: 60 mm, 1.68 m, 60 mm, the first port leftmost
@@ -184,14 +184,14 @@ def _times(m: Matrix, v: Vector) -> Vector:
 
 
 def product(a: Matrix, b: Matrix) -> Matrix:
-    """Matrix product."""
+    """Return the matrix product."""
     columns = [(b[0][k], b[1][k], b[2][k]) for k in range(3)]
     rows = [tuple(_dot(row, column) for column in columns) for row in a]
     return tuple(rows)  # type: ignore[return-value]
 
 
 def turned(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix:
-    """TR 38.901 (7.1-4): roll about x, then pitch about y, then yaw about z, each turning right about its axis."""
+    """Return the rotation of TR 38.901 (7.1-4): roll about x, pitch about y, yaw about z, all right-handed."""
     a, b, c = (math.radians(x) for x in (yaw_deg, pitch_deg, roll_deg))
     about_z: Matrix = ((math.cos(a), -math.sin(a), 0.0), (math.sin(a), math.cos(a), 0.0), (0.0, 0.0, 1.0))
     about_y: Matrix = ((math.cos(b), 0.0, math.sin(b)), (0.0, 1.0, 0.0), (-math.sin(b), 0.0, math.cos(b)))
@@ -209,7 +209,7 @@ def aircraft(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Matrix:
 
 
 def matrix_of(values: FloatArray) -> Matrix:
-    """A (3, 3) array as a Matrix."""
+    """Return a (3, 3) array as a Matrix."""
     return tuple(tuple(float(x) for x in row) for row in values)  # type: ignore[return-value]
 
 
@@ -248,7 +248,7 @@ class Mirror:
         return _dot(self.normal, p) - self.offset_m
 
     def mirrored(self, p: Vector) -> Vector:
-        """The image of a point."""
+        """Return the image of a point."""
         return _plus(p, self.normal, -2.0 * self.height(p))
 
     def box(self) -> tuple[Vector, Vector]:
@@ -277,7 +277,7 @@ class Mirror:
 
 
 def _edges(part: shapely.Polygon) -> Iterator[tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Edges of a footprint with the building to their left: outside round its rim, inside round a hole."""
+    """Yield the edges of a footprint in the direction in which the building is on their left."""
     for hole, ring in enumerate((part.exterior, *part.interiors)):
         points = list(ring.coords)
         for a, b in itertools.pairwise(points if ring.is_ccw is (hole == 0) else points[::-1]):
@@ -290,7 +290,7 @@ def _mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
     """Return the ground of the tower, then walls and roof of each building."""
     mirrors = [Mirror((0.0, 0.0, 1.0), tower.ground_m, site.ground_material)]
     for number, building in enumerate(site.buildings):
-        # as the replay's walls, so that planes and edges can be compared
+        # the same heights as in the replay, so that planes and edges can be compared
         foot, top = min(building.base_m, 0.0) - 0.5, building.base_m + building.height_m
         footprint = building.footprint if building.footprint.is_valid else shapely.make_valid(building.footprint)
         # repairing a ring that crosses itself may leave lines and points
@@ -337,7 +337,7 @@ class Blocks:
         """
         shadow = LineString([a[:2], b[:2]])
         for number, building in enumerate(self._site.buildings):
-            # a segment ends on its own wall: grown, that building would cut it always
+            # a segment ends on its own wall, and the enlarged building would always cut it
             grown = -MARGIN_M / 10 if number in spared else grow_m
             top = building.base_m + building.height_m + grown
             # a segment above the roof passes, regardless of what lies below
@@ -444,7 +444,7 @@ class Reference:
         return [tuple(self.mirrors[k] for k in row) for rows in near for row in rows.tolist()]
 
     def _from_source(self, max_depth: int, budget: int) -> list[_Chains] | None:
-        """Mirrors and images, by depth, of the sequences that the tower can begin, wherever the other end is."""
+        """Return mirrors and images, by depth, of the sequences that can begin at the tower, for any other end."""
         rows, images = np.zeros((1, 0), dtype=np.int64), np.array(self.source)[None, None]
         levels = [(rows, images)]
         for depth in range(max_depth):
@@ -485,7 +485,7 @@ class Reference:
         for step, mirror in enumerate(sequence):
             before, after = mirror.height(points[step]), mirror.height(points[step + 2])
             worst = min(worst, before + margin_m * (step == 0), after + margin_m * (step == last))
-        if worst >= -margin_m:  # the edges of faces are dearer to ask
+        if worst >= -margin_m:  # the distance from the edges of faces takes longer to compute
             worst = min([worst, *(m.margin(p) for m, p in zip(sequence, points[1:-1], strict=True))])
         if worst < -margin_m:
             return False
@@ -581,7 +581,10 @@ class Reference:
         return total + foliage_db(self.loss, depth, self.link.carrier_hz)
 
     def _rough_db(self, sequence: Sequence[Mirror], target: Vector) -> float:
-        """Ament's loss at the ground: the field falls by exp(-g / 2), g = (4 pi sigma sin(grazing) / lambda)^2."""
+        """Return Ament's loss at the ground [dB].
+
+        The field falls by exp(-g / 2), with g = (4 pi sigma sin(grazing) / lambda)^2.
+        """
         sigma = self.loss.ground_roughness_m
         if not sigma or not any(map(_is_ground, sequence)):
             return 0.0
@@ -599,7 +602,7 @@ class Reference:
     def matrix(
         self, paths: Sequence[tuple[Sequence[Mirror], float]], target: Vector, turn: Matrix
     ) -> tuple[ComplexArray, float]:
-        """H (uav elements, tower elements) of paths with their losses [dB], and the mean power of each added up."""
+        """Return H (uav elements, tower elements) of paths with losses [dB], and the sum of their mean powers."""
         uav, tower = len(self.link.uav.positions_m), len(self.link.towers[self.tower].positions_m)
         h = np.zeros((uav, tower), dtype=np.complex128)
         power = 0.0
@@ -708,7 +711,7 @@ def foliage_db(loss: ExpectedLoss, depth_m: float, carrier_hz: float) -> float:
 
 
 def _p833(mhz: float) -> tuple[float, float]:
-    """Specific attenuation and largest loss, straight lines in the logarithms between the pairs of P.833."""
+    """Return the specific attenuation and the largest loss, interpolated between the entries of P.833 in logarithms."""
     table = [
         (105.9, 0.04, 9.4), (466.475, 0.12, 18.0), (949.0, 0.17, 26.5), (1852.2, 0.30, 29.0), (2117.5, 0.34, 34.1),
     ]  # fmt: skip

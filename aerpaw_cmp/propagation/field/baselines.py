@@ -12,7 +12,7 @@ from .fresnel import reflection_coefficients
 def free_space_dbm(
     sources_m: FloatArray, targets_m: FloatArray, carrier_hz: float, transmit_power_dbm: float = 0.0
 ) -> FloatArray:
-    """Received power between isotropic antennas in empty space (Friis) [dBm].
+    """Return the received power between isotropic antennas in empty space (Friis) [dBm].
 
     Source: ITU-R P.525 eq. 4.
 
@@ -43,7 +43,7 @@ def two_ray_dbm(
     polarisation: str = "vertical",
     roughness_m: float = 0.0,
 ) -> FloatArray:
-    """Line of sight plus one reflection on a flat ground, isotropic antennas [dBm].
+    """Return the power of line of sight plus one reflection on a flat ground, isotropic antennas [dBm].
 
     Source: ITU-R P.2040-3 eq. 37.
 
@@ -60,7 +60,7 @@ def two_ray_dbm(
         this is the field along theta, which the reflection keeps.
     roughness_m : float
         Standard deviation of the ground's height: the specular ray falls by ``exp(-2 (k sigma sin(grazing))^2)``
-        (Ament, Proc. IRE 41 (1953), 142-146, doi:10.1109/JRPROC.1953.274171); infinite leaves free space.
+        (Ament, Proc. IRE 41 (1953), 142-146, doi:10.1109/JRPROC.1953.274171); an infinite roughness leaves free space.
 
     Returns
     -------

@@ -24,25 +24,18 @@ Rotation = tuple[Vector, Vector, Vector]
 
 
 def turned(m: Rotation, v: Vector) -> Vector:
-    """A site vector in device axes."""
-    return (
-        m[0][0] * v[0] + m[0][1] * v[1] + m[0][2] * v[2],
-        m[1][0] * v[0] + m[1][1] * v[1] + m[1][2] * v[2],
-        m[2][0] * v[0] + m[2][1] * v[1] + m[2][2] * v[2],
-    )
+    """Return a site vector in device axes."""
+    x, y, z = (row[0] * v[0] + row[1] * v[1] + row[2] * v[2] for row in m)
+    return x, y, z
 
 
 def turned_back(m: Rotation, v: Vector) -> Vector:
-    """A device vector in site axes."""
-    return (
-        m[0][0] * v[0] + m[1][0] * v[1] + m[2][0] * v[2],
-        m[0][1] * v[0] + m[1][1] * v[1] + m[2][1] * v[2],
-        m[0][2] * v[0] + m[1][2] * v[1] + m[2][2] * v[2],
-    )
+    """Return a device vector in site axes."""
+    return turned(((m[0][0], m[1][0], m[2][0]), (m[0][1], m[1][1], m[2][1]), (m[0][2], m[1][2], m[2][2])), v)
 
 
 def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector, axes: Rotation, uav_m: Vector) -> Any:
-    """Unit vector from the image of a tower element to a UAV element, and their distance [m].
+    """Return the unit vector from the image of a tower element to a UAV element, and their distance [m].
 
     Parameters
     ----------
@@ -58,10 +51,8 @@ def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector
     x, y, z, length
         Zero where the two meet.
     """
-    tower_offset, uav_offset = turned_back(frame, tower_m), turned_back(axes, uav_m)
-    x = place_m[0] + uav_offset[0] - (image_m[0] + tower_offset[0])
-    y = place_m[1] + uav_offset[1] - (image_m[1] + tower_offset[1])
-    z = place_m[2] + uav_offset[2] - (image_m[2] + tower_offset[2])
+    ends = zip(place_m, turned_back(axes, uav_m), image_m, turned_back(frame, tower_m), strict=True)
+    x, y, z = (place + uav - (image + tower) for place, uav, image, tower in ends)
     length = np.sqrt(x * x + y * y + z * z)
     # both branches are evaluated: the divisor must not be zero
     scale = np.where(length > 0.0, 1.0 / np.maximum(length, 1e-300), 0.0)
@@ -69,7 +60,7 @@ def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector
 
 
 def slant_rotation(e_theta: Number, e_phi: Number, cosine: Number, sine: Number) -> tuple[Number, Number]:
-    """Field of an element slanted from vertical: the pattern stays, its polarisation turns in the (theta, phi) basis.
+    """Return the field of an element slanted from vertical: only its polarisation in the (theta, phi) basis rotates.
 
     Source: 3GPP TR 38.901 section 7.3.2.
 
@@ -88,7 +79,7 @@ def slant_rotation(e_theta: Number, e_phi: Number, cosine: Number, sine: Number)
 
 
 def field_vector(m: Rotation, toward: Vector, e_theta: Number, e_phi: Number) -> Vector:
-    """Field ``e_theta theta + e_phi phi`` of a device with axes ``m``, radiated ``toward``, as a vector in site axes.
+    """Return the field ``e_theta theta + e_phi phi`` of a device with axes ``m`` as a vector in site axes.
 
     Sines and cosines of theta and phi are ratios of the direction's components; at a pole phi is 0.
 
@@ -145,7 +136,7 @@ def reflected(wave: Vector, toward: Vector, normal: Vector, te: Number, tm: Numb
 
 
 def spreading(cycles: Number) -> Number:
-    """Return ``lambda / (4 pi L)`` for a length in wavelengths, at most 1: no more arrives than was sent."""
+    """Return ``lambda / (4 pi L)`` for a length in wavelengths, at most 1: not more power arrives than was sent."""
     # where two elements coincide the length is zero: infinity becomes 1
     return np.minimum(1.0, 1.0 / (4.0 * np.pi * cycles))
 

@@ -10,18 +10,18 @@ centimetres, and crowns shade metres.
 For forests that are a medium, the loss is that through the canopy, over it and around it.
 
 A forest stand is a forest with a height: crowns from ``crown_base_m`` up to ``height_m`` over its area, trunks below. A
-segment of a path passes it by three components whose powers add up (ITU-R P.833-10 section 3.2): through the canopy, by
-the length inside it; over the top, with two knife edges where the ray enters and leaves; and around either side. Near
-the top, part of the Fresnel zone is in the canopy. The component through the canopy is then that of a ray lowered until
-the zone is below the top, and the detours only add the power that is missing. The level therefore has no step where a
-ray leaves the canopy.
+segment of a path passes it by three components whose powers add up (ITU-R P.833-10 section 3.2): through the canopy,
+over the top, and around either side. The loss through the canopy depends on the length inside it. The way over the top
+has two knife edges, where the ray enters and leaves. Near the top, part of the Fresnel zone is in the canopy. The
+component through the canopy is then that of a ray lowered until the zone is below the top, and the detours only add the
+power that is missing. The level therefore has no step where a ray leaves the canopy.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple, Protocol
 
@@ -53,16 +53,16 @@ class FoliageModel(Protocol):
     """A model that converts depth in foliage (...) [m] into loss (...) [dB]."""
 
     def loss_db(self, depth_m: FloatArray) -> FloatArray:
-        """Loss [dB], 0 at depth 0."""
+        """Return the loss [dB], which is 0 at depth 0."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class NoFoliage:
-    """Trees are not there."""
+    """A model without trees."""
 
     def loss_db(self, depth_m: FloatArray) -> FloatArray:
-        """Zero."""
+        """Return zero."""
         return np.zeros_like(np.asarray(depth_m, dtype=np.float64))
 
 
@@ -172,7 +172,7 @@ def foliage_model(
     gamma_db_per_m: float | None = None,
     maximum_db: float | None = None,
 ) -> FoliageModel:
-    """A model by the words of flight.yaml: ``none``, ``opaque``, ``attenuating`` (= ``p833``) or ``weissberger``.
+    """Return a model by its name in flight.yaml: ``none``, ``opaque``, ``attenuating`` (= ``p833``) or ``weissberger``.
 
     ``gamma_db_per_m`` and ``maximum_db`` replace the table's values in P.833.
 
@@ -284,17 +284,9 @@ _last_index: list[CrownIndex] = []
 
 def crown_index(trees: Trees) -> CrownIndex:
     """Return the spatial index of the cones of these trees. The last index is cached for repeated calls."""
-    index = next((item for item in _last_index if item.trees is trees or _same(item.trees, trees)), None)
-    if index is None:
-        index = CrownIndex(trees)
-        _last_index[:] = [index]
-    return index
-
-
-def _same(first: Trees, second: Trees) -> bool:
-    """Check whether two sets of trees are equal to the last digit."""
-    # compare values: each task of a campaign loads the site separately
-    return all(np.array_equal(getattr(first, of.name), getattr(second, of.name)) for of in fields(Trees))
+    if not _last_index or _last_index[0].trees is not trees:
+        _last_index[:] = [CrownIndex(trees)]
+    return _last_index[0]
 
 
 class CrownIndex:
@@ -331,13 +323,13 @@ class CrownIndex:
         return CrownIndex(stems, "cylinder")
 
     def _build_grid(self) -> None:
-        """Lists, per cell, the bodies within reach of any point of the cell (compressed rows)."""
+        """List, per cell, the bodies within reach of any point of the cell (compressed rows)."""
         centre, widest = self._bodies[:, :2], float(self._bodies[:, 4].max())
         # a piece is looked up by its middle, so half of it must be within reach
         reach = widest + _PIECE_M / 2
         low = centre.min(axis=0) - reach
         span = centre.max(axis=0) + reach - low
-        # a wood of square kilometres must not ask for more cells than memory holds
+        # limit the number of cells for woods of square kilometres, because of the memory
         self._cell_m = max(_CELL_M, math.sqrt(float(span.prod()) / _MAX_CELLS))
         self._low, self._shape2 = low, (span / self._cell_m).astype(np.int64) + 1
         home = ((centre - low) / self._cell_m).astype(np.int64)
@@ -369,8 +361,9 @@ class CrownIndex:
         total = np.zeros(len(start_m))
         if not len(self._bodies) or not len(start_m):
             return total
-        # most of a flight is above all trees: those parts are never looked up
-        first, last = self._within_heights(start_m, end_m)
+        # most of a flight is above all trees, and these parts are not looked up
+        low, high = self._bodies[:, 2].min(), self._bodies[:, 3].max()
+        first, last = slab(start_m[:, 2], end_m[:, 2] - start_m[:, 2], low, high)
         along = np.hypot(end_m[:, 0] - start_m[:, 0], end_m[:, 1] - start_m[:, 1])
         live = np.flatnonzero(last >= first)  # NaN compares false
         pieces = np.ceil((last - first)[live] * along[live] / _PIECE_M).clip(1).astype(np.int64)
@@ -385,11 +378,6 @@ class CrownIndex:
             total[some] = self._sum(start_m[some], end_m[some], first[some], last[some], pieces[begin:stop])
             begin = stop
         return total
-
-    def _within_heights(self, start_m: FloatArray, end_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the share of each segment (first, last) that lies between the lowest base and the highest top."""
-        low, high = self._bodies[:, 2].min(), self._bodies[:, 3].max()
-        return slab(start_m[:, 2], end_m[:, 2] - start_m[:, 2], low, high)
 
     def _sum(
         self, start: FloatArray, end: FloatArray, first: FloatArray, last: FloatArray, pieces: IntArray
@@ -410,7 +398,7 @@ class CrownIndex:
         square = step_east * step_east + step_north * step_north
         nearest = np.divide(east * step_east + north * step_north, square, out=low.copy(), where=square > 0)
         np.clip(nearest, low, last[owner], out=nearest)
-        # which piece that point lies in: others meet the crown too, and would count it twice
+        # the piece that contains that point: other pieces meet the crown, too, and would count it twice
         turn = np.divide(nearest - low, wide, out=np.zeros_like(low), where=wide > 0).astype(np.int64)
         east -= nearest * step_east
         north -= nearest * step_north
@@ -485,7 +473,7 @@ def _chord_share(start: FloatArray, move: FloatArray, bodies: FloatArray, shape:
 def _quadric_share(
     a: FloatArray, b: FloatArray, c: FloatArray, first: FloatArray, last: FloatArray, rise: FloatArray
 ) -> FloatArray:
-    """Length of {t in [first, last]: a t^2 + 2 b t + c <= 0}, for the part of a double cone below its apex."""
+    """Return the length of {t in [first, last]: a t^2 + 2 b t + c <= 0}, for a double cone only below its apex."""
     # a quarter of the usual discriminant, since the middle term is 2 b
     root2 = b * b - a * c
     # q avoids the cancellation of -b + sqrt(...); a = 0 (parallel to the cone's side) gives one root at infinity
@@ -620,7 +608,7 @@ class _Crossing:
         return self.stand.height_m
 
     def depth_m(self, lowered_m: FloatArray) -> FloatArray:
-        """Return the length (k,) in the canopy, what runs between trunks in part, of segments lowered by (k,) [m]."""
+        """Return the length (k,) in the canopy of segments lowered by (k,) [m]. That between trunks counts in part."""
         way = self.end - self.start
         up, rise = (self.start[:, 2] - lowered_m)[self.piece] - self.ground_m, way[self.piece, 2]
         base = self.height_m * self.stand.crown_base_fraction
@@ -729,7 +717,7 @@ def _between(share: FloatArray, up: FloatArray, rise: FloatArray, low: float, hi
 
 
 def _around(stand: Forest, start: FloatArray, end: FloatArray) -> Iterator[Profile]:
-    """Profiles of the ways around both sides of a stand."""
+    """Yield the profiles of the ways around both sides of a stand."""
     length = np.linalg.norm(end - start, axis=1)
     corner = shapely.get_coordinates(stand.area.convex_hull)[:, None]
     way = (end - start)[:, :2]

@@ -75,7 +75,7 @@ def coefficients(cosine: FloatArray, material: FaceMaterial) -> tuple[ComplexArr
 def reflection_coefficients(
     cos_theta: FloatArray, permittivity: ComplexArray, thickness_m: FloatArray, wavelength: float
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Reflection coefficients (TE, TM) of a half-space or a slab in air, as complex numbers.
+    """Return the reflection coefficients (TE, TM) of a half-space or a slab in air.
 
     Source: ITU-R P.2040-3 eq. 37; ITU-R P.2040-3 eq. 43.
 

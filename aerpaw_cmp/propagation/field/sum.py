@@ -1,15 +1,14 @@
 """The sum over paths: channel matrices in float64 for every pair of elements, and levels.
 
 For a pair (tower element ``t``, UAV element ``u``) and a path over the faces ``f1 .. fd``, the image of ``t``
-determines
-the length ``L`` and all directions. The entry of the channel matrix is::
+determines the length ``L`` and all directions. The entry of the channel matrix is::
 
     g_u . M_d ... M_1 . g_t   *   min(1, lambda / (4 pi L))   *   exp(-j 2 pi L / lambda)   *   10^(-loss / 20)
 
 Here ``g`` is the complex field of an element as a vector. ``M_k`` is the dyad of reflection ``k`` with the Fresnel
 coefficients of ITU-R P.2040 at this pair's angle (:mod:`dyads`, :mod:`fresnel`). The time factor is ``e^{+j omega t}``.
-The pattern of the receiving element is not conjugated (reciprocity), so swapping the ends of a link transposes H.
-Each path is evaluated alone and added in the order of the path set: results do not depend on chunks and threads.
+The pattern of the receiving element is not conjugated (reciprocity), so swapping the ends of a link transposes H. Each
+path is evaluated alone and added in the order of the path set: results do not depend on chunks and threads.
 """
 
 from __future__ import annotations
@@ -17,22 +16,176 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from ...common.errors import UsageError
 from ...common.units import AnyArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, db_from_power, wavelength_m
-from ..geometry import Array, Faces, Link, PathSet, Poses, Rows
+from ...site.antennas import Isotropic
+from ..geometry import Array, Faces, Link, PathSet, Pattern, Poses, Rows, sources_of
 from . import dyads
 from .fresnel import coefficients, face_table
-from .geometry import Elements, Ends, Geometry, directions, geometry, parts_of, pattern_fields, plain, rows_of
 
 # Element pairs that NumPy evaluates at once: their columns stay in the cache of a core.
 PAIRS_PER_CHUNK = 8_000
 
-# Paths per thread: a few milliseconds of work.
+# Paths that are evaluated together: this limits the memory and does not change a result.
 PATHS_PER_PART = 4096
+
+
+class Geometry(NamedTuple):
+    """Some paths, each in the space of its last image.
+
+    ``image_m`` (paths, 3) is the tower there, ``frame`` (paths, 3, 3) its device axes as rows, ``normal`` (paths, most,
+    3) those of the faces and ``face`` (paths, most, 3) the row of :func:`face_table` of each; ``place_m`` and
+    ``axes`` are the UAV's. ``depth`` and ``tower`` (paths,) are those of the path set.
+    """
+
+    image_m: FloatArray
+    frame: FloatArray
+    normal: FloatArray
+    face: FloatArray
+    depth: IntArray
+    tower: IntArray
+    place_m: FloatArray
+    axes: FloatArray
+
+    def some(self, rows: AnyArray | slice) -> Geometry:
+        """Return the paths of a mask, of indices or of a slice."""
+        return Geometry._make(column[rows] for column in self)
+
+
+class Elements(NamedTuple):
+    """Elements of both ends, spread over the pairs of a link: pair p joins UAV element p // ports and port p % ports.
+
+    Places (towers, 3, pairs) and (3, pairs) in the devices [m]; cosine and sine of the slants (towers, 2, pairs) and
+    (2, pairs).
+    """
+
+    tower_m: FloatArray
+    tower_slant: FloatArray
+    uav_m: FloatArray
+    uav_slant: FloatArray
+
+    @classmethod
+    def of(cls, link: Link) -> Elements:
+        """Return the elements of a link whose towers have the same number of ports."""
+        arrays, uav = list(link.tower_arrays.values()), link.uav_array
+        pair = np.arange(len(arrays[0]) * len(uav))
+        port, element = pair % len(arrays[0]), pair // len(arrays[0])
+        towers = [_columns(array, port) for array in arrays]
+        return cls(np.stack([t[0] for t in towers]), np.stack([t[1] for t in towers]), *_columns(uav, element))
+
+
+def _columns(array: Array, element: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return places (3, pairs) and slants (2, pairs) of chosen elements."""
+    return np.ascontiguousarray(array.positions_m[element].T), np.ascontiguousarray(array.slant_parts[:, element])
+
+
+# Pattern fields of tower and UAV; None for 1 along theta in all directions.
+Ends = tuple[ComplexArray | None, ComplexArray | None]
+
+
+def geometry(
+    paths: PathSet, faces: Faces, table: FloatArray, sources_m: FloatArray, poses: Poses, link: Link
+) -> Geometry:
+    """Return columns of some paths.
+
+    Parameters
+    ----------
+    paths : PathSet
+    faces : Faces
+    table : (faces + 1, 3)
+        Their materials: :func:`face_table`.
+    sources_m : (towers, 3) or (poses, towers, 3)
+        Centres of the tower arrays [m]; the latter for towers that move.
+    poses : Poses
+    link : Link
+
+    Returns
+    -------
+    Geometry
+    """
+    depth = int(paths.depth.max(initial=0))
+    sequence = paths.faces[:, :depth]
+    mounts = np.stack([array.mount.T for array in link.tower_arrays.values()])
+    image = sources_of(paths, sources_m)
+    frame = mounts[paths.tower]
+    normals = np.where((sequence >= 0)[..., None], faces.normal[sequence], 0.0)
+    for step in range(depth):
+        normal = normals[:, step]  # a zero normal means no face: the point is not mirrored
+        offset = np.where(sequence[:, step] >= 0, faces.offset_m[sequence[:, step]], 0.0)
+        image = image - 2.0 * ((image * normal).sum(axis=1) - offset)[:, None] * normal
+        # mirror earlier faces, too, because the last image sees their mirror images
+        for vectors in (frame, normals[:, :step]):
+            # in place, because frame and normals are copies
+            vectors -= 2.0 * np.einsum("nij,nj->ni", vectors, normal)[..., None] * normal[:, None, :]
+    # rotate only arrays of poses between the first and last of these paths
+    first, last = paths.pose.min(initial=len(poses)), paths.pose.max(initial=0)
+    axes = np.einsum("nij,jk->nki", poses.rotation[first : last + 1], link.uav_array.mount)
+    return Geometry(
+        image_m=image,
+        frame=frame,
+        normal=normals,
+        face=table[sequence],
+        depth=paths.depth,
+        tower=paths.tower,
+        place_m=poses.position_m[paths.pose],
+        axes=axes[paths.pose - first],
+    )
+
+
+def rows_of(matrix: FloatArray) -> dyads.Rotation:
+    """Return rotations (n, 3, 3) in the form that the formulas take, for broadcasting with (n, pairs)."""
+    return tuple(tuple(matrix[:, i, j, None] for j in range(3)) for i in range(3))  # type: ignore[return-value]
+
+
+def parts_of(vector: AnyArray) -> dyads.Vector:
+    """Return vectors (n, 3) in the form that the formulas take, for broadcasting with (n, pairs)."""
+    return vector[:, 0, None], vector[:, 1, None], vector[:, 2, None]
+
+
+def directions(g: Geometry, elements: Elements) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return unit vectors and lengths (paths, pairs) from the towers' images to the UAV."""
+    tower_m = elements.tower_m[g.tower]
+    ways = dyads.direction(
+        parts_of(g.image_m), rows_of(g.frame), (tower_m[:, 0], tower_m[:, 1], tower_m[:, 2]),
+        parts_of(g.place_m), rows_of(g.axes), tuple(elements.uav_m),  # type: ignore[arg-type]
+    )  # fmt: skip
+    return ways  # type: ignore[no-any-return]
+
+
+def pattern_fields(array: Array, element: IntArray, m: dyads.Rotation, toward: dyads.Vector) -> ComplexArray:
+    """Return E_theta and E_phi (paths, 2, pairs) of chosen elements ``toward`` site directions.
+
+    Parameters
+    ----------
+    array : Array
+    element : (pairs,) int
+    m : Rotation
+        Device axes as rows.
+    toward : Vector
+        Unit vectors (paths, pairs) away from the device.
+
+    Returns
+    -------
+    (paths, 2, pairs) complex
+    """
+    x, y, z = dyads.turned(m, toward)
+    theta, phi = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)  # arccos would lose half of the digits at the poles
+    fields = np.empty((len(theta), 2, theta.shape[1]), dtype=np.complex128)
+    patterns = array.patterns if len(array.patterns) > 1 else array.patterns * len(array)
+    # elements often share one pattern object: evaluate it once for all of them
+    for pattern in {id(p): p for p in patterns}.values():
+        pairs = np.flatnonzero([patterns[e] is pattern for e in element])
+        fields[:, 0, pairs], fields[:, 1, pairs] = pattern.field(theta[:, pairs], phi[:, pairs])
+    return fields
+
+
+def plain(patterns: tuple[Pattern, ...]) -> bool:
+    """Check whether every pattern is 1 along theta in all directions. Subclasses of Isotropic are excluded."""
+    return all(type(pattern) is Isotropic for pattern in patterns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +220,13 @@ class Further(Rows):
     missing: ClassVar[str]
 
     def lines(self) -> PathSet:
-        """The same polylines without faces: what terrain, foliage and drawings ask for."""
+        """Return the same polylines without faces, for terrain, foliage and drawings."""
         raise NotImplementedError
 
     def fields(
         self, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
     ) -> Fields:
-        """Return the part of the paths in H and in the powers, as :func:`channel_matrices` gives it.
+        """Return the part of the paths in H and in the powers, as :func:`channel_matrices` does.
 
         Parameters
         ----------
@@ -155,7 +308,7 @@ def channel_matrices(
         If the towers' arrays have different numbers of elements, or an array has patterns for some elements only.
     """
     arrays = list(link.tower_arrays.values())
-    ports, uavs = _ports(arrays), len(link.uav_array)
+    _check_ports(arrays)
     _check_patterns([*arrays, link.uav_array])
     elements, wavelength = Elements.of(link), wavelength_m(link.carrier_hz)
     table, key = face_table(faces, link.carrier_hz), paths.pose * len(arrays) + paths.tower
@@ -169,20 +322,52 @@ def channel_matrices(
         return replace(sorted_fields, path_power=power)
     if paths.terrain_db.any():
         loss_db = paths.terrain_db if loss_db is None else loss_db + paths.terrain_db
-    h = np.zeros((len(poses) * len(arrays), ports * uavs), dtype=np.complex128)
-    power = np.zeros(len(paths))
-    for part in parts_between_poses(paths.pose):
+
+    def evaluated(part: slice) -> ComplexArray:
         columns = geometry(paths.select(part), faces, table, sources_m, poses, link)
-        amplitude = amplitudes(columns, elements, pattern_ends(columns, elements, link), wavelength)
+        return amplitudes(columns, elements, pattern_ends(columns, elements, link), wavelength)
+
+    return summed(evaluated, paths, len(poses), link, loss_db)
+
+
+def summed(
+    evaluated: Callable[[slice], ComplexArray], paths: Rows, poses: int, link: Link, loss_db: FloatArray | None
+) -> Fields:
+    """Return the sums of the amplitudes of paths.
+
+    Parameters
+    ----------
+    evaluated : callable
+        Returns the amplitudes (paths, pairs) of a part of the paths.
+    paths : Rows
+        Sorted by pose and tower.
+    poses : int
+        Number of poses.
+    link : Link
+    loss_db : (paths,) or None
+        Further loss of each path.
+
+    Returns
+    -------
+    Fields
+    """
+    arrays = list(link.tower_arrays.values())
+    key, ends = paths.pose * len(arrays) + paths.tower, (len(link.uav_array), len(arrays[0]))
+    h = np.zeros((poses * len(arrays), ends[0] * ends[1]), dtype=np.complex128)
+    power = np.zeros(len(key))
+    for part in parts_between_poses(paths.pose):
+        amplitude = evaluated(part)
         if loss_db is not None:
             amplitude *= amplitude_from_db(-loss_db[part])[:, None]
         power[part] = (np.abs(amplitude) ** 2).mean(axis=1)
         first = np.flatnonzero(np.diff(key[part], prepend=-1))
+        # a part ends between poses, so no link is written twice
         h[key[part][first]] = np.add.reduceat(amplitude, first, axis=0)
-    matrices = h.reshape(len(poses), len(arrays), uavs, ports)
+    matrices = h.reshape(poses, len(arrays), *ends)
+    # H is (receiver, transmitter): reciprocity makes the other direction its transpose
     matrices = np.ascontiguousarray(matrices.swapaxes(2, 3)) if link.uav_transmits else matrices
-    summed = np.bincount(key, weights=power, minlength=len(h)).astype(np.float64)
-    return Fields(matrices, power, summed.reshape(len(poses), len(arrays)))
+    total = np.bincount(key, weights=power, minlength=len(h)).astype(np.float64)
+    return Fields(matrices, power, total.reshape(poses, len(arrays)))
 
 
 def amplitudes(
@@ -304,18 +489,17 @@ def _check_patterns(arrays: Sequence[Array]) -> None:
             )
 
 
-def _ports(arrays: Sequence[Array]) -> int:
+def _check_ports(arrays: Sequence[Array]) -> None:
     counts = {len(array) for array in arrays}
     if len(counts) != 1:
         raise UsageError(
             f"tower arrays of {sorted(counts)} elements",
             expected="the same number of elements at every tower of a link",
         )
-    return counts.pop()
 
 
 def parts_between_poses(pose: IntArray, most: int = PATHS_PER_PART) -> list[slice]:
-    """Return runs of some ``most`` paths that end between poses (paths,): threads must not share a link."""
+    """Return runs of some ``most`` paths that end between poses (paths,): no link is in two runs."""
     edges = [0]
     while edges[-1] < len(pose):
         stop = min(edges[-1] + most, len(pose))
@@ -328,9 +512,8 @@ def parts_between_poses(pose: IntArray, most: int = PATHS_PER_PART) -> list[slic
 def rss_dbm(power: FloatArray, transmit_power_dbm: float, noise_floor_dbm: float = -np.inf) -> FloatArray:
     """Return the received power [dBm]. NaN if ``power`` is zero (no path) or the level is below the noise floor [dBm].
 
-    ``power`` is the mean over element pairs of ``|h|^2``: the transmit power is shared equally by the transmitting
-    ports, which send independent signals, and the received power is the mean over the receiving ports. With one
-    element at both ends it is ``|h|^2``.
+    ``power`` is the mean over element pairs of ``|h|^2``. The transmitting ports share the transmit power equally and
+    send independent signals. The received power is the mean over the receiving ports.
     """
     level = transmit_power_dbm + db_from_power(power)
     return np.asarray(np.where((power > 0.0) & (level >= noise_floor_dbm), level, np.nan))

@@ -1,8 +1,8 @@
 """Search of every specular path among thousands of faces: compiled, with sequences grown along beams.
 
 The source is mirrored at a first face. The beam from that image through the face's outline meets the tree of faces. The
-faces that it meets are second faces, and so on. At each step the receivers, which have a separate tree, are cut by all
-side planes of the beam: those of the last face and the mirrored planes of earlier faces. For the remaining receivers
+faces that it meets are second faces, and so on. At each step, the side planes of the beam (those of the last
+face and the mirrored planes of earlier faces) select receivers from a separate tree. For the remaining receivers
 the search computes the reflection points, whether each lies in its face, and whether a triangle cuts a segment. All
 cuts are conservative, so the paths do not depend on them. Pairs are streamed: memory does not grow with their number.
 
@@ -15,6 +15,7 @@ in :mod:`aerpaw_cmp.propagation.search.mirror`, so both searches find the same p
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -28,7 +29,7 @@ from ..compiled import kernel, part
 from ..geometry import BoxTree, Faces, Links, PathSet, Surfaces, corners, triangles
 from ..options import Run
 from .merging import DEEPEST, WINDOW, box_outside, box_tree, next_leaf, within_planes
-from .mirror import Occlusion, images_of, merge, planes_of, scene_tolerance_m, searched_links, trace_back
+from .mirror import Occlusion, merge, planes_of, retraced, scene_tolerance_m, searched_links
 
 # Closer to a plane than this [m] is on it.
 SIDE_M = 1e-6
@@ -170,10 +171,10 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
         return paths
     plane = np.append(surfaces.plane, -1)[paths.faces]
     key = np.column_stack([paths.pose, paths.tower, paths.depth, plane])
-    # the first of each: paths are sorted, so the choice does not depend on threads
+    # keep the first of each, which does not depend on threads, because paths are sorted
     _, first = np.unique(key, axis=0, return_index=True)
     paths = paths.select(np.sort(first))
-    # near coincidence: neighbours in a grid of twice the tolerance, asked pairwise within a link
+    # compare the remaining paths of each link in pairs
     order = np.lexsort((paths.depth, paths.tower, paths.pose))
     link = np.column_stack([paths.pose, paths.tower, paths.depth])[order]
     starts = np.flatnonzero(np.append(True, (link[1:] != link[:-1]).any(axis=1)))
@@ -353,9 +354,9 @@ def _share_to(corners, a, way, length, margin):  # type: ignore[no-untyped-def]
 
 @part
 def _at_end(mirror, hit, distance, rules):  # type: ignore[no-untyped-def]
-    """Check whether a triangle is met too near an end to cut: in the mirror's plane, or at the antenna."""
+    """Check whether a triangle is too near an end to cut: in the plane of its mirror, or at its antenna."""
     normal, offset = mirror
-    # zeros stand for an antenna: a record for either kind would be counted in and out
+    # a normal of zeros means an antenna
     if normal[0] == 0.0 and normal[1] == 0.0 and normal[2] == 0.0:
         return distance <= _END_M
     return abs(normal[0] * hit[0] + normal[1] * hit[1] + normal[2] * hit[2] - offset) <= rules.clearance
@@ -409,7 +410,7 @@ def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
 
 @kernel
 def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
-    """Check whether one plane has the whole outline outside."""
+    """Check whether the outline is completely outside one plane."""
     for p in range(many):
         a, b, c, d = planes[p, 0], planes[p, 1], planes[p, 2], planes[p, 3]
         out = True
@@ -512,7 +513,7 @@ def _hidden(mirrors, solids, chain, source, points, target, rules):  # type: ign
 
 @kernel
 def _doubled(pose, faces, points):  # type: ignore[no-untyped-def]
-    """Rows with room for as many more."""
+    """Return arrays with twice the number of rows."""
     many, depth = faces.shape
     # double the size: the number of paths is unknown, and a list would need the interpreter
     pose2, points2 = np.empty(2 * many, np.int64), np.zeros((2 * many, depth, 3))
@@ -523,9 +524,9 @@ def _doubled(pose, faces, points):  # type: ignore[no-untyped-def]
 
 @kernel
 def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[no-untyped-def]
-    """All paths whose first face is one of ``firsts``: a walk, depth first, along beams.
+    """Return all paths whose first face is one of ``firsts``, by a walk along beams, depth first.
 
-    One body: a record handed to a part is counted in and out array by array, which costs as much as following a face.
+    It is one long function, because numba counts references to every array of a record that is passed to another one.
     """
     normal, offset, along, across, window, plane, usable, first, flat = mirrors
     shapes = normal, offset, along, across, first, flat
@@ -570,7 +571,7 @@ def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[
         mine, number = planes[level], 1
         mine[0, 0], mine[0, 1], mine[0, 2] = sign * n0, sign * n1, sign * n2
         mine[0, 3] = -sign * offset[f] + SIDE_M
-        # plane 0 of the level before is the face itself: nothing behind it is lost, and it is not a side of the beam
+        # skip plane 0 of the level before, which is the face itself and not a side of the beam
         for p in range(1, many[level - 1] if level > 0 else 1):
             b0, b1, b2 = planes[level - 1, p, 0], planes[level - 1, p, 1], planes[level - 1, p, 2]
             twice = 2.0 * (b0 * n0 + b1 * n1 + b2 * n2)
@@ -620,12 +621,12 @@ def obstacle(surfaces: Surfaces, points_m: FloatArray, sequence: IntArray) -> in
 
 
 def try_out() -> None:
-    """Compile, or read what was compiled before, and ask whether a triangle hides one of two points.
+    """Compile, or read the compiled code, and test whether a triangle hides one of two points.
 
     Raises
     ------
     RuntimeError
-        If it hides anything else.
+        If the result is wrong.
     """
     triangle = np.array([[[5.0, -9.0, -9.0], [5.0, 9.0, -9.0], [5.0, 0.0, 9.0]]])
     tree = box_tree(triangle.min(axis=1), triangle.max(axis=1))
@@ -667,19 +668,11 @@ def find_paths(
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m if extent_m is None else extent_m)
     # select too many candidates rather than too few
     paths = grow_paths(solid_surfaces(faces, sources_m, targets_m), links, run, max_depth=max_depth, solids=True)
-    hiding = Occlusion(faces, tolerance_m)
-    pieces = []
-    # one depth at a time, because tracing back requires sequences of one length
-    for depth in range(max_depth + 1):
-        some = paths.select(paths.depth == depth)
-        source, target = sources_m[some.tower], targets_m[some.pose]
-        sequence = some.faces[:, :depth]
-        vertices, good = trace_back(faces, sequence, images_of(faces, sequence, source), target, tolerance_m)
-        rows = np.flatnonzero(good)
-        rows = rows[~hiding.any_segment(source[rows], vertices[rows], target[rows])]
-        some.vertices_m[:, :depth] = vertices
-        pieces.append(some.select(rows))
-    return merge(pieces, max_depth, faces)
+    source, target = sources_m[paths.tower], targets_m[paths.pose]
+    vertices, good = retraced(faces, paths.faces, source, target, tolerance_m)
+    rows = np.flatnonzero(good)
+    rows = rows[~Occlusion(faces, tolerance_m).any_segment(source[rows], vertices[rows], target[rows])]
+    return merge([replace(paths, vertices_m=vertices).select(rows)], max_depth, faces)
 
 
 def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -> Surfaces:
@@ -689,7 +682,7 @@ def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -
     reach = REACH * float(max(1.0, *finite, *(np.abs(p).max(initial=0.0) for p in (known, sources_m))))
     vertices, triangle, owner = triangles(faces, reach)
     points = vertices[triangle]
-    # a bounding quadrilateral may be larger than a roof without right angles: the beam then keeps more
+    # a bounding quadrilateral may be larger than a roof without right angles, and then the beam keeps more
     outline = corners(faces, reach)
     axes = np.stack([faces.along[owner], faces.across[owner]], axis=1)
     flat = np.einsum("tki,tai->tka", points, axes)

@@ -3,10 +3,8 @@
 Triangles of one shape that share an edge and lie within a given tolerance of one plane are one face. Faces that touch
 or overlap in one plane share that plane, regardless of their shape. A reflection there is therefore one reflection.
 
-The module also contains a tree of boxes over triangles, faces or points, compiled, and its queries.
-
-Nodes are columns: bounds, the first of two children (or -1), and for leaves their items. Every answer of the
-tree is conservative. The decisive tests are computed on the items themselves, in float64.
+The module also contains a compiled tree of boxes over triangles, faces or points, and its queries. Every query is
+conservative: the tests that decide are computed on the items themselves, in float64.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ DEEPEST = 64
 
 
 def box_tree(lower: FloatArray, upper: FloatArray, leaf: int = 4) -> BoxTree:
-    """Tree over boxes (n, 3), halved at the median of their middles along the longest side.
+    """Build a tree over boxes (n, 3), halved at the median of their middles along the longest side.
 
     Parameters
     ----------
@@ -158,7 +156,7 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
 
 @part
 def next_leaf(lower, upper, child, todo, waiting, segment):  # type: ignore[no-untyped-def]
-    """Walk on to the next leaf whose box a segment meets.
+    """Find the next leaf whose box a segment meets.
 
     Parameters
     ----------
@@ -311,7 +309,7 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
 
 
 def _labels(shapes: tuple[str, ...], of_face: IntArray) -> tuple[str, ...]:
-    """``shape face 3``: faces counted within their shape."""
+    """Return labels such as ``shape face 3``, with faces counted within their shape."""
     counts: dict[int, int] = {}
     labels = []
     for shape in of_face.tolist():
@@ -321,7 +319,7 @@ def _labels(shapes: tuple[str, ...], of_face: IntArray) -> tuple[str, ...]:
 
 
 def _planes(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Unit normals, offsets and areas of triangles (n, 3, 3)."""
+    """Return unit normals, offsets and areas of triangles (n, 3, 3)."""
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(across, axis=1)
     normal = across / np.where(size > 0.0, size, 1.0)[:, None]
@@ -410,7 +408,7 @@ def _lie_in(corners, first, after, plane, merge_m):  # type: ignore[no-untyped-d
 
 @kernel
 def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type: ignore[no-untyped-def]
-    """Face whose plane each face takes: that of a larger one that it touches and lies in, or its own."""
+    """Return the face whose plane each face gets: a larger face that it touches and lies in, or itself."""
     (normal, offset), (low, high) = planes, bounds
     plane = np.arange(len(normal))
     near, todo = np.empty(len(normal), np.int64), np.empty(DEEPEST, np.int64)

@@ -6,11 +6,11 @@ For a sequence of faces ``f1 .. fd`` the source is mirrored face by face. A path
 2. going back from the target, each line to the current image meets its face inside the polygon;
 3. no segment is cut by a solid.
 
-A sequence is followed only while the beam from the image through its last face can still reach the next one.
-Sides are decided with a tolerance relative to the size of the scene, far above the rounding of a reflection point.
-A solid hides with its open inside (:mod:`aerpaw_cmp.propagation.search.mirror`), so a path along a wall stays, and
-there is no crack between two walls. An end that lies on a face reflects there like one a hair before it: nothing jumps
-when a UAV lands.
+A sequence is followed only while the beam from the image through its last face can still reach the next one. Sides are
+decided with a tolerance relative to the size of the scene, far above the rounding of a reflection point. A solid hides
+with its open inside (:mod:`aerpaw_cmp.propagation.search.mirror`), so a path along a wall stays, and there is no crack
+between two walls. An end that lies on a face reflects there like an end just in front of it, so nothing jumps when a
+UAV lands.
 
 Segments are occluded by buildings if the open segment meets the open solid.
 
@@ -39,7 +39,7 @@ from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..geometry import Faces, Links, PathSet, corners, inside, legs
 from ..options import Progress
 
-# Segment-solid pairs looked at at once.
+# Pairs of a segment and a solid that are tested together.
 PAIRS_PER_CHUNK = 1_000_000
 
 # Radius, in tolerances, within which a point of a seam must be surrounded by buildings; shorter seams hide nothing.
@@ -54,15 +54,15 @@ _AROUND = np.column_stack([np.cos(_ROUND), np.sin(_ROUND), np.zeros(16)])
 
 
 class Occlusion:
-    """Answers whether segments are cut by the solids of a scene.
+    """A test whether segments are cut by the solids of a scene.
 
     Parameters
     ----------
     faces : Faces
-        Faces with ``solid >= 0`` are roofs and walls of prisms; the ground does not hide: nothing that is traced lies
-        below it.
+        Faces with ``solid >= 0`` are roofs and walls of prisms. The ground does not hide, because all paths are above
+        it.
     tolerance_m : float
-        Deeper than this inside a solid a segment is cut.
+        A segment is cut if it runs deeper than this inside a solid.
     """
 
     def __init__(self, faces: Faces, tolerance_m: float) -> None:
@@ -100,8 +100,10 @@ class Occlusion:
         return cut
 
     def _cut(self, start: FloatArray, end: FloatArray) -> BoolArray:
-        # from coarse to fine: all segments at once, then each box separately, then the planes of a piece
-        solids = self._solids_near(start, end)
+        # from coarse to fine: the box of all segments, then each segment and box, then the planes of a piece
+        ends = np.concatenate([start, end])
+        near_all = (self.high >= np.fmin.reduce(ends)) & (self.low <= np.fmax.reduce(ends))
+        solids = np.flatnonzero(near_all.all(axis=1))
         near = self._boxes(start, end, solids)
         result = np.zeros(len(start), dtype=np.bool_)
         # most segments touch nothing, so seams are examined after all pieces
@@ -133,17 +135,6 @@ class Occlusion:
                 mine = order[first[index] : first[index + 1]]
                 result[index] = self._surrounded(start[index], end[index], enter[mine], leave[mine], pieces[mine])
         return result
-
-    def _solids_near(self, start: FloatArray, end: FloatArray) -> IntArray:
-        """Solids whose boxes meet the box of all segments, and from above also that turned to their mean direction."""
-        # links to one tower have similar directions, so a rotated box around them is thin
-        east, north = np.nansum((end - start)[:, :2], axis=0)
-        axes = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [east, north, 0], [-north, east, 0]])
-        ends = np.concatenate([start, end]) @ axes.T
-        middle = (self.low + self.high) / 2 @ axes.T
-        reach = (self.high - self.low) / 2 @ np.abs(axes).T + 1e-6 * np.abs(axes).sum(axis=1)
-        good = (middle + reach >= np.fmin.reduce(ends)) & (middle - reach <= np.fmax.reduce(ends))
-        return np.flatnonzero(good.all(axis=1))
 
     def _boxes(self, start: FloatArray, end: FloatArray, solids: IntArray) -> BoolArray:
         """Check whether segments meet bounding boxes: slab test, (segments, solids)."""
@@ -213,7 +204,7 @@ def _by_solid(faces: Faces) -> tuple[IntArray, IntArray]:
 def _prisms(
     faces: Faces, rows: IntArray, starts: IntArray
 ) -> tuple[IntArray, list[Polygon], list[tuple[FloatArray, FloatArray]]]:
-    """Convex pieces of all solids: the number of the solid, the footprint, and the planes of each.
+    """Return the convex pieces of all solids: number of the solid, footprint and planes of each.
 
     ``rows`` are the faces of solids, one solid after another from ``starts`` on.
     """
@@ -235,7 +226,7 @@ def _prisms(
 
 
 def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:
-    """The roofs (roofs,) seen from above, as polygons in site coordinates."""
+    """Return the roofs (roofs,) seen from above, as polygons in site coordinates."""
     low, high = faces.lower[roofs], faces.upper[roofs]
     polygons = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
     for place, roof in enumerate(roofs.tolist()):
@@ -332,7 +323,7 @@ def find_paths(
     extent_m: FloatArray | None = None,
     progress: Progress | None = None,
 ) -> PathSet:
-    """All paths with at most ``max_depth`` reflections.
+    """Find all paths with at most ``max_depth`` reflections.
 
     Parameters
     ----------
@@ -361,7 +352,7 @@ def find_paths(
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
     sources_m, targets_m, usable = links.sources_m, links.targets_m, links.usable
-    # a part of a flight has the tolerance of the whole, or its paths might differ
+    # a part of a flight needs the tolerance of the complete flight to find the same paths
     known = targets_m[np.isfinite(targets_m).all(axis=1)] if extent_m is None else extent_m
     tolerance_m = scene_tolerance_m(faces, sources_m, known)
     hiding = Occlusion(faces, tolerance_m)
@@ -392,7 +383,7 @@ def searched_links(links: Links) -> BoolArray:
 
 
 def scene_tolerance_m(faces: Faces, *points_m: FloatArray) -> float:
-    """Absolute tolerance [m] of side tests in this scene."""
+    """Return the absolute tolerance [m] of side tests in this scene."""
     sizes = [np.abs(p).max(initial=0.0, where=np.isfinite(p)) for p in (*points_m, faces.lower, faces.upper)]
     return RELATIVE_TOLERANCE * max(1.0, *(float(s) for s in sizes))
 
@@ -468,7 +459,7 @@ class _Growth:
         )
 
     def sequences(self, source: FloatArray, usable: BoolArray, targets_m: FloatArray) -> list[Sequences]:
-        """Sequences from the line of sight on that geometry does not rule out for all targets, by their lengths."""
+        """Return the sequences, by length, that may lead to a target, from the line of sight on."""
         level = Sequences(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
         levels, left = [level], self.budget - 1
         for _ in range(self.max_depth):
@@ -486,7 +477,7 @@ class _Growth:
         return [levels[0], *(self._reaching(level, lit, hull) for level in levels[1:])]
 
     def _one_face_longer(self, level: Sequences, source: FloatArray, usable: BoolArray, left: int) -> Sequences:
-        """Sequences one face longer, at most ``left`` of them."""
+        """Return the sequences that are one face longer, at most ``left`` of them."""
         faces, box, depth = self.faces, self.bounds, level.faces.shape[1]
         grown: list[IntArray] = []
         images: list[FloatArray] = []
@@ -522,7 +513,7 @@ class _Growth:
         return Sequences(np.concatenate(grown), np.concatenate(images))
 
     def _reaching(self, level: Sequences, lit: BoolArray, hull_m: tuple[FloatArray, FloatArray]) -> Sequences:
-        """Sequences whose last face is ``lit`` by a target, with a beam through it that reaches their box.
+        """Return the sequences whose last face is ``lit`` by a target, and whose beam reaches the box of the targets.
 
         ``hull_m`` (1, 3), (1, 3, 3) is the centre of that box, and half of each of its sides.
         """
@@ -549,7 +540,7 @@ class Mirrors:
         self._growth = _Growth.of(faces, extent_m, REACH_SLACK_M, max_depth=1, budget=len(faces) + 1)
 
     def toward(self, source_m: FloatArray, box_m: FloatArray) -> IntArray:
-        """Every face of a path from a source (3,) over one face into a box (lowest and highest corner, 3)."""
+        """Return every face of a path from a source (3,) over one face into a box (lowest and highest corner, 3)."""
         points = np.array(np.meshgrid(*box_m.T)).reshape(3, -1).T
         levels = self._growth.sequences(source_m, np.ones(len(self._growth.faces), np.bool_), points)
         return levels[1].faces[:, 0] if len(levels) > 1 else np.zeros(0, np.int64)
@@ -613,7 +604,7 @@ def _paths_of_level(
                 )
             else:
                 row, column = np.zeros(len(some), np.int64), np.arange(len(some))
-            # use take, because an index in brackets needs four times as long for rows of three
+            # take needs a quarter of the time of an index in brackets for rows of three
             sequence, images, pose = level.faces[part].take(row, 0), level.images_m[part].take(row, 0), some[column]
             # after the cheap test of the last face, which few pairs pass
             vertices, good = trace_back(faces, sequence, images, targets.take(pose, 0), hiding.tolerance_m)
@@ -627,7 +618,7 @@ def _paths_of_level(
 def _meets_last_face(
     faces: Faces, sequence: IntArray, image: FloatArray, targets: FloatArray, tolerance_m: float
 ) -> tuple[IntArray, IntArray]:
-    """(sequence, target) pairs whose line from the last image meets the bounds of the last face.
+    """Return the pairs (sequence, target) whose line from the last image meets the bounds of the last face.
 
     The in-plane coordinates of the meeting point are linear in those of the target, which are shared by all
     sequences that end on the face.
@@ -716,7 +707,7 @@ def trace_back(
     tolerance_m: float,
     edge_m: float | None = None,
 ) -> tuple[FloatArray, BoolArray]:
-    """Reflection points of sequences, from the target back to the source.
+    """Return the reflection points of sequences, computed from the target back to the source.
 
     Source: arXiv 2502.10324 eq. 4.
 
@@ -758,6 +749,42 @@ def trace_back(
     return vertices, good
 
 
+def retraced(
+    faces: Faces,
+    sequence: IntArray,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    tolerance_m: float,
+    edge_m: float | None = None,
+) -> tuple[FloatArray, BoolArray]:
+    """Return the reflection points of sequences of any length, and which of them make a path without obstacles.
+
+    Parameters
+    ----------
+    faces : Faces
+    sequence : (paths, most) int
+        Faces from the source on, -1 where unused.
+    sources_m, targets_m : (paths, 3)
+        Ends [m].
+    tolerance_m, edge_m : float
+        The same as in :func:`trace_back`.
+
+    Returns
+    -------
+    vertices_m : (paths, most, 3)
+        NaN where unused.
+    good : (paths,) bool
+    """
+    depth, vertices = (sequence >= 0).sum(axis=1), np.full((*sequence.shape, 3), np.nan)
+    good = np.zeros(len(sequence), dtype=np.bool_)
+    for length in np.unique(depth):
+        some = np.flatnonzero(depth == length)
+        mirrors = sequence[some, :length]
+        images = images_of(faces, mirrors, sources_m[some])
+        vertices[some, :length], good[some] = trace_back(faces, mirrors, images, targets_m[some], tolerance_m, edge_m)
+    return vertices, good
+
+
 def images_of(faces: Faces, sequence: IntArray, sources_m: FloatArray) -> FloatArray:
     """Return images (paths, depth, 3) of the sources (paths, 3) at the faces of ``sequence`` (paths, depth)."""
     images = np.zeros((*sequence.shape, 3))
@@ -771,7 +798,7 @@ def images_of(faces: Faces, sequence: IntArray, sources_m: FloatArray) -> FloatA
 
 
 def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet:
-    """One sorted set of several.
+    """Join sets of paths into one sorted set.
 
     Parameters
     ----------
@@ -832,9 +859,9 @@ def planes_of(faces: Faces) -> IntArray:
 
 
 def plane_keys(paths: PathSet, planes: IntArray) -> list[tuple[int, ...]]:
-    """(pose, tower, planes) of each path, ``planes`` (faces,) being the number of each face's: equal for the same path.
+    """Return a key (pose, tower, planes) of each path, which is equal for the same path. ``planes`` has shape (faces,).
 
-    The padding is left out: two sets may have different depths.
+    Keys do not contain unused entries, because two sets may have different depths.
     """
     rows = np.column_stack([paths.pose, paths.tower, np.append(planes, -1)[paths.faces]])
     # tuples, to be keys of sets

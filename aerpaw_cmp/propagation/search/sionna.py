@@ -11,7 +11,7 @@ Guards against silent behaviour of Sionna RT 2.2.0:
   that limit is below the number of receivers. Its own count of candidates is read after each batch. A batch that
   exceeded the limit, or filled too much of the table, is searched again with more room.
 - Positions given as numbers recompile kernels. They are arrays here, and each batch has the same size (the last is
-padded).
+  padded).
 - A line of sight must have Friis' amplitude, and no path may have a gain above one, or the run stops.
 """
 
@@ -36,25 +36,17 @@ from ...site.materials import material
 from ..geometry import Faces, Link, Links, PathSet, Surfaces, inside, path_lengths, triangles
 from ..llvm import INSTALL_AGAIN, SionnaMissingError, let_sionna_load, prepare_llvm
 from ..options import Progress, Search
-from .mirror import (
-    MINIMUM_LENGTH_M,
-    images_of,
-    merge,
-    planes_of,
-    scene_tolerance_m,
-    searched_links,
-    trace_back,
-)
+from .mirror import MINIMUM_LENGTH_M, merge, planes_of, retraced, scene_tolerance_m, searched_links
 
 SPECULAR_TABLE_SLOTS = 2**24
 _FEWEST_SLOTS = 2**20
 # Initial number of candidates per tower and batch: the actual number is known only afterwards.
 MAXIMUM_PATHS = 2**16
 
-# Room beyond which a batch is refused (some 100 bytes each).
+# Number of candidates above which a batch is refused (some 100 bytes each).
 _MOST_CANDIDATES = 2**25
 
-# Share of the table that candidates may fill: two hashes are asked, so about twice this share is lost.
+# Share of the table that candidates may fill. Each has two hashes, so about twice this share is lost.
 _FULLEST_TABLE = 1 / 32
 
 # Slots of the table, over all towers of a call (two tables of 4 bytes each).
@@ -84,7 +76,7 @@ def load_variant(prefer: str | None = None) -> str:
     UsageError
         If Dr.Jit finds no device of that kind.
     SionnaMissingError
-        If Sionna RT or a package that it needs is not installed, or no LLVM serves.
+        If Sionna RT or a package that it needs is not installed, or no LLVM works.
     """
     try:
         return _variant(("cuda", "llvm") if prefer is None else (prefer,))
@@ -97,7 +89,7 @@ def _missing(error: ImportError) -> SionnaMissingError:
 
 
 def _variant(kinds: Sequence[str]) -> str:
-    """The first of the kinds that serves, now in use."""
+    """Set the first of the kinds of variants that works, and return its name."""
     let_sionna_load()
     without_llvm: SionnaMissingError | None = None
     if "llvm" in kinds:
@@ -129,7 +121,7 @@ def _variant(kinds: Sequence[str]) -> str:
 
 
 def free_memory() -> None:
-    """Give back what Dr.Jit keeps for further searches, if it was ever loaded."""
+    """Free the memory that Dr.Jit keeps for further searches, if it was loaded."""
     if "drjit" in sys.modules:
         sys.modules["drjit"].flush_malloc_cache()
 
@@ -147,7 +139,7 @@ def engine_versions() -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class _Scene:
-    """A Sionna scene with the way back from its triangles to faces."""
+    """A Sionna scene, and the face of each of its triangles."""
 
     scene: Any
     face_of: dict[int, IntArray]  # object id -> face of each triangle
@@ -155,9 +147,9 @@ class _Scene:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Builder:
-    """Scenes of some of the faces: one mesh per material.
+    """A builder of Sionna scenes from some of the faces, with one mesh per material.
 
-    ``own_table`` takes Sionna's own constants of P.2040.
+    With ``own_table`` a scene has Sionna's own constants of P.2040.
     """
 
     faces: Faces
@@ -214,7 +206,7 @@ class _Builder:
 
 
 def _plain(name: str) -> str:
-    """A name that Mitsuba takes."""
+    """Return a name that Mitsuba accepts."""
     return re.sub(r"[^a-z0-9_]+", "-", name)
 
 
@@ -269,17 +261,17 @@ class _Ends:
         return cls(centres_m, np.tile(np.eye(3), (len(centres_m), 1, 1)))
 
     def arguments(self) -> tuple[Any, Any, Any]:
-        """Positions, orientations and element offsets."""
+        """Return positions, orientations and element offsets."""
         return _points(self.centres_m), _points(_euler(self.turns)), _points(np.zeros_like(self.centres_m))
 
     def padded(self, count: int) -> _Ends:
-        """The last device repeated until there are ``count``."""
+        """Repeat the last device until there are ``count``."""
         rows = np.minimum(np.arange(count), len(self.centres_m) - 1)
         return _Ends(self.centres_m[rows], self.turns[rows])
 
 
 def _euler(turns: FloatArray) -> FloatArray:
-    """(yaw, pitch, roll) of rotations, TR 38.901 eq. (7.1-4)."""
+    """Return (yaw, pitch, roll) of rotations, TR 38.901 eq. (7.1-4)."""
     yaw = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
     pitch = -np.arcsin(np.clip(turns[:, 2, 0], -1.0, 1.0))
     roll = np.arctan2(turns[:, 2, 1], turns[:, 2, 2])
@@ -386,7 +378,7 @@ class _Finder:
         self.built, self.solver = None, None  # type: ignore[assignment]
 
     def trace(self, targets: _Ends, search: Search) -> Any:
-        """Sionna's paths of one batch, padded, searched until there was room for all."""
+        """Search Sionna's paths of one padded batch, with more room until all candidates fit."""
         self.targets = targets.padded(self.batch).arguments()
         paths = self._solved(search)
         # lines of sight do not need a table
@@ -434,7 +426,7 @@ class _Finder:
         return True
 
     def searched(self, targets_m: FloatArray, search: Search) -> dict[str, Any]:
-        """Sionna's paths of one batch, of the real (not padding) targets: valid, kind, shape, primitive, gain."""
+        """Return Sionna's paths of one batch, without padding: valid, kind, shape, primitive, gain."""
         count = len(targets_m)
         paths = self.trace(_Ends.points(targets_m), search)
         real, imaginary = (np.asarray(part.numpy()) for part in paths.a)
@@ -462,9 +454,9 @@ def _arrays(paths: Any, count: int) -> dict[str, Any]:
 def _each_batch(
     make: Callable[[IntArray, IntArray], _Finder], groups: Iterable[tuple[IntArray, IntArray]], alive: BoolArray
 ) -> Iterator[tuple[_Finder, IntArray, IntArray]]:
-    """Finder, towers and poses of every batch of links that are ``alive`` (towers, poses).
+    """Yield finder, towers and poses of every batch of links that are ``alive`` (towers, poses).
 
-    One scene is alive at a time: ``make(towers, faces)`` of a group of towers that share one.
+    Only one scene exists at a time: that of ``make(towers, faces)`` for a group of towers that share it.
     """
     for towers, chosen in groups:
         poses = np.flatnonzero(alive[towers].any(axis=0))
@@ -536,7 +528,7 @@ def find_paths(
 
 @dataclass(frozen=True, slots=True)
 class Coefficients:
-    """Paths as Sionna itself has them, nothing refined.
+    """Paths and coefficients of Sionna without refinement.
 
     Parameters
     ----------
@@ -562,7 +554,7 @@ def own_coefficients(
     *,
     surfaces: Surfaces | None = None,
 ) -> Coefficients:
-    """Sionna's complex coefficient of each path, for the audit of the field.
+    """Return Sionna's complex coefficient of each path, for the audit of the field.
 
     Sionna supplies its constants of P.2040, rotations, patterns, slants, Fresnel coefficients and spreading. Only the
     carrier phase is computed here from the path length in float64, since Sionna would form ``2 pi f tau`` in float32.
@@ -631,7 +623,7 @@ def _raw_paths(
 
 
 def _groups(faces: Faces, sources_m: FloatArray, usable: BoolArray | None) -> Iterator[tuple[IntArray, IntArray]]:
-    """(towers, faces) that can share a scene: those that see the same ground."""
+    """Yield (towers, faces) that can share a scene, because they see the same ground."""
     if usable is None:
         yield np.arange(len(sources_m)), np.arange(len(faces))
         return
@@ -642,7 +634,7 @@ def _groups(faces: Faces, sources_m: FloatArray, usable: BoolArray | None) -> It
 
 
 def _check_gain(raw: dict[str, Any], sources_m: FloatArray, targets_m: FloatArray, carrier_hz: float) -> None:
-    """Line of sight equals Friis, and no path gains."""
+    """Check that a line of sight has the amplitude of Friis, and that no path gains power."""
     kind, valid = raw["kind"], raw["valid"]
     direct = valid & (kind == 0).all(axis=0)
     receiver, tower, _ = np.nonzero(direct)
@@ -659,7 +651,7 @@ def _check_gain(raw: dict[str, Any], sources_m: FloatArray, targets_m: FloatArra
 def _sequences(
     raw: dict[str, Any], face_of: dict[int, IntArray], max_depth: int
 ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """(receiver, tower, path) in Sionna's arrays, and faces, of the valid paths made of reflections only."""
+    """Return (receiver, tower, path) in Sionna's arrays, and the faces, of valid paths with reflections only."""
     receiver, tower, path = np.nonzero(raw["valid"])
     sequence = np.full((len(receiver), max_depth), -1, dtype=np.int64)
     good = np.ones(len(receiver), dtype=np.bool_)
@@ -691,42 +683,37 @@ def _refine(
     # rays that differ by rounding report one path several times
     rows = np.unique(rows, axis=0) if len(rows) else rows
     pose, tower, sequence = rows[:, 0], rows[:, 1], rows[:, 2:]
-    depth = (sequence >= 0).sum(axis=1)
-    vertices = np.full((*sequence.shape, 3), np.nan)
-    good = np.linalg.norm(targets_m[pose] - sources_m[tower], axis=1) >= MINIMUM_LENGTH_M
-    for number in np.unique(depth[depth > 0]):
-        some = np.flatnonzero(depth == number)
-        if surfaces is not None:
-            from .beams import reflection_points
+    depth, sources, targets = (sequence >= 0).sum(axis=1), sources_m[tower], targets_m[pose]
+    good = np.linalg.norm(targets - sources, axis=1) >= MINIMUM_LENGTH_M
+    if surfaces is None:
+        sequence = _relocate(faces, sources, targets, sequence, tolerance_m)
+        vertices, fits = retraced(faces, sequence, sources, targets, tolerance_m, _EDGE_TOLERANCE_M)
+        good &= fits
+    else:
+        from .beams import reflection_points
 
-            ends = (sources_m[tower[some]], targets_m[pose[some]])
+        vertices = np.full((*sequence.shape, 3), np.nan)
+        for number in np.unique(depth[depth > 0]):
+            some = np.flatnonzero(depth == number)
             sequence[some, :number], vertices[some, :number], fits = reflection_points(
-                surfaces, sequence[some, :number], *ends, edge_m=_EDGE_TOLERANCE_M
+                surfaces, sequence[some, :number], sources[some], targets[some], edge_m=_EDGE_TOLERANCE_M
             )
             good[some] &= fits
-            continue
-        part = _relocate(faces, sources_m[tower[some]], targets_m[pose[some]], sequence[some, :number], tolerance_m)
-        sequence[some, :number] = part
-        images = images_of(faces, part, sources_m[tower[some]])
-        vertices[some, :number], fits = trace_back(
-            faces, part, images, targets_m[pose[some]], tolerance_m, _EDGE_TOLERANCE_M
-        )
-        good[some] &= fits
     return PathSet(pose[good], tower[good], depth[good], sequence[good], vertices[good])
 
 
 def _relocate(
     faces: Faces, sources_m: FloatArray, targets_m: FloatArray, sequence: IntArray, tolerance_m: float
 ) -> IntArray:
-    """Each face replaced by the coplanar one that holds the reflection point: Sionna reports any of a plane."""
+    """Replace each face by the coplanar one that contains the reflection point: Sionna reports any of a plane."""
     plane = planes_of(faces)
     if len(np.unique(plane)) == len(plane) or not len(sequence):
         return sequence
-    everywhere = trace_back(faces, sequence, images_of(faces, sequence, sources_m), targets_m, tolerance_m, np.inf)[0]
-    result = sequence.copy()
+    everywhere, result = retraced(faces, sequence, sources_m, targets_m, tolerance_m, np.inf)[0], sequence.copy()
     for step in range(sequence.shape[1]):
+        used = np.flatnonzero(sequence[:, step] >= 0)
         # only if the face that Sionna named does not contain the point
-        outside = np.flatnonzero(~inside(faces, sequence[:, step], everywhere[:, step], _EDGE_TOLERANCE_M))
+        outside = used[~inside(faces, sequence[used, step], everywhere[used, step], _EDGE_TOLERANCE_M)]
         for row in outside:  # few: only scenes with disjoint coplanar faces
             twins = np.flatnonzero(plane == plane[sequence[row, step]])
             point = np.tile(everywhere[row, step], (len(twins), 1))
@@ -734,4 +721,4 @@ def _relocate(
             if len(holding):
                 # any face is correct: merge() keeps one of overlapping coplanar faces
                 result[row, step] = holding[-1]
-    return np.asarray(result)
+    return result

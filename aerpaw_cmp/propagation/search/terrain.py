@@ -19,7 +19,7 @@ import numpy as np
 from ...common.units import BoolArray, FloatArray, IntArray
 from ...site.relief import Dem
 from ..geometry import Faces, Links, PathSet, joined, legs
-from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, Occlusion, images_of, searched_links, trace_back
+from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, Occlusion, retraced, searched_links
 
 # ``solid`` of the tangent planes of the terrain; that of a tower's level ground is -1.
 TERRAIN = -2
@@ -64,8 +64,8 @@ def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_
     faces : Faces
     links : Links
     paths : PathSet
-        Over level ground, at most ``paths.faces.shape[1]`` reflections. Those over the ground and a wall are followed
-        where they exist on level ground too.
+        Paths over level ground, at most ``paths.faces.shape[1]`` reflections. A path over the ground and a wall is only
+        searched if it exists on level ground, too.
     wavelength_m : float
 
     Returns
@@ -106,7 +106,7 @@ def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_
 
 @dataclass(frozen=True, slots=True)
 class _Candidates:
-    """Sequences (n, depth) of faces with the ground plane of the tower once, and the engine's path of each or -1."""
+    """Sequences (n, depth) of faces with the ground plane of the tower once, and the row of the engine's path or -1."""
 
     pose: IntArray
     tower: IntArray
@@ -115,7 +115,7 @@ class _Candidates:
     plane: IntArray
 
     def followed(self, dem: Dem, faces: Faces, links: Links, wavelength_m: float) -> tuple[IntArray, PathSet, Faces]:
-        """Rows of the engine that hold as they are, paths over tangent planes, and all faces."""
+        """Return the rows of the engine that stay valid, paths over tangent planes, and all faces."""
         source, target = links.sources_m[self.tower], links.targets_m[self.pose]
         slot = (self.sequence == self.plane[self.tower][:, None]).argmax(axis=1)
         where, place, normal, part = specular_points(
@@ -146,22 +146,18 @@ class _Candidates:
 
     def _traced(self, faces: Faces, where: IntArray, sequence: IntArray, links: Links, loss_db: FloatArray) -> PathSet:
         """Return paths over the planes in order, sorted by pose and tower, without a test for obstacles."""
-        depth, vertices = (sequence >= 0).sum(axis=1), np.full((*sequence.shape, 3), np.nan)
-        good = np.zeros(len(where), dtype=np.bool_)
+        pose, tower = self.pose[where], self.tower[where]
         tolerance = RELATIVE_TOLERANCE * max(float(np.abs(links.sources_m).max(initial=1.0)), 1.0)
-        for deep in np.unique(depth):
-            some = np.flatnonzero(depth == deep)
-            source, target = links.sources_m[self.tower[where[some]]], links.targets_m[self.pose[where[some]]]
-            images = images_of(faces, sequence[some, :deep], source)
-            vertices[some, :deep], good[some] = trace_back(faces, sequence[some, :deep], images, target, tolerance)
-        paths = PathSet(self.pose[where], self.tower[where], depth, sequence, vertices, terrain_db=loss_db).select(good)
+        vertices, good = retraced(faces, sequence, links.sources_m[tower], links.targets_m[pose], tolerance)
+        depth = (sequence >= 0).sum(axis=1)
+        paths = PathSet(pose, tower, depth, sequence, vertices, terrain_db=loss_db).select(good)
         return paths.select(np.lexsort((paths.tower, paths.pose)))
 
 
 def _ends_seen_from(
     faces: Faces, sequence: IntArray, slot: IntArray, source: FloatArray, target: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Both ends as the ground at ``slot`` sees them: mirrored at the faces between."""
+    """Return both ends mirrored at the faces between them and the ground at ``slot``."""
     # from the tower up to the ground's place, and from the UAV back to it
     steps = range(sequence.shape[1])
     for end, order, side in ((source, steps, -1), (target, reversed(steps), 1)):
@@ -173,10 +169,10 @@ def _ends_seen_from(
 
 
 def _clear(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: float) -> BoolArray:
-    """Paths with one reflection off the ground of which the terrain stops no leg.
+    """Check which paths with one reflection off the ground have no leg that the terrain stops.
 
-    Ground that rises less into a leg than the height of Rayleigh's criterion at the bounce, and than the radius of the
-    Fresnel zone, is roughness and stops nothing.
+    Ground is roughness and does not stop a path if it rises into a leg by less than the height of Rayleigh's criterion
+    at the reflection, and by less than the radius of the Fresnel zone.
     """
     source, target = links.sources_m[paths.tower], links.targets_m[paths.pose]
     points, row = paths.vertices_m, np.arange(len(paths))
@@ -197,7 +193,7 @@ def _clear(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: f
 def specular_points(
     dem: Dem, source_m: FloatArray, target_m: FloatArray, wavelength_m: float
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Specular points of the ground between pairs of ends.
+    """Find the specular points of the ground between pairs of ends.
 
     Parameters
     ----------
@@ -312,7 +308,7 @@ def _zone_m(along: FloatArray, at: FloatArray, excess_m: FloatArray, wavelength_
 def _settled(
     dem: Dem, source: FloatArray, target: FloatArray, along: FloatArray, crease: BoolArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Points and normals of mirrors that begin on the profile, and whether both ends are above their planes."""
+    """Move mirrors from the profile to the surface: points, normals, and whether both ends are above their planes."""
     way = target[:, :2] - source[:, :2]
     way = way / np.maximum(np.hypot(*way.T), 1e-12)[:, None]
     begin = source[:, :2] + along[:, None] * way

@@ -19,9 +19,9 @@ from ..common.text import counted
 from ..site.antennas import read_gain_grid
 from ..site.footprints import site_yaml
 from ..site.materials import CONSTANT, material
-from ..site.mitsuba import TriangleScene
+from ..site.mitsuba import Mesh, TriangleScene
 from ..site.pattern_files import exported, read_cut_files, read_pattern_file
-from ..site.scenes import GROUND_SHARE, Mesh, bounds, ground_share, placed_scene, site_meshes
+from ..site.scenes import GROUND_SHARE, bounds, ground_share, placed_scene, site_meshes
 from ..site.site import Site
 from ..site.siteyaml import SceneModel, SiteModel, build_site, inputs_of_site, load_site, site_model
 from .options import JobOutcome

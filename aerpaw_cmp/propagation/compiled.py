@@ -77,8 +77,9 @@ def code_folder() -> Path | None:
         folder = base / f"kernels-{_source_hash()}"
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            status = folder.stat()
             # other users could leave code for us to run in a folder that they can write to
-            if not _is_private(folder.stat()):
+            if hasattr(os, "geteuid") and (status.st_uid != os.geteuid() or status.st_mode & 0o022):
                 continue
             # only a trial is reliable: rights, quotas and read-only mounts cannot be distinguished otherwise
             with tempfile.TemporaryFile(dir=folder):
@@ -86,11 +87,6 @@ def code_folder() -> Path | None:
         except OSError:
             continue
     return None
-
-
-def _is_private(status: os.stat_result) -> bool:
-    """Check whether only this user can write to a folder, because its contents will be executed."""
-    return not hasattr(os, "geteuid") or (status.st_uid == os.geteuid() and not status.st_mode & 0o022)
 
 
 def why_missing() -> str:

@@ -200,6 +200,9 @@ def by_beams(scene: Scene, search: Search) -> bool:
 # Raised whenever the entries or the search change.
 LAYOUT = 4
 
+# Columns of an entry. The terrain changes paths after the search.
+_STORED = ("pose", "tower", "depth", "faces", "vertices_m")
+
 # Written after the entry, before the SHA-256 of all preceding bytes.
 _SEAL = b"AERPAWCP"
 
@@ -272,17 +275,10 @@ class PathCache:
             return None
         # never pickled: an entry of a shared folder must not run code
         with np.load(io.BytesIO(entry), allow_pickle=False) as columns:
-            paths = PathSet(
-                pose=columns["pose"], tower=columns["tower"], depth=columns["depth"], faces=columns["faces"],
-                vertices_m=columns["vertices_m"],
-            )  # fmt: skip
-            return paths, float(columns["seconds"])
+            return PathSet(**{name: columns[name] for name in _STORED}), float(columns["seconds"])
 
     def save(self, key: str, paths: PathSet, seconds: float) -> None:
         """Write an entry atomically."""
-        entry = io.BytesIO()
-        np.savez(
-            entry, seconds=np.float64(seconds), pose=paths.pose, tower=paths.tower, depth=paths.depth,
-            faces=paths.faces, vertices_m=paths.vertices_m,
-        )  # fmt: skip
+        entry, columns = io.BytesIO(), {name: getattr(paths, name) for name in _STORED}
+        np.savez(entry, seconds=np.float64(seconds), **columns)
         write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)

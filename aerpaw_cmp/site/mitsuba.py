@@ -17,7 +17,7 @@ import hashlib
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,6 +46,10 @@ _TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
+
+
+# Vertices (n, 3) [m] and triangles (m, 3).
+Mesh = tuple[FloatArray, IntArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +247,13 @@ def _fans(polygons: list[IntArray], vertices: FloatArray) -> tuple[IntArray, int
     return (np.concatenate(triangles) if triangles else np.zeros((0, 3), dtype=np.int64)), bent
 
 
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """Return the vertices and triangles of several meshes as one mesh."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
+    triangles = [faces + start for (_, faces), start in zip(meshes, starts, strict=False)]
+    return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(triangles)
+
+
 # Thickness of a slab without a stated one, as in Sionna RT.
 _DEFAULT_THICKNESS_M = 0.1
 
@@ -337,13 +348,13 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
     if not parts:
         raise InputError("the scene has no triangle", expected="shapes of type ply")
     meshes = [part.mesh for part in parts]
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    vertices, triangles = joined([(mesh.vertices, mesh.triangles) for mesh in meshes])
     if bent := sum(mesh.bent for mesh in meshes):
         notes.append(f"{bent} polygons are not flat: they were cut into triangles from their first corner")
     notes += [f"warning: {counted(n, 'shape')} of type '{kind}' left out; read is ply" for kind, n in skipped.items()]
     return TriangleScene(
-        vertices_m=np.concatenate([mesh.vertices for mesh in meshes]),
-        triangles=np.concatenate([mesh.triangles + start for mesh, start in zip(meshes, starts, strict=False)]),
+        vertices_m=vertices,
+        triangles=triangles,
         shape=np.repeat(np.arange(len(parts)), [len(mesh.triangles) for mesh in meshes]),
         shapes=tuple(part.name for part in parts),
         materials=tuple(part.material for part in parts),

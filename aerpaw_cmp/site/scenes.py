@@ -19,9 +19,9 @@ from shapely.geometry import Polygon
 
 from ..common.errors import UsageError
 from ..common.text import counted
-from ..common.units import FloatArray, IntArray
+from ..common.units import FloatArray
 from .materials import CROWN, material
-from .mitsuba import TriangleScene, read_scene
+from .mitsuba import Mesh, TriangleScene, joined, read_scene
 from .site import Building, Forest, Site
 
 # Depth of walls below the base of a building.
@@ -29,10 +29,6 @@ WALL_DEPTH_M = 0.5
 
 # Margin of the ground around the area, so that no reflection misses it.
 _GROUND_MARGIN_M = 3000.0
-
-
-# Vertices (n, 3) [m] and triangles (m, 3).
-Mesh = tuple[FloatArray, IntArray]
 
 
 def building_mesh(building: Building) -> Mesh:
@@ -100,13 +96,7 @@ def site_meshes(site: Site) -> dict[str, Mesh]:
         pieces[material(site.ground_material).name] = [ground]
     for building in site.buildings:
         pieces.setdefault(material(building.material).name, []).append(building_mesh(building))
-    return {name: _joined(parts) for name, parts in pieces.items()}
-
-
-def _joined(parts: list[Mesh]) -> Mesh:
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    triangles = [faces + start for (_, faces), start in zip(parts, starts, strict=False)]
-    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(triangles)
+    return {name: joined(parts) for name, parts in pieces.items()}
 
 
 # Size of an added ground plane beyond the scene, in sizes of the scene.
@@ -198,11 +188,12 @@ def added(
     -------
     TriangleScene
     """
+    vertices, triangles = joined([(scene.vertices_m, scene.triangles), (vertices_m, triangles)])
     return replace(
         scene,
-        vertices_m=np.concatenate([scene.vertices_m, vertices_m]),
-        triangles=np.concatenate([scene.triangles, triangles + len(scene.vertices_m)]),
-        shape=np.concatenate([scene.shape, np.full(len(triangles), len(scene.shapes))]),
+        vertices_m=vertices,
+        triangles=triangles,
+        shape=np.append(scene.shape, np.full(len(triangles) - len(scene), len(scene.shapes))),
         shapes=(*scene.shapes, name),
         materials=(*scene.materials, of_material),
     )

@@ -234,22 +234,19 @@ class _Projection:
         scale = 1e-20 * float((self.y**2).sum())
         # Bayesian information criterion with a penalty for two more coefficients
         gain = n * np.log((cost_single + scale) / (cost + scale)) - 2 * np.log(n)
-        reasons = []
-        if gain <= 0:
-            reasons.append("one exponential fits as well")
-        if min(abs(c1), abs(c3)) < 1e-3 * max(abs(c1), abs(c3), 1e-300):
-            reasons.append("one of the two exponentials has no amplitude")
-        # rates within 5 % are one exponential in two parts
-        if log_rates[0] - log_rates[1] < 0.05:
-            reasons.append("both exponentials decay at the same rate")
-        if log_rates[0] > self.log_rates[1] - 1e-3:
-            reasons.append("the faster decay ends before the first distance, so its rate cannot be determined")
-        if -c4 * self.d.max() < 1e-3 or log_rates[1] < self.log_rates[0] + 1e-3:
-            reasons.append("the slower decay does not show within the largest distance")
+        reasons = {
+            "one exponential fits as well": gain <= 0,
+            "one of the two exponentials has no amplitude": min(c1, c3) <= 1e-3 * max(c1, c3),
+            # rates within 5 % are one exponential in two parts
+            "both exponentials decay at the same rate": log_rates[0] - log_rates[1] < 0.05,
+            "the faster decay ends before the first distance, so its rate cannot be determined":
+                log_rates[0] > self.log_rates[1] - 1e-3,
+            "the slower decay does not show within the largest distance":
+                -c4 * self.d.max() < 1e-3 or log_rates[1] < self.log_rates[0] + 1e-3,
+        }  # fmt: skip
+        found = [text for text, applies in reasons.items() if applies]
         rmse = float(np.sqrt(cost / n))
-        return BiExponential(
-            c1=c1, c2=c2, c3=c3, c4=c4, rmse=rmse, degenerate=bool(reasons), message="; ".join(reasons)
-        )
+        return BiExponential(c1=c1, c2=c2, c3=c3, c4=c4, rmse=rmse, degenerate=bool(found), message="; ".join(found))
 
 
 def _candidate_amplitudes(basis: FloatArray, target: FloatArray) -> FloatArray:
@@ -521,14 +518,11 @@ class _PairwisePearson:
 
 def _mean_product(scaled: FloatArray, present: BoolArray) -> Block:
     """Return the mean product of standardised fields that both positions have."""
-    known, complete = present.astype(np.float64), bool(present.all())
+    known = present.astype(np.float64)
 
     def of(rows: IntArray, columns: IntArray) -> FloatArray:
-        product = scaled[rows] @ scaled[columns].T
-        if complete and scaled.shape[1]:
-            return np.asarray(product / scaled.shape[1])
         common = known[rows] @ known[columns].T
-        return np.where(common > 0, product / np.maximum(common, 1.0), np.nan)
+        return np.where(common > 0, scaled[rows] @ scaled[columns].T / np.maximum(common, 1.0), np.nan)
 
     return of
 

@@ -206,47 +206,24 @@ def seconds_since(time: AnyArray, start: np.datetime64) -> FloatArray:
     return np.asarray((np.asarray(time) - start) / np.timedelta64(1, "s"), dtype=np.float64)
 
 
+# Steps between ticks of a time of day [s], and the largest number of ticks.
 _CLOCK_STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
-
-
-def _clock_ticks(low_s: float, high_s: float, start: np.datetime64, most: int = 9) -> tuple[FloatArray, list[str]]:
-    """Return ticks at round times of day.
-
-    Parameters
-    ----------
-    low_s, high_s : float
-        Ends of the axis, seconds after ``start``.
-    start : datetime64
-        Zero of the axis (UTC).
-    most : int
-        Approximate largest number of ticks.
-
-    Returns
-    -------
-    tuple of (n,) and list of str
-        Seconds after ``start``, and the times.
-
-    Examples
-    --------
-    >>> _clock_ticks(0.0, 200.0, np.datetime64("2025-06-01T14:00:13.5"))[1]
-    ['14:00:30', '14:01:00', '14:01:30', '14:02:00', '14:02:30', '14:03:00', '14:03:30']
-    """
-    step = next((s for s in _CLOCK_STEPS_S if (high_s - low_s) / s <= most), _CLOCK_STEPS_S[-1])
-    begun = float((start - start.astype("datetime64[D]")) / np.timedelta64(1, "s"))
-    ticks = np.arange(np.ceil((low_s + begun) / step), np.floor((high_s + begun) / step) + 1) * step
-    pattern = slice(11, 19 if step < 60 else 16)
-    day = start.astype("datetime64[D]").astype("datetime64[s]")
-    return ticks - begun, [str(day + np.timedelta64(int(tick), "s"))[pattern] for tick in ticks]
+_MOST_TICKS = 9
 
 
 def time_axis(ax: Axes, start: np.datetime64) -> None:
-    """Set label and ticks of an axis in seconds after ``start``. Ticks are times of day if the logs have UTC."""
+    """Set label and ticks of an axis in seconds after ``start``. Ticks are round times of day if the logs have UTC."""
     if not has_wall_clock(start):
         ax.set_xlabel("Time after the first sample [s]")
         return
     ax.set_xlabel(f"Time of day, {str(start)[:10]} (UTC)")
     low, high = ax.get_xlim()
-    ax.set_xticks(*_clock_ticks(low, high, start))
+    step = next((s for s in _CLOCK_STEPS_S if (high - low) / s <= _MOST_TICKS), _CLOCK_STEPS_S[-1])
+    day = start.astype("datetime64[D]").astype("datetime64[s]")
+    begun = float((start - day) / np.timedelta64(1, "s"))
+    seconds = np.arange(np.ceil((low + begun) / step), np.floor((high + begun) / step) + 1) * step
+    pattern = slice(11, 19 if step < 60 else 16)
+    ax.set_xticks(seconds - begun, [str(day + np.timedelta64(int(tick), "s"))[pattern] for tick in seconds])
     ax.set_xlim(low, high)
 
 

@@ -138,19 +138,14 @@ def _costs(models: Sequence[ModelRow]) -> dict[str, Any]:
     return {"x": {"label": "Computing time [s]"}, "y": {"label": "RMSE on held-out areas [dB]"}, "marks": marks}
 
 
-def _time_axis(start: np.datetime64 | None) -> dict[str, str]:
-    """Return the abscissa in seconds after ``start``. Without ``start`` the log has relative times."""
-    begun = "" if start is None else str(start.astype("datetime64[ms]"))
-    return {"label": "" if begun else "Time after the first sample [s]", "start": begun}
-
-
 def flown(data: ReportData) -> list[Chart]:
     """Return measured and simulated levels of every channel of a flight over time, for the page of a map."""
     start, caption = start_of(data), "Ray tracing is drawn less the offset of the channel."
-    known = start if has_wall_clock(start) else None
+    clock = {"label": "", "start": str(start.astype("datetime64[ms]"))}
+    axis = clock if has_wall_clock(start) else {"label": "Time after the first sample [s]", "start": ""}
     return [
         Chart(section="flights", title=f"{data.flight}, {panel.name}", caption=caption, content={
-            "x": _time_axis(known), "y": {"label": f"RSS [{panel.unit}]"},
+            "x": axis, "y": {"label": f"RSS [{panel.unit}]"},
             "marks": [
                 {"kind": kind, "name": name, "x": seconds_since(panel.time, start), "y": level}
                 for kind, name, level in (("dots", "measured", panel.measured_db),

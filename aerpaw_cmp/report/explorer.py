@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..common.units import BoolArray, IntArray, spread_out
+from ..common.jsonable import json_object
+from ..common.units import IntArray, spread_out
 from ..compare.level import PART_DB, RssComparison
 from ..compare.offset import STEP_DB
 from ..compare.result import ModelLevel, RankResult, RssResult
@@ -81,13 +82,13 @@ def _rss(
     panel: RssResult, source: Source | None, start: np.datetime64, arrays: PackedArrays, limit: int
 ) -> dict[str, Any]:
     # retain the extremes of the residual, too, because a reader looks for the largest errors
-    pick = keep_extremes([panel.measured_db, panel.residual_db], limit) if len(panel.time) else np.arange(0)
+    pick = keep_extremes([panel.measured_db, panel.residual_db], limit)
     models = [{"name": "ray tracing", **_fit(panel.score), "level": arrays.add(panel.simulated_dbm[pick]),
                "learned_here": panel.training}]  # fmt: skip
     for name, baseline in panel.baselines.items():
         models.append({"name": pretty(name), **_fit(baseline), "level": arrays.add(baseline.level_dbm[pick])})
     geometry = [
-        {"name": GEOMETRY[key].replace("\n", " "), "values": arrays.add(values[pick])}
+        {"name": GEOMETRY[key], "values": arrays.add(values[pick])}
         for key, values in panel.geometry.items()
         if key in GEOMETRY
     ]
@@ -124,11 +125,11 @@ def _beside(data: ReportData, panel: RssResult, start: np.datetime64) -> dict[st
 
 
 def _fit(model: RssComparison | ModelLevel) -> dict[str, float | None]:
-    return {"offset": _number(model.offset_db), "rmse": _number(model.rmse_db)}
+    return json_object(offset=model.offset_db, rmse=model.rmse_db)
 
 
 def _rank(panel: RankResult, start: np.datetime64, arrays: PackedArrays, limit: int) -> dict[str, Any]:
-    pick = keep_extremes([panel.measured], limit) if len(panel.time) else np.arange(0)
+    pick = keep_extremes([panel.measured], limit)
     shares = [] if panel.probability is None else panel.probability.T
     best = nearest_k(panel)
     return {
@@ -150,14 +151,11 @@ def _track(data: ReportData, start: np.datetime64, arrays: PackedArrays) -> dict
     track = data.track
     if track is None or not len(track.time):
         return None
-    known: BoolArray = np.isfinite(track.east_m) & np.isfinite(track.north_m) & np.isfinite(track.up_m)
-    pick = np.flatnonzero(known)[spread_out(int(known.sum()), TRACK_POINTS)]
-    return {
-        "time": arrays.add(seconds_since(track.time, start)[pick], "f8"),
-        "east": arrays.add(track.east_m[pick]),
-        "north": arrays.add(track.north_m[pick]),
-        "up": arrays.add(track.up_m[pick]),
-    }
+    places = np.stack([track.east_m, track.north_m, track.up_m])
+    known = np.flatnonzero(np.isfinite(places).all(axis=0))
+    pick = known[spread_out(len(known), TRACK_POINTS)]
+    position = {axis: arrays.add(place) for axis, place in zip(AXES, places[:, pick], strict=True)}
+    return {"time": arrays.add(seconds_since(track.time, start)[pick], "f8"), **position}
 
 
 def _paths(paths: PosePaths, start: np.datetime64) -> dict[str, Any]:
@@ -166,7 +164,3 @@ def _paths(paths: PosePaths, start: np.datetime64) -> dict[str, Any]:
         "time": np.round(seconds_since(paths.time, start), 3).tolist(),
         "lines": [[[np.round(line, 1).tolist(), kind] for line, kind in lines] for lines in paths.lines],
     }
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

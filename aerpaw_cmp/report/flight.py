@@ -123,14 +123,12 @@ def _histogram(share: FloatArray, intervals: Sequence[Interval]) -> dict[str, An
 def _rank_metrics(series: RankResult) -> dict[str, Any]:
     score = series.score
     simulated = {
-        k_key(k): {
+        k: {
             **_histogram(fit.histogram, fit.histogram_ci95),
             "out_of_coverage": fit.out_of_coverage, "agreement": fit.agreement, "agreement_ci95": fit.agreement_ci95,
             "kappa": fit.kappa, "total_variation": fit.total_variation,
-            "total_variation_ci95": fit.total_variation_ci95,
-            "wasserstein": fit.wasserstein,
-            "p_value": fit.p_histogram,
-            "confusion": fit.confusion[1:],
+            "total_variation_ci95": fit.total_variation_ci95, "wasserstein": fit.wasserstein,
+            "p_value": fit.p_histogram, "confusion": fit.confusion[1:],
         }
         for k, fit in score.simulated.items()
     }  # fmt: skip

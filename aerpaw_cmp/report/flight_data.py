@@ -38,8 +38,8 @@ GEOMETRY = {
     "azimuth_deg": "Azimuth of the UAV in the frame of the tower antenna [deg]",
     "heading_deg": "UAV heading [deg clockwise from north]",
     "altitude_m": "Height of the UAV above ground [m]",
-    "uav_azimuth_deg": "Azimuth of the tower,\nUAV antenna frame [deg]",
-    "uav_elevation_deg": "Elevation of the tower,\nUAV antenna frame [deg]",
+    "uav_azimuth_deg": "Azimuth of the tower, UAV antenna frame [deg]",
+    "uav_elevation_deg": "Elevation of the tower, UAV antenna frame [deg]",
     "foliage_depth_m": "Path length inside tree crowns [m]",
 }
 
@@ -83,7 +83,6 @@ class Waypoint:
     time: np.datetime64
     east_m: float
     north_m: float
-    up_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -372,13 +371,7 @@ def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
         # take the first time within 2 m of the nearest approach, because later visits belong to later waypoints
         near = np.flatnonzero(distance <= np.nanmin(distance) + 2.0)
         index = start + int(near[0])
-        out.append(
-            Waypoint(
-                label=point.label, east_m=point.east_m, north_m=point.north_m,
-                time=track.time[index],
-                up_m=point.height_m,
-            )
-        )  # fmt: skip
+        out.append(Waypoint(label=point.label, time=track.time[index], east_m=point.east_m, north_m=point.north_m))
         start = index
     return tuple(out)
 
@@ -400,15 +393,14 @@ def _lines(replayed: Replayed, pose: int, tower_m: FloatArray) -> Iterator[tuple
     """Yield the lines of a pose with their kind: the number of reflections, or FURTHER."""
     replay, target_m = replayed.replay, replayed.poses.position_m[pose]
     for number, some in enumerate(replay.contributions):
-        paths, kind = some.lines(), FURTHER if number else None
+        paths = some.lines()
         start, stop = np.searchsorted(paths.pose, [pose, pose + 1])
         lines = [
             np.concatenate([tower_m[None], paths.vertices_m[row, : paths.depth[row]], target_m[None]])
             for row in range(start, stop)
         ]
-        if kind is not None:
+        if number:
             lines = sorted(lines, key=lambda line: float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()))[
                 :SHORTEST
             ]
-        for line in lines:
-            yield line, len(line) - 2 if kind is None else kind
+        yield from ((line, FURTHER if number else len(line) - 2) for line in lines)

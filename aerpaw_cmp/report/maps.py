@@ -315,7 +315,7 @@ def half_width(at_m: FloatArray) -> float:
 def extent_m(data: MapsData) -> tuple[float, float, float, float]:
     """Return the outer edges of the grid: west, east, south, north [m]."""
     half_east, half_north = half_width(data.east_m), half_width(data.north_m)
-    west, east, south, north = *data.east_m[[0, -1]].tolist(), *data.north_m[[0, -1]].tolist()
+    west, east, south, north = map(float, (*data.east_m[[0, -1]], *data.north_m[[0, -1]]))
     return west - half_east, east + half_east, south - half_north, north + half_north
 
 

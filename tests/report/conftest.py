@@ -105,7 +105,7 @@ def make_rank(site: Site, track: Track) -> RankResult:
 def make_report() -> ReportData:
     site, track = make_site(), make_track()
     waypoints = tuple(
-        Waypoint(label=c, time=track.time[i], **{k: float(getattr(track, k)[i]) for k in ("east_m", "north_m", "up_m")})
+        Waypoint(label=c, time=track.time[i], **{k: float(getattr(track, k)[i]) for k in ("east_m", "north_m")})
         for c, i in zip("ABCDEF", (480, 1700, 2560, 3420, 4280, 5500), strict=True)
     )
     rss = tuple(

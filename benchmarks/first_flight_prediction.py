@@ -21,7 +21,7 @@ from aerpaw_cmp.compare.level import crps_normal
 from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import LinkSettings
 from aerpaw_cmp.jobs.calibrate import observe
-from aerpaw_cmp.jobs.sources import PRIOR_ANTENNA_DB, PRIOR_SHADOWING_DB, NamedFlight, Prior
+from aerpaw_cmp.jobs.sources import PRIOR_SD_DB, NamedFlight, Prior
 
 FLIGHTS = Path(__file__).parents[1] / "tests" / "field"
 CAMPAIGNS = {
@@ -48,7 +48,7 @@ def errors(path: Path, field: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         carrier_hz = next(s.link.carrier_hz for s in data.rss if s.channel == samples.channel)
         prior = Prior(data.site, LinkSettings(carrier_hz=carrier_hz))
         level = prior.sources()[f"{samples.tower}.level"].replayed_db(samples)
-        slow = np.hypot(PRIOR_ANTENNA_DB, PRIOR_SHADOWING_DB) + 0.0 * level
+        slow = np.hypot(PRIOR_SD_DB["antennas"], PRIOR_SD_DB["shadowing"]) + 0.0 * level
         traced.append(samples.residual_db - level)
         free.append(samples.residual_db)
         sd.append(prior.fading("").total_db(slow))

@@ -56,10 +56,7 @@ from .calibrate import learned_antennas, observe
 from .calibrate_rank import FittedReceiver, RankSamples, read_receiver
 from .options import DEFAULT, RANKS, JobOutcome, RunOptions
 from .sources import (
-    PRIOR_ANTENNA_DB,
-    PRIOR_FADING_DB,
-    PRIOR_OFFSET_DB,
-    PRIOR_SHADOWING_DB,
+    PRIOR_SD_DB,
     Flown,
     Memory,
     NamedFlight,
@@ -214,8 +211,8 @@ def _model_fields(
         fields["chosen"] = {"title": TITLES[base], "base": base, "corrected": False, "field": OFF}
     if isinstance(model, Prior):
         origin = prior_words(model.link.carrier_hz, model.link.transmit_power_dbm)
-        caution = prior_caution(PRIOR_OFFSET_DB, PRIOR_ANTENNA_DB, PRIOR_SHADOWING_DB, PRIOR_FADING_DB)
-        return fields | {"verdict": first_words(None, 0.0, *expected, origin=origin), "warnings": [caution]}
+        verdict = first_words(None, 0.0, *expected, origin=origin)
+        return fields | {"verdict": verdict, "warnings": [prior_caution(PRIOR_SD_DB)]}
     if isinstance(model, Memory):
         entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()
         return fields | {

@@ -213,27 +213,28 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
     """Read variables along the dimensions of the level, one row per element."""
     with parsing(path, "a NetCDF file"):
         values, notes = read_native("netcdf", content)
-    dims = {name.lower(): notes["dims"][name][: array.ndim] for name, array in values.items()}
-    arrays = {name.lower(): array for name, array in values.items()}
     remarks: tuple[str, ...] = ()
-    if "height_m" not in arrays and "up_m" in arrays:
-        arrays["height_m"], dims["height_m"] = arrays["up_m"], dims["up_m"]
-    if "h_real" in arrays and not set(arrays) & set(QUANTITIES):
+    # dimensions and values by name
+    known = {name.lower(): (notes["dims"][name][: array.ndim], array) for name, array in values.items()}
+    if "up_m" in known:
+        known.setdefault("height_m", known["up_m"])
+    if "h_real" in known and not set(known) & set(QUANTITIES):
         power_dbm = float(notes["attributes"].get("transmit_power_dbm", 0.0))
-        arrays["level_dbm"] = rss_dbm(mean_pair_power(arrays["h_real"] + 1j * arrays["h_imag"]), power_dbm)
-        dims["level_dbm"] = dims["h_real"][:-2]
+        (dims, real), (_, imaginary) = known["h_real"], known["h_imag"]
+        known["level_dbm"] = dims[:-2], rss_dbm(mean_pair_power(real + 1j * imaginary), power_dbm)
         remarks = (f"The levels of {path.name} are those of H, with {power_dbm:g} dBm transmitted.",)
-    main = next((name for name in (*QUANTITIES, "rank", RANKS[0]) if name in arrays), None)
+    main = next((name for name in (*QUANTITIES, "rank", RANKS[0]) if name in known), None)
     if main is None:
         raise InputError("no variable with a level", expected=_EXPECTED, path=path)
-    shape = dict(zip(dims[main], arrays[main].shape, strict=True))
+    shape = dict(zip(known[main][0], known[main][1].shape, strict=True))
     _check_rows(math.prod(shape.values()), path)
     columns = {}
-    known = ("time", "time_utc", "tower", "channel", *_PLACE, *_GEOGRAPHIC, *QUANTITIES, *_OPTIONAL)
-    for name in (name for name in known if name in arrays and set(dims[name]) <= set(shape)):
-        order = [dims[name].index(dim) for dim in shape if dim in dims[name]]
-        place = [size if dim in dims[name] else 1 for dim, size in shape.items()]
-        columns[name] = np.broadcast_to(arrays[name].transpose(order).reshape(place), tuple(shape.values())).ravel()
+    for name in ("time", "time_utc", "tower", "channel", *_PLACE, *_GEOGRAPHIC, *QUANTITIES, *_OPTIONAL):
+        dims, array = known.get(name, ((), None))
+        if array is not None and set(dims) <= set(shape):
+            place = [size if dim in dims else 1 for dim, size in shape.items()]
+            array = array.transpose([dims.index(dim) for dim in shape if dim in dims]).reshape(place)
+            columns[name] = np.broadcast_to(array, tuple(shape.values())).ravel()
     unit = str(notes["units"].get("time", ""))
     if "time" in columns and columns["time"].dtype.kind in "fiu":
         columns["time_s"] = columns.pop("time")

@@ -591,7 +591,7 @@ def memory_of(place: str | Path, site: Site) -> Memory | None:
 # unmeasured. Antennas: the gain of two unknown antennas over directions (a dipole's nulls, mast, airframe).
 # Shadowing: 3GPP TR 36.777, table B-3, gives 4.2 dB (LoS) and 6 dB (NLoS) for rural aerial links. Fading: Rayleigh's
 # 5.6 dB is the worst case. `benchmarks/first_flight_prediction.py` checks the sum on flights.
-PRIOR_OFFSET_DB, PRIOR_ANTENNA_DB, PRIOR_SHADOWING_DB, PRIOR_FADING_DB = 10.0, 8.0, 6.0, 5.0
+PRIOR_SD_DB = {"offset": 10.0, "antennas": 8.0, "shadowing": 6.0, "fading": 5.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -622,12 +622,12 @@ class Prior:
     def levels(self, each: Sequence[LinkSamples]) -> Levels:
         """Return level above free space and standard deviation (n,) [dB]. Isotropic antennas have no heading."""
         level = self.sources()[each[0].antenna].replayed_db(each[0])
-        slow_sd_db = math.sqrt(PRIOR_OFFSET_DB**2 + PRIOR_ANTENNA_DB**2 + PRIOR_SHADOWING_DB**2)
+        slow_sd_db = math.hypot(*(sd for part, sd in PRIOR_SD_DB.items() if part != "fading"))
         return level, np.where(np.isfinite(level), slow_sd_db, np.nan), np.ones(len(level), dtype=np.bool_)
 
     def fading(self, _antenna: str) -> Spread:
         """Return the spread of samples about their means over 4 s."""
-        return dataclasses.replace(NO_SPREAD, fading_sd_db=PRIOR_FADING_DB)
+        return dataclasses.replace(NO_SPREAD, fading_sd_db=PRIOR_SD_DB["fading"])
 
 
 def outside(position_m: FloatArray, flown: Sequence[LinkSamples]) -> BoolArray:

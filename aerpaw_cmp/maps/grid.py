@@ -568,10 +568,9 @@ class LinkBudget:
                 raise UsageError(f"a {what} of {value:g} {unit}", expected=f"{low:g} to {high:g} {unit}", cause=cause)
         if self.threshold_dbm is not None and self.threshold_snr_db is not None:
             raise UsageError("threshold_dbm and threshold_snr_db", expected="one of the two")
-        of_noise = {"threshold_snr_db": self.threshold_snr_db is not None, "a noise figure": self.noise_figure_db > 0.0}
-        if self.bandwidth_mhz is None and (named := [name for name, given in of_noise.items() if given]):
+        if self.bandwidth_mhz is None and (self.noise_figure_db or self.threshold_snr_db is not None):
             raise UsageError(
-                f"{named[0]} without a bandwidth",
+                "a noise figure or threshold_snr_db without a bandwidth",
                 expected="bandwidth_mhz (--bandwidth-mhz), from which the noise floor follows",
             )
         level_dbm, noise_dbm = self.threshold_dbm, self.noise_dbm

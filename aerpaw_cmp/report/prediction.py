@@ -176,22 +176,10 @@ def prior_words(carrier_hz: float, power_dbm: float) -> str:
     )
 
 
-def prior_caution(offset_db: float, antennas_db: float, shadowing_db: float, fading_db: float) -> str:
-    """Return the sentence about the parts of the standard deviation before any flight.
-
-    Parameters
-    ----------
-    offset_db, antennas_db, shadowing_db, fading_db : float
-        Standard deviations [dB].
-
-    Returns
-    -------
-    str
-    """
-    return (
-        f"The standard deviation is a prior: offset {offset_db:g} dB, antennas {antennas_db:g} dB, shadowing "
-        f"{shadowing_db:g} dB, fading {fading_db:g} dB. One flight determines the offset and most of the rest."
-    )
+def prior_caution(sd_db: Mapping[str, float]) -> str:
+    """Return the sentence on the parts of the standard deviation before any flight [dB]."""
+    parts = ", ".join(f"{name} {value:g} dB" for name, value in sd_db.items())
+    return f"The standard deviation is a prior: {parts}. One flight determines the offset and most of the rest."
 
 
 def _stated(correction: Correction) -> str:

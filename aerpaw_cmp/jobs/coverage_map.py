@@ -39,6 +39,7 @@ from ..maps.evaluate import (
     TREATMENTS,
     InverseDistance,
     Predictor,
+    Sampling,
     Score,
     ServingTowerMean,
     Study,
@@ -566,16 +567,14 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
     """Compute correlation, interpolation and its errors on the maps of the paper's foliage mode."""
     s, result = outcome.settings, outcome.shown
     heights, rank = rank_fields(result)
-    local: dict[str, Any] = {"neighbours": s.neighbours, "radius_m": s.reach_m, "seed": s.seed}
+    local = Sampling(neighbours=s.neighbours, radius_m=s.reach_m, seed=s.seed)
     with stages("leave one out"):
         zeros, towers = rank_fields(result, "zero")[1], result.towers_m
-        outcome.studies["missing"] = interpolation_study(result.grid, rank, towers, **local)
-        outcome.studies["zero"] = interpolation_study(result.grid, zeros, towers, **local)
-        random = outcome.studies["random"] = interpolation_study(
-            result.grid, zeros, towers, selection="random", **local
-        )
-        further = [{**local, "selection": "random", "seed": s.seed + draw} for draw in range(1, DRAWS)]
-        outcome.draws = [random.scores, *(paper_scores(result.grid, zeros, random.fit, **rule) for rule in further)]
+        outcome.studies["missing"] = interpolation_study(result.grid, rank, towers, local)
+        outcome.studies["zero"] = interpolation_study(result.grid, zeros, towers, local)
+        draws = [replace(local, selection="random", seed=s.seed + draw) for draw in range(DRAWS)]
+        random = outcome.studies["random"] = interpolation_study(result.grid, zeros, towers, draws[0])
+        outcome.draws = [random.scores, *(paper_scores(result.grid, zeros, random.fit, draw) for draw in draws[1:])]
     with stages("correlation"):
         points, width = result.grid.points_m, s.spacing_m
         outcome.correlations = {

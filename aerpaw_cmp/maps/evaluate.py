@@ -188,13 +188,17 @@ class _Near:
 
 
 @dataclass(eq=False, kw_only=True)
-class _Local:
-    """The base of predictors that use near samples, which ignores NaN in each field."""
+class Sampling:
+    """The samples that a target uses, as in :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`."""
 
     neighbours: int = 20
     radius_m: float = 150.0
     selection: Literal["nearest", "random"] = "nearest"
     seed: int = 0
+
+
+class _Local(Sampling):
+    """The base of predictors that use near samples, which ignores NaN in each field."""
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
         """Store samples (n, dims) with values (n,) or (n, fields). NaN means out of coverage."""
@@ -370,20 +374,9 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
     truth, guess = unmasked(values), unmasked(estimate)
     if truth.shape != guess.shape:
         raise UsageError(f"values of shape {truth.shape}, estimates of shape {guess.shape}")
-    known = np.isfinite(truth)
-    scored = known & np.isfinite(guess)
-    # set values that are not scored to 0, because NaN would remain in the sums
-    error = np.where(scored, guess - np.where(known, truth, 0.0), 0.0)
-    n = scored.sum(axis=0)
-
-    def mean(x: FloatArray) -> FloatArray:
-        return np.asarray(np.where(n > 0, x.sum(axis=0) / np.maximum(n, 1), np.nan))
-
-    return Score(
-        mean(np.abs(error)),
-        np.sqrt(mean(error**2)),
-        np.asarray(n, dtype=np.int64),
-    )
+    error = np.ma.masked_invalid(guess - truth)
+    mae, square = (np.ma.filled(part.mean(axis=0), np.nan) for part in (np.abs(error), error**2))
+    return Score(mae, np.sqrt(square), np.asarray(error.count(axis=0), dtype=np.int64))
 
 
 def leave_one_out(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> Score:
@@ -480,16 +473,7 @@ def rank_fields(
     return heights, np.where(rank > 0, rank, np.nan) if out_of_coverage == "missing" else rank
 
 
-def interpolation_study(
-    grid: Grid,
-    values: FloatArray,
-    towers_m: FloatArray,
-    *,
-    neighbours: int = 20,
-    radius_m: float = 150.0,
-    selection: Literal["nearest", "random"] = "nearest",
-    seed: int = 0,
-) -> Study:
+def interpolation_study(grid: Grid, values: FloatArray, towers_m: FloatArray, sampling: Sampling) -> Study:
     """Compute the correlation of maps and the leave-one-out errors of all interpolators.
 
     Parameters
@@ -500,39 +484,29 @@ def interpolation_study(
         Rank or RSS; NaN out of coverage. For RSS the last axis may be towers.
     towers_m : (towers, 2+)
         Positions of the towers, for the mean per serving tower.
-    neighbours, radius_m, selection, seed
-        M, r0 and the choice of samples, the same for every local interpolator.
+    sampling : Sampling
+        Samples that every local interpolator uses.
 
     Returns
     -------
     Study
         Correlation, fitted curve, and scores of every interpolator.
     """
-    points = grid.points_m
+    points, m, radius_m = grid.points_m, sampling.neighbours, sampling.radius_m
     # bins as wide as the step of the grid, as in the paper, because narrower bins would be empty
     correlation = variogram.vector_correlation(points, values, width_m=grid.spacing_m)
     fit = _curve(correlation)
-    rule: dict[str, Any] = {"neighbours": neighbours, "radius_m": radius_m, "selection": selection, "seed": seed}
     models: dict[str, Predictor] = {
         # a single sample has the weight 1 at any distance
         "nearest": InverseDistance(neighbours=1, radius_m=radius_m),
-        "inverse distance": InverseDistance(neighbours=neighbours, radius_m=radius_m),
+        "inverse distance": InverseDistance(neighbours=m, radius_m=radius_m),
         "serving-tower mean": ServingTowerMean(towers_m),
     }
     scores = {name: leave_one_out(model, points, values) for name, model in models.items()}
-    return Study(correlation, fit, paper_scores(grid, values, fit, **rule) | scores)
+    return Study(correlation, fit, paper_scores(grid, values, fit, sampling) | scores)
 
 
-def paper_scores(
-    grid: Grid,
-    values: FloatArray,
-    fit: variogram.BiExponential,
-    *,
-    neighbours: int = 20,
-    radius_m: float = 150.0,
-    selection: Literal["nearest", "random"] = "nearest",
-    seed: int = 0,
-) -> dict[str, Score]:
+def paper_scores(grid: Grid, values: FloatArray, fit: variogram.BiExponential, sampling: Sampling) -> dict[str, Score]:
     """Return the leave-one-out errors of the paper's interpolators, "Kriging", "makima" and "spline".
 
     Parameters
@@ -543,18 +517,17 @@ def paper_scores(
         Values; NaN out of coverage.
     fit : BiExponential
         Correlation that Kriging uses.
-    neighbours, radius_m, selection, seed
-        M, r0 and the choice of samples.
+    sampling : Sampling
+        Samples that each of them uses.
 
     Returns
     -------
     dict of str to Score
     """
-    rule: dict[str, Any] = {"neighbours": neighbours, "radius_m": radius_m, "selection": selection, "seed": seed}
     models: dict[str, Predictor] = {
-        "Kriging": OrdinaryKriging(fit, **rule),
-        "makima": IndexInterpolation("makima", grid, **rule),
-        "spline": IndexInterpolation("spline", grid, **rule),
+        "Kriging": OrdinaryKriging(fit, **vars(sampling)),
+        "makima": IndexInterpolation("makima", grid, **vars(sampling)),
+        "spline": IndexInterpolation("spline", grid, **vars(sampling)),
     }
     return {name: leave_one_out(model, grid.points_m, values) for name, model in models.items()}
 

@@ -395,13 +395,9 @@ class OrdinaryKriging:
             raise UsageError("; ".join(wrong))
 
     def _sill_of(self, values: FloatArray) -> FloatArray:
-        finite = np.isfinite(values)
-        count = finite.sum(axis=0)
         # subtract one value of the field, so that a constant field has a variance of exactly 0
-        centred = np.where(finite, values - _reference(values), 0.0)
-        mean = centred.sum(axis=0) / np.maximum(count, 1)
-        squares = np.where(finite, centred - mean, 0.0) ** 2
-        return np.asarray(squares.sum(axis=0) / np.maximum(count - 1, 1))
+        centred = np.ma.masked_invalid(values - _reference(values))
+        return np.ma.filled(centred.var(axis=0, ddof=1), 0.0)
 
     def _shaped(self, estimate: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
         if self.bounds is not None:

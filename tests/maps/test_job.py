@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.maps.evaluate import interpolation_study, rank_fields
+from aerpaw_cmp.maps.evaluate import Sampling, interpolation_study, rank_fields
 from aerpaw_cmp.maps.grid import (
     PAPER_RANK_ALTITUDES_M,
     Evaluation,
@@ -154,7 +154,7 @@ def test_layer_names_take_any_altitude_k_and_tower():
 
 def test_rank_study_runs_the_papers_comparison(result):
     heights, rank = rank_fields(result)
-    study = interpolation_study(GRID, rank, result.towers_m)
+    study = interpolation_study(GRID, rank, result.towers_m, Sampling())
     assert heights == (30.0, 40.0, 50.0)
     assert rank.shape == (len(GRID), 3, 2)
     assert set(study.scores) == {"Kriging", "makima", "spline", "nearest", "inverse distance", "serving-tower mean"}
@@ -165,7 +165,7 @@ def test_rank_study_runs_the_papers_comparison(result):
     assert (study.scores["Kriging"].n <= len(GRID) - out).all()
     assert (study.scores["Kriging"].n > 0.9 * (len(GRID) - out)).all()
     assert study.scores["Kriging"].mae.mean() < study.scores["serving-tower mean"].mae.mean()
-    zeros = interpolation_study(GRID, rank_fields(result, "zero")[1], result.towers_m)
+    zeros = interpolation_study(GRID, rank_fields(result, "zero")[1], result.towers_m, Sampling())
     assert (zeros.scores["Kriging"].n == len(GRID)).all()
 
 
@@ -175,7 +175,7 @@ def test_rank_study_of_a_flat_map_says_so():
         return Evaluation(-ones, -ones, 0 * ones, np.stack([ones, 0 * ones, 0 * ones, 0 * ones], axis=-1))
 
     made = map_job(GRID, TOWERS, flat, rss_altitudes_m=(), rank_altitudes_m=(30, 40))
-    study = interpolation_study(GRID, rank_fields(made)[1], made.towers_m)
+    study = interpolation_study(GRID, rank_fields(made)[1], made.towers_m, Sampling())
     assert study.fit.degenerate
     assert "the paper's curve is used" in study.fit.message
     assert (study.scores["Kriging"].mae == 0).all()
@@ -192,7 +192,7 @@ def test_no_tower_is_named():
 
 
 def test_rss_is_studied_like_rank(result):
-    study = interpolation_study(GRID, np.moveaxis(result.rss_siso_dbm, -1, 0), result.towers_m)
+    study = interpolation_study(GRID, np.moveaxis(result.rss_siso_dbm, -1, 0), result.towers_m, Sampling())
     assert study.scores["Kriging"].mae.shape == (2, 2)
     assert study.scores["Kriging"].mae.max() < 1.0, "free space is smooth"
     assert study.scores["Kriging"].mae.mean() < study.scores["nearest"].mae.mean()

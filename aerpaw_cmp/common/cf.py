@@ -29,7 +29,7 @@ def wgs84() -> dict[str, Any]:
     """Return the attributes of the grid mapping of latitudes and longitudes."""
     from pyproj import CRS
 
-    return CRS.from_epsg(4326).to_cf() | {"long_name": "coordinate reference system"}
+    return dict(CRS.from_epsg(4326).to_cf()) | {"long_name": "coordinate reference system"}
 
 
 def flags(meanings: Sequence[str], dtype: type[np.integer[Any]] = np.int8, first: int = 0) -> dict[str, Any]:

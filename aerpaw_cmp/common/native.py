@@ -212,7 +212,7 @@ def _data_sets(group: Any, depth: int, kinds: str, path: str = "", seen: set[Any
     """Return data sets of some kinds of numbers below a group, by path. Data sets outside the file are refused."""
     import h5py
 
-    seen, found = set() if seen is None else seen, {}
+    seen, found = set() if seen is None else seen, dict[str, Any]()
     for name in group:
         place = f"{path}{name}"
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):

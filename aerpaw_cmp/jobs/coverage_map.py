@@ -251,7 +251,7 @@ class SiteChannels:
         """Evaluate one position (3,) [m] in every mode, to raise the errors of the map before it is computed."""
         self._all_modes(position_m[None])
 
-    def tile(self, order: TileOrder, progress: Callable[[float], None] | None = None) -> TileDone:
+    def tile(self, order: TileOrder, progress: Callable[[float], object] | None = None) -> TileDone:
         """Map one tile with the towers and buildings that can reach it."""
         s = self.settings
         grid = Tiling(Grid.over_area(self.reach.site.area_m, s.spacing_m), order.cells).grid_of(order.number)
@@ -262,7 +262,7 @@ class SiteChannels:
         maps = self._maps(grid, progress)
         return TileDone(maps=maps, paths=self.paths)
 
-    def _maps(self, grid: Grid, progress: Callable[[float], None] | None = None) -> dict[str, job.MapResult]:
+    def _maps(self, grid: Grid, progress: Callable[[float], object] | None = None) -> dict[str, job.MapResult]:
         s = self.settings
         towers = {name: tower.position_m for name, tower in self.reach.site.towers.items()}
         return {

@@ -393,7 +393,7 @@ def map_job(
     rank_altitudes_m: Sequence[float] = PAPER_RANK_ALTITUDES_M,
     ks: Sequence[float] = PAPER_KS,
     chunk: int = CHUNK,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], object] | None = None,
 ) -> MapResult:
     """Evaluate the grid at all altitudes.
 

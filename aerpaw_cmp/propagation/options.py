@@ -81,7 +81,7 @@ def extent_of(points_m: FloatArray) -> FloatArray:
     return np.stack([known.min(axis=0), known.max(axis=0)]) if len(known) else known
 
 
-Progress = Callable[[float], None]
+Progress = Callable[[float], object]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -619,13 +619,6 @@ class Stop:
         with contextlib.suppress(OSError):
             os.write(self._write, b"x")
 
-    def wait(self, timeout_s: float) -> bool:
-        """Wait for a request to end, at most ``timeout_s``. Return whether there is one."""
-        poller = select.poll()
-        poller.register(self._read, select.POLLIN)
-        poller.poll(timeout_s * 1e3)
-        return self.count > 0
-
     def fileno(self) -> int:
         """Return a descriptor that is readable once the end is requested."""
         return self._read

@@ -10,7 +10,6 @@ import math
 import os
 import pty
 import re
-import select
 import termios
 import threading
 import time
@@ -172,21 +171,11 @@ class ModemSimulator:
                 link.unlink()
 
     def _read(self) -> bytes:
-        fd = self._master
-        if fd < 0:
-            return b""
-        poller = select.poll()
-        poller.register(fd, select.POLLIN)
+        """Return received bytes. If there are none, or no process has the port open, wait a moment."""
         try:
-            ready = poller.poll(20)
-            if not ready:
-                return b""
-            if not ready[0][1] & select.POLLIN:
-                self._stop.wait(0.02)  # if no process has the port open, poll reports a hang-up at once
-                return b""
-            return os.read(fd, 4096)
+            return os.read(self._master, 4096)
         except OSError:
-            self._stop.wait(0.02)
+            self._stop.wait(0.002)
             return b""
 
     def _write(self, data: bytes) -> bool:

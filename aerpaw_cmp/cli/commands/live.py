@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -168,7 +169,8 @@ def modem_sim(
     with Stop() as stop, ModemSimulator(modem, link=link) as simulator:
         if not answered({"port": str(simulator.port)}):
             show(simulator.port)
-        while not stop.wait(0.1):
+        while not stop.count:
+            time.sleep(0.1)
             if flown is not None:
                 flown()
     return 0

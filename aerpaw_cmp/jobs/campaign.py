@@ -73,6 +73,8 @@ class Task:
     logs_root: Path | None
     reference: bool = True
     """True for the setting whose flights are compared with each other: its positions are stored."""
+    key: str | None = None
+    """Digest of the inputs as the planning process sees them. None if an input cannot be read, or without a store."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,26 +174,14 @@ def failed_task(task: Task, message: str, error: BaseException | None = None) ->
 # --- tasks of a worker --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Order:
-    """A request to a worker: the task, and the digest of its inputs as the planning process sees them.
-
-    ``key`` is None if an input cannot be read, or if outcomes are not stored.
-    """
-
-    task: Task
-    key: str | None = None
-
-
-def carry_out(order: Order) -> Outcome:
-    """Run a requested task. This function runs in worker processes of every kind.
+def carry_out(task: Task) -> Outcome:
+    """Run a task. This function runs in worker processes of every kind.
 
     The key is computed again here, so that a worker with other files or other code fails the task instead of returning
     a wrong number.
     """
-    task = order.task
     try:
-        same = order.key is None or digest_of(task) == order.key
+        same = task.key is None or digest_of(task) == task.key
     except (AerpawCmpError, OSError) as error:
         return failed_task(task, f"an input can no longer be read: {error}", error)
     if not same:
@@ -324,28 +314,28 @@ def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: i
 
 def kept_outcomes(
     tasks: Sequence[Task], store: OutcomeStore | None, progress: Progress
-) -> tuple[dict[int, Outcome], dict[int, Order]]:
-    """Return the stored outcomes and the requests for the remaining tasks, both by task number."""
+) -> tuple[dict[int, Outcome], dict[int, Task]]:
+    """Return the stored outcomes and the remaining tasks with their keys, both by task number."""
     outcomes: dict[int, Outcome] = {}
-    orders = {number: Order(task=task) for number, task in enumerate(tasks)}
+    left = dict(enumerate(tasks))
     if store is None:
-        return outcomes, orders
+        return outcomes, left
     for number, task in enumerate(tasks):
         with suppress(AerpawCmpError, OSError):  # the task itself will report the error
             key = digest_of(task)
-            orders[number] = Order(task=task, key=key)
+            left[number] = dataclasses.replace(task, key=key)
             if isinstance(outcome := store.load(key), Outcome):
                 outcomes[number] = fitted_to(task, outcome)
-                del orders[number]
+                del left[number]
     for text in store.warnings:
         progress(text)
     if len(outcomes):
         progress(f"{len(outcomes)} of {counted(len(tasks), 'outcome')} stored before in {store.folder}")
-    return outcomes, orders
+    return outcomes, left
 
 
 def compute(
-    orders: Mapping[int, Order],
+    tasks: Mapping[int, Task],
     workers: Workers,
     outcomes: dict[int, Outcome],
     store: OutcomeStore | None,
@@ -355,8 +345,8 @@ def compute(
 
     Parameters
     ----------
-    orders : mapping of int to Order
-        Requests by task number.
+    tasks : mapping of int to Task
+        By task number.
     workers : Workers
     outcomes : dict of int to Outcome
         Receives the new outcomes.
@@ -365,21 +355,21 @@ def compute(
     progress : Progress
         Receives the number of finished tasks.
     """
-    numbers, total, failed = list(orders), len(outcomes) + len(orders), 0
+    numbers, total, failed = list(tasks), len(outcomes) + len(tasks), 0
 
     def take(place: int, result: Outcome | Lost) -> None:
         nonlocal failed
-        order = orders[numbers[place]]
+        task = tasks[numbers[place]]
         if isinstance(result, Lost):
-            result = failed_task(order.task, result.message)
-        if store is not None and order.key is not None and result.failure is None:
-            store.save(order.key, result)
-        outcomes[numbers[place]] = fitted_to(order.task, result)
+            result = failed_task(task, result.message)
+        if store is not None and task.key is not None and result.failure is None:
+            store.save(task.key, result)
+        outcomes[numbers[place]] = fitted_to(task, result)
         failed += result.failure is not None
         progress(f"flights\t{len(outcomes)} of {total} done, {failed} failed", len(outcomes) / total)
 
-    if orders:
-        workers.run(carry_out, [orders[number] for number in numbers], take)
+    if tasks:
+        workers.run(carry_out, list(tasks.values()), take)
 
 
 # Label of the setting of a campaign.yaml without ``settings``.
@@ -456,17 +446,17 @@ def run(
     settings = campaign.settings or {_AS_WRITTEN: {}}
     store = None if keep is None else OutcomeStore(keep, Outcome)
     with stages("flights"):
-        outcomes, orders = kept_outcomes(tasks, store, progress)
+        outcomes, left = kept_outcomes(tasks, store, progress)
     unread = [PlannedStage(failure.flight, one_line(failure.message)) for failure in failures]
     stages.checked(lambda: [*planned_tasks(tasks, outcomes, options.workers), *unread])
     if store is not None:
         store.check()
     inputs = _inputs_of(files, logs_root)
     with (
-        open_workers(options.workers, options.scheduler if orders else None, paths=inputs, progress=progress) as crew,
+        open_workers(options.workers, options.scheduler if left else None, paths=inputs, progress=progress) as crew,
         stages("flights"),
     ):
-        compute(orders, crew, outcomes, store, progress)
+        compute(left, crew, outcomes, store, progress)
     results = counted_once(tasks, [outcomes[number] for number in range(len(tasks))])
     rank = tuple(row for o in results for row in o.rank)
     failures += [o.failure for o in results if o.failure is not None]

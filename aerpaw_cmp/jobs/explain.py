@@ -19,7 +19,6 @@ from ..common.units import FloatArray
 from ..flight.data import FlightData, RankSeries, RssSeries, Times, load_data
 from ..flight.gains import load_with_learned, path_losses
 from ..flight.replay import estimate_clocks, rank_poses, replay_poses, telemetry_time, valid_poses
-from ..flight.settings import RtSettings
 from ..propagation.check.explain import (
     ExplainedPath,
     explain_paths,
@@ -33,7 +32,6 @@ from ..propagation.geometry import Link, Poses
 from ..propagation.options import Engine
 from ..propagation.replay import Replay
 from ..report.texts import iso_time
-from ..site.site import Site
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,7 +120,11 @@ def run_explain(
     source = data.site.towers[tower].position_m
     if tower in data.nodes:
         notes.append(f"{tower} moves: it was at {source[0]:.1f} m east, {source[1]:.1f} m north, {source[2]:.1f} m up")
-    paths = _paths(data.site, rt, replayed, link, pose, source)
+    losses = path_losses(data.site, rt, link.carrier_hz)
+    further = {name: loss(replayed.paths, source[None], pose.position_m) for name, loss in losses.items()}
+    if replayed.paths.terrain_db.any():
+        further["terrain"] = replayed.paths.terrain_db
+    paths = explain_paths(replayed.paths, replayed.faces, source, pose, link, further)
     if isinstance(series, RssSeries) and settings.rss.field != "coherent":
         notes.append(f"rss.csv has rss.field: {settings.rss.field}; the level here is the coherent sum")
     notes += further_path_lines(replayed, np.asarray(source), pose, link)
@@ -232,17 +234,6 @@ def _check_pose(valid: Any, series: RssSeries | RankSeries, at: int) -> None:
             expected="a time with telemetry",
             cause="the telemetry starts later, ends earlier or has a gap (rt.advanced.maximum_gap_s)",
         )
-
-
-def _paths(
-    site: Site, rt: RtSettings, replayed: Replay, link: Link, pose: Poses, source: FloatArray
-) -> tuple[ExplainedPath, ...]:
-    """Return the paths with their terms, one term per loss."""
-    losses = path_losses(site, rt, link.carrier_hz)
-    further = {name: loss(replayed.paths, source[None], pose.position_m) for name, loss in losses.items()}
-    if replayed.paths.terrain_db.any():
-        further["terrain"] = replayed.paths.terrain_db
-    return explain_paths(replayed.paths, replayed.faces, source, pose, link, further)
 
 
 def _absent(replayed: Replay, source: FloatArray, target: FloatArray) -> Iterator[tuple[str, str]]:

@@ -1,5 +1,6 @@
 """Stored task results: reused under any name, ignored if damaged or out of date; tasks are tried twice."""
 
+import dataclasses
 import io
 import shutil
 import signal
@@ -18,7 +19,7 @@ from aerpaw_cmp.common.files import seal
 from aerpaw_cmp.common.stages import logged
 from aerpaw_cmp.flight.settings import FlightFile, load_flight, overridden
 from aerpaw_cmp.jobs import campaign, sample
-from aerpaw_cmp.jobs.campaign import Order, Outcome, Task, carry_out, compute, digest_of, kept_outcomes, planned_tasks
+from aerpaw_cmp.jobs.campaign import Outcome, Task, carry_out, compute, digest_of, kept_outcomes, planned_tasks
 from aerpaw_cmp.jobs.tasks import OutcomeStore, task_inputs, task_key
 from aerpaw_cmp.jobs.workers import InProcess, Lost, Workers
 from aerpaw_cmp.report.campaign import Failure
@@ -224,7 +225,7 @@ def test_a_new_name_or_place_in_the_list_computes_nothing(
 
 def test_a_worker_that_sees_other_files_fails_the_task(flight: Path) -> None:
     task = Task(flight, "f", "a", {}, None)
-    outcome = carry_out(Order(task=task, key="0" * 64))
+    outcome = carry_out(dataclasses.replace(task, key="0" * 64))
     assert outcome.failure is not None
     assert "sees other inputs" in outcome.failure.message
 
@@ -282,7 +283,7 @@ def test_a_lost_worker_costs_its_own_task_alone(flight: Path) -> None:
     class Loses(InProcess):
         def run(self, function: Any, items: Sequence[Any], on_result: Any) -> None:  # noqa: ARG002
             lost = Lost("its worker process ended")
-            super().run(lambda order: lost if order.task.flight == "f1" else outcome_of(0.0), items, on_result)
+            super().run(lambda task: lost if task.flight == "f1" else outcome_of(0.0), items, on_result)
 
     told = [outcome.failure and outcome.failure.message for outcome in run_tasks(tasks_of(flight, 3), Loses())]
     assert told == [None, "its worker process ended", None]

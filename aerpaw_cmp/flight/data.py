@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -545,9 +546,11 @@ def _sort_log(found: _Found, settings: FlightFile, site: Site, files: Sequence[I
     found.telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
     heard = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
     for stream in (s for s in heard if log.node or not is_own_radio(s)):
-        # the sounder writes power and quality to separate files
-        elsewhere = (candidate for source in files if source is not file for candidate in source.result.streams)
-        locked, remark = lock_of(stream, [*file.result.streams, *elsewhere])
+        # the sounder writes power and quality to separate files, and the paths of one receiver begin with equal letters
+        alike = {id(f): len(os.path.commonprefix([f.path, file.path])) for f in files}  # noqa: RUF071
+        others = sorted(files, key=lambda f: (f is not file, -alike[id(f)]))
+        elsewhere = (candidate for source in others for candidate in source.result.streams)
+        locked, remark = lock_of(stream, elsewhere)
         texts += [remark] if remark else []
         found.rss.append((log.path, _rss_series(settings.link, log, stream, site, number=number, locked=locked)))
     ranked = [stream for stream in streams if stream.kind == "rank"]

@@ -13,8 +13,10 @@ from scipy.signal import lfilter
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.gains import ANTENNA_TERMS, link_directions, term_kernel
+from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.drafting.proposals import Placer, searching_airframe
 from aerpaw_cmp.flight.gains import sphere_angles
+from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.writers import format_power_log
@@ -211,6 +213,31 @@ def test_two_logs_without_channels_are_two_channels_whose_ports_the_levels_show(
     assert content["antennas"] == ports
     assert [log.get("channel") for log in content["logs"] if "power" in log["path"]] == [None, "power_2"]
     assert "left out" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("names", [("a/", "b/"), ("left_", "right_")])
+def test_each_of_two_receivers_has_the_lock_of_its_own_quality(names, tmp_path, capsys) -> None:
+    """Neither folders nor files name a tower or a channel."""
+    lost = np.arange(len(TIMES)) % 900 < 300
+    known = {"USRP1": np.full(len(TIMES), 72.2) + 0.1 * (np.arange(len(TIMES)) % 3)}
+    known["USRP2"] = np.where(lost, 40.0, known["USRP1"])
+
+    def write(folder: Path) -> None:
+        pose_table(folder)
+        for name, channel in zip(names, LEVELS, strict=True):
+            # in lock, levels of this receiver are above -15 dB
+            level = np.where(known[channel] > 60.0, LEVELS[channel] + 40.0, RNG.normal(-70.0, 1.0, len(TIMES)))
+            for what, values in (("power", level), ("quality", known[channel])):
+                log = folder / f"{name}2026-05-06_10_00_00_{what}_log.txt"
+                log.parent.mkdir(exist_ok=True)
+                log.write_bytes(format_power_log(TIMES.to_numpy(), values, ZONE))
+
+    draft, content = drafted(write, tmp_path, known_site(tmp_path))
+    data = load_data(load_flight(draft), draft.parent)
+    shares = sorted(float(np.nanmean(series.locked)) for series in data.rss)
+    assert shares == pytest.approx([2.0 / 3.0, 1.0], abs=0.01)
+    assert len([log for log in content["logs"] if log.get("skip")]) == 2
+    capsys.readouterr()
 
 
 def test_another_level_or_a_copy_of_a_log_is_asked_about_or_left_out(tmp_path, capsys) -> None:

@@ -492,8 +492,9 @@ def remembered(site: str | Path) -> dict[str, Remembered]:
     return {f"{known.series.tower}.{known.series.channel}": known for known in every_antenna(site)}
 
 
-# Standard deviation of the path-loss exponent for antennas that were learned under free space.
-_TAUGHT_SLOPE_SD = 0.2
+# Standard deviation of the path-loss exponent for antennas that were learned under free space, and the smallest scatter
+# of levels about them [dB].
+_TAUGHT_SLOPE_SD, _LEAST_SCATTER_DB = 0.2, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -886,14 +887,11 @@ def taught(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[
             each = out.setdefault(known.series.tower, [])
             if known.learned_from(*log):
                 continue
-            model = LevelModel(
-                slope=2.0,
-                slope_sd=_TAUGHT_SLOPE_SD,
-                elevation_sd_db=known.spread.own_sd_db,
-                cases=known_cases(
-                    float(np.hypot(known.spread.own_sd_db, known.series.sd_db)), known.spread.noise_sd_db
-                ),
-            )
+            # a model without scatter would make each level below the floor impossible or certain
+            scatter_db = max(known.spread.noise_sd_db, _LEAST_SCATTER_DB)
+            cases = known_cases(float(np.hypot(known.spread.own_sd_db, known.series.sd_db)), scatter_db)
+            elevation_sd_db = known.spread.own_sd_db
+            model = LevelModel(slope=2.0, slope_sd=_TAUGHT_SLOPE_SD, elevation_sd_db=elevation_sd_db, cases=cases)
             each.append(Taught(tower=known.tower, uav=known.uav, model=model, moments=known.moments))
         return out
     return {}

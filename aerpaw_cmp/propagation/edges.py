@@ -155,7 +155,7 @@ def edge_term(angle: FloatArray, exterior: FloatArray, distance: FloatArray) -> 
     above, below = np.abs(np.sin(np.pi * turns * exterior)), np.sin(np.pi * turns)
     # on the boundary itself the ray that grazes the edge counts as seen, so the limit is that of the lit side
     ratio = np.where(below == 0.0, exterior, above / np.where(below == 0.0, 1.0, below))
-    # w of a root, not F of a square: wofz keeps its digits at zero and far away
+    # use w of a root instead of F of a square, because wofz is exact at zero and far away
     reach = np.sqrt(2.0 * distance)
     return np.asarray(transition(reach * above) * np.cos(np.pi * turns) * reach * ratio)
 
@@ -614,7 +614,7 @@ def _ends(
     for side, (centre, turned, place, slant) in enumerate(rows):
         ground = paths.ground[:, side]
         bounced = ground >= 0
-        # a zero normal does not mirror, so that one formula serves all paths
+        # a zero normal does not mirror, so that one formula is valid for all paths
         normal = np.where(bounced[:, None], faces.normal[ground], 0.0)
         offset = np.where(bounced, faces.offset_m[ground], 0.0)
         centre = centre - 2.0 * ((centre * normal).sum(axis=1) - offset)[:, None] * normal
@@ -659,7 +659,7 @@ def _round_edge(
     phi: ComplexArray = np.zeros(1, complex)
     for unit, field in (((1.0, 0.0), e_theta), ((0.0, 1.0), e_phi)):
         wave = dyads.field_vector(rows_of(end.axes), tuple(sign * part for part in toward), *unit)  # type: ignore[arg-type]
-        # the dyad is evaluated for all and taken where a ground bounced: a leg that is straight keeps its wave
+        # evaluate the dyad for all legs, but use it only for legs that the ground reflects
         after = np.hstack(dyads.reflected(wave, toward, normal, *mirror))
         vector = np.where(end.bounced[:, None], after, np.hstack(wave))
         beta = beta + field * (vector * flat).sum(axis=1)[:, None]

@@ -130,10 +130,12 @@ class Faces:
         return Faces(**columns)
 
 
-def joined(first: Faces, second: Faces) -> Faces:
-    """Return the faces of both. The first faces keep their numbers."""
-    columns: dict[str, Any] = {name: getattr(first, name) + getattr(second, name) for name in _WORDS}
-    columns |= {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in _ARRAYS}
+def joined(*pieces: Faces) -> Faces:
+    """Return the faces of all pieces, in order."""
+    columns: dict[str, Any] = {
+        name: tuple(value for piece in pieces for value in getattr(piece, name)) for name in _WORDS
+    }
+    columns |= {name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in _ARRAYS}
     return Faces(**columns)
 
 
@@ -348,21 +350,6 @@ _COLLINEAR = 1e-9
 _UP = np.array([0.0, 0.0, 1.0])
 
 
-class _Face(NamedTuple):
-    """One row of :class:`~aerpaw_cmp.propagation.geometry.Faces`."""
-
-    normal: FloatArray
-    along: FloatArray
-    across: FloatArray
-    offset_m: float
-    lower: tuple[float, float]
-    upper: tuple[float, float]
-    material: str
-    label: str
-    polygon: Polygon | None = None
-    solid: int = -1
-
-
 def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
     """Return faces of a site.
 
@@ -385,27 +372,13 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
 @lru_cache(maxsize=16)
 def _faces(grounds: tuple[float, ...], ground_material: str, buildings: tuple[Building, ...]) -> Faces:
     """Return the faces of ground planes and buildings. They are cached, because each part of a replay requests them."""
-    faces = [_ground(height, ground_material, len(grounds) > 1) for height in grounds]
+    count = len(grounds)
+    label = ("ground",) if count == 1 else tuple(f"ground at {height:g} m" for height in grounds)
+    pieces = [Faces(np.tile(_UP, (count, 1)), np.array(grounds), (ground_material,) * count, label)]
     for solid, building in enumerate(buildings):
         for part in _parts(building.footprint):
-            faces += [*_walls(building, part, solid), _roof(building, part, solid)]
-    columns: dict[str, Any] = dict(zip(_Face._fields, zip(*faces, strict=True), strict=True))
-    numbers = {name: np.array(columns[name]) for name in _Face._fields if name not in ("material", "label", "polygon")}
-    return Faces(**(columns | numbers))
-
-
-def _ground(height_m: float, material: str, several: bool) -> _Face:
-    label = f"ground at {height_m:g} m" if several else "ground"
-    return _Face(
-        normal=_UP,
-        along=np.array([1.0, 0, 0]),
-        across=np.array([0, 1.0, 0]),
-        offset_m=height_m,
-        lower=(-np.inf, -np.inf),
-        upper=(np.inf, np.inf),
-        material=material,
-        label=label,
-    )
+            pieces += [_walls(building, part, solid), _roof(building, part, solid)]
+    return joined(*pieces)
 
 
 def _parts(footprint: Polygon) -> list[Polygon]:
@@ -436,38 +409,33 @@ def _corners(ring: shapely.LinearRing) -> FloatArray:
     return points
 
 
-def _walls(building: Building, footprint: Polygon, solid: int) -> list[_Face]:
-    foot = min(building.base_m, 0.0) - _WALL_FOOT_M
-    top = building.base_m + building.height_m
-    faces: list[_Face] = []
-    for ring in (footprint.exterior, *footprint.interiors):
-        points = np.asarray(ring.coords, dtype=np.float64)
-        for start, end in pairwise(points):
-            edge = end - start
-            length = float(np.hypot(*edge))
-            # the solid lies left of every edge, so the outward normal is to the right
-            along = np.array([edge[0], edge[1], 0.0]) / length
-            normal = np.array([along[1], -along[0], 0.0])
-            # in-plane coordinates count from the site's origin, not from the wall's corner
-            first = float(along[:2] @ start)
-            faces.append(
-                # along x up = (along_north, -along_east, 0): the outward normal
-                _Face(
-                    normal=normal,
-                    along=along,
-                    across=_UP,
-                    offset_m=float(normal[:2] @ start),
-                    lower=(first, foot),
-                    upper=(first + length, top),
-                    material=building.material,
-                    label=f"{building.name} wall {len(faces) + 1}",
-                    solid=solid,
-                )
-            )
-    return faces
+def _walls(building: Building, footprint: Polygon, solid: int) -> Faces:
+    """Return the walls along all rings of a footprint."""
+    rings = [shapely.get_coordinates(ring) for ring in (footprint.exterior, *footprint.interiors)]
+    start = np.concatenate([ring[:-1] for ring in rings])
+    edge = np.concatenate([np.diff(ring, axis=0) for ring in rings])
+    length, count = np.hypot(*edge.T), len(edge)
+    along = np.column_stack([edge / length[:, None], np.zeros(count)])
+    # along x up: the solid lies left of every edge, so the outward normal is to the right
+    normal = np.column_stack([along[:, 1], -along[:, 0], np.zeros(count)])
+    # in-plane coordinates count from the site's origin, not from the wall's corner
+    first = (along[:, :2] * start).sum(axis=1)
+    foot, top = min(building.base_m, 0.0) - _WALL_FOOT_M, building.base_m + building.height_m
+    return Faces(
+        normal=normal,
+        offset_m=(normal[:, :2] * start).sum(axis=1),
+        material=(building.material,) * count,
+        label=tuple(f"{building.name} wall {number + 1}" for number in range(count)),
+        along=along,
+        across=np.tile(_UP, (count, 1)),
+        lower=np.column_stack([first, np.full(count, foot)]),
+        upper=np.column_stack([first + length, np.full(count, top)]),
+        polygon=(None,) * count,
+        solid=np.full(count, solid),
+    )
 
 
-def _roof(building: Building, footprint: Polygon, solid: int) -> _Face:
+def _roof(building: Building, footprint: Polygon, solid: int) -> Faces:
     """Return the roof. Its axes follow the longest edge, so that a rectangular roof fills its bounds."""
     points = np.asarray(footprint.exterior.coords, dtype=np.float64)
     edges = np.diff(points, axis=0)
@@ -480,19 +448,18 @@ def _roof(building: Building, footprint: Polygon, solid: int) -> _Face:
     # most roofs are rectangles: the bounds decide what is inside, without a polygon
     fills = np.isclose(turned.area, (high_a - low_a) * (high_b - low_b), rtol=1e-12, atol=0.0)
     polygon = None if fills else turned
-    if polygon is not None:
-        shapely.prepare(polygon)
-    return _Face(
-        normal=_UP,
-        along=along,
-        across=across,
-        offset_m=building.base_m + building.height_m,
-        lower=(low_a, low_b),
-        upper=(high_a, high_b),
-        polygon=polygon,
-        material=building.material,
-        label=f"{building.name} roof",
-        solid=solid,
+    shapely.prepare(polygon)
+    return Faces(
+        normal=_UP[None],
+        offset_m=np.array([building.base_m + building.height_m]),
+        material=(building.material,),
+        label=(f"{building.name} roof",),
+        along=along[None],
+        across=across[None],
+        lower=np.array([[low_a, low_b]]),
+        upper=np.array([[high_a, high_b]]),
+        polygon=(polygon,),
+        solid=np.array([solid]),
     )
 
 
@@ -702,11 +669,7 @@ def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, rol
     >>> (r @ [1, 0, 0]).round(12).tolist()
     [0.0, 1.0, 0.0]
     """
-    yaw, pitch, roll = np.broadcast_arrays(
-        unmasked(yaw_rad),
-        unmasked(pitch_rad),
-        unmasked(roll_rad),
-    )
+    yaw, pitch, roll = np.broadcast_arrays(*map(unmasked, (yaw_rad, pitch_rad, roll_rad)))
     # written out, because this needs one pass over a flight; a product of three rotations needs three
     ca, sa = np.cos(yaw), np.sin(yaw)
     cb, sb = np.cos(pitch), np.sin(pitch)

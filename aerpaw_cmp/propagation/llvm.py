@@ -37,7 +37,7 @@ LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 # Folders to look into instead of the system's, separated as in PATH.
 FOLDERS_VARIABLE = "AERPAW_CMP_LLVM_FOLDERS"
 
-# Far above the two seconds that it takes: a slow disk must not look like a library that hangs.
+# A trial takes about two seconds. The limit is far above, so that a slow disk does not look like a library that hangs.
 _TRIAL_TIMEOUT_S = 300.0
 
 # Dr.Jit's wheel links libatomic.so.1, which a minimal Debian does not have.

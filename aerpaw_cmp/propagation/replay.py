@@ -592,7 +592,7 @@ def passed(
 def further_paths(
     site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field
 ) -> list[tuple[Further, Fields]]:
-    """Return paths of the further kinds that are asked for, and what they add to H and to the powers.
+    """Find the paths of the requested further kinds, and what they add to H and to the powers.
 
     Parameters
     ----------

@@ -203,7 +203,7 @@ def _sphere_mean(gain: FloatArray) -> float:
 
 
 def _pole_vectors(e_theta: ComplexArray, e_phi: ComplexArray, row: int, slope: float) -> tuple[complex, complex, float]:
-    """Return the mean field (x, y) of a row at or next to a pole, and the share of its power in the mean."""
+    """Return the mean field (x, y) of a row at or next to a pole, and its share of the power of the row."""
     phi = np.arange(e_theta.shape[1]) * (2 * np.pi / e_theta.shape[1])
     x = slope * e_theta[row] * np.cos(phi) - e_phi[row] * np.sin(phi)
     y = slope * e_theta[row] * np.sin(phi) + e_phi[row] * np.cos(phi)
@@ -304,11 +304,6 @@ _FOREIGN = (
 )  # fmt: skip
 
 
-def _foreign_format(text: str) -> str | None:
-    """Return the format that a file without a known pattern probably has, with the remedy."""
-    return next((cause for sign, cause in _FOREIGN if re.match(sign, text)), None)
-
-
 _FREQUENCY = re.compile(
     r"\s*frequency\s*=\s*([-+]?\d{1,20}(?:\.\d{0,20})?(?:e[-+]?\d{1,2})?)\s*\(\s*([kMG]?)Hz\s*\)",
     re.IGNORECASE | re.ASCII,
@@ -338,7 +333,7 @@ def _read_rows(path: Path) -> _Rows:
         raise InputError(
             f"no antenna pattern of a known format; the file begins with '{one_line(first)[:60]}'",
             expected=READABLE,
-            cause=_foreign_format(text),
+            cause=next((cause for sign, cause in _FOREIGN if re.match(sign, text)), None),
         )
     rows.values = np.array(values)
     return rows
@@ -509,7 +504,7 @@ def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
 
 
 def check_power(pattern: MeasuredPattern, *, most_db: float = 0.5, cause: str = NOT_GAIN) -> None:
-    """Refuse a pattern that radiates more than it is fed, almost nothing, or has linear numbers.
+    """Refuse a pattern that radiates more power than it is fed, or almost none, or whose numbers are linear.
 
     Parameters
     ----------
@@ -519,8 +514,7 @@ def check_power(pattern: MeasuredPattern, *, most_db: float = 0.5, cause: str = 
     cause : str
         Likely cause of a mean gain out of range, if the values are not linear.
     """
-    # if no gain is below that of an isotropic antenna, none can be above it
-    # linear gains that are read as dBi lie between 0 and a few, but no antenna is above isotropic everywhere
+    # a mean gain of 1 or less requires directions below 0 dBi, but linear gains read as dBi are all above 0
     linear = pattern.least_gain_dbi >= 0.0 and pattern.peak_gain_dbi - pattern.least_gain_dbi > most_db
     if linear or not _MINIMUM_EFFICIENCY <= pattern.efficiency <= power_from_db(most_db):
         raise InputError(

@@ -51,7 +51,7 @@ from .siteyaml import TALLEST_TREE_M, WIDEST_CROWN_M, SiteModel, build_site, ext
 
 # Storey height that OpenStreetMap suggests.
 _LEVEL_M = 3.0
-# Two storeys, as of a barn or a house.
+# Two storeys, the height of a barn or a house.
 _DEFAULT_HEIGHT_M = 6.0
 TALLEST_M = 300.0
 # Outlines farther from the origin do not belong to the site.

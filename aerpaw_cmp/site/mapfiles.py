@@ -111,7 +111,7 @@ def is_tangled(ring: Polygon) -> bool:
     """Check whether a ring has more than :data:`MAX_CROSSINGS` self-intersections, in pieces and with an early end."""
     line = np.asarray(ring.exterior.coords)[:, :2]
     segments = shapely.linestrings(np.stack([line[:-1], line[1:]], axis=1))
-    # there are too few pairs for so many intersections
+    # there are not more pairs of segments than allowed intersections
     if len(segments) * (len(segments) - 1) // 2 <= MAX_CROSSINGS:
         return False
     tree, crossings = shapely.STRtree(segments), 0
@@ -133,18 +133,11 @@ def lonlat(point: Any, where: str) -> Position:
     return latitude, longitude
 
 
-def reason(error: Exception) -> str:
-    """Return the reason why an element cannot be used."""
-    if isinstance(error, InputError):
-        return error.found
-    if isinstance(error, KeyError):
-        return f"it is not valid: no {error}"
-    return "it is not valid"
-
-
 def left_out(path: Path, what: str, error: Exception) -> str:
     """Return the note about the element ``what`` of a map file, which cannot be used because of an error."""
-    why = reason(error).removeprefix(f"{path.name}: ").removeprefix(f"{what}: ")
+    why = "it is not valid" + (f": no {error}" if isinstance(error, KeyError) else "")
+    if isinstance(error, InputError):
+        why = error.found.removeprefix(f"{path.name}: ").removeprefix(f"{what}: ")
     return f"warning: {path.name}: {what} was left out: {why}"
 
 
@@ -408,7 +401,7 @@ def _sort(element: Element, number: int, data: _Data) -> None:
         data.nodes[identity] = lonlat((element.get("lon"), element.get("lat")), f"node {identity}")
         tags = element.get("tags") or {}
         if tags.get("natural") == "tree":
-            data.trees[identity] = _osm_words(element)
+            data.trees[identity] = _words(element.get("tags"))
         if (height_m := metres(str(tags.get("ele", "")))) is not None:
             data.ground[identity] = height_m
     elif element["type"] in ("way", "relation"):
@@ -416,10 +409,6 @@ def _sort(element: Element, number: int, data: _Data) -> None:
         given = {key: value for key, value in element.items() if value is not None and value != {}}
         # "out body; >; out skel;" contains a way with tags, and again without tags
         store[identity] = {**store.get(identity, {}), **given}
-
-
-def _osm_words(element: Element) -> dict[str, str]:
-    return {str(key): str(value) for key, value in (element.get("tags") or {}).items()}
 
 
 def _outline(tags: dict[str, str], identity: str, path: Path) -> Outline:
@@ -430,7 +419,7 @@ def _outline(tags: dict[str, str], identity: str, path: Path) -> Outline:
 
 
 def _way_outline(identity: str, way: Element, data: _Data, result: MapFile, lines: Counter[str]) -> None:
-    outline = _outline(_osm_words(way), f"way {identity}", data.path)
+    outline = _outline(_words(way.get("tags")), f"way {identity}", data.path)
     ring = _points(way, data, outline)
     if outline.tags.get("natural") == "tree_row":
         result.trees.append(TreeLine(outline.source, outline.tags, tuple(ring)))
@@ -474,7 +463,7 @@ def _relations(data: _Data, result: MapFile, lines: Counter[str]) -> set[str]:
     """Add multipolygons and return the ways that are part of them and must not be added again."""
     used_ways: set[str] = set()
     for identity, relation in data.relations.items():
-        tags = _osm_words(relation)
+        tags = _words(relation.get("tags"))
         # other relations, such as sites and routes, bound no area
         if tags.get("type") not in ("multipolygon", "boundary"):
             if kind_of({k: v for k, v in tags.items() if k != "type"}):
@@ -482,18 +471,15 @@ def _relations(data: _Data, result: MapFile, lines: Counter[str]) -> set[str]:
             continue
         # old relations have an empty role for an outer way
         outer = [str(m.get("ref")) for m in relation.get("members") or [] if m.get("role") in ("outer", "", None)]
-        own = [ref for ref in outer if (data.ways.get(ref) or {}).get("tags")]
+        own = {ref: words for ref in outer if (words := _words((data.ways.get(ref) or {}).get("tags")))}
         kind = kind_of({k: v for k, v in tags.items() if k != "type"})
         if kind is None:  # multipolygons of before 2017 have their tags on the outer way
-            kinds = {kind_of(_osm_words(data.ways[ref])) for ref in own} - {None}
+            kinds = {kind_of(words) for words in own.values()} - {None}
             if len(kinds) != 1 or tags.get("type") == "boundary":
                 lines[f"relations of type '{tags['type']}' without tags of a building or forest"] += 1
                 continue
             kind = kinds.pop()
-            tags = {
-                **_osm_words(next(data.ways[ref] for ref in own if kind_of(_osm_words(data.ways[ref])) == kind)),
-                **tags,
-            }
+            tags = {**next(words for words in own.values() if kind_of(words) == kind), **tags}
         outline = _outline(tags, f"relation {identity}", data.path)
         try:
             _multipolygon(relation, data, outline)
@@ -501,7 +487,7 @@ def _relations(data: _Data, result: MapFile, lines: Counter[str]) -> set[str]:
             result.notes.append(left_out(data.path, f"relation {identity}", error))
             continue
         if outline.parts:
-            used_ways |= {ref for ref in own if kind_of(_osm_words(data.ways[ref])) == kind}
+            used_ways |= {ref for ref, words in own.items() if kind_of(words) == kind}
         result.outlines.append(outline)
     return used_ways
 
@@ -729,8 +715,8 @@ def _feature(feature: Any, number: int, result: MapFile, lines: Counter[str], pa
         result.outlines.append(outline)
 
 
-def _words(properties: dict[str, Any]) -> dict[str, str]:
-    return {str(key): str(value) for key, value in properties.items() if value is not None}
+def _words(properties: dict[str, Any] | None) -> dict[str, str]:
+    return {str(key): str(value) for key, value in (properties or {}).items() if value is not None}
 
 
 def _geometry(geometry: dict[str, Any], outline: Outline, result: MapFile, lines: Counter[str], path: Path) -> None:

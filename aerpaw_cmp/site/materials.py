@@ -67,7 +67,7 @@ class Material:
         near = stated_name(self.relative_permittivity(edge * 1e9).real, self.conductivity_s_per_m(edge * 1e9), None)
         raise UsageError(
             f"ITU-R P.2040 gives no values for '{self.name}' at {frequency_ghz:g} GHz",
-            expected=f"{low:g}-{high:g} GHz, or numbers of your own, '{near}' say (those of {edge:g} GHz)",
+            expected=f"{low:g}-{high:g} GHz, or stated constants such as '{near}' (those of {edge:g} GHz)",
             cause="the carrier was given in MHz or GHz where hertz are expected" if frequency_hz < 1e6 else None,
         )
 

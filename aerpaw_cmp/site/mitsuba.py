@@ -351,7 +351,9 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
     vertices, triangles = joined([(mesh.vertices, mesh.triangles) for mesh in meshes])
     if bent := sum(mesh.bent for mesh in meshes):
         notes.append(f"{bent} polygons are not flat: they were cut into triangles from their first corner")
-    notes += [f"warning: {counted(n, 'shape')} of type '{kind}' left out; read is ply" for kind, n in skipped.items()]
+    notes += [
+        f"warning: {counted(n, 'shape')} of type '{kind}' left out: only ply is read" for kind, n in skipped.items()
+    ]
     return TriangleScene(
         vertices_m=vertices,
         triangles=triangles,
@@ -474,12 +476,12 @@ def _of_shape(shape: ElementTree.Element, name: str, radio: Mapping[str, str], u
     if which in unknown:
         others = "" if len(unknown) == 1 else f" and {len(unknown) - 1} more ({', '.join(list(unknown)[:6])})"
         raise UsageError(
-            f"the material '{which}'{others} is of type '{unknown[which]}', which says nothing about radio",
+            f"the material '{which}'{others} is of type '{unknown[which]}', which has no radio properties",
             expected="itu-radio-material, radio-material, or an id such as 'mat-itu_concrete'",
-            cause=f"say what it is: --material '{which}=concrete'",
+            cause=f"a material of a renderer; name its radio material: --material '{which}=concrete'",
         )
     raise InputError(
-        f"the shape '{name}' names the material '{which}', which the scene has not",
+        f"the shape '{name}' names the material '{which}', which is not in the scene",
         expected="one of " + ", ".join([*radio, *unknown][:20]),
     )
 

@@ -226,7 +226,7 @@ def _great_circle(text: str, name: str, carrier_hz: float | None) -> MeasuredPat
     frequency = float(frequencies[0])
     if len(frequencies) > 1:
         if carrier_hz is None:
-            raise InputError(f"{len(frequencies)} frequencies", expected="a carrier that says which")
+            raise InputError(f"{len(frequencies)} frequencies", expected="the carrier frequency, to choose one of them")
         frequency = float(frequencies[np.argmin(np.abs(frequencies - carrier_hz))])
     cut = table[table[:, 0] == frequency]
     # -pi and pi, or a repeated row: interpolation needs ascending angles

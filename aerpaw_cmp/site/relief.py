@@ -78,8 +78,8 @@ class Dem:
         Centre of the first cell, in the units of ``crs``.
     step_x, step_y : float
         Cell size in the units of ``crs``, both positive.
-    A name that pyproj knows, such as ``EPSG:4326`` (degrees), or ``local`` for metres of the site frame.
-        Any that pyproj knows, such as ``EPSG:4326`` (degrees), or ``local`` for metres of the site frame.
+    crs : str
+        A name that pyproj knows, such as ``EPSG:4326`` (degrees), or ``local`` for metres of the site frame.
     frame : SiteFrame
         Frame of the site.
     """
@@ -116,7 +116,9 @@ class Dem:
         # up is measured from the ground at the origin, independent of the datum of the grid
         object.__setattr__(self, "_origin_m", float(self.absolute_m(0.0, 0.0)))
         if np.isnan(self._origin_m):
-            gap = self._covers_origin()
+            column, row = self._cell(0.0, 0.0)
+            rows, columns = self.height_m.shape
+            gap = bool(0 <= column <= columns - 1 and 0 <= row <= rows - 1)
             raise InputError(
                 "the elevation model has no height at the site's origin",
                 expected="a grid that covers the site",
@@ -124,12 +126,6 @@ class Dem:
                 if gap
                 else "another place, another crs, or latitude and longitude swapped",
             )
-
-    def _covers_origin(self) -> bool:
-        """Check whether the origin is within the grid, including cells without a height."""
-        column, row = self._cell(0.0, 0.0)
-        rows, columns = self.height_m.shape
-        return bool(0 <= column <= columns - 1 and 0 <= row <= rows - 1)
 
     def _cell(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return column and row of positions, with fractions."""

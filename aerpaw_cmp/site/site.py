@@ -211,7 +211,8 @@ class Site:
     def ground_under_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
         """Return the height of the ground, shape (n,) [m].
 
-        It is that of the terrain, or otherwise that of the plane of the nearest tower, and in a scene that of take-off.
+        This is the height of the terrain if it is known. Otherwise it is that of the plane of the nearest tower, and in
+        a scene that of the take-off point.
 
         A plane above up = 0 ends at its tower, because a UAV below it flies over lower ground between towers.
         """

@@ -66,7 +66,7 @@ def test_closed_boxes_look_outward_and_other_shapes_are_told(tmp_path):
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert 0.5 * np.linalg.norm(outward, axis=1).sum() == pytest.approx(2 * (6 + 8 + 12))
     assert (np.einsum("ti,ti->t", outward, corners.mean(axis=1) - [2, 3.5, 2]) > 0).all()
-    assert scene.notes == ("warning: 1 shape of type 'sphere' left out; read is ply",)
+    assert scene.notes == ("warning: 1 shape of type 'sphere' left out: only ply is read",)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,7 @@ MESH = '<shape type="ply" id="s"><string name="filename" value="{}"/>' + REF + "
         (MESH.format("text.ply"), ITU, "does not begin with 'ply'"),
         ('<shape type="ply" id="s">' + REF + "</shape>", ITU, "the shape 's' names no file"),
         (SQUARE.format(""), ITU, "the shape 's' has no material"),
-        (SQUARE.format('<ref id="other"/>'), ITU, "names the material 'other', which the scene has not"),
+        (SQUARE.format('<ref id="other"/>'), ITU, "names the material 'other', which is not in the scene"),
         (SQUARE.format(REF), ITU.replace("concrete", "cheese"), "unknown material 'cheese'"),
         (SQUARE.format(REF + '<transform name="to_world"><scale value="2"/></transform>'), ITU, "moved by a to_world"),
         (SQUARE.format(REF), ITU.replace("</bsdf>", '<float name="thickness" value="a"/></bsdf>'), "'a'; expected a finite"),

@@ -34,7 +34,7 @@ from ..replay import replay as run_replay
 from ..scene import Scene
 from ..search.mirror import plane_keys, planes_of
 from ..search.terrain import TERRAIN
-from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of
+from .reference import MARGIN_M, ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of
 
 if TYPE_CHECKING:
     from ..search.sionna import Coefficients
@@ -182,16 +182,25 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
     FieldAudit
         ``phantom_paths`` and their failures; all other fields are empty.
     """
-    count, beyond = 0, _over_terrain(replay)
-    for row in rows[~beyond[rows]]:
-        tower = int(replay.paths.tower[row])
-        reference = Reference(site, replay.towers[tower], expected.link, expected.loss)
-        sequence = _mirrors_of(reference, replay.faces, replay.paths, row)
-        east, north, up = poses.position_m[replay.paths.pose[row]].tolist()
-        if sequence is None or reference.verdict(sequence, (east, north, up)) is False:
-            count += 1
+    rows = rows[~_over_terrain(replay)[rows]]
+    count = _verdicts(site, replay, replay.paths, replay.faces, poses, rows, expected).count(False)
     failures = (f"{counted(count, 'path')} that cannot exist",) if count else ()
     return FieldAudit(phantom_paths=count, failures=failures)
+
+
+def _verdicts(
+    site: Site, replay: Replay, paths: PathSet, faces: Faces, poses: Poses, rows: IntArray, expected: Expected,
+    margin_m: float = MARGIN_M,
+) -> list[bool | None]:  # fmt: skip
+    """Return whether each of the paths ``rows`` exists by the second implementation. None means doubtful."""
+    references = [Reference(site, name, expected.link, expected.loss) for name in replay.towers]
+    verdicts = []
+    for row in rows:
+        reference = references[int(paths.tower[row])]
+        sequence = _mirrors_of(reference, faces, paths, row)
+        east, north, up = poses.position_m[paths.pose[row]].tolist()
+        verdicts.append(False if sequence is None else reference.verdict(sequence, (east, north, up), margin_m))
+    return verdicts
 
 
 _STANDS = "paths near forests modelled as a medium"
@@ -571,16 +580,10 @@ def _lacking(
     site: Site, replay: Replay, theirs: PathSet, faces: Faces, rows: IntArray, few: Poses, expected: Expected
 ) -> FieldAudit:
     """Count paths that only Sionna has: missing if they certainly exist, else doubtful because of its float32."""
-    missing = doubtful = 0
-    references = [Reference(site, name, expected.link, expected.loss) for name in replay.towers]
-    for row in rows:
-        reference = references[int(theirs.tower[row])]
-        sequence = _mirrors_of(reference, faces, theirs, row)
-        east, north, up = few.position_m[theirs.pose[row]].tolist()
-        # with a wider margin, because float32 may differ within 2 mm
-        exists = None if sequence is None else reference.verdict(sequence, (east, north, up), _SIONNA_MARGIN_M)
-        missing += exists is True
-        doubtful += exists is not True
+    # with a wider margin, because float32 may differ within 2 mm
+    verdicts = _verdicts(site, replay, theirs, faces, few, rows, expected, _SIONNA_MARGIN_M)
+    missing = verdicts.count(True)
+    doubtful = len(verdicts) - missing
     failures = (f"{counted(missing, 'path of Sionna is', 'paths of Sionna are')} missing",) if missing else ()
     return FieldAudit(missing_paths=missing, doubtful=doubtful, failures=failures)
 

@@ -567,7 +567,7 @@ def over_stands(site: Site, source_m: FloatArray, vertices_m: FloatArray, target
 
 
 def stand_depth_m(site: Site, source_m: FloatArray, target_m: FloatArray) -> FloatArray:
-    """Return the length (lines,) [m] in the stands of a site of straight lines between points (lines, 3)."""
+    """Return the length (lines,) [m] that straight lines between points (lines, 3) run in the stands of a site."""
     depth = np.zeros(len(source_m))
     for crossing in _crossings(site, source_m, target_m):
         depth[crossing.segment] += crossing.depth_m(np.zeros(len(crossing.segment)))

@@ -31,7 +31,7 @@ def half_space(cosine: FloatArray, eta: ComplexArray) -> tuple[ComplexArray, Com
     te, tm, root : (...) complex
     """
     # the imaginary part of the root has the sign of eta's, so that the refracted wave decays
-    root = np.sqrt(eta - (1.0 - cosine * cosine))
+    root: ComplexArray = np.sqrt(eta - (1.0 - cosine * cosine))
     return (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root), root
 
 

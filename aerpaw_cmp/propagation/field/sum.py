@@ -137,12 +137,12 @@ def geometry(
 
 
 def rows_of(matrix: FloatArray) -> dyads.Rotation:
-    """Return rotations (n, 3, 3) in the form that the formulas take, for broadcasting with (n, pairs)."""
+    """Return rotations (n, 3, 3) in the form that the formulas require, for broadcasting with (n, pairs)."""
     return tuple(tuple(matrix[:, i, j, None] for j in range(3)) for i in range(3))  # type: ignore[return-value]
 
 
 def parts_of(vector: AnyArray) -> dyads.Vector:
-    """Return vectors (n, 3) in the form that the formulas take, for broadcasting with (n, pairs)."""
+    """Return vectors (n, 3) in the form that the formulas require, for broadcasting with (n, pairs)."""
     return vector[:, 0, None], vector[:, 1, None], vector[:, 2, None]
 
 

@@ -439,7 +439,7 @@ def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type
 def _windows(flat: FloatArray, first: IntArray, base: FloatArray, along: FloatArray, across: FloatArray) -> FloatArray:
     """Return convex outlines (faces, 8, 3), counter-clockwise round the normal."""
     owner = np.repeat(np.arange(len(base)), 3 * np.diff(first))
-    # a corner that turns by a tenth of a micrometre is rounding, and would take one of the eight places
+    # a corner that turns by a tenth of a micrometre is a rounding error, and would use one of the eight corners
     hull = shapely.simplify(shapely.convex_hull(shapely.multipoints(flat.reshape(-1, 2), indices=owner)), 1e-7)
     corners = shapely.get_num_coordinates(hull) - 1
     hull[corners > WINDOW] = shapely.oriented_envelope(hull[corners > WINDOW])

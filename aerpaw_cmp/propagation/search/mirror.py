@@ -657,7 +657,7 @@ def _meets_last_face(
         good &= point >= faces.lower[last, which, None] - tolerance_m
         good &= point <= faces.upper[last, which, None] + tolerance_m
     if sequence.shape[1] > 1:
-        # the ground as the last face meets every line: tracing each back would take most of a search
+        # every line meets the ground as its last face, and tracing all of them back would take most of a search
         often = np.flatnonzero(good.sum(axis=1) > _OFTEN * len(targets))
         good[often] &= _passes_first_faces(faces, sequence[often], image[often], targets)
     row, column = np.divmod(np.flatnonzero(good), len(targets))

@@ -374,7 +374,7 @@ class _Finder:
         del scene.sources, scene.targets
         for name in (*scene.transmitters, *scene.receivers):
             scene.remove(name)
-        scene.edit(remove=list(scene.objects))  # before 2.2 the only way to take an object out
+        scene.edit(remove=list(scene.objects))  # the only way to remove an object before Sionna RT 2.2
         self.built, self.solver = None, None  # type: ignore[assignment]
 
     def trace(self, targets: _Ends, search: Search) -> Any:

@@ -316,7 +316,10 @@ class OutputFolder:
         with explained_os_errors(self.named):
             self._refuse_shape()
             try:
-                _make_folders(self.target.parent, self._made)
+                missing = [place for place in self.target.parents if not place.exists()]
+                for place in reversed(missing):
+                    place.mkdir(exist_ok=True)
+                    self._made.append(place)
                 self._place = _Place(self.target, self.named, folder=True)
                 _restore(self.target)
                 self._refuse_content()
@@ -332,7 +335,10 @@ class OutputFolder:
             if self._place is not None:
                 self._place.leave()
                 self._place = None
-            _remove_folders(self._made)
+            # deepest first: a parent is empty only then
+            for place in reversed(self._made):
+                with contextlib.suppress(OSError):
+                    place.rmdir()
             if not self._written:
                 _say_kept(error, self.named)
 
@@ -460,22 +466,6 @@ def _mounted_below(folder: Path) -> list[Path]:
     # blanks and similar characters are octal numbers in this list
     points = (re.sub(r"\\(\d{3})", lambda code: chr(int(code[1], 8)), line.split(" ")[4]) for line in lines)
     return [Path(point) for point in points if folder in Path(point).parents]
-
-
-def _make_folders(folder: Path, created: list[Path]) -> None:
-    """Create a folder and its parents. Append the ones that were missing to ``created``."""
-    missing = [place for place in (folder, *folder.parents) if not place.exists()]
-    for place in reversed(missing):
-        place.mkdir(exist_ok=True)
-        created.append(place)
-
-
-def _remove_folders(created: list[Path]) -> None:
-    """Remove empty folders that were created for a failed run."""
-    # deepest first: a parent is empty only then
-    for place in reversed(created):
-        with contextlib.suppress(OSError):
-            place.rmdir()
 
 
 # --- the hidden path ------------------------------------------------------------------------------

@@ -135,6 +135,7 @@ def _names(paths: Sequence[str]) -> list[str]:
 
 
 def _ended(folder: Path, summaries: Sequence[TapSummary], twin: Any) -> dict[str, Any]:
+    """Return the text and the commands that the page shows at the end."""
     records, gaps = sum(s.records for s in summaries), sum(s.gaps for s in summaries)
     lost = sum(s.lost_records for s in summaries)
     at = time.strftime("%H:%M:%S", time.gmtime())
@@ -142,15 +143,7 @@ def _ended(folder: Path, summaries: Sequence[TapSummary], twin: Any) -> dict[str
         f", {counted(lost, 'record')} lost" if lost else ""
     )
     text = f"The tap ended at {at} UTC ({summaries[0].reason}): {counts}. The log is in {folder}."
-    return {"text": text, "commands": _report_commands(folder, twin)}
-
-
-def _report_commands(folder: Path, twin: Any) -> list[str]:
-    """Return the commands for a report of a tapped flight."""
-    log = shlex.quote(str(folder))
     telemetry = "VEHICLEOUT_LOG" if twin is None else shlex.quote(str(twin.telemetry))
     zone = "ZONE" if twin is None else twin.settings.timezone
-    return [
-        f"aerpaw-cmp ingest {log} {telemetry} --timezone {zone} --draft flight.yaml",
-        "aerpaw-cmp report flight.yaml",
-    ]
+    ingest = f"aerpaw-cmp ingest {shlex.quote(str(folder))} {telemetry} --timezone {zone} --draft flight.yaml"
+    return {"text": text, "commands": [ingest, "aerpaw-cmp report flight.yaml"]}

@@ -604,14 +604,14 @@ class Framer:
         self._echo_seen = False
 
     def send(self, command: str, prefixes: tuple[str, ...] | None) -> None:
-        """A command goes out.
+        """Register the command that is sent now.
 
         Parameters
         ----------
         command : str
             Command as written to the port, without the line end.
         prefixes : tuple of str, or None
-            Starts of its information lines, without blanks; ``()`` if it has none, None if any line may be one.
+            Prefixes of its information lines, without blanks. ``()``: it has none. None: any line.
         """
         self._open = _Open(command, prefixes, [], [])
 
@@ -652,14 +652,8 @@ class Framer:
         """
         assert self._open is not None
         now, self._open = self._open, None
-        answer = Answer(
-            command=now.command,
-            lines=tuple(now.lines),
-            status=status,
-            code=None,
-            flags=tuple(now.flags),
-            partial=self._partial.decode("latin-1"),
-        )
+        partial = self._partial.decode("latin-1")
+        answer = Answer(now.command, tuple(now.lines), status, flags=tuple(now.flags), partial=partial)
         self._echo_seen = now.echoed  # a reset modem may have stopped echoing
         if status == "lost":
             self._partial.clear()

@@ -190,8 +190,7 @@ class Tap:
             self._wait((start - now) / 1e9)
             return
         self._schedule.started(name, now)
-        decoded = self._exchange(name)[1]
-        if name == modem.RI_QUERY and decoded.values.get("rank") is not None:
+        if self._exchange(name)["decoded"].get("rank") is not None and name == modem.RI_QUERY:
             self._last_csi_ns = self._clock.mono_ns()
             self._alarm = False
 
@@ -237,12 +236,10 @@ class Tap:
         """Restore the former state of CSI reporting. None if it was not changed."""
         if not self._csi_changed:
             return None
-        answer = None
         if self._port is not None and self._csi_before is not None and self._stop.count < 2:
             with contextlib.suppress(ports.PortGoneError):
-                answer, _ = self._exchange("csi_ctrl", modem.csi_write(*self._csi_before))
-        if answer is not None and answer.status == "ok":
-            return True
+                if self._exchange("csi_ctrl", modem.csi_write(*self._csi_before))["status"] == "ok":
+                    return True
         self._say("CSI reporting stays on: the modem could not be asked to switch it back")
         return False
 
@@ -299,8 +296,7 @@ class Tap:
 
     def _probe(self) -> bool:
         """Send a bare ``AT``. Its answer shows that all earlier commands were answered, so that none is mixed up."""
-        answer, _ = self._exchange("sync", timeout_s=self._settings.probe_timeout_s)
-        if answer.status in ("timeout", "lost"):
+        if self._exchange("sync", timeout_s=self._settings.probe_timeout_s)["status"] in ("timeout", "lost"):
             return False
         self._in_step = True
         for event in self._framer.settle():
@@ -381,14 +377,13 @@ class Tap:
         self._initialise_again = False
         self._exchange("identity")
         self._exchange("firmware")
-        answer, decoded = self._exchange("csi_ctrl")
-        state = (decoded.values.get("lte"), decoded.values.get("nr5g"))
+        decoded = self._exchange("csi_ctrl")["decoded"]
+        state = decoded.get("lte"), decoded.get("nr5g")
         if self._settings.enable_csi and state != (1, 1):
             # keep the state of the first connection: the modem may have lost it after it was replugged
             if None not in state and self._csi_before is None:
                 self._csi_before = (int(state[0] or 0), int(state[1] or 0))
-            answer, _ = self._exchange("csi_ctrl", modem.csi_write(1, 1))
-            self._csi_changed = answer.status == "ok"
+            self._csi_changed = self._exchange("csi_ctrl", modem.csi_write(1, 1))["status"] == "ok"
             if not self._csi_changed:
                 self._say("the modem refused to switch CSI reporting on")
             elif self._csi_before is None:
@@ -398,10 +393,8 @@ class Tap:
 
     # one exchange -----------------------------------------------------------------------------------------
 
-    def _exchange(
-        self, name: str, command: str | None = None, *, timeout_s: float | None = None
-    ) -> tuple[modem.Answer, modem.Decoded]:
-        """Send one command and wait for its end. The record is written before this returns.
+    def _exchange(self, name: str, command: str | None = None, *, timeout_s: float | None = None) -> Record:
+        """Send one command and wait for its end. Return its record, which has been passed to the log.
 
         Raises
         ------
@@ -423,10 +416,10 @@ class Tap:
             answer, last = self._await(sent + timeout_ns)
         except ports.PortGoneError as error:
             loss, answer, last = error, self._framer.give_up("lost"), self._clock.mono_ns()
-        decoded = self._record_exchange(name, command is None, answer, sent_utc, sent, last)
+        record = self._record_exchange(name, command is None, answer, sent_utc, sent, last)
         if loss is not None:
             raise loss
-        return answer, decoded
+        return record
 
     def _await(self, deadline: int) -> tuple[modem.Answer, int]:
         """Return the answer to the command in flight, and the monotonic time of its last byte."""
@@ -472,7 +465,7 @@ class Tap:
 
     def _record_exchange(
         self, name: str, query: bool, answer: modem.Answer, sent_utc: int, sent: int, last: int
-    ) -> modem.Decoded:
+    ) -> Record:
         lines = [self._redactor.clean(line) for line in answer.lines]
         decoded = modem.decode(name, lines) if query and lines else modem.Decoded()
         pause = int(self._settings.pause_s * 1e9)
@@ -496,25 +489,24 @@ class Tap:
             record["partial"] = self._redactor.clean(answer.partial, cut=True)
         self._record(record)
         self._answers.setdefault(name, Counter())[answer.status] += 1
-        self._note(name, answer, decoded, record)
-        return decoded
+        self._note(record)
+        return record
 
-    def _note(self, name: str, answer: modem.Answer, decoded: modem.Decoded, record: Record) -> None:
+    def _note(self, record: Record) -> None:
         """Store the values of the status line, and request a prediction."""
+        name, status, decoded = record["query"], record["status"], record["decoded"]
         if name == modem.RI_QUERY:
-            self._last["rank"] = decoded.values.get("rank")
-            if answer.status == "ok":
+            self._last["rank"] = decoded.get("rank")
+            if status == "ok":
                 self._ri_times.append(record["last_mono_ns"])
                 if self._worker is not None:
                     # the pose at the middle of the exchange, because the time of the rank within it is unknown
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
-                    self._worker.ask(
-                        Asked(middle, record["sent_utc_ns"], decoded.values.get("rank"), self._last["rsrp_dbm"])
-                    )
-            elif answer.status in ("error", "cme"):
-                self._say_once(f"the modem answers {answer.status.upper()} to {name}: is it an RM5xxQ?")
+                    self._worker.ask(Asked(middle, record["sent_utc_ns"], decoded.get("rank"), self._last["rsrp_dbm"]))
+            elif status in ("error", "cme"):
+                self._say_once(f"the modem answers {status.upper()} to {name}: is it an RM5xxQ?")
         elif name == "servingcell":
-            nr = decoded.values.get("nr") or {}
+            nr = decoded.get("nr") or {}
             self._last["rsrp_dbm"], self._last["sinr_db"] = nr.get("rsrp_dbm"), nr.get("sinr_db")
 
     def _other(self, event: modem.Event) -> None:

@@ -114,7 +114,7 @@ def _line(name: str, frame: pd.DataFrame) -> str:
 
 
 def _in_utc(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the frame with ``time`` in UTC with its zone, which records do not have."""
+    """Return a frame whose ``time`` has the zone UTC, unlike the naive times of records."""
     out: pd.DataFrame = frame.copy(deep=False)
     out["time"] = pd.to_datetime(out["time"]).dt.tz_localize("UTC")
     return out

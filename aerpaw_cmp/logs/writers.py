@@ -72,7 +72,7 @@ def format_vehicle_out(frame: pd.DataFrame, timezone: str) -> bytes:
     )
     angles = np.radians(frame[["pitch_deg", "yaw_deg", "roll_deg"]].fillna(0.0).to_numpy())
     angles = (angles + np.pi) % (2 * np.pi) - np.pi  # the autopilot writes yaw in -pi..pi
-    # plus 0.0: -0.0 would be written with its sign
+    # add 0.0, because -0.0 would be written with its sign
     speed = frame[["velocity_north_mps", "velocity_east_mps", "velocity_down_mps"]].fillna(0.0).to_numpy() + 0.0
     fix = np.where(nowhere, 0, np.where(frame["fix"] < 0, 3, frame["fix"]))
     # -1 is the record's "unknown": the logger always writes a number

@@ -94,7 +94,7 @@ def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
 
 
 def _text_messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
-    """Return the same from a log in text, in which every line is a message with scaled values."""
+    """Return the same as :func:`_messages` for a log in text, where a line is a message with scaled values."""
     columns: dict[str, tuple[str, ...]] = {}
     by_name: _Rows = {name: {} for name in _WANTED}
     damaged: list[RejectedLine] = []

@@ -375,13 +375,9 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
 
 def _is_level(sheet: _sheet.Sheet, column: int, alone: bool) -> bool:
     meaning = sheet.meanings[column]
-    of_cell = meaning is not None and not meaning.indirect and meaning.place == "serving"
-    of_cell = of_cell and not _is_statistic(sheet, column)
-    return (
-        of_cell
-        and meaning is not None
-        and (meaning.quantity.role == "rss" or (alone and meaning.quantity.name == "SINR"))
-    )
+    if meaning is None or meaning.indirect or meaning.place != "serving" or _is_statistic(sheet, column):
+        return False
+    return meaning.quantity.role == "rss" or (alone and meaning.quantity.name == "SINR")
 
 
 def _is_statistic(sheet: _sheet.Sheet, column: int) -> bool:

@@ -1,7 +1,7 @@
 """NMEA 0183 sentences of a GNSS receiver.
 
 Positions are those of ``GGA``, ``GNS`` or ``RMC``, dates those of ``RMC``, else of ``ZDA``. Times are UTC. A sentence
-counts if its checksum is right. Text in front of the ``$``, such as a logger's own time, is not read. The fix is that
+is read if its checksum is right. Text in front of the ``$``, such as a logger's own time, is not read. The fix is that
 of MAVLink: 3 single, 4 differential, 5 and 6 RTK. Altitudes are above mean sea level.
 """
 

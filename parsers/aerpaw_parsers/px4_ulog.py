@@ -35,7 +35,7 @@ _KINDS = frozenset(b"BFIMPQADLCSORT")
 
 
 def _layout(text: str) -> np.dtype[np.void] | None:  # type: ignore[type-var]
-    """Return the layout of a topic, or None if it contains another topic, unlike all wanted ones."""
+    """Return the layout of a topic, or None if it contains another topic, which no wanted topic does."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     for part in text.split(";"):
         if not part:

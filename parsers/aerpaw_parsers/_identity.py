@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.readers import AnyArray, Attribute, BoolArray, FloatArray, Rows, dictionary
+from aerpaw_cmp.readers import AnyArray, Attribute, BoolArray, FloatArray, Rows, counted, dictionary
 
 from . import _sheet
 
@@ -27,6 +27,8 @@ _MOST_PARTS = 64
 # At a handover a program updates its columns one after the other. A value in at most this number of rows, and in at
 # most this share of the rows of the other columns' key, is such a delay.
 _LAG_ROWS, _LAG_SHARE = 2, 0.1
+# A column of identities that is empty in more than this share of the rows may have merged cells.
+_MOSTLY = 0.8
 
 
 def parts(
@@ -55,12 +57,17 @@ def parts(
     ]
     marks = _marks(rows, sheet, keys, columns, level) if found else []
     texts = {i: _named(sheet, i) for i in (*columns, *marks)}
-    counted = _with_level(sheet)
-    picked = np.flatnonzero(counted).tolist()
+    filled = _with_level(sheet)
+    picked = np.flatnonzero(filled).tolist()
     several = [i for i in columns if len({*texts[i]}) > 1]
     several = [i for i in several if 1 < len({texts[i][row] for row in picked}) <= _MOST_PARTS]
     base = ["\t".join(row) for row in zip(*(texts[i] for i in several), strict=True)]
-    several += dividing_columns({i: texts[i] for i in marks}, counted, base)
+    several += dividing_columns({i: texts[i] for i in marks}, filled, base)
+    for i in several:
+        empty = [texts[i][row] for row in picked].count("")
+        if empty > _MOSTLY * len(picked):
+            text = f"is empty in {counted(empty, 'row')}, a series of their own: are its cells merged? Then fill them"
+            rows.warnings.append(f"column {sheet.names[i]!r} {text}")
     if unknown := [sheet.names[i] for i in several if i in marks and sheet.meanings[i] is None]:
         shown = ", ".join(map(repr, unknown))
         rows.warnings.append(f"column {shown} distinguishes the rows: each of its values is a series")
@@ -258,7 +265,9 @@ def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
         meaning is None or meaning.quantity.name != "network" or sheet.plain[column].startswith(("sim", "slot", "sub"))
     )
     texts = sheet.texts(column)
-    named = {text: text if _is_identity(text, zero=zero) else "" for text in {*texts}}
+    # 'lw1' and 'LW1' are one tower
+    spelling = {text.casefold(): text for text in reversed(texts)}
+    named = {text: spelling[text.casefold()] if _is_identity(text, zero=zero) else "" for text in {*texts}}
     return [named[text] for text in texts]
 
 

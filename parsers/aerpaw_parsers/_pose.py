@@ -149,6 +149,10 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
         return "unknown", np.full(len(rows), np.nan)
     meaning = sheet.meanings[column]
     assert meaning is not None
+    imperial = next((i for i in range(len(sheet.names)) if sheet.unit(i) in _IMPERIAL), None)
+    if imperial is not None and not sheet.unit_read(column):
+        text = f"has no unit, while {sheet.names[imperial]!r} is imperial: read as metres; or is it in feet?"
+        rows.warnings.append(f"the column of heights, {sheet.names[column]!r}, {text}")
     rows.height_from, datum = "written", meaning.quantity.datum
     if datum == "unknown":
         known = sheet.program.datum if sheet.program is not None else ""
@@ -164,6 +168,7 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
     return datum if home_is_set else "sea level", height
 
 
+_IMPERIAL = ("mph", "ft", "feet", "foot", "ft/s")
 # Columns that name the datum of the heights.
 _OF_DATUM = re.compile(r"(vertical )?(alt|altitude|height)? ?(ref|reference|type|datum|mode|frame)( frame)?")
 # Home has moved if its altitude changes by more than this [m]. An aircraft that is this much higher has taken off [m].

@@ -235,8 +235,20 @@ class Sheet:
     def unit(self, column: int) -> str:
         """Return the unit in the name of a column, or that of its program, or an empty text."""
         what, unit, _ = self._described[1][column]
+        if not unit and what is not None and what.quantity.role == "rss":
+            return self._unit_of_levels
         written = what is not None and what.unit
         return unit if written or unit not in dictionary.OF_INTEGERS or self._in_integers else ""
+
+    @cached_property
+    def _unit_of_levels(self) -> str:
+        """Return the unit of levels in a column such as ``unit`` with ``dBW`` in every row, or an empty text."""
+        for i, name in enumerate(self._own):
+            texts = {cells[i].strip().lower() for cells in self.cells} if re.fullmatch(r"(.* )?units?", name) else set()
+            if len(texts) == 1 and dictionary.is_unit(text := texts.pop()):
+                self.used.add(i)
+                return text
+        return ""
 
     def unit_read(self, column: int) -> str:
         """Return the unit of :meth:`numbers`, empty if the brackets contain other text, such as ``(LTE scell0)``."""
@@ -825,6 +837,9 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     zone = _stamps.header_zone(sheet.names[column], dictionary.in_brackets(sheet.names[column])[1])
     if day is not None and not zone:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
+    if day is not None and "local" in sheet.names[day].lower() and zone == "UTC":
+        text = "local dates with UTC times: near midnight of the two zones the date is off by a day"
+        sheet.notes[day] = f"columns {sheet.names[day]!r} and {sheet.names[column]!r}: {text}"
     if (beside := sheet.find("zone")) is not None:
         zone, texts = _zone_column(sheet, beside, zone, texts, options)
     gps = re.search(r"\bgps", name) is not None

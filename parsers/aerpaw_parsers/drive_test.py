@@ -474,7 +474,7 @@ def _rank(rows: Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     # a row without a report has no CQI either, and such rows are few; ranks that count from 0 have many zeros
     doubtful = none if cqi is None else none & (sheet.numbers(cqi) > 0)
     few = _MOST_IDLE * len(ri) if cqi is None else none.sum() / 2
-    if doubtful.sum() > max(few, 2) and np.nanmax(ri, initial=0) < _MOST_PORTS:
+    if doubtful.sum() > max(few, 1) and np.nanmax(ri, initial=0) < _MOST_PORTS:
         text = f"0 in {counted(int(doubtful.sum()), 'row')}, read as no report: do its ranks count from 0?"
         rows.warnings.append(f"column {sheet.names[column]!r}: {text} Then use --map and --ri-base zero")
     source = "scheduled PDSCH rank" if "pdsch" in name else "CSI report"

@@ -178,8 +178,8 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
     Returns
     -------
     dict
-        ``seconds_image``, ``seconds_sionna``, ``ratio``, ``paths_image``, ``paths_sionna``, ``missing_paths``,
-        ``extra_paths`` and ``rss_max_error_db`` (image against Sionna), and the conditions.
+        ``seconds_image``, ``seconds_sionna``, ``ratio``, ``missing_paths``, ``extra_paths`` and ``rss_max_error_db``
+        (image against Sionna), ``poses`` and ``samples``.
     """
     from ..propagation.search import mirror, sionna
 
@@ -204,15 +204,10 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
         "ratio": theirs.search_seconds / seconds,
         "seconds_image": seconds,
         "seconds_sionna": theirs.search_seconds,
-        "paths_image": difference.reference_paths - difference.missing_paths + difference.extra_paths,
-        "paths_sionna": difference.reference_paths,
         "missing_paths": difference.missing_paths, "extra_paths": difference.extra_paths,
         "rss_max_error_db": difference.rss_max_error_db,
         "poses": poses,
         "samples": samples,
-        "batch": BATCH,
-        "faces": len(scene.faces),
-        "depth": _DEPTH,
         "versions": sionna.engine_versions(),
     }  # fmt: skip
 

@@ -319,9 +319,7 @@ class _Climber:
         return [*models, *([dataclasses.replace(best, ground="rough", roughness_m=rough)] if rough else [])]
 
     def _buildings(self, best: Model) -> list[Model]:
-        if not self._data.site.buildings:
-            return []
-        return [dataclasses.replace(best, buildings=True)]
+        return [dataclasses.replace(best, buildings=True)] if self._data.site.buildings else []
 
     def _edges(self, best: Model) -> list[Model]:
         # only if the flight has diffraction: it is the slowest model, and the best on none of 28 real series

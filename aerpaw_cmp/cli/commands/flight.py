@@ -36,16 +36,13 @@ def report(
         str | None,
         Option(help="Number of audited links, 'full' or 'none'; ignores the cache  [default: rt.audit_links]"),
     ] = None,
-    recommend: Annotated[
-        Path | None, Option("--recommend", help="Write a flight.yaml with the recommended model.")
-    ] = None,
+    recommend: Annotated[Path | None, Option(help="Write a flight.yaml with the recommended model.")] = None,
     learned: Annotated[
         Path | None, Option("--with", metavar="CALIBRATED", help="calibrated.yaml with antennas, ground and receiver.")
     ] = None,
     against: Annotated[
         list[Path] | None,
         Option(
-            "--against",
             metavar="PREDICTION",
             help="Score a prediction of this flight; repeatable: a folder of 'predict', or CSV, NetCDF, .npz or logs "
             "of another program.",
@@ -213,10 +210,7 @@ def calibrate(
     ] = None,
     logs_root: LogsRoot = None,
     into_site: Annotated[
-        str | None,
-        Option(
-            "--into-site", metavar="SITE", help="Site that stores the learned antennas; drafts then use them by name."
-        ),
+        str | None, Option(metavar="SITE", help="Site that stores the learned antennas; drafts then use them by name.")
     ] = None,
     score: Annotated[
         list[Path] | None, Option(help="flight.yaml to score with the learned settings; repeatable.")

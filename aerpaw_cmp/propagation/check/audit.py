@@ -700,9 +700,7 @@ def audit(
     -------
     Audit
     """
-    chosen = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
-    if second.links is not None:
-        chosen = chosen[spread_out(len(chosen), -(-second.links // max(1, len(replay.towers))))]
+    chosen = _spread(poses, None if second.links is None else -(-second.links // max(1, len(replay.towers))))
     engine: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
     search = replace(search, engine=engine)
     # on few poses, because the other engine is some hundred times slower
@@ -731,6 +729,12 @@ def audit(
         # a reference from the cache took no time now: report the time of its original search
         reference_seconds=checked.seconds + (checked.search_seconds if checked.from_cache else 0.0),
     )
+
+
+def _spread(poses: Poses, count: int | None) -> IntArray:
+    """Return indices of poses with a position, evenly spread."""
+    good = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
+    return good if count is None else np.asarray(good[spread_out(len(good), count)])
 
 
 def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[float] = RANK_K) -> Difference:

@@ -54,7 +54,7 @@ _STEP_S, _FINEST_S, _MOST_FINE = 0.5, 0.02, 40
 # Means of the level per channel, over one second or longer.
 _BINS = 900
 _FEWEST = 60
-# Number of times at which the prediction is averaged over a mean.
+# Number of times within a mean at which the prediction is evaluated.
 _PER_BIN = 8
 
 # Lengths (chord of the unit sphere) of the gains of tower and UAV: fine, broad, and both.
@@ -78,7 +78,7 @@ _LEFT_OUT, _WITHOUT_NAT = 10, 2.0
 # limit.
 _LONE, _NEIGHBOURS = 4.0, 9
 
-# Number of lags whose systems are in memory.
+# Number of lags that are evaluated together, which limits the memory.
 _AT_ONCE = 16
 
 
@@ -261,7 +261,7 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     n = sum(b.n * len(together) for together, b in bins.items())
     estimate = replace(estimate, model=models[int(total.argmax())], n=n)
     explained = total.max() - sum(b.constant() for b in bins.values())
-    if explained < EVIDENCE_NAT + np.log(len(lags)):  # this is the gain of trying this number of lags by chance
+    if explained < EVIDENCE_NAT + np.log(len(lags)):  # a gain of this size occurs by chance among this number of lags
         return replace(estimate, verdict=CANNOT_TELL, reason=_NO_DEPENDENCE)
     if estimate.verdict != SHIFTED or _shown_without(bins, parts, estimate.radio_minus_telemetry_s):
         return estimate
@@ -576,7 +576,7 @@ def _likelihood(columns: FloatArray, time_s: FloatArray, residuals: int, parts: 
         spread = np.concatenate([[_FREE] * 2, np.full(p - 2, part.gain), np.ones(residuals)])
         bordered = spread[:, None] * gram[which] * spread
         square = np.diagonal(bordered, axis1=1, axis2=2)[:, p:]
-        # only the left part of the last rows of the factor counts; the 1 keeps the matrix positive definite
+        # only the left part of the last rows of the factor is used, and the 1 keeps the matrix positive definite
         lower = np.linalg.cholesky(bordered + np.eye(len(spread)))
         square = np.maximum(square - (lower[:, p:, :p] ** 2).sum(axis=2), np.finfo(np.float64).tiny)
         determinant = np.log(np.diagonal(lower, axis1=1, axis2=2)[:, :p]).sum(axis=1)[:, None] + 0.5 * log_det[which]
@@ -674,7 +674,7 @@ def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[
 
 # Median distance of two receivers on one aircraft.
 _AGREE_M = 12.0
-# If a few points are farther apart at each second, all points are farther apart at each tenth of a second.
+# A log whose few tested points are farther from the track than this at each full second is not on it [m].
 _NEAR_M = 4.0 * _AGREE_M
 # The second-best origin, a minute away or more, must have a distance larger by this factor.
 _UNIQUE = 1.8
@@ -722,13 +722,13 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     # horizontally, because heights may count from different grounds
     line = shapely.linestrings(track_m[:, :2])
     shapely.prepare(line)
-    # half of the part within the time of the track must be so close to it, at any time
+    # at least a quarter of the log must be this close to the track, independent of time
     if 4 * shapely.dwithin(line, shapely.points(log_m[:, :2]), _AGREE_M).sum() < len(log_m):
         return None
     length = time_s[-1] - time_s[0]
     # half of the log may be outside the track at either end
     shifts = np.arange(-time_s[0] - 0.5 * length, track_s[-1] - time_s[0] - 0.5 * length, 1.0)
-    # a few points show if no second brings the log near the track, which is the case for most pairs in a folder
+    # test a few points first, because most pairs of logs in a folder do not belong together
     few = _median_distances(shifts, time_s[::8], log_m[::8], track_s, track_m)
     if not (few < _NEAR_M).any():
         return None

@@ -27,7 +27,7 @@ from .track import Track
 
 # Logs that end and begin within this belong to one flight, because radios are started before take-off.
 SLACK = np.timedelta64(5, "m")
-# Tracks at one time but about 5 km apart belong to two aircraft.
+# Tracks at the same time that are farther apart belong to two aircraft (about 5 km) [deg].
 APART_DEG = 0.05
 
 Span = tuple[np.datetime64, np.datetime64]
@@ -155,7 +155,7 @@ def _meet(flight: Flight, span: Span, place: tuple[float, float] | None) -> bool
         return False
     if place is None or flight.place is None:
         return True
-    # the margin before and after is for radios; two tracks must share time
+    # the margin before and after applies to radios, while two tracks must share time
     return meet(flight.span, span) and max(abs(place[0] - flight.place[0]), abs(place[1] - flight.place[1])) < APART_DEG
 
 
@@ -241,8 +241,8 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
     if start is not None:
         zone = ZoneInfo(timezone) if timezone else None
         starts = _name_starts(file.path)
-        # the names in a flight file are those of the machine that made it
-        if not file.holder:  # the path may be that of another machine
+        # a log in a flight file has the path of the machine that made it, where no summary can be looked up
+        if not file.holder:
             starts += _summary_starts(Path(file.path))
         texts += [
             f"{where} has {time:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is correct?"
@@ -262,7 +262,7 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
     return list(dict.fromkeys(texts))
 
 
-# No flight is higher, so a lowest height above this has another datum [m].
+# A lowest height above this has another datum, because no flight is that high [m].
 _TOO_HIGH_M = 150.0
 
 # Radios are started within this time of the telemetry. A difference of full hours shows a wrong zone.
@@ -320,7 +320,7 @@ def doubts(
     return tuple(texts)
 
 
-# A flight has samples below this height above take-off [m]; otherwise its heights count from the sea.
+# Heights of a flight without samples below this height above take-off count from the sea [m].
 _FLOWN_M = 300.0
 
 # Heights that begin within this of the ground of the site above the sea probably count from the sea [m].
@@ -453,7 +453,7 @@ _HEAD_BYTES = 2000
 def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
     """Return the smallest difference of a time from the start, as UTC and as local time (in any zone if unknown)."""
     if not exact:
-        # a date means its noon, plus or minus half a day
+        # a date is compared as its noon
         return abs(start - time - timedelta(hours=12))
     if zone is not None:
         # the offset of that day, because a zone has two in a year
@@ -475,6 +475,6 @@ def _lowest_m(stream: Stream) -> float | None:
         return None
     # not the minimum, because a row of a receiver without a fix may be far below
     low = float(np.percentile(height, 1.0))
-    # a log may end in the air; a climb from its first row is not a jump of a receiver without a fix
+    # a log may end in the air, so its first height is used unless it jumps as that of a receiver without a fix
     begins = np.abs(np.diff(height[: len(height) // 100 + 2], prepend=0.0)).max() <= _GROUND_M
     return min(low, float(height[0])) if begins else low

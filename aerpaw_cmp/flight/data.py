@@ -38,7 +38,7 @@ from .rows import FLAG, frozen, lock_of, scored_rows, unscored, without_values
 from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, RankSettings, SiteChoice
 from .track import Track, TrackPoses, at_height, good_positions, lacks_height, raised
 
-# A log with relative times starts at its origin; a longer distance shows that its times are absolute.
+# A log with relative times starts at its origin. If it starts later than this, its times are absolute.
 _NEAR_ORIGIN = pd.Timedelta(days=2)
 
 
@@ -67,7 +67,7 @@ def idle_log_keys(log: LogSettings, file: IngestedFile) -> list[str]:
 
 
 def _starts_near(origin: str, file: IngestedFile) -> bool:
-    # an origin that cannot be read is near no time
+    # an origin that cannot be read becomes NaT, which is not near any time
     zero = pd.to_datetime(origin, errors="coerce", utc=True).tz_localize(None)
     times = [s.frame["time"].min() for s in file.result.streams if len(s.frame) and "time" in s.frame]
     return not times or bool(np.min([abs(time - zero) for time in times]) < _NEAR_ORIGIN)
@@ -234,7 +234,7 @@ def choose_site(choice: SiteChoice, folder: Path) -> Site:
             key: dataclasses.replace(tower, antenna_height_m=choice.antenna_height_m)
             for key, tower in site.towers.items()
         }
-        # change every tower, because a flight does not name its towers
+        # the height applies to every tower, because a flight file does not list its towers
         site = dataclasses.replace(site, towers=towers)
     if choice.without_buildings:
         note = "this flight is replayed without the buildings of the site (site.without_buildings)"
@@ -495,7 +495,7 @@ def gather(
         track = _flown_track(site, path, telemetry, settings)
         warnings += [f"{path}: {text}" for text in track.account.warnings]
         rss = [(place, _moving(place, series, track, warnings)) for place, series in rss]
-    # without any position, the message about the overlap is better
+    # if the ranks have no positions either, the check of the overlap has the better message
     elif rss and any(series.position_m is not None for _, series in rank):
         levels = ", ".join(dict.fromkeys(f"{series.tower} {series.channel}" for _, series in rss))
         warnings.append(f"no telemetry log: the levels of {levels} have no positions and are ignored")
@@ -546,7 +546,7 @@ def _sort_log(found: _Found, settings: FlightFile, site: Site, files: Sequence[I
     found.telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
     heard = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
     for stream in (s for s in heard if log.node or not is_own_radio(s)):
-        # the sounder writes power and quality to separate files, and the paths of one receiver begin with equal letters
+        # the sounder writes power and quality to separate files, whose paths begin with equal letters per receiver
         alike = {id(f): len(os.path.commonprefix([f.path, file.path])) for f in files}  # noqa: RUF071
         others = sorted(files, key=lambda f: (f is not file, -alike[id(f)]))
         elsewhere = (candidate for source in others for candidate in source.result.streams)
@@ -737,7 +737,7 @@ def check_place(site: Site, path: str, stream: Stream) -> None:
     latitude, longitude = (stream.frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
     if not (near := nearest_m(site, latitude, longitude)) > FAR_M:
         return
-    # in the order of their frequency
+    # the most frequent mistakes first
     turned = {
         "latitude and longitude are swapped": (longitude, latitude),
         "the sign of the longitude is missing (west is negative)": (latitude, -longitude),
@@ -899,7 +899,7 @@ def _records(parts: Sequence[tuple[str, Series]], name: Callable[[Series], str])
 def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
     if len(group) == 1:
         return group[0][1]
-    # sort by time, independent of the order in the flight file; a record without samples is not included
+    # sort records with samples by time, independent of their order in the flight file
     parts = sorted((p for p in group if len(p[1].time)), key=lambda p: p[1].time.min()) or [group[0]]
     for (path, before), (later_path, after) in itertools.pairwise(parts):
         if after.time.min() < before.time.max() or _form(before) != _form(after):
@@ -980,7 +980,7 @@ def _check_shared(data: FlightData, what: str, time: Times, track: Track, node: 
     expected = "logs of the same flight"
     if node is not None:
         of, expected = "the track of this tower", "positions of the node during the flight"
-        # a year of 1970 means times from another zero
+        # a year near 1970 means that relative times have no origin
         if pd.Timestamp(end).year < _FIRST_YEAR:
             cause = "relative times: they require 'time_origin' next to the log"
         cause = cause.replace("next to the log", f"next to 'path' in towers.{node}.track")
@@ -1010,7 +1010,7 @@ def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray,
     known = np.isfinite(position).all(axis=1)
     if track is not None and not known.all():
         pose = track.pose_at(series.time)
-        # decide row by row: a modem without a fix for some time has the position of the track then
+        # row by row, because a modem may have no fix for some time
         use = ~known & pose.valid
         position, known = np.where(use[:, None], pose.position_m, position), known | use
     return position, np.asarray(known)

@@ -128,7 +128,7 @@ def mean_gain_db(patterns: Sequence[Pattern], theta_rad: FloatArray, phi_rad: Fl
     """Return the mean gain (n,) of the elements of an array in directions of its frame [dBi], at least -60."""
     fields = [pattern.field(theta_rad, phi_rad) for pattern in patterns]
     power = sum(np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2 for e_theta, e_phi in fields)
-    # nulls are limited to -60 dB: no model of a pattern is more accurate
+    # nulls are limited to -60 dB, because no model of a pattern is that accurate
     return np.asarray(10.0 * np.log10(np.maximum(power / len(patterns), 1e-6)))
 
 
@@ -415,7 +415,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
         If a key of ``antennas`` is neither ``uav`` nor ``TOWER.CHANNEL``.
     """
     ends = _Ends(settings.link.rss, dict(settings.link.channels))
-    # the airframe last: it belongs to every channel, also to those that antennas of towers bring
+    # the airframe last, because it belongs to every channel, also to those that antennas of towers add
     for key, name in sorted(settings.antennas.items(), key=lambda item: item[0] == "uav"):
         tower, _, channel = key.partition(".")
         if key != "uav" and not (tower and channel):
@@ -474,7 +474,7 @@ def _named(name: str, folder: Path, end: str, key: str) -> Named | Caution:
 
 def _receiver(settings: FlightFile, name: str, folder: Path, ends: _Ends) -> str | None:
     """Return the file of a rank receiver. None, with the reason in ``ends``, if it does not fit."""
-    if Path(name).suffix == ".json":  # a file that is missing: reading it reports that
+    if Path(name).suffix == ".json":  # the error of a missing file comes from reading it
         return name
     named = _named(name, folder, "receiver", "rank.receiver")
     if not isinstance(named, Caution):

@@ -305,7 +305,7 @@ class PlanSettings(StrictModel):
 class FlightSettings(StrictModel):
     """The name and kind of the flight."""
 
-    # it is the name of the report's folder: no blanks, no separators, no dot in front
+    # the name of the report's folder must not have blanks, separators or a leading dot
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
     title: str | None = None
     synthetic: bool = False
@@ -597,9 +597,9 @@ def joined(settings: FlightFile, learned: Path) -> FlightFile:
         check_seal(learned)
     known = files_of(load_yaml(learned, LearnedSettings).model_dump(exclude_unset=True), learned.parent, learned)
     taught: dict[str, Any] = known.get("link", {}).get("channels", {})
-    # only stated values: a default must not replace a learned value
+    # only stated values, because a default must not replace a learned value
     stated: dict[str, Any] = settings.model_dump(mode="json", exclude_unset=True)
-    # a channel begins as the RSS link, as with overrides; learned values come last
+    # a channel begins as the RSS link, as with overrides, and learned values come last
     rss_link = settings.link.rss.model_dump(mode="json", exclude_unset=True)
     channels = dict(stated.get("link", {}).get("channels", {}))
     for name, channel in taught.items():

@@ -107,7 +107,7 @@ def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
             cause="the log has altitudes, or no positions",
         )
     note = f"no altitude in the log: {log.height_m:g} m above take-off everywhere (height_m)"
-    # the question of the reader is answered here
+    # height_m answers the reader's question about the missing height
     warnings = [text for text in file.result.warnings if not text.startswith("no column is known as a height")]
     return replace(file, result=replace(file.result, streams=tuple(streams), warnings=(*warnings, note)))
 
@@ -145,7 +145,7 @@ AT_ONCE = 100_000
 # Time before and after for a velocity from positions [s].
 _COURSE_SPAN_S = 2.0
 
-# Reasons why a pose is not valid; index 0 is a valid pose.
+# Reasons why a pose is not valid. Index 0 means a valid pose.
 REASONS = (
     "", "before telemetry", "after telemetry", "telemetry gap", "no telemetry", "no time", "no position of the tower",
     "below the site's ground plane",

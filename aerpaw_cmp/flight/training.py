@@ -48,7 +48,7 @@ _BEGIN = "f"
 _SLACK, _HOUR = 120, 7200
 
 # Smallest number of common half seconds, correlation, and z value of Fisher above which two fingerprints belong to one
-# log. The largest z of two logs of the field is 7.3, the next 5.7; the smallest for a changed copy is 8.6.
+# log. The largest z of two logs of the field is 7.3, and the next 5.7. The smallest for a changed copy is 8.6.
 _FEWEST, _LEAST_R, _LEAST_Z = 80, 0.5, 7.5
 
 # Readings of a run, changes in it (a constant level repeats in every log), and strides of readings. A copy with half or
@@ -58,7 +58,7 @@ _RUN, _LEAST_CHANGES, _STRIDES = 24, 8, (1, 2, 4)
 # A series with fewer different values has no runs, because ranks along one route change similarly on every flight.
 _FEWEST_VALUES = 6
 
-# Runs in a fingerprint, and common runs above which two belong to one log; a tenth of a log has about 6 of 64 in
+# Runs in a fingerprint, and common runs above which two belong to one log. A tenth of a log has about 6 of 64 in
 # common.
 _RUNS, _LEAST_SHARED = 64, 3
 
@@ -274,7 +274,7 @@ def _original(pattern: MeasuredPattern, folder: Path, memory: Path) -> SpherePat
     The search includes learned tables of the site and of packaged sites, and calibrations in the folder.
     """
     packaged = folder_of("lake_wheeler").parent.glob("*.learned/*.csv.gz")
-    # learned tables of the site first, because the table is mostly there
+    # learned tables of the site first, because they contain most of the tables that are looked up
     places = dict.fromkeys([*memory.glob("*.csv.gz"), *packaged, *folder.glob("*.csv"), *folder.glob("*/*.csv")])
     tables = (table for place in places if (table := _learned_table(place)) is not None)
     return next((table for table in tables if _same_numbers(pattern, table)), None)

@@ -115,7 +115,10 @@ def learned_healths(observed: Sequence[Observed], fits: Mapping[str, Learned]) -
 
 
 def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[str, str], Learned]:
-    """Return gains learned without each pair of flights, so that a forecast for one uses levels that know neither."""
+    """Return gains learned without each pair of flights, by pair.
+
+    The forecast of P(lock) for one flight is fitted to levels of the others, which are predicted without both.
+    """
     out: dict[tuple[str, str], Learned] = {}
     for one, other in combinations(groups_of(flights_of(observed)), 2):
         learned = learn([o.samples for o in observed if o.samples.flight not in (*one, *other)], recipe)
@@ -187,7 +190,7 @@ def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
         gain, level = (np.concatenate(values) for values in zip(*each, strict=True))
         alike = np.concatenate([np.full(len(g), len(g) ** -0.5) for g, _ in each])  # equal weights of the flights
         slope, middle = np.polyfit(gain, level, 1, w=alike)
-        # in lock, fades are rare and deep: use the central 90 %, so that the 90 % band does not cover more
+        # in lock, fades are rare and deep, so the central 90 % give a 90 % band that does not cover more
         central = np.mean([np.ptp(np.quantile(m - slope * g, (0.05, 0.95))) for g, m in each]) / _CENTRAL
         sd = central if in_lock else (level - middle - slope * gain).std()
         numbers |= {f"{name}_db": middle, f"{name}_per_db": slope, f"{name}_sd_db": max(sd, _LEAST_SD_DB)}
@@ -210,7 +213,7 @@ _ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
 
 
 class PatternsSettings(StrictModel):
-    """Measured patterns to which the learned gain is added. Default: isotropic."""
+    """The measured patterns to which the learned gain is added, isotropic by default."""
 
     uav: AntennaSettings | None = None
     tower: AntennaSettings | None = None
@@ -273,7 +276,7 @@ class GroundFit:
 
     @property
     def used_m(self) -> float | None:
-        """The most probable height, for replays. None if no ground ray is as likely."""
+        """The most probable height, for replays. None if the data fit as well without a ground ray."""
         return None if math.isinf(self.likely_m[1]) else self.roughness_m[int(np.argmax(self.log_likelihood))]
 
 
@@ -514,7 +517,7 @@ def in_campaigns(
 
 
 def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
-    """Return the samples of every series relative to free space, and remarks on them."""
+    """Return the samples of every series relative to free space, and remarks."""
     observed: list[Observed] = []
     warnings: list[str] = []
     carriers: dict[str, dict[str, float]] = {}
@@ -648,7 +651,7 @@ def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lea
 def _score_all(
     observed: Sequence[Observed], recipe: Recipe, stages: Stages, fits: dict[str, Learned]
 ) -> dict[str, tuple[Score, ...]]:
-    """Score every split on data without a part in the fit. Fits are shared between splits.
+    """Score every split on samples that were not used in the fit. Fits are shared between splits.
 
     Parameters
     ----------
@@ -727,7 +730,7 @@ def teaching(observed: Sequence[Observed], campaigns: Mapping[str, str], fits: M
     for flight, learned in fits.items():
         series = [o.samples for o in observed if o.samples.flight == flight]
         antenna = next((s.antenna for s in series if s.antenna in learned.fit.antennas), None)
-        if antenna is None:  # without this flight, nothing was learned for its campaign
+        if antenna is None:  # the antennas of this flight were learned from it alone
             continue
         process = _airframe(learned, antenna)
         passed.setdefault(campaigns[flight], []).append(FlightEvidence(series).of_airframe(process).fits)

@@ -139,7 +139,7 @@ def _listed(key: str, entries: Sequence[str]) -> list[str]:
 def _learned_antenna(
     calibration: Calibration, antenna: str, end: str, files: Mapping[str, str], place: str, command: str
 ) -> str:
-    """Return the value of ``antenna`` in calibrated.yaml: table, SHA-256 and error model of an antenna, on one line."""
+    """Return the value of ``antenna`` in calibrated.yaml on one line, with table, SHA-256 and error model."""
 
     def sha256(file: str) -> str:
         return hashlib.sha256(files[file].encode()).hexdigest()
@@ -413,7 +413,7 @@ _OFFSET_SD_DB = 1.5
 def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:
     """Return the mean level of the flights above the written antennas, with the error on held-out flights."""
     mine = [o for o in calibration.observed if (o.samples.tower, o.samples.channel) == (series.tower, series.channel)]
-    if mine[0].samples.antenna in calibration.locks:  # without lock, a level does not depend on the path
+    if mine[0].samples.antenna in calibration.locks:  # the level without lock does not depend on the path
         mine = [o.part(o.locked == 1.0) for o in mine if o.locked is not None]
     sent = series.link.transmit_power_dbm
     offsets = [calibration.learned.mean_error(o.samples) + o.sent_dbm - sent for o in mine]

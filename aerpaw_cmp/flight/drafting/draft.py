@@ -58,13 +58,13 @@ class DryRun:
     Parameters
     ----------
     samples : int
-        Levels and ranks with a position, a value and the height that the settings ask for.
+        Number of levels and ranks with a value, a position and at least the minimum height of the settings.
     refused : str
         The message with which a report would stop. Empty if it would run.
     lost : tuple of str
         Series of which less than half of the samples are compared, each with the reason.
     data : FlightData or None
-        The gathered flight; None if the report would stop.
+        The gathered flight, or None if the report would stop.
     """
 
     samples: int = 0
@@ -79,7 +79,7 @@ class DryRun:
 
 
 def dry_run(settings: FlightFile, folder: Path, files: Sequence[IngestedFile]) -> DryRun:
-    """Gather a flight as a report does, by :func:`~aerpaw_cmp.flight.data.gather`, and count what could be scored."""
+    """Gather a flight as a report does, and count the samples that the report would score."""
     try:
         data = gather(settings, folder, files)
     except (InputError, UsageError) as error:
@@ -182,7 +182,7 @@ def draft(
     Returns
     -------
     str, list of str
-        The text; and what the user should check, and what is not used.
+        The text, and remarks on what the user should check and on what is not used.
 
     Raises
     ------
@@ -209,7 +209,7 @@ def draft(
     kinds = {stream.kind for line in lines for stream in line.compared}
     out = sorted(remark for line in lines for remark in line.remarks)
     if not kinds & {"rss", "rank"}:
-        # the warnings of a table of positions list the columns that may be levels under an unknown name
+        # a table of positions may contain levels under an unknown name, which its warnings list
         unread = [text for file in files for text in file.result.warnings if "--map" in text]
         raise UsageError(
             "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in (*out, *unread)),
@@ -220,13 +220,13 @@ def draft(
 
     def text_with(known: Proposal) -> str:
         logs = [line.with_receiver(known.receivers.get(number)) for number, line in enumerate(used)]
-        # a log that is not used may have the place of a node of other logs
+        # a log that is not used may have determined the place of a node that other logs share
         parts = _first_lines(name, [*(line for line in lines if not line.entry), *logs], out, context)
         learned_lines = _learned_lines(known, link) if "rss" in kinds else []
         rank = [RANK] if "rank" in kinds else []
         return "".join([*parts, *learned_lines, *rank, *_settings(lines, context, known)])
 
-    # a report would read and gather the draft in the same way, so what the remarks promise is true
+    # the counts in the remarks come from a dry run, which reads and gathers the flight as a report does
     proof = _proof(text_with(Proposal()), folder, [line.file for line in used])
     known, remarks = _remembered(lines, context, proof.data)
     text = text_with(known)
@@ -257,7 +257,7 @@ def _first_lines(name: str, lines: Sequence[_Line], out: Sequence[str], context:
 
 
 def _link(lines: Sequence[_Line], own: Sequence[IngestedFile]) -> str:
-    """Return ``link:``: a downlink if all levels are what a phone or modem reports of its cell."""
+    """Return the lines of ``link``, which is a downlink if all levels are RSRP of a phone or modem."""
     levels = [stream for line in lines for stream in line.compared if stream.kind == "rss"]
     link = _DOWNLINK if levels and all(s.attributes.get("quantity") == "RSRP" for s in levels) else LINK
     return link.replace("20e6", f"{_bandwidth_mhz([file.path for file in own]):g}e6")
@@ -294,8 +294,8 @@ class Draft:
 def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = DraftOptions()) -> list[Draft]:
     """Return a flight.yaml for each flight of the logs, in the order of time.
 
-    If only one flight is complete (levels or ranks, and positions), its draft lists all logs, and marks those of no
-    flight as not used. See :func:`draft`.
+    If only one flight is complete (levels or ranks, and positions), its draft lists all logs, and names those that it
+    does not use. See :func:`draft`.
 
     Parameters
     ----------
@@ -348,7 +348,7 @@ class NamedFlight:
 def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, NamedFlight]:
     """Return the flights that can be drafted, by name, in the order of time."""
     every = [flight for flight in flights(files) if flight.measured]
-    # without any track, each flight waits for its own
+    # if no flight has a track, all are drafted
     complete = [flight for flight in every if flight.complete] or every
     named: dict[str, NamedFlight] = {}
     for flight in complete or [Flight(list(files))]:
@@ -365,7 +365,7 @@ def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, NamedFlight]:
 # Lower samples are take-off, landing and waiting: at 2 m the airframe, its pilot and the grass determine the level.
 MINIMUM_HEIGHT_M = 5
 
-# A flight that never was higher has no part that is better than its start.
+# Take-off and landing are excluded only from a flight that reached this height [m].
 _FLOWN_ABOVE_M = 15.0
 
 
@@ -375,7 +375,8 @@ _QUICK_AUDIT = 24
 _QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers to publish"
 
 
-# A flight some hundred metres away knows the direction of a node with this radius within some tens of degrees.
+# Learned antennas are compared at a node whose 90 % region has at most this radius [m]. Its direction from a flight
+# some hundred metres away is then known within some tens of degrees.
 _SURE_M = 100.0
 
 
@@ -548,7 +549,7 @@ def receiver_floor_db(levels: Sequence[Stream]) -> float | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Context:
-    """The flight, its site and the options: the same for every log of a draft.
+    """The flight, its site and the options, which are equal for all logs of a draft.
 
     Parameters
     ----------
@@ -558,19 +559,19 @@ class _Context:
     flown : (Stream, Span), optional
         The telemetry that is the track, and its time span.
     which : str
-        Question about the vehicle if several flew; otherwise empty.
+        Question about the vehicle, empty if only one flew.
     unsure : mapping of str to str
         Questions about files that may belong to another flight, by path.
     has_level : bool
-        A log of the flight contains levels of the experiment.
+        True if a log of the flight contains levels of the experiment.
     positioned : bool
-        A log to compare contains its own positions.
+        True if a log of ranks contains its own positions.
     locks : bool
-        The receiver is a sounder that can lose its lock.
+        True if the receiver is a sounder that can lose its lock.
     towers : sequence of str
         Towers of the site.
     placer : Placer, optional
-        Proposals for nodes; None if there is no track at the site.
+        Proposals for nodes, or None if there is no track at the site.
     """
 
     folder: Path
@@ -596,7 +597,7 @@ class _Context:
     def shift(self, stream: Stream) -> np.timedelta64:
         """Return the time to add to a UTC clock that was read as local time. It is 0 for other clocks."""
         span = stream_span(stream)
-        # the log itself specifies its UTC offset: do not correct it
+        # a clock is not corrected if the log itself specifies its UTC offset
         if self.flown is None or span is None or stream.kind == "telemetry":
             return np.timedelta64(0, "m")
         trap = clock_trap(span, self.flown[1], self.options.timezone)
@@ -630,7 +631,7 @@ class _Context:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Line:
-    """One log of a draft: its line in ``logs:``, or the reasons why it is not used.
+    """A log of a draft, with its line in ``logs:`` or the reasons why it is not used.
 
     Parameters
     ----------
@@ -638,9 +639,9 @@ class _Line:
     shown : str
         Path relative to the flight.yaml, for messages.
     entry : mapping
-        Keys of the line; empty if the log is not used.
+        Keys of the line, empty if the log is not used.
     comment : str
-        Reasons and questions at its end.
+        Comment at the end of the line, with reasons and questions.
     remarks : tuple of str
         Streams that are not compared, with the reason.
     compared : tuple of Stream
@@ -673,13 +674,13 @@ class _Line:
 
 
 def _lines(files: Sequence[IngestedFile], context: _Context) -> list[_Line]:
-    """Return a line per log: telemetry first, then in the order of the files."""
+    """Return a line per log, telemetry first and the others in the order of the files."""
     lines: list[_Line] = []
 
     def samples(file: IngestedFile) -> int:
         return sum(len(s.frame) for s in file.result.streams if s.kind != "telemetry")
 
-    # copies of a log: use the one on the telemetry's clock, then the one with the most samples
+    # the first of several copies is used: that on the telemetry's clock, then that with the most samples
     for file in sorted(files, key=lambda f: (not context.leads(f), context.is_utc(f), -samples(f))):
         lines.append(_line(file, context, lines))
     order = {file.path: number for number, file in enumerate(files)}
@@ -687,7 +688,7 @@ def _lines(files: Sequence[IngestedFile], context: _Context) -> list[_Line]:
 
 
 def _line(file: IngestedFile, context: _Context, earlier: Sequence[_Line]) -> _Line:
-    """Return the line of one log. Logs that were used before it are not used twice."""
+    """Return the line of one log. Its series are not used if an ``earlier`` log has them."""
     path = os.path.relpath(Path(file.holder or file.path).resolve(), context.folder)
     path = str(Path(path, name_inside(file.path))) if file.holder else path
     shown = one_line(path)
@@ -757,7 +758,7 @@ def _heights_and_floor(
     # RSRP is reported in whole decibels, so its lowest value repeats without a floor
     levels = [s for s in compared if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"]
     if (floor := receiver_floor_db(levels)) is not None:
-        # a hundredth above: levels at or below the floor are out of coverage
+        # a hundredth above, because levels at or below floor_db are out of coverage
         keys["floor_db"] = round(floor + 0.01, 2)
         asked.append(
             f"floor of the receiver at {floor:.1f} dB?" if commented or asked else f"receiver floor {floor:.1f} dB?"
@@ -859,7 +860,7 @@ def _refused(
 ) -> dict[str, str]:
     """Return the streams of a log that are not compared, by name, with the reason.
 
-    ``dated``: relative times have an origin.
+    ``dated`` is True if relative times have an origin.
     """
     leading = _leading(streams)
     taken = [
@@ -869,7 +870,7 @@ def _refused(
         if s.kind != "telemetry"
     ]
     refused = {}
-    # a log can contain two ranks: the one with more values comes first
+    # of two ranks in a log, the one with more values is used
     for stream in sorted(streams, key=_missing):
         span, key = context.span(stream), _key(stream, entry)
         if span is None:
@@ -890,8 +891,8 @@ def _refused(
     return refused
 
 
-# Means of two logs over this time [s] differ by a constant if they have the same readings, in any form. Those of two
-# antennas differ by some decibels more [dB].
+# Means over this time [s] show whether two logs have the same readings, in any form: their difference then has a
+# standard deviation below this [dB]. That of the levels of two antennas is some decibels.
 _MEANS_S, _OTHER_READINGS_DB = 2.0, 1.0
 
 
@@ -962,10 +963,10 @@ def _missing(stream: Stream) -> int:
 
 
 def _leading(streams: Sequence[Stream]) -> dict[str, str]:
-    """Return the streams that repeat the RSRP of their receiver and cell in another quantity, with that RSRP's name."""
+    """Return the streams with another quantity of a receiver and cell than its RSRP, with the name of the RSRP."""
     leaders: dict[object, str] = {}
     same = {}
-    # RSRP first: RSSI and wideband power of a cell include its load and its neighbours
+    # RSRP first, because RSSI and wideband power of a cell include its load and its neighbours
     for stream in sorted(streams, key=lambda s: s.attributes.get("quantity") != "RSRP"):
         if stream.kind != "rss" or "quantity" not in stream.attributes:
             continue
@@ -1005,7 +1006,7 @@ def _has_level(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None)
 
 
 def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
-    """Return the telemetry that overlaps most levels and ranks, and its time span. The longest wins a tie."""
+    """Return the telemetry that overlaps most levels and ranks, and its time span. In a tie it is the longest one."""
     timed = [(stream, span, file) for file in files for stream in file.result.streams if (span := stream_span(stream))]
     measured = [span for s, span, _ in timed if s.kind != "telemetry" and has_wall_clock(span[0])]
     tracks = [(s, span, file) for s, span, file in timed if s.kind == "telemetry"]
@@ -1074,7 +1075,7 @@ def _apart_m(first: Stream, second: Stream) -> float:
     return float(np.median(np.linalg.norm(here - there, axis=1))) if both.any() else 0.0
 
 
-# Propose the cells with the most samples only: in a city a phone reports a hundred cells.
+# Largest number of cells that are proposed, those with the most samples. In a city a phone reports a hundred cells.
 MOST_CELLS = 6
 
 
@@ -1105,7 +1106,7 @@ def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[s
     if not need:
         return entry, ""
     here = Path(file.path).resolve()
-    # the names of the file and its folder only: a home folder may have the name of a tower
+    # only the names of the file and its folder, because a home folder may have the name of a tower
     near = named_tower("/".join(here.parts[-2:]), towers)
     alone = towers[0] if len(towers) == 1 else None
     entry["node"] = near or named_tower(path, towers) or alone or next(iter(towers), "LW1")
@@ -1126,12 +1127,15 @@ def _also(comment: str, question: str) -> str:
 
 def _plain(entry: Mapping[str, Any]) -> str:
     """Return a mapping of plain names on one line of YAML."""
-    # not wrapped: a question follows on the same line
+    # on one line, because a question follows at its end
     return str(yaml.safe_dump(dict(entry), default_flow_style=True, sort_keys=False, width=10_000)).strip()
 
 
 def _flow(entry: dict[str, Any]) -> str:
-    """Return the YAML mapping of a log on one line, quoted if necessary: a file name can be 1e6."""
+    """Return the YAML mapping of a log on one line.
+
+    Texts are quoted if one of them looks like a number, such as 1e6.
+    """
 
     def dumped(style: str | None) -> str:
         text = yaml.safe_dump(
@@ -1142,14 +1146,14 @@ def _flow(entry: dict[str, Any]) -> str:
 
     text = dumped(None)
     try:
-        # our reader follows YAML 1.2, the writer 1.1: a name such as 1e6 or 12:30 can change
+        # a name such as 1e6 or 12:30 can change, because our reader follows YAML 1.2 and the writer YAML 1.1
         as_read = len(text.splitlines()) == 1 and parse_yaml(text, LogSettings).path == entry["path"]
     except UsageError:
         as_read = False
     return text if as_read else dumped('"')
 
 
-# Earlier times are relative, or from a clock that was never set: they do not name a flight.
+# Earlier times are not used in the name of a flight, because they are relative or from a clock that was never set.
 _FIRST_CLOCK = np.datetime64("1981")
 
 

@@ -64,7 +64,7 @@ _FADING_RATE = 40.0
 # Weight of a correlation over place relative to the mean weight of one over time, and the length above which it falls
 # as 1 / length, by kind. The terms hardly distinguish such lengths, but the mean and the power of a test depend on
 # them. Found by simulation. Differences of squares are correlated over half of the errors' length.
-_PLACE_WEIGHT = {"mean": (0.06, 1.0), "power": (0.06, 1.0), "ratio": (0.07, 0.2), "influence": (0.07, 1.0)}
+_PLACE_WEIGHT = {"mean": (0.06, 1.0), "power": (0.06, 1.0), "ratio": (0.12, 0.2), "influence": (0.07, 1.0)}
 
 # Largest number of positions from which the correlations of a track are computed.
 _THINNED = 400

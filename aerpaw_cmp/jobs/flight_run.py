@@ -40,7 +40,6 @@ from ..flight.replay import FlightReplay, Replayed, attitude_rotation, replay_fl
 from ..flight.settings import FlightFile, RssSettings
 from ..flight.training import learned_here
 from ..propagation.drivers import replay_moving
-from ..propagation.edges import diffracted
 from ..propagation.field.sum import fields_of, mean_pair_power, rss_dbm
 from ..propagation.geometry import Link, PathSet, Poses, single_element
 from ..propagation.options import Field, Run, Search
@@ -91,8 +90,6 @@ class Model:
     """True if attenuating woods are media instead of single trees."""
     relief: Relief = "flat"
     """Ground at the towers and below the paths, instead of that of the flight file."""
-    diffraction: bool = False
-    """Paths over one edge of a building, with ground reflections on both sides."""
     roughness_m: float = 0.0
     """Roughness for ``ground: rough``, from the flight file."""
 
@@ -106,7 +103,6 @@ class Model:
         if self.ground != "none":
             parts.append(f"{_GROUND_WORDS[self.ground]} ground reflection")
         parts += ["buildings"] if self.buildings else []
-        parts += ["diffraction"] if self.diffraction else []
         if self.trees != "none":
             woods = "woods as media" if self.media else "trees"
             parts.append("opaque trees" if self.trees == "opaque" else f"{woods} ({self.trees})")
@@ -123,8 +119,6 @@ class Model:
             **({"ground_roughness_m": self.roughness_m} if self.ground == "rough" else {}),
             "foliage": "none" if self.trees == "none" else "opaque" if self.trees == "opaque" else "attenuating",
         }
-        if self.diffraction:
-            rt["diffraction"] = "edges"
         if self.trees == "p833":
             rt["foliage_model"] = self.trees
         return {
@@ -190,7 +184,7 @@ class _Climber:
         self._data, self._series = data, series
         self._measured = [s.levels.measured_db[s.rows] for s in series]
         self._traced: dict[tuple[Any, ...], tuple[Replay, float]] = {}
-        self._lost: dict[tuple[int, Model], tuple[Replay, PathSet, list[FloatArray | None], float]] = {}
+        self._lost: dict[tuple[int, Model], tuple[Replay, PathSet, FloatArray | None, float]] = {}
         patterns = [p for s in series for a in _arrays(s.replayed.link) for p in a.patterns]
         self._offer = offered(data) if all(p.name == "iso" for p in patterns) else None
         links = [s.replayed.link for s in series]
@@ -209,7 +203,7 @@ class _Climber:
         models: list[Model | None] = [None] * len(rungs)
         best = Model()
         # woods first: their loss is larger than the effect of a reflection and would hide it
-        for stage in (self._antennas, self._trees, self._ground, self._buildings, self._edges, self._relief):
+        for stage in (self._antennas, self._trees, self._ground, self._buildings, self._relief):
             for model in stage(best):
                 if model not in models:
                     models.append(model)
@@ -321,14 +315,6 @@ class _Climber:
     def _buildings(self, best: Model) -> list[Model]:
         return [dataclasses.replace(best, buildings=True)] if self._data.site.buildings else []
 
-    def _edges(self, best: Model) -> list[Model]:
-        # only if the flight has diffraction: it is the slowest model, and the best on none of 28 real series
-        moving = any(s.replayed.tower_m is not None for s in self._series)
-        site, asked = self._data.site, self._data.settings.rt.diffraction != "none"
-        if not asked or not site.buildings or site.scene is not None or moving:
-            return []
-        return [dataclasses.replace(best, buildings=True, diffraction=True)]
-
     def _trees(self, best: Model) -> list[Model]:
         if not self._data.site.wooded:
             return []
@@ -338,8 +324,7 @@ class _Climber:
         return [dataclasses.replace(best, trees=kind, media=media and kind != "opaque") for kind in kinds]
 
     def _relief(self, best: Model) -> list[Model]:
-        # without diffraction, which over terrain takes longer than all earlier models
-        return [dataclasses.replace(best, relief=kind, diffraction=False) for kind in self._reliefs]
+        return [dataclasses.replace(best, relief=kind) for kind in self._reliefs]
 
     @cached_property
     def _reliefs(self) -> dict[Relief, Site]:
@@ -407,22 +392,16 @@ class _Climber:
         series, link, site = self._series[index], self._links[index], self._site(model.relief)
         if model.antennas == "isotropic":
             link = _isotropic_link(link)
-        traced, paths, losses_db, search_s = self._paths(index, model)
+        traced, paths, loss_db, search_s = self._paths(index, model)
         begin = time.perf_counter()
         poses, sources = self._poses(series, model.attitude), self._sources(series, site)
-        fields = [
-            fields_of(some, traced.faces, traced.ends.sources_m, poses, link, loss_db)
-            for some, loss_db in zip((paths, *traced.further), losses_db, strict=True)
-        ]
-        if model.ground == "power sum":
-            power = sum(item.power for item in fields)
-        else:
-            power = mean_pair_power(np.asarray(sum(item.h for item in fields)))
-        level = rss_dbm(np.asarray(power), link.transmit_power_dbm)[:, 0] + pair_db(link, poses, sources)
+        field = fields_of(paths, traced.faces, traced.ends.sources_m, poses, link, loss_db)
+        power = field.power if model.ground == "power sum" else mean_pair_power(field.h)
+        level = rss_dbm(power, link.transmit_power_dbm)[:, 0] + pair_db(link, poses, sources)
         return level, series.step * (search_s + time.perf_counter() - begin)
 
-    def _paths(self, index: int, model: Model) -> tuple[Replay, PathSet, list[FloatArray | None], float]:
-        """Return the replay, its paths without an edge for a model, their losses [dB], and the seconds."""
+    def _paths(self, index: int, model: Model) -> tuple[Replay, PathSet, FloatArray | None, float]:
+        """Return the replay, its paths for a model, their losses [dB], and the seconds."""
         # antennas and attitude do not change paths and losses
         key = self._like[index], dataclasses.replace(model, antennas="isotropic", attitude="ignored")
         if key not in self._lost:
@@ -432,23 +411,20 @@ class _Climber:
             paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
             changed = rt.model_copy(update=without_losses() | model.settings(rt.max_depth)["rt"])
             field, ends = Field(path_loss(site, changed, self._links[index].carrier_hz)), traced.ends
-            lines = [paths, *(some.lines() for some in traced.further)]
-            losses = [field.loss_db(some, ends.sources_m, ends.poses.position_m) for some in lines]
-            self._lost[key] = traced, paths, losses, search_s + time.perf_counter() - begin
+            loss_db = field.loss_db(paths, ends.sources_m, ends.poses.position_m)
+            self._lost[key] = traced, paths, loss_db, search_s + time.perf_counter() - begin
         return self._lost[key]
 
     def _traced_for(self, index: int, model: Model) -> tuple[Replay, float]:
         """Return the replay between single elements, and its seconds."""
         direct = model.relief != "flat" and model.ground == "none"  # the search of reflections off terrain is slow
-        key = self._like[index], model.buildings, model.diffraction, model.relief, direct
+        key = self._like[index], model.buildings, model.relief, direct
         if key not in self._traced:
             begin = time.perf_counter()
             series, tower, site = self._series[index], self._data.rss[index].tower, self._site(model.relief)
             site = site if model.buildings else dataclasses.replace(site, buildings=())
             depth = max(self._data.settings.rt.max_depth, 1) if model.buildings else 1
-            search = Search(
-                max_depth=0 if direct else depth, further=diffracted("edges" if model.diffraction else "none")
-            )
+            search = Search(max_depth=0 if direct else depth)
             link = Link(self._links[index].carrier_hz, {tower: single_element()}, single_element())
             poses, sources = self._poses(series, "ignored"), self._sources(series, site)
             if series.replayed.tower_m is not None:
@@ -511,8 +487,9 @@ def recommended_changes(
         if current[section].get(key) != value
     }
     rt = stated.get("rt") or {}
-    gone = {"ground_roughness_m": model.ground != "rough", "diffraction": not model.diffraction}
-    changes |= {("rt", key): None for key, unused in gone.items() if unused and key in rt}
+    # no model has diffraction: it was the best on none of 28 real series
+    unused = ("diffraction",) if model.ground == "rough" else ("diffraction", "ground_roughness_m")
+    changes |= {("rt", key): None for key in unused if key in rt}
     if isinstance(stated.get("site"), str):
         of_site = {key: changes.pop(("site", key)) for section, key in list(changes) if section == "site"}
         if of_site:

@@ -76,14 +76,13 @@ def unpacked_pieces(file: BinaryIO, path: str | Path) -> Iterator[bytes]:
         raise InputError(found, expected="the log unpacked", path=path) from error
     count = 0
     try:
-        with module.open(file) as content:
-            while piece := content.read(_PIECE):
-                count += len(piece)
-                # check while unpacking, so that a zip bomb is stopped at its first piece
-                if count > _MOST_RATIO * file.tell() + _PIECE:
-                    found = f"the {name} file unpacks to more than {_MOST_RATIO} times its size"
-                    raise InputError(found, cause="no log", path=path)
-                yield piece
+        for piece in iter(partial(module.open(file).read, _PIECE), b""):
+            count += len(piece)
+            # check while unpacking, so that a zip bomb is stopped at its first piece
+            if count > _MOST_RATIO * file.tell() + _PIECE:
+                found = f"the {name} file unpacks to more than {_MOST_RATIO} times its size"
+                raise InputError(found, cause="no log", path=path)
+            yield piece
     except EOFError as error:
         raise InputError(f"the {name} file ends too early", cause="a cut download", path=path) from error
     # the header of an xz file may ask for more memory than there is

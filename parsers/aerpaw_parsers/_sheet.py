@@ -210,14 +210,14 @@ class Sheet:
         said = {i: dictionary.Meaning(row, dictionary.without_unit(self.names[i])[1]) for i, row in self.said.items()}
         known = [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
         if not any(what and what.quantity.name == "technology" for what in known):
-            # any column whose cells name radio accesses, such as 'mode'
-            rats = ({cells[i].strip() for cells in self.cells[:200]} - {""} for i in range(len(known)))
-            named = [
-                what is None and bool(cells) and all(map(_RAT.fullmatch, cells))
-                for what, cells in zip(known, rats, strict=True)
-            ]
-            known = [dictionary.meaning("technology") if it else what for what, it in zip(known, named, strict=True)]
+            of_rats = dictionary.meaning("technology")
+            known = [of_rats if what is None and self._names_rats(i) else what for i, what in enumerate(known)]
         return dictionary.with_places(zip(self.plain, known, strict=True))
+
+    def _names_rats(self, column: int) -> bool:
+        """Check whether the cells of a column name radio accesses, such as those of a column ``mode``."""
+        cells = {cells[column].strip() for cells in self.cells[:200]} - {""}
+        return bool(cells) and all(map(_RAT.fullmatch, cells))
 
     def find(self, *quantities: str) -> int | None:
         """Return the column that fits one of the quantities best, an empty column only if there is no other."""

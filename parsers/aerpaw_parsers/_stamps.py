@@ -520,14 +520,10 @@ def _numbers(
         hours = step / scale * 1e9 / 3600
         odd = unit is None and bool(likely) and hours > 1 and hours % 1 > 0
         if middle >= 0.9 * scale and not odd and (unit is None or scale >= _text.COUNTS[unit].least_epoch):
-            early = middle < 1.58 * scale  # before 2020 if counted from 1970, before 2030 if counted from 1980
-            warnings = ["the times are called GPS time and count from 1970: read as UTC"] if gps else []
-            if gps and early:
+            epoch_s = middle * 1e9 / scale
+            warnings = _doubts_of_epoch(epoch_s, gps)
+            if gps and epoch_s < _GPS_S_OF[1]:
                 value, warnings = value + (GPS_S - LEAP_S) * scale / 1e9, [_GPS_COUNT]
-            elif early and middle > _GPS_OF_2018 * scale:
-                years = [np.datetime64(round(middle * 1e9 / scale) + zero, "s").item().year for zero in (0, GPS_S)]
-                text = f"the times are read as epochs of {years[0]}; if they count from 1980 (GPS time), they are of"
-                warnings = [f"{text} {years[1]}: then call their column 'GPS time'"]
             return (form, value, warnings) if form else ("epoch_us", value / 1e3, warnings)
     for zero, low, high, program in _DAY_NUMBERS:
         if unit is None and len(value) > 2 and _are_days(value, low, high):
@@ -556,6 +552,17 @@ def _numbers(
     return f"relative_{unit}", value, [f"{text}; {advice}"]
 
 
+def _doubts_of_epoch(epoch_s: float, gps: bool) -> list[str]:
+    """Return a sentence about epochs that are called GPS time, or that may be GPS time."""
+    if gps:
+        return ["the times are called GPS time and count from 1970: read as UTC"]
+    if not _GPS_S_OF[0] < epoch_s < _GPS_S_OF[1]:
+        return []
+    years = [np.datetime64(round(epoch_s) + zero, "s").item().year for zero in (0, GPS_S)]
+    text = f"the times are read as epochs of {years[0]}; if they count from 1980 (GPS time), they are of {years[1]}"
+    return [f"{text}: then call their column 'GPS time'"]
+
+
 def _lasting(value: FloatArray, unit: str) -> str:
     seconds = float(np.nanmax(value) - np.nanmin(value)) * _text.COUNTS[unit].ns / 1e9
     return f"{seconds:,.4g} s" if seconds < 7200 else f"{seconds / 3600:,.0f} h"
@@ -565,8 +572,8 @@ def _lasting(value: FloatArray, unit: str) -> str:
 GPS_S, LEAP_S = 315_964_800, 18
 # Scales of time without leap seconds, and how far they are ahead of UTC since 2017 [s].
 SCALES_S = {"gpst": LEAP_S, "gpstime": LEAP_S, "tai": 37}
-# GPS time of January 2018, which is an epoch of January 2008, in billions of seconds.
-_GPS_OF_2018 = 1.2
+# GPS time of January 2018 and of February 2030. As epochs they are of 2008 and 2020.
+_GPS_S_OF = (1.2e9, 1.58e9)
 _GPS_COUNT = "the times count from 1980 (GPS time): 18 leap seconds were taken off"
 # Date of number zero, and the numbers of the years 2000 to 2099.
 _DAY_NUMBERS = (("1899-12-30", 36_526.0, 73_051.0, "a spreadsheet"), ("-001-12-31", 730_486.0, 767_011.0, "MATLAB"))

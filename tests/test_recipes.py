@@ -60,7 +60,9 @@ for rain in (0.0, 10.0):
     levels.append(one.replay.rss_dbm[:, 0])
 site, rt, expected = data.site, settings.rt, expectations(data, replays.all)[0]
 source, target = one.source_m(site)[0], one.poses.position_m[0]
-paths = explain._paths(site, rt, one.replay, one.link, one.poses, source)
+losses = explain.path_losses(site, rt, one.link.carrier_hz)
+further = {name: loss(one.replay.paths, source[None], target[None]) for name, loss in losses.items()}
+paths = explain.explain_paths(one.replay.paths, one.replay.faces, source, one.poses, one.link, further)
 reference = Reference(site, one.replay.towers[0], expected.link, expected.loss)
 print(json.dumps({
     "km": float(np.linalg.norm(target - source)) / 1000, "lost_db": float((levels[0] - levels[1])[0]),

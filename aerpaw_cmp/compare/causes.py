@@ -305,28 +305,28 @@ class _Demand:
     """The cause changes the levels of all channels."""
     restores: bool = False
     """With learned antennas, the cause must bring the error back to that of held-out flights."""
-    follows: bool = False
-    """The log must follow the level of the cause better than a constant."""
+    follows: float | None = None
+    """Largest remaining error as a share of that of a constant level: any smoother level fits a log of noise."""
     most_left: float = 2.0
     """Largest remaining error as a multiple of the largest usual one."""
 
 
 _DEMANDS = {
     "attitude": _Demand(of_uav=True),
-    # imitated by slow fading and by levels that belong to other places
-    "blocked": _Demand(lead=5.0),
+    # fading looks like a shadow that explains a small part of the error
+    "blocked": _Demand(share=0.2),
     "channels": _Demand(part=0.5, restores=True),
     "clock": _Demand(part=0.5, restores=True),
     "decibels": _Demand(most_left=math.inf),
     "gain step": _Demand(lead=2.5, part=0.5),
-    "heading": _Demand(learned_share=0.25, part=0.5, of_uav=True, restores=True, follows=True),
-    "height": _Demand(part=0.5, of_uav=True, restores=True, follows=True),
-    "pattern": _Demand(learned_share=0.25, part=0.5, restores=True, follows=True),
+    "heading": _Demand(learned_share=0.25, part=0.5, of_uav=True, restores=True, follows=0.9),
+    "height": _Demand(part=0.5, of_uav=True, restores=True, follows=0.9),
+    "pattern": _Demand(learned_share=0.25, part=0.5, restores=True, follows=1.0),
     # the nearest of all places explains a part of many errors
-    "place": _Demand(lead=2.5, share=0.3, part=0.75, restores=True, follows=True),
+    "place": _Demand(lead=2.5, share=0.3, part=0.75, restores=True, follows=0.9),
     "saturation": _Demand(part=0.5, restores=True),
-    "telemetry": _Demand(part=0.5, of_uav=True, restores=True, follows=True),
-    "tower": _Demand(part=0.75, follows=True, most_left=math.inf),
+    "telemetry": _Demand(part=0.5, of_uav=True, restores=True, follows=0.9),
+    "tower": _Demand(part=0.75, follows=1.0, most_left=math.inf),
 }
 
 
@@ -353,9 +353,7 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     if demand.learned_share is not None and sound[0].evidence.antenna == "learned":
         least_share = demand.learned_share
     certain &= least_share <= _LEAST_SHARE
-    # any smoother level fits a log of noise or of a gain control
-    most = 1.0 if name == _CATCH_ALL else 1.0 - _LEAST_SHARE
-    if demand.follows and any(m.residual_db.std() >= most * m.evidence.measured_db.std() for m in alone):
+    if demand.follows and any(m.residual_db.std() >= demand.follows * m.evidence.measured_db.std() for m in alone):
         return False
     if name == _CATCH_ALL and lead < _SURE_GAIN and not _holds_in_halves(alone):
         return False
@@ -384,17 +382,17 @@ def _holds_in_halves(models: Sequence[_Model]) -> bool:
         assert columns is not None
         error_db = e.measured_db - e.predicted_db
         first = np.arange(len(error_db)) < len(error_db) // 2
-        for half, other in ((first, ~first), (~first, first)):
-            x, y = columns[half] - columns[half].mean(axis=0), error_db[half] - error_db[half].mean()
-            gain = x.T @ x / (_CORRELATED_BINS * max(float(y.var()), LEAST_VARIANCE)) + np.eye(columns.shape[1])
-            fit = np.linalg.solve(gain, x.T @ y / (_CORRELATED_BINS * max(float(y.var()), LEAST_VARIANCE)))
+        for fitted, other in ((first, ~first), (~first, first)):
+            x, y = columns[fitted] - columns[fitted].mean(axis=0), error_db[fitted] - error_db[fitted].mean()
+            noise = _CORRELATED_BINS * max(float(y.var()), LEAST_VARIANCE) * np.eye(columns.shape[1])
+            gain = columns @ np.linalg.solve(x.T @ x + noise, x.T @ y)
             before += len(error_db) * float(error_db[other].var())
-            after += len(error_db) * float((error_db - columns @ fit)[other].var())
+            after += len(error_db) * float((error_db - gain)[other].var())
     return after <= _MOST_IN_HALVES**2 * before
 
 
-# Means per independent sample of the error, largest error of the other half with the gain as a share, and log odds per
-# channel from which on the halves may show different directions.
+# Means per independent sample of the error, and largest error of the other half with the gain, as a share. Halves may
+# show different directions: a pattern with these log odds per channel needs no such agreement.
 _CORRELATED_BINS, _MOST_IN_HALVES, _SURE_GAIN = 10.0, 0.85, 20.0
 
 

@@ -1,13 +1,14 @@
 """Likely cause of a level error: a fault of the log, its settings or its site that explains the error by likelihood.
 
-Each fault changes the predicted level in its own way: by known decibels, by columns with free coefficients, or by
-samples that the receiver clipped, whose level is their own mean and which fade less. The offset is fitted as well, and
-the residual is noise with a long and a short correlation time, because slow fading is not a fault. Explanations are
-single faults and pairs, the second fault judged by the residual of the first. Each explanation has a marginal
-likelihood over all channels: coefficients, angles, heights, places and instants are averaged over their possible
-values, so that an explanation with many free numbers pays for them. A fault is named if the explanations with it are
-likelier by a margin than all without it, and if it reduces the RMSE. A paired test of two models would need a flight
-much longer than a fault lasts.
+Each fault changes the predicted level: by known decibels, by columns with free coefficients, or at samples that the
+receiver clipped. The level of clipped samples is their own mean, and they fade less. The offset is fitted as well. The
+residual is noise with a long and a short correlation time, because slow fading is not a fault.
+
+An explanation is a single fault or a pair, and the second fault of a pair is searched in the residual of the first.
+Explanations compete by their marginal likelihood over all channels. Coefficients, angles, heights, places and instants
+are averaged over their possible values, so that an explanation with many free numbers pays for them. A fault is named
+if the explanations with it are likelier by a margin than all others, and if it reduces the RMSE as required. A paired
+test of two models would need a flight much longer than a fault lasts.
 
 A new fault is a function that yields its :class:`Trial`, and an entry of :data:`CANDIDATES`.
 """
@@ -37,19 +38,17 @@ _FEWEST_BINS, _ENOUGH_BINS = 24, 100
 FEWEST_SAMPLES = 100
 # A fault occurs in one flight of ten. It is named from odds of five to one.
 _SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
-# Largest number of words of the sentence and next step of a cause: the first paragraph has sixty.
+# Largest number of words in the sentence and the next step of a cause, because the first paragraph has at most sixty.
 MOST_CAUSE_WORDS = 28
-# A cause must reduce the RMSE by this share, unless its log likelihood gains the second number per channel: a floor
-# leaves the error of all levels above it.
+# A cause must reduce the RMSE by this share. Half of it suffices if the log odds per channel reach the second number,
+# because a floor leaves the error of all levels above it.
 _LEAST_SHARE, _CERTAIN = 0.1, 30.0
-# The sentence states the error without a cause and with it: they must differ in print, however certain the cause.
+# The sentence states the RMSE without the cause and with it. The two numbers must differ in print.
 SHOWN_DB = 0.1
 # Half of the 95 % point of chi-squared with one degree of freedom.
 _NEAR = 1.92
 _EPOCH = np.datetime64(0, "s")
 _UNNAMED = ""
-_Estimate = tuple[float, float, float]
-_NOTHING: _Estimate = (math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +108,7 @@ class LevelEvidence:
     serving: FloatArray | None = None
     clock: ClockResult | None = None
     floored: bool = False
-    """True if the settings remove levels at the floor: of the lowest links only those that fade upwards remain."""
+    """True if the settings remove levels at the floor, so that only upward fading of the lowest links remains."""
     limits_known: bool = False
     """True if both levels are no lower than the receiver's floor already, as the page counts them."""
     learned: LearnedSeries | None = None
@@ -121,7 +120,7 @@ class LevelEvidence:
     displaced_db: Mapping[tuple[float, float], FloatArray] = field(default_factory=dict)
     """Change of the predicted level with the tower elsewhere, by distance [m] and azimuth [deg]."""
     swapped_db: FloatArray | None = None
-    """Change of the predicted level (n,) if the log is that of the other channel of the tower."""
+    """Change of the predicted level (n,) if the log belongs to the other channel of the tower."""
     least: BoolArray | None = None
     """Samples (n,) at the least level of the log if that level is frequent, exactly or within its noise."""
 
@@ -144,12 +143,12 @@ class Trial:
     columns: FloatArray | None = None
     clipped: BoolArray | None = None
     fading: FloatArray | None = None
-    estimate: _Estimate = _NOTHING
+    estimate: tuple[float, float, float] = (math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True)
 class _Model:
-    """Faults of one channel, with their joint gain in log likelihood minus their cost."""
+    """Faults of one channel, with their gain in log likelihood minus their cost."""
 
     evidence: LevelEvidence
     trials: tuple[Trial, ...]
@@ -189,10 +188,10 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         if any(either < pair for pair in named):
             continue
         name = max(either & best)
-        # the UAV has one height and one attitude: all channels must show that these are wrong
-        of_all = all(_demand(each).of_uav for each in either)
+        # the UAV has one height and one attitude, so all channels must show that these are wrong
+        of_all = all(_conditions(each).of_uav for each in either)
         shown = [table for table in tables if of_all or name in _names(_best(table, best))]
-        # the words are those of the channel that shows the cause most clearly
+        # the sentence quotes the channel that shows the cause most clearly
         shown.sort(key=lambda table: -_best(table, {name}).gain)
         if all(
             _explains(other, shown, _lead({other}, odds) / len(channels), (best & certain) - either) for other in either
@@ -200,7 +199,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             named[either] = shown
     if not named:
         return _by_health(None, tables)
-    # a gain over directions imitates many faults: it is named last
+    # name a gain over directions last, because it imitates many faults
     either = min(named, key=lambda e: (_CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
     cause = _named(sorted(either, key=lambda n: n not in best), named[either], _lead(either, odds))
     return _by_health(cause, tables) if _OF_HEALTH & either else cause
@@ -209,7 +208,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
 def _by_health(cause: Cause | None, tables: Sequence[_Models]) -> Cause | None:
     """Return the cause after steps and offsets were compared with those of held-out flights.
 
-    A fit within the flight cannot separate a step from slow fading: where all channels have a health, it decides.
+    A fit within the flight cannot separate a step from slow fading. Where all channels have a health, it decides.
     """
     known = [(judged, table) for table in tables if (judged := _judged(table[_SOUND])) is not None]
     if not known:
@@ -255,13 +254,10 @@ def _rivalled(step: Step, known: Sequence[tuple[Judged, _Models]]) -> bool:
         for names, model in table.items():
             if len(names) == 1 and "gain step" not in names:
                 columns = sum(0 if trial.columns is None else trial.columns.shape[1] for trial in model.trials)
-                fall = before - channel.square(model.residual_db) - _NAT_OF_COLUMN * columns
+                # a free coefficient that explains nothing lowers the square by 1 on average
+                fall = before - channel.square(model.residual_db) - columns
                 squares[max(names)] = squares.get(max(names), 0.0) + max(fall, 0.0)
     return max(squares.values(), default=0.0) > step.chi2 - _RARE
-
-
-# Mean fall of the square by a free coefficient that explains nothing.
-_NAT_OF_COLUMN = 1.0
 
 
 def _lead(names: Set[str], odds: Mapping[frozenset[str], float]) -> float:
@@ -290,70 +286,68 @@ _DISTINCT = 1.7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Demand:
-    """What a cause must show before it is named."""
+class _Conditions:
+    """The conditions that a cause must meet before it is named."""
 
     lead: float = -math.inf
     """Log odds per channel against all explanations without it."""
     share: float = 0.1
     """Least reduction of the RMSE."""
-    learned_share: float | None = None
-    """The same with learned antennas, which miss some decibels of each flight."""
+    learned_share: float = 0.0
+    """The least reduction of the RMSE with learned antennas, which have an error of some decibels on each flight."""
     part: float = 0.0
-    """Least share of the reduction by all candidates together, for flights without learned antennas."""
+    """Least share of the reduction that all candidates reach together, for flights without learned antennas."""
     of_uav: bool = False
     """The cause changes the levels of all channels."""
     restores: bool = False
-    """With learned antennas, the cause must bring the error back to that of held-out flights."""
+    """True if the cause must bring the error back to that of held-out flights, for flights with learned antennas."""
     follows: float | None = None
-    """Largest remaining error as a share of that of a constant level: any smoother level fits a log of noise."""
+    """Largest remaining error as a share of that of a constant level, which fits a log of noise best."""
     most_left: float = 2.0
     """Largest remaining error as a multiple of the largest usual one."""
 
 
-_DEMANDS = {
-    "attitude": _Demand(of_uav=True),
-    # fading looks like a shadow that explains a small part of the error
-    "blocked": _Demand(share=0.2),
-    "channels": _Demand(part=0.5, restores=True),
-    "clock": _Demand(part=0.5, restores=True),
-    "decibels": _Demand(most_left=math.inf),
-    "gain step": _Demand(lead=2.5, part=0.5),
-    "heading": _Demand(learned_share=0.25, part=0.5, of_uav=True, restores=True, follows=0.9),
-    "height": _Demand(part=0.5, of_uav=True, restores=True, follows=0.9),
-    "pattern": _Demand(learned_share=0.25, part=0.5, restores=True, follows=1.0),
+_CONDITIONS = {
+    "attitude": _Conditions(of_uav=True),
+    # slow fading imitates a weak shadow
+    "blocked": _Conditions(share=0.2),
+    "channels": _Conditions(part=0.5, restores=True),
+    "clock": _Conditions(part=0.5, restores=True),
+    "decibels": _Conditions(most_left=math.inf),
+    "gain step": _Conditions(lead=2.5, part=0.5),
+    "heading": _Conditions(learned_share=0.25, part=0.5, of_uav=True, restores=True, follows=0.9),
+    "height": _Conditions(part=0.5, of_uav=True, restores=True, follows=0.9),
+    "pattern": _Conditions(learned_share=0.25, part=0.5, restores=True, follows=1.0),
     # the nearest of all places explains a part of many errors
-    "place": _Demand(lead=2.5, share=0.3, part=0.75, restores=True, follows=0.9),
-    "saturation": _Demand(part=0.5, restores=True),
-    "telemetry": _Demand(part=0.5, of_uav=True, restores=True, follows=0.9),
-    "tower": _Demand(part=0.75, follows=1.0, most_left=math.inf),
+    "place": _Conditions(lead=2.5, share=0.3, part=0.75, restores=True, follows=0.9),
+    "saturation": _Conditions(part=0.5, restores=True),
+    "telemetry": _Conditions(part=0.5, of_uav=True, restores=True, follows=0.9),
+    "tower": _Conditions(part=0.75, follows=1.0, most_left=math.inf),
 }
 
 
-def _demand(name: str) -> _Demand:
-    return _DEMANDS.get(name, _Demand())
+def _conditions(name: str) -> _Conditions:
+    return _CONDITIONS.get(name, _Conditions())
 
 
 def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]) -> bool:
-    """Check whether a cause explains the error of the channels that show it, by what it takes off their RMSE.
+    """Check whether a cause reduces the RMSE of the channels that show it as much as its conditions require.
 
     ``beside`` are the other causes of the likeliest explanation.
     """
-    demand, sound = _demand(name), [table[_SOUND] for table in shown]
-    if not all(frozenset([name]) in table for table in shown) or lead < demand.lead:
+    need, sound = _conditions(name), [table[_SOUND] for table in shown]
+    if not all(frozenset([name]) in table for table in shown) or lead < need.lead:
         return False
     alone = [table[frozenset([name])] for table in shown]
     # the cause alone must reduce the RMSE, not only the changes from second to second
-    if demand.of_uav and any(model.gain <= 0.0 for model in alone):
+    if need.of_uav and any(model.gain <= 0.0 for model in alone):
         return False
     known_db, alone_db = _rmse_db(sound), _rmse_db(alone)
     before_db, after_db = (_rmse_db([_best(table, of) for table in shown]) for of in (beside, {*beside, name}))
     share = max(alone_db / known_db, after_db / before_db) if known_db and before_db else 1.0
-    certain, least_share = lead >= _CERTAIN and share <= 1.0 - 0.5 * _LEAST_SHARE, demand.share
-    if demand.learned_share is not None and sound[0].evidence.antenna == "learned":
-        least_share = demand.learned_share
-    certain &= least_share <= _LEAST_SHARE
-    if demand.follows and any(m.residual_db.std() >= demand.follows * m.evidence.measured_db.std() for m in alone):
+    least_share = max(need.share, need.learned_share * (sound[0].evidence.antenna == "learned"))
+    certain = lead >= _CERTAIN and least_share <= _LEAST_SHARE and share <= 1.0 - 0.5 * _LEAST_SHARE
+    if need.follows and any(m.residual_db.std() >= need.follows * m.evidence.measured_db.std() for m in alone):
         return False
     if name == _CATCH_ALL and lead < _SURE_GAIN and not _holds_in_halves(alone):
         return False
@@ -362,15 +356,14 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
         return False
     usual = _usual_db(shown)
     if usual is None:
-        # half of what all candidates take off together, or more
-        enough = not demand.part or alone_db <= known_db - demand.part * (known_db - _together_db(shown))
+        enough = not need.part or alone_db <= known_db - need.part * (known_db - _together_db(shown))
         restored = False
     else:
-        # from above the error of any held-out flight to below it
-        restored = demand.restores and name != _CATCH_ALL and known_db > usual[1] >= alone_db
-        # an error as large as that of any flight has no such cause
+        # the error was larger than on any held-out flight, and is usual with the cause
+        restored = need.restores and name != _CATCH_ALL and known_db > usual[1] >= alone_db
+        # an error that held-out flights have, too, does not need such a cause
         least_db = usual[1] if name in OF_DIRECTION else usual[0] if name == "saturation" and not certain else 0.0
-        enough = known_db > least_db and alone_db <= (1.0 if demand.restores else demand.most_left) * usual[1]
+        enough = known_db > least_db and alone_db <= (1.0 if need.restores else need.most_left) * usual[1]
     return enough and (share <= 1.0 - least_share or certain or restored)
 
 
@@ -391,8 +384,8 @@ def _holds_in_halves(models: Sequence[_Model]) -> bool:
     return after <= _MOST_IN_HALVES**2 * before
 
 
-# Means per independent sample of the error, and largest error of the other half with the gain, as a share. Halves may
-# show different directions: a pattern with these log odds per channel needs no such agreement.
+# Number of means per independent sample of the error, and largest ratio of the error of the other half with and without
+# the gain. Halves may show different directions, so a pattern with the last log odds per channel is not tested.
 _CORRELATED_BINS, _MOST_IN_HALVES, _SURE_GAIN = 10.0, 0.85, 20.0
 
 
@@ -416,7 +409,7 @@ def _together_db(shown: Sequence[_Models]) -> float:
             columns += [] if trial.change_db is None else [trial.change_db]
             columns += [] if trial.columns is None else list(trial.columns.T)
         design, target = np.column_stack(columns), e.measured_db - e.predicted_db
-        # a place at the tower itself has no level
+        # the level at a place on top of the UAV is infinite
         design = design[:, np.isfinite(design).all(axis=0)]
         residual = target - design @ np.linalg.lstsq(design, target, rcond=1e-9)[0]
         squares.append((residual**2).sum() / max(len(target) - design.shape[1], 1))
@@ -424,7 +417,7 @@ def _together_db(shown: Sequence[_Models]) -> float:
 
 
 def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
-    """Check that a gain over directions, which antennas learn, takes off a channel an error that a page shows."""
+    """Check whether a calibration could reduce the printed error of a channel, by a gain over directions."""
     for evidence in filter(None, map(_binned, channels)):
         sound, (antenna,) = _fitted(evidence), _pattern(evidence)
         learned = _fitted(evidence, antenna, at=sound.memories)
@@ -437,16 +430,15 @@ def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
 
 def fall_without_lag_db(channels: Iterable[LevelEvidence]) -> float:
     """Return by how much the RMSE of some channels falls if the lags of their clocks are corrected [dB]."""
-    errors: list[tuple[FloatArray, FloatArray]] = []
+    before, after = list[FloatArray](), list[FloatArray]()
     for e in channels:
         lag = 0.0 if e.clock is None else e.clock.radio_minus_telemetry_s
         known = np.isfinite(e.measured_db) & np.isfinite(e.predicted_db)
         time_s, measured_db, predicted_db = e.time_s[known], e.measured_db[known], e.predicted_db[known]
         if len(time_s):
-            late_db = np.interp(time_s - lag, time_s, predicted_db)
-            errors.append((measured_db - predicted_db, measured_db - late_db))
-    before, after = ([error - error.mean() for error in of] for of in zip(*errors, strict=True)) if errors else ([], [])
-    return float(np.concatenate(before).std() - np.concatenate(after).std()) if errors else 0.0
+            for errors, level_db in ((before, predicted_db), (after, np.interp(time_s - lag, time_s, predicted_db))):
+                errors.append(measured_db - level_db - (measured_db - level_db).mean())
+    return float(np.concatenate(before).std() - np.concatenate(after).std()) if before else 0.0
 
 
 def _names(model: _Model) -> frozenset[str]:
@@ -454,11 +446,11 @@ def _names(model: _Model) -> frozenset[str]:
 
 
 def _best(table: _Models, faults: Set[str]) -> _Model:
-    """Return the best model of a channel with some faults or a part of them."""
+    """Return the best model of a channel that has no other faults than the given ones."""
     return max((model for names, model in table.items() if names <= faults), key=lambda model: model.gain)
 
 
-# Numbers of faults of a channel that are combined in pairs, and of faults after which all others are searched again.
+# Number of faults per channel that are combined in pairs, and number of faults whose residual is searched for others.
 _MOST_TRIED, _MOST_FIRST = 6, 2
 
 
@@ -473,7 +465,7 @@ def _models(e: LevelEvidence) -> _Models:
         return _Model(e, trials, fit.residual_db, gain, fit.memories)
 
     def best_of(sets: Iterable[tuple[Trial, ...]], at: Memories) -> list[_Model]:
-        """Return the likeliest model of each set of names, the best ones fitted with their own noise."""
+        """Return the likeliest model of each set of names, best first, with its own noise."""
         best: dict[frozenset[str], _Model] = {}
         for trials in sets:
             tried = model(*trials, at=at, climb=False)
@@ -483,12 +475,11 @@ def _models(e: LevelEvidence) -> _Models:
         likely = sorted(best.values(), key=lambda m: -m.gain)[:_MOST_TRIED]
         return sorted((model(*m.trials, at=at) for m in likely), key=lambda m: -m.gain)
 
-    # pairs are made of the best with each other
     alone = best_of(((trial,) for trial in _candidates(e)), sound.memories)
     models, likely = [model(climb=False), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
     pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
     models += [model(first.trials[0], second.trials[0], at=first.memories) for first, second in pairs]
-    # half or twice the decibels is the name of a slope
+    # unnamed slopes do not compete with half or twice the decibels
     named = any("decibels" in _names(m) and m.gain > 0.0 for m in alone)
     for first in likely:
         rest = [trial for trial in _candidates(_without(e, first)) if trial.name or not named]
@@ -514,10 +505,13 @@ def _rmse_db(models: Sequence[_Model]) -> float:
 
 
 def _named(names: Sequence[str], shown: Sequence[_Models], gain: float) -> Cause:
-    """Return the cause in words, those of the channel that shows it best; a second name cannot be distinguished."""
+    """Return the cause with the sentence of the channel that shows it best.
+
+    The data cannot distinguish the first name from the other ones.
+    """
     name = names[0]
     trial = shown[0][frozenset([name])].trials[0]
-    # a channel with other numbers, such as those of another clock, would contradict the sentence
+    # omit channels with other numbers, such as those of another clock, because they contradict the sentence
     shown = [table for table in shown if table[frozenset([name])].trials[0].sentence == trial.sentence]
     alone = [table[frozenset([name])] for table in shown]
     rmse, rmse_with = _rmse_db([table[_SOUND] for table in shown]), _rmse_db(alone)
@@ -526,27 +520,18 @@ def _named(names: Sequence[str], shown: Sequence[_Models], gain: float) -> Cause
     others = [shown[0][frozenset([other])].trials[0].sentence for other in names[1:]]
     value, low, high = trial.estimate
     return Cause(
-        name=" or ".join(names),
+        name=" or ".join(names), channels=channels, estimate=value, ci95=(low, high),
         sentence=f"Likely cause at {where}: {', or '.join([trial.sentence, *others])}; "
         f"1-s RMSE {rmse:.1f} \N{RIGHTWARDS ARROW} {rmse_with:.1f} dB.",
-        next_step=trial.next_step,
-        estimate=value,
-        ci95=(low, high),
-        channels=channels,
-        rmse_db=rmse,
-        rmse_with_db=rmse_with,
-        gain=gain,
-    )
-
-
-_ANGLES = ("uav_azimuth_deg", "tower_azimuth_deg")
+        next_step=trial.next_step, rmse_db=rmse, rmse_with_db=rmse_with, gain=gain,
+    )  # fmt: skip
 
 
 def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
-    """Return means over :data:`BIN_S` and over hovers of the samples with both levels. None if they are too few."""
+    """Return means of the samples with both levels over :data:`BIN_S` and over hovers. None if there are too few."""
     finite = np.isfinite(evidence.measured_db) & np.isfinite(evidence.predicted_db)
     level = evidence.measured_db[finite]
-    # two levels or few samples do not show the form of an error
+    # two levels or few samples do not show how the error varies
     if len(level) < FEWEST_SAMPLES or len(np.unique(level)) == 2:
         return None
     time, level = evidence.time_s[finite], evidence.measured_db[finite]
@@ -565,7 +550,7 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
             return {key: mean(column) for key, column in value.items()}
         if not isinstance(value, np.ndarray):
             return value
-        if name not in _ANGLES:
+        if name not in ("uav_azimuth_deg", "tower_azimuth_deg"):
             # treat missing flags as 1: a gap in the log is not an error
             return mean(np.nan_to_num(value, nan=1.0) if name in ("locked", "serving") else value)
         # the mean of 359 and 1 degrees is 0
@@ -574,7 +559,7 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
 
     changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
     at = level == level.min()
-    # each rounded level is frequent, but the least one is rarer than the next
+    # if levels are rounded, each is frequent, but the least one is rarer than the next
     next_often = (level == level[~at].min()).sum() if not at.all() else 0
     often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level), next_often)
     changed["least"] = np.bincount(place, at) > 0.5 * count if often else _undetected(mean(evidence.measured_db))
@@ -583,16 +568,12 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
 
 def _mean(values: FloatArray, place: IntArray, count: AnyArray) -> FloatArray:
     """Return means of values (n,) or (n, k) over the ``count`` samples of each place."""
-    if values.ndim == 1:
-        return np.asarray(np.bincount(place, values) / count)
-    return np.column_stack([_mean(column, place, count) for column in values.T])
+    totals = np.apply_along_axis(lambda column: np.bincount(place, column), 0, values)
+    return np.asarray((totals.T / count).T)
 
 
 def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray:
-    """Return the number of the place of each second.
-
-    Seconds in which the UAV neither moves nor turns have the same number.
-    """
+    """Return a number per second, which is the same while the UAV neither moves nor turns."""
     azimuth, elevation = np.radians(e.uav_azimuth_deg[finite]), np.radians(e.uav_elevation_deg[finite])
     flat = np.cos(elevation)
     towards = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
@@ -612,9 +593,9 @@ _AT_END, _SHARE_AT_END = 10, 0.01
 
 
 def _undetected(level_db: FloatArray) -> BoolArray | None:
-    """Return the samples (n,) near the densest level and below it if links drop to it suddenly: a detector's noise.
+    """Return the samples (n,) without detection: those near and below the densest level, if links drop to it suddenly.
 
-    Return None if the level fades into it, as near a floor or in a hover.
+    Return None if the level fades slowly into the densest level, as near a floor or in a hover.
     """
     ordered, step = np.sort(level_db), np.abs(np.diff(level_db))
     within = np.searchsorted(ordered, ordered + 2.0 * _PILE_DB, "right") - np.arange(len(ordered))
@@ -629,8 +610,8 @@ def _undetected(level_db: FloatArray) -> BoolArray | None:
     return under if at_once and np.median(step[inside]) < _MOST_FADING * fading_db else None
 
 
-# A loss of detection exceeds the usual step of fading by this factor: 9 for a receiver with a noisy least level; other
-# receivers have 3.
+# A loss of detection exceeds the usual step of fading by this factor. A receiver with a noisy least level has 9, others
+# have 3.
 _LOST = 5.0
 
 
@@ -654,7 +635,7 @@ def _fitted(e: LevelEvidence, *trials: Trial, at: Memories = START, climb: bool 
     residual[link] = fit.residual_db * scale
     if clipped.any():  # values beyond the limit of a receiver do not depend on the link
         residual[clipped] = e.measured_db[clipped] - e.measured_db[clipped].mean()
-        # their mean and spread are two numbers (Schwarz)
+        # charge for two fitted numbers, their mean and spread (Schwarz)
         spread = max(float(residual[clipped].std()), _LEAST_SPREAD_DB)
         likelihood -= float(clipped.sum()) * (math.log(spread) + 0.5) + math.log(float(clipped.sum()))
     return MemoryFit(likelihood, residual, fit.memories)
@@ -669,7 +650,7 @@ _OFFSET_DB = 100.0
 
 
 def _clock(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the lag of the test of the radio clock, or without one the likeliest lag, which has no name."""
+    """Yield the tested lag of the radio clock, or the likeliest lag as an alternative without a name."""
     if e.clock is not None and e.clock.shifted:
         lag = e.clock.radio_minus_telemetry_s
         late = np.interp(e.time_s - lag, e.time_s, e.predicted_db)
@@ -693,7 +674,7 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _drifting(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the likeliest radio clock that gains or loses a share of the time, right somewhere in the flight."""
+    """Yield the likeliest radio clock that gains or loses time and is right at one instant of the flight."""
     if e.clock is None:
         return
     middle, length = 0.5 * (e.time_s[0] + e.time_s[-1]), float(np.ptp(e.time_s))
@@ -715,7 +696,7 @@ def _drifting(e: LevelEvidence) -> Iterator[Trial]:
     )  # fmt: skip
 
 
-# Shares of the time that a clock may gain, how far off that leads it [s], and where in the flight it is right.
+# Relative rates of a clock, least and largest error that they lead to [s], and where in the flight the clock is right.
 _RATES = tuple(sign * rate for rate in (0.0025, 0.004, 0.006, 0.008, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05)
                for sign in (-1.0, 1.0))  # fmt: skip
 _LEAST_DRIFT_S, _MOST_DRIFT_S, _RIGHT_AT = 3.0, 60.0, (0.0, 0.25, 0.5)
@@ -735,12 +716,12 @@ def _likeliest(
 
 
 def _nearer(e: LevelEvidence, level_db: FloatArray) -> BoolArray:
-    """Check which levels (..., n) reduce the error: a smoother level may fit the changes and not the level."""
+    """Check which levels (..., n) reduce the error, not only its changes from sample to sample."""
     error_db = (e.measured_db - e.predicted_db).std()
     return np.asarray((e.measured_db - level_db).std(axis=-1) <= (1.0 - _LEAST_SHARE) * error_db)
 
 
-# Lags of a clock without a test result. Longer lags are rarer.
+# Lags of a clock without a test result [s]. Beyond them, the step is twice as large.
 _LAG_STEP_S = 2.0
 _LAGS_S = np.arange(-60.0, 61.0, _LAG_STEP_S)
 
@@ -770,7 +751,7 @@ _BETWEEN = np.linspace(-0.8, 0.8, 9)
 def _tuned(
     e: LevelEvidence, changes_db: Mapping[float, FloatArray], trial: Callable[[float, FloatArray], Trial]
 ) -> Trial:
-    """Return the trial with the likeliest value, also between the given ones, whose changes are interpolated."""
+    """Return the trial with the likeliest value. Changes at values between the given ones are interpolated."""
     # the value 0 changes nothing, and the interpolation goes through it
     values = sorted({0.0, *changes_db})
     likely = _profiled(e, {value: trial(value, change) for value, change in changes_db.items()})
@@ -785,12 +766,12 @@ def _tuned(
 
 
 def _spline(knots: FloatArray, at: FloatArray) -> FloatArray:
-    """Return weights (m, n) of values at n knots in a cubic spline at m places.
+    """Return the weights (m, n) of n knots for a cubic spline at m places.
 
-    scipy.interpolate would load for 0.1 s.
+    Loading scipy.interpolate would take 0.1 s.
     """
     n, share = len(knots), (np.append(knots, at)[:, None] - knots[0]) / np.ptp(knots)
-    # no term at the second and the last but one knot: one cubic at each end needs no slope
+    # without terms at the second and the last but one knot, the ends need no given slope
     terms = np.hstack([share ** np.arange(min(n, 4)), np.maximum(share - share[2 : n - 2, 0], 0.0) ** 3])
     return np.asarray(np.linalg.solve(terms[:n].T, terms[n:].T).T)
 
@@ -814,14 +795,11 @@ def _heading(e: LevelEvidence) -> Iterator[Trial]:
 def _attitude(e: LevelEvidence) -> Iterator[Trial]:
     """Yield an attitude that the settings do not use, or should not use."""
     for mode, change in e.attitude_db.items():
-        idle = mode != "ignored"  # an unused log has no free number
+        idle = mode != "ignored"  # to ignore an attitude that was logged is the rarer remedy
         yield Trial(
-            name="attitude",
-            cost=0.0 if idle else _RARE,
+            name="attitude", cost=0.0 if idle else _RARE, change_db=change, next_step=f"`rt: {{attitude: {mode}}}`",
             sentence="the UAV's attitude is not used" if idle else "the logged attitude does not fit the level",
-            next_step=f"`rt: {{attitude: {mode}}}`",
-            change_db=change,
-        )
+        )  # fmt: skip
 
 
 def _height(e: LevelEvidence) -> Iterator[Trial]:
@@ -885,7 +863,7 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     radii = np.array(sorted({radius for radius, _ in e.displaced_db}))
     azimuths = np.array(sorted({azimuth for _, azimuth in e.displaced_db}))
     table = np.array([[e.displaced_db[radius, azimuth] for azimuth in azimuths] for radius in radii])
-    # the radii grow by a factor: each is weighted by its area, and far places are unlikely
+    # weight each radius by the area that it represents, because radii grow by a factor, and by its probability
     weight = np.repeat(radii**2 * (1.0 + (radii / _NEAR_PLACE_M) ** 2) ** -1.5, len(azimuths))
     coarse, cost = _likeliest(e, e.predicted_db + table.reshape(len(weight), -1), weight=weight)
     i, j = np.unravel_index(coarse, table.shape[:2])
@@ -912,7 +890,7 @@ def _between(table: FloatArray, at: float, around: float) -> FloatArray:
     return np.asarray((1.0 - up) * rows[0] + up * rows[1])
 
 
-# A place further away than this is unlikely [m]; steps between the places that are computed.
+# Places further away than this become unlikely [m], and steps between the computed places.
 _NEAR_PLACE_M, _FINER = 50.0, (-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75)
 _SIDES = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
@@ -928,24 +906,16 @@ def _channels(e: LevelEvidence) -> Iterator[Trial]:
 
 _CATCH_ALL = "pattern"
 
-# Functions of direction alone: they also explain the errors of a wrong model.
+# Causes that depend on the direction alone, and therefore imitate errors of the propagation model.
 OF_DIRECTION = frozenset({"blocked", _CATCH_ALL})
-# Causes that give way to a step that held-out flights do not show.
+# Causes that a step replaces if held-out flights do not have such a step.
 _OF_HEALTH = OF_DIRECTION | {"gain step"}
 
+_CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT`"
 _PATTERN = {
-    "isotropic": (
-        "the antenna pattern of the UAV",
-        "`aerpaw-cmp calibrate FLIGHT FLIGHT`",
-    ),
-    "measured": (
-        "the antenna file does not fit the UAV",
-        "check `antenna:`, else `aerpaw-cmp calibrate FLIGHT FLIGHT`",
-    ),
-    "learned": (
-        "the learned antennas do not fit this UAV",
-        "check which aircraft and antennas flew",
-    ),
+    "isotropic": ("the antenna pattern of the UAV", _CALIBRATE),
+    "measured": ("the antenna file does not fit the UAV", f"check `antenna:`, else {_CALIBRATE}"),
+    "learned": ("the learned antennas do not fit this UAV", "check which aircraft and antennas flew"),
 }
 
 
@@ -955,17 +925,15 @@ def _pattern(e: LevelEvidence) -> Iterator[Trial]:
     axes = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     terms = [term for degree in (1, 2, 3) for term in combinations_with_replacement(axes, degree)]
     columns = [_GAIN_DB * np.prod(term, axis=0) for term in terms]
-    if e.turned_db:  # remove the known pattern: the mean over all headings
+    if e.turned_db:  # a column that removes the known pattern, by the mean over all headings
         columns.append(np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1))
     sentence, step = _PATTERN[e.antenna]
-    yield Trial(
-        name=_CATCH_ALL, sentence=sentence, next_step=step, columns=np.column_stack(columns),
-    )  # fmt: skip
+    yield Trial(name=_CATCH_ALL, sentence=sentence, next_step=step, columns=np.column_stack(columns))
 
 
 # Prior standard deviations of the terms of an antenna's gain, of steps and of losses [dB].
 _GAIN_DB, _STEP_DB, _LOSS_DB = 3.0, 8.0, 15.0
-# Log odds against rare faults of a log or its settings.
+# Log odds against rare faults.
 _RARE = 3.0
 
 
@@ -979,7 +947,7 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _decibels(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the decibels of an amplitude as if it were a power, or the reverse.
+    """Yield levels with half or twice the decibels, as if an amplitude were a power or the reverse.
 
     The interval of the slope must support the factor, and a path-loss exponent and a gain over elevation, which change
     levels in the same way, must be much less likely.
@@ -1004,26 +972,23 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
         if _is_slope(e, factor, fit.memories) and fit.log_likelihood > max(least, slope):
             yield trial
             return
-    # other slopes and exponents have no name: a cause that changes levels in the same way must be likelier
+    # a cause that changes levels like another slope or exponent must be likelier than these, which have no name
     yield from (others[0], *others[2:])
 
 
-# Standard deviation of the slope of levels about their prediction, before the flight.
+# Prior standard deviation of the slope of measured over predicted levels.
 _SLOPE = 0.5
-# Share by which a slope may differ from half of a decibel or twice: any antennas, and learned ones, whose
-# slope on held-out flights is 0.95 to 1.09.
+# Largest relative difference of a slope from 0.5 and 2, for any antennas and for learned ones. The slope of learned
+# antennas on held-out flights is 0.95 to 1.09.
 _SLOPE_SHARE, _LEARNED_SLOPE_SHARE = {0.5: 0.1, 2.0: 0.05}, {0.5: 0.12, 2.0: 0.1}
 
 
 def _is_slope(e: LevelEvidence, factor: float, at: Memories) -> bool:
-    """Check whether slopes outside the ends of a factor are less likely than those inside."""
+    """Check whether the 95 % interval of the slope is near a factor."""
     step = factor * (_SLOPE_SHARE if e.learned is None else _LEARNED_SLOPE_SHARE)[factor]
-
-    def likelihood(slope: float) -> float:
-        return _fitted(e, Trial(change_db=(slope - 1.0) * e.predicted_db), at=at, climb=False).log_likelihood
-
+    changes = (Trial(change_db=(factor + i * step - 1.0) * e.predicted_db) for i in (-1, 0, 1))
     # the log likelihood is a parabola in the slope
-    below, middle, above = (likelihood(factor + i * step) for i in (-1, 0, 1))
+    below, middle, above = (_fitted(e, change, at=at, climb=False).log_likelihood for change in changes)
     bend = below - 2.0 * middle + above
     if bend >= 0.0:
         return False
@@ -1055,15 +1020,12 @@ def _is_flat(e: LevelEvidence) -> bool:
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the noise that the receiver writes without lock, by the quality in the log."""
     if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
-        yield Trial(
-            name="lock", clipped=lost,
-            sentence="the receiver had no lock in parts of the flight",  # the cautions count the samples
-            next_step="",  # the first sentence has the error with the floor already
-        )  # fmt: skip
+        # the cautions count the samples, and the first sentence has the error with the floor already
+        yield Trial(name="lock", clipped=lost, sentence="the receiver had no lock in parts of the flight")
 
 
 def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a frequent least level: nothing was detected there."""
+    """Yield samples without detection, which have the same least level."""
     if not e.limits_known and e.least is not None and e.least.any() and not e.least.all():
         level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
         # means over seconds spread less than samples
@@ -1077,14 +1039,14 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
 
 def _floor(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a receiver that shows no level below its floor."""
-    # without limits in the log, which would show where nothing was detected
+    # a frequent least level already shows where nothing was detected
     if e.least is None and not e.limits_known and not _is_flat(e):
         yield from _clipping(e, 1.0)
 
 
 def _saturation(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a receiver that shows no level above its ceiling."""
-    drowned = e.unit == "dB" and bool(np.median(e.measured_db) < 0.0)  # a signal below the noise overloads nothing
+    drowned = e.unit == "dB" and bool(np.median(e.measured_db) < 0.0)  # signals below the noise overload no receiver
     if not drowned and not _is_flat(e):
         yield from _clipping(e, -1.0)
 
@@ -1113,14 +1075,14 @@ _PILE_DB, _LEAST_PILE, _LEAST_CLIPPED, _MOST_FADING = 1.2, 0.1, 0.06, 0.35
 
 
 def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
-    """Return the samples at the receiver's limit, or None if those near the end of the levels fade like all others."""
+    """Return the samples at the receiver's limit, or None if the samples at the end of the levels fade like others."""
     end = float(np.quantile(e.measured_db, 0.01 if side > 0 else 0.99))
     pile = side * (e.measured_db - end) < _PILE_DB
     step = np.abs(np.diff(e.measured_db))
     inside, outside = pile[1:] & pile[:-1], ~(pile[1:] | pile[:-1])
     if inside.sum() < max(_LEAST_BINS, _LEAST_CLIPPED * len(pile)) or outside.sum() < _LEAST_BINS:
         return None
-    # interference at one power is not a limit: without the limit, the link would be at it or beyond
+    # the link is beyond a limit where the receiver shows it, but within it during interference of constant power
     error = e.measured_db - e.predicted_db
     missing = side * float(np.median(error[pile]) - np.median(error[~pile]))
     limited = np.median(step[inside]) < _MOST_FADING * np.median(step[outside]) and missing > -_BEYOND_DB
@@ -1139,7 +1101,7 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
 
 def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     """Return a soft limit: the power of a floor is added, or the level approaches a ceiling."""
-    # the median: samples at the limit do not move it
+    # the median does not depend on the samples at the limit
     offset = float(np.median(e.measured_db - e.predicted_db))
     for _ in range(5):
         level = e.predicted_db + offset
@@ -1184,13 +1146,13 @@ _SEARCHED_PHI = (0.6, 0.93)
 _WIDTHS_DEG = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 # Degrees over which the edge of a shadow fades: a Fresnel zone some hundred metres away.
 _EDGE_DEG = 4.0
-# An obstacle loses more than this. A smaller loss in a sector is usually that of an antenna.
+# Least loss behind an obstacle. A smaller loss in a sector is usually caused by an antenna.
 _LEAST_LOSS_DB = 6.0
 _MOSTSTARTS = 600
 
 
 def _blocked(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a loss in a sector of directions from the tower, searched by 5 degrees, then by 1 degree."""
+    """Yield a loss in a sector of directions from the tower, searched in steps of 5 degrees, then of 1 degree."""
     residual = e.measured_db - e.predicted_db
     coarse = [(middle, width) for width in _WIDTHS_DEG for middle in np.arange(0.0, 360.0, 5.0).tolist()]
     shadows = _shadows(e, coarse)
@@ -1235,7 +1197,7 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     # neighbouring bins show the same step
     starts = starts[:: 1 + len(starts) // _MOSTSTARTS]
     masks = (np.arange(n)[None, :] >= starts[:, None]).astype(np.float64)
-    # a creeping gain is not a step, and has no name
+    # a gain that drifts is an alternative to a step
     creep = _STEP_DB * (np.arange(n) / n)[:, None]
     yield Trial(columns=creep)
     for phi in _SEARCHED_PHI:

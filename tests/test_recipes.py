@@ -61,7 +61,7 @@ for rain in (0.0, 10.0):
 site, rt, expected = data.site, settings.rt, expectations(data, replays.all)[0]
 source, target = one.source_m(site)[0], one.poses.position_m[0]
 losses = explain.path_losses(site, rt, one.link.carrier_hz)
-further = {name: loss(one.replay.paths, source[None], target[None]) for name, loss in losses.items()}
+further = {name: loss(one.replay.paths, source[None], one.poses.position_m) for name, loss in losses.items()}
 paths = explain.explain_paths(one.replay.paths, one.replay.faces, source, one.poses, one.link, further)
 reference = Reference(site, one.replay.towers[0], expected.link, expected.loss)
 print(json.dumps({

@@ -623,12 +623,14 @@ def _shaped_ground(
     """Return the scene with tangent planes of the terrain, paths over level ground and over the planes, and notes."""
     if site.dem is None or scene.surfaces is not None or not paths.faces.shape[1]:
         return scene, paths, paths.select(slice(0, 0)), []
-    terrain = on_terrain(site.dem, scene.faces, scene.links_to(poses), paths, wavelength_m(link.carrier_hz))
+    level, shaped, faces, unknown = on_terrain(
+        site.dem, scene.faces, scene.links_to(poses), paths, wavelength_m(link.carrier_hz)
+    )
     words = "links over ground that the elevation model does not know: level ground reflects there"
     # a tangent plane is valid only for the path for which it was computed
-    more = np.zeros((len(scene.usable), len(terrain.faces) - len(scene.faces)), dtype=np.bool_)
-    scene = replace(scene, faces=terrain.faces, usable=np.concatenate([scene.usable, more], axis=1))
-    return scene, terrain.level, terrain.shaped, [Omission(words, (terrain.unknown,))]
+    more = np.zeros((len(scene.usable), len(faces) - len(scene.faces)), dtype=np.bool_)
+    scene = replace(scene, faces=faces, usable=np.concatenate([scene.usable, more], axis=1))
+    return scene, level, shaped, [Omission(words, (unknown,))]
 
 
 def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:

@@ -33,29 +33,9 @@ _STEPS = 8
 _STILL_M = 1e-6
 
 
-@dataclass(frozen=True, slots=True)
-class OnTerrain:
-    """Paths of a replay over the ground of an elevation model.
-
-    Parameters
-    ----------
-    level : PathSet
-        Paths of the engine without a ground reflection, or over ground that is level or unknown.
-    shaped : PathSet
-        Paths over tangent planes. Buildings and terrain are not yet considered.
-    faces : Faces
-        Faces of the scene, followed by the tangent planes.
-    unknown : int
-        Links over ground that the model does not know.
-    """
-
-    level: PathSet
-    shaped: PathSet
-    faces: Faces
-    unknown: int
-
-
-def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: float) -> OnTerrain:
+def on_terrain(
+    dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: float
+) -> tuple[PathSet, PathSet, Faces, int]:
     """Return paths of an engine with the ground of an elevation model instead of level planes.
 
     Parameters
@@ -70,7 +50,14 @@ def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_
 
     Returns
     -------
-    OnTerrain
+    level : PathSet
+        Paths of the engine without a ground reflection, or over ground that is level or unknown.
+    shaped : PathSet
+        Paths over tangent planes. Buildings and terrain are not yet considered.
+    faces : Faces
+        Faces of the scene, followed by the tangent planes.
+    unknown : int
+        Links over ground that the model does not know.
     """
     ground = np.append(faces.solid < 0, False)
     once = ground[paths.faces].any(axis=1)  # never twice: no face of a prism looks down
@@ -101,7 +88,7 @@ def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_
     )
     same, shaped, more = candidates.followed(dem, faces, links, wavelength_m)
     stays[same[_clear(dem, faces, links, paths.select(same), wavelength_m)]] = True
-    return OnTerrain(paths.select(stays), shaped, more, int(unknown.sum()))
+    return paths.select(stays), shaped, more, int(unknown.sum())
 
 
 @dataclass(frozen=True, slots=True)

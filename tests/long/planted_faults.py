@@ -121,7 +121,6 @@ def _forget() -> None:
     from aerpaw_cmp.propagation.field import foliage
 
     faces._faces.cache_clear()
-    faces._solids.cache_clear()
     foliage._last_index.clear()
 
 

@@ -85,10 +85,8 @@ def wedge(
     # sine of the grazing angle, equal to the cosine from the normal in Fresnel's formulas
     sine = upright * np.sqrt(1.0 - cos_beta * cos_beta)
     # seen from face n, both the angles and the edge are reversed, so the matrix is the same
-    te, tm = 0.0, 0.0
-    for term, face in ((at_n, face_n), (at_0, face_0)):
-        face_te, face_tm = coefficients(sine, face)
-        te, tm = te + term * face_te, tm + term * face_tm
+    (te_n, tm_n), (te_0, tm_0) = coefficients(sine, face_n), coefficients(sine, face_0)
+    te, tm = at_n * te_n + at_0 * te_0, at_n * tm_n + at_0 * tm_0
     # angle between the edge-fixed basis and the plane of incidence, whose unit normal is sigma
     askew = cos_beta * upright  # like across, multiplied by the sine of incidence: -(sigma . phi) and -(sigma . beta)
     size = across * across + askew * askew

@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
-from ..common.errors import InputError, UsageError
+from ..common.errors import InputError, UsageError, about_file
 from ..common.geodesy import SiteFrame
 from ..common.text import counted
 from ..common.units import FloatArray
@@ -174,11 +174,12 @@ def import_footprints(
     shapes: dict[Kind, list[_Shape]] = {"building": [], "forest": [], "geofence": []}
     for path in files:
         content = read_map_file(path)
-        _check_place(content, frame, Path(path))
         result.actions += content.notes
         if content.credit and content.credit not in result.credits:
             result.credits.append(content.credit)
-        _sort(content, Path(path), frame, untagged, shapes, result.actions)
+        with about_file(path):
+            _check_place(content, frame)
+            _sort(content, Path(path).name, frame, untagged, shapes, result.actions)
         for place, height_m in content.ground:
             east, north = frame.to_local(*place)
             result.ground.append((float(east), float(north), height_m))
@@ -203,13 +204,13 @@ def import_footprints(
 
 def _sort(
     content: MapFile,
-    path: Path,
+    name: str,
     frame: SiteFrame,
     untagged: Kind | None,
     shapes: dict[Kind, list[_Shape]],
     actions: list[str],
 ) -> None:
-    """Add each outline of a file to the shapes of its kind, and count outlines of unknown kind."""
+    """Add each outline of the file ``name`` to the shapes of its kind, and count outlines of unknown kind."""
     skipped: Counter[str] = Counter()
     for outline in content.outlines:
         bare = untagged if main_tag(outline.tags) == "untagged" else None
@@ -224,7 +225,7 @@ def _sort(
         shape = _project(outline, frame, actions)
         if shape is not None:
             if kind == "building":
-                _describe(shape, outline, path, actions)
+                _describe(shape, outline, actions)
             elif kind == "forest":
                 _describe_wood(shape, outline.tags, actions)
             shapes[kind].append(shape)
@@ -232,7 +233,7 @@ def _sort(
         listed = ", ".join(f"{count} {tag}" for tag, count in skipped.most_common(5))
         more = "" if len(skipped) <= 5 else f" and {counted(len(skipped) - 5, 'other tag')}"
         hint = "; '--untagged building' takes areas without tags for buildings" if skipped["untagged"] else ""
-        actions.append(f"{path.name}: left out, no building or forest above the ground: {listed}{more}{hint}")
+        actions.append(f"{name}: left out, no building or forest above the ground: {listed}{more}{hint}")
 
 
 def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[SingleTree]:
@@ -327,37 +328,32 @@ def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float 
 # ---------------------------------------------------------------- what an outline is, and where
 
 
-def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
+def _check_place(content: MapFile, frame: SiteFrame) -> None:
     """Refuse a file whose outlines are all far away, and report if swapped coordinates would be near."""
     positions = [p for outline in content.outlines for outer, _ in outline.parts for p in outer]
     positions += [p for tree in content.trees for p in tree.positions]
     if not positions:
         return
     latitude, longitude = np.array(positions).T
-    # one near outline is sufficient, because a file may extend beyond the site
-    if _distance_m(latitude, longitude, frame).min() <= FAR_M:
-        return
-    centre = f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}"
-    first = f"latitude {latitude[0]:.5f}, longitude {longitude[0]:.5f}"
-    if _distance_m(longitude, latitude, frame).min() <= FAR_M:
-        raise InputError(
-            f"the positions belong to another place ({first})",
-            expected=f"near the site's origin {centre}",
-            cause="latitude and longitude are swapped",
-            path=path,
-        )
-    spans = [abs(np.diff([p[1] for p in outer])).max(initial=0) for o in content.outlines for outer, _ in o.parts]
     away = float(_distance_m(latitude, longitude, frame).min())
+    # one near outline is sufficient, because a file may extend beyond the site
+    if away <= FAR_M:
+        return
+    spans = [abs(np.diff([p[1] for p in outer])).max(initial=0) for o in content.outlines for outer, _ in o.parts]
+    found = "the positions are not latitudes and longitudes"
+    if math.isfinite(away):
+        found = f"the nearest position is {away / 1000:.0f} km from the site"
+    causes = (
+        (_distance_m(longitude, latitude, frame).min() <= FAR_M, "latitude and longitude are swapped"),
+        (max(spans, default=0) > 180, "the area crosses the antimeridian (180 deg)"),
+        (not math.isfinite(away), "metres or feet instead of degrees"),
+        (True, "a map of another place"),
+    )
     raise InputError(
-        f"the nearest position is {away / 1000:.0f} km from the site ({first})"
-        if math.isfinite(away)
-        else f"the positions are not latitudes and longitudes ({first})",
-        expected=f"WGS84 degrees near the site's origin {centre}, or a site where the map is: --base SITE, or "
-        "--tower NAME=LATITUDE,LONGITUDE,HEIGHT of its antenna",
-        cause="the area crosses the antimeridian (180 deg)"
-        if max(spans, default=0) > 180
-        else ("metres or feet instead of degrees" if not math.isfinite(away) else "a map of another place"),
-        path=path,
+        f"{found} (latitude {latitude[0]:.5f}, longitude {longitude[0]:.5f})",
+        expected=f"WGS84 degrees near the site's origin {frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}, or a site "
+        "where the map is: --base SITE, or --tower NAME=LATITUDE,LONGITUDE,HEIGHT of its antenna",
+        cause=next(cause for holds, cause in causes if holds),
     )
 
 
@@ -400,12 +396,11 @@ def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape |
     if union.is_empty:
         actions.append(f"{outline.source}: left out, it has no area")
         return None
-    if math.hypot(union.centroid.x, union.centroid.y) > FAR_M:
-        away = math.hypot(union.centroid.x, union.centroid.y) / 1000
+    if (away := math.hypot(union.centroid.x, union.centroid.y)) > FAR_M:
         first = np.array(outline.parts[0][0][0])
         swapped = _distance_m(first[1], first[0], frame) <= FAR_M
         hint = "; latitude and longitude are swapped" if swapped else ""
-        actions.append(f"warning: {outline.source}: left out, it lies {away:.0f} km from the site{hint}")
+        actions.append(f"warning: {outline.source}: left out, it lies {away / 1000:.0f} km from the site{hint}")
         return None
     return _Shape(outline.name, outline.source, union, part=is_part(outline.tags))
 
@@ -448,7 +443,7 @@ def _areas_only(shape: BaseGeometry) -> BaseGeometry:
 # ---------------------------------------------------------------- heights and materials
 
 
-def _describe(shape: _Shape, outline: Outline, path: Path, actions: list[str]) -> None:
+def _describe(shape: _Shape, outline: Outline, actions: list[str]) -> None:
     # shapefiles write the names of their columns in capitals
     tags = {key.lower(): value for key, value in outline.tags.items()}
     notes: list[str] = []
@@ -467,7 +462,6 @@ def _describe(shape: _Shape, outline: Outline, path: Path, actions: list[str]) -
             f"{shape.source}: a building {height:g} m high",
             expected=f"0 to {TALLEST_M:g} m",
             cause="feet or centimetres in place of metres",
-            path=path,
         )
     shape.height_m = height
     shape.material = material_of(tags)

@@ -30,6 +30,7 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
+from .. import __version__
 from ..common.errors import AerpawCmpError, InputError, UsageError
 from ..common.stages import Progress, logged
 from ..common.text import counted
@@ -339,28 +340,6 @@ def _scheduler(address: str, paths: Sequence[Path], progress: Progress) -> Itera
             client.close(timeout=5)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerFacts:
-    """The version, code and missing files of a worker."""
-
-    host: str
-    version: str
-    code: str
-    missing: tuple[str, ...]
-
-
-def _worker_facts(paths: Sequence[str]) -> WorkerFacts:
-    """Return the facts of the process that runs this function."""
-    from .. import __version__
-
-    return WorkerFacts(
-        host=platform.node(),
-        version=__version__,
-        code=code_digest(),
-        missing=tuple(path for path in paths if not os.access(path, os.R_OK)),
-    )
-
-
 def check_workers(client: Any, paths: Sequence[Path]) -> None:
     """Check that all workers run the same code and can read the files.
 
@@ -369,9 +348,15 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
     UsageError
         If the workers differ. The message lists workers, hosts and differences.
     """
-    answers = client.run(_worker_facts, [str(path.absolute()) for path in paths], on_error="return")
-    ours = _worker_facts([])
-    wrong = [f"{worker}: {text}" for worker, facts in answers.items() if (text := _difference(facts, ours))]
+    names = [str(path.absolute()) for path in paths]
+    answers = client.run(_difference, names, code_digest(), __version__, on_error="return")
+    wrong = [
+        f"{worker}: aerpaw-cmp cannot be loaded there ({type(answer).__name__}: {answer})"
+        if isinstance(answer, BaseException)
+        else f"{worker}: {answer}"
+        for worker, answer in answers.items()
+        if answer
+    ]
     if wrong:
         more = f"; and {len(wrong) - 4} more" if len(wrong) > 4 else ""
         raise UsageError(
@@ -381,13 +366,23 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
         )
 
 
-def _difference(facts: Any, ours: WorkerFacts) -> str:
-    if isinstance(facts, BaseException):
-        return f"aerpaw-cmp cannot be loaded there ({type(facts).__name__}: {facts})"
-    if facts.code != ours.code:
-        what = f"aerpaw-cmp {facts.version}, here {ours.version}" if facts.version != ours.version else "another state"
-        return f"{facts.host} runs different code ({what} of the program or of NumPy, SciPy, Sionna RT)"
-    if facts.missing:
-        more = f" and {len(facts.missing) - 1} more" if len(facts.missing) > 1 else ""
-        return f"{facts.host} does not see {facts.missing[0]}{more}"
-    return ""
+def _difference(paths: Sequence[str], code: str, version: str) -> str:
+    """Return how the process that runs this function differs from the planning process. Empty if it does not.
+
+    Parameters
+    ----------
+    paths : sequence of str
+        Files and folders that it must be able to read.
+    code, version : str
+        Digest of the code and version of the planning process.
+
+    Returns
+    -------
+    str
+    """
+    if code_digest() != code:
+        what = "another state" if __version__ == version else f"aerpaw-cmp {__version__}, here {version}"
+        return f"{platform.node()} runs different code ({what} of the program or of NumPy, SciPy, Sionna RT)"
+    missing = [path for path in paths if not os.access(path, os.R_OK)]
+    more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+    return f"{platform.node()} does not see {missing[0]}{more}" if missing else ""

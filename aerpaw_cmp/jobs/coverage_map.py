@@ -480,18 +480,16 @@ def make_maps(
             _write_tiles(outcome, outcome.store, partial(crew.run, evaluate), order, stages.progress)
             outcome.tiles["store"] = str(out / ZARR)
             return outcome
-        parts: dict[int, Mapping[str, job.MapResult]] = {}
+        parts: dict[int, tuple[Mapping[str, job.MapResult], int]] = {}
 
         def done(number: int, result: TileDone | Lost) -> None:
             if isinstance(result, Lost):
                 raise InputError(f"a tile of the map: {result.message}")
-            parts[number] = result.maps
-            outcome.paths += result.paths
+            parts[number] = result.maps, result.paths
             share(len(parts) / len(tiling))
 
         crew.run(evaluate, [order(number=number) for number in range(len(tiling))], done)
-        for mode in settings.foliage:
-            outcome.maps[mode] = tiling.joined({number: maps[mode] for number, maps in parts.items()})
+        outcome.maps, outcome.paths = tiling.joined(parts[number] for number in range(len(tiling)))
     return outcome
 
 
@@ -522,7 +520,7 @@ def _write_tiles(
             cause="too little memory; the finished tiles are kept, and the same command computes the others",
         )
     step = math.ceil(math.sqrt(len(tiling.grid) / SHOWN_POSITIONS))
-    outcome.maps, outcome.paths = store.every_nth(step)
+    outcome.maps, outcome.paths = tiling.joined(map(store.read, range(len(tiling))), step)
     # the study needs neighbours at distances that every n-th position does not have
     outcome.settings = replace(outcome.settings, study=False)
     outcome.tiles = {"tiles": len(tiling), "positions": len(tiling.grid), "shown_every": step}

@@ -17,7 +17,7 @@ values that ``serving_tower`` selects from the maps of each tower. NetCDF requir
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -281,23 +281,20 @@ def _places(maps: MapResult, frame: SiteFrame) -> dict[str, _Variable]:
 def _levels(maps: Mapping[str, MapResult]) -> dict[str, _Variable]:
     """Return levels and ratios of singular values, of each tower and of the nearest tower."""
     limit = f"at most {RATIO_LIMIT_DB:g} dB"
-    kinds: dict[str, tuple[str, str, str, str, Callable[[MapResult], FloatArray]]] = {
-        "rss_siso": ("received level, one element at both ends", "height", DBM, "dBm", lambda m: m.rss_siso_dbm),
-        "rss_mimo": ("received level, arrays at both ends", "height", DBM, "dBm", lambda m: m.rss_mimo_dbm),
-        "rss_sd": ("standard deviation of the level over the element pairs", "height", DB, "dB",
-                   lambda m: m.level_sd_db),
-        "spread": (f"largest over second singular value, {limit}", "height_of_rank", DB, "dB",
-                   lambda m: np.minimum(m.spread_db, RATIO_LIMIT_DB)),
-        "condition": (f"largest over last singular value, {limit}", "height_of_rank", DB, "dB",
-                      lambda m: np.minimum(m.condition_db, RATIO_LIMIT_DB)),
-    }  # fmt: skip
+    kinds = {
+        "rss_siso": ("rss_siso_dbm", "received level, one element at both ends", DBM, "dBm"),
+        "rss_mimo": ("rss_mimo_dbm", "received level, arrays at both ends", DBM, "dBm"),
+        "rss_sd": ("level_sd_db", "standard deviation of the level over the element pairs", DB, "dB"),
+        "spread": ("spread_db", f"largest over second singular value, {limit}", DB, "dB"),
+        "condition": ("condition_db", f"largest over last singular value, {limit}", DB, "dB"),
+    }
     variables = {}
-    for name, (meaning, height, unit, shown, values_of) in kinds.items():
-        by_tower = [np.moveaxis(values_of(item), 1, 0) for item in maps.values()]  # tower, height, n
-        joint = [
-            values[result.serving, :, np.arange(len(result.grid))].T
-            for result, values in zip(maps.values(), by_tower, strict=True)
-        ]
+    for name, (plane, meaning, unit, shown) in kinds.items():
+        height = "height" if name.startswith("rss") else "height_of_rank"
+        # no level is near the limit of the ratios
+        values = {mode: np.minimum(getattr(item, plane), RATIO_LIMIT_DB) for mode, item in maps.items()}
+        by_tower = [np.moveaxis(item, 1, 0) for item in values.values()]  # tower, height, n
+        joint = [item.of_tower(values[mode]) for mode, item in maps.items()]
         attributes = {"long_name": meaning, "units": unit, "comment": f"unit: {shown}"}
         variables[name] = _stacked(maps, by_tower, ("tower", height), attributes)
         variables[f"{name}_joint"] = _stacked(maps, joint, (height,), attributes)

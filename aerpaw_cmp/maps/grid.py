@@ -360,11 +360,11 @@ class MapResult:
 
     def rss(self, antennas: Antennas = "mimo", tower: str | None = None) -> FloatArray:
         """Return RSS (altitudes, n) of one tower, or of the serving tower of each position."""
-        return self._of(self.rss_siso_dbm if antennas == "siso" else self.rss_mimo_dbm, tower)
+        return self.of_tower(self.rss_siso_dbm if antennas == "siso" else self.rss_mimo_dbm, tower)
 
     def ranks(self, tower: str | None = None) -> NDArray[np.int8]:
         """Return rank (altitudes, K, n) of one tower, or of the serving tower of each position."""
-        return np.asarray(self._of(self.rank, tower), dtype=np.int8)
+        return np.asarray(self.of_tower(self.rank, tower), dtype=np.int8)
 
     def rank_shares(self, tower: str | None = None) -> FloatArray:
         """Return shares (altitudes, K, 1 + highest rank) of out of coverage and of ranks 1, 2, ... as in the paper."""
@@ -375,7 +375,8 @@ class MapResult:
         """Return the probability of coverage per RSS altitude: share of positions with a path."""
         return np.asarray(np.isfinite(self.rss(antennas, tower)).mean(axis=1))
 
-    def _of(self, values: NDArray[np.generic], tower: str | None) -> FloatArray:
+    def of_tower(self, values: NDArray[np.generic], tower: str | None = None) -> FloatArray:
+        """Return values (..., towers, n) of one tower, or of the serving tower of each position, as (..., n)."""
         if tower is not None:
             if tower not in self.tower_names:
                 raise UsageError(f"unknown tower {tower!r}", expected=f"one of {', '.join(self.tower_names)}")
@@ -495,7 +496,7 @@ def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
             for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
                 name = f"rss_{antennas}_h{in_name(height)}m_{who}"
                 layers.append(layer(name, values, "dBm", f"RSS {antennas.upper()}", height_m=height))
-        spread, condition = (result._of(values, tower) for values in (result.spread_db, result.condition_db))
+        spread, condition = (result.of_tower(values, tower) for values in (result.spread_db, result.condition_db))
         for height, ranks, *ratios in zip(result.rank_altitudes_m, result.ranks(tower), spread, condition, strict=True):
             at = f"h{in_name(height)}m_{who}"
             for k, rank in zip(result.ks, ranks, strict=True):

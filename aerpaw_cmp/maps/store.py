@@ -18,10 +18,11 @@ With more reflections, terrain or a scene of triangles, every building counts.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -82,18 +83,35 @@ class Tiling:
         rows, columns = self.part(number)
         return Grid(self.grid.east_m[columns], self.grid.north_m[rows], self.grid.spacing_m)
 
-    def joined(self, parts: Mapping[int, MapResult]) -> MapResult:
-        """Return the map of the complete grid from the maps of all tiles."""
-        first = next(iter(parts.values()))
-        values = {}
-        for name in PLANES:
-            like = getattr(first, name)
-            plane = np.empty((*like.shape[:-1], *self.grid.shape), dtype=like.dtype)
-            for number, tile in parts.items():
-                rows, columns = self.part(number)
-                plane[..., rows, columns] = getattr(tile, name).reshape(*like.shape[:-1], *tile.grid.shape)
-            values[name] = plane.reshape(*like.shape[:-1], -1)
-        return over_grid(first, self.grid, values)
+    def joined(
+        self, tiles: Iterable[tuple[Mapping[str, MapResult], int]], step: int = 1
+    ) -> tuple[dict[str, MapResult], int]:
+        """Return the maps of the complete grid by foliage mode, and the number of paths.
+
+        Parameters
+        ----------
+        tiles : iterable of (mapping of str to MapResult, int)
+            Maps by foliage mode and number of paths of each tile, in the order of the tiles.
+        step : int
+            The maps contain every ``step``-th position along either axis. The paths of all positions count.
+        """
+        grid = Grid(self.grid.east_m[::step], self.grid.north_m[::step], self.grid.spacing_m * step)
+        rasters: dict[tuple[str, str], AnyArray] = {}
+        maps: Mapping[str, MapResult] = {}
+        total = 0
+        for number, (maps, paths) in enumerate(tiles):
+            total += paths
+            part = self.part(number)
+            inner = tuple(slice(-axis.start % step, None, step) for axis in part)
+            outer = tuple(slice(-(-axis.start // step), -(-axis.stop // step)) for axis in part)
+            for mode, name in itertools.product(maps, PLANES):
+                plane = getattr(maps[mode], name)
+                if number == 0:
+                    rasters[mode, name] = np.empty((*plane.shape[:-1], *grid.shape), dtype=plane.dtype)
+                tile = plane.reshape(*plane.shape[:-1], *maps[mode].grid.shape)
+                rasters[mode, name][..., outer[0], outer[1]] = tile[..., inner[0], inner[1]]
+        flat = {key: raster.reshape(*raster.shape[:-2], -1) for key, raster in rasters.items()}
+        return {m: over_grid(like, grid, {name: flat[m, name] for name in PLANES}) for m, like in maps.items()}, total
 
 
 def over_grid(like: MapResult, grid: Grid, values: Mapping[str, Any]) -> MapResult:
@@ -317,32 +335,6 @@ class TileStore:
                 start = stop
             maps[mode] = over_grid(like, grid, planes)
         return maps, int.from_bytes(content[:8], "little")
-
-    def every_nth(self, step: int) -> tuple[dict[str, MapResult], int]:
-        """Return maps of every ``step``-th position along either axis, by foliage mode, and the paths of all tiles."""
-        full, paths = self.tiling.grid, 0
-        grid = Grid(full.east_m[::step], full.north_m[::step], full.spacing_m * step)
-        rasters = {
-            (mode, name): np.empty((*getattr(like, name).shape[:-1], *grid.shape), dtype=getattr(like, name).dtype)
-            for mode, like in self._empty.items()
-            for name in PLANES
-        }
-        for number in range(len(self.tiling)):
-            maps, in_tile = self.read(number)
-            paths += in_tile
-            part = self.tiling.part(number)
-            inner = tuple(slice(-axis.start % step, None, step) for axis in part)
-            outer = tuple(slice(-(-axis.start // step), -(-axis.stop // step)) for axis in part)
-            for (mode, name), raster in rasters.items():
-                plane = getattr(maps[mode], name)
-                tile = plane.reshape(*plane.shape[:-1], *maps[mode].grid.shape)
-                raster[..., outer[0], outer[1]] = tile[..., inner[0], inner[1]]
-        flat = {key: raster.reshape(*raster.shape[:-2], -1) for key, raster in rasters.items()}
-        joined = {
-            mode: over_grid(like, grid, {name: flat[mode, name] for name in PLANES})
-            for mode, like in self._empty.items()
-        }
-        return joined, paths
 
     def write_zarr(self, path: Path, frame: SiteFrame, about: Mapping[str, str]) -> Path:
         """Write all tiles as a new Zarr store with the variables of ``maps.nc``, one chunk per tile.

@@ -54,8 +54,8 @@ def in_tiles(site, chosen, cells):
     for number in range(len(tiling)):
         done.append(channels.tile(coverage_map.TileOrder(site="", settings=chosen, cells=cells, number=number)))
         buildings.append(len(channels.site.buildings))
-    maps = {mode: tiling.joined({n: tile.maps[mode] for n, tile in enumerate(done)}) for mode in chosen.foliage}
-    return maps, buildings, sum(tile.paths for tile in done)
+    maps, paths = tiling.joined((tile.maps, tile.paths) for tile in done)
+    return maps, buildings, paths
 
 
 def in_one_piece(site, chosen):

@@ -262,7 +262,7 @@ def test_no_error_of_a_model_is_shown_on_the_flight_it_was_learned_from(small_re
         choose(browser, "choose-series", learned.name)
         choose(browser, "choose-model", "ray tracing")
         shown = browser.execute_script("return document.getElementById('span').textContent")
-        assert "n/a: learned from this flight" in shown
+        assert "not scored: antennas learned from this flight" in shown
         assert "RMSE with" not in shown
         choose(browser, "choose-model", "free space")
         assert "RMSE with" in browser.execute_script("return document.getElementById('span').textContent")

@@ -1,13 +1,13 @@
 "use strict";
-// What the scripts of all pages share: arrays of the page's data, colours, words, small charts.
+// Functions of the scripts of all pages: arrays of the page's data, colours, texts, small charts.
 const common = (() => {
   const at = id => document.getElementById(id);
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-  // what rounds to zero has no sign
+  // a number that rounds to zero has no sign
   const number = (v, digits = 1, unit = "") => Number.isFinite(v) ? (+v.toFixed(digits) === 0 ? 0 : v).toFixed(digits).replace("-", "−") + (unit ? " " + unit : "") : "–";
   const FONT = "12px system-ui, sans-serif";
 
-  // one deflated block in base64 that holds all arrays one after the other, each at a multiple of eight bytes
+  // one deflated block in base64 that contains all arrays, each at a multiple of eight bytes
   async function unpack(packed) {
     const raw = atob(packed.data), bytes = new Uint8Array(raw.length);
     for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
@@ -17,7 +17,7 @@ const common = (() => {
     return packed.arrays.map(([kind, offset, length]) => new kinds[kind](buffer, offset, length));
   }
 
-  // numbers kept as integers: value = stored * step; the least integer stands for "none"
+  // numbers stored as integers: value = stored * step; the smallest integer means "none"
   const none = { i1: -128, i2: -32768, u1: 255, u2: 65535 };
   function values(array, step) {
     const missing = array instanceof Int16Array ? none.i2 : array instanceof Uint8Array ? none.u1 : array instanceof Uint16Array ? none.u2 : none.i1;
@@ -45,8 +45,8 @@ const common = (() => {
     return [pen, w, h];
   }
 
-  // names of points inside an area [left, top, right, bottom]: beside their points, clear of its edges, of each other
-  // and of whose map it is (credit), in the lower right corner
+  // names next to their points inside an area [left, top, right, bottom], which overlap neither its edges, nor each
+  // other, nor the source of the map (credit) in the lower right corner
   function names(pen, area, points, credit = "", font = "bold 12px system-ui, sans-serif") {
     const [left, top, right, bottom] = area, placed = [], high = 13;
     pen.save(); pen.lineWidth = 3; pen.textAlign = "left"; pen.lineJoin = "round";
@@ -71,13 +71,13 @@ const common = (() => {
     return placed.filter(place => place[4]);
   }
 
-  function ticks(low, high, most = 5) { // three at least
+  function ticks(low, high, most = 5) { // at least three
     if (!(high > low)) return [low];
     const raw = (high - low) / most, mag = 10 ** Math.floor(Math.log10(raw)), step = [1, 2, 5, 10].map(k => k * mag).find(k => k >= raw * (1 - 1e-9)), out = [];
     for (let v = Math.ceil(low / step - 1e-9) * step; v <= high + 1e-9 * step; v += step) out.push(Math.abs(v) < 1e-9 * step ? 0 : v);
     return out.length < 3 && most < 20 ? ticks(low, high, most + 1) : out;
   }
-  // instants at round times of day between two, all in seconds; "begun" is the time of day of zero
+  // round times of day between two times, all in seconds; "begun" is the time of day of second 0
   function clockTicks(low, high, most, begun) {
     const day = 86400, steps = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, day, 2 * day, 7 * day, 30 * day, 90 * day, 365 * day];
     const step = steps.find(s => (high - low) / s <= most) ?? 3650 * day, out = [];
@@ -88,7 +88,7 @@ const common = (() => {
   const clockText = seconds => new Date(Math.round(seconds * 1000)).toISOString().slice(11, seconds % 1 ? 21 : 19);
   const digits = marks => { const step = marks.length > 1 ? Math.abs(marks[1] - marks[0]) : 1; return Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9))); };
 
-  // axes of a small chart; gives the two scales. x and y: {low, high, label, marks?, words?}
+  // axes of a small chart; returns both scales. x and y: {low, high, label, marks?, words?}
   function axes(pen, w, h, x, y, left = 50) {
     const right = w - 12, top = 10, bottom = h - 38;
     const X = v => left + (v - x.low) / (x.high - x.low || 1) * (right - left), Y = v => bottom - (v - y.low) / (y.high - y.low || 1) * (bottom - top);
@@ -105,7 +105,7 @@ const common = (() => {
     return { X, Y, left, right, top, bottom };
   }
 
-  // a plan: scales that show [west, east, south, north] in an area [left, top, right, bottom], zoomed and moved
+  // scales of a plan, zoomed and moved, that show [west, east, south, north] in an area [left, top, right, bottom]
   function plan(area, [west, east, south, north], zoom = 1, moved = [0, 0]) {
     const [left, top, right, bottom] = area, scale = zoom * Math.min((right - left) / (east - west), (bottom - top) / (north - south));
     const mx = (west + east) / 2 + moved[0], my = (south + north) / 2 + moved[1], ox = (left + right) / 2, oy = (top + bottom) / 2;
@@ -125,7 +125,7 @@ const common = (() => {
     pen.beginPath(); pen.moveTo(x, y - 8); pen.lineTo(x - 7, y + 5); pen.lineTo(x + 7, y + 5); pen.closePath();
     pen.globalAlpha = alpha; pen.fillStyle = "#C1121F"; pen.strokeStyle = "#fff"; pen.lineWidth = 1.2; pen.fill(); pen.stroke(); pen.globalAlpha = 1;
   }
-  // a bar of colours with numbers below it
+  // a colour scale with numbers below it
   function colourBar(pen, of, [low, high], [left, right], top) {
     for (let i = 0; i <= right - left; i++) { pen.fillStyle = `rgb(${of(i / (right - left))})`; pen.fillRect(left + i, top, 1.5, 14); }
     pen.strokeStyle = css("--soft"); pen.strokeRect(left, top, right - left, 14);
@@ -134,13 +134,13 @@ const common = (() => {
     for (const v of marks) { const x = left + (v - low) / (high - low) * (right - left); pen.fillText(number(v, d), x, top + 28); pen.fillRect(x, top + 14, 1, 3); }
   }
 
-  // colour ramps of matplotlib as six-digit colours one after the other
+  // colour maps of matplotlib as consecutive colours of six digits
   const RAMPS = {
     viridis: "44015445045746075a460a5d470d6047106347136548166848186a481b6d481d6f482071482374482576482878472a7a472d7b472f7d46327e463480453781443983443b84433e854240864142874045883f47883e49893e4c8a3d4e8a3c508b3b528b3a548c39568c38598c375b8d365d8d355f8d34618d33638d32658e31678e30698e2f6b8e2e6d8e2e6f8e2d718e2c728e2b748e2a768e2a788e297a8e287c8e277e8e27808e26828e25838e25858e24878e23898e228b8d228d8d218f8d20928c20938c1f958b1f978b1f998a1e9b8a1e9d891f9f881fa1881fa28720a48621a68522a88424aa8325ac8227ad8129af7f2cb17e2eb37c31b57b34b67937b8783aba763dbc7440bd7244bf7048c16e4cc26c50c46a54c56858c7655cc86360ca6065cb5e69cd5b6ece5873d05677d1537cd25081d34d86d5498bd64690d74395d8409bd93ca0da39a5db36aadc32b0dd2fb5de2bbade28c0df25c5e021cae11fd0e11cd5e21adae319dfe318e5e419eae51aefe51cf4e61ef8e621fde725",
     plasma: "0d088713078919068c1d068e2206902605912a05932e059531059735049838049a3c049b3f049c43039e46039f4903a04c02a15002a25302a35601a45901a55c01a66001a66300a76600a76900a86c00a86f00a87201a87501a87801a87b02a87e03a88104a78405a78707a68a09a58d0ba58f0da4920fa39511a19814a09a169f9d189da01a9ca21d9aa51f99a72197aa2395ac2694ae2892b12a90b32c8eb52f8cb7318aba3388bc3587be3885c03a83c23c81c43e7fc6417dc8437bca457acc4977ce4b75d04d73d24f71d45270d5546ed7566cd9586ada5b69dc5d67de5f65df6263e16462e26660e4695ee56b5de76e5be87059e97257eb7556ec7754ed7a52ef7c51f07f4ff1814df2844bf3874af48948f58c46f68f44f79143f89441f9973ff99a3efa9c3cfb9f3afba238fca537fca835fdab33fdae32fdb130fdb42ffeb72dfeba2cfebd2afec029fdc328fdc627fdca26fccd25fcd025fbd324fbd724fada24f9dd25f8e125f7e425f6e826f5eb27f3ee27f2f227f1f525f0f921",
     RdBu_r: "05306107346709386d0c3d730e417910457e124984144e8a1752901956961b5a9c1d5fa21f63a82267ac246aae276eb02a71b22c75b42f79b5327cb73480b93783bb3a87bd3c8abe3f8ec04291c24695c44c99c6529dc859a1ca5fa5cd65a9cf6bacd171b0d378b4d57eb8d784bcd98ac0db90c4dd96c7df9bc9e0a0cce2a5cee3a9d1e5aed3e6b3d6e8b8d8e9bddbeac2ddecc7e0edcce2efd1e5f0d4e6f1d7e8f1dae9f2ddebf2e0ecf3e3edf3e6eff4e9f0f4ecf2f5eff3f5f2f5f6f5f6f7f7f5f4f8f3f0f8f1edf9efe9f9ede5faeae1fae8defbe6dafbe4d6fce2d2fcdfcffdddcbfddbc7fcd7c2fcd3bcfbceb7facab1f9c6acf9c2a7f8bda1f7b99cf7b596f6b191f5ac8bf5a886f3a481f19e7def9979ec9374ea8e70e8896ce58368e37e64e17860de735cdc6e57da6853d7634fd55d4cd25849cf5246cc4c44c94741c6413ec43b3cc13639be3036bb2a34b82531b61f2eb3192cae172aa81529a213289c1127960f27900d268a0b258409247f08237906227304216d022067001f",
   };
-  // at night a ramp begins where it can be told from the page: a quarter of the way up, its order as it is
+  // on a dark page the first quarter of a colour map is not used, because it looks like the background
   const night = matchMedia("(prefers-color-scheme: dark)"), theme = document.documentElement.dataset;
   const lifted = t => (theme.theme ? theme.theme === "dark" : night.matches) ? 0.25 + 0.75 * t : t;
   function ramp(name) {
@@ -156,7 +156,7 @@ const common = (() => {
     return sorted[low] + (sorted[high] - sorted[low]) * (place - low);
   }
 
-  // a colour of viridis, or between blue and red about the middle
+  // a colour of viridis, or of a scale from blue to red around the middle
   function shade(v, low, high, diverging) {
     const x = Math.min(1, Math.max(0, (v - low) / (high - low)));
     if (diverging) {
@@ -183,28 +183,28 @@ const common = (() => {
     jobs.forEach(job => waiting.add(job));
   }
 
-  // commands of a path in the words of SVG; an arc is two, as SVG has none that ends where it began
+  // commands of a path as SVG; an arc is written as two, because SVG has no arc that ends at its start
   const SPELLED = {
     closePath: () => ["Z"], moveTo: (x, y) => ["M", x, y], lineTo: (x, y) => ["L", x, y], rect: (x, y, w, h) => ["M", x, y, "h", w, "v", h, "h", -w, "Z"],
     arc: (x, y, r, from, to) => SPELLED.ellipse(x, y, r, r, 0, from, to),
-    ellipse: (x, y, wide, high, _, from, to) => [0, 0.5, 1].flatMap(part => { // ours lie along the axes
+    ellipse: (x, y, wide, high, _, from, to) => [0, 0.5, 1].flatMap(part => { // no ellipse of these pages is rotated
       const angle = from + part * Math.min(to - from, 2 * Math.PI);
       return [...(part ? ["A", wide, high, 0, 0, 1] : ["L"]), x + wide * Math.cos(angle), y + high * Math.sin(angle)];
     }),
   };
   const spell = (name, values) => SPELLED[name](...values).map(v => Number.isFinite(v) ? +v.toFixed(2) : v).join(" ") + " ";
-  // a path as uPlot makes them apart from its canvas
+  // a path that uPlot makes without a canvas
   class SpelledPath extends Path2D { constructor(...other) { super(...other); this.spelled = other.length ? other[0].spelled : ""; } }
   const drawn = Path2D.prototype;
   for (const name in SPELLED) SpelledPath.prototype[name] = function (...values) { this.spelled += spell(name, values); drawn[name].apply(this, values); };
 
-  // what a canvas is drawn with, taken down as SVG while it is drawn anew
+  // records the drawing of a canvas as SVG, while ``draw`` repeats it
   function drawnAsSvg(canvas, draw) {
     const pen = canvas.getContext("2d"), out = [], clips = [0], text = v => String(v).replace(/[&<"]/g, c => `&#${c.charCodeAt(0)};`);
     let path = "", clip = 0;
-    const d = other => `d="${(other?.spelled ?? path).replace(/^L/, "M")}"`; // a canvas begins a line where nothing stands yet
-    const paint = (use, style) => { // many readers of SVG know no rgba()
-      if (typeof style !== "string") return `${use}="none"`; // a pattern, over a colour of its own
+    const d = other => `d="${(other?.spelled ?? path).replace(/^L/, "M")}"`; // in a canvas the first line of a path needs no starting point
+    const paint = (use, style) => { // many programs cannot read rgba() in an SVG
+      if (typeof style !== "string") return `${use}="none"`; // a pattern, which is drawn over a colour
       const [, rgb, alpha] = style.match(/^rgba\((.*), ([\d.]+)\)$/) || [];
       return rgb ? `${use}="rgb(${rgb})" ${use}-opacity="${alpha}"` : `${use}="${style}"`;
     };
@@ -216,7 +216,7 @@ const common = (() => {
     const box = filled => (x, y, w, h) => mark("rect", `x="${x}" y="${y}" width="${w}" height="${h}"/>`, filled);
     const words = filled => (t, x, y) => {
       const above = () => pen.measureText(t).actualBoundingBoxAscent, own = pen.textBaseline, to = above();
-      pen.textBaseline = "alphabetic"; // the only one that all readers of SVG draw alike
+      pen.textBaseline = "alphabetic"; // the only baseline that all programs draw equally
       const base = y + above() - to;
       pen.textBaseline = own;
       mark("text", `x="${x}" y="${base}" style="font: ${text(pen.font)}" text-anchor="${{ center: "middle", right: "end" }[pen.textAlign] || "start"}">${text(t)}</text>`, filled);
@@ -236,10 +236,10 @@ const common = (() => {
     return `<svg xmlns="http://www.w3.org/2000/svg" width="${canvas.clientWidth}" viewBox="0 0 ${canvas.width} ${canvas.height}">${out.join("")}${left}</svg>`;
   }
 
-  // a menu that saves a chart: drawn again by ``draw`` as SVG, as a picture, or the rows of its numbers
+  // a menu that saves a chart: as SVG, for which ``draw`` draws it again, as a picture, or as rows of numbers
   function downloads(canvas, name, rows, draw) {
     const save = (kind, blob) => { const a = document.createElement("a"); a.href = URL.createObjectURL(blob); a.download = `${name}.${kind}`; a.click(); URL.revokeObjectURL(a.href); };
-    // texts as aerpaw_cmp.common.text guards them: a spreadsheet must not take a name for a formula
+    // same rule as in aerpaw_cmp.common.text, so that a spreadsheet does not execute a name as a formula
     const guarded = v => typeof v === "string" ? v.replace(/(^|;)(?=[=+\-@\t\r'])/g, "$1'") : v;
     const quoted = v => /[",\n]/.test(v) ? `"${String(v).replaceAll('"', '""')}"` : v;
     const cell = v => v === null || Number.isNaN(v) ? "" : quoted(guarded(v));
@@ -251,7 +251,7 @@ const common = (() => {
     return menu;
   }
 
-  // the same in a line of its own below the chart, or below its scale
+  // the same menu in a line below the chart, or below its colour scale
   function saves(canvas, name, rows, draw, above = canvas) {
     let place = above.nextElementSibling;
     if (!place?.classList.contains("saves")) above.after(place = Object.assign(document.createElement("p"), { className: "key saves" }));
@@ -264,8 +264,8 @@ const common = (() => {
     night.addEventListener("change", () => later(job));
   }
 
-  // Charts of the sections, from marks over two axes; ``get`` returns the array with a number. Marks differ in colour
-  // and in shape or dashes, so that they can be told apart without colours.
+  // Charts of the sections, from marks over two axes; ``get`` returns the array with a number. Marks differ in shape or
+  // dashes, too, so that they can be distinguished without colours.
   const SHAPES = "■●▲◆✚▼", DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
   function plots(specs, get) {
     const HUES = ["--measured", "--second", "--baseline", "--accent", "--ink", "--soft"];

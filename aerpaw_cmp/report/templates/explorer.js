@@ -1,6 +1,6 @@
 "use strict";
-// The linked views: one pose, one span and one choice of series, shown by a map and by charts over time.
-// Numbers of a span follow the formulas of aerpaw_cmp.compare: offset on the grid, RMSE about it, Pearson correlation.
+// The linked views: a map and charts over time show one pose, one segment and one choice of series.
+// Numbers of a segment follow aerpaw_cmp.compare: offset on the grid, RMSE with this offset, Pearson correlation.
 (async () => {
   const data = JSON.parse(document.getElementById("explorer-data").textContent);
   const root = document.getElementById("explorer");
@@ -20,7 +20,7 @@
   function gridOffset(meanDifference) {
     const [low, high] = data.span_db, exact = meanDifference / data.step_db, whole = Math.trunc(exact);
     const rest = Math.abs(exact - whole);
-    const steps = rest > 0.5 + 1e-9 ? whole + Math.sign(exact) : whole; // a tie goes to the offset nearer zero
+    const steps = rest > 0.5 + 1e-9 ? whole + Math.sign(exact) : whole; // the offset nearer to zero wins a tie
     return Math.min(high, Math.max(low, steps * data.step_db));
   }
 
@@ -71,7 +71,7 @@
     return { n, pairs, agreement: pairs ? same / pairs : NaN, shares };
   }
 
-  // --- words --------------------------------------------------------------------------------------------------------
+  // --- texts --------------------------------------------------------------------------------------------------------
 
   function clock(t) {
     if (!data.start) return number(t, 2, "s");
@@ -85,7 +85,7 @@
 
   function describe() {
     const s = rss(), r = rank(), rows = [], t = state.pose;
-    document.body.classList.toggle("pointed", t !== null || state.span !== null); // readouts keep in view only while they are asked for
+    document.body.classList.toggle("pointed", t !== null || state.span !== null); // the values remain visible only while a pose or a segment is selected
     if (t === null) { cells(at("pose"), [["Pose", "point at a chart or at the map"]]); return; }
     rows.push(["Time", clock(t)]);
     if (s) {
@@ -112,7 +112,7 @@
     rows.push(["Span", span]);
     if (s) {
       rows.push(["Samples", number(s.n, 0)]);
-      if (rss().models[state.model].learned_here) rows.push(["RMSE", "n/a: learned from this flight"]);
+      if (rss().models[state.model].learned_here) rows.push(["RMSE", "not scored: antennas learned from this flight"]);
       else if (s.n) rows.push(["RMSE, offset refitted on the selection", number(s.rmse, 1, "dB")], ["Offset of the selection", number(s.offset, 1, "dB")],
         ["RMSE with the flight's offset", number(s.rmseFlight, 1, "dB")], ["Mean residual", number(s.bias, 2, "dB")], ["Correlation", number(s.correlation, 2)]);
     }
@@ -183,7 +183,7 @@
     const made = new uPlot(options, columns, host);
     made.parted = extra.parted;
     common.saves(made.ctx.canvas, label, () => [["time", ...series.map(one => one.label || "band")], ...Array.from(columns[0], (t, i) => columns.map(list => list[i]))],
-      () => made.batch(u => u.redraw()), made.root); // a batch draws before it returns, its paths made anew
+      () => made.batch(u => u.redraw()), made.root); // a batch computes the paths again and draws before it returns
     made.over.addEventListener("dblclick", () => { span(null); zoomTo(null); });
     charts.push({ chart: made, host, height });
   }
@@ -208,12 +208,12 @@
     const s = rss(), r = rank(), tall = innerWidth < 600 ? 150 : 175;
     if (s) {
       const time = get(s.time), model = s.models[state.model], measured = get(s.measured);
-      // levels as logged; each model is moved to them by its own offset
+      // levels are as logged, and each model is shifted to them by its offset
       const moved = (index, by) => Array.from(get(index), v => Number.isFinite(v) ? v - (by ?? 0) : null), ray = s.models[0];
       const columns = [Array.from(time), column(measured), moved(model.level, model.offset)], series = [dots("measured", css("--measured"), 4), line(model.name, css("--ink"))];
       const words = [`dots: measured, as logged; line: ${model.name}${model.learned_here ? " with antennas learned from this flight" : ""}, minus its offset of ${number(model.offset, 1, "dB")}`], extra = {};
       if (state.model === 0 && s.models[1]) { columns.push(moved(s.models[1].level, s.models[1].offset)); series.push(line(s.models[1].name, css("--baseline"), [6, 4], 1)); words.push("dashed: " + s.models[1].name); }
-      const second = data.rss.find(o => o.name === s.beside), first = second ? 1 : 0; // under the dots and the line of the chosen channel
+      const second = data.rss.find(o => o.name === s.beside), first = second ? 1 : 0; // drawn below the dots and the line of the chosen channel
       if (state.model === 0 && s.band) {
         for (const end of s.band) { columns.push(moved(end, ray.offset)); series.push(line("", "transparent")); }
         extra.bands = [{ series: [columns.length - 1 + first, columns.length - 2 + first], fill: css("--band-90") }];
@@ -244,7 +244,7 @@
   // --- the map, plan or in three dimensions ---------------------------------------------------------------------------
 
   const canvas = at("map"), pen = canvas.getContext("2d");
-  const KEY = 46; // strip below the map that holds its scale and its colours: nothing of the map lies under them
+  const KEY = 46; // height of the strip below the map that contains its scale and colours
   let project = null, drawn = [], labels = [];
 
   function flown() {
@@ -252,12 +252,12 @@
     return s && get(s.east) ? { time: get(s.time), east: get(s.east), north: get(s.north), up: get(s.up) } : null;
   }
 
-  function way() { // of a tower that moves, sample by sample
+  function way() { // positions of a moving tower, one per sample
     const s = rss() || rank();
     return s && s.tower_east !== undefined ? { tower: s.tower, time: get(s.time), east: get(s.tower_east), north: get(s.tower_north), up: get(s.tower_up) } : null;
   }
 
-  function standing(t) { // foot and top of a tower: of one that moves, at the pose that is shown
+  function standing(t) { // foot and top of a tower, of a moving tower at the visible pose
     const m = way();
     if (m && m.tower === t.name && state.pose !== null) {
       const i = nearest(m.time, state.pose);
@@ -369,7 +369,7 @@
     drawWay();
     for (const t of data.site.towers) {
       const [foot, top] = standing(t).map(project);
-      if (Math.max(foot[1], top[1] + 4) > h - KEY) continue; // half a mark at the edge of the key says nothing
+      if (Math.max(foot[1], top[1] + 4) > h - KEY) continue; // a mark that the strip would cut is not drawn
       polyline([foot, top], css("--accent"), 3);
       polygon([[top[0], top[1] - 6], [top[0] - 5, top[1] + 4], [top[0] + 5, top[1] + 4]], css("--accent"), null);
     }
@@ -542,7 +542,7 @@
   controls();
   everything();
   window.explorer = { times: () => charts.map(c => c.chart.axes[0]._values), state, statistics, rankStatistics, choose, span, series: i => Array.from(get(i)), labels: () => labels, keyTop: () => canvas.clientHeight - KEY, data };
-})().catch(error => { // an old browser without the means: the tables stay
+})().catch(error => { // a browser that is too old: the tables remain visible
   document.documentElement.classList.remove("live");
   console.error(error);
 });

@@ -1,5 +1,5 @@
 "use strict";
-// The linked map: one layer or the difference of two, what stands at the pointer, a profile, the numbers of the layer.
+// The linked map: one layer or the difference of two, values at the pointer, a profile, and numbers of the layer.
 (async () => {
   const { at, css, number, cells, fill, frame, axes, ramp, quantile, later, whenResized } = common;
   const data = JSON.parse(at("explorer-data").textContent), arrays = await common.unpack(data.packed);
@@ -13,7 +13,7 @@
 
   const quantity = () => data.quantities[state.quantity];
   const kept = new Map();
-  function layer(choice) { // values of a combination, row 0 in the south; null where there is no such layer
+  function layer(choice) { // values of a choice, row 0 in the south; null if there is no such layer
     const q = quantity(), i = q.layers[choice.join(",") || ""];
     if (i === undefined) return null;
     const key = state.quantity + ":" + i;
@@ -40,7 +40,7 @@
       const counts = q.classes.map(() => 0);
       for (const v of finite) counts[v]++;
       if (q.classes[0] === "Z") counts[0] = total - finite.length;
-      found.share = counts.map(c => c / total); // by class: an object would put "1" before "Z"
+      found.share = counts.map(c => c / total); // a list in the order of the classes, because an object would sort "1" before "Z"
       return found;
     }
     let sum = 0, square = 0;
@@ -85,7 +85,7 @@
   // --- the map ----------------------------------------------------------------------------------------------------------
 
   let image = null, project = null, labels = [];
-  function draw() { // the cells once per layer, scaled by the browser
+  function draw() { // draws the cells once per layer; the browser scales the image
     image = document.createElement("canvas"); image.width = columns; image.height = rows;
     const pen = image.getContext("2d"), pixels = pen.createImageData(columns, rows), ends = limits();
     for (let r = 0; r < rows; r++) for (let c = 0; c < columns; c++) {
@@ -155,7 +155,7 @@
     pen.textAlign = "right"; pen.fillText(`${name}${said ? ` [${said}]` : ""}`, w - 40, 17); pen.textAlign = "left";
   }
 
-  // --- words and numbers --------------------------------------------------------------------------------------------
+  // --- texts and numbers --------------------------------------------------------------------------------------------
 
   function chosen(axis, choice) { const i = quantity().axes.findIndex(x => x.name === axis); return i < 0 ? null : quantity().axes[i].values[choice[i]]; }
 
@@ -166,7 +166,7 @@
     return [lat, lon];
   }
 
-  function column(cell) { // values of a cell over the heights of the chosen layer
+  function column(cell) { // values of a cell at all heights of the chosen layer
     const i = quantity().axes.findIndex(axis => axis.name === "Height");
     if (i < 0 || !cell) return [];
     const at = cell[0] * columns + cell[1];
@@ -217,7 +217,7 @@
     const c = Math.floor((e - edges[0]) / (edges[1] - edges[0]) * columns), r = Math.floor((n - edges[2]) / (edges[3] - edges[2]) * rows);
     return c >= 0 && c < columns && r >= 0 && r < rows ? [r, c] : null;
   }
-  function profile() { // [distance along the line, value], of the cell that each point lies in
+  function profile() { // [distance along the line, value of the cell that contains the point]
     if (!state.line || !shown) return [];
     const [[e0, n0], [e1, n1]] = state.line, length = Math.hypot(e1 - e0, n1 - n0), steps = Math.max(2, Math.min(2000, Math.ceil(length / Math.min(...data.half))));
     return Array.from({ length: steps + 1 }, (_, i) => {
@@ -280,13 +280,13 @@
       return label;
     }));
   }
-  function nearestLayer(wanted) { // the layer that agrees in most axes, the first axes first
+  function nearestLayer(wanted) { // the layer that agrees in the most axes; the first axes count most
     const keys = Object.keys(quantity().layers).map(k => k === "" ? [] : k.split(",").map(Number));
     let best = keys[0], most = -1;
     for (const k of keys) { const same = k.reduce((t, v, i) => t + (v === wanted[i] ? 1 : 0), 0); if (same > most) { most = same; best = k; } }
     return [...best];
   }
-  function carry(before, choice) { // the same tower, height, ... in another quantity
+  function carry(before, choice) { // the choice with the same tower, height, ... in another quantity
     return quantity().axes.map(axis => {
       const i = before ? before.axes.findIndex(x => x.name === axis.name) : -1, value = i < 0 ? null : before.axes[i].values[choice[i]];
       return Math.max(0, axis.values.indexOf(value));
@@ -306,13 +306,13 @@
     at("scale").closest("label").hidden = quantity().kind === "classes" || state.difference;
     at("choices-b").hidden = !state.difference;
     selects(at("axes-a"), "a"); selects(at("axes-b"), "b");
-    at("steps").textContent = `This page stores values in steps of ${quantity().kind === "classes" ? "one class" : quantity().step + (quantity().unit ? " " + quantity().unit : "")}; the tables beside it hold them in full.`
-      + (data.left_out ? ` Left out of this page for its size: ${data.left_out}.` : "")
+    at("steps").textContent = `This page stores values in steps of ${quantity().kind === "classes" ? "one class" : quantity().step + (quantity().unit ? " " + quantity().unit : "")}; files in the same folder contain the exact values.`
+      + (data.left_out ? ` To limit its size, the page does not contain ${data.left_out}.` : "")
       + (data.stride > 1 ? " Numbers of the layer are those of the cells in this page." : "");
   }
   function setDifference(on) {
     state.difference = on && Object.keys(quantity().layers).length > 1;
-    if (state.difference && state.a.join() === state.b.join()) { // another layer, so that there is something to see
+    if (state.difference && state.a.join() === state.b.join()) { // B becomes another layer, because the difference would be zero
       const keys = Object.keys(quantity().layers), axis = ["Foliage", "Height", "Tower", "K", "Antennas"].map(n => quantity().axes.findIndex(x => x.name === n)).find(i => i >= 0 && quantity().axes[i].values.length > 1);
       const other = [...state.a];
       if (axis !== undefined) other[axis] = (other[axis] + 1) % quantity().axes[axis].values.length;
@@ -371,7 +371,7 @@
   state.b = [...state.a];
   everything();
   window.mapExplorer = { state, data, statistics, layer, degrees, profile, column, cellAt, limits, point, line, setQuantity, setDifference, everything, shown: () => shown, labels: () => labels, project: () => project, ready: true };
-})().catch(error => { // an old browser without the means: the tables stay
+})().catch(error => { // a browser that is too old: the tables remain visible
   document.documentElement.classList.remove("live");
   console.error(error);
 });

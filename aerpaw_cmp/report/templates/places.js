@@ -1,5 +1,5 @@
 "use strict";
-// Values at points: on the plan of the site, or on a sphere of directions that turns; what stands at the pointer; along a route.
+// Values at points on the plan of the site or on a turning sphere of directions, at the pointer, and along a route.
 (async () => {
   const { at, css, number, cells, fill, frame, axes, later, polyline } = common;
   const data = JSON.parse(at("explorer-data").textContent), arrays = await common.unpack(data.packed);
@@ -25,7 +25,7 @@
   // --- the plan and the sphere ----------------------------------------------------------------------------------------
 
   let project = null, drawn = [], labels = [];
-  function limits() { // of what is drawn of this group, and the lines
+  function limits() { // extent of the points of this group and of the lines
     const [e, n] = group().at.map(i => arrays[i]), all = [[...e].filter(Number.isFinite), [...n].filter(Number.isFinite)];
     for (const line of [...data.lines, ...data.rings]) for (const [x, y] of line) { all[0].push(x); all[1].push(y); }
     const ends = all.flatMap(list => [list.reduce((a, b) => Math.min(a, b), Infinity), list.reduce((a, b) => Math.max(a, b), -Infinity)]);
@@ -55,7 +55,7 @@
     common.planAxes(pen, project, w, h);
   }
   const spacing = new Map();
-  function apart(g) { // the largest distance of a direction to its neighbour, of some
+  function apart(g) { // the largest distance of a direction to its nearest neighbour, from about 60 directions
     if (!spacing.has(g)) {
       const [x, y, z] = g.at.map(i => arrays[i]), n = x.length;
       let most = 0;
@@ -109,10 +109,10 @@
     if (banded) common.polygon(pen, [...known.map(i => [a.X(time[i]), a.Y(low[i])]), ...known.reverse().map(i => [a.X(time[i]), a.Y(high[i])])], css("--band-90"));
     polyline(pen, [...v.keys()].filter(i => Number.isFinite(v[i])).map(i => [a.X(time[i]), a.Y(v[i])]), css("--ink"), 1.4);
     if (state.point !== null) polyline(pen, [[a.X(time[state.point]), a.top], [a.X(time[state.point]), a.bottom]], css("--accent"), 1);
-    at("along-words").textContent = banded ? "Line: median. Band: the interval that holds 90 % of the samples." : "";
+    at("along-words").textContent = banded ? "Line: median. Band: the interval that contains 90 % of the samples." : "";
   }
 
-  // --- words, choices and the pointer -----------------------------------------------------------------------------------
+  // --- texts, choices and the pointer -----------------------------------------------------------------------------------
 
   const degrees = x => x * 180 / Math.PI;
   function place(i) {
@@ -173,7 +173,7 @@
 
   choose(0);
   window.places = { state, data, values, choose, point, drawn: () => drawn, labels: () => labels, ready: true };
-})().catch(error => { // an old browser without the means
+})().catch(error => { // a browser that is too old
   document.documentElement.classList.remove("live");
   console.error(error);
 });

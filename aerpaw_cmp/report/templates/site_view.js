@@ -1,4 +1,4 @@
-// A painter's-algorithm view: everything becomes polygons, lines and labels, sorted by depth, drawn far to near.
+// A 3-D view by the painter's algorithm: polygons, lines and labels, sorted by depth, are drawn from far to near.
 const scene = JSON.parse(document.getElementById("scene").textContent);
 const canvas = document.getElementById("view"), pen = canvas.getContext("2d");
 const L = scene.limits, centre = L.map(([a, b]) => (a + b) / 2);
@@ -9,7 +9,7 @@ const box = id => document.getElementById(id);
 const on = id => !box(id) || box(id).checked;
 let shape = null;
 
-// A view is fitted once, when chosen; turning and zooming then leave its middle where it is.
+// A view is fitted when it is chosen. Turning and zooming do not move its centre.
 function prepare() {
   const ct = Math.cos(eye.turn), st = Math.sin(eye.turn), ce = Math.cos(eye.tilt), se = Math.sin(eye.tilt);
   const w = canvas.clientWidth, h = canvas.clientHeight, far = 2.6 * size, scale = eye.zoom * eye.fit;
@@ -135,7 +135,7 @@ box("above").addEventListener("click", () => view(0, 1.57));
 box("side").addEventListener("click", () => view(0, 0.12));
 new ResizeObserver(redraw).observe(canvas);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
-// corners of everything that stands there, whatever is drawn
+// corners of all objects, those that are not drawn too
 function corners() {
   const of = (kind, name, points) => points.map(p => [kind, name, p[0], p[1], p[2] ?? 0]), all = (kind, rings) => rings.flatMap((ring, i) => of(kind, i + 1, ring));
   return [["kind", "name", "east_m", "north_m", "up_m"], ...scene.towers.flatMap(t => of("tower", t.name, [t.at, [t.at[0], t.at[1], t.top]])),

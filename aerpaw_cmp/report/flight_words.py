@@ -541,6 +541,7 @@ class Headline:
 
 # Largest number of words of a summary.
 MOST_WORDS = 60
+TO_SCORE = "To score it: `calibrate` on other flights, then `report --with`."
 
 
 def paragraph(data: ReportData) -> str:
@@ -553,7 +554,7 @@ def paragraph(data: ReportData) -> str:
     advice = "" if data.next_step is None else f"Next: {data.next_step}."
     if learned := _training(data):
         other = error if panels or not data.rss else _baseline_sentence(data.rss)
-        parts = [learned, other, expected_sentence(data.rss), advice]
+        parts = [learned, other, expected_sentence(data.rss), advice or ("" if panels else TO_SCORE)]
     elif error:
         none = _without_cause(data.verdict, panels) if panels else ""
         # the next step of such a flight is always a wider search range

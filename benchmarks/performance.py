@@ -218,6 +218,11 @@ def town(history: list[dict[str, Any]]) -> list[str]:
         ratio = "1" if row["kind"] == "image" else number(cpu / ours[row["depth"]])
         lacks = "none known" if row["kind"] == "image" else f"{row['extra']} of {sum(row['exact'])}"
         out.append(f"| {name} | {row['depth']} | {number(cpu)} | {ratio} | {lacks} |")
+    if str(when) < "2026-11-29":
+        out += [
+            "", "From 2026-11-29 on, the search also follows first faces that another face hides: 1.85 s at depth 2 "
+            "and 60.1 s at depth 3 on a machine under load. It finds the same paths with less code.",
+        ]  # fmt: skip
     return [*out, ""]
 
 

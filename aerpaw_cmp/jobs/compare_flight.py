@@ -381,8 +381,11 @@ def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore 
 def _stated_error_db(
     case: _Case, score: rss.RssComparison, stated: StatedSpread | None, detection: DetectionScore | None
 ) -> FloatArray:
-    """Return the residual (n,) that stated intervals are checked with: levels without lock are below the floor [dB]."""
-    if stated is None or detection is None or not detection.locks:
+    """Return the residual (n,) that stated intervals are checked with [dB].
+
+    Levels without lock are known to be below the floor, and no more. A band with P(lock) predicts them as logged.
+    """
+    if stated is None or stated.lock is not None or detection is None or not detection.locks:
         return score.residual_db
     level = case.levels.simulated_db - detection.offset_db
     error = error_above_floor(case.levels.measured_db, level, stated.total_db, detection.floor_db)

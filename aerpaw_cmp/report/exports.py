@@ -126,7 +126,21 @@ def of_report(data: ReportData) -> Export:
 def points_table(
     kind: str, data: ReportData, columns: Sequence[Column], links: Sequence[tuple[Any, dict[str, Any]]]
 ) -> Points:
-    """Return the samples of one kind from the times and columns of each link."""
+    """Return the samples of one kind as points.
+
+    Parameters
+    ----------
+    kind : str
+        ``rss`` or ``rank``.
+    data : ReportData
+    columns : sequence of Column
+    links : sequence of (times, columns)
+        Times of each link, and its columns by name.
+
+    Returns
+    -------
+    Points
+    """
     import pandas as pd
 
     link = {"channel": "", "unit": "1", "flight": data.flight}

@@ -145,6 +145,11 @@ def first_sentence(
     unit : str
         Plural name of a series.
 
+    Returns
+    -------
+    str
+        One or two sentences.
+
     Examples
     --------
     >>> first_sentence([(6.72, 9), (6.72, 9)], {"free_space": 6.0}, [{"free_space": "not significant"}] * 2)

@@ -318,6 +318,10 @@ def of_sheet(rows: Rows, sheet: _sheet.Sheet, *, track: str = "phone", source: s
     sheet : Sheet
     track, source : str
         Name of the telemetry, and the source of its positions.
+
+    Returns
+    -------
+    ReadResult
     """
     _settle_names(sheet)
     streams: list[Stream | None] = []

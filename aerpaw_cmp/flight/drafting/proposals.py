@@ -829,6 +829,11 @@ def searching_airframe(
         The levels, without antennas.
     carrier_hz : float, optional
         Carrier of the levels [Hz]. Airframes of other bands are then not used.
+
+    Returns
+    -------
+    SpherePattern or None
+        Its gain over the directions of the airframe.
     """
     if len(track.level_db) < FEWEST or track.rotation is None:
         return None

@@ -16,7 +16,7 @@ from ._origins import CLOCKS, HEIGHTS
 # Modules in the order in which ``aerpaw-cmp formats`` lists them.
 _FORMATS = (
     "vehicle_out", "sounder_log", "flight_mat", "quectel_csv", "quectel_ri", "nemo_csv", "nemo_kml", "drive_test",
-    "gnettrack_kml", "aadm_snr", "controller_log", "srsenb_log", "tap_jsonl", "gpx", "pawprints",
+    "gnettrack_kml", "controller_log", "srsenb_log", "tap_jsonl", "gpx", "pawprints",
     "srsue_log", "vehicle_log", "quectel_console", "cell_search", "srsran_gnb", "oai_log", "ardupilot_bin",
     "mavlink_tlog", "px4_ulog", "nmea", "rtklib_pos", "dji_srt", "sigmf", "iq_burst", "generic_csv", "no_log",
 )  # fmt: skip

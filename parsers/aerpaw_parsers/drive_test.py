@@ -7,7 +7,8 @@ stream (from one), and positions become the telemetry stream ``phone``.
 
 A table of positions without a level (converted vehicleOut, ArduPilot exports, AirData) is read in the same way by
 ``pose_csv``, with the telemetry stream ``vehicle``. Units in brackets (``[ft]``, ``[MPH]``) are converted. Times
-without a zone are local unless the name of the column contains UTC or GPS.
+without a zone are local unless the name of the column contains UTC or GPS. ``aadm_snr`` is AADM's table of the SNR of
+several towers, ``time,snr_lw1,snr_lw2,...``.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from aerpaw_cmp.readers import (
     snr_stream,
 )
 
-from . import _cells, _identity, _pose, _sheet, aadm_snr, ardupilot_bin, nemo_csv, quectel_ri, rtklib_pos, vehicle_out
+from . import _cells, _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, rtklib_pos, vehicle_out
 
 _IsHeader = Callable[[list[str]], bool]
 # A tower of Lake Wheeler in the name of a column.
@@ -76,12 +77,18 @@ def _has_time(names: list[str]) -> bool:
 
 
 # Readers of tables that also have a time and a level or position. They know units that are not in the names.
-_NARROWER = (nemo_csv, quectel_ri, aadm_snr, ardupilot_bin, rtklib_pos, vehicle_out)
+_NARROWER = (nemo_csv, quectel_ri, ardupilot_bin, rtklib_pos, vehicle_out)
 
 
 def _is_table(head: bytes, header: _IsHeader) -> bool:
     """Check whether a file begins with such a header and is not of a narrower format."""
-    return _sheet.starts(head, header) and not any(module.READER.sniff(head) for module in _NARROWER)
+    narrower = _is_snr_of_towers(head) or any(module.READER.sniff(head) for module in _NARROWER)
+    return not narrower and _sheet.starts(head, header)
+
+
+def _is_snr_of_towers(head: bytes) -> bool:
+    """Check whether a file begins with the header of AADM's SNR table, ``time,snr_lw1,snr_lw2``."""
+    return re.match(rb"(?i)(?:\xef\xbb\xbf)?time(?:,snr_[a-z0-9]{1,12}){1,16}[ \t]*\r?\n", head) is not None
 
 
 @dataclass
@@ -519,5 +526,9 @@ READERS = (
         read=partial(
             _read, header=is_track_header, reader="pose_csv", track="vehicle", source="table of positions"
         ),
+    ),
+    Reader(
+        name="aadm_snr", kinds=("rss",), title="SNR of several towers, CSV (AADM)", sample="time,snr_lw1,snr_lw2",
+        sniff=_is_snr_of_towers, read=partial(_read, header=is_header, reader="aadm_snr"),
     ),
 )  # fmt: skip

@@ -54,5 +54,5 @@ def test_of_many_rejected_lines_the_first_are_kept_and_all_are_counted() -> None
     octal, talk = result.reasons
     assert (octal.count, octal.first, octal.last) == (60 * lines, lines + 1, 61 * lines)
     assert (talk.count, talk.first, talk.last) == (5, 61 * lines + 1, 61 * lines + 5)
-    table = by_name("aadm_snr").read(b"time,snr_lw1\n" + b"talk\n" * 5000, OPTIONS)
+    table = by_name("aadm_snr").read(b"time,snr_lw1\n" + b"talk,x,y\n" * 5000, OPTIONS)
     assert (len(table.rejected), table.rejected_count) == (KEPT_REJECTED, 5000)

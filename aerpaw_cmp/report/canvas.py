@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -418,6 +418,39 @@ def draw_credit(ax: Axes, site: Site) -> None:
         )  # fmt: skip
 
 
+# Looks of the areas of a site on a plan.
+_PLAN: Mapping[str, Mapping[str, Any]] = {
+    "forest": {"facecolor": _FOREST, "edgecolor": "#7FA873", "hatch": "..", "linewidth": 0.6, "alpha": 0.7,
+               "zorder": 0.3},
+    "building": {"facecolor": _BUILDING, "edgecolor": "black", "linewidth": 0.7, "zorder": 0.6},
+    "geofence": {"facecolor": "none", "edgecolor": "#333333", "linestyle": (0, (4, 3)), "linewidth": 0.9,
+                 "zorder": 0.6},
+}  # fmt: skip
+
+
+def draw_areas(ax: Axes, site: Site, looks: Mapping[str, Mapping[str, Any]]) -> None:
+    """Draw the areas of each kind with a look, and the source of the map."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.path import Path as Outline
+
+    draw_credit(ax, site)
+    areas = {
+        "forest": [forest.area for forest in site.forests],
+        "building": [building.footprint for building in drawn_buildings(site)],
+        "geofence": [fence.area for fence in site.geofences],
+    }
+    for label, look in looks.items():
+        # one path with all rings of an area, so that holes are not filled
+        outlines: list[Any] = [
+            Outline.make_compound_path(*(Outline(np.asarray(ring.coords)[:, :2], closed=True) for ring in rings))
+            for rings in ((area.exterior, *area.interiors) for area in areas[label])
+        ]
+        if outlines:
+            drawn = PolyCollection([], **look, label=label)
+            drawn.set_verts_and_codes([path.vertices for path in outlines], [path.codes for path in outlines])
+            ax.add_collection(drawn)
+
+
 def draw_site(ax: Axes, site: Site) -> None:
     """Draw forests, trees, buildings, geofences and towers on a plan (east, north) [m].
 
@@ -426,28 +459,9 @@ def draw_site(ax: Axes, site: Site) -> None:
     ax : Axes
     site : Site
     """
-    from matplotlib.patches import PathPatch
-    from matplotlib.path import Path as Outline
-
-    draw_credit(ax, site)
     if not site.mapped:
         ax.text(0.5, 0.02, "no map here", transform=ax.transAxes, ha="center", color="#777777", fontsize=8, zorder=7)
-    areas: dict[str, tuple[list[Any], dict[str, Any]]] = {
-        "forest": ([forest.area for forest in site.forests],
-                   {"facecolor": _FOREST, "edgecolor": "#7FA873", "hatch": "..", "linewidth": 0.6, "alpha": 0.7,
-                    "zorder": 0.3}),
-        "building": ([building.footprint for building in drawn_buildings(site)],
-                     {"facecolor": _BUILDING, "edgecolor": "black", "linewidth": 0.7, "zorder": 0.6}),
-        "geofence": ([fence.area for fence in site.geofences],
-                     {"facecolor": "none", "edgecolor": "#333333", "linestyle": (0, (4, 3)), "linewidth": 0.9,
-                      "zorder": 0.6}),
-    }  # fmt: skip
-    for label, (polygons, look) in areas.items():
-        for number, polygon in enumerate(polygons):
-            # one path with all rings, so that holes are not filled
-            rings = [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
-            outline = Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
-            ax.add_patch(PathPatch(outline, **look, label=label if number == 0 else None))
+    draw_areas(ax, site, _PLAN)
     if len(site.trees):
         _draw_crowns(ax, site.trees)
     for number, tower in enumerate(site.towers.values()):

@@ -26,10 +26,9 @@ from ..compare.verdict import Coverage, coverage_verdict
 from ..maps.evaluate import TREATMENTS
 from ..maps.grid import PAPER_SPACING_M
 from ..maps.variogram import BiExponential, BinnedCorrelation
-from ..site.scenes import drawn_buildings
 from ..site.site import Site
 from . import canvas
-from .canvas import TOWER, FigureSpec, beyond, colour_bar, draw_credit, draw_tower, placed
+from .canvas import FigureSpec, beyond, colour_bar, draw_areas, draw_tower, placed
 from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, bold, paragraph, settings_card
 from .charts import Chart, drawn, flown
 from .flight_data import RANKS, ReportData
@@ -339,12 +338,24 @@ def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | N
     matplotlib.image.AxesImage
         The image, for a colour bar.
     """
+    from matplotlib.patheffects import withStroke
+
     ax.patch.set(**MISSING)  # cells without a value are transparent and show the hatched background
     image = ax.imshow(values, origin="lower", extent=extent_m(data), interpolation="none", zorder=1, **options)
-    _draw_overlay(ax, data.site, highlight)
+    halo = [withStroke(linewidth=2.2, foreground="white")]
+    looks = {
+        "forest": {"facecolor": "none", "edgecolor": "#2F5D28", "linewidth": 0.9, "linestyle": (0, (2, 1)),
+                   "zorder": 2.1, "path_effects": halo},
+        "building": {"facecolor": "white", "edgecolor": "black", "linewidth": 0.7, "zorder": 2.2},
+    }  # fmt: skip
+    draw_areas(ax, data.site, looks)
+    for name, tower in data.site.towers.items():
+        if highlight is None or name == highlight:
+            draw_tower(ax, tower, markersize=7, label="tower")
     for line in data.borders_m if highlight is None else ():
         ax.plot(line[:, 0], line[:, 1], color="white", linewidth=1.8, zorder=3)
-        ax.plot(line[:, 0], line[:, 1], color="black", linewidth=0.9, linestyle=(0, (4, 2)), zorder=3.1)
+        dashed: dict[str, Any] = {"color": "black", "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 3.1}
+        ax.plot(line[:, 0], line[:, 1], label="border of the towers' areas", **dashed)
     west, east, south, north = extent_m(data)
     ax.set(xlim=(west, east), ylim=(south, north))
     ax.set_aspect("equal", adjustable="box")
@@ -354,36 +365,12 @@ def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | N
     return image
 
 
-def _draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
-    """Draw outlines of buildings and forests, and the towers, or only ``highlight``."""
-    from matplotlib.collections import PolyCollection
-
-    draw_credit(ax, site)
-    for forest in site.forests:
-        outline = np.asarray(forest.area.exterior.coords)
-        ax.plot(outline[:, 0], outline[:, 1], color="white", linewidth=1.4, zorder=2)
-        ax.plot(outline[:, 0], outline[:, 1], color="#2F5D28", linewidth=0.8, linestyle=(0, (2, 1)), zorder=2.1)
-    outlines = [np.asarray(building.footprint.exterior.coords)[:, :2] for building in drawn_buildings(site)]
-    ax.add_collection(PolyCollection(outlines, facecolor="white", edgecolor="black", linewidth=0.7, zorder=2.2))
-    for name, tower in site.towers.items():
-        if highlight is None or name == highlight:
-            draw_tower(ax, tower, markersize=7)
-
-
-def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
-    """Return legend entries of the objects that :func:`draw_map` draws."""
-    from matplotlib.lines import Line2D
+def overlay_legend(axes: Sequence[Axes]) -> list[Any]:
+    """Return legend entries of the objects on maps, and of positions out of coverage."""
     from matplotlib.patches import Patch
 
-    entries: list[Any] = [Patch(**MISSING, label="out of coverage")]
-    entries.append(Line2D([], [], marker="^", color=TOWER, markeredgecolor="white", linestyle="none", label="tower"))
-    if drawn_buildings(data.site):
-        entries.append(Patch(facecolor="white", edgecolor="black", label="building"))
-    if data.site.forests:
-        entries.append(Line2D([], [], color="#2F5D28", linestyle=(0, (2, 1)), label="forest"))
-    if borders and data.borders_m:
-        entries.append(Line2D([], [], color="black", linestyle=(0, (4, 2)), label="border of the towers' areas"))
-    return entries
+    drawn = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    return [Patch(**MISSING, label="out of coverage"), *drawn.values()]
 
 
 def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure, list[Axes]]:
@@ -422,8 +409,7 @@ def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]
     low, high = axes[-1].get_position().y0, axes[0].get_position().y1
     bar = fig.add_axes((0.91, low + 0.1 * (high - low), 0.016, 0.8 * (high - low)))
     colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits), bar)
-    entries = overlay_legend(data, borders=any(entry.tower == JOINT for entry in maps))
-    fig.legend(handles=entries, loc="lower center", ncols=3)
+    fig.legend(handles=overlay_legend(axes), loc="lower center", ncols=3)
     return fig
 
 
@@ -439,7 +425,7 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
         draw_map(ax, data, shown.values, cmap=colours, norm=norm)
         ax.set_title(f"{shown.height_m:g} m", fontsize=9)
     entries = [Patch(facecolor=CLASS_COLOURS[r], edgecolor="black", label=f"rank {r}") for r in RANKS]
-    fig.legend(handles=[*entries, *overlay_legend(data, borders=True)], loc="lower center", ncols=5)
+    fig.legend(handles=[*entries, *overlay_legend(axes)], loc="lower center", ncols=5)
     return fig
 
 

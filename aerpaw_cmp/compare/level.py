@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtr, ndtri  # every report loads this module, and scipy.stats takes 0.4 s
+from scipy.special import ndtr  # every report loads this module, and scipy.stats takes 0.4 s
 
 from ..common.geodesy import azimuth_rad, bearing_deg, elevation_rad
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
@@ -741,30 +741,6 @@ def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: flo
     mse = np.maximum(low[k] + moved, 0.0) / n
     best = int(mse.argmin())
     return OffsetFit(float(grid[best]), float(np.sqrt(mse[best])), n, best in (0, len(grid) - 1))
-
-
-def error_above_floor(
-    measured_db: FloatArray, simulated_db: FloatArray, sd_db: FloatArray, floor_db: float
-) -> FloatArray:
-    """Return measured minus simulated (n,) [dB], to check the standard deviation that was stated for it.
-
-    A level at the floor is only known to be below it. It is replaced by a level below the floor from the stated normal
-    distribution, evenly spread over the samples: if the statement is right, an interval contains its nominal share.
-
-    Parameters
-    ----------
-    measured_db, simulated_db, sd_db : (n,)
-    floor_db : float
-    """
-    below, reach = measured_db <= floor_db, (floor_db - simulated_db) / sd_db
-    evenly = np.arange(1, len(below) + 1) * _GOLDEN % 1.0
-    # far in the tail the floor itself is the likeliest level
-    replaced = np.where(reach < -_FAR, reach, ndtri(evenly * ndtr(np.maximum(reach, -_FAR))))
-    return np.where(below, sd_db * replaced, measured_db - simulated_db)
-
-
-# Multiples of the golden ratio, modulo 1, are spread evenly. Standard deviations beyond which a level is its bound.
-_GOLDEN, _FAR = 0.6180339887498949, 8.0
 
 
 def _reliability(stated: FloatArray, detected: BoolArray) -> tuple[tuple[float, float, int], ...]:

@@ -30,7 +30,6 @@ from ..compare.level import (
     ServingComparison,
     at_times,
     compare_serving,
-    error_above_floor,
     nearest_in_time,
     score_detection,
 )
@@ -308,7 +307,6 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
     settings, levels, series, replayed = case.data.settings.rss, case.levels, case.series, case.replayed
     wild = rss.outliers(levels.measured_db)
     detection = None if case.trained else _detection(case)
-    error_db = None if case.trained else _stated_error_db(case, score, stated, detection)
     further = RssFurther(
         n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out,
         n_too_low=int((replayed.valid & ~levels.posed).sum()),
@@ -321,7 +319,7 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
         compared_with={},
         averaged={},
         simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
-        error_bars=None if stated is None else _error_bars(stated, error_db),
+        error_bars=None if stated is None else _error_bars(stated, None if case.trained else score.residual_db),
         elsewhere=_elsewhere(case, score, detection),
         trained_on=case.trained or None,
         rmse_bound=_bound(series, score),
@@ -376,20 +374,6 @@ def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore 
     if lock is not None:
         out["floor_rmse_db"], out["free_space_floor_rmse_db"] = lock.floor_rmse_db, lock.free_space_floor_rmse_db
     return out or None
-
-
-def _stated_error_db(
-    case: _Case, score: rss.RssComparison, stated: StatedSpread | None, detection: DetectionScore | None
-) -> FloatArray:
-    """Return the residual (n,) that stated intervals are checked with [dB].
-
-    Levels without lock are known to be below the floor, and no more. A band with P(lock) predicts them as logged.
-    """
-    if stated is None or stated.lock is not None or detection is None or not detection.locks:
-        return score.residual_db
-    level = case.levels.simulated_db - detection.offset_db
-    error = error_above_floor(case.levels.measured_db, level, stated.total_db, detection.floor_db)
-    return np.where(np.isfinite(score.residual_db), error, np.nan)
 
 
 def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[str, float]:

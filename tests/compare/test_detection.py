@@ -9,7 +9,6 @@ from aerpaw_cmp.compare.level import (
     BASE_S,
     DetectionForecast,
     aligned_quality,
-    error_above_floor,
     floored_fit,
     learn_detection,
     score_detection,
@@ -27,19 +26,6 @@ def _flight(offset_db: float = -40.0, n: int = 6000) -> tuple[FloatArray, FloatA
     measured = simulated - offset_db + random.normal(0.0, 4.0, n)
     detected = random.random(n) < expit((simulated - offset_db - FLOOR) / 3.0)
     return time, measured, simulated, detected
-
-
-def test_levels_without_lock_are_only_known_to_be_below_the_floor() -> None:
-    """A receiver without lock logs noise: its share inside the true interval is that of the censored levels."""
-    random = np.random.default_rng(5)
-    expected = random.uniform(-40.0, 5.0, 20_000)
-    measured = expected + random.normal(0.0, 4.0, len(expected))
-    logged = np.where(measured < FLOOR, random.uniform(-45.0, -30.0, len(expected)), measured)
-    inside = np.abs(error_above_floor(logged, expected, np.full(20_000, 4.0), FLOOR)) < 1.645 * 4.0
-    assert np.mean(np.abs(logged - expected) < 1.645 * 4.0) < 0.75
-    for level in (-30.0, -18.0, -12.0, 0.0):
-        assert inside[np.abs(expected - level) < 5.0].mean() == pytest.approx(0.9, abs=0.015)
-    assert np.isnan(error_above_floor(np.array([np.nan, -20.0]), np.array([0.0, np.nan]), np.ones(2), FLOOR)).all()
 
 
 def test_the_probability_is_calibrated_and_beats_the_constant() -> None:

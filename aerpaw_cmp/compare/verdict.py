@@ -34,7 +34,6 @@ from .statistics import (
     NO_INTERVAL,
     Interval,
     corrected,
-    independent_samples,
     is_flat,
     mean_interval,
     middle_span,
@@ -254,7 +253,8 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
     Notes
     -----
     Student's t for n flights. From :data:`_MANY_FLIGHTS` flights on, n is the number of independent flights
-    (:func:`~aerpaw_cmp.compare.statistics.independent_samples`), because consecutive flights can correlate.
+    n (1 - r) / (1 + r), because consecutive flights can correlate. r is the correlation of consecutive flights,
+    corrected for its bias of -(1 + 3 r) / n (Kendall 1954, doi:10.2307/2332720); a negative r counts as 0.
     """
     from scipy.special import stdtrit  # scipy.stats would load for 0.2 s what one quantile needs
 
@@ -266,8 +266,12 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
     mean = float(array.mean())
     if n < FEWEST_FLIGHTS:
         return MeanOfFlights(n=n, mean=mean, low=np.nan, high=np.nan)
-    # at least the flights that an interval requires: with one, Student's t has no degree of freedom
-    independent = max(independent_samples(array), FEWEST_FLIGHTS) if n >= _MANY_FLIGHTS else float(n)
+    independent, change = float(n), array - mean
+    if n >= _MANY_FLIGHTS and change.any():
+        r = float(change[1:] @ change[:-1] / (change @ change))
+        r = float(np.clip(r + (1.0 + 3.0 * r) / n, 0.0, 1.0))
+        # at least the flights that an interval requires: with one, Student's t has no degree of freedom
+        independent = max(n * (1.0 - r) / (1.0 + r), FEWEST_FLIGHTS)
     reach = float(stdtrit(independent - 1.0, 0.975)) * float(array.std(ddof=1)) / independent**0.5
     return MeanOfFlights(n=n, mean=mean, low=mean - reach, high=mean + reach)
 

@@ -5,7 +5,6 @@ import pytest
 from scipy.stats import t as student
 
 from aerpaw_cmp.compare.offset import grid_offset
-from aerpaw_cmp.compare.statistics import independent_samples
 from aerpaw_cmp.compare.verdict import error_at_offset, left_out_offsets, mean_of_flights, verdict_of
 
 
@@ -46,11 +45,31 @@ def test_few_flights_and_missing_ones():
     assert (same.low, same.high) == (0.25, 0.25)
 
 
+@pytest.mark.parametrize(("correlation", "least"), [(0.0, 0.93), (0.6, 0.87)])
+def test_intervals_of_24_flights_contain_the_mean(correlation: float, least: float) -> None:
+    """Independent flights get no wider intervals than Student's t, but for one in ten; correlated flights get wider."""
+    rng, inside, wider = np.random.default_rng(8), [], []
+    for _ in range(400):
+        values = rng.normal(size=64)
+        for k in range(1, 64):
+            values[k] += correlation * values[k - 1]
+        last = values[40:]
+        mean = mean_of_flights(last)
+        inside.append(mean.low <= 0.0 <= mean.high)
+        plain = student.ppf(0.975, 23) * last.std(ddof=1) / np.sqrt(24)
+        wider.append(0.5 * (mean.high - mean.low) / plain)
+    assert least < np.mean(inside) < 0.98
+    assert (np.median(wider) < 1.1) == (correlation == 0.0)
+
+
 @pytest.mark.parametrize("n", [3, 19, 20])
 def test_intervals_are_those_of_students_t(n):
     """For twenty flights that drift, the effective number is that of independent flights."""
     values = np.arange(n) // 4 + np.sin(np.arange(n))
-    mean, independent = mean_of_flights(values), max(independent_samples(values), 3.0) if n >= 20 else n
+    mean, change = mean_of_flights(values), values - values.mean()
+    r = np.sum(change[1:] * change[:-1]) / np.sum(change**2)
+    r += (1.0 + 3.0 * r) / n
+    independent = max(n * (1.0 - r) / (1.0 + r), 3.0) if n >= 20 else n
     reach = student.ppf(0.975, independent - 1) * values.std(ddof=1) / np.sqrt(independent)
     assert (mean.n, mean.low, mean.high) == pytest.approx((n, values.mean() - reach, values.mean() + reach))
     slow = np.cumsum(np.ones(40)) + values[0]

@@ -705,7 +705,7 @@ def audit(
     search = replace(search, engine=engine)
     # on few poses, because the other engine is some hundred times slower
     few = poses[chosen]
-    checked = run_replay(site, link, few, search, Field(field.loss), run)
+    checked = run_replay(site, link, few, search, field, run)
     rays = checked.samples or (_FIELD_SAMPLES if search.samples == "auto" else search.samples)
     fields, ks, expected = None, second.ks, second.expected
     if expected is not None:

@@ -721,4 +721,4 @@ def _relocate(
             if len(holding):
                 # any face is correct: merge() keeps one of overlapping coplanar faces
                 result[row, step] = holding[-1]
-    return result
+    return np.asarray(result)

@@ -14,7 +14,7 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import noise_floor_dbm
-from aerpaw_cmp.compare.gains import NO_SPREAD, LostLock, Spread, StatedSpread
+from aerpaw_cmp.compare.gains import NO_SPREAD, StatedSpread
 from aerpaw_cmp.compare.result import Cause, RssResult
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.gains import foliage_notes
@@ -533,25 +533,3 @@ def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: p
     assert (parts.locked_sd_db, parts.lost_sd_db) == (7.0, 8.0)
     case.series.locked = None
     assert compare_flight._with_lock(case, score, stated) is stated
-
-
-def test_a_band_with_p_lock_predicts_levels_without_lock_as_logged() -> None:
-    """Without P(lock), such a level is only known to be below the floor."""
-    measured, simulated, residual = np.array([0.0, -40.0]), np.array([1.0, -20.0]), np.array([-1.0, -20.0])
-    case = SimpleNamespace(levels=SimpleNamespace(measured_db=measured, simulated_db=simulated))
-    detection = SimpleNamespace(locks=True, offset_db=0.0, floor_db=-15.0)
-    sd_db, share = np.ones(2), np.full(2, 0.5)
-    lock = LostLock(probability=share, locked_db=0 * sd_db, lost_db=-20 * sd_db, locked_sd_db=2.0, lost_sd_db=5.0)
-    spread = Spread(own_sd_db=2.0, noise_sd_db=0.0, fading_sd_db=0.0, fading_kurtosis=0.0, bin_s=4.0)
-    checked = [
-        compare_flight._stated_error_db(
-            case,
-            SimpleNamespace(residual_db=residual),
-            StatedSpread(gain_sd_db=sd_db, spread=spread, lock=known),
-            detection,
-        )
-        for known in (None, lock)
-    ]
-    assert checked[1] == pytest.approx(residual)
-    assert checked[0][0] == pytest.approx(-1.0)
-    assert abs(checked[0][1]) < 5.0

@@ -431,10 +431,7 @@ Parts = Callable[[Observed, Observed], list[tuple[BoolArray, BoolArray]]]
 
 
 def parts_left_out(
-    observed: Sequence[Observed],
-    recipe: Recipe,
-    without: Mapping[str, Learned],
-    parts: Parts,
+    observed: Sequence[Observed], recipe: Recipe, without: Mapping[str, Learned], parts: Parts
 ) -> tuple[Score, ...]:
     """Score each flight as predicted part by part, from other flights without samples that are like the part.
 

@@ -640,9 +640,7 @@ def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[Gai
 
 
 def column_forms(
-    series: Sequence[LinkSamples],
-    model: GainModel,
-    columns: Callable[[LinkSamples, float], FloatArray],
+    series: Sequence[LinkSamples], model: GainModel, columns: Callable[[LinkSamples, float], FloatArray]
 ) -> FloatArray:
     """Return ``X' Sigma^-1 X`` (width, width), with the gains integrated out of the covariance Sigma of a model.
 

@@ -472,12 +472,7 @@ def replay_poses(
     engine = engine or rt.engine
     towers = "+".join(link.tower_arrays)
     name = f"{engine} {towers}" if towers_m is None else f"replay {towers}, which moves"
-    search = Search(
-        engine,
-        max_depth=rt.max_depth,
-        samples=rt.advanced.samples,
-        further=diffracted(rt.diffraction),
-    )
+    search = Search(engine, max_depth=rt.max_depth, samples=rt.advanced.samples, further=diffracted(rt.diffraction))
     # the image engine finds the paths of a pose independently of others, but numbers planes of terrain in order
     alone = engine == "image" and site.dem is None
     long = alone and len(poses) > BLOCK

@@ -551,11 +551,7 @@ class Track:
             valid = code == 0
             position[~valid], rotation[~valid], known[~valid] = np.nan, np.nan, False
         return TrackPoses(
-            position_m=position,
-            rotation=rotation,
-            valid=valid,
-            reason_code=code.astype(np.int8),
-            attitude_known=known,
+            position_m=position, rotation=rotation, valid=valid, reason_code=code.astype(np.int8), attitude_known=known
         )
 
     def _sparse(self, interval_s: FloatArray) -> tuple[float, BoolArray, tuple[float, float]]:

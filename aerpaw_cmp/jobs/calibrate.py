@@ -26,16 +26,7 @@ from ..common.text import counted
 from ..common.units import FloatArray
 from ..common.yamlfile import StrictModel, load_yaml
 from ..compare import calibration, gains
-from ..compare.calibration import (
-    BIN_S,
-    Learned,
-    Observed,
-    Recipe,
-    Score,
-    flights_of,
-    groups_of,
-    learn,
-)
+from ..compare.calibration import BIN_S, Learned, Observed, Recipe, Score, flights_of, groups_of, learn
 from ..compare.gains import FlightEvidence, GainOf, KnownProcess
 from ..compare.health import HeldOut, learned_health
 from ..compare.level import DetectionScore, learn_detection, score_detection
@@ -430,10 +421,7 @@ def calibrate(
 
 
 def _score_further(
-    further: Sequence[FlightData],
-    flights: Sequence[FlightData],
-    learned: Learned,
-    observed: Sequence[Observed],
+    further: Sequence[FlightData], flights: Sequence[FlightData], learned: Learned, observed: Sequence[Observed]
 ) -> tuple[tuple[Score, ...], list[str]]:
     """Score further flights with the learned antennas, and remark on those that were training flights."""
     distinct, remarks = counted_once([*flights, *further])
@@ -469,10 +457,7 @@ def read_flights(
 
 
 def in_campaigns(
-    settings: CalibrationFile,
-    observed: Sequence[Observed],
-    flights: Sequence[FlightData],
-    campaigns: Mapping[str, str],
+    settings: CalibrationFile, observed: Sequence[Observed], flights: Sequence[FlightData], campaigns: Mapping[str, str]
 ) -> list[Observed]:
     """Return samples with their campaign, and with their airframe and band, of several campaigns.
 

@@ -131,9 +131,7 @@ def _errors(scores: Sequence[Score], name: str = "rmse_db") -> list[tuple[str, f
 
 
 def sentences(
-    scores: Mapping[str, Sequence[Score]],
-    controls: Mapping[str, Sequence[Score]],
-    ground_m: tuple[float, float] | None,
+    scores: Mapping[str, Sequence[Score]], controls: Mapping[str, Sequence[Score]], ground_m: tuple[float, float] | None
 ) -> tuple[str, ...]:
     """Return the summary of page and terminal, then further sentences.
 

@@ -753,12 +753,7 @@ class SpherePattern(MeasuredPattern):
     """
 
     def __init__(
-        self,
-        name: str,
-        gain_dbi: FloatArray,
-        sd_db: FloatArray,
-        frequency_hz: float | None = None,
-        notes: str = "",
+        self, name: str, gain_dbi: FloatArray, sd_db: FloatArray, frequency_hz: float | None = None, notes: str = ""
     ) -> None:
         super().__init__(name, np.sqrt(power_from_db(gain_dbi)).astype(np.complex128), None, frequency_hz)
         self.trained_on, self.marks = trained_on(notes), marks(notes)
@@ -1003,8 +998,7 @@ def read_known(path: Path, written: Written | None = None) -> KnownDirections:
     lower = np.zeros((len(rows), len(rows)))
     lower[np.tril_indices(len(rows))] = np.concatenate([row[2:] for row in rows])
     return KnownDirections(
-        directions=vectors_of(np.array([row[:2] for row in rows])),
-        covariance_db2=lower + np.tril(lower, -1).T,
+        directions=vectors_of(np.array([row[:2] for row in rows])), covariance_db2=lower + np.tril(lower, -1).T
     )
 
 

@@ -918,10 +918,7 @@ def offered(data: FlightData) -> FlightFile | None:
 
 
 def errors_elsewhere(
-    antennas: Mapping[str, str],
-    series: RssSeries,
-    folder: Path,
-    flown: tuple[FloatArray, FloatArray] | None = None,
+    antennas: Mapping[str, str], series: RssSeries, folder: Path, flown: tuple[FloatArray, FloatArray] | None = None
 ) -> tuple[learned.Errors | None, str]:
     """Return the errors of learned antennas on held-out flights like that of a series, and a phrase for their kind.
 

@@ -295,8 +295,8 @@ def _rank_rows(task: Task, data: FlightData, result: RankResult, series: RankSer
 def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: int) -> list[PlannedStage]:
     """Return the tasks of each setting for a dry run. ``kept`` has the stored outcomes by task number.
 
-    The time of a task is the mean of the stored tasks of its setting, divided by ``workers``. If its setting has no
-    stored task, the mean is that of all stored tasks. The time is unknown if no task is stored.
+    The time of a task is the mean time of the stored tasks of its setting, divided by ``workers``.
+    If its setting has no stored task, the mean is taken over all stored tasks. Without a stored task it is unknown.
     """
     spent: dict[str, list[float]] = {}
     for number, outcome in kept.items():

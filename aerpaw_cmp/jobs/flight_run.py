@@ -237,8 +237,8 @@ class _Climber:
     def _contradicts(self, climbed: FlightLadder) -> bool:
         """Check whether a model ignores the attitude that its learned antennas were learned with.
 
-        On a third of a flight such a model gained 0.4 dB, and on the complete flight it lost 2.1 dB. The training
-        flights of the antennas are stronger evidence than a part of one flight.
+        The training flights of the antennas are stronger evidence than a part of one flight: on a third of a flight
+        such a model was 0.4 dB better, and on the complete flight 2.1 dB worse.
         """
         chosen = climbed.ladder.recommended
         model = None if chosen is None else climbed.models[chosen]

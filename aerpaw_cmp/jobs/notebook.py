@@ -395,10 +395,11 @@ class Comparison:
         Returns
         -------
         xarray.DataTree
-            A node ``<tower>/<channel>`` per RSS series with ``measured_db``, ``calibrated_db`` (measured plus the
-            fitted offset), ``simulated_dbm`` and ``residual_db`` (calibrated minus simulated, NaN without a
-            comparison), and ``<tower>/rank`` per rank series with ``measured`` and ``simulated`` by ``k``. Times are
-            UTC.
+            A node ``<tower>/<channel>`` per RSS series and ``<tower>/rank`` per rank series. Times are UTC.
+
+            - RSS: ``measured_db``, ``calibrated_db`` (measured plus the fitted offset), ``simulated_dbm``, and
+              ``residual_db`` (calibrated minus simulated, NaN without a comparison).
+            - Rank: ``measured``, and ``simulated`` by ``k``.
 
         Raises
         ------

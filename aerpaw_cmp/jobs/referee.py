@@ -88,9 +88,13 @@ class ForeignPrediction:
     quantity : str
         One of :data:`QUANTITIES`. Empty if only ranks are predicted.
     table : DataFrame
-        One row per prediction: ``time`` (datetime64[ns], NaT if unknown), ``east_m north_m height_m`` in the site
-        frame (NaN if unknown), ``tower``, ``channel`` (empty: every channel of the tower), ``level`` [dB or dBm], and
-        those of ``sd_db q05_db q95_db rank yaw_deg time_s p_rank1..4`` that the file has.
+        One row per prediction.
+
+        - ``time``: datetime64[ns], NaT if unknown.
+        - ``east_m north_m height_m``: position in the site frame, NaN if unknown.
+        - ``tower``, and ``channel`` (empty: every channel of the tower).
+        - ``level`` [dB or dBm].
+        - Those of ``sd_db q05_db q95_db rank yaw_deg time_s p_rank1..4`` that the file has.
     sha256 : str
         Digest of the file. Empty for a folder of logs.
     remarks : tuple of str

@@ -47,7 +47,6 @@ from ..logs.records import has_wall_clock
 from ..report.campaign import (
     CampaignData,
     Failure,
-    PlaceMap,
     PooledOffset,
     RankRow,
     RankTransfer,
@@ -675,7 +674,7 @@ def with_season(
         started={name: _iso(ns) for name, ns in started.items()},
         ranking=tuple(ranking),
         nodes=season.nodes or _flown(data.reference_rows, order, started),
-        places=_place_map(data.reference_rows, data.cell_m),
+        places_db=_places_db(data.reference_rows, data.cell_m),
     )
     return dataclasses.replace(data, season=season)
 
@@ -837,17 +836,15 @@ def _radio(link: Mapping[str, Any], end: str) -> str:
 # --- places -----------------------------------------------------------------------------------------------------------
 
 
-def _place_map(rows: Sequence[RssRow], cell_m: float) -> PlaceMap | None:
-    """Return the mean residual of each cell of the map over flights, towers and channels. None without a cell."""
+def _places_db(rows: Sequence[RssRow], cell_m: float) -> dict[tuple[int, int], float]:
+    """Return the mean residual of each cell of the plan over flights, towers and channels [dB]."""
     residuals: dict[tuple[int, int], list[float]] = {}
     for row in rows:
         scored = np.isfinite(row.residual_db) & np.isfinite(row.position_m).all(axis=1)
         cells, means, _ = cell_means(row.position_m, row.residual_db, scored, cell_m)
         for (east, north), residual in zip(cells.tolist(), means, strict=True):
             residuals.setdefault((east, north), []).append(residual)
-    if not residuals:
-        return None
-    return PlaceMap(cells=np.array(list(residuals)), mean_db=np.array([np.mean(v) for v in residuals.values()]))
+    return {cell: float(np.mean(each)) for cell, each in residuals.items()}
 
 
 # --- reports of the flights -------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from ..common.jsonable import fields_of, json_safe
 from ..common.text import counted, guarded
-from ..common.units import FloatArray, IntArray
+from ..common.units import FloatArray
 from ..compare.level import LEARNED_HERE
 from ..compare.offset import Moments, difference_moments
 from ..compare.statistics import Interval
@@ -251,18 +251,6 @@ class SettingRank:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlaceMap:
-    """The mean residual of cells of the plan over flights, towers and channels.
-
-    ``cells`` (n, 2) are the column and row of each cell, counted from the origin of the site. ``mean_db`` (n,) is the
-    mean of the mean residuals of all flights, towers and channels in the cell [dB].
-    """
-
-    cells: IntArray
-    mean_db: FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Season:
     """The result of all flights together.
 
@@ -276,8 +264,9 @@ class Season:
         Rankings over all links and, if there are several, of each link. The best setting is first.
     nodes : tuple of NodeOffset
         Offsets of nodes under the first setting, or of soundings between towers.
-    places : PlaceMap, optional
-        Residuals of the first setting.
+    places_db : mapping of (int, int) to float
+        Mean residual of the first setting over flights, towers and channels, by column and row of a cell of the plan,
+        counted from the origin of the site.
     reports : mapping of str to str
         Address of the report of a flight, relative to the folder of the campaign.
     """
@@ -286,7 +275,7 @@ class Season:
     started: Mapping[str, str] = field(default_factory=dict)
     ranking: tuple[SettingRank, ...] = ()
     nodes: tuple[NodeOffset, ...] = ()
-    places: PlaceMap | None = None
+    places_db: Mapping[tuple[int, int], float] = field(default_factory=dict)
     reports: Mapping[str, str] = field(default_factory=dict)
 
     def over_all(self) -> tuple[SettingRank, ...]:
@@ -331,6 +320,11 @@ class CampaignData(Made):
     def reference_rows(self) -> tuple[RssRow, ...]:
         """The RSS rows of the first setting."""
         return tuple(row for row in self.rss if row.setting == self.reference)
+
+    @property
+    def scored_rows(self) -> list[RssRow]:
+        """The RSS rows of the first setting with an error."""
+        return [row for row in self.reference_rows if np.isfinite(row.rmse_db) and row.n]
 
 
 # Largest number of warnings of flights that are listed one by one.
@@ -490,8 +484,7 @@ def by_error(rows: Iterable[RssRow], name: str) -> list[tuple[str, float, str]]:
 
 def verdict(data: CampaignData) -> list[str]:
     """Return sentences about ray tracing and the baselines under the first setting."""
-    rows = [row for row in data.reference_rows if np.isfinite(row.rmse_db) and row.n]
-    if not rows:
+    if not (rows := data.scored_rows):
         return []
     scored = [(row.rmse_db, row.n) for row in rows]
     known = {name: [row.baselines.get(name, np.nan) for row in rows] for row in rows for name in row.baselines}
@@ -510,10 +503,9 @@ def verdict(data: CampaignData) -> list[str]:
 
 def cause(data: CampaignData) -> Verdict:
     """Return the likely cause of errors of the campaign under the first setting."""
-    rows = [row for row in data.reference_rows if np.isfinite(row.rmse_db) and row.n]
     errors: dict[str, list[float]] = {}
     offsets: dict[str, dict[str, float]] = {}
-    for row in rows:
+    for row in data.scored_rows:
         errors.setdefault(row.flight, []).append(row.rmse_db)
         offsets.setdefault(row.link, {})[row.flight] = row.moments.mean_db
     order = sorted(data.flights, key=lambda name: data.season.started.get(name, ""))
@@ -562,11 +554,12 @@ def charts_of(data: CampaignData) -> list[Chart]:
 
 def _places(data: CampaignData) -> list[Places]:
     """Return the mean residual of each cell of the plan over flights, towers and channels."""
-    if (shown := data.season.places) is None:
+    residuals, name = data.season.places_db, f"all flights, {data.reference}"
+    if not residuals:
         return []
-    at = np.pad((shown.cells + 0.5) * data.cell_m, ((0, 0), (0, 1)))
-    name = f"all flights, {data.reference}"
-    return [Places(name=name, at=at, values={f"{RESIDUAL} [dB]": shown.mean_db}, cell_m=data.cell_m)]
+    at = np.pad((np.array(list(residuals)) + 0.5) * data.cell_m, ((0, 0), (0, 1)))
+    values = {f"{RESIDUAL} [dB]": list(residuals.values())}
+    return [Places(name=name, at=at, values=values, cell_m=data.cell_m)]
 
 
 # Largest number of warnings on the page.
@@ -615,7 +608,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "held_out": data.season.held_out, "started": data.season.started, "ranking": data.season.ranking,
             "nodes": data.season.nodes,
             "steps": step_words(data),
-            "cells": 0 if data.season.places is None else len(data.season.places.cells),
+            "cells": len(data.season.places_db),
         },
         **about(data),
     }  # fmt: skip
@@ -693,7 +686,7 @@ def _mean_errors(data: CampaignData) -> Table:
     flights = rss_flights(data)
     shown = (data.rss or not data.rank) and 0 < len(flights) <= _FEW_FLIGHTS
     return Table(
-        caption="Mean RMSE over towers and channels [dB], each with an offset fitted on its own samples.",
+        caption="Mean RMSE over towers and channels [dB], each with the offset fitted on its samples.",
         columns={"Setting": HEAD, **dict.fromkeys(flights, 1)},
         rows=[(setting, *(by[f] for f in flights)) for setting, by in mean_rmse(data).items()] if shown else [],
     )  # fmt: skip
@@ -791,11 +784,10 @@ def _levels(data: CampaignData) -> Table:
         rows = sorted(rows, key=lambda r: -np.nan_to_num(r.rmse_db, nan=-1.0))[:ROWS_SHOWN]
     models = list(dict.fromkeys(name for row in data.rss for name in row.baselines))
     return Table(
-        caption=f"RSS. Offset and RMSE are fitted on the row's own samples; baselines have an offset of their "
-        f"own{few}.",
+        caption=f"RSS. Offset and RMSE are fitted on the samples of the row; each baseline has its own offset{few}.",
         columns={"Flight": HEAD, "Setting": TEXT, "Link": TEXT, "Offset [dB]": RIGHT, "RMSE [dB]": RIGHT, "95 %": 1,
                  "Held-out RMSE [dB]": 1, **{f"{pretty(name)} [dB]": 1 for name in models},
-                 "Against baselines (95 %)": TEXT, "RMSE, shared offset [dB]": 1, "Corr.": 2, "Samples": 0,
+                 "Against baselines (95 %)": TEXT, "RMSE, shared offset [dB]": 1, "Correlation": 2, "Samples": 0,
                  "Out of coverage": 0, "Clock": TEXT, "Fitted here": TEXT},
         rows=[
             (r.flight, r.setting, r.link, number(r.offset_db) + (" (edge)" if r.at_search_edge else ""),
@@ -834,7 +826,7 @@ def settings_of(data: CampaignData, files: Sequence[str]) -> Card:
               for name, change in data.settings.items()],
     )  # fmt: skip
     method = "Method: D. Lee, O. Ozdemir, A. Ram, I. Guvenc, arXiv 2502.10324."
-    beside = f"Beside this page: {', '.join(files)}. {method}"
+    beside = f"Files in the same folder: {', '.join(files)}. {method}"
     return replace(settings_card(data, {"workers": data.workers}), tables=[table], text=[beside])
 
 

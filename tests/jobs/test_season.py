@@ -57,14 +57,14 @@ def test_settings_that_share_no_flight_have_no_difference(data):
 
 def test_the_planted_hill_lies_where_it_was_put(data):
     """Mean residual of all links by place: highest near (200 m, 300 m), north not flipped, east not exchanged."""
-    everything = data.season.places
-    east_m, north_m = (everything.cells.T + 0.5) * data.cell_m
+    residual_db = np.array(list(data.season.places_db.values()))
+    east_m, north_m = (np.array(list(data.season.places_db)).T + 0.5) * data.cell_m
     near = np.hypot(east_m - 200, north_m - 300) < 100
     mirror = np.hypot(east_m - 200, north_m + 100) < 100
     assert near.any()
-    assert everything.mean_db[near].mean() > everything.mean_db[~near].mean() + 1.0
+    assert residual_db[near].mean() > residual_db[~near].mean() + 1.0
     if mirror.any():
-        assert everything.mean_db[near].mean() > everything.mean_db[mirror].mean() + 1.0
+        assert residual_db[near].mean() > residual_db[mirror].mean() + 1.0
 
 
 def test_one_flight_has_its_own_errors_only(data):

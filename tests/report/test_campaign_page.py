@@ -80,7 +80,7 @@ def test_charts_of_a_season_are_few_and_show_the_intervals_of_steps(data):
     text = campaign_html.campaign_page(data, [])
     assert text.count("data-plot=") == 1
     assert '"name":"residual [dB]"' in text
-    alone = dataclasses.replace(data, season=dataclasses.replace(data.season, nodes=(), places=None))
+    alone = dataclasses.replace(data, season=dataclasses.replace(data.season, nodes=(), places_db={}))
     assert "<script" not in campaign_html.campaign_page(alone, [])
 
 

@@ -369,10 +369,11 @@ def _detection_words(panel: RssResult) -> str:
 
 def learned_on(score: DetectionScore) -> str:
     """Return the origin of a probability of detection as text."""
-    return {
-        "other flights": "learned on other flights",
-        "held-out segments": "learned in other segments of this flight",
-    }[score.learned_on]
+    return (
+        "learned on other flights"
+        if score.learned_on == "other flights"
+        else "learned in other segments of this flight"
+    )
 
 
 def _snr_words(panel: RssResult) -> str:
@@ -414,10 +415,9 @@ def _ground_error(panel: RankResult, k: float) -> str:
 
 def nearest_k(panel: RankResult) -> float | None:
     """Return the K whose distribution is closest to the reported one, or None if nothing could be scored."""
-    distance = {
-        k: fit.total_variation for k, fit in panel.score.simulated.items() if math.isfinite(fit.total_variation)
-    }
-    return min(distance, key=lambda k: distance[k], default=None)
+    fits = panel.score.simulated
+    scored_k = [k for k, fit in fits.items() if math.isfinite(fit.total_variation)]
+    return min(scored_k, key=lambda k: fits[k].total_variation, default=None)
 
 
 def _kappa_references(panel: RankResult) -> str:
@@ -611,10 +611,8 @@ def _training(data: ReportData) -> str:
 def _baseline_sentence(panels: Sequence[RssResult]) -> str:
     """Return the sentence about the error of the best baseline on a training flight."""
     errors = baseline_errors([panel for panel in panels if panel.training])
-    if not errors:
-        return ""
-    best = min(errors, key=errors.__getitem__)
-    return f"For comparison, {with_article(best)}: RMSE {errors[best]:.1f} dB."
+    best = min(errors, key=errors.__getitem__, default=None)
+    return "" if best is None else f"For comparison, {with_article(best)}: RMSE {errors[best]:.1f} dB."
 
 
 def _pooled(panels: Sequence[RssResult]) -> float:
@@ -629,39 +627,24 @@ def _forecast_of(panel: RankResult) -> ForecastScore | None:
     return score if known else None
 
 
-def _forecast_sentence(panel: RankResult, score: ForecastScore) -> str:
-    return (
-        f"Rank at {panel.tower} by the receiver learned on other flights: kappa {score.kappa:.2f} (0 is chance), "
-        f"{_log_score(score)}. It agrees in {100 * score.agreement:.0f} % of samples; always guessing the most "
-        f"frequent rank agrees in {100 * score.majority_agreement:.0f} %."
-    )
-
-
 def _log_score(score: ForecastScore) -> str:
     side = "below" if score.log_score_gain > 0 else "above"
     return f"log score {abs(100 * score.log_score_gain):.0f} % {side} the constant forecast"
 
 
-def _forecast_card(panel: RankResult, score: ForecastScore) -> Headline:
-    return Headline(
-        label=f"Rank forecast at {panel.tower}",
-        value=f"kappa {score.kappa:.2f}",
-        interval=_interval(score.kappa_ci95, ".2f"),
-        reference=_log_score(score),
-    )
-
-
 def _rank_sentence(panels: Sequence[RankResult]) -> str:
     for panel in panels:
         if score := _forecast_of(panel):
-            return _forecast_sentence(panel, score)
+            return (
+                f"Rank at {panel.tower} by the receiver learned on other flights: kappa {score.kappa:.2f} (0 is "
+                f"chance), {_log_score(score)}. It agrees in {100 * score.agreement:.0f} % of samples; always guessing "
+                f"the most frequent rank agrees in {100 * score.majority_agreement:.0f} %."
+            )
         k = nearest_k(panel)
         if k is not None:
             at, commonest = panel.score.simulated[k], panel.further.commonest
-            guess = (
-                f"; always guessing {commonest.rank} agrees in {100 * commonest.agreement:.0f} %"
-                if commonest.rank else ""
-            )  # fmt: skip
+            agreement = 100 * commonest.agreement
+            guess = f"; always guessing {commonest.rank} agrees in {agreement:.0f} %" if commonest.rank else ""
             agree = f" Per position they agree in {100 * at.agreement:.0f} % of samples{guess}."
             return (
                 f"Rank at {panel.tower} (K = {k:.10g}, best of {len(panel.score.simulated)} thresholds): predicted and "
@@ -673,32 +656,20 @@ def _rank_sentence(panels: Sequence[RankResult]) -> str:
 
 def headlines(data: ReportData) -> list[Headline]:
     """Return at most four numbers, each with its interval and its reference."""
-    lines = []
     panels = scored(data.rss)
-    if panels:
-        lines += [_error(panels, data.verdict), *_difference(data.verdict)]
-    for panel in data.rank:
-        score, k = _forecast_of(panel), nearest_k(panel)
-        if score is not None:
-            lines.append(_forecast_card(panel, score))
-            break
-        if k is not None:
-            lines.append(_rank(panel, k))
-            break
-    audit = None if data.engine is None else data.engine.audit
-    if audit is not None:
-        lines.append(_audit(audit))
+    lines = [_error(panels, data.verdict), *_difference(data.verdict)] if panels else []
+    lines += [card for panel in data.rank if (card := _rank(panel)) is not None][:1]
+    if data.engine is not None and data.engine.audit is not None:
+        lines.append(_audit(data.engine.audit))
     return lines[:4]
 
 
 def _audit(audit: AuditResult) -> Headline:
     """Return the failed checks of the audit, which do not include paths that Sionna RT did not sample."""
-    fields = audit.fields
     extent = f"{counted(audit.links, 'link')} against {audit.reference}"
-    if fields is None:
-        value = f"{counted(audit.missing_paths, 'path')} missing"
-    else:
-        value = f"{count(len(fields.failures))} failed"
+    value = f"{counted(audit.missing_paths, 'path')} missing"
+    if audit.fields is not None:
+        value = f"{count(len(audit.fields.failures))} failed"
     return Headline(label="Audit", value=value, interval=audit_paths(audit), reference=extent)
 
 
@@ -706,12 +677,11 @@ def _error(panels: Sequence[RssResult], pooled: FlightVerdict | None) -> Headlin
     total = _pooled(panels) if pooled is None else pooled.rmse_db
     best = "no baseline" if pooled is None else f"{pretty(pooled.against)}: {pooled.baseline_rmse_db:.1f} dB"
     floor = ", lower levels as the floor" if any(map(lock_lost, panels)) else ""
+    channels = f", {len(panels)} channels" if len(panels) > 1 else ""
     return Headline(
-        label=f"RMSE of the level{f', {len(panels)} channels' if len(panels) > 1 else ''}{floor}",
-        value=f"{total:.1f} dB",
-        interval="" if floor else _ends(panels),
-        reference=best,
-    )
+        label=f"RMSE of the level{channels}{floor}", value=f"{total:.1f} dB",
+        interval="" if floor else _ends(panels), reference=best,
+    )  # fmt: skip
 
 
 def _interval(ends: Interval, form: str, unit: str = "") -> str:
@@ -732,30 +702,31 @@ def _ends(panels: Sequence[RssResult]) -> str:
 def _difference(pooled: FlightVerdict | None) -> list[Headline]:
     if pooled is None:
         return []
-    return [
-        Headline(
-            label=f"Against {pretty(pooled.against)}, same samples",
-            value=f"{Printed(pooled.difference_db):+.2f} dB",
-            interval=_interval(pooled.ci95_db, "+.2f", " dB"),
-            reference="negative: smaller error of ray tracing",
-        )
-    ]
+    return [Headline(
+        label=f"Against {pretty(pooled.against)}, same samples", value=f"{Printed(pooled.difference_db):+.2f} dB",
+        interval=_interval(pooled.ci95_db, "+.2f", " dB"), reference="negative: smaller error of ray tracing",
+    )]  # fmt: skip
 
 
-def _rank(panel: RankResult, k: float) -> Headline:
+def _rank(panel: RankResult) -> Headline | None:
+    """Return the card of the rank forecast, or else of the predicted shares. None if nothing could be scored."""
+    if score := _forecast_of(panel):
+        return Headline(
+            label=f"Rank forecast at {panel.tower}", value=f"kappa {score.kappa:.2f}",
+            interval=_interval(score.kappa_ci95, ".2f"), reference=_log_score(score),
+        )  # fmt: skip
+    k = nearest_k(panel)
+    if k is None:
+        return None
     at, commonest = panel.score.simulated[k], panel.further.commonest
     low, high = at.total_variation_ci95
-    known = math.isfinite(low) and math.isfinite(high)
+    ends = f" (95 %: {100 * low:.0f} to {100 * high:.0f})" if math.isfinite(low) and math.isfinite(high) else ""
     agree = f"agreement {100 * at.agreement:.0f} %" if math.isfinite(at.agreement) else "no pose in common"
+    guess = f"; always guessing {commonest.rank}: {100 * commonest.agreement:.0f} %" if commonest.rank else ""
     return Headline(
-        label=f"Rank at {panel.tower}, K = {k:.10g}",
-        value=points(at.total_variation),
-        interval="between predicted and reported shares"
-        + (f" (95 %: {100 * low:.0f} to {100 * high:.0f})" if known else ""),
-        reference=f"{agree}; always guessing {commonest.rank}: {100 * commonest.agreement:.0f} %"
-        if commonest.rank
-        else agree,
-    )
+        label=f"Rank at {panel.tower}, K = {k:.10g}", value=points(at.total_variation),
+        interval=f"between predicted and reported shares{ends}", reference=f"{agree}{guess}",
+    )  # fmt: skip
 
 
 def points(share: float) -> str:

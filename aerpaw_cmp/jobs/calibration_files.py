@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from ..common.content import KEY, MARKS, union
 from ..common.gaussian import determining, gaussian_kernel
 from ..common.units import spread_out
+from ..common.yamlfile import dump_yaml
 from ..compare.calibration import Score, cruise_height_m, mean_rmse
 from ..compare.gains import Frame, Spread, directed, student_factor
 from ..flight.data import FlightData, RssSeries, quantity_of
@@ -130,16 +130,10 @@ def _pair_gain(calibration: Calibration, antenna: str) -> PairGain | None:
     )
 
 
-def _listed(key: str, entries: Sequence[str]) -> list[str]:
-    """Return the lines of calibrated.yaml that name the training logs."""
-    comment = {KEY: "SHA-256 of the training logs (never scored)", MARKS: "fingerprints, to identify copies"}[key]
-    return [f"# {comment}", f"{key}:", *(f"  - '{entry}'" for entry in entries)] if entries else []
-
-
 def _learned_antenna(
     calibration: Calibration, antenna: str, end: str, files: Mapping[str, str], place: str, command: str
-) -> str:
-    """Return the value of ``antenna`` in calibrated.yaml on one line, with table, SHA-256 and error model."""
+) -> dict[str, Any]:
+    """Return the array of one end in calibrated.yaml: its table, with SHA-256 and error model."""
 
     def sha256(file: str) -> str:
         return hashlib.sha256(files[file].encode()).hexdigest()
@@ -150,8 +144,8 @@ def _learned_antenna(
         file=f"{place}/{pair_file}", sha256=sha256(pair_file), length=pair.length, prior_sd_db=_rounded(pair.sd_db)
     )  # fmt: skip
     known = LearnedAntenna(sha256=sha256(file), command=command, pair=both, spread=rounded_spread(spread))
-    content = {"model": "sphere", "file": f"{place}/{file}", "learned": known.model_dump(exclude_none=True)}
-    return str(yaml.safe_dump(content, default_flow_style=True, sort_keys=False, width=10_000)).strip()
+    learned = known.model_dump(exclude_none=True)
+    return {"antenna": {"model": "sphere", "file": f"{place}/{file}", "learned": learned}}
 
 
 def rounded_spread(spread: Spread) -> LearnedSpread:
@@ -163,8 +157,10 @@ def _rounded(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-def settings_text(calibration: Calibration, folder_name: str, files: Mapping[str, str], command: str) -> str:
-    """Return calibrated.yaml: the part of a flight.yaml that names the learned antennas.
+def learned_settings(
+    calibration: Calibration, folder_name: str, files: Mapping[str, str], command: str
+) -> dict[str, Any]:
+    """Return the part of a flight.yaml that names the learned antennas, for calibrated.yaml.
 
     Parameters
     ----------
@@ -175,38 +171,26 @@ def settings_text(calibration: Calibration, folder_name: str, files: Mapping[str
         Content of the antenna files by name.
     command : str
         Command that makes them.
-
-    Returns
-    -------
-    str
     """
-    lines = [
-        f"{_MARK}: {calibration.settings.calibration}. Learned from {', '.join(calibration.names)}.",
-        *(f"# {text}" for text in calibration.words),
-        "# Put this into a flight.yaml; files resolve against its folder, or --logs-root.",
-        *_listed(KEY, calibration.trained_on),
-        "link:",
-        "  channels:",
-    ]
-    for antenna in calibration.fit.antennas:
-        channel, link = antenna.partition(".")[2], calibration.first_series(antenna)[1].link
-        ends = {e: _learned_antenna(calibration, antenna, e, files, folder_name, command) for e in ("tower", "uav")}
-        lines += [
-            f"    {channel}:" if channel.isidentifier() else f"    {channel!r}:",
-            f"      carrier_hz: {link.carrier_hz:.6g}",
-            f"      transmit_power_dbm: {link.transmit_power_dbm:g}",
-            f"      tower: {{antenna: {ends['tower']}}}",
-            f"      uav: {{antenna: {ends['uav']}}}",
-        ]
-    rough = calibration.ground.used_m
-    lines += [
-        "# the gains were learned with the direct path only",
-        "rt: {engine: image, max_depth: 0, attitude: logged}",
-    ] if rough is None else [
-        "# with the learned gains, a ground ray of this roughness is likelier than none",
-        f"rt: {{engine: image, max_depth: 1, attitude: logged, ground_roughness_m: {rough:g}}}",
-    ]  # fmt: skip
-    return "\n".join(lines) + "\n"
+    channels: dict[str, dict[str, Any]] = {}
+    towers = [antenna.partition(".")[::2] for antenna in calibration.fit.antennas]
+    for antenna, (tower, channel) in zip(calibration.fit.antennas, towers, strict=True):
+        link = calibration.first_series(antenna)[1].link
+        at_uav, at_tower = (
+            _learned_antenna(calibration, antenna, e, files, folder_name, command) for e in ("uav", "tower")
+        )
+        power_dbm = link.transmit_power_dbm
+        entry = channels.setdefault(channel, {"carrier_hz": link.carrier_hz, "transmit_power_dbm": power_dbm})
+        entry["uav"] = at_uav
+        # the antenna of the only tower with a channel is also used at other towers
+        if [name for _, name in towers].count(channel) == 1:
+            entry["tower"] = at_tower
+        else:
+            entry.setdefault("towers", {})[tower] = at_tower
+    rough_m = calibration.ground.used_m
+    # without a ground ray, the gains were learned with the direct path only
+    depth = {"max_depth": 0} if rough_m is None else {"max_depth": 1, "ground_roughness_m": rough_m}
+    return {"link": {"channels": channels}, "rt": {"engine": "image", "attitude": "logged", **depth}}
 
 
 def _record_of(
@@ -291,33 +275,36 @@ def write_files(
     calibration, ranked = calibrated.calibration, calibrated.ranked
     rank, rank_warnings = (None, ()) if ranked is None else (ranked.metrics(), ranked.warnings)
     logs, marks = union(*map(flight_logs, calibrated.flights)), marks_of(calibrated.flights)
+    head = [f"{_MARK}: {calibrated.settings.calibration}"]
+    content: dict[str, Any] = {KEY: list(logs)}
     if calibration is not None:
         maps = _antenna_maps(calibration)
         carrier = next(s.link.carrier_hz for data in calibrated.flights for s in data.rss)
         files = _antenna_files(calibration, maps, carrier)
-        for file, content in files.items():
-            write_file(folder / file, content)
-        text = settings_text(calibration, name, files, calibrated.command)
+        for file, table in files.items():
+            write_file(folder / file, table)
+        head[0] += f". Learned from {', '.join(calibration.names)}."
+        head += [f"# {text}" for text in calibration.words]
+        head.append("# Put this into a flight.yaml. Files resolve against its folder, or --logs-root.")
+        content |= learned_settings(calibration, name, files, calibrated.command)
         record = dataclasses.replace(
-            _record_of(calibration, maps, text, stages_s),
+            _record_of(calibration, maps, dump_yaml(content), stages_s),
             rank=rank,
             warnings=(*calibrated.remarks, *calibration.warnings, *rank_warnings),
         )
         write_calibration(record, folder)
         metrics = calibration_metrics(record)
     else:
-        text = "\n".join([f"{_MARK}: {calibrated.settings.calibration}", *_listed(KEY, logs)]) + "\n"
         metrics = {
             "scores": {}, "controls": {}, "words": [], "antennas": [], "calibration": calibrated.settings.calibration,
             "rank": rank, "warnings": [*calibrated.remarks, *rank_warnings], "flights": calibrated.settings.flights,
             KEY: list(logs), MARKS: list(marks),
         }  # fmt: skip
         (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-    text += "".join(f"{line}\n" for line in _listed(MARKS, marks))
     if ranked is not None:
         (folder / "receiver.json").write_text(ranked.text(), encoding="utf-8")
-        text += f"rank:\n  receiver: {name}/receiver.json\n"
-    return metrics, text
+        content["rank"] = {"receiver": f"{name}/receiver.json"}
+    return metrics, "".join(f"{line}\n" for line in head) + dump_yaml({**content, MARKS: list(marks)})
 
 
 def site_entries(calibrated: Calibrated) -> dict[str, tuple[Entry, dict[str, bytes]]]:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -9,8 +10,12 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.yamlfile import dump_yaml
 from aerpaw_cmp.compare.calibration import BASELINES, SPLITS, mean_rmse
+from aerpaw_cmp.compare.gains import NO_SPREAD
+from aerpaw_cmp.flight.settings import ArraySettings, FlightFile, LinkSettings, joined
 from aerpaw_cmp.jobs.calibrate import load_calibration, observe, read_flights, recipe_of
+from aerpaw_cmp.jobs.calibration_files import learned_settings
 from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.jobs.run import run_calibrate
 from aerpaw_cmp.site.antennas import TR38901
@@ -193,3 +198,26 @@ def test_dataset12_each_way(tmp_path: Path) -> None:
     assert mean_rmse(scores) < 3.75
     assert mean_rmse(scores, "rmse_4s_db") < 3.0
     assert mean_rmse(scores, "free_space_rmse_db") == pytest.approx(6.37, abs=0.05)
+
+
+def test_towers_with_one_channel_keep_their_own_antennas(tmp_path: Path) -> None:
+    """As the SNR of four towers in one log: each tower has an entry, and the only tower of a channel serves for all."""
+    antennas = ("LW1.snr", "LW2.snr", "LW1.A")
+    series = SimpleNamespace(link=LinkSettings(carrier_hz=3.3e9))
+    calibration = SimpleNamespace(
+        fit=SimpleNamespace(antennas=antennas), first_series=lambda _: (None, series), pair_term=None,
+        learned=SimpleNamespace(spread=lambda _: NO_SPREAD), ground=SimpleNamespace(used_m=None),
+    )  # fmt: skip
+    files = {f"{antenna}.{end}.csv": f"{antenna} {end}" for antenna in antennas for end in ("uav", "tower")}
+    learned = tmp_path / "calibrated.yaml"
+    learned.write_text(dump_yaml(learned_settings(calibration, "calibrated", files, "aerpaw-cmp calibrate c.yaml")))
+    flight = FlightFile.model_validate({"flight": "f", "logs": []})
+    channels = joined(flight, learned).link.channels
+
+    def file(array: ArraySettings) -> str:
+        return Path(str(array.antenna.file)).name
+
+    assert {name: file(array) for name, array in channels["snr"].towers.items()} == {
+        "LW1": "LW1.snr.tower.csv", "LW2": "LW2.snr.tower.csv"
+    }  # fmt: skip
+    assert file(channels["A"].tower) == "LW1.A.tower.csv"

@@ -1,4 +1,4 @@
-"""Evidence for the likely cause of a flight's error, computed from its replayed series."""
+"""Likely cause of a flight's error: the evidence from its replayed series, and causes that the logs show directly."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ _RISES_M = (-150.0, -100.0, -60.0, -40.0, -25.0, -15.0, 15.0, 25.0, 40.0, 60.0, 
 
 
 def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResult]) -> tuple[Cause | None, str | None]:
-    """Return the likely cause of the error of a flight over its scored channels, and the next step without a cause.
+    """Return the likely cause of the error of a flight, or the next step if there is no cause.
 
-    Towers that move have no cause. The next step is a calibration if a gain over the directions of the UAV's antenna
-    explains a part of the error.
+    Channels that are not scored and towers that move are not considered. The next step is a calibration if a gain over
+    the directions of the UAV's antenna explains a part of the error and no learned antennas are used.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     if meaning := next(filter(None, meant), ""):
         sentence = f"Likely cause: {meaning}, by the logged vertical speed."
         return Cause(name="telemetry", sentence=sentence, next_step="check the telemetry's columns and units"), None
-    names = {result.name for result in without_copies(results)}  # a copy is replayed with antennas of another channel
+    names = {result.name for result in without_copies(results)}  # the antennas of a copy belong to another channel
     compared = [
         (series, replayed, result)
         for series, replayed, result in zip(data.rss, replays.rss, results, strict=True)
@@ -79,20 +79,20 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     cause = flight_cause(evidence)
     late = _late_clock(evidence, [series.tower for series, _, _ in compared])
     by_direction = cause is None or any(name in OF_DIRECTION for name in cause.name.split(" or "))
-    # the test of the clock comes before causes of direction, which imitate a lag
+    # prefer the test of the clock to causes of direction, which imitate a lag
     if late is not None and by_direction:
         return late, None
-    # an antenna that the file names is missing: errors by direction are expected, and the first caution has the reason
+    # without an antenna that the flight file names, errors by direction are expected, and a caution has the reason
     if any(not c.used for c in data.settings.cautions) and by_direction:
         return None, "see the first caution: a learned antenna that the flight file names is not used"
-    # learned antennas, from the flight file or of `report --with`, have some decibels of error on any flight
+    # learned antennas, of the flight file or of `report --with`, have an error of some decibels on each flight
     if cause is not None or any(e.antenna == "learned" for e in evidence) or not gains_by_direction(evidence):
         return cause, None
     return None, _CALIBRATE
 
 
 def _late_clock(evidence: Sequence[LevelEvidence], towers: Sequence[str]) -> Cause | None:
-    """Return the radio clocks that are late, if correcting them lowers the error of their towers as printed."""
+    """Return the radio clocks that are wrong, if correcting them lowers the printed error of their towers."""
     late: dict[str, list[str]] = {}
     for tower in dict.fromkeys(towers):
         here = [e for e, at in zip(evidence, towers, strict=True) if at == tower]
@@ -117,7 +117,7 @@ _CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT` with two flights of this site
 
 
 def is_simulated(telemetry: Stream) -> bool:
-    """Check for the receiver and the battery of ArduPilot's simulator, which AERPAW's emulator runs.
+    """Check whether receiver and battery are those of ArduPilot's simulator, which AERPAW's emulator runs.
 
     At least two of its signs (fix 6, 10 satellites, few voltages of the battery) are in the log, and none contradicts.
     """
@@ -127,7 +127,7 @@ def is_simulated(telemetry: Stream) -> bool:
     signs = [bool((rows[name] == value).all()) for name, value in _RECEIVER.items() if (rows[name] >= 0).any()]
     if "battery_v" in rows and len(rows) >= _FEWEST_VOLTAGES:
         volts = rows["battery_v"].dropna().to_numpy()
-        # a log of tenths of a volt has few voltages of any battery
+        # voltages in steps of 0.1 V are few for any battery
         if len(volts) and (np.abs(volts * 10.0 - np.round(volts * 10.0)) > 1e-6).any():
             commonest = np.sort(np.unique(volts, return_counts=True)[1])[-3:]
             signs.append(bool(commonest.sum() >= _SHARE_OF_VOLTAGES * len(volts)))
@@ -135,8 +135,8 @@ def is_simulated(telemetry: Stream) -> bool:
 
 
 _RECEIVER = {"fix": 6, "satellites": 10}
-# Least rows for constant columns and for few voltages. The simulator's battery has three voltages in 97 % of the rows
-# of one flight. A real battery has another voltage in each row (at most 5 % share one).
+# Least numbers of rows for the test of constant columns and of voltages, and the share of rows with three voltages. The
+# simulator's battery has three voltages in 97 % of the rows of one flight. With a real battery, at most 5 % share one.
 _FEWEST_ROWS, _FEWEST_VOLTAGES, _SHARE_OF_VOLTAGES = 4, 15, 0.8
 
 SIMULATED = Cause(
@@ -147,34 +147,36 @@ SIMULATED = Cause(
 
 
 def heights_meant(telemetry: Stream) -> str | None:
-    """Return the meaning of heights whose changes do not fit the logged vertical speed, in words.
+    """Return the unit of logged heights in words if their changes do not fit the logged vertical speed.
 
-    Empty if they fit as they are; None if the speeds do not decide.
+    The text is empty if they fit. Return None if the speeds cannot decide.
     """
     rows, time_s, place_m = path_of(telemetry.frame)
     speed_mps = telemetry.frame[list(_SPEED)].to_numpy(np.float64)[rows] * [1.0, 1.0, -1.0]
     step_s, flown = np.diff(time_s)[:, None], np.diff(place_m, axis=0)
-    told = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * step_s
-    near = np.isfinite(told).all(axis=1) & (step_s[:, 0] > 0.0) & (step_s[:, 0] < _LONG_STEP_S)
-    flown, told = flown[near], told[near]
-    if min(np.abs(told[:, :2]).sum(), np.abs(told[:, 2]).sum()) < _LEAST_PATH_M:
+    expected = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * step_s
+    near = np.isfinite(expected).all(axis=1) & (step_s[:, 0] > 0.0) & (step_s[:, 0] < _LONG_STEP_S)
+    flown, expected = flown[near], expected[near]
+    if min(np.abs(expected[:, :2]).sum(), np.abs(expected[:, 2]).sum()) < _LEAST_PATH_M:
         return None
-    # speeds of another unit differ along the ground, too
-    along, upwards = ((flown[:, axes] * told[:, axes]).sum() / np.square(told[:, axes]).sum() for axes in (slice(2), 2))
-    if upwards * (flown[:, 2] @ told[:, 2]) <= _ALIKE * (flown[:, 2] @ flown[:, 2]):
+    # the ratio along the ground shows a wrong unit of the speeds, which does not concern the heights
+    along, upwards = (
+        (flown[:, axes] * expected[:, axes]).sum() / np.square(expected[:, axes]).sum() for axes in (slice(2), 2)
+    )
+    if upwards * (flown[:, 2] @ expected[:, 2]) <= _LEAST_FIT * (flown[:, 2] @ flown[:, 2]):
         return None
     meanings = {"": 1.0, **_HEIGHTS}
-    return next((m for m, to_m in meanings.items() if abs(upwards * to_m - along) < _AS_TOLD * along), None)
+    return next((m for m, to_m in meanings.items() if abs(upwards * to_m - along) < _SAME_RATIO * along), None)
 
 
 # Factor to metres by meaning of the heights.
 _HEIGHTS = {"the logged heights are in feet": FOOT_M, "the logged heights were divided by 3.28": 1.0 / FOOT_M}
-# Four field logs climb at .90 to 1.00 of their speeds. Rows further apart [s] do not determine the path between them.
-_AS_TOLD, _ALIKE, _LONG_STEP_S, _LEAST_PATH_M = 0.2, 0.5, 3.0, 10.0
+# In four field logs, heights change by 0.90 to 1.00 of the logged speed. Longer steps [s] do not determine the path.
+_SAME_RATIO, _LEAST_FIT, _LONG_STEP_S, _LEAST_PATH_M = 0.2, 0.5, 3.0, 10.0
 _SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")
 
 
-# Below this RMSE no cause is searched for, because receivers and positions are not more accurate.
+# Below this RMSE no cause is searched, because receivers and positions are not more accurate.
 _GOOD_DB = 1.0
 _Compared = tuple[RssSeries, Replayed, RssResult]
 
@@ -182,7 +184,7 @@ _Compared = tuple[RssSeries, Replayed, RssResult]
 def _with_other(
     e: LevelEvidence, own: _Compared, compared: Sequence[_Compared], evidence: Sequence[LevelEvidence]
 ) -> LevelEvidence:
-    """Return the evidence with the change of the level if the log is that of the other channel of its tower."""
+    """Return the evidence with the change of the level if the log belongs to the other channel of its tower."""
     pairs = zip(compared, evidence, strict=True)
     others = [o for (series, _, _), o in pairs if series.tower == own[0].tower and o is not e and o.unit == e.unit]
     if len(others) != 1 or len(others[0].time_s) < 2:
@@ -214,12 +216,12 @@ def _evidence(
     rotations: dict[tuple[str, bytes], FloatArray],
     scaled: bool = True,
 ) -> LevelEvidence:
-    """Return the evidence of a series with the levels that the page scores.
+    """Return the evidence of a series, with the levels that the page scores.
 
-    With ``scaled`` the heights may have another unit.
+    ``scaled`` also tries heights in other units.
     """
     n = len(replayed.poses)
-    # changes vary slowly along the track: compute them at some poses and interpolate
+    # changes vary slowly along the track, so compute them at some poses and interpolate
     some = np.zeros(n, dtype=np.bool_)
     some[np.linspace(0, max(n - 1, 0), min(n, _MOST_POSES)).astype(np.int64)] = True
     track = None if replayed.track is None else replayed.track.pick(some)
@@ -238,7 +240,7 @@ def _evidence(
     lock = lock_lost(result)
     simulated_db, floor_db = result.simulated_dbm[order], -math.inf
     measured_db = result.measured_db[order]
-    if lock is not None:  # both sides no lower than the floor, as the page scores them
+    if lock is not None:  # raise both levels to the floor, as the page does
         floor_db, measured_db = lock.floor_db + lock.offset_db, np.maximum(measured_db, lock.floor_db)
     predicted = np.maximum(simulated_db, floor_db)
 
@@ -284,17 +286,17 @@ def _evidence(
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Direct:
-    """Level of the direct path of a series at its poses (m,) [dBm], as set and with faults."""
+    """The level of the direct path of a series at its poses (m,) [dBm], as set and with faults."""
 
     site: Site
     tower: str
     replayed: Replayed
     rotations: dict[tuple[str, bytes], FloatArray]
-    """Attitudes by another meaning of the telemetry and times, shared by all channels."""
+    """The attitudes by meaning of the telemetry and times, shared by all channels."""
 
     @property
     def place_m(self) -> FloatArray:
-        """Position of the tower, (1, 3) or (m, 3) [m]."""
+        """The position of the tower, (1, 3) or (m, 3) [m]."""
         return self.replayed.source_m(self.site)
 
     @property
@@ -302,14 +304,14 @@ class _Direct:
         return not all(isinstance(pattern, Isotropic) for pattern in self.replayed.link.uav_array.patterns)
 
     def turned_db(self) -> dict[float, FloatArray]:
-        """Return levels with a greater heading, or nothing for isotropic antennas."""
+        """Return levels with the UAV turned clockwise, by the angle [deg]. Empty for isotropic antennas."""
         rotation = self.replayed.poses.rotation
-        # a heading grows clockwise, the angle of a mount the other way
+        # headings count clockwise, angles of a mount counter-clockwise
         angles = _ANGLES_DEG if self._has_pattern else ()
         return {angle: self.level(rotation=turned(-angle) @ rotation) for angle in angles}
 
     def raised_db(self) -> dict[float, FloatArray]:
-        """Return levels with the UAV at other heights above the ground."""
+        """Return levels with the UAV at other heights, by the difference [m]."""
         positions = {rise: self.replayed.poses.position_m + np.array([0.0, 0.0, rise]) for rise in _RISES_M}
         return {
             rise: self.level(position_m=position_m, tower=True)
@@ -327,7 +329,7 @@ class _Direct:
 
     @property
     def distance_db(self) -> FloatArray:
-        """Level of free space alone."""
+        """The level of free space alone."""
         link = self.replayed.link
         position_m = self.replayed.poses.position_m
         return np.asarray(free_space_dbm(self.place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
@@ -341,7 +343,7 @@ class _Direct:
         n = len(poses.position_m)
         if not n:
             return {}
-        # a change varies slowly along the track: interpolate between some poses
+        # a change varies slowly along the track, so interpolate between some poses
         at = np.unique(np.linspace(0, n - 1, min(n, _DISPLACED_POSES)).astype(np.int64))
         position_m, rotation = poses.position_m[at], poses.rotation[at]
         levels = {}
@@ -353,7 +355,7 @@ class _Direct:
         return levels
 
     def misread_db(self, data: FlightData, time: Times, *, scaled: bool = True) -> dict[str, FloatArray]:
-        """Return levels with telemetry that means something else, at the instants of the poses (m,)."""
+        """Return levels by another meaning of the telemetry, at the instants of the poses (m,)."""
         position_m, track, used = self.replayed.poses.position_m, self.replayed.track, data.settings.rt.attitude
         if data.track is None or track is None:
             return {}
@@ -365,7 +367,7 @@ class _Direct:
         levels = {meaning: self.level(position_m=moved_m, tower=True) for meaning, moved_m in positions.items()}
         if used != "ignored" and self._has_pattern and track.attitude_known.any():
             for meaning in MISREAD:
-                # the channels of a tower have the same times
+                # channels with the same times share the attitude
                 key = meaning, time.tobytes()
                 if key not in self.rotations:
                     self.rotations[key] = data.track.rotations_if(meaning, time)
@@ -409,10 +411,10 @@ class _Direct:
 
 
 _MIRRORED = "east and north of the track are swapped"
-# Tried places of the tower, and number of poses at which they are computed.
+# Distances [m] and azimuths [deg] of the tower from its place, and number of poses at which these places are computed.
 _RADII_M, _AZIMUTHS_DEG = (25.0, 40.0, 65.0, 105.0, 170.0, 275.0), tuple(22.5 * i for i in range(16))
 _DISPLACED_POSES = 300
 # Number of poses at which the other changes of the level are computed.
 _MOST_POSES = 1200
-# A track under another datum may begin so far below the ground [m].
+# A wrong datum may place the start of a track below the ground, but not further than this [m].
 _BELOW_GROUND_M = 20.0

@@ -181,8 +181,6 @@ def _print_report_summary(outcome: Any) -> None:
     _print_forecasts(outcome.metrics["rank"])
     for verdict in outcome.metrics.get("referee", []):
         _print_cards(verdict)
-    if "against" in outcome.metrics:
-        show(outcome.metrics["against"]["sentence"])
     for text in outcome.metrics["antennas"]:
         show(text)
     warn_all(outcome.metrics["warnings"])

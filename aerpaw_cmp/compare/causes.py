@@ -957,7 +957,9 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     rivals = [_SLOPE * e.predicted_db[:, None], elevation]
     rivals += [] if e.distance_db is None else [_SLOPE * e.distance_db[:, None]]
     others = [Trial(columns=columns) for columns in rivals]
-    for factor, words in ((0.5, "half"), (2.0, "twice")):
+    # without antennas in the prediction, twice the decibels are those of a path-loss exponent of 4
+    alike = e.distance_db is not None and bool((e.predicted_db - e.distance_db).std() < SHOWN_DB)
+    for factor, words in ((0.5, "half"), (2.0, "twice"))[: 1 if alike else 2]:
         trial = Trial(
             name="decibels", cost=2.0 * _RARE + math.log(2.0), change_db=(factor - 1.0) * e.predicted_db,
             sentence=f"the levels change by {words} the link's decibels",

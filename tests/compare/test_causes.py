@@ -453,6 +453,9 @@ def test_an_exponent_of_the_distance_or_a_gain_over_elevation_is_no_unit() -> No
     antenna = 6.0 * np.cos(np.radians(3.0 * sound.uav_azimuth_deg))
     walk = replace(e, predicted_db=distance + antenna, distance_db=distance, turned_db={})
     assert _named(replace(walk, measured_db=noise + antenna + 2.0 * distance)) != "decibels"
+    # twice the decibels of free space alone are an exponent of 4
+    bare = replace(e, predicted_db=distance, distance_db=distance - 3.0, turned_db={})
+    assert _named(replace(bare, measured_db=noise + 2.0 * distance)) == NONE
 
 
 def test_a_cause_brings_the_error_back_to_that_of_other_flights() -> None:

@@ -39,7 +39,7 @@ SOURCES = (
 )  # fmt: skip
 
 _MARK = b"aerpaw-cmp kernel 1\n"
-# As NumPy: 1 / 0 is infinite, not an exception; and no sum is reordered, or bits would differ.
+# The same as in NumPy: 1 / 0 is infinite, not an exception. Sums are not reordered, because the last bits would differ.
 _MATHS: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
 
 
@@ -81,7 +81,7 @@ def code_folder() -> Path | None:
             # other users could leave code for us to run in a folder that they can write to
             if hasattr(os, "geteuid") and (status.st_uid != os.geteuid() or status.st_mode & 0o022):
                 continue
-            # only a trial is reliable: rights, quotas and read-only mounts cannot be distinguished otherwise
+            # try to write, because no other test covers rights, quotas and read-only mounts
             with tempfile.TemporaryFile(dir=folder):
                 return folder
         except OSError:
@@ -103,11 +103,11 @@ def _failure() -> str:
     """
     if find_spec("numba") is None:
         return "numba is not installed (pip install 'aerpaw-cmp[fast]')"
-    if os.path.lexists(".numba_config.yaml"):  # it names files that numba then writes, and may come from a third party
-        return "the working folder holds a .numba_config.yaml, which numba would obey"
+    if os.path.lexists(".numba_config.yaml"):  # a third party may have made it, and it can make numba write files
+        return "the working folder contains a .numba_config.yaml, which numba would obey"
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numba's own, about its cache
+            warnings.simplefilter("ignore")  # numba warns about its cache
             # a broken LLVM fails only when something is compiled, not on import
             import_module("aerpaw_cmp.propagation.search.beams").try_out()
     except Exception as error:
@@ -157,13 +157,13 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
             compiled.enable_caching()
         finally:
             config.CACHE_DIR = before
-        # after numba has created its cache, which would unpickle any file in the folder
+        # replace the cache that numba created, because it would unpickle any file in the folder
         compiled._cache._cache_file = _Sealed(function, folder)
     return compiled
 
 
 class _Sealed:
-    """The compiled code of one kernel on disk, instead of numba's files, whose damage raises any exception or crashes.
+    """The compiled code of one kernel on disk. Damaged files of numba itself can crash the process.
 
     An entry is followed by its SHA-256. A damaged entry is ignored, and the kernel is compiled again. Only this user
     can write to the folder (:func:`code_folder`), since an entry contains machine code.
@@ -193,9 +193,9 @@ class _Sealed:
 
 
 def part(function: Callable[..., Any]) -> Any:
-    """Compile a part of kernels that creates no array.
+    """Compile a function that kernels call and that creates no array.
 
-    A call would hand over each array of its records, hundreds of words, and count its users up and down: four fifths of
-    the time of a search went there. The caller holds the arrays, so nothing is counted in a part (numba's ``_nrt``).
+    Reference counts of the arrays in its records would be updated at each call, which took four fifths of the time of a
+    search. The caller keeps the arrays alive, so such a function does not count references (numba's ``_nrt``).
     """
     return kernel(function, forceinline=True, _nrt=False)

@@ -61,7 +61,7 @@ def replay_in_parts(
     rows = np.array_split(np.arange(len(poses)), max(1, -(-len(poses) // size)))
     if len(rows) == 1:
         return replay(site, link, poses, search, field, run)
-    # each part would report its progress from 0 to 1
+    # Do not pass the callback on: each part would report its own progress from 0 to 1.
     progress, run = run.progress, replace(run, progress=None, extent_m=extent_of(poses.position_m))
 
     def of(at: IntArray) -> Replay:
@@ -81,7 +81,7 @@ def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | 
         if progress is not None:
             progress(finished / count)
     first = replays[0]
-    # planes of terrain are numbered in order of first use, so blocks have different planes
+    # terrain planes are numbered in order of first use, so the same number is another plane in each part
     faces, shifted = _joined_faces(replays)
     pieces = [shifted, *zip(*(part.further for part in replays), strict=True)]
     further: dict[str, Any] = {
@@ -94,7 +94,7 @@ def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | 
     columns = {name: [getattr(part, name) for part in replays] for name in PER_LINK}
     replays.clear()
     arrays: dict[str, Any] = {}
-    # join one array at a time and free its parts: the peak is then one array more
+    # join one array at a time and free its parts, so that the peak memory is only one array above the result
     for name in PER_LINK:
         values = columns.pop(name)
         arrays[name] = np.empty((count, *values[0].shape[1:]), dtype=values[0].dtype)
@@ -104,7 +104,7 @@ def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | 
 
 
 def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:
-    """Return paths of all parts as one set: their poses are numbered as in the flight, and in order."""
+    """Return the paths of all parts as one set, sorted by pose, with the pose numbers of the flight."""
     numbered = [replace(part, pose=at[part.pose]) for at, part in zip(rows, parts, strict=True)]  # type: ignore[type-var]
     paths = numbered[0].one_after_another(numbered)
     # stable sort, so that within a pose the order by tower, depth and faces remains
@@ -112,7 +112,7 @@ def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:
 
 
 def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
-    """Return the faces of all blocks, and their paths over these faces. Shared faces are stored once."""
+    """Return the faces of all parts, shared ones only once, and the path set of each part with their new numbers."""
     common = min(_shared(parts[0].faces, part.faces) for part in parts)
     if all(len(part.faces) == common for part in parts):
         return parts[0].faces, [part.paths for part in parts]
@@ -126,18 +126,18 @@ def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
 
 
 def _shared(first: Faces, second: Faces) -> int:
-    """Return the number of faces, from the first on, that are the same in both."""
+    """Return the number of leading faces that are the same in both sets."""
     count = min(len(first), len(second))
     same = (first.normal[:count] == second.normal[:count]).all(axis=1)
     same &= first.offset_m[:count] == second.offset_m[:count]
-    # faces of two buildings may lie in one plane, and are two
+    # compare labels, too: faces of two buildings may lie in one plane
     same &= np.array([a == b for a, b in zip(first.label, second.label, strict=False)], dtype=np.bool_)
-    # argmin of booleans is the first that differs
+    # argmin of booleans returns the first face that differs
     return count if same.all() else int(np.argmin(same))
 
 
 def added_up(omissions: Iterable[Omission]) -> list[Omission]:
-    """Return omissions of the parts of a replay, each once, counts added up."""
+    """Return the omissions of all parts of a replay, each once, with their counts added up."""
     added: dict[tuple[str, str], Omission] = {}
     for item in omissions:
         key = item.tower, item.what
@@ -147,7 +147,8 @@ def added_up(omissions: Iterable[Omission]) -> list[Omission]:
     return list(added.values())
 
 
-# Largest number of node positions per block. H of a block is this many times larger than needed.
+# Largest number of node positions per block. H of a block has a tower for each position, although a pose uses only one
+# of them.
 PLACES_AT_ONCE = 64
 
 # Largest number of links (poses times positions) per block: about 4 MB of H with 4 x 4 elements.
@@ -156,7 +157,10 @@ LINKS_AT_ONCE = 16_384
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """Some poses (rows of the flight) with the node's positions: ``place`` (rows,) indexes ``places_m`` (places, 3)."""
+    """Some poses (rows of the flight) and the node's positions ``places_m`` (places, 3).
+
+    ``place`` (rows,) is the index of each pose's position.
+    """
 
     rows: IntArray
     places_m: FloatArray
@@ -166,7 +170,7 @@ class _Block:
 def _blocks(sources_m: FloatArray) -> Iterator[_Block]:
     """Yield the poses in blocks, in the order in which the positions of the node first occur."""
     unique, first, member = np.unique(sources_m, axis=0, return_index=True, return_inverse=True)
-    # unique sorts places by coordinate; blocks follow the flight
+    # np.unique sorts positions by coordinate, but blocks must follow the order of the flight
     order = np.argsort(first)
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
@@ -190,7 +194,7 @@ def _blocks(sources_m: FloatArray) -> Iterator[_Block]:
 
 
 def site_with_tower_at(site: Site, tower: str, place_m: AnyArray) -> Site:
-    """Return the site with a tower's array at a position (3,) [m] and with the same ground."""
+    """Return the site with one tower moved to a position (3,) [m]. The ground height of the tower does not change."""
     return replace(site, towers={**site.towers, tower: _moved(site, site.towers[tower], tower, place_m)})
 
 
@@ -237,8 +241,7 @@ def replay_moving(
 
     Notes
     -----
-    Exact: each pose is traced from the tower's position at that pose. Paths and fields are those of a fixed tower
-    there.
+    The result is exact: each pose is traced from the tower's position at that pose, as if the tower were fixed there.
     """
     if len(link.tower_arrays) != 1:
         raise UsageError(
@@ -272,7 +275,7 @@ def replay_moving(
 def _scene_of(
     site: Site, link: Link, name: str, poses: Poses, block: _Block
 ) -> tuple[Site, Link, Poses, BoolArray | None]:
-    """Return site, link and poses of a block with a tower for each position, and which links count."""
+    """Return site, link and poses of a block with one tower per position, and a mask of the links to search."""
     # a single position keeps the tower's name, so that it is replayed as a fixed tower
     names = [name] if len(block.places_m) == 1 else [f"{name}@{i}" for i in range(len(block.places_m))]
     towers = {n: _moved(site, site.towers[name], n, at) for n, at in zip(names, block.places_m, strict=True)}
@@ -315,11 +318,11 @@ class Geometry:
     Parameters
     ----------
     uav_yaw_deg, uav_pitch_deg, uav_roll_deg : float
-        Mount of the UAV's array in its carrier: body, or site axes where no attitude is known.
+        Rotation of the UAV's array relative to the body, or to the site axes if the attitude is not known.
     tower_slant_deg, uav_slant_deg : tuple of float
-        Per port; 0 vertical.
+        Polarisation of each port from vertical.
     ground : float
-        Amplitude factor on the ground reflection: 1 that of a smooth half-space, 0 none.
+        Amplitude factor of the ground reflection: 1 for a smooth half-space, 0 for no reflection.
     sum : {"coherent", "power_sum"}
     """
 
@@ -333,7 +336,7 @@ class Geometry:
 
     @property
     def mount_deg(self) -> tuple[float, float, float]:
-        """Yaw, pitch and roll."""
+        """Yaw, pitch and roll of the UAV's array."""
         return self.uav_yaw_deg, self.uav_pitch_deg, self.uav_roll_deg
 
     def in_words(self) -> str:
@@ -351,7 +354,7 @@ def every_geometry(
     grounds: Sequence[float],
     sums: Sequence[Ground] = ("power_sum",),
 ) -> tuple[Geometry, ...]:
-    """Return all combinations. Mounts are (yaw, pitch, roll), and geometries with the same mount are adjacent.
+    """Return all combinations of the values. Geometries with the same mount are adjacent.
 
     Parameters
     ----------
@@ -394,11 +397,11 @@ def singular_values_of(
     geometries : sequence of Geometry
         Geometries, grouped by mount: each group needs one evaluation of the field, or two with the ground.
     tower : Array
-        Positions, pattern and mount; its slants are those of the geometry.
+        Array of the tower. Its slants are replaced by those of the geometry.
     tower_m : (3,)
         Array centre, east, north, up over flat ground at 0 [m].
     uav : Array
-        Positions and pattern; slants and mount are those of the geometry.
+        Array of the UAV. Its slants and mount are replaced by those of the geometry.
     poses : Poses
     carrier_hz : float
 
@@ -425,21 +428,21 @@ def singular_values_of(
 
 def _of_power_sum(los: ComplexArray, ground: ComplexArray) -> FloatArray:
     covariance = sum(field @ field.conj().swapaxes(-1, -2) for field in (los, ground))
-    # the eigenvalues of a Hermitian matrix come ascending; rounding leaves the zero ones slightly negative
+    # eigvalsh returns ascending eigenvalues, and rounding can make a zero eigenvalue slightly negative
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., ::-1], 0.0)))
 
 
 def basis_fields(
     tower: Array, tower_m: FloatArray, uav: Array, poses: Poses, carrier_hz: float, with_ground: bool = True
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return channel matrices of line of sight and of the ground reflection alone, for vertical and horizontal ports.
+    """Return separate channel matrices of line of sight and ground reflection, for vertical and horizontal ports.
 
     Parameters
     ----------
     tower, uav : Array
         Their slants are not used.
     tower_m : (3,)
-        [m].
+                Centre of the tower's array [m].
     poses : Poses
     carrier_hz : float
     with_ground : bool
@@ -448,14 +451,16 @@ def basis_fields(
     Returns
     -------
     direct, bounced : (2, 2, n, uav ports, tower ports) complex
-        Vertical, then horizontal, at the UAV and at the tower: :func:`slanted` combines them.
+        The first two axes are the polarisation (vertical, horizontal) at the UAV and at the tower. :func:`slanted`
+        combines them.
     """
     link, wavelength = Link(carrier_hz, {"tower": tower}, uav, uav_transmits=False), wavelength_m(carrier_hz)
     faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (_GROUND_MATERIAL,), ("ground",))
     table, elements = face_table(faces, carrier_hz), Elements.of(link)
     n, ports = len(poses), (len(uav), len(tower))
     index, zero, step = np.arange(n), np.zeros(n, dtype=np.int64), max(1, PAIRS_PER_CHUNK // (len(uav) * len(tower)))
-    # cosine and sine of the two slants, against (tower's slant, paths, pairs) and (UAV's, tower's, paths, pairs)
+    # cosine and sine of a vertical and a horizontal port, in shapes that broadcast with (tower's slant, paths, pairs)
+    # and (UAV's slant, tower's slant, paths, pairs)
     upright, level = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     slants = [(upright.reshape(shape), level.reshape(shape)) for shape in ((2, 1, 1), (2, 1, 1, 1))]
     fields = np.zeros((2, 2, 2, n, *ports), dtype=np.complex128)
@@ -471,7 +476,7 @@ def basis_fields(
 
 
 def slanted(field: ComplexArray, uav_slant_deg: Sequence[float], tower_slant_deg: Sequence[float]) -> ComplexArray:
-    """Return channel matrices (n, uav ports, tower ports) of :func:`basis_fields` for slants of the ports [deg]."""
+    """Combine :func:`basis_fields` into channel matrices (n, uav ports, tower ports) for slants of the ports [deg]."""
     at_uav, at_tower = (np.radians(slant) for slant in (uav_slant_deg, tower_slant_deg))
     upright, level = field[:, 0] * np.cos(at_tower) + field[:, 1] * np.sin(at_tower)
     return np.asarray(np.cos(at_uav)[:, None] * upright + np.sin(at_uav)[:, None] * level)

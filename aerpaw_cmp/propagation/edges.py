@@ -2,12 +2,12 @@
 
 An edge is where two faces of a building meet at an exterior angle above 180 degrees: the rim of a flat roof and its
 upright corners. A path runs from the source, or its image in the ground, to a point of the edge, and on to the target
-or its image in the ground. At this point both legs make the same angle with the edge (Keller's cone). It exists when
-that point lies on the edge, both legs are free, and the point is on no other building's wall or inside one.
+or its image in the ground. At this point both legs make the same angle with the edge (Keller's cone). The path exists
+if that point lies on the edge, both legs are free, and the point is on no other building's wall or inside one.
 
-A reflected leg is straight in the space of the mirrored end. The whole path is straight once both legs are rotated
-about the edge into one plane, and positions of elements in that plane determine the length of each pair. Directions,
-patterns and the diffraction matrix are those of the array centres, like the paths. The field is therefore continuous
+A reflected leg is straight in the space of the mirrored end. The whole path is straight if both legs are rotated about
+the edge into one plane. The positions of the elements in that plane determine the path length of each pair. Paths,
+directions, patterns and the diffraction matrix are computed for the array centres. The field is therefore continuous
 where a direct or reflected path between the centres ends.
 
 The field behind an edge is that of the uniform theory of diffraction.
@@ -73,10 +73,11 @@ def wedge(
 
     Notes
     -----
-    ``-e^{-j pi/4} / (2 n sqrt(2 pi) sin_beta) [(T(pi + d) + T(pi - d)) I + T(pi + u) R_n + T(pi - u) R_0]`` with
-    ``d = phi_out - phi_in``, ``u = phi_out + phi_in`` and ``T(x) = cot(x / 2n) F(2 distance cos^2(...))`` (Kouyoumjian
-    and Pathak, eq. 25). Reflection matrices ``R`` of the faces replace Luebbers' plus and minus one. A perfectly
-    conducting screen is therefore theirs, and the sum with direct and reflected waves is continuous at any obliquity.
+    ``-e^{-j pi/4} / (2 n sqrt(2 pi) sin_beta) [(T(pi + d) + T(pi - d)) I + T(pi + u) R_n + T(pi - u) R_0]`` with ``d =
+    phi_out - phi_in``, ``u = phi_out + phi_in`` and ``T(x) = cot(x / 2n) F(2 distance cos^2(...))`` (Kouyoumjian and
+    Pathak, eq. 25). As in Luebbers' method, reflection matrices ``R`` of the faces replace the factors +1 and -1 of a
+    perfect conductor. A perfectly conducting screen therefore has the original coefficients, and the sum with direct
+    and reflected waves is continuous at any obliquity.
     """
     less, more = phi_out - phi_in, phi_out + phi_in
     shadow = edge_term(np.pi + less, exterior, distance) + edge_term(np.pi - less, exterior, distance)
@@ -90,7 +91,7 @@ def wedge(
     # angle between the edge-fixed basis and the plane of incidence, whose unit normal is sigma
     askew = cos_beta * upright  # like across, multiplied by the sine of incidence: -(sigma . phi) and -(sigma . beta)
     size = across * across + askew * askew
-    # along the edge both are zero, and any plane of incidence is valid
+    # for a ray along the edge both are zero, and any plane of incidence is valid
     weight = 1.0 / np.where(size == 0.0, 1.0, size)
     along, mixed, sideways = np.where(size == 0.0, 1.0, across * across * weight), across * askew * weight, askew**2
     sideways = sideways * weight
@@ -106,10 +107,11 @@ def wedge(
 def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return sine and cosine of the assumed angle of incidence on the faces of a wedge, in the plane across the edge.
 
-    The angle of incidence is only defined at the reflection boundary. Elsewhere this function uses the angle on the
-    mirror through the edge which would send the ray to the target, half of ``pi - less``, times a factor. The factor is
-    1 on both reflection boundaries (continuity), the same in both directions (reciprocity), and 0 if source or target
-    lies in a face. There the field of a face that is not a perfect conductor vanishes.
+    The angle of incidence is only defined at the reflection boundary. Elsewhere this function assumes a mirror through
+    the edge that sends the ray to the target. The angle on this mirror is half of ``pi - less``, and its sine is
+    multiplied by a factor. The factor is 1 on both reflection boundaries (continuity), the same in both directions
+    (reciprocity), and 0 if source or target lies in a face, where the field at a face that is not a perfect conductor
+    vanishes.
 
     Parameters
     ----------
@@ -124,9 +126,9 @@ def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> 
     """
     less = phi_out - phi_in
     up, down = (np.abs(np.sin((np.pi + turn) / (2.0 * exterior))) for turn in (less, -less))
-    # source and target exchange up and down: the smaller and the larger do not
+    # swapping source and target swaps ``up`` and ``down``, but not the smaller and the larger of the two
     near, far = np.minimum(up, down), np.maximum(up, down)
-    # at the shadow boundary both go to 0; their ratio to the exterior angle over pi
+    # at the shadow boundary cosine and ``near`` go to 0, and their ratio goes to the exterior angle over pi
     ratio = np.where(near < 1e-9, exterior, np.abs(np.cos(less / 2.0)) / np.maximum(near, 1e-9))
     lifted = np.sin(phi_in / exterior) * np.sin(phi_out / exterior) / np.maximum(far, 1e-9)
     return np.clip(ratio * lifted, 0.0, 1.0), np.sin(less / 2.0)
@@ -148,10 +150,10 @@ def edge_term(angle: FloatArray, exterior: FloatArray, distance: FloatArray) -> 
     (...) complex
     """
     turns = angle / (2.0 * np.pi * exterior)
-    # to the nearest boundary: -0.5 and 0.5 are the same angle
+    # measure from the nearest boundary: -0.5 and 0.5 turns are the same angle
     turns = turns - np.floor(turns + 0.5)
     above, below = np.abs(np.sin(np.pi * turns * exterior)), np.sin(np.pi * turns)
-    # on the boundary itself the ray that grazes the edge counts as seen, so the limit is that of the lit side
+    # on the boundary itself the ray that grazes the edge counts as visible, so use the limit from the lit side
     ratio = np.where(below == 0.0, exterior, above / np.where(below == 0.0, 1.0, below))
     # use w of a root instead of F of a square, because wofz is exact at zero and far away
     reach = np.sqrt(2.0 * distance)
@@ -169,7 +171,7 @@ def transition(root: FloatArray) -> ComplexArray:
 # An end nearer than this to an edge has no path over it, because it is not in the far field.
 NEAREST_M = 0.01
 
-# Exterior angles nearer than this to 180 degrees [rad] are a plane.
+# If the exterior angle is nearer than this to 180 degrees [rad], the two faces count as one plane.
 _SHARPEST = 1e-6
 
 # The formula is asymptotic: faces lower than this many wavelengths are not treated as wedges, nor their building as an
@@ -196,7 +198,7 @@ class EdgePaths(Further):
     ground : (paths, 2) int
         Ground planes that reflect before and after the edge. -1 means no reflection.
     vertices_m : (paths, 3, 3)
-        Reflection, edge, reflection point for array centres; NaN where unused.
+        Ground reflection, edge point and ground reflection of each path between array centres. NaN where unused.
     """
 
     kind: ClassVar[str] = "over an edge"
@@ -231,12 +233,12 @@ class EdgePaths(Further):
 
     @property
     def turns(self) -> IntArray:
-        """2 for the edge, 1 before and after it where the ground reflects (paths,)."""
+        """Digits of each path (paths,): 2 for the edge, with a 1 before or after it for a ground reflection."""
         before, after = (self.ground >= 0).T
         return np.asarray(np.where(after, 10 * (2 + 10 * before) + 1, 2 + 10 * before))
 
     def words(self, faces: Faces) -> list[str]:
-        """Return corners of each path, from tower to UAV."""
+        """Return a description of each path's corners, from tower to UAV."""
         label = (*faces.label, "")  # index -1 (no face) selects the last entry
         edges = zip(self.wedge.tolist(), self.vertices_m[:, 1].tolist(), strict=True)
         middle = (f"edge of {label[f]} and {label[n]} at {', '.join(f'{x:.1f}' for x in at)} m" for (f, n), at in edges)
@@ -246,7 +248,7 @@ class EdgePaths(Further):
     def fields(
         self, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
     ) -> Fields:
-        """Return the part of the paths in H and in the powers.
+        """Return what the paths add to H and to the powers.
 
         Parameters
         ----------
@@ -314,7 +316,7 @@ def over_edges(scene: Scene, poses: Poses, link: Link) -> EdgePaths:
     return paths.select(np.lexsort((after, before, last, first, paths.tower, paths.pose)))
 
 
-# Values of ``rt.diffraction``, and the additional paths of each value.
+# Values of ``rt.diffraction``, and the additional searches of each value.
 DIFFRACTION: dict[str, tuple[Callable[..., Further], ...]] = {"none": (), "edges": (over_edges,)}
 
 
@@ -326,7 +328,7 @@ def diffracted(name: str) -> tuple[Callable[..., Further], ...]:
 
 
 class Edges(NamedTuple):
-    """Convex edges of a scene, a row each.
+    """Convex edges of a scene, one per row.
 
     ``start_m``, ``end_m``, ``along`` (edges, 3) with ``face_axis x normal = along``; ``face_axis`` lies in face 0, away
     from the edge; ``normal`` and ``normal_n`` point out of faces 0 and n; ``face`` (edges, 2).
@@ -352,9 +354,9 @@ class Edges(NamedTuple):
     def of(cls, faces: Faces, wavelength: float = 0.0) -> Edges:
         """Return edges of the prisms of a scene, except prisms lower than half a wavelength [m].
 
-        Upright corners begin at the highest of the level grounds where their wall begins lower.
+        A vertical edge starts at the highest level ground if its wall starts below that.
         """
-        # walls extend below the ground, where a corner does not diffract
+        # walls extend below the ground, where an edge does not diffract
         ground_m = max(0.0, float(faces.offset_m[faces.solid == -1].max(initial=0.0)))
         least_m = _LEAST_WAVELENGTHS * wavelength
         solids = np.unique(faces.solid[faces.solid >= 0])
@@ -380,7 +382,7 @@ def wedge_axes(normal: FloatArray, normal_n: FloatArray) -> tuple[FloatArray, Fl
 def _of_solid(
     faces: Faces, solid: int, ground_m: float, least_m: float
 ) -> list[tuple[FloatArray, FloatArray, tuple[int, int]]]:
-    """Start, end and faces of each edge, so that the outward normal of face 0 and the direction are as in Edges."""
+    """Return start, end and faces of each edge, in the order that the axes of :class:`Edges` require."""
     # only edges between faces of one building: an edge between two touching buildings is not listed
     members = np.flatnonzero(faces.solid == solid)
     walls = [int(i) for i in members if faces.normal[i, 2] == 0.0]
@@ -389,7 +391,7 @@ def _of_solid(
     first = {_corner(faces, wall, 0): wall for wall in walls}
     for wall in walls:
         top, low = faces.upper[wall, 1], max(float(faces.lower[wall, 1]), ground_m)
-        # its rim and corners are not edges for which the asymptotic formula is valid
+        # skip a low building: the asymptotic formula is not valid for its edges
         if top - low <= least_m:
             continue
         near, far = (_point(faces, wall, end, top) for end in (0, 1))
@@ -405,13 +407,13 @@ def _of_solid(
 
 
 def _point(faces: Faces, wall: int, end: int, height_m: float) -> FloatArray:
-    """Return the point of a wall's first or last upright at a height."""
+    """Return the point at a height on a vertical side of a wall, the first or the last."""
     at = (faces.lower, faces.upper)[end][wall, 0]
     return np.asarray(faces.normal[wall] * faces.offset_m[wall] + at * faces.along[wall] + [0.0, 0.0, height_m])
 
 
 def _corner(faces: Faces, wall: int, end: int) -> tuple[float, float]:
-    """Return the corner of the footprint, to the tenth of a millimetre, as a key."""
+    """Return a corner of the footprint, rounded to 0.1 mm, as a key."""
     point = _point(faces, wall, end, 0.0)
     # both walls compute the corner from their own plane, so the last digits differ
     return round(float(point[0]), 4), round(float(point[1]), 4)
@@ -432,17 +434,17 @@ class _Search:
         near = np.asarray(touch.all(axis=2))
         # an edge always touches its building
         near[np.arange(len(edges)), solid] = False
-        # another building may touch a face of these
+        # edges at which another building may touch a face
         self.doubtful = np.asarray(near.any(axis=1))
         axis_n = np.cross(edges.along, edges.normal_n)
-        # along each face and a tenth outside it, because a probe in the plane would graze the wall
+        # probe along each face and a tenth of that outwards, because a probe in the plane would graze the wall
         self.sides = np.stack([edges.face_axis + 0.1 * edges.normal, axis_n + 0.1 * edges.normal_n], axis=1)
 
     def of_tower(
         self, tower: int, source_m: FloatArray, targets_m: FloatArray, poses: IntArray, ground: tuple[int, int]
     ) -> list[EdgePaths]:
         """Return paths of one tower with the given ground reflections before and after the edge."""
-        # mirrored in their ground, so that each bent leg is straight
+        # mirror the ends at their ground, so that each reflected leg is straight
         images = (source_m, targets_m[poses])
         source, ends = (p if g < 0 else self.faces.mirrored(g, p) for g, p in zip(ground, images, strict=True))
         at_source, near = (part[:, 0] for part in self._round_edges(source[None]))
@@ -451,7 +453,7 @@ class _Search:
         for first in range(0, len(poses), step):
             some = ends[first : first + step]
             at_target, far = (part[lit].T for part in self._round_edges(some))
-            # Keller's cone unrolled: both legs have one angle with the edge where the unfolded line crosses it
+            # unroll Keller's cone: where the straight line crosses the edge, both legs make the same angle with it
             at = at_source[lit] + (at_target - at_source[lit]) * (near[lit] / (near[lit] + far))
             row, column = np.nonzero((at >= 0.0) & (at <= self.edges.length_m[lit]) & (far >= 0.0))
             edge, pose = lit[column], poses[first + row]
@@ -495,7 +497,7 @@ class _Search:
         good = np.ones(len(edge), dtype=np.bool_)
         rows = np.flatnonzero(self.doubtful[edge])
         for side in (0, 1):
-            # from half-way on: the first half may still lie in the rounding of the edge itself
+            # check only the second half: the first half may lie within the rounding error of the edge
             step = _PROBE_M * self.sides[edge[rows], side]
             good[rows] &= ~self.hiding.segments(points_m[rows] + 0.5 * step, points_m[rows] + step)
         return good
@@ -573,11 +575,12 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
     rise = place[1][0] - place[0][0]
     total = np.hypot(near + far, rise)
     sine, cosine = (near + far) / total, rise / total
-    # 0 lies in face 0; behind it the angle runs on to the exterior angle, not to minus pi
+    # the angle is 0 in face 0 and grows up to the exterior angle, without a jump from pi to minus pi
     phi_in, phi_out = (np.mod(np.arctan2(up, down), 2.0 * np.pi) for _, down, up in place)
     distance, materials = wave_number * near * far / total, (tuple(table[face].T) for face in (face_0, face_n))
     bb, bp, pp = wedge(phi_in, phi_out, cosine, exterior, distance, *materials)
-    # lambda / (4 pi) = 1 / 2k; the legs are near / sine and far / sine long, both bases lack a factor 1 / sine
+    # lambda / (4 pi) = 1 / 2k; the lengths of the legs are near / sine and far / sine, and both bases still need a
+    # factor 1 / sine
     spread = (1.0 / (2.0 * wave_number * sine * np.sqrt(wave_number * near * far)))[:, None]
     ways = unit_vectors(point - ends[0].centre_m), unit_vectors(ends[1].centre_m - point)
     towers = tuple(link.tower_arrays.values())
@@ -644,7 +647,7 @@ def _round_edge(
 ) -> tuple[ComplexArray, ComplexArray]:  # fmt: skip
     """Return fields (paths, elements) of an end's elements in the edge-fixed basis, times the sine with the edge.
 
-    ``way`` (paths, 3) is the direction of the wave at the edge's end of the leg. ``sign`` is 1 at the source. It is -1
+    ``way`` (paths, 3) is the direction of the wave where the leg meets the edge. ``sign`` is 1 at the source. It is -1
     at the target, whose elements are evaluated in the opposite direction.
     """
     flat, cross = along - cosine[:, None] * way, np.cross(along, way)
@@ -666,7 +669,7 @@ def _round_edge(
 
 
 def _element_places(end: _End, point_m: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return places of an end's elements along the edge and their distances from it (paths, elements) [m]."""
+    """Return positions of an end's elements along the edge and their distances from it (paths, elements) [m]."""
     places = (end.centre_m - point_m)[:, :, None] + np.einsum("nji,njk->nik", end.axes, end.places_m)
     along, down, up = np.einsum("nij,njk->ink", frame, places)
     return along, np.hypot(down, up)

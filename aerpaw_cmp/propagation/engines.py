@@ -1,7 +1,7 @@
 """Path search by the requested engine, with a cache of earlier searches.
 
-The cache is content-addressed. Paths depend on the faces, the ends and the search, not on arrays, attitude or power:
-one entry serves every array.
+The cache is content-addressed. Paths depend on the faces, the ends and the search, but not on arrays, attitude or
+power, so one entry is valid for every array.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from .options import Run, Search
 from .scene import Scene
 from .search import mirror
 
-# Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same.
+# Number of faces above which sequences of two reflections are found by compiled beams. The paths are the same.
 MANY_FACES = 400
 
 # PathSolver finds a wall of solid angle W with probability ``1 - exp(-N W / 4 pi)``, so the required rays depend on the
 # smallest and farthest walls. Pilot searches on a batch of poses use more rays each time, until two find the same
-# paths. A wall that both miss and that other poses see can still be lost; the audit reports this.
+# paths. A wall that both searches miss can still be lost at other poses. The audit reports such a wall.
 # Rays per tower of the first pilot.
 FIRST = 10_000
 
 _FACTOR = 4
 
-# Rays per tower at which pilots end in any case.
+# Largest number of rays per tower of a pilot.
 MOST = 2_560_000
 
 
 def path_cache(search: Search, run: Run) -> PathCache | None:
-    """Return the cache of a replay, None where there is none."""
+    """Return the path cache of a replay, or None if it does not use one."""
     folder = run.cache_dir
     if folder is None:
         # the image engine is faster than reading its paths back
@@ -243,7 +243,7 @@ class PathCache:
         carrier_hz : float
             Used for Sionna only: paths of the image engine do not depend on the frequency.
         search : Search
-            Engine, depth, samples and the rest.
+            Engine, depth, samples and other search options.
 
         Returns
         -------
@@ -253,7 +253,7 @@ class PathCache:
         faces, surfaces = scene.faces, scene.surfaces
         decides: list[object] = [__version__, LAYOUT, search.engine, search.max_depth, search.samples, search.batch]
         if search.engine == "sionna":
-            # another version of its tracer may find other paths; the image engine's are exact
+            # another version of Sionna's tracer may find other paths, whereas the image engine is exact
             decides += [[version(name) for name in ("sionna-rt", "mitsuba", "drjit")], carrier_hz, faces.material]
         columns = (faces.normal, faces.offset_m, faces.along, faces.lower, faces.upper, faces.solid)
         mesh = None if surfaces is None else (surfaces.corners_m, surfaces.first)

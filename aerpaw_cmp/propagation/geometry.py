@@ -3,16 +3,16 @@
 A path is an ordered list of reflecting faces between the source (tower) and the target (UAV). Lengths, phases
 and fields are not stored: :mod:`aerpaw_cmp.propagation.field.sum` evaluates them in float64 from the faces.
 
-The planar faces of a site: one ground plane per ground height, walls and flat roofs of the buildings.
+The faces of a site are planar: one ground plane per ground height, walls and flat roofs of the buildings.
 
-Walls reach below the ground so that no crack stays at their foot; buildings have no bottom. Collinear edges of a
-footprint are one wall, however many vertices the map gave it.
+Walls extend below the ground so that there is no gap at their foot. Buildings have no bottom face. Collinear edges of a
+footprint form one wall, regardless of the number of vertices on the map.
 
-Antenna arrays, poses and the link between a tower and the UAV.
+The module also contains antenna arrays, poses and links between towers and the UAV.
 
-Device frame of every array: x forward (boresight), y left, z up. A pattern is given in that frame by zenith
-angle theta and azimuth phi (from x towards y). Rotations are (3, 3) matrices that turn device coordinates into
-site coordinates (east, north, up): ``v_site = R @ v_device``.
+Device frame of every array: x forward (boresight), y left, z up. A pattern is a function of zenith angle theta and
+azimuth phi in that frame (from x towards y). Rotations are (3, 3) matrices that turn device coordinates into site
+coordinates (east, north, up): ``v_site = R @ v_device``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Links:
     targets_m : (poses, 3)
         NaN positions have no path.
     usable : (towers, faces) bool, optional
-        Faces that may reflect for each tower (default: all). All faces hide.
+        Faces that may reflect for each tower (default: all). All faces block paths.
     excluded : (towers, poses) bool, optional
         Links without any path, e.g. poses inside buildings.
     """
@@ -55,7 +55,7 @@ class Links:
 
 
 _ARRAYS = ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
-# Columns of faces: arrays, and tuples.
+# Columns of :class:`Faces` that are tuples. All other columns are arrays.
 _WORDS = ("material", "label", "polygon")
 
 
@@ -81,7 +81,7 @@ class Faces:
     lower, upper : (faces, 2)
         Bounds of the in-plane coordinates; infinite for the ground.
     polygon : tuple of Polygon or None, length faces
-        The face in its plane, where it does not fill its bounds.
+        Outline of the face in its plane, if it does not fill its bounds.
     solid : (faces,) int
         Index of the building, -1 for the ground, which never hides anything.
     """
@@ -124,7 +124,7 @@ class Faces:
         return np.asarray(points_m - 2.0 * self.height_m(face, points_m)[..., None] * self.normal[face])
 
     def select(self, rows: IntArray) -> Faces:
-        """Return some of the faces."""
+        """Return the faces of the given rows."""
         columns: dict[str, Any] = {name: tuple(getattr(self, name)[row] for row in rows) for name in _WORDS}
         columns |= {name: getattr(self, name)[rows] for name in _ARRAYS}
         return Faces(**columns)
@@ -140,7 +140,7 @@ def joined(*pieces: Faces) -> Faces:
 
 
 class BoxTree(NamedTuple):
-    """A tree of boxes as columns.
+    """A tree of bounding boxes, stored as columns.
 
     ``lower``, ``upper`` (nodes, 3) are bounds, ``child`` (nodes,) the first of two children or -1. A leaf
     contains ``many`` of the ``items`` from ``start`` on.
@@ -163,7 +163,7 @@ class Surfaces:
     faces : Faces
         Planes, materials and labels; ``solid`` is the shape. Their polygons are the triangles below.
     corners_m : (triangles, 3, 3)
-        Corners of every triangle as the file has it.
+        Corners of every triangle, as in the file.
     face : (triangles,) int
         Face of each triangle; triangles of a face follow each other.
     first : (faces + 1,) int
@@ -173,7 +173,7 @@ class Surfaces:
     window_m : (faces, 8, 3)
         Convex outline of each face, in its plane; the last corner is repeated.
     plane : (faces,) int
-        Faces of one number lie in one plane.
+        Number of the plane of each face. Coplanar faces have the same number.
     tree, face_tree : BoxTree
         Trees over triangles and over faces.
     notes : tuple of str
@@ -196,7 +196,7 @@ class Surfaces:
         return len(self.faces)
 
     def mesh(self) -> tuple[FloatArray, IntArray, IntArray]:
-        """Return vertices (n, 3), triangles (m, 3) and the face of each triangle, as the file has them."""
+        """Return vertices (n, 3), triangles (m, 3) and the face of each triangle, as in the file."""
         count = len(self.corners_m)
         return self.corners_m.reshape(-1, 3), np.arange(3 * count, dtype=np.int64).reshape(-1, 3), self.face
 
@@ -248,7 +248,7 @@ class PathSet(Rows):
     terrain_db: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        # the record is frozen, so set the default of the right length in this way
+        # the default depends on the number of paths, and a frozen record can only be changed in this way
         if len(self.terrain_db) != len(self.pose):
             object.__setattr__(self, "terrain_db", np.zeros(len(self.pose)))
 
@@ -256,7 +256,7 @@ class PathSet(Rows):
         return len(self.pose)
 
     def lines(self) -> PathSet:
-        """Return the paths, which are polylines."""
+        """Return the set itself, because its paths are polylines already."""
         return self
 
     @property
@@ -266,7 +266,7 @@ class PathSet(Rows):
 
     @property
     def turns(self) -> IntArray:
-        """One digit 1 per reflection (paths,)."""
+        """Digits of each path (paths,): a 1 for each reflection."""
         # 1, 11, 111
         return np.asarray((10**self.depth - 1) // 9)
 
@@ -281,7 +281,7 @@ class PathSet(Rows):
         faces : (paths, depth) int
             Index of each face from tower to UAV.
         vertices_m : (paths, depth, 3)
-            Reflection points [m]; those without a face do not count.
+            Reflection points [m]. Points without a face are ignored.
         max_depth : int
 
         Returns
@@ -305,14 +305,14 @@ class PathSet(Rows):
 
 
 def sources_of(paths: Rows, sources_m: FloatArray) -> FloatArray:
-    """Return sources (paths, 3) of paths, of places (towers, 3), or (poses, towers, 3) of towers that move."""
+    """Return the source (paths, 3) of each path from positions (towers, 3), or (poses, towers, 3) if towers move."""
     return np.asarray(sources_m[paths.tower] if sources_m.ndim == 2 else sources_m[paths.pose, paths.tower])
 
 
 def legs(source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Iterate over the starts and ends (paths, 3) of the legs of polylines, leg by leg.
 
-    A vertex (paths, vertices, 3) that is not used (NaN) is the point after it: a leg that begins there has no length.
+    An unused vertex (NaN) is replaced by the point after it, so that the leg from there has zero length.
     """
     # backwards: an unused corner gets the position of the next corner
     points = [target_m]
@@ -344,27 +344,28 @@ def path_lengths(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -
 _WALL_FOOT_M = 0.5
 
 # Two edges are one wall if the sine of the angle between them is below this.
-# A nanometre off over a metre; maps are drawn to the millimetre.
+# It is one nanometre over one metre, and maps are drawn to the millimetre.
 _COLLINEAR = 1e-9
 
 _UP = np.array([0.0, 0.0, 1.0])
 
 
 def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
-    """Return faces of a site.
+    """Return the planar faces of a site.
 
     Parameters
     ----------
     site : Site
     towers : sequence of str, optional
-        Towers whose ground heights need a plane (default: all of the site, at least ``up = 0``).
+        Towers whose ground heights need a plane. Default: all towers of the site. Without towers the plane is ``up =
+        0``.
 
     Returns
     -------
     Faces
         Ground planes first (``solid`` is -1), then walls and roof of each building.
     """
-    # sorted and each once: the numbers of faces must not depend on the order of towers
+    # sort and drop duplicates: face numbers must not depend on the order of towers
     grounds = sorted({site.towers[name].ground_m for name in (towers or site.towers)}) or [0.0]
     return _faces(tuple(grounds), site.ground_material, site.buildings)
 
@@ -416,9 +417,9 @@ def _walls(building: Building, footprint: Polygon, solid: int) -> Faces:
     edge = np.concatenate([np.diff(ring, axis=0) for ring in rings])
     length, count = np.hypot(*edge.T), len(edge)
     along = np.column_stack([edge / length[:, None], np.zeros(count)])
-    # along x up: the solid lies left of every edge, so the outward normal is to the right
+    # the normal is along x up: the building is to the left of every edge, so the outside is to the right
     normal = np.column_stack([along[:, 1], -along[:, 0], np.zeros(count)])
-    # in-plane coordinates count from the site's origin, not from the wall's corner
+    # in-plane coordinates are measured from the site's origin, not from the wall's corner
     first = (along[:, :2] * start).sum(axis=1)
     foot, top = min(building.base_m, 0.0) - _WALL_FOOT_M, building.base_m + building.height_m
     return Faces(
@@ -473,7 +474,8 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
         Face of each point.
     points_m : (points, 3)
     tolerance_m : float
-        How far outside an edge a point still counts; negative: how far inside it must lie.
+        Distance outside an edge at which a point still belongs to the face. If negative, points must lie this far
+        inside.
 
     Returns
     -------
@@ -481,7 +483,7 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
     """
     a = np.einsum("ij,ij->i", faces.along.take(index, 0), points_m)
     b = np.einsum("ij,ij->i", faces.across.take(index, 0), points_m)
-    # take: an index in brackets is several times slower for rows of two
+    # use take, because indexing with brackets is several times slower for rows of two numbers
     low, high = (faces.lower - tolerance_m).take(index, 0), (faces.upper + tolerance_m).take(index, 0)
     good = (a >= low[:, 0]) & (a <= high[:, 0]) & (b >= low[:, 1]) & (b <= high[:, 1])
     # polygons last, and only for points within the bounds
@@ -492,7 +494,7 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
         rows = np.flatnonzero(good & (index == face))
         hit = shapely.intersects_xy(polygon, a[rows], b[rows])
         if tolerance_m > 0.0 and not hit.all():
-            # beyond the edge by up to the tolerance still counts
+            # also accept points outside the edge by up to the tolerance
             hit = hit | shapely.dwithin(polygon, shapely.points(a[rows], b[rows]), tolerance_m)
         elif tolerance_m < 0.0 and hit.any():
             hit = hit & ~shapely.dwithin(polygon.boundary, shapely.points(a[rows], b[rows]), -tolerance_m)
@@ -520,7 +522,7 @@ def triangles(faces: Faces, reach_m: float) -> tuple[FloatArray, IntArray, IntAr
     ----------
     faces : Faces
     reach_m : float
-        Infinite faces end here.
+                In-plane coordinate at which infinite faces are cut [m].
 
     Returns
     -------
@@ -565,7 +567,7 @@ def inside_solids(site: Site, points_m: FloatArray) -> BoolArray:
 class Pattern(Protocol):
     """An element's far field.
 
-    ``field(theta_rad, phi_rad)`` gives complex ``(E_theta, E_phi)`` of the broadcast shape, scaled so that
+    ``field(theta_rad, phi_rad)`` returns complex ``(E_theta, E_phi)`` of the broadcast shape, scaled so that
     ``|E_theta|^2 + |E_phi|^2`` is the gain (linear, over isotropic).
     """
 
@@ -719,7 +721,7 @@ def rotation_from_axes(yaw_deg: FloatArray, up: FloatArray) -> FloatArray:
     """
     yaw, up = np.radians(yaw_deg), np.broadcast_to(up, (len(yaw_deg), 3))
     nose = np.stack([np.sin(yaw), np.cos(yaw), 0.0 * yaw], axis=1)
-    # level, then down along the vertical until it is square to the upward axis: its bearing stays
+    # start with a level nose and lower it until it is perpendicular to the upward axis, which keeps its bearing
     nose[:, 2] = -(nose * up).sum(axis=1) / up[:, 2]
     nose /= np.linalg.norm(nose, axis=1, keepdims=True)
     return np.stack([nose, np.cross(up, nose), up], axis=2)
@@ -744,7 +746,7 @@ def _mounted(
     yaw_deg: float,
     roll_deg: float = 0.0,
 ) -> Array:
-    """Return elements of one pattern in a device that is turned and rolled."""
+    """Return an array of elements with one pattern in a device that is rotated by yaw and roll."""
     # no pitch: the arrays of the paper and of maps point horizontally
     mount = rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, 0.0, roll_deg]))
     return Array(positions_m, np.radians(np.array(slant_deg)), (pattern or Isotropic(),), mount)
@@ -773,9 +775,9 @@ def uav_comparison_array(
     Parameters
     ----------
     wavelength_m : float
-        Elements are half of it apart [m].
+        Wavelength [m]. Elements are half a wavelength apart.
     yaw_deg, roll_deg : float
-        Mount: counter-clockwise from the nose (or east), about the boresight [deg].
+        Yaw counter-clockwise from the nose (or east) and roll about the boresight [deg].
     slant_deg : tuple of 4 float
         Polarisation of each port from vertical [deg].
     pattern : Pattern, optional

@@ -1,4 +1,4 @@
-"""The LLVM that Dr.Jit compiles with: find one, try it in a child process, name the line that installs one.
+"""The LLVM that Dr.Jit compiles with: find it, try it in a child process, or return the command that installs it.
 
 Standard library only, so that set-up can use it before anything else works.
 
@@ -31,10 +31,10 @@ from ..common.versions import version
 # 14 is refused by Dr.Jit; 15 and 16 abort on AVX-512. 19 and 22 were tried on such a machine.
 MINIMUM_MAJOR = 17
 
-# What Dr.Jit reads; a path set by the user is tried, never replaced.
+# Variable that Dr.Jit reads. A path that the user has set is tried and never replaced.
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
-# Folders to look into instead of the system's, separated as in PATH.
+# Variable with the folders that are searched instead of the system's, separated as in PATH.
 FOLDERS_VARIABLE = "AERPAW_CMP_LLVM_FOLDERS"
 
 # A trial takes about two seconds. The limit is far above, so that a slow disk does not look like a library that hangs.
@@ -58,9 +58,9 @@ _FOLDERS = (
 
 _NAME = re.compile(r"libLLVM(?:-(?P<dash>\d+(?:\.\d+)*))?\.(?:so|dylib)(?:\.(?P<dot>\d+(?:\.\d+)*))?")
 
-# One triangle of ground, one link: the direct and the reflected path of known length, by the kinds of instructions that
-# Sionna's solver compiles to. With LLVM 15 on AVX-512 this program aborts like Sionna's solver, but Sionna takes 2 s to
-# load.
+# A program that traces a direct and a reflected path of known length over one ground triangle. It uses the same kinds
+# of instructions as Sionna's solver, so with LLVM 15 on AVX-512 it aborts in the same way. Loading Sionna itself would
+# take 2 s.
 TRIAL_PROGRAM = """
 import json, math, sys
 try:
@@ -93,7 +93,7 @@ llvm = list(dr.detail.llvm_version()) if "llvm" in sys.argv[1] else []
 print(json.dumps({"right": right, "found_m": found, "llvm": llvm}))
 """
 
-# The same for ``doctor`` and ``make setup``, which also report a Sionna RT that cannot be loaded.
+# The program for ``doctor`` and ``make setup``, which also report a Sionna RT that cannot be loaded.
 _SIONNA_LOADS = f"""{TRIAL_PROGRAM}
 import typing, typing_extensions
 typing.__dict__.setdefault("Self", typing_extensions.Self)
@@ -157,7 +157,7 @@ def _library(path: Path) -> Library | None:
 
 
 def _system_paths() -> list[Path]:
-    """Return every file with a libLLVM name that the linker or the usual folders contain."""
+    """Return every file with a libLLVM name that is known to the linker or is in one of the usual folders."""
     paths: list[Path] = []
     # /sbin is not in the path of a plain Debian user
     if ldconfig := shutil.which("ldconfig") or shutil.which("/sbin/ldconfig"):
@@ -165,7 +165,7 @@ def _system_paths() -> list[Path]:
         paths += [Path(line.rpartition("=> ")[2]) for line in listing.splitlines() if "libLLVM" in line]
     for pattern in _FOLDERS:
         folder = Path(pattern)
-        # pathlib refuses absolute patterns: they are taken from the root
+        # pathlib refuses absolute patterns, so search from the root
         paths += folder.parents[-1].glob(str(folder.relative_to(folder.anchor) / "libLLVM*"))
     return paths
 
@@ -321,8 +321,8 @@ def _verdict_file(library: Library) -> Path:
     return cache_folder("llvm", sha256(key.encode()).hexdigest()[:24])
 
 
-def _remembered_trial(library: Library) -> Trial:
-    """Return a stored good trial of :func:`try_library` without Sionna, else try. Failures are not stored."""
+def _cached_trial(library: Library) -> Trial:
+    """Return the stored trial of a library, or try it without Sionna. Only successful trials are stored."""
     note = _verdict_file(library)
     if note.is_file() and not _too_old(library.version):
         return Trial(library, True)
@@ -337,11 +337,11 @@ def _remembered_trial(library: Library) -> Trial:
 @cache
 def _trials() -> tuple[Trial, ...]:
     """Return the trials that led to this process's choice. They are made once."""
-    return tuple(first_that_works(candidates(), _remembered_trial))
+    return tuple(first_that_works(candidates(), _cached_trial))
 
 
 class SionnaMissingError(CheckError):
-    """Sionna RT cannot be loaded on this machine: only the audit and ``rt.engine: sionna`` need it."""
+    """The error that Sionna RT cannot be loaded. Only the audit and ``rt.engine: sionna`` need it."""
 
 
 def prepare_llvm() -> Path:
@@ -361,7 +361,7 @@ def prepare_llvm() -> Path:
     if not trials or not trials[-1].ok or trials[-1].library is None:
         line = INSTALL_AGAIN if sionna_fails(trials) else install_line()
         raise SionnaMissingError(f"{explain(trials)}. Repair it with: {line}")
-    # Dr.Jit reads it once, when it is imported
+    # Dr.Jit reads the variable only once, on import
     os.environ[LIBRARY_VARIABLE] = str(trials[-1].library.path)
     return trials[-1].library.path
 
@@ -382,7 +382,7 @@ INSTALL_AGAIN = "pip install --force-reinstall sionna-rt"
 
 
 def sionna_fails(trials: Sequence[Trial]) -> bool:
-    """Check whether it is Sionna RT or a package that it needs which cannot be loaded, not an LLVM."""
+    """Check whether the last trial failed because of Sionna RT or a package that it needs, not because of an LLVM."""
     return bool(trials) and not trials[-1].ok and not trials[-1].blames_library and not trials[-1].missing
 
 
@@ -400,7 +400,7 @@ def explain(trials: Sequence[Trial]) -> str:
 
 
 def os_families() -> set[str]:
-    """Return the names of the distribution and of related ones. Without a distribution, return the system's name."""
+    """Return the names of the distribution and of related distributions, or of the operating system if it has none."""
     try:
         release = platform.freedesktop_os_release()
     except OSError:
@@ -444,9 +444,9 @@ def install_line() -> str:
     if families & {"debian", "ubuntu"}:
         known = known_to_apt()
         offered = apt_packages(known)
-        if known and not offered:  # Ubuntu 22.04 ends at 15: packages of the LLVM project
-            # a minimal image has none of these
-            needs = "wget gnupg lsb-release software-properties-common"  # programs that the script calls
+        if known and not offered:  # Ubuntu 22.04 has only LLVM 15: use the LLVM project's packages
+            # programs that the script calls, which a minimal image does not have
+            needs = "wget gnupg lsb-release software-properties-common"
             fetch = "wget https://apt.llvm.org/llvm.sh && sudo bash llvm.sh 19"
             first = f"sudo apt-get update && sudo apt-get install -y {needs} && {fetch}"
             return f"{first} && sudo apt-get install -y libllvm19 {APT_RUNTIME}"

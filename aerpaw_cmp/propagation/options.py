@@ -58,7 +58,7 @@ class Field:
     Parameters
     ----------
     loss : callable, optional
-        Further loss per path [dB], such as foliage; infinite where nothing gets through.
+        Further loss per path [dB], such as foliage; infinite if the path is blocked.
     """
 
     loss: Loss | None = None

@@ -2,7 +2,8 @@
 
 The path table of a replay contains delay, gain per element pair, directions and Doppler of each path separately.
 
-H is the sum of the gains. The field of one path is the sum over a path set of one path, so there is only one formula.
+H is the sum of the gains. The field of a single path is computed as the sum over a set that contains only this path, so
+there is only one formula.
 
 Directions are unit vectors away from the ends. In the site frame, azimuth is counter-clockwise from east and elevation
 is above the horizon. In the array frame (:mod:`aerpaw_cmp.propagation.geometry`) they are measured from the boresight.
@@ -47,11 +48,11 @@ from .scene import Omission, Scene, buried_towers, within_reach
 from .search import mirror
 from .search.terrain import on_terrain
 
-# Codes of ``kind``; names of other kinds of bends follow. The codes are stored in channel files, so append new kinds at
-# the end.
+# Names of the codes in ``kind``, followed by the names of other kinds of bends. The codes are stored in channel files,
+# so append new kinds at the end.
 _KINDS = ("line_of_sight", "reflection", "edge")
 
-# Gains are computed at the carrier: materials, patterns and foliage are not evaluated at other frequencies.
+# Largest bandwidth as a share of the carrier: materials, patterns and foliage are evaluated only at the carrier.
 WIDEST_BAND = 0.1
 
 
@@ -64,7 +65,7 @@ class Ends:
     link : Link
     poses : Poses
     sources_m : (towers, 3) or (poses, 1, 3)
-        Centres of the tower arrays; the latter of one tower that moves.
+        Centres of the tower arrays. The second shape is for one tower that moves.
     field : Field
         Further losses.
     """
@@ -75,7 +76,7 @@ class Ends:
     field: Field = Field()
 
     def part(self, rows: slice) -> Ends:
-        """Return the ends of some poses."""
+        """Return the ends of the given poses."""
         return replace(self, poses=self.poses[rows], sources_m=self.sources_m[rows] if self.moving else self.sources_m)
 
     @property
@@ -86,7 +87,7 @@ class Ends:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathTable:
-    """Paths of a replay, a row each, by pose and tower, the shortest first.
+    """Paths of a replay, one per row, sorted by pose, tower and length.
 
     Parameters
     ----------
@@ -125,7 +126,7 @@ class PathTable:
 
     @property
     def most(self) -> int:
-        """Paths of the link that has most."""
+        """Largest number of paths of a link."""
         return int(self.number.max(initial=-1)) + 1
 
     @property
@@ -190,7 +191,7 @@ def path_table(
     counts : (poses, towers) bool
         Links that have a channel. Paths of other links are omitted.
     names : dict of str to int
-        Faces of a path by number, those of earlier poses; new ones are added.
+        Number of each sequence of faces found at earlier poses. New sequences are added.
 
     Returns
     -------
@@ -209,7 +210,7 @@ def path_table(
         unique, via = np.unique(item.touched, axis=0, return_inverse=True)
         texts = [", ".join(labels[i] for i in row if i >= 0) for row in unique.tolist()]
         codes = np.array([names.setdefault(text, len(names)) for text in texts], dtype=np.int64)
-        # from the centres of the arrays: delays and directions are per path, gains per element pair
+        # use the array centres: delays and directions are per path, but gains are per element pair
         places = sources_of(lines, ends.sources_m), lines.vertices_m, ends.poses.position_m[lines.pose]
         away = list(legs(*places))
         back = next(legs(places[2], lines.vertices_m[:, ::-1], places[0]))  # from the UAV
@@ -217,7 +218,7 @@ def path_table(
             {
                 "pose": item.pose,
                 "tower": item.tower,
-                # for any number of reflections: ``turns`` contains the number
+                # one kind for any number of reflections, because ``turns`` contains the number
                 "kind": np.full(len(lines), code) if code else np.minimum(lines.depth, 1),
                 "via": codes[via.ravel()],
                 "gain": _gains(item, faces, ends, loss_db),
@@ -231,7 +232,7 @@ def path_table(
             }
         )
     columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
-    # the last key is the first to count
+    # lexsort sorts by its last key first
     order = np.lexsort((columns["length_m"], columns["tower"], columns["pose"]))
     columns = {name: value[order] for name, value in columns.items()}
     link = columns["pose"] * counts.shape[1] + columns["tower"]
@@ -263,7 +264,7 @@ def impulse_responses(
     table : PathTable
     ends : Ends
     velocity_mps : (poses, 3), optional
-        Turns the paths by their Doppler shift over the times.
+        Velocity of the UAV, which rotates the phases of the paths by their Doppler shift over ``times_s``.
     times_s : (times,)
 
     Returns
@@ -300,7 +301,7 @@ def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> 
     Raises
     ------
     UsageError
-        A band wider than a tenth of the carrier.
+        If the band is wider than a tenth of the carrier.
 
     Notes
     -----
@@ -310,7 +311,7 @@ def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> 
     check_band(float(np.ptp(offsets)) if len(offsets) else 0.0, ends.link.carrier_hz)
     gains, delays = (table.by_link(values, ends, 0.0) for values in (table.gain, table.delay_s))
     h = np.zeros((*gains.shape[1:], len(offsets)), dtype=np.complex128)
-    # a path of each link at a time: the product over all paths would take memory for each of them
+    # add one path per link at a time, because a product over all paths would need memory for each path
     for gain, delay in zip(gains, delays, strict=True):
         h += gain[..., None] * np.exp(-2j * np.pi * delay[..., None] * offsets)[:, :, None, None]
     return h
@@ -327,14 +328,14 @@ def check_band(bandwidth_hz: float, carrier_hz: float) -> None:
 
 
 def subcarriers_hz(bandwidth_hz: float, count: int) -> FloatArray:
-    """Return offsets (count,) of subcarriers from the carrier, as an FFT centred on it has them.
+    """Return offsets (count,) of subcarriers from the carrier, in the order of an FFT centred on the carrier.
 
     Examples
     --------
     >>> subcarriers_hz(4.0, 4).tolist()
     [-2.0, -1.0, 0.0, 1.0]
     """
-    # as np.fft.fftshift orders them: with an even count the lowest has no partner
+    # like np.fft.fftshift: with an even count the lowest frequency has no positive counterpart
     return np.asarray((np.arange(count) - count // 2) * (bandwidth_hz / count))
 
 
@@ -425,11 +426,11 @@ class Replay:
         )
 
     def path_table(self, names: dict[str, int] | None = None) -> PathTable:
-        """Return every path with delay, gain per element pair and directions. ``names`` continues earlier poses."""
+        """Return every path with delay, gain per element pair and directions. ``names`` are those of earlier poses."""
         return path_table(self.contributions, self.faces, self.ends, self.has_path, {"": 0} if names is None else names)
 
     def paths_frame(self) -> Any:
-        """Return a row per path: ``pose tower kind faces delay_s power_db`` and the angles [deg] of both ends.
+        """Return a row for each path: ``pose tower kind faces delay_s power_db`` and the angles [deg] of both ends.
 
         ``power_db`` is the mean over the element pairs.
         """
@@ -514,7 +515,7 @@ def replay(
     Raises
     ------
     UsageError
-        Unknown tower or engine, a scene too large for ``image``.
+        If a tower or the engine is unknown, or the scene is too large for ``image``.
     """
     started = time.perf_counter()
     if search.engine not in ("image", "sionna"):
@@ -531,7 +532,7 @@ def replay(
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
     # report a damaged entry: the numbers are right, but the time is not
     notes += map(Omission, cache.warnings) if cache else []
-    # on the scene before terrain changes it: these paths reflect off level ground
+    # use the scene without terrain planes, because these paths reflect off level ground
     further = further_paths(site, scene, link, poses, search, field)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
     fields, has_path = _channels(scene, link, poses, paths, [added for _, added in further], field)
@@ -560,7 +561,7 @@ def replay(
 def passed(
     site: Site, scene: Scene, link: Link, poses: Poses, paths: PathSet, search: Search
 ) -> tuple[Scene, PathSet, list[Omission]]:
-    """Return the paths that the terrain does not stop, and those that reflect off it.
+    """Return the paths that the terrain does not block, and the paths that reflect off it.
 
     Parameters
     ----------
@@ -584,7 +585,7 @@ def passed(
     notes += [Omission("paths end at the terrain of the elevation model", (lost, len(level)))]
     paths = level.select(clear) if lost else level
     if len(shaped):
-        # None: adjacent planes of terrain are not repeated faces
+        # pass no faces: adjacent terrain planes are not repeated faces
         paths = mirror.merge([paths, shaped], search.max_depth, None)
     return scene, paths, notes
 
@@ -602,7 +603,7 @@ def further_paths(
     Returns
     -------
     list of (Further, Fields)
-        Without paths that the terrain stops or that lose all.
+        Paths that the terrain blocks or that have infinite loss are excluded.
     """
     pieces = []
     for find in search.further:
@@ -634,7 +635,7 @@ def _shaped_ground(
 
 
 def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:
-    """Return paths (paths,) that the elevation model lets through.
+    """Return which paths (paths,) the elevation model does not block.
 
     For a line of sight or a reflection off level ground the direct line between the ends decides. For a path over walls
     alone each of its segments decides.
@@ -704,7 +705,8 @@ def trace(
         Poses, or positions east, north and up of the site's origin [m]. A UAV at a plain position is level, with its
         nose to the east.
     engine : {"image", "sionna"}
-        The exact image method, or Sionna RT's PathSolver as path finder; fields are float64 either way.
+        The exact image method, or Sionna RT's PathSolver as path finder. Fields are computed in float64 with both
+        engines.
     max_depth : int
         Largest number of reflections, 0 to 3.
     loss : callable, optional
@@ -722,12 +724,13 @@ def trace(
     Raises
     ------
     UsageError
-        An unknown site, tower or engine, poses of another shape, a scene too large for ``image``.
+        If the site, a tower or the engine is unknown, poses have another shape, or the scene is too large for
+        ``image``.
 
     Notes
     -----
     ``H[m, n] = sum_p a_p(m, n)`` over the paths p, each with its own length per pair of elements (spherical waves);
-    ``a_p`` by free space, Fresnel coefficients and the elements' patterns (ITU-R P.2040).
+    ``a_p`` is the product of free-space loss, Fresnel coefficients (ITU-R P.2040) and the elements' patterns.
 
     Examples
     --------
@@ -739,7 +742,7 @@ def trace(
     place = site if isinstance(site, Site) else load_site(site)
     search = Search(engine, max_depth=max_depth, samples=samples, further=diffracted(diffraction))
     if isinstance(poses, Poses):
-        # a masked value is missing: NaN, not the number under the mask
+        # use NaN for a masked value, because the number under the mask is not valid
         poses = Poses(unmasked(poses.position_m), unmasked(poses.rotation))
     else:
         poses = _level(poses)

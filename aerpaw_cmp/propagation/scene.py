@@ -52,7 +52,7 @@ class Scene:
             )
         surfaces, towers = surfaces_of(site), [site.towers[name] for name in names]
         sources = np.array([tower.position_m for tower in towers]).reshape(-1, 3)
-        # excluded before the search, which would follow every face for a link that cannot exist
+        # exclude such links before the search, which would otherwise try every face for them
         excluded = inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
         if surfaces is not None:
             usable = np.ones((len(names), len(surfaces)), dtype=np.bool_)
@@ -65,7 +65,7 @@ class Scene:
         # a pose below a tower's plane but above the lowest ground, or above the terrain, is not buried
         lowest = np.minimum(ground, 0.0)[:, None]
         if site.dem is not None:
-            # fmin, not minimum: outside the model (NaN) the plane decides
+            # use fmin: outside the elevation model (NaN) the tower's plane is the limit
             lowest = np.fmin(lowest, site.dem.ground_m(*poses.position_m[:, :2].T))
         return cls(faces, sources, usable, excluded | (poses.position_m[:, 2] < lowest))
 
@@ -75,7 +75,7 @@ class Scene:
 
 
 def surfaces_of(site: Site) -> Surfaces | None:
-    """Return the faces of the site's scene of triangles and of its buildings. None without such a scene."""
+    """Return the faces of the site's scene of triangles and of its buildings. None if the site has no such scene."""
     if site.scene is None:
         return None
     scene = site.scene
@@ -106,7 +106,7 @@ REACH_M = 100_000.0
 
 @dataclass(frozen=True, slots=True)
 class Omission:
-    """A part that a replay does not model. ``counts`` is empty, or the number, or the number and the total."""
+    """A part that a replay does not model. ``counts`` is empty, (number,) or (number, total)."""
 
     what: str
     counts: tuple[int, ...] = ()
@@ -118,16 +118,16 @@ class Omission:
 
 
 def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[Omission]]:
-    """Return the poses with NaN for those that cannot be replayed, so that the others keep their paths.
+    """Return the poses, with NaN for poses that cannot be replayed, and the omissions.
 
-    Tolerances grow with the size of the scene: one pose at 1e12 m would change the paths of all. A pose without a
-    rotation has no field.
+    Tolerances grow with the size of the scene, so one pose at 1e12 m would change the paths of all poses. A pose
+    without a rotation has no field.
     """
     towers = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
     known = np.isfinite(poses.position_m).all(axis=1)
     turned = np.isfinite(poses.rotation).all(axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
-        # tower by tower: an array of all pairs would grow with both
+        # loop over towers, because an array of all pairs would grow with poses and towers
         far = np.ones(len(poses), dtype=np.bool_)
         for place in towers:
             # hypot does not overflow, unlike squares of 1e200
@@ -152,7 +152,7 @@ def buried_towers(site: Site, link: Link) -> list[Omission]:
     lines = []
     names = list(link.tower_arrays)
     places = np.array([site.towers[name].position_m for name in names]).reshape(-1, 3)
-    # one building after the other to find the name, for buried towers only
+    # test building by building to find its name, for buried towers only
     for number in np.flatnonzero(inside_solids(site, places)):
         name = names[number]
         for building in site.buildings:

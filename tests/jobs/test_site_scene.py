@@ -139,7 +139,7 @@ def test_a_report_of_a_scene_is_audited_and_its_paths_explained(
     assert audit["links"] == 3
     assert audit["field"]["paths"] > 3
     assert audit["field"]["power_max_db"] < 0.1
-    assert "the second implementation: it knows prisms, no scene of triangles" in audit["field"]["not_covered"]
+    assert "the second implementation, which supports only prisms, not triangles" in audit["field"]["not_covered"]
     capsys.readouterr()
     assert main(["explain", str(flown), "--time", "4", "--tower", "T", "--json", "--quiet"]) == 0
     explained = json.loads(capsys.readouterr().out)

@@ -49,7 +49,7 @@ def test_no_file_of_the_working_folder_tells_numba_what_to_write(tmp_path, monke
     """``chrome_trace: thesis.tex`` there made numba replace the thesis at the end of the command."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / ".numba_config.yaml").write_text("chrome_trace: thesis.tex\n")
-    assert "the working folder holds a .numba_config.yaml" in compiled._failure.__wrapped__()
+    assert "the working folder contains a .numba_config.yaml" in compiled._failure.__wrapped__()
 
 
 def test_no_pose_is_shared_by_two_threads(case):

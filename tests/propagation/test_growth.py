@@ -139,7 +139,7 @@ def test_flipped_and_degenerate_triangles_change_nothing():
     ends = np.array([[0, 0, 3.0]]), np.array([[2.0, 1, 4]])
     expected = grow_paths(merged(enumerate_.scene_of(sheet)), Links(*ends), max_depth=2)
     surfaces = merged(enumerate_.scene_of(np.concatenate([flipped, needle])))
-    assert surfaces.notes == ("1 triangle was dropped for want of an area",)
+    assert surfaces.notes == ("1 triangle was dropped: no area",)
     paths = grow_paths(surfaces, Links(*ends), max_depth=2)
     assert np.allclose(paths.vertices_m, expected.vertices_m, equal_nan=True)
 

@@ -1,1 +1,1 @@
-"""Second ways: an independent reference, the audit by the other engine, explanations. Nothing above imports it."""
+"""Checks of a replay: an independent reference, the audit by the other engine, and explanations of paths."""

@@ -79,7 +79,7 @@ class Expected:
 
     @classmethod
     def of(cls, link: Link, loss: ExpectedLoss | None = None) -> Expected:
-        """Return the settings of a link: its layout, slants and mounts as they are."""
+        """Return the settings of a link, with its layout, slants and mounts unchanged."""
         towers = {name: expected_array(array) for name, array in link.tower_arrays.items()}
         uav = expected_array(link.uav_array)
         settings = (link.carrier_hz, link.transmit_power_dbm, link.uav_transmits)
@@ -158,14 +158,14 @@ def against_reference(
             total += link.paths_checked(max_depth, site.dem is None)
             try:
                 total += link.field_checked(ks)
-            # a material outside the second implementation's table of P.2040
+            # the second implementation's table of P.2040 does not contain the material
             except LookupError as error:
                 total += FieldAudit(not_covered=(f"the material {error.args[0]} at this carrier",))
     return total
 
 
 def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expected: Expected) -> FieldAudit:
-    """Count the paths ``rows`` of a replay, which the other engine does not have, that cannot exist.
+    """Count the paths of a replay that the other engine does not have and that cannot exist.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def _verdicts(
     site: Site, replay: Replay, paths: PathSet, faces: Faces, poses: Poses, rows: IntArray, expected: Expected,
     margin_m: float = MARGIN_M,
 ) -> list[bool | None]:  # fmt: skip
-    """Return whether each of the paths ``rows`` exists by the second implementation. None means doubtful."""
+    """Check whether each path of ``rows`` exists according to the second implementation. None means doubtful."""
     references = [Reference(site, name, expected.link, expected.loss) for name in replay.towers]
     verdicts = []
     for row in rows:
@@ -285,7 +285,7 @@ class _OneLink:
         """Compare H, RSS and rank of the replay with the expected ``h`` and total path ``power`` of a link."""
         link, ours, failures = self.reference.link, self.replay.h[self.row, self.tower], []
         over = _decibel(float((np.abs(h) ** 2).mean())) + link.transmit_power_dbm - link.noise_floor_dbm
-        # so close to the noise floor that rounding decides whether there is a channel
+        # this close to the noise floor, rounding decides whether there is a channel
         if abs(over) < 1e-3:
             return FieldAudit(doubtful=1)
         if over < 0:  # below the receiver's floor: no channel
@@ -300,7 +300,7 @@ class _OneLink:
             failures.append(f"{self.name}: H differs by {error:.2g} of its size")
         worst, level_of_h = 0.0, float((np.abs(h) ** 2).mean())
         for level, value in ((self.replay.rss_dbm, level_of_h), (self.replay.rss_power_dbm, 0.0 if under else power)):
-            # the coherent level comes from H, the other from the path powers
+            # the coherent level is computed from H, and the other level from the path powers
             off = _level_error(float(level[self.row, self.tower]), value, link.transmit_power_dbm, size)
             if off > 1e-3:
                 failures.append(f"{self.name}: RSS differs by {off:.2g} dB")
@@ -329,9 +329,9 @@ def _decibel(power: float) -> float:
 
 
 def _level_error(level_dbm: float, power: float, transmit_dbm: float, size: float) -> float:
-    """Return how far a level exceeds the rounding error of a fade [dB].
+    """Return the error of a level [dB] beyond the rounding error, which is large in a fade.
 
-    Infinite if only one of the two is in coverage.
+    The error is infinite if only one of the two levels is in coverage.
     """
     if power <= (1e-9 * size) ** 2:  # no power, or a fade deeper than 180 dB
         return 0.0 if not math.isfinite(level_dbm) or power > 0 else math.inf
@@ -470,7 +470,7 @@ def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
     def centre(array: Array) -> Array:
         first = array.patterns[0]
         if first.name not in _SIONNA_PATTERNS:
-            unasked.append(f"the antenna pattern '{first.name}' (Sionna is asked with isotropic elements)")
+            unasked.append(f"the antenna pattern '{first.name}' (Sionna computes with isotropic elements instead)")
             first = Isotropic()
         return Array(np.zeros((2, 3)), np.array([0.0, np.pi / 2]), (first,), array.mount)
 
@@ -508,7 +508,7 @@ def _paths_against_sionna(
     rss = _link_error(ours, h, theirs.gain, near, len(few), len(replay.towers))
     failures = []
     for error, bad, unit in (
-        # not share > allowed: NaN must be a failure, too
+        # negate the comparison, so that NaN counts as a failure
         (power, ~(share <= allowed), "dB"),
         (phase, near & ~(phase <= _PHASE_TOLERANCE_RAD), "rad"),
     ):
@@ -544,8 +544,8 @@ def _turned_by_float32(
     """
     mounts = np.stack([array.mount for array in probe.tower_arrays.values()])
     ends = scene.sources_m[ours.tower], spots.position_m
-    # as search.sionna builds its ground: coordinates so large round a reflection point
-    reach = 4.0 * max(float(np.abs(np.concatenate(ends)).max()), 100.0)  # size of the ground's triangles
+    # use the size of the ground in search.sionna, because float32 rounds coordinates in proportion to it
+    reach = 4.0 * max(float(np.abs(np.concatenate(ends)).max()), 100.0)
     shift = np.nan_to_num(np.abs(theirs.paths.vertices_m - ours.vertices_m)).max(axis=(1, 2), initial=0.0)
     axes = [mounts[ours.tower][:, :, 2], (spots.rotation @ probe.uav_array.mount)[:, :, 2]]
     both = (list(legs(ends[0], vertices, ends[1])) for vertices in (ours.vertices_m, theirs.paths.vertices_m))
@@ -666,7 +666,7 @@ class Second:
     ks : sequence of float
         Singular-value ratios of the rank comparison.
     reference_links : int
-        Poses that the second implementation computes.
+        Number of poses that the second implementation computes.
     known : dict
         Sionna's own coefficients by the digest of their inputs: channels with the same tower and track share them.
     """
@@ -710,7 +710,7 @@ def audit(
     fields, ks, expected = None, second.ks, second.expected
     if expected is not None:
         # open sheets need a separate formula, which the second implementation does not have
-        fields = FieldAudit(not_covered=("the second implementation: it knows prisms, no scene of triangles",))
+        fields = FieldAudit(not_covered=("the second implementation, which supports only prisms, not triangles",))
         if site.scene is None:
             few_kinds = spread_over_paths(replay, chosen, second.reference_links)
             fields = against_reference(site, poses, replay, few_kinds, expected, ks=ks, max_depth=search.max_depth)
@@ -792,7 +792,7 @@ def _of_chosen(paths: PathSet, chosen: IntArray) -> tuple[IntArray, PathSet]:
 
 def _keyed(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Faces) -> tuple[list[_Key], list[_Key]]:
     """Return pose, tower and planes of each path of two sets. Coplanar faces are the same mirror."""
-    # numbered together, because the terrain planes that a replay lists depend on its poses
+    # number the planes of both together, because a replay numbers its terrain planes by its own poses
     plane = planes_of(joined(our_faces, their_faces))
     return plane_keys(ours, plane[: len(our_faces)]), plane_keys(theirs, plane[len(our_faces) :])
 

@@ -104,7 +104,7 @@ def explain_paths(
     link : Link
         The link with only that tower.
     further_db : dict of str to (paths,)
-        Losses in addition to the field's own [dB], positive, by name.
+        Positive losses [dB] by name, in addition to those that the field includes.
 
     Returns
     -------
@@ -214,7 +214,7 @@ def _bounce(faces: Faces, face: int, point: FloatArray, leg: FloatArray, link: L
         east_m=float(point[0]),
         north_m=float(point[1]),
         up_m=float(point[2]),
-        # rounding takes the cosine of normal incidence beyond 1
+        # rounding can make the cosine at normal incidence larger than 1
         incidence_deg=float(np.degrees(np.arccos(min(cosine, 1.0)))),
         te_db=float(db_from_amplitude(abs(te))),
         tm_db=float(db_from_amplitude(abs(tm))),
@@ -223,7 +223,7 @@ def _bounce(faces: Faces, face: int, point: FloatArray, leg: FloatArray, link: L
 
 
 def power_sum_dbm(paths: tuple[ExplainedPath, ...]) -> float:
-    """Return the level of the paths' powers added [dBm]."""
+    """Return the level of the sum of the paths' powers [dBm]."""
     return float(db_from_power(sum(float(power_from_db(path.level_dbm)) for path in paths)))
 
 
@@ -255,7 +255,7 @@ def why_not(
     sequence = sequence[sequence >= 0]
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
     # on unbounded planes, so that the message can give the distance in metres by which a point misses its face
-    planes = Faces(faces.normal, faces.offset_m, faces.material, faces.label)  # every face as an unbounded plane
+    planes = Faces(faces.normal, faces.offset_m, faces.material, faces.label)
     points, ahead = retraced(planes, sequence[None], source_m[None], target_m[None], tolerance)
     if not ahead[0]:
         return "an end or an image lies behind a face: it has no reflection point"
@@ -265,7 +265,7 @@ def why_not(
         if far > tolerance:
             return f"its reflection point lies {_metres(far)} outside {faces.label[face]}"
     corners = np.concatenate([source_m[None], points[0], target_m[None]])
-    # building by building, to name the one in the way
+    # test building by building, to name the building that blocks the path
     for solid in np.unique(faces.solid[faces.solid >= 0]):
         members = np.flatnonzero(faces.solid == solid)
         if Occlusion(faces.select(members), tolerance).segments(corners[:-1], corners[1:]).any():
@@ -283,7 +283,7 @@ def _why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArra
     points = np.zeros((0, 3))
     if len(sequence):
         ends = source_m[None], target_m[None]
-        # check the sides first, with faces of any size; then whether the points lie in their faces
+        # first check the sides with faces of any size, then check whether the points lie in their faces
         _, _, ahead = reflection_points(surfaces, sequence[None], *ends, edge_m=1e9)
         if not ahead[0]:
             return "the ends of a reflection lie on two sides of its face"

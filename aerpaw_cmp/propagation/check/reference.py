@@ -33,10 +33,10 @@ C_MPS = 299_792_458.0
 # CODATA 2018. All constants of this file are typed a second time.
 _EPS0 = 8.8541878128e-12
 
-# Paths that a change of the geometry by this much makes or breaks are not judged.
+# Paths that appear or disappear if the geometry changes by this distance are not judged.
 MARGIN_M = 1e-6
 
-# ITU-R P.2040-4 table 3: lowest and highest GHz, a, b, c, d; and the thickness of a wall of it [m], None a half-space
+# ITU-R P.2040-4 table 3: lowest and highest GHz, a, b, c, d; and the thickness of a wall [m], or None for a half-space
 _P2040: dict[str, tuple[float, float, float, float, float, float, float | None]] = {
     "vacuum": (0.001, 100, 1.0, 0.0, 0.0, 0.0, None),
     "concrete": (1, 100, 5.24, 0.0, 0.0462, 0.7822, 0.3),
@@ -81,7 +81,7 @@ class ExpectedArray:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedLink:
-    """Radio settings as they were given."""
+    """Radio settings of a link, as configured."""
 
     carrier_hz: float
     transmit_power_dbm: float
@@ -93,7 +93,7 @@ class ExpectedLink:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedLoss:
-    """Foliage and reflection loss as they were given.
+    """Foliage and reflection loss, as configured.
 
     Parameters
     ----------
@@ -200,8 +200,8 @@ def turned(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix:
 
 
 def aircraft(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Matrix:
-    """Return the rotation from forward-left-up to east-north-up, by the textbook's forward-right-down axes."""
-    # right turns about down, right and forward: heading, nose up and right wing down
+    """Return the rotation from forward-left-up to east-north-up, by the forward-right-down axes of textbooks."""
+    # heading, nose up and right wing down are right-handed rotations about down, right and forward
     to_ned = turned(yaw_deg, pitch_deg, roll_deg)
     enu_of_ned: Matrix = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
     frd_of_flu: Matrix = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
@@ -218,7 +218,7 @@ def matrix_of(values: FloatArray) -> Matrix:
 
 @dataclass(frozen=True, slots=True)
 class Mirror:
-    """One reflecting plane: a wall, a roof, the ground, or a facet that was given.
+    """One reflecting plane: a wall, a roof, the ground, or a given facet.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ def _edges(part: shapely.Polygon) -> Iterator[tuple[tuple[float, ...], tuple[flo
     for hole, ring in enumerate((part.exterior, *part.interiors)):
         points = list(ring.coords)
         for a, b in itertools.pairwise(points if ring.is_ccw is (hole == 0) else points[::-1]):
-            # a map may repeat a corner
+            # skip edges without length, because a map may repeat a corner
             if a[:2] != b[:2]:
                 yield a, b
 
@@ -400,7 +400,7 @@ class _Planes(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Links of one tower computed the slow way.
+    """Links of one tower, computed path by path with slow independent formulas.
 
     Parameters
     ----------
@@ -431,9 +431,9 @@ class Reference:
         return (tower.east_m, tower.north_m, tower.ground_m + tower.antenna_height_m)
 
     def sequences(self, target: Vector, max_depth: int, budget: int = 20_000) -> list[tuple[Mirror, ...]] | None:
-        """Return all sequences that may lead to a target. None if there are more than ``budget`` from the tower.
+        """Return all sequences of mirrors that may lead to a target. None if more than ``budget`` start at the tower.
 
-        Their images lie on the right sides, and their points of reflection within the boxes of the faces.
+        The images of these sequences are on the correct sides, and the reflection points are in the boxes of the faces.
         """
         if (max_depth, budget) not in self._chains:
             self._chains[max_depth, budget] = self._from_source(max_depth, budget)
@@ -444,14 +444,14 @@ class Reference:
         return [tuple(self.mirrors[k] for k in row) for rows in near for row in rows.tolist()]
 
     def _from_source(self, max_depth: int, budget: int) -> list[_Chains] | None:
-        """Return mirrors and images, by depth, of the sequences that can begin at the tower, for any other end."""
+        """Return mirrors and images, by depth, of the sequences that can start at the tower, for any target."""
         rows, images = np.zeros((1, 0), dtype=np.int64), np.array(self.source)[None, None]
         levels = [(rows, images)]
         for depth in range(max_depth):
             height = images[:, -1] @ self._planes.normal.T - self._planes.offset_m
             # the source may lie on a face; an image may not
             facing = height > (0.0 if depth else -MARGIN_M)
-            # a face twice in a row would send the ray back into itself
+            # exclude the same face twice in a row, because it would send the ray back into itself
             if depth:
                 facing[np.arange(len(rows)), rows[:, -1]] = False
             past, mirror = np.nonzero(facing)
@@ -485,7 +485,7 @@ class Reference:
         for step, mirror in enumerate(sequence):
             before, after = mirror.height(points[step]), mirror.height(points[step + 2])
             worst = min(worst, before + margin_m * (step == 0), after + margin_m * (step == last))
-        if worst >= -margin_m:  # the distance from the edges of faces takes longer to compute
+        if worst >= -margin_m:  # the distance from edges takes longer, so compute it last
             worst = min([worst, *(m.margin(p) for m, p in zip(sequence, points[1:-1], strict=True))])
         if worst < -margin_m:
             return False
@@ -576,7 +576,7 @@ class Reference:
                 trunks += crown_depth_m(self.site.trees, a, b, trunks=True)
         if self.loss.model == "opaque":
             touched = depth + trunks
-            # a chord of a micrometre is there or not by rounding
+            # rounding decides whether a chord of a micrometre exists
             return None if 0 < touched < 1e-6 else (math.inf if touched else total)
         return total + foliage_db(self.loss, depth, self.link.carrier_hz)
 
@@ -667,7 +667,7 @@ def element_wave(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -
     """
     back: Matrix = tuple(zip(*turn, strict=True))  # type: ignore[assignment]
     x, y, z = _times(back, ray)
-    # not acos(z), which has half of the digits near the poles
+    # use atan2, because acos(z) loses half of the digits near the poles
     theta, phi = math.atan2(math.hypot(x, y), z), math.atan2(y, x)
     e_theta, e_phi = array.patterns[number](theta, phi)
     slant = math.radians(array.slants_deg[number])
@@ -699,9 +699,12 @@ def _bounces(sequence: Sequence[Mirror], source: Vector, target: Vector) -> list
 
 
 def foliage_db(loss: ExpectedLoss, depth_m: float, carrier_hz: float) -> float:
-    """Return the loss in foliage [dB] by ITU-R P.833 woodland or Weissberger. Leafless trees attenuate 1/1.2 of it."""
+    """Return the loss in foliage [dB] by ITU-R P.833 woodland or Weissberger.
+
+    The loss of leafless trees is divided by 1.2.
+    """
     if loss.model == "weissberger":
-        # Weissberger's models are of trees in leaf
+        # Weissberger's model is for trees in leaf
         f = (carrier_hz / 1e9) ** 0.284 / (1.0 if loss.in_leaf else 1.2)
         return float(f * (0.45 * depth_m if depth_m <= 14 else 1.33 * depth_m**0.588))
     gamma, largest = _p833(carrier_hz / 1e6)
@@ -737,12 +740,12 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -
     a, b : (3,)
         Ends of the segment [m].
     trunks : bool
-        Cylinders below the cones replace them.
+        If true, use the trunks (cylinders below the cones) instead of the crowns.
 
     Returns
     -------
     float
-        [m]
+        Length [m].
     """
     start, step = np.array(a), np.array(b) - np.array(a)
     length = float(np.sqrt((step**2).sum()))
@@ -751,7 +754,7 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -
     radius = (trees.trunk_diameter_m if trunks else trees.crown_diameter_m) / 2
     flat = step[0] ** 2 + step[1] ** 2
     east, north = trees.east_m - start[0], trees.north_m - start[1]
-    # seen from above first: most trees are nowhere near the segment
+    # compare in plan first, because most trees are far from the segment
     near = np.clip((east * step[0] + north * step[1]) / flat, 0, 1) if flat > 0 else np.zeros(len(trees))
     close = np.hypot(east - near * step[0], north - near * step[1]) < radius
     close &= (min(a[2], b[2]) < top) & (max(a[2], b[2]) > base) & (radius > 0) & (top > base)
@@ -767,7 +770,7 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -
         return np.asarray(np.maximum(np.maximum(low - up, up - high), side - reach))
 
     left, right, ratio = np.zeros(len(rows)), np.ones(len(rows)), (math.sqrt(5) - 1) / 2
-    # 0.618 to the power of 70 is 2e-15: to rounding
+    # 0.618 to the power of 70 is 2e-15, about the rounding error
     for _ in range(70):
         near_left, near_right = right - ratio * (right - left), left + ratio * (right - left)
         lower = outside(near_left) < outside(near_right)
@@ -775,7 +778,7 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -
     middle = (left + right) / 2
     inside = outside(middle) < 0
     ends = []
-    # from the middle, which is inside, to either end
+    # bisect from the minimum, which is inside, to both ends of the segment
     for edge in (0.0, 1.0):
         within, beyond = middle, np.full(len(rows), edge)
         for _ in range(50):

@@ -19,7 +19,7 @@ def free_space_dbm(
     Parameters
     ----------
     sources_m : (towers, 3) or (poses, towers, 3)
-        The latter for towers that move.
+        The second shape is for towers that move.
     targets_m : (poses, 3)
     carrier_hz, transmit_power_dbm : float
 
@@ -56,11 +56,12 @@ def two_ray_dbm(
     ground_m : float or (towers,)
         Height of the ground at each tower.
     polarisation : {"vertical", "horizontal"}
-        Decides the Fresnel coefficient: TM or TE. For vertical antennas whose gain does not depend on direction
-        this is the field along theta, which the reflection keeps.
+        Determines the Fresnel coefficient: TM for vertical, TE for horizontal. Vertical antennas with the same gain in
+        all directions have a field along theta, which stays along theta after the reflection.
     roughness_m : float
         Standard deviation of the ground's height: the specular ray falls by ``exp(-2 (k sigma sin(grazing))^2)``
-        (Ament, Proc. IRE 41 (1953), 142-146, doi:10.1109/JRPROC.1953.274171); an infinite roughness leaves free space.
+        (Ament, Proc. IRE 41 (1953), 142-146, doi:10.1109/JRPROC.1953.274171); with infinite roughness only free space
+        remains.
 
     Returns
     -------
@@ -70,7 +71,7 @@ def two_ray_dbm(
     wavelength = wavelength_m(carrier_hz)
     across = np.linalg.norm(targets_m[:, None, :2] - sources_m[..., :2], axis=2)
     ground = np.broadcast_to(np.asarray(ground_m, dtype=np.float64), (sources_m.shape[-2],))
-    # above the ground of that tower: each has a separate plane
+    # heights above the ground of each tower, because each tower has a separate ground plane
     low = np.atleast_2d(sources_m[..., 2]) - ground
     high = targets_m[:, None, 2] - ground[None, :]
     direct = np.hypot(across, high - low)
@@ -80,7 +81,7 @@ def two_ray_dbm(
         te, tm = reflection_coefficients(np.abs(high + low) / bounced, eta, np.asarray(np.inf), wavelength)
         sine = np.abs(high + low) / bounced
         gamma = (tm if polarisation == "vertical" else te) * specular_factor(roughness_m, sine, wavelength)
-        # the difference of the two lengths, without cancellation
+        # difference of the two lengths, in a form without cancellation
         extra = 4.0 * high * low / (bounced + direct)
         field = 1.0 / direct + gamma / bounced * np.exp(-2j * np.pi * extra / wavelength)
         level = transmit_power_dbm + db_from_amplitude(wavelength / (4.0 * np.pi) * np.abs(field))
@@ -88,7 +89,7 @@ def two_ray_dbm(
 
 
 def specular_factor(roughness_m: float, sine_grazing: FloatArray, wavelength_m: float) -> FloatArray:
-    """Return the share of the field that rough ground still reflects as a mirror: ``exp(-2 (k sigma sin(grazing))^2)``.
+    """Return the share of the field that rough ground reflects specularly: ``exp(-2 (k sigma sin(grazing))^2)``.
 
     Source: Ament, Proc. IRE 41 (1953), 142-146, doi:10.1109/JRPROC.1953.274171.
 

@@ -44,12 +44,12 @@ def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector
     frame, axes : Rotation
         Device axes of the tower in the last space, and of the UAV.
     tower_m, uav_m : Vector
-        Places of the elements in their devices [m].
+        Positions of the elements in their device frames [m].
 
     Returns
     -------
     x, y, z, length
-        Zero where the two meet.
+        All are 0 if the two positions coincide.
     """
     ends = zip(place_m, turned_back(axes, uav_m), image_m, turned_back(frame, tower_m), strict=True)
     x, y, z = (place + uav - (image + tower) for place, uav, image, tower in ends)
@@ -117,7 +117,7 @@ def reflected(wave: Vector, toward: Vector, normal: Vector, te: Number, tm: Numb
     Parameters
     ----------
     wave : Vector
-        The wave before.
+        Field vector before the reflection.
     toward, normal : Vector
         Unit vectors of the ray and of the face, in the last space.
     te, tm : Number
@@ -136,7 +136,7 @@ def reflected(wave: Vector, toward: Vector, normal: Vector, te: Number, tm: Numb
 
 
 def spreading(cycles: Number) -> Number:
-    """Return ``lambda / (4 pi L)`` for a length in wavelengths, at most 1: not more power arrives than was sent."""
+    """Return ``lambda / (4 pi L)`` for a length in wavelengths, at most 1, as no gain is possible."""
     # where two elements coincide the length is zero: infinity becomes 1
     return np.minimum(1.0, 1.0 / (4.0 * np.pi * cycles))
 

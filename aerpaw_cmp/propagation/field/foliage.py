@@ -4,17 +4,17 @@ Crowns are not in the traced scene. The polyline of each path (source, reflectio
 every crown near the path. The chords add up to the path's depth in foliage, and a model converts depth into loss. A
 changed parameter does not require new ray tracing, and foliage does not change the phase.
 
-Where crowns overlap both chords count. Trunks count only for :class:`Opaque`: as thin cylinders they shade
-centimetres, and crowns shade metres.
+Where crowns overlap, both chords count. Trunks count only for :class:`Opaque`: the shadow of a trunk is centimetres
+wide, and that of a crown is metres wide.
 
-For forests that are a medium, the loss is that through the canopy, over it and around it.
+A forest can also be modelled as a medium. Its loss combines the components through, over and around the canopy.
 
 A forest stand is a forest with a height: crowns from ``crown_base_m`` up to ``height_m`` over its area, trunks below. A
-segment of a path passes it by three components whose powers add up (ITU-R P.833-10 section 3.2): through the canopy,
-over the top, and around either side. The loss through the canopy depends on the length inside it. The way over the top
-has two knife edges, where the ray enters and leaves. Near the top, part of the Fresnel zone is in the canopy. The
-component through the canopy is then that of a ray lowered until the zone is below the top, and the detours only add the
-power that is missing. The level therefore has no step where a ray leaves the canopy.
+segment of a path passes the stand by three components whose powers add up (ITU-R P.833-10 section 3.2): through the
+canopy, over the top, and around either side. The loss through the canopy depends on the length inside it. The way over
+the top has two knife edges, where the ray enters and leaves. Near the top, part of the Fresnel zone is in the canopy.
+There, the component through the canopy is that of a ray lowered until the zone is below the top, and the detours only
+add the missing power. The level therefore has no step where a ray leaves the canopy.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...site.site import Forest, Site, Trees
 from ..geometry import legs
 
-# Form of a crown between its base and the tree's top; the paper's is the cone.
+# Form of a crown between its base and the tree's top. The paper uses the cone.
 Shape = Literal["cone", "cylinder"]
 
 # ITU-R P.833: near 1 GHz trees in leaf attenuate about 20 % more (dB/m) than leafless ones.
@@ -230,9 +230,9 @@ def foliage_loss_db(
     vertices_m : (paths, depth, 3)
         Reflection points in order; NaN where unused. ``depth`` may be 0.
     trees : Trees or CrownIndex
-        Keep an index when many batches of paths meet the same trees.
+        Pass an index if many batches of paths meet the same trees.
     model : FoliageModel
-        Depth to loss.
+                Model that converts depth into loss.
 
     Returns
     -------
@@ -295,7 +295,7 @@ class CrownIndex:
     Parameters
     ----------
     trees : Trees
-        Any number.
+                Trees to index; there may be none.
     shape : {"cone", "cylinder"}
         Form of all bodies.
     """
@@ -437,7 +437,7 @@ def slab(
     Returns
     -------
     first, last : (n,)
-        first > last where there is none.
+        ``first > last`` if there is no such interval.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         at_low, at_high = (low - at) / step, (high - at) / step
@@ -495,9 +495,9 @@ def _quadric_share(
     return np.where(missed, 0.0, np.maximum(inside, 0.0))
 
 
-# Loss per metre between trunks over that in crowns: assumed.
+# Assumed ratio of the loss per metre between trunks to that in crowns.
 TRUNKS = 0.3
-# First Fresnel radii by which a ray clears a knife edge without loss.
+# Clearance at which a knife edge causes no loss, as a multiple of the first Fresnel radius.
 # At 0.55 of the first Fresnel radius nu is -0.78, where the knife edge's loss begins.
 _CLEAR = 0.55
 
@@ -608,7 +608,7 @@ class _Crossing:
         return self.stand.height_m
 
     def depth_m(self, lowered_m: FloatArray) -> FloatArray:
-        """Return the length (k,) in the canopy of segments lowered by (k,) [m]. That between trunks counts in part."""
+        """Return the length (k,) in the canopy of segments lowered by (k,) [m]. Trunk space counts in part."""
         way = self.end - self.start
         up, rise = (self.start[:, 2] - lowered_m)[self.piece] - self.ground_m, way[self.piece, 2]
         base = self.height_m * self.stand.crown_base_fraction
@@ -668,7 +668,7 @@ def _pieces(start: FloatArray, end: FloatArray, corner: FloatArray, last: IntArr
     (east, north), (side_east, side_north) = (corner[edge] - start[line]).T, (corner[edge + 1] - corner[edge]).T
     way_east, way_north = way[line].T
     share = (east * side_north - north * side_east) / (way_east * side_north - way_north * side_east)
-    # an odd number of sides behind the start: it begins inside
+    # if the number of sides behind the start is odd, the line begins inside
     inside = np.bincount(line[share <= 0.0], minlength=len(way)) % 2 == 1
     line, share = line[between := (share > 0.0) & (share < 1.0)], share[between]
     order, count = np.lexsort([share, line]), np.bincount(line, minlength=len(way))
@@ -733,7 +733,7 @@ def _around(stand: Forest, start: FloatArray, end: FloatArray) -> Iterator[Profi
 
 
 class Profile(NamedTuple):
-    """Edges under straight lines, a column of samples each.
+    """Edges under straight lines, one column of samples per line.
 
     ``length_m`` (links,) is the length of the lines, ``share`` (samples, links) the part of the line up to each sample,
     and ``intrusion_m`` the height of the edge above the line there. It is NaN if the height is unknown.
@@ -783,7 +783,7 @@ def deygout_db(profile: Profile, wavelength_m: float) -> FloatArray:
     # without an edge, any position is correct, because its loss is zero
     at, top = np.where(known, share[main, link], 0.5), np.where(known, intrusion_m[main, link], 0.0)
     for way, place in ((share, at), (1.0 - share, 1.0 - at)):
-        # above the line from the end to the top of the main edge
+        # heights above the line from the end to the top of the main edge
         height = intrusion_m - top * way / place
         side = _parameter(height, way * length_m, (place - way) * length_m, wavelength_m)
         edge = side.argmax(axis=0)

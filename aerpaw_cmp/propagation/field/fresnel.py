@@ -36,7 +36,7 @@ def half_space(cosine: FloatArray, eta: ComplexArray) -> tuple[ComplexArray, Com
 
 
 def echo(thickness: FloatArray, root: ComplexArray) -> ComplexArray:
-    """Return the factor of a wave's way through slabs and back, 0 for half-spaces. Thickness is in wavelengths."""
+    """Return the factor of the way through a slab and back, 0 for half-spaces. Thickness is in wavelengths."""
     finite = np.isfinite(thickness)
     # infinity times the root would be NaN
     return np.where(finite, np.exp(-4j * np.pi * np.where(finite, thickness, 0.0) * root), 0.0)
@@ -84,16 +84,16 @@ def reflection_coefficients(
     cos_theta : (...)
         Cosine of the angle of incidence, from the normal.
     permittivity : (...) complex
-        Relative, negative imaginary part.
+        Relative permittivity. Its imaginary part is negative.
     thickness_m : (...)
-        Infinite for a half-space.
+                Thickness of the slab, infinite for a half-space.
     wavelength : float
         Wavelength in air [m].
 
     Returns
     -------
     te, tm : (...) complex
-        Coefficients of the electric field across and in the plane of incidence.
+        Coefficients of the electric field perpendicular to the plane of incidence, and in it.
 
     Examples
     --------

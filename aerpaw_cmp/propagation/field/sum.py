@@ -35,11 +35,12 @@ PATHS_PER_PART = 4096
 
 
 class Geometry(NamedTuple):
-    """Some paths, each in the space of its last image.
+    """Columns of paths, each in the space of its last image.
 
-    ``image_m`` (paths, 3) is the tower there, ``frame`` (paths, 3, 3) its device axes as rows, ``normal`` (paths, most,
-    3) those of the faces and ``face`` (paths, most, 3) the row of :func:`face_table` of each; ``place_m`` and
-    ``axes`` are the UAV's. ``depth`` and ``tower`` (paths,) are those of the path set.
+    ``image_m`` (paths, 3) is the image of the tower, and ``frame`` (paths, 3, 3) contains its device axes as rows.
+    ``normal`` (paths, most, 3) contains the normals of the faces, and ``face`` (paths, most, 3) their rows of
+    :func:`face_table`. ``place_m`` and ``axes`` are the position and the device axes of the UAV. ``depth`` and
+    ``tower`` (paths,) are those of the path set.
     """
 
     image_m: FloatArray
@@ -59,8 +60,8 @@ class Geometry(NamedTuple):
 class Elements(NamedTuple):
     """Elements of both ends, spread over the pairs of a link: pair p joins UAV element p // ports and port p % ports.
 
-    Places (towers, 3, pairs) and (3, pairs) in the devices [m]; cosine and sine of the slants (towers, 2, pairs) and
-    (2, pairs).
+    Positions (towers, 3, pairs) and (3, pairs) are in the device frames [m]. Slants (towers, 2, pairs) and (2, pairs)
+    are given by their cosine and sine.
     """
 
     tower_m: FloatArray
@@ -79,7 +80,7 @@ class Elements(NamedTuple):
 
 
 def _columns(array: Array, element: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return places (3, pairs) and slants (2, pairs) of chosen elements."""
+    """Return positions (3, pairs) and slants (2, pairs) of the given elements."""
     return np.ascontiguousarray(array.positions_m[element].T), np.ascontiguousarray(array.slant_parts[:, element])
 
 
@@ -90,16 +91,16 @@ Ends = tuple[ComplexArray | None, ComplexArray | None]
 def geometry(
     paths: PathSet, faces: Faces, table: FloatArray, sources_m: FloatArray, poses: Poses, link: Link
 ) -> Geometry:
-    """Return columns of some paths.
+    """Return the columns of paths that the sum needs.
 
     Parameters
     ----------
     paths : PathSet
     faces : Faces
     table : (faces + 1, 3)
-        Their materials: :func:`face_table`.
+        Materials of the faces: :func:`face_table`.
     sources_m : (towers, 3) or (poses, towers, 3)
-        Centres of the tower arrays [m]; the latter for towers that move.
+        Centres of the tower arrays [m]. The second shape is for towers that move.
     poses : Poses
     link : Link
 
@@ -226,7 +227,7 @@ class Further(Rows):
     def fields(
         self, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
     ) -> Fields:
-        """Return the part of the paths in H and in the powers, as :func:`channel_matrices` does.
+        """Return what the paths add to H and to the powers, like :func:`channel_matrices`.
 
         Parameters
         ----------
@@ -240,7 +241,7 @@ class Further(Rows):
         raise NotImplementedError
 
     def words(self, faces: Faces) -> list[str]:
-        """Return corners of each path, from tower to UAV."""
+        """Return a description of each path's corners, from tower to UAV."""
         raise NotImplementedError
 
     @property
@@ -257,7 +258,7 @@ class Further(Rows):
 def fields_of(
     paths: Any, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
 ) -> Fields:
-    """Return the part of any contribution to a replay in H and in the powers.
+    """Return what any contribution to a replay adds to H and to the powers.
 
     Parameters
     ----------
@@ -313,7 +314,7 @@ def channel_matrices(
     elements, wavelength = Elements.of(link), wavelength_m(link.carrier_hz)
     table, key = face_table(faces, link.carrier_hz), paths.pose * len(arrays) + paths.tower
     if (np.diff(key) < 0).any():
-        # the paths of a link must follow each other, because reduceat adds runs
+        # the paths of a link must be consecutive, because reduceat adds consecutive rows
         order = np.argsort(key, kind="stable")
         some_db = None if loss_db is None else loss_db[order]
         sorted_fields = channel_matrices(paths.select(order), faces, sources_m, poses, link, some_db)
@@ -499,11 +500,11 @@ def _check_ports(arrays: Sequence[Array]) -> None:
 
 
 def parts_between_poses(pose: IntArray, most: int = PATHS_PER_PART) -> list[slice]:
-    """Return runs of some ``most`` paths that end between poses (paths,): no link is in two runs."""
+    """Return slices of about ``most`` paths that end between poses (paths,), so that no link is in two slices."""
     edges = [0]
     while edges[-1] < len(pose):
         stop = min(edges[-1] + most, len(pose))
-        if stop < len(pose):  # to the end of the pose
+        if stop < len(pose):  # extend the slice to the end of the pose
             stop = int(np.searchsorted(pose, pose[stop - 1], side="right"))
         edges.append(stop)
     return [slice(start, stop) for start, stop in pairwise(edges)]

@@ -1,4 +1,4 @@
-"""Search of every specular path among thousands of faces: compiled, with sequences grown along beams.
+"""A compiled search for all specular paths among thousands of faces, which grows sequences along beams.
 
 The source is mirrored at a first face. The beam from that image through the face's outline meets the tree of faces. The
 faces that it meets are second faces, and so on. At each step, the side planes of the beam (those of the last
@@ -8,9 +8,9 @@ cuts are conservative, so the paths do not depend on them. Pairs are streamed: m
 
 For thousands of prisms, compiled beams find candidates, and the exact rules of the image engine decide.
 
-The beams are cut with tolerances a thousand times wider than those that decide. A candidate is rejected only if a
-segment runs through the middle of a wall or roof. The remaining candidates, hardly more than the paths, are decided as
-in :mod:`aerpaw_cmp.propagation.search.mirror`, so both searches find the same paths.
+The tolerances of the beams are a thousand times wider than those of the image engine. A candidate is rejected only if a
+segment runs through the middle of a wall or roof. Few of the remaining candidates are not paths. They are tested as in
+:mod:`aerpaw_cmp.propagation.search.mirror`, so both searches find the same paths.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from ..options import Run
 from .merging import DEEPEST, WINDOW, box_outside, box_tree, next_leaf, within_planes
 from .mirror import Occlusion, merge, planes_of, retraced, scene_tolerance_m, searched_links
 
-# Closer to a plane than this [m] is on it.
+# A point closer to a plane than this [m] is on the plane.
 SIDE_M = 1e-6
 
 # A surface closer to an antenna than this [m] does not hide it: it is mounted there.
@@ -40,7 +40,7 @@ _END_M = 1e-3
 # Outlines are enlarged by this in the cuts [m], so that rounding does not remove a path.
 SLACK_M = 1e-5
 
-# How far outside its triangles a reflection point may lie [m]: the seams inside a face.
+# Distance by which a reflection point may lie outside the triangles of its face [m], because of the seams between them.
 EDGE_M = 1e-6
 
 # A segment certainly cuts a triangle if it passes its edges by this share of the triangle's height.
@@ -48,7 +48,7 @@ _SOLID_MARGIN = 1e-6
 
 
 class _Mirrors(NamedTuple):
-    """Faces as the compiled code takes them."""
+    """Faces in the form that the compiled code requires."""
 
     normal: FloatArray
     offset: FloatArray
@@ -62,7 +62,7 @@ class _Mirrors(NamedTuple):
 
 
 class _Solids(NamedTuple):
-    """Surfaces that hide: the tree of faces, triangles (n, 3, 3) and their tree."""
+    """Surfaces that block paths: the tree of faces, triangles (n, 3, 3) and their tree."""
 
     face_tree: BoxTree
     corners: FloatArray
@@ -78,7 +78,7 @@ class Rules(NamedTuple):
 
     @classmethod
     def of(cls, surfaces: Surfaces, depth: int, *, solids: bool = False) -> Rules:
-        """Return the rules for surfaces."""
+        """Return the rules for a search among surfaces."""
         return cls(depth, 2.0 * surfaces.merge_m, _SOLID_MARGIN if solids else 0.0)
 
 
@@ -96,8 +96,8 @@ def grow_paths(
     max_depth : int
         0 to 3.
     solids : bool
-        The faces are those of closed solids: they reflect in front only, and a segment is cut beyond doubt or not at
-        all. The result contains candidates for :func:`find_paths`, including coincident paths.
+        True if the faces are those of closed solids: only their fronts reflect, and a segment is cut only if that is
+        certain. The result contains candidates for :func:`find_paths`, including coincident paths.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def grow_paths(
     rules, hiding = Rules.of(surfaces, max_depth, solids=solids), _solids(surfaces)
     pieces: list[PathSet] = []
     alive = searched_links(links)
-    # tower by tower: they share a scene but have different usable faces
+    # loop over towers, because they share a scene but have different usable faces
     for tower in np.flatnonzero(alive.any(axis=1)).tolist():
         poses, source = np.flatnonzero(alive[tower]), np.ascontiguousarray(links.sources_m[tower])
         mirrors = _mirrors(surfaces, None if links.usable is None else links.usable[tower])
@@ -119,11 +119,11 @@ def grow_paths(
         pose = np.flatnonzero(_direct(hiding, source, targets, rules))
         levels: list[_Level] = [(pose, np.zeros((len(pose), 0), np.int64), np.zeros((len(pose), 0, 3)))]
         height = faces.normal @ source - faces.offset_m
-        # a sheet has two sides, but not for a source in its plane; a solid has an outside
+        # a sheet reflects on both sides unless the source is in its plane, and a solid only on its outside
         first = np.flatnonzero(mirrors.usable & (height >= -SIDE_M if solids else np.abs(height) > SIDE_M))
-        # shuffled, so that the share done grows evenly
+        # shuffle the faces, so that the reported progress grows evenly
         first = np.random.default_rng(0).permutation(first) if max_depth else first[:0]
-        # chunks small enough to share out evenly, and large enough to hide the call
+        # use chunks that are small enough to balance the threads and large enough to make the cost of a call negligible
         each = max(16, min(1024, len(first) // (8 * threads) + 1))
         chunks = [first[at : at + each] for at in range(0, len(first), each)]
         for at in range(0, len(chunks), 4 * threads):
@@ -138,7 +138,7 @@ def grow_paths(
     return paths if solids else without_coincident(paths, surfaces)
 
 
-# Receivers (n,), faces (n, depth), reflection points (n, depth, 3); -1 and any point where a path has fewer.
+# Receivers (n,), faces (n, depth), reflection points (n, depth, 3). Unused entries are face -1 with any point.
 _Level = tuple[IntArray, IntArray, FloatArray]
 
 
@@ -171,7 +171,7 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
         return paths
     plane = np.append(surfaces.plane, -1)[paths.faces]
     key = np.column_stack([paths.pose, paths.tower, paths.depth, plane])
-    # keep the first of each, which does not depend on threads, because paths are sorted
+    # keep the first of equal paths: paths are sorted, so it does not depend on threads
     _, first = np.unique(key, axis=0, return_index=True)
     paths = paths.select(np.sort(first))
     # compare the remaining paths of each link in pairs
@@ -198,13 +198,13 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
 def reflection_points(
     surfaces: Surfaces, sequence: IntArray, sources_m: FloatArray, targets_m: FloatArray, *, edge_m: float
 ) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Return the place where paths over stated faces reflect, in float64.
+    """Return the reflection points of paths over given faces, in float64.
 
     Parameters
     ----------
     surfaces : Surfaces
     sequence : (paths, depth) int
-        Faces; one of the same plane takes the place of a face that the reflection point misses.
+        Faces of each path. If a reflection point misses its face, another face of the same plane is used.
     sources_m, targets_m : (paths, 3)
     edge_m : float
         How far outside its face a point may lie.
@@ -245,7 +245,7 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
         for step in range(depth - 1, -1, -1):
             f = sequence[row, step]
             low, top = _height(normal, offset, f, images[step]), _height(normal, offset, f, point)
-            # the ends are on two sides of the mirror or in it: no reflection
+            # no reflection: the ends are on different sides of the mirror or in its plane
             if low * top < 0.0 or abs(low) + abs(top) <= SIDE_M:
                 good[row] = False
                 break
@@ -291,7 +291,7 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
     before, after : ((3,), float)
         Unit normals and offsets [m] of the mirrors at ``a`` and ``b``.
     rules : Rules
-        Clearance, reach of an antenna, and the margin with which a triangle has to be met.
+        Clearance, reach of an antenna, and the margin by which a segment must meet a triangle.
 
     Returns
     -------
@@ -311,7 +311,7 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
     while node >= 0:
         for k in range(start[node], start[node] + many[node]):
             t = _share_to(corners[items[k]], a, way, length, rules.margin)
-            # the open segment: its ends lie on mirrors and antennas
+            # exclude the ends of the segment, because they lie on mirrors and antennas
             if t <= 0.0 or t >= 1.0:
                 continue
             hit = a[0] + t * way[0], a[1] + t * way[1], a[2] + t * way[2]
@@ -337,7 +337,7 @@ def _share_to(corners, a, way, length, margin):  # type: ignore[no-untyped-def]
     # a segment in the triangle's plane does not cut it
     if abs(det) <= 1e-14 * length:
         return -1.0
-    if margin > 0.0:  # so near to grazing that a tolerance might decide
+    if margin > 0.0:  # reject near-grazing hits, which depend on a tolerance
         m0, m1, m2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
         if abs(det) < 1e-5 * length * np.sqrt(m0 * m0 + m1 * m1 + m2 * m2):
             return -1.0
@@ -354,7 +354,7 @@ def _share_to(corners, a, way, length, margin):  # type: ignore[no-untyped-def]
 
 @part
 def _at_end(mirror, hit, distance, rules):  # type: ignore[no-untyped-def]
-    """Check whether a triangle is too near an end to cut: in the plane of its mirror, or at its antenna."""
+    """Check whether a hit does not count because it is in the plane of the mirror or at the antenna of an end."""
     normal, offset = mirror
     # a normal of zeros means an antenna
     if normal[0] == 0.0 and normal[1] == 0.0 and normal[2] == 0.0:
@@ -395,10 +395,10 @@ def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
             continue
         n0, n1, n2 = n0 / size, n1 / size, n2 / size
         middle = n0 * (m0 - a[0]) + n1 * (m1 - a[1]) + n2 * (m2 - a[2])
-        # which way an outline goes round depends on the side it is seen from
+        # the direction of an outline depends on the side from which it is seen
         if middle < 0.0:
             n0, n1, n2 = -n0, -n1, -n2
-        # the plane goes through the apex and, a little outside, along the side of the outline
+        # the plane contains the apex and runs slightly outside the side of the outline
         offset = n0 * apex[0] + n1 * apex[1] + n2 * apex[2]
         reach = np.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
         planes[count, 0], planes[count, 1], planes[count, 2] = n0, n1, n2
@@ -430,7 +430,7 @@ def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-
     Parameters
     ----------
     first : (faces + 1,) int
-        Where the triangles of each face begin.
+        Index of the first triangle of each face.
     flat : (triangles, 3, 2)
         Corners in the axes of their face [m].
     along, across : (faces, 3)
@@ -440,7 +440,7 @@ def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-
     p : (3,)
         The point [m].
     edge : float
-        How far outside a triangle it may lie [m].
+        Distance by which the point may lie outside a triangle [m].
 
     Returns
     -------
@@ -451,7 +451,7 @@ def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-
     for t in range(first[f], first[f + 1]):
         c = flat[t]
         area = (c[1, 0] - c[0, 0]) * (c[2, 1] - c[0, 1]) - (c[1, 1] - c[0, 1]) * (c[2, 0] - c[0, 0])
-        # triangles of a file go round either way
+        # the corners of a triangle in a file may be in either direction
         sign = 1.0 if area > 0.0 else -1.0
         good = True
         for k in range(3):
@@ -476,7 +476,7 @@ def _ahead(normal, offset, f, sign, outline):  # type: ignore[no-untyped-def]
 
 @part
 def _reflects(shapes, level, chain, signs, images, points, target, rules):  # type: ignore[no-untyped-def]
-    """Check whether a path to a target meets each face of the sequence, and write its ``points`` there."""
+    """Check whether a path to a target meets each face of the sequence, and write the points into ``points``."""
     normal, offset, along, across, first, flat = shapes
     strict, point = rules.margin == 0.0, target
     for step in range(level, -1, -1):
@@ -488,7 +488,7 @@ def _reflects(shapes, level, chain, signs, images, points, target, rules):  # ty
             return False
         if step < level and top <= (SIDE_M if strict else -SIDE_M):
             return False
-        # the image lies as far behind the mirror as its source before it
+        # the image is as far behind the mirror as its source is in front of it
         share, behind = low / (low + top), images[step + 1]
         for axis in range(3):
             points[step, axis] = behind[axis] + share * (point[axis] - behind[axis])
@@ -526,7 +526,7 @@ def _doubled(pose, faces, points):  # type: ignore[no-untyped-def]
 def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[no-untyped-def]
     """Return all paths whose first face is one of ``firsts``, by a walk along beams, depth first.
 
-    It is one long function, because numba counts references to every array of a record that is passed to another one.
+    It is one long function, because passing a record to another function makes numba count references to its arrays.
     """
     normal, offset, along, across, window, plane, usable, first, flat = mirrors
     shapes = normal, offset, along, across, first, flat
@@ -608,11 +608,11 @@ def obstacle(surfaces: Surfaces, points_m: FloatArray, sequence: IntArray) -> in
     for (a, b), (before, after) in zip(pairwise(points_m), pairwise(ends), strict=True):
         first = -1
         while (hit := segment_cut(surfaces.corners_m, surfaces.tree, a, b, before, after, rules)) >= 0:
-            # a triangle may lie a little before the plane of its face, where the segment ends now
+            # a triangle may lie slightly in front of the plane of its face, at which the segment now ends
             if surfaces.face[hit] == first:
                 break
             first = int(surfaces.face[hit])
-            # end the segment in this face, to find one before it
+            # end the segment at this face, to find a face in front of it
             b = a + (offset[first] - normal[first] @ a) / (normal[first] @ (b - a)) * (b - a)
             after = antenna
         if first >= 0:
@@ -621,7 +621,7 @@ def obstacle(surfaces: Surfaces, points_m: FloatArray, sequence: IntArray) -> in
 
 
 def try_out() -> None:
-    """Compile, or read the compiled code, and test whether a triangle hides one of two points.
+    """Compile the search or read its compiled code, and test it with a triangle that hides one of two points.
 
     Raises
     ------
@@ -636,10 +636,10 @@ def try_out() -> None:
         raise RuntimeError(f"compiled code sees {free.tolist()} where one of two points is hidden")
 
 
-# The ground extends to this multiple of the largest coordinate, beyond all reflection points.
+# The ground extends to this multiple of the largest coordinate, which is beyond all reflection points.
 REACH = 10.0
 
-# Boxes of faces are this much larger [m].
+# The bounding boxes of faces are enlarged by this distance [m].
 OVERLAP_M = 1e-3
 
 
@@ -682,7 +682,8 @@ def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -
     reach = REACH * float(max(1.0, *finite, *(np.abs(p).max(initial=0.0) for p in (known, sources_m))))
     vertices, triangle, owner = triangles(faces, reach)
     points = vertices[triangle]
-    # a bounding quadrilateral may be larger than a roof without right angles, and then the beam keeps more
+    # the bounding quadrilateral of a roof without right angles is larger than the roof, so the beam keeps more
+    # candidates
     outline = corners(faces, reach)
     axes = np.stack([faces.along[owner], faces.across[owner]], axis=1)
     flat = np.einsum("tki,tai->tka", points, axes)

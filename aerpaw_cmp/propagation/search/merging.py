@@ -1,10 +1,10 @@
-"""Planar faces merged from triangles, compiled.
+"""Compiled code that merges triangles into planar faces.
 
 Triangles of one shape that share an edge and lie within a given tolerance of one plane are one face. Faces that touch
 or overlap in one plane share that plane, regardless of their shape. A reflection there is therefore one reflection.
 
 The module also contains a compiled tree of boxes over triangles, faces or points, and its queries. Every query is
-conservative: the tests that decide are computed on the items themselves, in float64.
+conservative, because the final tests are computed on the items themselves, in float64.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ DEEPEST = 64
 
 
 def box_tree(lower: FloatArray, upper: FloatArray, leaf: int = 4) -> BoxTree:
-    """Build a tree over boxes (n, 3), halved at the median of their middles along the longest side.
+    """Build a tree over boxes (n, 3). Each node is split at the median of the box centres along its longest side.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
             for k in range(first, first + many):
                 low[node, axis] = min(low[node, axis], lower[items[k], axis])
                 high[node, axis] = max(high[node, axis], upper[items[k], axis])
-        # a few items are tested as fast as their boxes
+        # stop splitting: testing a few items takes no longer than testing their boxes
         if many <= leaf:
             continue
         longest, widest = 0, -1.0
@@ -116,7 +116,7 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
     for p in range(many):
         a, b, c = planes[p, 0], planes[p, 1], planes[p, 2]
         best = planes[p, 3]
-        # the corner farthest along the normal: if it is outside, the whole box is outside
+        # use the corner farthest along the normal: if it is outside, the complete box is outside
         best += a * (upper[node, 0] if a > 0.0 else lower[node, 0])
         best += b * (upper[node, 1] if b > 0.0 else lower[node, 1])
         best += c * (upper[node, 2] if c > 0.0 else lower[node, 2])
@@ -134,7 +134,7 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
     lower, upper, node
         The same as in :func:`box_outside`.
     segment : ((3,), (3,))
-        Start [m], and one over each component of its vector [1/m]; 1e300 where that is 0.
+        Start [m], and the reciprocal of each component of its vector [1/m], which is 1e300 for a component of 0.
 
     Returns
     -------
@@ -148,7 +148,7 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
         at_upper = (upper[node, axis] - a[axis]) * inverse[axis]
         if at_lower > at_upper:
             at_lower, at_upper = at_upper, at_lower
-        # rounding must not lose a box that is only just met
+        # widen the interval, so that rounding does not lose a box that is only just met
         enter = max(enter, at_lower - 1e-12 * abs(at_lower))
         leave = min(leave, at_upper + 1e-12 * abs(at_upper))
     return enter > leave
@@ -189,7 +189,7 @@ def next_leaf(lower, upper, child, todo, waiting, segment):  # type: ignore[no-u
 
 @kernel
 def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-def]
-    """Write the items whose leaf is partly inside each of the first ``many`` planes into ``hits``. Return their number.
+    """Write items into ``hits`` if their leaf is partly inside each of the first ``many`` planes. Return their number.
 
     Parameters
     ----------
@@ -237,13 +237,13 @@ _SMALLEST_M2 = 1e-10
 
 
 def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
-    """Return faces of a scene.
+    """Return the planar faces of a scene of triangles.
 
     Parameters
     ----------
     scene : TriangleScene
     merge_m : float
-        How far a corner may lie from the plane of its face [m].
+        Largest distance of a corner from the plane of its face [m].
 
     Raises
     ------
@@ -255,7 +255,7 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
     good = area > _SMALLEST_M2
     notes = list(scene.notes)
     if not good.all():
-        notes.append(f"{counted(int((~good).sum()), 'triangle was', 'triangles were')} dropped for want of an area")
+        notes.append(f"{counted(int((~good).sum()), 'triangle was', 'triangles were')} dropped: no area")
     if not good.any():
         raise InputError("no triangle of the scene has an area", expected="surfaces in metres")
     corners, normal, offset, area = corners[good], normal[good], offset[good], area[good]
@@ -327,13 +327,13 @@ def _planes(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _axes(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return in-plane unit axes: level and uphill, if the face has a slope."""
-    # across the slope, so level unless the face is level
+    """Return in-plane unit axes. If the face has a slope, they are level and uphill."""
+    # start across the slope, which is level
     along = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
     size = np.linalg.norm(along, axis=1)
     level = size < 1e-6
     along = np.where(level[:, None], np.array([1.0, 0.0, 0.0]), along / np.where(level, 1.0, size)[:, None])
-    # the axis of a nearly level face still leans out of the face
+    # subtract the normal component that the axis of a nearly level face still has
     along -= np.einsum("fi,fi->f", along, normal)[:, None] * normal
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     return along, np.cross(normal, along)
@@ -342,10 +342,10 @@ def _axes(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _faces_of_triangles(
     corners: FloatArray, normal: FloatArray, offset: FloatArray, area: FloatArray, shape: IntArray, merge_m: float
 ) -> tuple[IntArray, IntArray]:
-    """Return the face of each triangle, and the triangle whose plane each face has: its largest."""
+    """Return the face of each triangle, and the largest triangle of each face, which defines its plane."""
     # files repeat corners for each triangle in float32: corners within 0.1 mm are equal
     grid = np.round(corners.reshape(-1, 3) / WELD_M).astype(np.int64)
-    # only within one shape: touching walls of two houses are two faces
+    # compare corners only within one shape, because touching walls of two houses are two faces
     key = np.column_stack([np.repeat(shape, 3), grid])
     order = np.lexsort(key.T)
     new = np.ones(len(order), dtype=np.int64)
@@ -360,7 +360,7 @@ def _faces_of_triangles(
     by_edge = np.argsort(edge, kind="stable")
     start = np.searchsorted(edge[by_edge], np.arange(int(edge.max()) + 2))
     neighbours = edge.reshape(-1, 3), by_edge // 3, start
-    # the largest first: its plane is known best
+    # start with the largest triangle, because its plane is the most accurate
     face, leader = _merge_neighbours(np.argsort(-area, kind="stable"), corners, normal, offset, neighbours, merge_m)
     return face, leader
 
@@ -408,7 +408,10 @@ def _lie_in(corners, first, after, plane, merge_m):  # type: ignore[no-untyped-d
 
 @kernel
 def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type: ignore[no-untyped-def]
-    """Return the face whose plane each face gets: a larger face that it touches and lies in, or itself."""
+    """Return the face whose plane each face gets.
+
+    This is a larger face that it touches and in whose plane it lies, or the face itself.
+    """
     (normal, offset), (low, high) = planes, bounds
     plane = np.arange(len(normal))
     near, todo = np.empty(len(normal), np.int64), np.empty(DEEPEST, np.int64)
@@ -424,7 +427,7 @@ def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type
             if area[neighbour] < area[f] or (area[neighbour] == area[f] and neighbour >= f):
                 continue
             lead = plane[neighbour]
-            # a tiny face lies within a millimetre of planes that it has nothing to do with
+            # skip planes of another direction, because a tiny face is within a millimetre of many planes
             if abs(np.dot(normal[lead], normal[f])) < 0.7:
                 continue
             if not _lie_in(corners, first[f], first[f + 1], (normal[lead], offset[lead]), merge_m):

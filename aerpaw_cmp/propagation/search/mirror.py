@@ -1,26 +1,25 @@
-"""Every specular path by the image method: exhaustive, float64, vectorised over poses.
+"""An exhaustive search for specular paths by the image method, in float64 and vectorised over poses.
 
-For a sequence of faces ``f1 .. fd`` the source is mirrored face by face. A path exists when
+For a sequence of faces ``f1 .. fd`` the source is mirrored face by face. A path exists if
 
 1. each image lies in front of the next face, and the target in front of the last (decided per sequence);
 2. going back from the target, each line to the current image meets its face inside the polygon;
 3. no segment is cut by a solid.
 
-A sequence is followed only while the beam from the image through its last face can still reach the next one. Sides are
-decided with a tolerance relative to the size of the scene, far above the rounding of a reflection point. A solid hides
-with its open inside (:mod:`aerpaw_cmp.propagation.search.mirror`), so a path along a wall stays, and there is no crack
-between two walls. An end that lies on a face reflects there like an end just in front of it, so nothing jumps when a
-UAV lands.
+A sequence is followed only while the beam from the image through its last face can still reach the next one. The
+tolerance of side tests is relative to the size of the scene, far above the rounding error of a reflection point. A
+solid blocks only segments through its interior, so a path along a wall exists, and there is no gap between two walls.
+An end that lies on a face reflects there like an end just in front of it, so the level does not jump when a UAV lands.
 
 Segments are occluded by buildings if the open segment meets the open solid.
 
 A building is a prism: its footprint, cut into convex pieces, from its foot to its roof. A segment is cut if a part of
-it runs inside a piece, deeper than a tolerance for rounding. A touch of a wall, an edge, a corner or a roof does not
-cut, regardless of its position and of the segment's ends. The inside of two buildings that touch is one solid: a
-segment that runs in the seam between them, outside both, is cut too.
+it runs inside a piece, deeper than a tolerance for rounding. A segment that only touches a wall, an edge, a corner or a
+roof is not cut, regardless of where it ends. Two buildings that touch are one solid: a segment that runs in the seam
+between them, outside both, is cut too.
 
-Triangles have a separate rule (:func:`.beams.segment_cut`), because an open sheet has no inside. A sheet's rule decides
-198 of 3 984 segments of a grid about two touching boxes differently, where they run along walls or in the seam.
+Triangles have a separate rule (:func:`.beams.segment_cut`), because an open sheet has no inside. On a grid of 3 984
+segments around two touching boxes, the rule of sheets differs for 198 segments, which run along walls or in the seam.
 """
 
 from __future__ import annotations
@@ -42,11 +41,11 @@ from ..options import Progress
 # Pairs of a segment and a solid that are tested together.
 PAIRS_PER_CHUNK = 1_000_000
 
-# Radius, in tolerances, within which a point of a seam must be surrounded by buildings; shorter seams hide nothing.
-# At 1 km some ten micrometres: far above rounding, far below any gap that a map draws.
+# Radius, in tolerances, within which a point of a seam must be surrounded by buildings. Shorter seams do not block. At
+# 1 km it is about ten micrometres, far above rounding errors and far below any gap on a map.
 _NEIGHBOURHOOD = 1e4
 
-# Share of its area by which a convex footprint may fall short of its hull.
+# Share of its area by which a convex footprint may be smaller than its hull.
 _ROUNDING = 1e-13
 
 _ROUND = np.pi / 8 * (np.arange(16) + 0.37)  # offset so that no direction coincides with a map axis
@@ -59,7 +58,7 @@ class Occlusion:
     Parameters
     ----------
     faces : Faces
-        Faces with ``solid >= 0`` are roofs and walls of prisms. The ground does not hide, because all paths are above
+        Faces with ``solid >= 0`` are roofs and walls of prisms. The ground does not block, because all paths are above
         it.
     tolerance_m : float
         A segment is cut if it runs deeper than this inside a solid.
@@ -100,7 +99,7 @@ class Occlusion:
         return cut
 
     def _cut(self, start: FloatArray, end: FloatArray) -> BoolArray:
-        # from coarse to fine: the box of all segments, then each segment and box, then the planes of a piece
+        # test from coarse to fine: the box of all segments, then each segment and box, then the planes of a piece
         ends = np.concatenate([start, end])
         near_all = (self.high >= np.fmin.reduce(ends)) & (self.low <= np.fmax.reduce(ends))
         solids = np.flatnonzero(near_all.all(axis=1))
@@ -109,7 +108,7 @@ class Occlusion:
         # most segments touch nothing, so seams are examined after all pieces
         seams: list[tuple[IntArray, FloatArray, FloatArray, IntArray]] = []
         for column, solid in enumerate(solids.tolist()):
-            # one piece that cuts the segment is enough
+            # skip segments that another piece has cut already
             rows = np.flatnonzero(near[:, column] & ~result)
             for piece in self.parts[solid]:
                 if not len(rows):
@@ -158,7 +157,8 @@ class Occlusion:
     ) -> bool:
         """Check whether the pieces along which one segment runs fill the whole neighbourhood of one of its points.
 
-        It runs along each of the ``pieces`` (n,) from the share ``enter`` to the share ``leave`` of its length.
+        The segment runs along each of the ``pieces`` (n,) from the share ``enter`` to the share ``leave`` of its
+        length.
         """
         radius_m = _NEIGHBOURHOOD * self.tolerance_m
         length_m = float(np.linalg.norm(end - start))
@@ -172,7 +172,7 @@ class Occlusion:
             for piece in pieces[(enter < share) & (share < leave)]:
                 normal, offset = self.pieces[piece]
                 height = ring @ normal.T - offset
-                # between roof and foot: a point above a roof is not surrounded
+                # require a point between foot and roof, because a point above a roof is not surrounded
                 if (height[:, :2] < -self.tolerance_m).all():
                     covered |= (height[:, 2:] <= self.tolerance_m).all(axis=1)
             if covered.all():
@@ -181,9 +181,9 @@ class Occlusion:
 
 
 def _within(before: FloatArray, after: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
-    """Return shares (enter, leave) between which a segment is below ``level`` of all planes. Nowhere if enter >= leave.
+    """Return shares (enter, leave) between which a segment is below ``level`` of all planes. Empty if enter >= leave.
 
-    Cyrus and Beck (1978): it enters at planes that it crosses downwards and leaves at the others.
+    Cyrus and Beck (1978): the segment enters at planes that it crosses inwards and leaves at the other planes.
     """
     slope = after - before
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -211,7 +211,7 @@ def _prisms(
     if not len(rows):
         return np.zeros(0, np.int64), [], []
     number = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(rows)))
-    # exactly: roofs are made with this very normal
+    # compare exactly, because roofs are created with this normal
     level = faces.normal[rows, 2] == 1.0
     # the lowest wall of each building; roofs do not count
     foot = np.minimum.reduceat(np.where(level, np.inf, faces.lower[rows, 1]), starts)
@@ -241,8 +241,8 @@ def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:
 def convex_pieces(footprint: Polygon) -> tuple[Polygon, ...]:
     """Split a footprint that is not convex into convex polygons without additional corners.
 
-    Triangles are joined while the result is convex (Hertel and Mehlhorn, 1983); cached, because each replay
-    needs them.
+    Triangles are joined while the result is convex (Hertel and Mehlhorn, 1983). The pieces are cached, because each
+    replay needs them.
     """
     pieces = list(shapely.get_parts(shapely.constrained_delaunay_triangles(footprint)))
     first = 0
@@ -260,7 +260,7 @@ def convex_pieces(footprint: Polygon) -> tuple[Polygon, ...]:
 
 
 def _is_convex(polygons: Polygon | AnyArray) -> BoolArray:
-    """Check whether a polygon, or each of an array, fills its hull."""
+    """Check whether a polygon, or each polygon of an array, is convex."""
     hull = shapely.area(shapely.convex_hull(polygons))
     full = hull - shapely.area(polygons) <= _ROUNDING * hull
     return np.asarray(full & (shapely.get_num_interior_rings(polygons) == 0))
@@ -304,7 +304,7 @@ MINIMUM_LENGTH_M = 0.01
 # Face sequences per tower beyond which the ``image`` engine gives up.
 _SEQUENCE_BUDGET = 200_000
 
-# Limits the memory of every dense step (8 MB per array).
+# Largest number of cells of a dense step, which limits its memory (8 MB per array).
 CELLS_PER_CHUNK = 1_000_000
 
 # Number of targets whose heights over all faces are cached.
@@ -374,7 +374,7 @@ def searched_links(links: Links) -> BoolArray:
     """Return links (towers, poses) that may have paths: with a pose, long enough and not excluded."""
     alive = np.empty((len(links.sources_m), len(links.targets_m)), dtype=np.bool_)
     with np.errstate(invalid="ignore"):
-        # tower by tower: an array of all pairs and three coordinates would be the largest of the search
+        # loop over towers, because the coordinates of all pairs would be the largest array of the search
         for tower, source in enumerate(links.sources_m.reshape(-1, 3)):
             apart = links.targets_m - source
             gap2 = np.einsum("ij,ij->i", apart, apart)
@@ -433,7 +433,7 @@ class _Growth:
     facing : (faces, faces) bool
         Faces that can follow each other.
     tolerance_m : float
-        A point this far behind a face still counts as before it [m].
+        A point up to this far behind a face still counts as in front of it [m].
     max_depth, budget : int
         Largest numbers of reflections and of sequences per tower.
     """
@@ -459,7 +459,7 @@ class _Growth:
         )
 
     def sequences(self, source: FloatArray, usable: BoolArray, targets_m: FloatArray) -> list[Sequences]:
-        """Return the sequences, by length, that may lead to a target, from the line of sight on."""
+        """Return the sequences that may lead to a target, by length, beginning with the line of sight."""
         level = Sequences(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
         levels, left = [level], self.budget - 1
         for _ in range(self.max_depth):
@@ -472,12 +472,12 @@ class _Growth:
         highest = [(normal @ targets_m[start : start + TARGETS_AT_ONCE].T).max(axis=1) for start in starts]
         lit = np.max(highest, axis=0) - self.faces.offset_m >= -self.tolerance_m
         low, high = targets_m.min(axis=0), targets_m.max(axis=0)
-        # the box round all poses: a beam that misses it misses each
+        # use the box round all poses: a beam that misses the box misses every pose
         hull = (low + high)[None] / 2, np.diag(high - low)[None] / 2
         return [levels[0], *(self._reaching(level, lit, hull) for level in levels[1:])]
 
     def _one_face_longer(self, level: Sequences, source: FloatArray, usable: BoolArray, left: int) -> Sequences:
-        """Return the sequences that are one face longer, at most ``left`` of them."""
+        """Return the sequences that are one face longer. At most ``left`` are allowed."""
         faces, box, depth = self.faces, self.bounds, level.faces.shape[1]
         grown: list[IntArray] = []
         images: list[FloatArray] = []
@@ -487,7 +487,7 @@ class _Growth:
             now, past = level.faces[start : start + step], level.images_m[start : start + step]
             last_image = past[:, -1] if depth else np.broadcast_to(source, (len(now), 3))
             height = last_image @ faces.normal.T - faces.offset_m
-            # the source itself may lie on the face, an image may not: its reflection would be an edge of two faces
+            # the source itself may lie on the face, but not an image, whose reflection would be at an edge of two faces
             good = usable & (height > self.tolerance_m if depth else height >= -self.tolerance_m)
             hit = good & self.facing[now[:, -1]] if depth else good
             row, face = np.divmod(np.flatnonzero(hit), len(faces))
@@ -495,7 +495,7 @@ class _Growth:
                 before = now[row, -1]
                 beam = last_image[row], box.corners_m[before], box.centre_m[face], box.reach_m[face]
                 keep = _beam_meets(*beam, self.tolerance_m)
-                # any beam that goes down meets the ground, and its cut corners are not an outline
+                # keep the ground: every downward beam meets it, and the corners at which it is cut are not its outline
                 keep |= ~np.isfinite(faces.lower[face, 0]) | ~np.isfinite(faces.lower[before, 0])
                 row, face = row[keep], face[keep]
             # the image is the same for every target, so it is computed once per sequence
@@ -527,7 +527,7 @@ class _Growth:
 
 
 class Mirrors:
-    """The faces over which one reflection may reach a box. Build it once for many boxes.
+    """The faces at which one reflection may reach a box. Create the object once for many boxes.
 
     Parameters
     ----------
@@ -540,14 +540,14 @@ class Mirrors:
         self._growth = _Growth.of(faces, extent_m, REACH_SLACK_M, max_depth=1, budget=len(faces) + 1)
 
     def toward(self, source_m: FloatArray, box_m: FloatArray) -> IntArray:
-        """Return every face of a path from a source (3,) over one face into a box (lowest and highest corner, 3)."""
+        """Return the faces that may reflect from a source (3,) into a box (lowest and highest corner, 3)."""
         points = np.array(np.meshgrid(*box_m.T)).reshape(3, -1).T
         levels = self._growth.sequences(source_m, np.ones(len(self._growth.faces), np.bool_), points)
         return levels[1].faces[:, 0] if len(levels) > 1 else np.zeros(0, np.int64)
 
 
 def _facing(faces: Faces, box: _Bounds, tolerance_m: float) -> BoolArray:
-    """Return pairs (first, second) of which each has a point in front of the other."""
+    """Return a mask of pairs (first, second) of faces that each have a point in front of the other."""
     highest = faces.normal @ box.centre_m.T - faces.offset_m[:, None]
     for half in box.reach_m.transpose(1, 2, 0):
         highest += np.abs(faces.normal @ half)
@@ -560,8 +560,8 @@ def _beam_meets(
 ) -> BoolArray:
     """Check whether the beam from ``apex`` through the quadrilateral ``window`` may meet a parallelogram or a box.
 
-    apex (n, 3), window (n, 4, 3), centre (n or 1, 3), reach (n or 1, axes, 3): half of each side. Conservative: True
-    unless one side plane of the beam has all of it outside.
+    apex (n, 3), window (n, 4, 3), centre (n or 1, 3), reach (n or 1, axes, 3): half of each side. Conservative: the
+    result is False only if the target is completely outside one side plane of the beam.
     """
     # components first, then corners: each step is one pass over contiguous rows of sequences
     ray = np.ascontiguousarray((window - apex[:, None, :]).transpose(2, 1, 0))
@@ -571,7 +571,7 @@ def _beam_meets(
     sense = np.sign((side.sum(axis=1) * ray.sum(axis=1)).sum(axis=0))
     ahead = (side * (centre - apex).T[:, None]).sum(axis=0) * sense
     ahead += np.abs((side * reach.transpose(1, 2, 0)[:, :, None]).sum(axis=1)).sum(axis=0)
-    # side planes are not normalised, so the tolerance takes their length instead
+    # side planes are not normalised, so the tolerance is multiplied by their length
     size = np.sqrt((side * side).sum(axis=0))
     return np.asarray((ahead >= -tolerance_m * size).all(axis=0))
 
@@ -604,12 +604,12 @@ def _paths_of_level(
                 )
             else:
                 row, column = np.zeros(len(some), np.int64), np.arange(len(some))
-            # take needs a quarter of the time of an index in brackets for rows of three
+            # use take, which needs a quarter of the time of indexing with brackets for rows of three numbers
             sequence, images, pose = level.faces[part].take(row, 0), level.images_m[part].take(row, 0), some[column]
-            # after the cheap test of the last face, which few pairs pass
+            # trace only the few pairs that passed the fast test of the last face
             vertices, good = trace_back(faces, sequence, images, targets.take(pose, 0), hiding.tolerance_m)
             sequence, pose, vertices = sequence[good], pose[good], vertices[good]
-            # last, because it is the slowest test: only for paths that passed the geometric tests
+            # test for obstacles last, because this is the slowest test
             free = ~hiding.any_segment(np.broadcast_to(source, (len(pose), 3)), vertices, targets[pose])
             pieces.append(PathSet.from_tower(tower, pose[free], sequence[free], vertices[free], max_depth))
     return merge(pieces, max_depth, None)
@@ -632,12 +632,12 @@ def _meets_last_face(
     targets : (n, 3)
         [m].
     tolerance_m : float
-        Bounds are taken this much larger [m].
+        The bounds are enlarged by this distance [m].
 
     Returns
     -------
     sequence, target : (m,)
-        Numbers of the pairs that are left.
+        Indices of the pairs.
     """
     last = sequence[:, -1]
     used, position = np.unique(last, return_inverse=True)
@@ -646,7 +646,7 @@ def _meets_last_face(
     with np.errstate(divide="ignore", invalid="ignore"):
         share = below[:, None] / (below[:, None] - height)
     good = height >= -tolerance_m
-    # a target behind the face would put the point anywhere
+    # the point of a target behind the face is meaningless
     share[~good] = 0.0
     for axis, which in ((faces.along, 0), (faces.across, 1)):
         start = np.einsum("ij,ij->i", axis[last], image)[:, None]
@@ -672,9 +672,9 @@ _SURE_M = 1e-4
 
 
 def _passes_first_faces(faces: Faces, sequence: IntArray, image: FloatArray, targets: FloatArray) -> BoolArray:
-    """Check whether lines (sequences, targets) from last images may pass all faces but the last, with a margin.
+    """Check, with a margin, whether lines (sequences, targets) from the last images may meet all faces but the last.
 
-    Each face is mirrored at those after it, so that the path is one straight line.
+    Each face is mirrored at the faces after it, so that the path is one straight line.
     """
     good = np.ones((len(sequence), len(targets)), dtype=np.bool_)
     for step in range(sequence.shape[1] - 1):
@@ -718,7 +718,7 @@ def trace_back(
     images_m : (paths, depth, 3)
     targets_m : (paths, 3)
     tolerance_m : float
-        For sides.
+                Tolerance of side tests [m].
     edge_m : float, optional
         How far outside its face a point may lie (default: ``tolerance_m``).
 
@@ -757,7 +757,7 @@ def retraced(
     tolerance_m: float,
     edge_m: float | None = None,
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the reflection points of sequences of any length, and which of them make a path without obstacles.
+    """Return the reflection points of sequences of any length, and which of them form a path if obstacles are ignored.
 
     Parameters
     ----------
@@ -825,7 +825,7 @@ def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet
 
 
 def _order(paths: PathSet) -> IntArray:
-    """Return the order of rows by pose, tower, depth, faces. It is immediate if they are already sorted."""
+    """Return the order of rows by pose, tower, depth, faces. Sorting is skipped if they are already sorted."""
     keys = [paths.pose, paths.tower, paths.depth, *paths.faces.T]
     sorted_, tied = np.ones(max(len(paths) - 1, 0), np.bool_), np.ones(max(len(paths) - 1, 0), np.bool_)
     for key in keys:
@@ -836,7 +836,7 @@ def _order(paths: PathSet) -> IntArray:
 
 
 def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
-    """Return paths (paths,) over the same planes as one before them in ``order``, with the same ends."""
+    """Return a mask (paths,) of paths that have the same ends and planes as an earlier path in ``order``."""
     plane = planes_of(faces)
     # most scenes have no two faces in a plane, and then no path can repeat
     shared = np.append(np.bincount(plane)[plane] > 1, False)
@@ -853,7 +853,7 @@ def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
 
 def planes_of(faces: Faces) -> IntArray:
     """Return the number (faces,) of each face's plane. Coplanar faces with the same orientation share it."""
-    # coplanar to the rounding of a map: a nanometre of tilt, a micrometre of offset
+    # coplanar within the rounding of a map: 1e-9 of tilt and a micrometre of offset
     key = np.column_stack([faces.normal / 1e-9, faces.offset_m / 1e-6]).round() + 0.0
     return np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
 
@@ -864,5 +864,5 @@ def plane_keys(paths: PathSet, planes: IntArray) -> list[tuple[int, ...]]:
     Keys do not contain unused entries, because two sets may have different depths.
     """
     rows = np.column_stack([paths.pose, paths.tower, np.append(planes, -1)[paths.faces]])
-    # tuples, to be keys of sets
+    # tuples, so that they can be members of sets
     return [tuple(number for number in row if number >= 0) for row in rows.tolist()]

@@ -5,14 +5,14 @@ points come from the image method in float64 and fields from :mod:`aerpaw_cmp.pr
 
 Guards against silent behaviour of Sionna RT 2.2.0:
 
-- Its hash table of candidates is shared by all receivers of a call and loses paths. The guard is a table of 2**24 slots
-  and batches of at most 100 poses.
+- Its hash table of candidates is shared by all receivers of a call and loses paths. Therefore this module uses a table
+  of 2**24 slots and batches of at most 100 poses.
 - It drops candidates past ``max_num_paths_per_src``, most of which are not paths in the end, and corrupts memory if
   that limit is below the number of receivers. Its own count of candidates is read after each batch. A batch that
-  exceeded the limit, or filled too much of the table, is searched again with more room.
-- Positions given as numbers recompile kernels. They are arrays here, and each batch has the same size (the last is
-  padded).
-- A line of sight must have Friis' amplitude, and no path may have a gain above one, or the run stops.
+  exceeded the limit, or filled too much of the table, is searched again with larger limits.
+- Positions given as numbers recompile kernels. Positions are therefore arrays here, and each batch has the same size
+  (the last batch is padded).
+- A line of sight without Friis' amplitude, or a path with a gain above one, stops the run.
 """
 
 from __future__ import annotations
@@ -53,13 +53,14 @@ _FULLEST_TABLE = 1 / 32
 _MOST_SLOTS = 2**28
 
 _LARGEST_BATCH = 100
-# Sionna supports slabs only: this thickness prevents a second echo. Its coefficients are not used for H.
+# Thickness of a half-space for Sionna, which supports only slabs: a slab this thick has no second echo. H does not use
+# Sionna's coefficients.
 HALF_SPACE_THICKNESS_M = 10.0
 # A float32 reflection point may lie this far outside its face.
 _EDGE_TOLERANCE_M = 1e-3
 
-# Scenes in use. Dr.Jit compiles virtual calls for every living material, including those of scenes that are not used
-# any more. It may then define a function twice and abort the process, so no scene may exist when the next is created.
+# Scenes in use. Dr.Jit compiles virtual calls for every existing material, including materials of unused scenes. It may
+# then define a function twice and abort the process, so no old scene may exist when the next scene is created.
 _ALIVE: WeakSet[Any] = WeakSet()
 
 
@@ -116,7 +117,7 @@ def _variant(kinds: Sequence[str]) -> str:
             mi.set_variant(f"{kind}_ad_mono_polarized")
             return str(mi.variant())
     raise UsageError(
-        f"Dr.Jit finds no {' and no '.join(kinds)} device", cause="'aerpaw-cmp doctor' says what is missing"
+        f"Dr.Jit finds no {' and no '.join(kinds)} device", cause="'aerpaw-cmp doctor' shows what is missing"
     )
 
 
@@ -186,7 +187,7 @@ class _Builder:
             objects.append(rt.SceneObject(mi_mesh=mesh, name=plain, radio_material=material))
             owners.append(owner[rows])
         scene.edit(add=objects)
-        # read when a kernel runs: literals would be compiled again for each carrier
+        # pass as data, because literals would be compiled again for each carrier
         materials = scene.radio_materials.values()
         dr.make_opaque(scene.frequency, *((m.relative_permittivity, m.conductivity) for m in materials))
         return _Scene(scene, {int(o.object_id): f for o, f in zip(objects, owners, strict=True)})
@@ -195,7 +196,7 @@ class _Builder:
         import mitsuba as mi
 
         corners, place = np.unique(triangle, return_inverse=True)
-        # only used corners: a mesh with all corners would be sent to the device once per material
+        # use only the corners of these triangles: otherwise all corners would be sent to the device for each material
         points = vertices[corners]
         mesh = mi.Mesh(name, vertex_count=len(points), face_count=len(triangle))
         parameters = mi.traverse(mesh)
@@ -221,7 +222,7 @@ def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
 
         if name.partition(" with ")[0] in ITU_MATERIALS_PROPERTIES:
             return rt.ITURadioMaterial(f"m-{plain}", name.partition(" with ")[0], thickness=thick)
-    # Sionna takes the conductivity [S/m] and divides by omega eps0 again
+    # Sionna expects the conductivity [S/m], which it divides by omega eps0
     conductivity = -eta.imag * 2.0 * np.pi * carrier_hz * 8.8541878128e-12
     return rt.RadioMaterial(
         f"m-{plain}",
@@ -244,13 +245,13 @@ def _slots(built: _Scene, targets: int) -> int:
 def _points(values: FloatArray) -> Any:
     import mitsuba as mi
 
-    # lists: Dr.Jit would use NumPy's memory directly, and compile again for each alignment
+    # use lists, because Dr.Jit would use NumPy's memory directly and compile again for each alignment
     return mi.Point3f(*(mi.Float(column) for column in values.T.astype(np.float32).tolist()))
 
 
 @dataclass(frozen=True, slots=True)
 class _Ends:
-    """The devices of one element for PathSolver: centres (devices, 3) and rotations (devices, 3, 3)."""
+    """Devices with one element each, for PathSolver: centres (devices, 3) and rotations (devices, 3, 3)."""
 
     centres_m: FloatArray
     turns: FloatArray
@@ -304,7 +305,7 @@ class _Finder:
         self.built, self.batch = built, batch
         scene = built.scene
         for name, kind in zip(("tx_array", "rx_array"), patterns, strict=True):
-            # both polarisations: slants are computed from them afterwards without another search
+            # use both polarisations, from which all slants are computed without another search
             pattern = rt.antenna_pattern.antenna_pattern_registry.get(kind)(polarization="VH")
             setattr(scene, name, rt.AntennaArray(pattern, _points(np.zeros((1, 3)))))
         for i in range(len(sources.centres_m)):
@@ -323,7 +324,7 @@ class _Finder:
         self._share_kernels()
 
     def _watch_candidates(self) -> None:
-        """Keep PathSolver's own count of candidates per source, which goes on counting beyond its limit."""
+        """Store PathSolver's own count of candidates per source, which also counts candidates beyond its limit."""
         generator = self.solver._candidate_generator
         inner = generator._shoot_and_bounce
         place = list(inspect.signature(inner).parameters).index("paths_counter_per_source")
@@ -336,7 +337,7 @@ class _Finder:
         generator._shoot_and_bounce = watched
 
     def _share_kernels(self) -> None:
-        """Let kernels read the ray directions. Their number, a literal, would compile the largest two kernels again."""
+        """Pass ray directions to kernels as data. As a literal, their number would compile two kernels again."""
         import drjit as dr
         import sionna.rt.path_solvers.sb_candidate_generator as generator
         from sionna.rt.utils import fibonacci_lattice
@@ -352,11 +353,11 @@ class _Finder:
         self.solver._field_calculator = lambda **named: field(**named | {"samples_per_src": 1})
 
     def _replace_endpoints(self, towers: int) -> None:
-        """Give PathSolver arrays of positions: those of the devices would be literals in the kernels."""
+        """Give PathSolver arrays of positions, because positions of devices would be literals in the kernels."""
         import drjit as dr
         import mitsuba as mi
 
-        # public methods with a documented result
+        # replace public methods, whose results are documented
         def sources(synthetic_array: bool, return_velocities: bool) -> tuple[Any, Any, Any, Any]:  # noqa: ARG001
             return *self.sources, dr.zeros(mi.Vector3f, towers) if return_velocities else None
 
@@ -369,7 +370,7 @@ class _Finder:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Undo what makes scene and finder refer to each other, so that both are freed with their last user."""
+        """Remove the references between scene and finder, so that both are freed with their last user."""
         scene = self.built.scene
         del scene.sources, scene.targets
         for name in (*scene.transmitters, *scene.receivers):
@@ -378,7 +379,7 @@ class _Finder:
         self.built, self.solver = None, None  # type: ignore[assignment]
 
     def trace(self, targets: _Ends, search: Search) -> Any:
-        """Search Sionna's paths of one padded batch, with more room until all candidates fit."""
+        """Search Sionna's paths of one padded batch. Increase the limits until all candidates fit."""
         self.targets = targets.padded(self.batch).arguments()
         paths = self._solved(search)
         # lines of sight do not need a table
@@ -401,12 +402,12 @@ class _Finder:
         )
 
     def _more_room(self) -> bool:
-        """Check whether the last batch had more candidates than room, and increase the room if it had."""
+        """Check whether the last batch exceeded the limits on candidates, and increase the limits if it did."""
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
         most = 0 if self.candidates is None else int(np.asarray(self.candidates.numpy()).max(initial=0))
         slots = self.slots
-        # doubled, so that the slots of a table stay a power of two
+        # double the number of slots, which must be a power of two
         while most > _FULLEST_TABLE * slots:
             slots *= 2
         slots = max(self.slots, min(slots, _MOST_SLOTS // max(1, len(self.built.scene.transmitters))))
@@ -436,7 +437,7 @@ class _Finder:
                 f"a tower has nearly {self.limit} paths in one batch, beyond which Sionna drops paths",
                 cause="take a smaller batch",
             )
-        # over both polarisations at both ends
+        # sum over both polarisations at both ends
         gain = np.sqrt((real**2 + imaginary**2).sum(axis=(1, 3)))[:count]
         return _arrays(paths, count) | {"gain": gain}
 
@@ -485,7 +486,7 @@ def find_paths(
     search : Search
         Depth, rays and batch.
     carrier_hz : float
-        Sionna shoots by reflection power, so materials matter to what it finds.
+        Carrier frequency. Sionna samples rays by reflected power, so the materials at this frequency affect its search.
     surfaces : Surfaces, optional
         Surfaces of the faces, if they are open surfaces.
     progress : callable, optional
@@ -535,9 +536,9 @@ class Coefficients:
     paths : PathSet
         Paths with Sionna's reflection points.
     gain : (paths, 2, 2) complex
-        UAV elements by tower elements, carrier phase included.
+        Coefficients (UAV elements, tower elements), including the carrier phase.
     length_m : (paths,)
-        Along Sionna's reflection points, in float64.
+        Length along Sionna's reflection points, in float64.
     """
 
     paths: PathSet
@@ -566,7 +567,7 @@ def own_coefficients(
     probe : Link
         Link with two elements of one pattern in each array's centre.
     turns : ((towers, 3, 3), (poses, 3, 3))
-        Device to site, of the towers' arrays and of the UAV's at each pose.
+        Rotations from device to site, for the towers' arrays and for the UAV's array at each pose.
 
     Returns
     -------
@@ -705,7 +706,7 @@ def _refine(
 def _relocate(
     faces: Faces, sources_m: FloatArray, targets_m: FloatArray, sequence: IntArray, tolerance_m: float
 ) -> IntArray:
-    """Replace each face by the coplanar one that contains the reflection point: Sionna reports any of a plane."""
+    """Replace each face by the coplanar face with the reflection point, because Sionna reports any face of a plane."""
     plane = planes_of(faces)
     if len(np.unique(plane)) == len(plane) or not len(sequence):
         return sequence
@@ -714,7 +715,7 @@ def _relocate(
         used = np.flatnonzero(sequence[:, step] >= 0)
         # only if the face that Sionna named does not contain the point
         outside = used[~inside(faces, sequence[used, step], everywhere[used, step], _EDGE_TOLERANCE_M)]
-        for row in outside:  # few: only scenes with disjoint coplanar faces
+        for row in outside:  # rarely used, only in scenes with disjoint coplanar faces
             twins = np.flatnonzero(plane == plane[sequence[row, step]])
             point = np.tile(everywhere[row, step], (len(twins), 1))
             holding = twins[inside(faces, twins, point, _EDGE_TOLERANCE_M)]

@@ -24,11 +24,11 @@ from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, Occlusion, retraced, s
 # ``solid`` of the tangent planes of the terrain; that of a tower's level ground is -1.
 TERRAIN = -2
 
-# A mirror over a smaller part of its Fresnel zone is ignored.
-# At this part, a reflection is 20 dB below that of a complete mirror.
+# A mirror is ignored if the ground fills a smaller part of its Fresnel zone than this.
+# At this part, the reflection is 20 dB below that of a complete mirror.
 _SMALLEST_PART = 0.1
 
-# A point that still moves after this many steps gets the plane of a crease.
+# Number of iterations after which a point that still moves is treated like a crease.
 _STEPS = 8
 _STILL_M = 1e-6
 
@@ -36,7 +36,7 @@ _STILL_M = 1e-6
 def on_terrain(
     dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: float
 ) -> tuple[PathSet, PathSet, Faces, int]:
-    """Return paths of an engine with the ground of an elevation model instead of level planes.
+    """Return the paths of an engine after replacing level ground by the ground of an elevation model.
 
     Parameters
     ----------
@@ -57,10 +57,10 @@ def on_terrain(
     faces : Faces
         Faces of the scene, followed by the tangent planes.
     unknown : int
-        Links over ground that the model does not know.
+        Number of links over ground outside the elevation model.
     """
     ground = np.append(faces.solid < 0, False)
-    once = ground[paths.faces].any(axis=1)  # never twice: no face of a prism looks down
+    once = ground[paths.faces].any(axis=1)  # at most one ground reflection, because no face of a prism faces down
     pose, tower = np.nonzero(searched_links(links).T)
     unknown = np.zeros((len(links.targets_m), len(links.sources_m)), dtype=np.bool_)
     for some, _, height in dem.profiles(links.sources_m[tower], links.targets_m[pose]):
@@ -102,7 +102,7 @@ class _Candidates:
     plane: IntArray
 
     def followed(self, dem: Dem, faces: Faces, links: Links, wavelength_m: float) -> tuple[IntArray, PathSet, Faces]:
-        """Return the rows of the engine that stay valid, paths over tangent planes, and all faces."""
+        """Return the rows of the engine's paths that remain valid, the paths over tangent planes, and all faces."""
         source, target = links.sources_m[self.tower], links.targets_m[self.pose]
         slot = (self.sequence == self.plane[self.tower][:, None]).argmax(axis=1)
         where, place, normal, part = specular_points(
@@ -119,20 +119,20 @@ class _Candidates:
             material=tuple(faces.material[f] for f in mine.tolist()),
             label=("terrain",) * len(where),
         )
-        # in place: the record is frozen, the array that it made is not shared
+        # change the array in place: the record is frozen, but its array is not shared
         plain.solid[:] = TERRAIN
         every = joined(faces, plain)
         sequence = self.sequence[where].copy()
         sequence[np.arange(len(where)), slot[where]] = len(faces) + np.arange(len(where))
         paths = self._traced(every, where, sequence, links, -20.0 * np.log10(part[~level]))
-        # buildings of the scene before its new planes, which hide nothing
+        # use the faces without the tangent planes, which do not block
         hiding = Occlusion(faces, RELATIVE_TOLERANCE * 1e4)
         cut = hiding.any_segment(links.sources_m[paths.tower], paths.vertices_m, links.targets_m[paths.pose])
         paths = paths.select(~cut)
         return rows[rows >= 0], paths.select(_clear(dem, every, links, paths, wavelength_m)), every
 
     def _traced(self, faces: Faces, where: IntArray, sequence: IntArray, links: Links, loss_db: FloatArray) -> PathSet:
-        """Return paths over the planes in order, sorted by pose and tower, without a test for obstacles."""
+        """Return paths over the planes, sorted by pose and tower. Obstacles are not tested."""
         pose, tower = self.pose[where], self.tower[where]
         tolerance = RELATIVE_TOLERANCE * max(float(np.abs(links.sources_m).max(initial=1.0)), 1.0)
         vertices, good = retraced(faces, sequence, links.sources_m[tower], links.targets_m[pose], tolerance)
@@ -156,10 +156,10 @@ def _ends_seen_from(
 
 
 def _clear(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: float) -> BoolArray:
-    """Check which paths with one reflection off the ground have no leg that the terrain stops.
+    """Check which paths with one ground reflection have no leg that the terrain blocks.
 
-    Ground is roughness and does not stop a path if it rises into a leg by less than the height of Rayleigh's criterion
-    at the reflection, and by less than the radius of the Fresnel zone.
+    Ground that rises into a leg by little counts as roughness and does not block it. The rise must be less than the
+    height of Rayleigh's criterion at the reflection, and less than the radius of the Fresnel zone.
     """
     source, target = links.sources_m[paths.tower], links.targets_m[paths.pose]
     points, row = paths.vertices_m, np.arange(len(paths))
@@ -219,13 +219,13 @@ def _stationary(
         slope = np.diff(ground, axis=0) / np.diff(along, axis=0)  # NaN where a shorter profile repeats its end
 
         def growth(d: FloatArray, z: FloatArray) -> FloatArray:
-            """Return the growth of the way over the ground along the profile."""
+            """Return the derivative of the path length over the ground along the profile."""
             from_source, from_target = np.hypot(d, z - up[0]), np.hypot(d - length, z - up[1])
             before = (d + slope * (z - up[0])) / np.maximum(from_source, 1e-12)
             after = (d - length + slope * (z - up[1])) / np.maximum(from_target, 1e-12)
             return np.asarray(before + after)
 
-        # at both ends of each piece of the profile: between them it changes its sign at most once
+        # evaluate it at both ends of each piece of the profile, between which it changes its sign at most once
         ends = [growth(along[:-1], ground[:-1]), growth(along[1:], ground[1:])]
     turns = np.stack(ends, axis=1).reshape(-1, len(source))
     # a change of sign within a piece is a mirror in it; between two pieces it is a mirror in their crease
@@ -245,13 +245,13 @@ def _stationary(
     good = crease | ((over[0] > 0.0) & (over[1] > 0.0))
     column, d, z, crease, way = column[good], d[good], z[good], crease[good], way[good]
     zone = np.cumsum((np.diff(column, prepend=-1) != 0) | (np.abs(np.diff(way, prepend=0.0)) >= wavelength_m / 2.0))
-    # within a Fresnel zone the shortest way, which comes first (Fermat)
+    # within a Fresnel zone keep the shortest path, which sorts first (Fermat)
     order = np.lexsort((way, zone))
     first = order[np.flatnonzero(np.diff(zone[order], prepend=-1))]
     column, d, z, crease, way = column[first], d[first], z[first], crease[first], way[first]
     at, heights = along[:, column], (source[column, 2], target[column, 2])
     total = length[column]
-    # the slope at which the way is stationary: that of the piece, or between those of both sides of a crease
+    # slope at which the path is stationary: the slope of the piece, or a slope between those of both sides of a crease
     to_source, to_target = np.hypot(d, z - heights[0]), np.hypot(d - total, z - heights[1])
     steep = (z - heights[0]) / np.maximum(to_source, 1e-12) + (z - heights[1]) / np.maximum(to_target, 1e-12)
     lean = -(d / np.maximum(to_source, 1e-12) + (d - total) / np.maximum(to_target, 1e-12)) / np.where(
@@ -264,14 +264,14 @@ def _stationary(
         for up in (ground[:, column], z + lean * (at - d))
     ]
     part = np.minimum(widths[0] / np.maximum(widths[1], 1e-12), 1.0)
-    # level ground must come out as exactly 1, so that it stays the plane that it was
+    # level ground must be exactly 1, so that its original plane is kept
     part = np.where(part > 1.0 - 1e-9, 1.0, part)
     good = part >= _SMALLEST_PART
     return column[good], d[good], crease[good], part[good]
 
 
 def _zone_m(along: FloatArray, at: FloatArray, excess_m: FloatArray, wavelength_m: float) -> FloatArray:
-    """Return the length round ``at`` over which profiles (samples, points) lengthen a path by half a wavelength."""
+    """Return the length around ``at`` where profiles (samples, points) lengthen a path by up to half a wavelength."""
     number, point = np.arange(len(along))[:, None], np.arange(len(at))
     half, width = wavelength_m / 2.0, np.zeros(len(at))
     beyond = ~(excess_m < half)
@@ -295,7 +295,7 @@ def _zone_m(along: FloatArray, at: FloatArray, excess_m: FloatArray, wavelength_
 def _settled(
     dem: Dem, source: FloatArray, target: FloatArray, along: FloatArray, crease: BoolArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Move mirrors from the profile to the surface: points, normals, and whether both ends are above their planes."""
+    """Move mirrors from the profile to the surface. Return points, normals, and whether both ends are above."""
     way = target[:, :2] - source[:, :2]
     way = way / np.maximum(np.hypot(*way.T), 1e-12)[:, None]
     begin = source[:, :2] + along[:, None] * way
@@ -309,7 +309,7 @@ def _settled(
         height_sum = np.where(over[0] + over[1] > 0.0, over[0] + over[1], np.inf)
         moved = feet[0] + (feet[1] - feet[0]) * (over[0] / height_sum)[:, None] - spot
         moved = np.where(crease[:, None], moved - (moved * way).sum(axis=1)[:, None] * way, moved)
-        # within a cell: farther off the surface is another one
+        # limit a step to one cell, because the surface of another cell is different
         spot = begin + np.clip(spot + moved - begin, -dem.cell_m, dem.cell_m)
     place = np.column_stack([spot, dem.ground_m(*spot.T)])
     slope = np.stack(dem.slope(*spot.T), axis=1)

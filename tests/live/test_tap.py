@@ -268,7 +268,7 @@ def test_clock_steps_are_recorded(modem, tap, tools, tmp_path):
 
     sim = modem(faults=Faults(latency_s=0.0))
     session = tap(sim.port, options={"clock": Clock(wall, time.monotonic_ns)})
-    session.wait(lambda: len(served_and_read(sim, CSI)) >= 3)
+    session.wait(lambda: len(served_and_read(sim, CSI)) >= 12)  # on a busy machine, fewer may bring no first offset
     pause[0] = 0.056
     count = len(sim.journal)
     session.wait(lambda: len(sim.journal) > count + 3)

@@ -5,7 +5,7 @@ The lag between radio clock and telemetry clock follows from the likelihood of t
 There is one sign convention: ``radio_minus_telemetry_s`` is positive if the radio clock shows a later time. Radio times
 are corrected by subtracting it.
 
-Clocks that differ by full hours are found because their logs overlap only after such a shift.
+A clock that is wrong by full hours is recognised because the logs overlap only after a shift of that many hours.
 
 The start of a log with relative times follows from a companion log with absolute times.
 """
@@ -33,36 +33,37 @@ from .track import interpolated, nanoseconds
 # Verdicts.
 OK, SHIFTED, CANNOT_TELL = "ok", "shifted", "cannot tell"
 
-# Lags whose log likelihood is lower than the best one by this are excluded [nat].
+# A lag is excluded if its log likelihood is below the maximum by more than this value [nat].
 EVIDENCE_NAT = 4.0
 
-# Smaller lags are not a shift [s], because positions, models and time stamps of real flights are not more accurate.
+# Lags up to this value [s] are not reported as a shift: positions, models and time stamps of real flights are not
+# accurate enough.
 _SAME_S = 0.5
 
 # Clocks agree if every lag beyond this is excluded [s].
 _AGREE_S = 1.0
 
-# A channel that contradicts the common lag by more has its own clock [nat]. Real channels contradict it by at most 1.1,
-# two loggers 4 s apart by 350.
+# A channel has its own clock if its log likelihood at the common lag is below its maximum by more than this value
+# [nat]. The difference is at most 1.1 for real channels, and 350 for two loggers 4 s apart.
 _APART_NAT = 12.0
 
-# Accuracy of time stamps of autopilots and loggers [s], by which the interval is widened on each side.
+# Accuracy of the time stamps of autopilots and loggers [s]. The interval is widened by this value on each side.
 STAMPS_S = 0.25
 
 # First and last spacing of the lags, and the largest number of lags that are refined.
 _STEP_S, _FINEST_S, _MOST_FINE = 0.5, 0.02, 40
-# Means of the level per channel, over one second or longer.
+# Largest number of means of the level per channel. Each mean covers one second or more.
 _BINS = 900
 _FEWEST = 60
-# Number of times within a mean at which the prediction is evaluated.
+# Number of times per mean at which the prediction is evaluated.
 _PER_BIN = 8
 
-# Lengths (chord of the unit sphere) of the gains of tower and UAV: fine, broad, and both.
+# Correlation lengths of the gains of tower and UAV over direction, as chords of the unit sphere.
 _CHORDS = ((0.2, 0.4, 0.8), (0.2, 0.45, 0.9))
-# Largest number of features of the gain of an end, and the variance that they may miss.
+# Largest number of features per gain, and the share of its variance that they may miss.
 _FEATURES, _LEFT = 64, 0.01
 
-# Standard deviation of offset and slope relative to that of the residual, which leaves them free.
+# Prior standard deviation of offset and slope, relative to that of the residual: so large that the data decide.
 _FREE = 1e3
 
 _MEMORY_S = (2.0, 5.0, 15.0, 40.0)
@@ -70,12 +71,11 @@ _WHITE = (0.1, 0.3, 0.9)
 # Candidate standard deviations for :class:`_Parts`.
 _GAIN = (0.05, 0.5, 1.0, 2.0)
 
-# Parts of the flight. A shift must also be significant without any two neighbouring parts [nat], because a dip, a jump
-# of the position or a frozen track must not shift a clock.
+# The flight is divided into this number of parts. With any two neighbouring parts removed, a shift must still be more
+# likely than no shift by this value [nat]: one dip, one jump of the position or a frozen track must not shift a clock.
 _LEFT_OUT, _WITHOUT_NAT = 10, 2.0
 
-# A mean farther than this number of robust standard deviations from the median of its neighbours is moved to that
-# limit.
+# Means are limited to this number of robust standard deviations from the median of this number of neighbours.
 _LONE, _NEIGHBOURS = 4.0, 9
 
 # Number of lags that are evaluated together, which limits the memory.
@@ -83,7 +83,7 @@ _AT_ONCE = 16
 
 
 class _Parts(NamedTuple):
-    """The correlation time [s], white part and gains of a residual, relative to the SD of its correlated part."""
+    """The correlation time [s] of a residual, and the SDs of white part and gains relative to its correlated part."""
 
     memory_s: float
     white: float
@@ -95,7 +95,7 @@ _START = _Parts(5.0, 0.3, 1.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Along:
-    """Predictors of the level of a channel, at equally spaced times of the telemetry. NaN without a pose.
+    """Predictors of the level of a channel at equally spaced times of the telemetry, NaN where the pose is unknown.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class Along:
 
     @property
     def place(self) -> tuple[float, float, bytes, bytes]:
-        """Key that is equal if the features are equal."""
+        """A key that is equal for channels with equal features."""
         return self.start_s, self.step_s, self.distance_m.tobytes(), self.directions.tobytes()
 
 
@@ -138,7 +138,7 @@ class ClockChannel:
 
     @property
     def flat(self) -> bool:
-        """True if the levels hardly vary although every model predicts that they do."""
+        """True if the levels hardly vary although every model predicts a variation."""
         at = (self.time_s - self.along.start_s) / self.along.step_s
         known = np.isfinite(self.measured_db)
         models = (np.interp(at[known], np.arange(len(p)), p) for p in self.along.predicted_db.values())
@@ -182,12 +182,12 @@ class ClockEstimate:
 
     @property
     def correction_s(self) -> float:
-        """Correction to subtract from radio times: the estimate if it differs significantly from zero, otherwise 0."""
+        """The lag to subtract from radio times: the estimate if it differs significantly from zero, otherwise 0."""
         low, high = self.ci95_s
         return 0.0 if self.verdict == CANNOT_TELL or low <= 0.0 <= high else self.radio_minus_telemetry_s
 
     def result(self, receiver: str, *, apply: bool) -> ClockResult:
-        """Return the estimate as a result of the flight, which is applied if ``apply`` is set and it is significant."""
+        """Return the estimate as a result of the flight, applied if ``apply`` is set and the lag is significant."""
         applied = ESTIMATED
         if (apply and self.verdict != OK) or (apply and self.correction_s):
             applied = APPLIED if self.correction_s else NOT_APPLIED
@@ -203,7 +203,7 @@ class ClockEstimate:
 
 
 def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> ClockEstimate:
-    """Return one estimate for the channels with time stamps of one computer.
+    """Estimate the lag of channels whose time stamps come from one computer.
 
     Parameters
     ----------
@@ -223,9 +223,9 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     model. Three parts are random: gains over the direction at either end (Gaussian processes), a correlated residual
     (Ornstein-Uhlenbeck) and a white residual. Offset, slope and gains are integrated out, and the scale is profiled.
     The correlation time, the white share and the gains maximise the likelihood on a small grid, per channel, at lag 0
-    or at the most likely lag of a model. Each lag counts with the model that explains it best, so a model that is not
-    more likely than another at another lag excludes nothing. A level without any dependence on position must be less
-    likely. A shift must also be significant without any fifth of the flight, because one dip, jump of the position or
+    or at the most likely lag of a model. For each lag, the model with the highest likelihood counts. A poor model
+    therefore cannot exclude a lag. The best lag must be more likely than a level that does not depend on position at
+    all. A shift must also be significant without any fifth of the flight, because one dip, jump of the position or
     frozen track must not decide.
     """
     alive = [channel for channel in channels if not channel.flat]  # a constant level contains no information about time
@@ -245,9 +245,9 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
         return _nothing(_NO_OVERLAP, window_s)
     steps = int(window_s / _STEP_S + 1e-9)
     lags = np.asarray(np.arange(-steps, steps + 1) * _STEP_S, dtype=np.float64)
-    # find likely lags with one guess of the correlation time, which is then fitted at these lags
+    # find likely lags with a guess of the correlation time, then fit the correlation time at these lags
     first = np.sum([b.likelihood(lags, [[_START]] * len(names)).sum(axis=0) for names, b in bins.items()], axis=0)
-    starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # lags of each model, and zero
+    starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # the likeliest lag of each model, and zero
     parts = {names: b.fitted(starts) for names, b in bins.items()}
 
     def likelihood(block: FloatArray) -> FloatArray:
@@ -257,7 +257,7 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     names = [name for together in bins for name in together]
     estimate = _judged(tried, nats, names, window_s)
     # channels of one computer have one lag, so their log likelihoods add
-    total = nats.sum(axis=0).max(axis=1)  # each model at its most likely lag
+    total = nats.sum(axis=0).max(axis=1)  # the most likely model at each lag
     n = sum(b.n * len(together) for together, b in bins.items())
     estimate = replace(estimate, model=models[int(total.argmax())], n=n)
     explained = total.max() - sum(b.constant() for b in bins.values())
@@ -305,7 +305,7 @@ def _same_models(channels: Sequence[ClockChannel]) -> list[ClockChannel]:
 
 
 def _at_one_time(channels: Sequence[ClockChannel]) -> dict[tuple[Hashable, ...], list[ClockChannel]]:
-    """Return groups of channels with equal positions, times, and missing levels."""
+    """Return the channels in groups with equal positions, times and missing levels."""
     groups: dict[tuple[Hashable, ...], list[ClockChannel]] = {}
     for channel in channels:
         finite = [np.isfinite(v).tobytes() for v in (channel.measured_db, *channel.along.predicted_db.values())]
@@ -316,11 +316,11 @@ def _at_one_time(channels: Sequence[ClockChannel]) -> dict[tuple[Hashable, ...],
 def _finer(
     lags: FloatArray, likelihood: Callable[[FloatArray], FloatArray], window_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return lags (m,) that are finer near the maximum of the log likelihood (channels, models, m)."""
+    """Refine the lags near the maximum, and return lags (m,) and log likelihoods (channels, models, m)."""
     nats, step = likelihood(lags), _STEP_S
     while step > _FINEST_S:
         total = nats.sum(axis=0).max(axis=0)
-        # 2 nat more, because an optimum that is not excluded may lie between two excluded lags
+        # 2 nat of margin, because a lag that is not excluded may lie between two excluded lags
         near = lags[total > total.max() - EVIDENCE_NAT - 2.0]
         if len(near) > _MOST_FINE:
             break
@@ -342,11 +342,11 @@ def _nothing(reason: str, window_s: float) -> ClockEstimate:
 
 
 def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: float) -> ClockEstimate:
-    """Return the verdict for log likelihoods (channels, models, lags)."""
+    """Return the estimate and verdict from log likelihoods (channels, models, lags)."""
     models = nats.sum(axis=0)
     best, total = int(models.max(axis=1).argmax()), models.max(axis=0) - models.max()
     near = np.flatnonzero(total > -EVIDENCE_NAT)
-    # the nearest excluded lags
+    # the interval ends at the nearest excluded lags
     first, last = lags[max(near[0] - 1, 0)], lags[min(near[-1] + 1, len(lags) - 1)]
     low, high = max(float(first) - STAMPS_S, -window_s), min(float(last) + STAMPS_S, window_s)
     against = -float(total[np.abs(lags) <= _SAME_S + 1e-9].max())
@@ -378,7 +378,7 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bins:
-    """Means (n, channels), the times (s,) at which predictions are averaged, and the first time of each mean.
+    """Means of levels (n, channels), the times (s,) of the predictions, and the index of the first time of each mean.
 
     ``features`` of directions are averaged over the same duration about each time. ``predicted`` (channels, models) is
     the index in ``levels`` (g, k) of the prediction for a channel by a model.
@@ -414,13 +414,13 @@ class _Bins:
             low, high = (np.floor((t + side - along.start_s) / along.step_s) for side in (-window_s, window_s))
             ok: BoolArray = np.isfinite(y).all(axis=1) & (low >= 0) & (high + 1 < len(lost))
         begin, end = (np.where(ok, side, 0).astype(np.int64) for side in (low, high))
-        # a running count of gaps, because no time of the complete window may lack a prediction
+        # count gaps cumulatively: the prediction must exist at all times of the window
         ok[ok] = missing[end[ok] + 2] == missing[begin[ok]]
         order = np.flatnonzero(ok)[np.argsort(t[ok], kind="stable")]
         t, y = t[order], y[order]
         if not len(t):
             return None
-        # one second, and longer on flights over a quarter of an hour, because the cost grows with the bins
+        # one second, or more on flights over a quarter of an hour, because the cost grows with the number of bins
         width = max(1.0, (t[-1] - t[0]) / _BINS)
         _, first, count = np.unique(np.floor(t / width), return_index=True, return_counts=True)
         if len(first) < _FEWEST:
@@ -440,12 +440,12 @@ class _Bins:
         low = place.astype(np.int64)
         share = (place - low)[:, None]
         out = table.take(low, axis=0)
-        out *= 1.0 - share  # in place and with take, because brackets and new tables need twice the time
+        out *= 1.0 - share  # in place and with take, because indexing with brackets and new tables takes twice the time
         out += table.take(low + 1, axis=0) * share
         return out
 
     def systems(self, lags: FloatArray) -> FloatArray:
-        """Return features of offset, slope and gains, then residuals of each channel and model: (n, lags, columns)."""
+        """Return a table (n, lags, columns) of features (offset, slope, gains) and residuals per channel and model."""
         count = np.diff(np.append(self.first, len(self.at_s)))[:, None]
         features, models = self.features.shape[1], self.predicted.shape[1]
         out = np.empty((self.n, len(lags), features + self.predicted.size))
@@ -453,14 +453,14 @@ class _Bins:
             level = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
             residual = np.repeat(self.mean_db, models, axis=1) - level[:, self.predicted.ravel()]
             out[:, row, :features] = self._between(self.mean_s - lag, self.features)
-            # the offset is free, and numbers near 0 retain their digits
+            # the offset is fitted anyway, and numbers near 0 keep their digits
             out[:, row, features:] = residual - residual.mean(axis=0)
         return out
 
     def likelihood(
         self, lags: FloatArray, parts: Sequence[Sequence[_Parts]], kept: BoolArray | None = None
     ) -> FloatArray:
-        """Return the log likelihood (channels, models, lags) of the means ``kept``, with the most likely parts."""
+        """Return the log likelihood (channels, models, lags) of means ``kept`` with the best parts per channel."""
         every = list(dict.fromkeys(chain(*parts)))
         belongs = np.array([[part in mine for mine in parts] for part in every])[:, None, :, None]
         blocks = np.array_split(lags, -(-len(lags) // _AT_ONCE))
@@ -468,13 +468,13 @@ class _Bins:
         return np.moveaxis(np.concatenate(tried), 0, -1)
 
     def fitted(self, lags: FloatArray) -> list[list[_Parts]]:
-        """Return the most likely parts of each channel, for each model at some lags."""
+        """Return the most likely parts of each channel over all models and the given lags."""
         parts = [_Parts(*each) for each in product(_MEMORY_S, _WHITE, _GAIN)]
         best = self._tried(lags, parts).argmax(axis=0)
         return [[parts[at] for at in set(best[:, channel].flat)] for channel in range(best.shape[1])]
 
     def _tried(self, lags: FloatArray, parts: Sequence[_Parts], kept: BoolArray | None = None) -> FloatArray:
-        """Return the log likelihood (parts, lags, channels, models)."""
+        """Return the log likelihood of every combination (parts, lags, channels, models)."""
         rows = np.ones(self.n, dtype=bool) if kept is None else kept
         tried = _likelihood(self.systems(lags)[rows], self.mean_s[rows], self.predicted.size, parts)
         return tried.reshape(*tried.shape[:2], *self.predicted.shape)
@@ -488,7 +488,7 @@ class _Bins:
 
 
 def _calm(mean_db: FloatArray) -> FloatArray:
-    """Limit the distance of means (n,) from their neighbours, so that a single dip has little weight."""
+    """Limit the difference of means (n,) from their neighbours, so that a single dip has little weight."""
     from scipy.ndimage import median_filter
 
     middle = median_filter(mean_db, _NEIGHBOURS, mode="nearest")
@@ -498,9 +498,9 @@ def _calm(mean_db: FloatArray) -> FloatArray:
 
 
 def _averaged(table: FloatArray, width: float) -> FloatArray:
-    """Return the running mean of a table (g, k) over rows. NaN if a row has NaN.
+    """Return the running mean of a table (g, k) over its rows. Rows with NaN stay NaN.
 
-    Attitudes vary within a mean of the level. Taken at single times they would make the likelihood jump by 10 nat
+    The attitude varies while a level is averaged. If it were taken at single times, the likelihood would jump by 10 nat
     between lags 0.1 s apart, and one of the jumps would look like a sharp optimum.
     """
     from scipy.ndimage import correlate1d
@@ -514,7 +514,7 @@ def _averaged(table: FloatArray, width: float) -> FloatArray:
 
 
 def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray:
-    """Return features (g, q) whose products are the covariance of a gain of unit variance over directions (g, 3)."""
+    """Return features (g, q) of directions (g, 3). Their products are the covariance of a gain of unit variance."""
     finite = np.isfinite(direction).all(axis=1)
     unit = direction[finite] / np.linalg.norm(direction[finite], axis=1, keepdims=True)
 
@@ -525,7 +525,7 @@ def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray
     some = unit[:: max(1, len(unit) // 1500)]
     base = some[determining(some, covariance, _LEFT, _FEATURES)]
     out = np.full((len(direction), len(base)), np.nan)
-    # the points are almost independent, and the added diagonal covers rounding errors
+    # the added diagonal covers rounding errors; it changes little, because the points are almost independent
     known = Factor.of(covariance(base, base) + 1e-9 * np.eye(len(base)))
     out[finite] = known.whiten(covariance(unit, base).T).T
     return out
@@ -534,7 +534,7 @@ def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray
 def _whitened(
     columns: FloatArray, time_s: FloatArray, memories: Sequence[tuple[float, float]]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return whitened columns (n, times, ...) for each correlation time, and log determinants of covariances (times,).
+    """Return whitened columns (n, times, ...) per correlation time, and log determinants (times,) of the covariances.
 
     A residual with a correlation time and a white share has the covariance exp(-|dt| / memory), plus white^2 on the
     diagonal. A Kalman filter subtracts from each row its expectation from earlier rows.
@@ -566,7 +566,7 @@ def _likelihood(columns: FloatArray, time_s: FloatArray, residuals: int, parts: 
     memories = list(dict.fromkeys((part.memory_s, part.white) for part in parts))
     white, log_det = _whitened(columns, time_s, memories)
     lags = range(columns.shape[1])
-    # the likelihood needs only these small matrices of the rows, on which gains are tried
+    # the likelihood needs only these small matrices, so the gains are varied without the rows
     gram = np.stack([[white[:, m, lag].T @ white[:, m, lag] for lag in lags] for m in range(len(memories))])
     n, p = len(columns), columns.shape[2] - residuals
     out = np.empty((len(parts), len(lags), residuals))
@@ -576,7 +576,7 @@ def _likelihood(columns: FloatArray, time_s: FloatArray, residuals: int, parts: 
         spread = np.concatenate([[_FREE] * 2, np.full(p - 2, part.gain), np.ones(residuals)])
         bordered = spread[:, None] * gram[which] * spread
         square = np.diagonal(bordered, axis1=1, axis2=2)[:, p:]
-        # only the left part of the last rows of the factor is used, and the 1 keeps the matrix positive definite
+        # only the first p columns of the last rows are used; adding 1 keeps the matrix positive definite
         lower = np.linalg.cholesky(bordered + np.eye(len(spread)))
         square = np.maximum(square - (lower[:, p:, :p] ** 2).sum(axis=2), np.finfo(np.float64).tiny)
         determinant = np.log(np.diagonal(lower, axis1=1, axis2=2)[:, :p]).sum(axis=1)[:, None] + 0.5 * log_det[which]
@@ -593,7 +593,7 @@ class ClockTrap:
     hours : float
         Hours to add to radio times.
     explanation : str
-        Explanation of the shift.
+        Cause of the shift.
     """
 
     hours: float
@@ -661,7 +661,7 @@ def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[
         moment = datetime.fromtimestamp(instant, utc.utc).astimezone(ZoneInfo(timezone))
         offset = moment.utcoffset()
         east = offset.total_seconds() / 3600.0 if offset else 0.0
-        # hours are added to the radio clock, because local time is behind UTC in western zones
+        # local time is behind UTC in western zones, so hours are added to the radio clock
         if east and hours == -east:
             return f"radio times are local time ({timezone}) stored as if they were UTC", False
         if east and hours == east:
@@ -672,11 +672,11 @@ def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[
     return f"the clocks differ by {hours:+g} h: a time zone was taken into account in one log only", False
 
 
-# Median distance of two receivers on one aircraft.
+# Largest median distance of two receivers on one aircraft [m].
 _AGREE_M = 12.0
-# A log whose few tested points are farther from the track than this at each full second is not on it [m].
+# A log is not on the track if the median distance of a few of its points exceeds this at every shift [m].
 _NEAR_M = 4.0 * _AGREE_M
-# The second-best origin, a minute away or more, must have a distance larger by this factor.
+# The best origin is unique if every origin more than a minute away has a distance larger by this factor.
 _UNIQUE = 1.8
 _POINTS = 240
 
@@ -698,17 +698,17 @@ class Origin:
 
 
 def origin_of(log: Stream, track: Stream) -> Origin | None:
-    """Return the zero of relative times with which the positions of a log are on a track.
+    """Return the zero of relative times that puts the positions of a log on a track.
 
-    It is None if there is no such time, or more than one.
+    Returns None if there is no such time, or more than one.
 
-    Both logs contain positions of the aircraft, the log at relative times t and the track at UTC. The search minimises
-    the median of ``|p_log(t) - p_track(t + s)|`` over shifts s, in steps of a second, then of 0.1 s near the best one.
+    Both contain positions of the aircraft: the log at relative times t, the track at UTC. The search minimises the
+    median of ``|p_log(t) - p_track(t + s)|`` over shifts s, in steps of a second, then of 0.1 s near the best one.
 
     Parameters
     ----------
     log : Stream
-        Log with positions, whose times count from 1970.
+        Log with positions, and relative times that were read as times since 1970.
     track : Stream
         Telemetry with absolute times.
     """
@@ -719,10 +719,10 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     time_s = mine[0].astype(np.int64) / 1e9
     track_s = tracked[0].astype(np.int64) / 1e9 - zero_s
     log_m, track_m = _metres(mine[1], tracked[1]), _metres(tracked[1], tracked[1])
-    # horizontally, because heights may count from different grounds
+    # horizontally, because the two logs may have different zeros of height
     line = shapely.linestrings(track_m[:, :2])
     shapely.prepare(line)
-    # at least a quarter of the log must be this close to the track, independent of time
+    # at least a quarter of the positions must be this close to the track at any time
     if 4 * shapely.dwithin(line, shapely.points(log_m[:, :2]), _AGREE_M).sum() < len(log_m):
         return None
     length = time_s[-1] - time_s[0]
@@ -756,16 +756,16 @@ def _points(frame: pd.DataFrame, most: int | None) -> tuple[AnyArray, FloatArray
     places = np.column_stack([frame[name].to_numpy(np.float64) for name in names])
     known = np.flatnonzero(np.isfinite(places[:, :2]).all(axis=1))
     time, first = np.unique(frame["time"].to_numpy("datetime64[ns]")[known], return_index=True)
-    # fewer positions may lie on any track by chance
+    # fewer positions may be on a track by chance
     if len(time) < 20:
         return None
-    # evenly, because take-off is similar in all flights
+    # evenly over the flight, because all flights have a similar take-off
     at = slice(None) if most is None or len(time) <= most else np.linspace(0, len(time) - 1, most).astype(int)
     return time[at], places[known[first]][at]
 
 
 def _metres(points: FloatArray, about: FloatArray) -> FloatArray:
-    """Return positions in metres relative to the first. Heights as logged, 0 if missing."""
+    """Return positions in metres relative to the first of ``about``, with heights as logged, or 0 if missing."""
     return np.column_stack([rough_m(points[:, 0], points[:, 1], about[0]), np.nan_to_num(points[:, 2])])
 
 
@@ -778,7 +778,7 @@ def _median_distances(
         time = time_s + some[:, None]
         inside = (time >= track_s[0]) & (time <= track_s[-1])
         apart = log_m - interpolated(time.ravel(), track_s, track_m).reshape(*time.shape, 3)
-        apart[..., 2] -= _medians(apart[..., 2], inside)[:, None]  # heights of the logs count from different grounds
+        apart[..., 2] -= _medians(apart[..., 2], inside)[:, None]  # the logs may have different zeros of height
         median = _medians(np.linalg.norm(apart, axis=2), inside)
         parts.append(np.where(2 * inside.sum(axis=1) < len(time_s), np.nan, median))
     return np.concatenate(parts)
@@ -788,7 +788,7 @@ _SHIFTS_AT_ONCE = 500
 
 
 def _medians(values: FloatArray, counts: BoolArray) -> FloatArray:
-    """Return the median of each row (n, m) over the values with ``counts``. NaN if there are none."""
+    """Return the median of each row (n, m) over the values that ``counts`` marks, NaN if it marks none."""
     ordered = np.sort(np.where(counts, values, np.inf), axis=1)
     number, row = counts.sum(axis=1), np.arange(len(values))
     low, high = np.maximum(number - 1, 0) // 2, np.minimum(number // 2, values.shape[1] - 1)

@@ -1,6 +1,6 @@
-"""Questions about logs: contradictions of names, neighbouring files, clocks and ground heights, and assumptions.
+"""Questions about logs: contradictions with file names, neighbouring files, clocks or ground heights, and assumptions.
 
-The file also sorts logs of several flights by time and position.
+The module also assigns the logs of several flights to their flights, by time and position.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from ..site.site import Site
 from .clock import Origin, origin_of
 from .track import Track
 
-# Logs that end and begin within this belong to one flight, because radios are started before take-off.
+# Largest pause between logs of one flight. Radios are started before take-off.
 SLACK = np.timedelta64(5, "m")
-# Tracks at the same time that are farther apart belong to two aircraft (about 5 km) [deg].
+# Two tracks at the same time belong to two aircraft if they are farther apart than this [deg] (about 5 km).
 APART_DEG = 0.05
 
 Span = tuple[np.datetime64, np.datetime64]
@@ -50,18 +50,18 @@ class Flight:
 
     @property
     def complete(self) -> bool:
-        """True if the flight has measurements, and positions for them."""
+        """True if the flight has measurements, and positions to compare them at."""
         measured = self.measured
         tracked = any(_tracks(file) for file in self.files)
         return bool(measured) and (tracked or any("latitude_deg" in stream.frame for stream in measured))
 
 
 def flights(files: Sequence[IngestedFile]) -> list[Flight]:
-    """Return flights in the order of time.
+    """Return the flights of a set of logs in order of time.
 
-    Telemetry begins a flight, and a radio log belongs to the flight with which it shares most time. Logs with relative
-    times belong to the flight on whose track their positions are, or otherwise to the flight in their folder. Without
-    such evidence they belong to the only flight, or to a separate one. If several logs have both levels and positions
+    Each telemetry log begins a flight. A radio log belongs to the flight with which it shares most time. A log with
+    relative times belongs to the flight whose track contains its positions, or else to the flight in its folder.
+    Otherwise it belongs to the only flight, or it is a separate flight. If several logs have both levels and positions
     and there is no absolute time, each is a flight.
 
     Parameters
@@ -70,7 +70,7 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
     """
     timed = [(file, span) for file in files if (span := _span_of(file)) is not None]
     groups: list[Flight] = []
-    # tracks first, in the order of time, so that radio logs then find their flight
+    # sort tracks by time before radio logs, so that every radio log finds its flight
     for file, span in sorted(timed, key=lambda entry: (not _tracks(entry[0]), entry[1][0])):
         place = _place(file)
         near = [flight for flight in groups if _meet(flight, span, place)]
@@ -95,19 +95,19 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
     return sorted(groups, key=lambda group: (group.span is None, (group.span or ())[:1]))
 
 
-# Number of a flight, and date, in the name of a log or of its folder.
+# Flight number in the name of a log or of its folder.
 _FLIGHT_NUMBER = re.compile(r"(?<![a-z])(flight|flt|sortie|mission)[ _.-]?0*(\d{1,3})(?!\d)", re.IGNORECASE)
 _DATE = re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)")
 
 
 def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
-    """Return the question about a log whose name has another flight or date than the track, or an empty text."""
+    """Return the question about a log whose name has another flight number or date than the track, otherwise empty."""
     names = ["/".join(Path(item.path).parts[-2:]) for item in (file, track)]
     first, second = ({(word.lower(), number) for word, number in _FLIGHT_NUMBER.findall(name)} for name in names)
     if first and second and not first & second:
         (shown, other) = (" ".join(min(found)) for found in (first, second))
         return f"its name has {shown}, the name of the track has {other}: which flight?"
-    # absolute times outweigh a name, because an evening flight has the next day in UTC
+    # absolute times count more than a name, because an evening flight has the date of the next day in UTC
     if _span_of(file) is not None:
         return ""
     dates = [{"-".join(parts) for parts in _DATE.findall(name)} for name in names]
@@ -155,7 +155,7 @@ def _meet(flight: Flight, span: Span, place: tuple[float, float] | None) -> bool
         return False
     if place is None or flight.place is None:
         return True
-    # the margin before and after applies to radios, while two tracks must share time
+    # the margin applies to radios only: two tracks must share time
     return meet(flight.span, span) and max(abs(place[0] - flight.place[0]), abs(place[1] - flight.place[1])) < APART_DEG
 
 
@@ -166,7 +166,7 @@ def _shared(first: Span | None, second: Span) -> np.timedelta64:
 
 
 def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
-    """Return the zero of relative times with which a log with positions is on the track of a flight."""
+    """Return the zero of relative times that puts the positions of a log on the track of a flight, or None."""
     track = next((track for member in flight.files for track in _tracks(member)), None)
     # use the longest stream, because a log of a hundred cells has the positions of one receiver a hundred times
     placed = [stream for stream in file.result.streams if "latitude_deg" in stream.frame]
@@ -174,7 +174,7 @@ def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
     return None if track is None or fullest is None else origin_of(fullest, track)
 
 
-# Limits within which a log fits two tracks about equally, so that it may belong to either flight.
+# A log may also belong to another track if its distance is below this factor or this value [m].
 _ALIKE, _ALIKE_M = 2.0, 5.0
 
 
@@ -185,8 +185,8 @@ def _called(flight: Flight) -> str:
 
 
 def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
-    """Return the flight of a file without absolute times. A new one is added to ``groups``."""
-    # a log with both levels and positions is a separate flight, because relative times share nothing with others
+    """Return the flight of a file without absolute times, and add it to ``groups`` if it is new."""
+    # a log with levels and positions is complete, and its relative times have no relation to those of other logs
     alone = Flight([file]).complete
     known = [flight for flight in groups if flight.span is not None] if alone else groups
     by_track = [
@@ -216,32 +216,32 @@ _IN_NAME = re.compile(
 )
 _NEMO_START = re.compile(r"^Measurement start;(\d{4} \w{3} \d\d \d\d:\d\d)", re.MULTILINE)
 
-# A date in a name may be local or UTC, and that of the start or the end.
+# A date in a name may be local or UTC, and that of the start or of the end.
 _OF_THE_DAY = timedelta(hours=36)
 
-# A program is started before its radio.
+# A time in a name may be earlier than the log, because a program starts before its radio.
 _OF_THE_MINUTE = timedelta(minutes=15)
 
-# A track whose lowest height [m] is farther from 0 does not begin at take-off.
+# A track does not begin at take-off if its lowest height differs from 0 by more than this [m].
 _GROUND_M = 5.0
 
 
 def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | None) -> list[str]:
-    """Return questions of a draft about the streams of a log, each with both values.
+    """Return the questions of a draft about the streams of a log. Each question contains both values.
 
     Parameters
     ----------
     file : IngestedFile
     streams : sequence of Stream
     timezone : str or None
-        Zone of clocks without a zone.
+        Time zone of clocks that do not specify one.
     """
     texts = []
     start = _start(streams)
     if start is not None:
         zone = ZoneInfo(timezone) if timezone else None
         starts = _name_starts(file.path)
-        # a log in a flight file has the path of the machine that made it, where no summary can be looked up
+        # a log inside a flight file has a path of another machine, so its folder cannot be searched for a summary
         if not file.holder:
             starts += _summary_starts(Path(file.path))
         texts += [
@@ -262,10 +262,10 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
     return list(dict.fromkeys(texts))
 
 
-# A lowest height above this has another datum, because no flight is that high [m].
+# If the lowest height of a track is above this [m], its heights have another datum: no flight is that high throughout.
 _TOO_HIGH_M = 150.0
 
-# Radios are started within this time of the telemetry. A difference of full hours shows a wrong zone.
+# A log whose start differs from that of the telemetry by full hours, within this time [s], has a wrong time zone.
 _TOGETHER_S = 90.0
 
 _MANY_WITHOUT_POSE = 0.1
@@ -278,7 +278,7 @@ def doubts(
     undated: Sequence[str] = (),
     takeoff_ground_m: float = 0.0,
 ) -> tuple[str, ...]:
-    """Return clauses about clocks and heights that the summary of a report repeats.
+    """Return doubts about clocks and heights, as clauses for the summary of a report.
 
     Parameters
     ----------
@@ -288,9 +288,10 @@ def doubts(
     series : sequence of (str, (n,) datetime64)
         Names and times of the series that are compared on the track.
     undated : sequence of str
-        Logs with positions that the flight file dates, while the telemetry has absolute times.
+        Logs with positions and relative times that the flight file dates, although the telemetry has absolute times.
     takeoff_ground_m : float
-        Height of the ground of the site at take-off, or minus its height above the sea if the log counts from there.
+        Height of the take-off point above the ground at the site's origin. If the heights of the log count from the
+        sea, it is minus the height of that ground above the sea.
 
     Returns
     -------
@@ -320,13 +321,13 @@ def doubts(
     return tuple(texts)
 
 
-# Heights of a flight without samples below this height above take-off count from the sea [m].
+# If no sample is below this height [m], the heights count from the sea and not from take-off.
 _FLOWN_M = 300.0
 
-# Heights that begin within this of the ground of the site above the sea probably count from the sea [m].
+# If the lowest height is within this [m] of the site's ground above the sea, heights probably count from the sea.
 _NEAR_GROUND_M = 50.0
 
-# A UAV at rest moves by at most this during this time [s, m], and then climbs by this [m].
+# A track starts with a take-off if the UAV moves by at most _REST_M in the first _REST_S, and then climbs by _CLIMB_M.
 _REST_S, _REST_M, _CLIMB_M = 5.0, 0.5, 5.0
 
 
@@ -358,7 +359,7 @@ def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
     near = sea_m is not None and low_m > _GROUND_M and abs(low_m - sea_m) < _NEAR_GROUND_M
     high = low_m > _FLOWN_M
     if high or (near and _takes_off(telemetry)):
-        # a UAV at rest is on the ground, independent of the datum of its heights
+        # a UAV at rest is on the ground, regardless of the datum of its heights
         ground_m = low_m if sea_m is None or not high else sea_m
         ground = "the ground of the take-off above the sea [m]" if sea_m is None else f"the ground is {sea_m:g} m up"
         line = f"'takeoff_ground_m: {site.takeoff_ground_m - ground_m:.0f}' under 'origin:' of the site file"
@@ -434,7 +435,7 @@ def _summary_starts(path: Path) -> list[tuple[str, datetime, str, timedelta]]:
 
 
 def _tables_beside(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield names and first bytes of CSV files in the folder of a log, or of the archive that contains it."""
+    """Yield the name and first bytes of every other CSV file in the folder of a log, on disk or inside an archive."""
     if path.parent.is_dir():
         for table in (table for table in sorted(path.parent.glob("*.csv")) if table != path and table.is_file()):
             with table.open("rb") as stream:
@@ -451,12 +452,12 @@ _HEAD_BYTES = 2000
 
 
 def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
-    """Return the smallest difference of a time from the start, as UTC and as local time (in any zone if unknown)."""
+    """Return the smallest difference of a time, read as UTC or local time (in any zone if unknown), from the start."""
     if not exact:
-        # a date is compared as its noon
+        # a date without a time means its noon
         return abs(start - time - timedelta(hours=12))
     if zone is not None:
-        # the offset of that day, because a zone has two in a year
+        # use the offset of that day, because a zone has two offsets per year
         offset = start.astimezone(zone).utcoffset() or timedelta(0)
         return min(abs(start - time), abs(start + offset - time))
     # all zones of the world, in half hours
@@ -473,8 +474,8 @@ def _lowest_m(stream: Stream) -> float | None:
     height = height[np.isfinite(height)]
     if not len(height):
         return None
-    # not the minimum, because a row of a receiver without a fix may be far below
+    # use a percentile, because a row of a receiver without a fix may be far too low
     low = float(np.percentile(height, 1.0))
-    # a log may end in the air, so its first height is used unless it jumps as that of a receiver without a fix
+    # also use the first height, because a log may end in the air; but not if it jumps, as without a fix
     begins = np.abs(np.diff(height[: len(height) // 100 + 2], prepend=0.0)).max() <= _GROUND_M
     return min(low, float(height[0])) if begins else low

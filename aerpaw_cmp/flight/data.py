@@ -1,9 +1,7 @@
 """The data of one flight from a checked flight file: site, logs, track, RSS and rank series.
 
-A report also warns of each setting that has no effect, because such a value misleads the reader.
-
-A value that equals its default is not reported. Names that no flight could have are refused
-(:func:`aerpaw_cmp.flight.data.check_names`).
+Settings that have no effect are reported, because they mislead the reader of a report. A value that equals its default
+is not reported. Towers and channels that the flight does not have are refused (:func:`check_names`).
 """
 
 from __future__ import annotations
@@ -43,7 +41,7 @@ _NEAR_ORIGIN = pd.Timedelta(days=2)
 
 
 def idle_log_keys(log: LogSettings, file: IngestedFile) -> list[str]:
-    """Return a warning per reason why keys of a line of ``logs:`` have no effect on its log."""
+    """Return warnings about keys of a line of ``logs:`` that have no effect, one per reason."""
     streams = file.result.streams
     kinds = {stream.kind for stream in streams}
     keys: dict[str, list[str]] = {}
@@ -74,7 +72,7 @@ def _starts_near(origin: str, file: IngestedFile) -> bool:
 
 
 def idle_settings(settings: FlightFile, kinds: Collection[str]) -> list[str]:
-    """Return a warning per reason why settings have no effect.
+    """Return warnings about settings that have no effect, one per reason.
 
     Parameters
     ----------
@@ -91,7 +89,7 @@ def idle_settings(settings: FlightFile, kinds: Collection[str]) -> list[str]:
 
 
 def _reasons(settings: FlightFile, kinds: Collection[str]) -> Iterator[tuple[str, str]]:
-    """Yield reasons, and the dotted keys that have no effect for each reason."""
+    """Yield each reason with the dotted keys that have no effect because of it."""
     rt, lag = settings.rt, settings.rss.lag
     if rt.foliage != "attenuating":
         foliage = "foliage_model leaves advanced.gamma_db_per_m advanced.maximum_loss_db"
@@ -122,7 +120,7 @@ Times = NDArray[np.datetime64]
 class RssSeries:
     """The measured RSS of one tower and channel.
 
-    ``time`` (n,) is UTC, and ``measured_db`` (n,) is NaN out of coverage.
+    ``time`` (n,) is in UTC. ``measured_db`` (n,) is NaN out of coverage.
     """
 
     tower: str
@@ -132,7 +130,7 @@ class RssSeries:
     measured_db: FloatArray
     link: LinkSettings
     settings_key: str
-    """Equal for series with equal link settings, which share a replay."""
+    """A key that is equal for series with equal link settings. Such series share a replay."""
     log: IntArray
     """Number of the log (n,) under ``logs:`` that contains each sample."""
     line: IntArray
@@ -186,12 +184,12 @@ class FlightData:
     doubts: tuple[str, ...] = ()
     """Clauses about clocks and heights that the summary of a report repeats."""
     cautions: tuple[str, ...] = ()
-    """Sentences about settings of the user that do not fit, which come before all other warnings."""
+    """Sentences about settings of the user that do not fit the flight. They come before all other warnings."""
     _links: dict[str, Link] = field(init=False, default_factory=dict, repr=False, compare=False)
 
     @property
     def series(self) -> list[tuple[str, RssSeries | RankSeries]]:
-        """All series with the kind of their measurement, RSS first."""
+        """All series, each with its kind ("rss" or "rank"), RSS first."""
         return [*(("RSS", s) for s in self.rss), *(("rank", s) for s in self.rank)]
 
     def link_of(self, series: RssSeries | RankSeries) -> Link:
@@ -208,7 +206,7 @@ class FlightData:
         return self.track.pose_at(time)
 
     def tower_at(self, tower: str, time: Times) -> tuple[FloatArray, BoolArray]:
-        """Return the array centre of a tower at times (n,), and whether it is known (n,). Unknown positions are NaN.
+        """Return the array centre of a tower at times (n,), NaN if unknown, and a mask (n,) of the known positions.
 
         The shape is (1, 3) for a fixed tower, and (n, 3) for one that moves.
         """
@@ -242,7 +240,7 @@ def choose_site(choice: SiteChoice, folder: Path) -> Site:
     return site
 
 
-# A ground node is fixed if its positions stay within this distance of their median, which is the noise of its GNSS.
+# A ground node is fixed if its positions stay within this distance of their median, because GNSS noise is that large.
 STANDS_STILL_M = 3.0
 
 
@@ -303,7 +301,7 @@ def ground_nodes(
 def _tracked_node(
     name: str, node: GroundNode, folder: Path, settings: FlightFile, site: Site
 ) -> tuple[tuple[float, float, float], Track | None, Sequence[str]]:
-    """Return the middle of the positions of a node (latitude, longitude, height), its track if it moves, and remarks.
+    """Return the median position of a node (latitude, longitude, height), its track or None if fixed, and remarks.
 
     Latitude and longitude are in degrees, the height in metres.
     """
@@ -315,7 +313,7 @@ def _tracked_node(
     middle = np.median(places, axis=0)
     east, north = site.frame.to_local(*np.vstack([middle, places]).T)
     reach_m = float(np.hypot(east - east[0], north - north[0]).max())
-    # GNSS heights of a node on the ground are as often below the ground as above
+    # limit heights, because half of the GNSS heights of a node on the ground are below the ground
     up = np.maximum(frame["altitude_m"].to_numpy(np.float64) + site.takeoff_ground_m, MINIMUM_HEIGHT_M)
     if logged and not np.isfinite(up).any():
         raise InputError(
@@ -323,7 +321,7 @@ def _tracked_node(
         )
     height_m = float(np.nanmedian(up)) if logged else node.antenna_height_m
     at = float(middle[0]), float(middle[1]), height_m
-    # a height that is taken from the ground does not change
+    # the height of a node on the ground does not change
     if max(reach_m, float(np.nanmax(np.abs(up - height_m))) if logged else 0.0) <= STANDS_STILL_M:
         return at, None, ()
     # the heights of a node on the ground are not used and may be missing
@@ -336,7 +334,7 @@ def _tracked_node(
             path=path,
         )
     remarks = [f"moves {reach_m:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
-    # the attitude of a node is not used
+    # the attitude of a node is not used, so its warnings are omitted
     return at, track, [*remarks, *dataclasses.replace(track.account, unknown_attitude=0, heading_alone=0).warnings]
 
 
@@ -347,7 +345,7 @@ def _track_of(site: Site, frame: pd.DataFrame, settings: FlightFile) -> Track:
 
 
 def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | None) -> pd.DataFrame:
-    """Return rows of the first stream with a position, with all columns of telemetry."""
+    """Return the rows of the first stream with positions, with all columns of telemetry."""
     if not path.is_file():
         raise InputError("there is no such log", expected=f"the positions of towers.{name}", path=path)
     options = log.options(timezone)
@@ -364,7 +362,7 @@ def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | Non
     raise InputError("no positions in this log", expected=f"those of towers.{name}", path=path)
 
 
-# All columns except fix and satellites, which are not part of a pose.
+# All columns of telemetry except fix and satellites, which are not part of a pose.
 _TELEMETRY = COLUMNS["telemetry"][:-2]
 
 
@@ -378,7 +376,7 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     """
     if not settings.logs:
         raise UsageError("the flight file lists no log", expected="one or more lines under 'logs:'")
-    # a flight file with several logs is read once
+    # an archive or file that contains several logs is read once
     root, cache = logs_root or folder, Held()
     for log in settings.logs:
         # report a missing log before the logs above it are read for minutes
@@ -389,7 +387,7 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 
 
 SNR = "snr"
-# Names of streams or channels of kind rss that are ratios, as the sounder and the controller name them.
+# Names of streams or channels of kind rss that are ratios, from the sounder and the controller.
 RATIOS = ("quality", SNR)
 
 
@@ -400,12 +398,12 @@ def is_ratio(stream: Stream, names: Sequence[str] = RATIOS) -> bool:
 
 
 def is_own_radio(stream: Stream) -> bool:
-    """Check whether a level is that of the telemetry radio of the autopilot, which receives no tower."""
+    """Check whether a level is that of the autopilot's telemetry radio, which does not receive towers."""
     return stream.kind == "rss" and _text(stream, "quantity") == "telemetry radio RSSI"
 
 
 def rank_quantity(stream: Stream, reader: str) -> str:
-    """Return the name of the rank in a stream, or the name of its reader."""
+    """Return the name that a stream specifies for its rank, or else the name of its reader."""
     return _text(stream, "source") or reader
 
 
@@ -416,9 +414,9 @@ def quantity_of(data: FlightData, series: RankSeries) -> str:
 
 
 def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettings]:
-    """Return the noise below an SNR [dBm], if the flight file has it, and the link for such a receiver.
+    """Return the noise power of an SNR [dBm] (None if the flight file does not specify it), and the link to use.
 
-    An estimator also reports ratios below 0 dB, because it knows the signal, so its noise floor cuts nothing off.
+    An SNR estimator knows the signal and also reports ratios below 0 dB, so the link has no noise floor.
     """
     if not is_ratio(stream, (SNR,)) or link.bandwidth_hz is None:
         return None, link
@@ -426,7 +424,7 @@ def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettin
 
 
 def unread(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> FlightData:
-    """Return the site and the nodes of a flight with remarks about the nodes, without reading its logs.
+    """Return the data of a flight without its logs: site, nodes, and remarks about the nodes.
 
     Parameters
     ----------
@@ -447,7 +445,7 @@ def unread(settings: FlightFile, folder: Path, logs_root: Path | None = None) ->
 def gather(
     settings: FlightFile, folder: Path, files: Sequence[IngestedFile], logs_root: Path | None = None
 ) -> FlightData:
-    """Sort the streams into track, RSS and rank, and check that they belong together.
+    """Return the data of a flight: sort its streams into track, RSS and rank, and check that they belong together.
 
     Parameters
     ----------
@@ -467,7 +465,7 @@ def gather(
     Raises
     ------
     UsageError
-        If a log has no tower, the site does not have a tower, or two records have one time.
+        If a log does not specify its tower, the site does not have this tower, or two records have the same time.
     InputError
         If there is no position or no row to compare, or the flight is far from every tower.
     """
@@ -495,7 +493,7 @@ def gather(
         track = _flown_track(site, path, telemetry, settings)
         warnings += [f"{path}: {text}" for text in track.account.warnings]
         rss = [(place, _moving(place, series, track, warnings)) for place, series in rss]
-    # if the ranks have no positions either, the check of the overlap has the better message
+    # without any positions, the check of the overlap reports the error with a better message
     elif rss and any(series.position_m is not None for _, series in rank):
         levels = ", ".join(dict.fromkeys(f"{series.tower} {series.channel}" for _, series in rss))
         warnings.append(f"no telemetry log: the levels of {levels} have no positions and are ignored")
@@ -523,7 +521,7 @@ def gather(
 class _Found:
     """Streams of the logs with their paths, sorted by use, and warnings.
 
-    ``placed`` are ranks with their own positions. ``void`` are the errors of series without any value.
+    ``placed`` contains the ranks with their own positions, ``void`` the errors of series without any value.
     """
 
     warnings: list[str]
@@ -535,7 +533,7 @@ class _Found:
 
 
 def _sort_log(found: _Found, settings: FlightFile, site: Site, files: Sequence[IngestedFile], number: int) -> None:
-    """Add the streams of one log, by its number, and warnings about it."""
+    """Add the streams of the log with this number, and warnings about it."""
     log, file = settings.logs[number], files[number]
     streams = [stream for stream in file.result.streams if stream.name not in log.skip]
     measured = (s for s in streams if s.kind in ("rss", "rank"))
@@ -546,7 +544,7 @@ def _sort_log(found: _Found, settings: FlightFile, site: Site, files: Sequence[I
     found.telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
     heard = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
     for stream in (s for s in heard if log.node or not is_own_radio(s)):
-        # the sounder writes power and quality to separate files, whose paths begin with equal letters per receiver
+        # the sounder writes power and quality to separate files; those of one receiver have similar paths
         alike = {id(f): len(os.path.commonprefix([f.path, file.path])) for f in files}  # noqa: RUF071
         others = sorted(files, key=lambda f: (f is not file, -alike[id(f)]))
         elsewhere = (candidate for source in others for candidate in source.result.streams)
@@ -582,7 +580,7 @@ def check_names(settings: FlightFile, site: Site, series: Sequence[tuple[str, st
     Raises
     ------
     UsageError
-        For a tower that neither site nor flight has, and a channel or tower with a channel that no log has.
+        If neither site nor flight has a tower, or no log has a channel or a channel of a tower.
     """
     channels = list(dict.fromkeys(channel for _, channel in series))
     pairs = [f"{tower}.{channel}" for tower, channel in dict.fromkeys(series)]
@@ -613,7 +611,7 @@ def _unknown(key: str, kind: str, name: str, valid: Sequence[str]) -> NoReturn:
 
 
 def _learned_cautions(settings: FlightFile, channels: Sequence[str]) -> tuple[str, ...]:
-    """Return a sentence per caution about learned antennas, which names channels if only some are affected."""
+    """Return one sentence per caution about learned antennas. It names the channels if only some are affected."""
     touched: dict[tuple[str, str], list[str]] = {}
     for caution in settings.cautions:
         # None is the link of all channels without an entry
@@ -631,14 +629,14 @@ def _learned_cautions(settings: FlightFile, channels: Sequence[str]) -> tuple[st
 
 
 def _idle_channels(settings: FlightFile, channels: Sequence[str]) -> tuple[str, ...]:
-    """Return a sentence if calibrations or overrides add channels that no log has."""
+    """Return a sentence about channels of calibrations or overrides that no log has. Empty if there are none."""
     idle = sorted((settings.link.channels.keys() & settings.lent) - {*channels})
     text = f"link.channels names {', '.join(idle)}, which no log of this flight has: these settings are not used."
     return (text,) if idle else ()
 
 
 def _undated(data: FlightData, track: str) -> list[str]:
-    """Return logs with positions that only 'time_origin' dates, while the track has a clock."""
+    """Return the logs with positions whose times depend on 'time_origin' although the track has a clock."""
     dated = {log.path for log in data.settings.logs if log.time_origin is not None}
     return [
         log.path
@@ -669,7 +667,7 @@ def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 
 
 def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
-    """Return remarks about streams that are compared with a level over noise."""
+    """Return remarks about ratios that are compared as levels, because their noise is unknown."""
     ratios = [s for s in streams if is_ratio(s) and s.name not in log.skip]
     blind = [s.name for s in ratios if _noise(s, links.of(_channel_of(log, s)))[0] is None]
     if not blind:
@@ -703,7 +701,7 @@ def _channel_of(log: LogSettings, stream: Stream) -> str:
 
 
 def _flown_track(site: Site, path: str, stream: Stream, settings: FlightFile) -> Track:
-    """Return the track of the UAV. InputError if no row has a position or a height."""
+    """Return the track of the UAV, or raise InputError if no row has both position and height."""
     track = _track_of(site, scored_rows(stream, path)[0], settings)
     if not len(track) and lacks_height(stream):
         raise InputError(
@@ -727,7 +725,7 @@ FAR_M = 30_000.0
 
 
 def check_place(site: Site, path: str, stream: Stream) -> None:
-    """Refuse a flight far from every tower, and report swapped or mirrored angles.
+    """Check that a flight is near a tower. Otherwise name the likely cause, such as swapped angles.
 
     Raises
     ------
@@ -737,7 +735,7 @@ def check_place(site: Site, path: str, stream: Stream) -> None:
     latitude, longitude = (stream.frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
     if not (near := nearest_m(site, latitude, longitude)) > FAR_M:
         return
-    # the most frequent mistakes first
+    # most frequent mistakes first
     turned = {
         "latitude and longitude are swapped": (longitude, latitude),
         "the sign of the longitude is missing (west is negative)": (latitude, -longitude),
@@ -755,12 +753,12 @@ def check_place(site: Site, path: str, stream: Stream) -> None:
 
 def nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) -> float:
     """Return the smallest horizontal distance of positions to any tower [m]. NaN without a position."""
-    # impossible angles are refused by another check, and would stop the projection
+    # skip impossible angles: the projection fails for them, and another check refuses them
     can = (np.abs(latitude_deg) <= 90.0) & (np.abs(longitude_deg) <= 180.0)
     if not can.any():
         return float("nan")
     east, north = site.frame.to_local(latitude_deg[can], longitude_deg[can])
-    # use the nearest sample of each tower, because a flight may be long
+    # one tower at a time, which limits the memory for long flights
     gaps = [np.hypot(east - t.position_m[0], north - t.position_m[1]).min() for t in site.towers.values()]
     return float(np.min(gaps, initial=np.inf))
 
@@ -807,7 +805,7 @@ def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:
 
 
 def _unnamed_cell(log: LogSettings, stream: Stream) -> bool:
-    """Check whether a stream belongs to a cell that the flight file, which names other cells, does not name."""
+    """Check whether a stream belongs to a cell that is missing from ``cells`` of the flight file."""
     return bool(log.cells) and not {"pci", "part"}.isdisjoint(stream.attributes) and _home(log, stream) is None
 
 
@@ -841,7 +839,7 @@ def _rss_series(
 
 
 def _moving(path: str, series: RssSeries, track: Track, warnings: list[str]) -> RssSeries:
-    """Return a series without samples whose level is frozen in flight, which are counted as flagged."""
+    """Return a series without the samples whose level is frozen in flight, and count them as flagged."""
     order = np.argsort(series.time, kind="stable")
     bad = np.zeros(len(order), dtype=np.bool_)
     bad[order] = frozen(series.time[order], series.measured_db[order], track.pose_at(series.time[order]).position_m)
@@ -865,7 +863,7 @@ def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | N
         takeoff_m = site.takeoff_ground_m  # altitude_m counts from the take-off point, as in the track
         up = frame["altitude_m"].to_numpy(np.float64) + takeoff_m
         up, buried = raised(up, site.ground_under_m(east, north), takeoff_m)
-        # samples below the ground or without a height have no position, as in a track
+        # as in a track, samples below the ground or without a height have no position
         position = np.stack([east, north, np.where(buried | np.isnan(frame["altitude_m"]), np.nan, up)], axis=-1)
     sinr = frame["sinr_db"].to_numpy(np.float64) if "sinr_db" in frame else np.full(len(frame), np.nan)
     return RankSeries(
@@ -883,7 +881,7 @@ Series = TypeVar("Series", "RssSeries", "RankSeries")
 
 
 def _records(parts: Sequence[tuple[str, Series]], name: Callable[[Series], str]) -> tuple[Series, ...]:
-    """Return one series per name. Logs that follow each other, as after a restart of the radio, are one record.
+    """Return one series per name, joining logs that follow each other, such as after a restart of the radio.
 
     Raises
     ------
@@ -914,7 +912,7 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
                 expected="one record of each channel and of each tower's rank",
                 cause=f"{cause}; another radio: give it its own 'channel'",
             )
-    # values that do not grow with the record (link, unit) are those of its first part
+    # take values that are not per sample (link, unit) from the first part
     first = parts[0][1]
     series = [part for _, part in parts]
     arrays: dict[str, Any] = {
@@ -935,7 +933,7 @@ def _joined(parts: Sequence[RssSeries | RankSeries], name: str) -> AnyArray:
 
 
 def _form(series: RssSeries | RankSeries) -> object:
-    """Return the property that two parts of one record must share."""
+    """Return the properties that must be equal in all parts of one record."""
     return series.unit if isinstance(series, RssSeries) else series.position_m is None
 
 
@@ -945,7 +943,7 @@ def _text(stream: Stream, key: str) -> str | None:
 
 
 def _check_overlap(data: FlightData) -> None:
-    """Check that every series shares time with the track of its poses, and with that of a tower that moves."""
+    """Check that every series overlaps in time with the track of the UAV, and with that of a tower that moves."""
     if not data.rss and not data.rank:
         raise UsageError(
             "none of the logs contains RSS or rank",
@@ -1001,7 +999,7 @@ def _clock_cause(timezone: str | None, time: Times, start: np.datetime64, end: n
 
 
 def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray, BoolArray]:
-    """Return positions (n, 3) of the log, or of the track where the log has none [m], and which of them are known."""
+    """Return positions (n, 3) [m] from the log, or else from the track, and a mask (n,) of the known positions."""
     if series.position_m is None:
         assert track is not None
         pose = track.pose_at(series.time)
@@ -1010,7 +1008,7 @@ def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray,
     known = np.isfinite(position).all(axis=1)
     if track is not None and not known.all():
         pose = track.pose_at(series.time)
-        # row by row, because a modem may have no fix for some time
+        # decide per row, because a modem may temporarily have no fix
         use = ~known & pose.valid
         position, known = np.where(use[:, None], pose.position_m, position), known | use
     return position, np.asarray(known)

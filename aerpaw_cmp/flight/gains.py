@@ -1,10 +1,10 @@
-"""Learned gains of a link, and losses of its paths.
+"""Learned gains of a link, losses of its paths, and learned antennas in flight settings.
 
 The replay uses patterns. This module adds the learned gain of both ends together and its error model, the losses of a
 path (foliage, reflections, rough ground), and notes about foliage models.
 
-It also replaces the names of learned antennas and receivers in flight settings by files. Reading a flight.yaml opens no
-table, so a job that replays or lists its inputs calls :func:`with_learned`.
+It also replaces the names of learned antennas and receivers in flight settings by files. Reading a flight.yaml does not
+do this, so a job that replays a flight or lists its inputs calls :func:`with_learned`.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class LearnedGain:
     sd_db : (poses,)
         Standard deviation of the sum of learned gains [dB].
     spread : Spread
-        Error model of the level without ``sd_db``, from the tower's antenna, or else from the UAV's.
+        Error model of the level, excluding ``sd_db``. It comes from the tower's antenna, or else from the UAV's.
     """
 
     pair_db: FloatArray
@@ -71,7 +71,7 @@ class LearnedGain:
 
 
 def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain | None:
-    """Return the learned gain of a link to one tower. None if no end is learned.
+    """Return the learned gain of a link to one tower, or None if neither antenna is learned.
 
     Parameters
     ----------
@@ -100,20 +100,20 @@ def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain 
 
 
 def spread_of(stated: LearnedSpread | None) -> Spread:
-    """Return the error model of a learned antenna, or only that of the gain if it has no error model."""
+    """Return the error model of a learned antenna, or an empty one (only the gain has an error) if it has none."""
     return NO_SPREAD if stated is None else Spread(**stated.model_dump())
 
 
 def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tuple[FloatArray, FloatArray]:
     """Return the gain of both ends together (n,), and the standard deviation (n,) of all learned gains [dB].
 
-    ``ends`` contains pattern and directions (n, 3) in its frame, for ``uav`` and ``tower``, or one of them.
+    ``ends`` contains a pattern and directions (n, 3) in its frame, for ``uav``, ``tower`` or both.
     """
     square = sum(pattern.gain_sd_db(*sphere_angles(direction)) ** 2 for pattern, direction in ends.values())
     sd_db = np.sqrt(square)
     if len(ends) == 2:
         (uav, at_uav), (tower, at_tower) = ends["uav"], ends["tower"]
-        # the gain of a pair is valid only for the two tables with which it was learned
+        # the gain of a pair is valid only for the two patterns with which it was learned
         if tower.pair is not None and uav.trained_on == tower.trained_on:  # from one calibration
             return tower.pair.at(np.concatenate([at_uav, at_tower], axis=1), sd_db)
     return np.zeros(len(sd_db)), sd_db
@@ -125,7 +125,7 @@ def sphere_angles(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def mean_gain_db(patterns: Sequence[Pattern], theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:
-    """Return the mean gain (n,) of the elements of an array in directions of its frame [dBi], at least -60."""
+    """Return the mean gain (n,) of the elements of an array in directions of its frame, limited to at least -60 dBi."""
     fields = [pattern.field(theta_rad, phi_rad) for pattern in patterns]
     power = sum(np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2 for e_theta, e_phi in fields)
     # nulls are limited to -60 dB, because no model of a pattern is that accurate
@@ -133,7 +133,7 @@ def mean_gain_db(patterns: Sequence[Pattern], theta_rad: FloatArray, phi_rad: Fl
 
 
 def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | float:
-    """Return the gain (poses,) of both ends together, to add to the level [dB]. 0 if no gain is learned."""
+    """Return the learned gain (poses,) of both ends together, to add to the level [dB], or 0 if none is learned."""
     gain = learned_gain(link, poses, source_m)
     return 0.0 if gain is None else gain.pair_db
 
@@ -142,7 +142,7 @@ def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | floa
 
 
 def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
-    """Return the loss in crowns and in woods as media. None without trees or foliage."""
+    """Return the loss in tree crowns and woods, or None if the site has no trees or foliage is switched off."""
     if not site.wooded or rt.foliage == "none":
         return None
     site = site.under(rt.foliage)
@@ -168,7 +168,7 @@ def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
 
 
 def _reflection_loss(_site: Site, rt: RtSettings, _carrier_hz: float) -> Loss | None:
-    """Return ``rt.reflection_loss_db`` per reflection. None if it is 0."""
+    """Return a loss of ``rt.reflection_loss_db`` per reflection, or None if it is 0."""
     if rt.reflection_loss_db == 0.0:
         return None
     return lambda paths, _sources_m, _targets_m: np.asarray(rt.reflection_loss_db * paths.depth, dtype=np.float64)
@@ -178,16 +178,16 @@ def _reflection_loss(_site: Site, rt: RtSettings, _carrier_hz: float) -> Loss | 
 _ON_GROUND_M = 1e-6
 
 
-# The same for an elevation model, whose specular points are found by iteration.
+# The same limit for an elevation model. It is larger, because specular points are found by iteration.
 _NEAR_TERRAIN_M = 0.01
 
 
 def _roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
-    """Return the loss of ground reflections by ``rt.ground_roughness_m``. None for smooth ground.
+    """Return the loss of ground reflections by ``rt.ground_roughness_m``, or None for smooth ground.
 
     Each ground reflection is multiplied by ``exp(-2 (k sigma sin(grazing))^2)``, with the grazing angle of the array
-    centres. It is :func:`aerpaw_cmp.propagation.field.baselines.specular_factor` as a loss, which does not underflow.
-    Scattered power is not followed.
+    centres. This is :func:`aerpaw_cmp.propagation.field.baselines.specular_factor` in decibels, which cannot underflow.
+    The scattered power is not traced.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def _roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | Non
             expected="a site with a ground plane, or reflection_loss_db",
             cause="no face of the scene is known to be its ground",
         )
-    # tower_ground: offsets adds planes to that of the origin
+    # with 'tower_ground: offsets', towers have ground planes at other heights
     heights = np.array(sorted({0.0, *(tower.ground_m for tower in site.towers.values())}))
     wavelength = wavelength_m(carrier_hz)
 
@@ -211,7 +211,7 @@ def _roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | Non
         total, ray_start = np.zeros(len(paths)), sources_m[paths.tower]
         for step in range(paths.vertices_m.shape[1]):
             corner = paths.vertices_m[:, step]
-            on = np.abs(corner[:, 2:] - heights).min(axis=1) < _ON_GROUND_M  # NaN where the path has no such corner
+            on = np.abs(corner[:, 2:] - heights).min(axis=1) < _ON_GROUND_M  # NaN if the path has fewer corners
             if site.dem is not None:
                 on |= np.abs(corner[:, 2] - site.dem.ground_m(corner[:, 0], corner[:, 1])) < _NEAR_TERRAIN_M
             ray = corner[on] - ray_start[on]
@@ -225,14 +225,15 @@ def _roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | Non
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathLoss:
-    """A loss of a path besides its own field, which replay, explain, model comparison and audit use.
+    """A loss of a path in addition to its field. Replay, explain, model comparison and audit use it.
 
     Parameters
     ----------
     name : str
         Name of its term in ``explain``.
     off : mapping
-        Keys of ``rt`` that switch the loss off. A model of the comparison includes a loss only if it sets these keys.
+        Keys and values of ``rt`` that switch the loss off. A model of the comparison includes a loss only if it sets
+        these keys.
     of : callable
         ``of(site, rt, carrier_hz)`` returns the loss as a function, or None if no path has this loss.
     expected : callable
@@ -279,13 +280,13 @@ def without_losses() -> dict[str, Any]:
 
 
 def path_losses(site: Site, rt: RtSettings, carrier_hz: float) -> dict[str, Loss]:
-    """Return the losses of the paths of a flight by name: functions as those of :func:`path_loss`."""
+    """Return the losses of the paths of a flight by name. Each is a function like the result of :func:`path_loss`."""
     every = ((declared.name, declared.of(site, rt, carrier_hz)) for declared in LOSSES)
     return {name: loss for name, loss in every if loss is not None}
 
 
 def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
-    """Return the sum of all losses of a path besides its own field.
+    """Return the sum of all losses of a path in addition to its field.
 
     Parameters
     ----------
@@ -303,7 +304,7 @@ def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
     Raises
     ------
     UsageError
-        ``rt.ground_roughness_m`` with a scene of triangles.
+        If ``rt.ground_roughness_m`` is set and the site is a scene of triangles.
     """
     losses = list(path_losses(site, rt, carrier_hz).values())
     if len(losses) < 2:
@@ -315,7 +316,7 @@ def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
     return loss
 
 
-# Sight lines do not depend on the carrier.
+# Any carrier, because sight lines do not depend on it.
 _ANY_HZ = 3.4e9
 
 
@@ -324,35 +325,35 @@ def sight_shares(site: Site, tower: str, poses_m: FloatArray) -> tuple[float, fl
     source = site.towers[tower].position_m
     array = single_element()
     poses = Poses(poses_m, np.broadcast_to(np.eye(3), (len(poses_m), 3, 3)))
-    # without a cache, because a draft needs this once
+    # without a cache, because a draft needs this result only once
     seen = replay(site, Link(_ANY_HZ, {tower: array}, array), poses, Search(max_depth=0), run=Run(cache_dir=""))
     return float((direct_foliage_m(source, poses_m, site) > 0.0).mean()), float(1.0 - len(seen.paths) / len(poses_m))
 
 
 def direct_foliage_m(tower_m: FloatArray, poses_m: FloatArray, site: Site) -> FloatArray:
-    """Return the length (n,) [m] in crowns and woods of sight lines from a tower (3,) or (n, 3) to poses (n, 3) [m]."""
+    """Return the length (n,) [m] inside crowns and woods of lines from a tower (3,) or (n, 3) to poses (n, 3) [m]."""
     source = np.broadcast_to(tower_m, poses_m.shape)
     in_crowns = foliage_depth_m(source, np.zeros((len(poses_m), 0, 3)), poses_m, site.trees)
     return in_crowns + stand_depth_m(site, source, poses_m)
 
 
 def load_with_learned(path: str | Path, learned: Path | None = None, overrides: Overrides | None = None) -> FlightFile:
-    """Return the settings of a flight.yaml with the learned antennas and receiver that it names, as files.
+    """Return the settings of a flight.yaml, with names of learned antennas and receiver replaced by files.
 
     Parameters
     ----------
     path : str or Path
     learned : Path, optional
-        calibrated.yaml whose settings replace those of the flight file, also its named antennas.
+        calibrated.yaml whose settings replace those of the flight file, including its named antennas.
     overrides : mapping, optional
-        Dotted keys with other values. They are applied before the antennas, whose band must fit the carrier.
+        Values of dotted keys. They are applied before the antennas are chosen, because an antenna must fit the carrier.
     """
     settings = with_learned(overridden(load_flight(path), overrides or {}), Path(path).parent)
     return settings if learned is None else joined(settings, learned)
 
 
 def flight_of(path: Path) -> FlightFile | None:
-    """Return the settings of the flight file that a path names, or None for any other file."""
+    """Return the settings of a flight file, or None if the path is another kind of file."""
     if path.suffix.lower() not in (".yaml", ".yml") or not path.is_file():
         return None
     text = path.read_text(encoding="utf-8", errors="replace")
@@ -361,7 +362,7 @@ def flight_of(path: Path) -> FlightFile | None:
 
 @dataclass(slots=True)
 class _Ends:
-    """Links of a flight, to which learned antennas are added, and those that do not fit."""
+    """The links of a flight, to which learned antennas are added, and cautions about antennas that do not fit."""
 
     rss: LinkSettings
     channels: dict[str, LinkSettings]
@@ -369,7 +370,7 @@ class _Ends:
     used: set[str] = field(default_factory=set)
 
     def link(self, channel: str | None) -> LinkSettings:
-        """Return the link of a channel. It is ``link.rss`` for None and for a channel without an entry."""
+        """Return the link of a channel: ``link.rss`` for None and for a channel without an entry."""
         return self.rss if channel is None else self.channels.get(channel, self.rss)
 
     def use(self, key: str, channel: str | None, name: str, named: Named) -> None:
@@ -396,10 +397,10 @@ class _Ends:
 
 
 def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
-    """Return the settings with the learned antennas and the receiver that they name, as files.
+    """Return the settings with names of learned antennas and receiver replaced by files.
 
-    The airframe (``antennas.uav``) is the UAV's end of every channel. What does not fit (another band, a damaged
-    table) is not used: :attr:`.FlightFile.cautions` has the reasons, and the run continues.
+    The airframe (``antennas.uav``) is the UAV antenna of every channel. An antenna that does not fit (another band, a
+    damaged table) is not used. :attr:`.FlightFile.cautions` contains the reason, and the run continues.
 
     Parameters
     ----------
@@ -410,12 +411,12 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
     Raises
     ------
     UnknownName
-        If no learned model has a name, or only for another end.
+        If no learned model has the name, or only one for the other end.
     UsageError
         If a key of ``antennas`` is neither ``uav`` nor ``TOWER.CHANNEL``.
     """
     ends = _Ends(settings.link.rss, dict(settings.link.channels))
-    # the airframe last, because it belongs to every channel, also to those that antennas of towers add
+    # the airframe last, because it applies to every channel, including those that antennas of towers add
     for key, name in sorted(settings.antennas.items(), key=lambda item: item[0] == "uav"):
         tower, _, channel = key.partition(".")
         if key != "uav" and not (tower and channel):
@@ -440,7 +441,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
 
 
 def antennas_used(series: Sequence[tuple[str, str, LinkSettings]]) -> tuple[str, ...]:
-    """Return a sentence per pair of antennas: its names, and the channels that are replayed with it if others are not.
+    """Return one sentence per pair of antennas. It names the channels if not all of them use this pair.
 
     Examples
     --------
@@ -463,7 +464,7 @@ def _antenna_name(antenna: AntennaSettings) -> str:
 
 
 def _named(name: str, folder: Path, end: str, key: str) -> Named | Caution:
-    """Return the entry of a name, or the reason why the learned models cannot be read."""
+    """Return the learned model of a name, or a caution if the learned models cannot be read."""
     try:
         return find_named(name, folder, end)
     except UnknownName as error:
@@ -473,8 +474,8 @@ def _named(name: str, folder: Path, end: str, key: str) -> Named | Caution:
 
 
 def _receiver(settings: FlightFile, name: str, folder: Path, ends: _Ends) -> str | None:
-    """Return the file of a rank receiver. None, with the reason in ``ends``, if it does not fit."""
-    if Path(name).suffix == ".json":  # the error of a missing file comes from reading it
+    """Return the file of a rank receiver, or None and add a caution to ``ends`` if the receiver does not fit."""
+    if Path(name).suffix == ".json":  # a missing file is reported when it is read
         return name
     named = _named(name, folder, "receiver", "rank.receiver")
     if not isinstance(named, Caution):
@@ -487,13 +488,13 @@ def _receiver(settings: FlightFile, name: str, folder: Path, ends: _Ends) -> str
 
 
 def _reason(error: InputError | UsageError) -> str:
-    """Return what was found, in which file, and what was expected instead."""
+    """Return an error as text: what was found, in which file, and what was expected."""
     where = f" in {Path(error.path).name}" if error.path else ""
     return f"{error.found}{where}; expected: {error.expected}"
 
 
 def foliage_notes(wooded: bool, rt: RtSettings, carriers_hz: Collection[float]) -> tuple[str, ...]:
-    """Return notes about extrapolations and assumptions of foliage models, if the site has trees."""
+    """Return notes about extrapolations and assumptions of the foliage models. Empty for a site without trees."""
     if not wooded or rt.foliage != "attenuating":
         return ()
     notes = []
@@ -503,19 +504,19 @@ def foliage_notes(wooded: bool, rt: RtSettings, carriers_hz: Collection[float]) 
         what = "gamma" if rt.foliage_model == "p833" else "the loss"
         notes.append(
             f"Trees out of leaf: {what} in leaf divided by {1 / LEAFLESS_FACTOR:g}. That is an assumption of this "
-            "tool: ITU-R P.833 gives about 20 % near 1 GHz, and no number at this carrier."
+            "tool: ITU-R P.833 states about 20 % near 1 GHz, and no value at this carrier."
         )
     return tuple(notes)
 
 
 def p833_note(carrier_hz: float) -> str | None:
-    """Return a note that P.833's table is extrapolated, or None within the table."""
+    """Return the note that the table of P.833 is extrapolated, or None if the carrier is within the table."""
     low, high = P833_TABLE[0][0], P833_TABLE[-1][0]
     if low <= carrier_hz / 1e6 <= high:
         return None
     model = P833.at(carrier_hz)
     return (
         f"Trees at {carrier_hz / 1e9:g} GHz: an extrapolation of ITU-R P.833, whose table of woodland covers {low:g} "
-        f"to {high:g} MHz. Continued it gives gamma = {model.gamma_db_per_m:.2f} dB/m and A_m = {model.maximum_db:.0f} "
-        "dB in leaf; other continuations give 0.45 to 0.7 dB/m at 3.4 GHz, so treat gamma as a sensitivity."
+        f"to {high:g} MHz. Beyond it, gamma = {model.gamma_db_per_m:.2f} dB/m and A_m = {model.maximum_db:.0f} "
+        "dB in leaf; other extrapolations yield 0.45 to 0.7 dB/m at 3.4 GHz, so treat gamma as a sensitivity."
     )

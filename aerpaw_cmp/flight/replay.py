@@ -1,6 +1,6 @@
-"""Replay of the series of a flight: poses from the track, one replay per tower and link, and foliage.
+"""Replay of the series of a flight: poses from the track, and one replay per tower and link, with foliage.
 
-The file also computes levels of a flight relative to a model without antennas, in the directions at both ends.
+The module also computes the levels of a flight relative to a model without antennas, with the directions at both ends.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Replayed:
-    """A replayed series. ``valid`` (n,) marks samples with a known pose. Other arrays have only these samples."""
+    """A replayed series. ``valid`` (n,) marks samples with a known pose; all other arrays contain only these."""
 
     link: Link
     poses: Poses
@@ -123,7 +123,7 @@ SeriesT = TypeVar("SeriesT", RssSeries, RankSeries)
 
 
 def try_replay(data: FlightData) -> None:
-    """Replay the first known pose of every series, which raises the errors of a complete replay."""
+    """Replay only the first known pose of every series, to find errors before a complete replay."""
 
     def first(series: SeriesT, known: BoolArray) -> SeriesT:
         at = np.flatnonzero(known & data.tower_at(series.tower, series.time)[1])[:1]
@@ -179,7 +179,7 @@ def replay_rss(
 def _towers_and_poses(
     data: FlightData, tower: str, times: Sequence[Times]
 ) -> tuple[list[BoolArray], list[FloatArray], list[TrackPoses]]:
-    """Return when a tower and the UAV are known, and their positions and poses at these times."""
+    """Return masks of times with known tower and UAV, and positions and poses at these times, per series."""
     valid, places, tracks = [], [], []
     for time in times:
         place, known = data.tower_at(tower, time)
@@ -191,7 +191,7 @@ def _towers_and_poses(
 
 
 def telemetry_time(time: Times, clock: Clock | None) -> Times:
-    """Return radio times on the clock of the telemetry."""
+    """Return radio times, corrected to the clock of the telemetry."""
     if clock is None:
         return time
     return np.asarray(time - np.round(clock.applied_s * 1e9).astype("timedelta64[ns]"))
@@ -200,9 +200,8 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
 def estimate_clocks(data: FlightData, progress: Progress = logged) -> list[Clock | None]:
     """Return the clock of each RSS series relative to the telemetry, as ``rss.lag`` specifies.
 
-    Series of one computer share it.
-
-    Predictions are the RSS of the image engine along the track with at most one reflection.
+    Series that one computer logged share a clock. The predictions are RSS of the image engine along the track, with at
+    most one reflection.
     """
     lag = data.settings.rss.lag
     if lag == "off" or data.track is None:
@@ -225,13 +224,13 @@ def same_computer(data: FlightData) -> list[list[int]]:
         keys.add(("tower", series.tower))
         shared = [group for group in groups if group[0] & keys]
         groups = [group for group in groups if not group[0] & keys]
-        # this series joins these groups
+        # this series merges all groups with which it shares a tower or a file
         groups.append((keys.union(*(k for k, _ in shared)), [*(i for _, many in shared for i in many), index]))
     return [members for _, members in groups]
 
 
 def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) -> Clock:
-    """Return the clock that a flight file states."""
+    """Return the clock of a lag that the flight file specifies."""
     lag_s = radio_minus_telemetry_s
     result = ClockResult(
         receiver=receiver,
@@ -247,18 +246,18 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
 # Number of times that are replayed together, which limits the memory on flights over half an hour.
 BLOCK = 100_000
 
-# Sampling of the prediction for the clock [s]; longer flights have wider steps.
+# Spacing [s] and largest number of the predictions for the clock. Long flights have a larger spacing.
 _CLOCK_STEP_S, _CLOCK_INSTANTS = 0.05, 40_000
 
-# Sampling for a tower that moves, because each position is traced separately.
+# Spacing for a tower that moves. It is larger, because every position of the tower is traced separately.
 _MOVING_CLOCK_STEP_S = 0.25
 
 
 def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[ClockChannel]:
-    """Return levels with time stamps of one computer, and their predictors along the telemetry, for its clock.
+    """Return the levels that one computer logged, and their predictors along the telemetry, to estimate its clock.
 
-    Ratios (the ``quality`` of the sounder, an SNR) saturate and lose lock where levels do not. They are used only if
-    there are no levels.
+    Ratios (the ``quality`` of the sounder, an SNR) saturate and lose lock where levels do not. Therefore they are used
+    only if there are no levels.
     """
     assert data.track is not None
     channels = [series for series in channels if series.unit != "dB"] or channels
@@ -290,7 +289,7 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
 
 
 def _along(data: FlightData, different: Sequence[RssSeries], instants: Times, step_s: float) -> list[Along]:
-    """Return predictors of the levels of series of one tower and carrier. The replay has at most one reflection."""
+    """Return predictors of the levels of series with one tower and carrier, replayed with at most one reflection."""
     links = [data.link_of(series) for series in different]
     blocks = np.array_split(instants, max(1, -(-len(instants) // BLOCK)))  # about equal in size
     parts = [_levels_along(data, links, different[0].tower, part) for part in blocks]
@@ -298,7 +297,7 @@ def _along(data: FlightData, different: Sequence[RssSeries], instants: Times, st
     for series, link, *mine in zip(different, links, *parts, strict=True):
         columns = {name: np.concatenate([part[name] for part in mine]) for name in mine[0]}
         distance, directions = columns.pop("distance_m"), columns.pop("directions")
-        if learned_here(data, series, link):  # antennas that were learned from this log contain its lag
+        if learned_here(data, series, link):  # antennas learned from this log would reproduce its lag
             columns = {"free space": columns["free space"]}
         out.append(Along(start_s=0.0, step_s=step_s, predicted_db=columns, distance_m=distance, directions=directions))
     return out
@@ -312,12 +311,12 @@ def _levels_along(
     track = data.poses_at(instants).where(known)
     poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
     field = Field(path_loss(data.site, data.settings.rt, links[0].carrier_hz))
-    # directions at both ends, because gains over them are fitted together with the lag
+    # directions at both ends, because gains over direction are fitted together with the lag
     line = track.position_m - place
     distance = np.linalg.norm(line, axis=1)
     unit = line / distance[:, None]
     body = -np.einsum("nij,ni->nj", track.rotation, unit)
-    # use the image engine for all flights, because a lag needs no deeper paths
+    # always use the image engine, because a lag does not need paths with more reflections
     search = Search("image", max_depth=depth)
     if tower not in data.nodes:
         traced, sources = replay(data.site, links[0], poses, search), data.site.towers[tower].position_m[None, :]
@@ -344,7 +343,7 @@ def _levels_along(
 def _clock_levels(data: FlightData, series: RssSeries) -> FloatArray:
     """Return the levels (n,) for the clock, NaN below ``rss.minimum_height_m``.
 
-    Levels of a sounder below its lock limit are at this limit.
+    Levels of a sounder are limited from below to its lock limit.
     """
     levels, least = series.measured_db, data.settings.rss.minimum_height_m
     if least is not None:
@@ -355,7 +354,7 @@ def _clock_levels(data: FlightData, series: RssSeries) -> FloatArray:
 
 
 def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
-    """Return the clock of a receiver as that of one of its series."""
+    """Return the clock of a receiver for one of its series."""
     result = fit.result(series.tower, apply=apply)
     used = result.applied == APPLIED
     return Clock(result=result, applied_s=np.full(len(series.time), fit.correction_s if used else 0.0))
@@ -370,7 +369,7 @@ def part_of(replayed: Replay, start: int, stop: int) -> Replay:
         rows = (paths.pose >= start) & (paths.pose < stop)
         return dataclasses.replace(paths.select(rows), pose=paths.pose[rows] - start)  # type: ignore[type-var]
 
-    # the time of a part is its share of the total time
+    # the part gets its share of the computing time
     share = (stop - start) / max(len(replayed.rss_dbm), 1)
     # views, not copies, because the paths of a long flight are large
     columns: dict[str, Any] = {name: getattr(replayed, name)[start:stop] for name in PER_LINK}
@@ -399,15 +398,15 @@ def replay_rank(data: FlightData, progress: Progress = logged) -> list[Replayed]
 
 
 def rank_poses(data: FlightData, series: RankSeries) -> tuple[Poses, BoolArray, TrackPoses | None]:
-    """Return poses of reports with known UAV and tower, which reports these are (n,), and the track at them.
+    """Return the poses of reports with known UAV and tower, a mask (n,) of these reports, and the track at their times.
 
     Positions come from the log if it has them, and otherwise from the track. The attitude comes from the track in both
-    cases. Without an attitude in the track, the UAV array stays as mounted.
+    cases. If the track has no attitude, the UAV array keeps its orientation in the site.
     """
     position, valid = rank_positions(series, data.track)
     valid = valid & data.tower_at(series.tower, series.time)[1]
     track = None if data.track is None else data.poses_at(series.time).pick(valid)
-    # without an attitude the array stays as mounted in the site
+    # without an attitude the array keeps its orientation in the site
     rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
     if track is not None:
         rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
@@ -425,7 +424,7 @@ def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
 
 
 def valid_poses(track: TrackPoses, attitude: str) -> Poses:
-    """Return the valid poses. A track without invalid poses is not copied."""
+    """Return the valid poses of a track. The arrays are not copied if all are valid."""
     some = track.pick(track.valid)
     return Poses(some.position_m, np.ascontiguousarray(attitude_rotation(some, attitude)))
 
@@ -452,12 +451,12 @@ def replay_poses(
         Carrier, power and arrays. Its towers are those of ``site`` by name.
     poses : Poses
     towers_m : (poses, 3), optional
-        Positions of the only tower of the link, which moves [m].
+        Positions of the tower of the link if it moves [m]. The link then has only this tower.
     engine : {"image", "sionna"}, optional
     progress : Progress
-        Called with the share that is done, for the sionna engine.
+        Called with the completed share of a long replay.
     extent_m : (points, 3), optional
-        Points that span all poses of the job, if the poses are a part of it [m].
+        Points that span all poses of the job [m], if ``poses`` is only a part of them.
 
     Returns
     -------
@@ -473,11 +472,11 @@ def replay_poses(
     towers = "+".join(link.tower_arrays)
     name = f"{engine} {towers}" if towers_m is None else f"replay {towers}, which moves"
     search = Search(engine, max_depth=rt.max_depth, samples=rt.advanced.samples, further=diffracted(rt.diffraction))
-    # the image engine finds the paths of a pose independently of others, but numbers planes of terrain in order
+    # the image engine finds the paths of each pose independently, but it numbers planes of terrain in order of use
     alone = engine == "image" and site.dem is None
     long = alone and len(poses) > BLOCK
     run = Run(
-        # the image engine finishes before a bar could be seen
+        # a short run of the image engine needs no progress bar
         progress=partial(progress, name) if engine == "sionna" or long or towers_m is not None else None,
         extent_m=extent_m,
     )
@@ -490,7 +489,7 @@ def replay_poses(
 
 
 def observed_series(data: FlightData, series: RssSeries) -> tuple[Observed, float, float]:
-    """Return the samples of one series at known poses, relative to free space through the woods of the flight.
+    """Return the samples of one series at known poses, relative to free space with the loss of woods.
 
     Parameters
     ----------
@@ -501,7 +500,7 @@ def observed_series(data: FlightData, series: RssSeries) -> tuple[Observed, floa
     -------
     Observed
     float
-        Share of attitudes that are not logged: heading from the track, level flight.
+        Share of samples without a logged attitude, for which level flight along the course is assumed.
     float
         Share of levels without a position.
 
@@ -553,7 +552,7 @@ def observed_series(data: FlightData, series: RssSeries) -> tuple[Observed, floa
 
 
 def _through_woods(data: FlightData, series: RssSeries, poses: Poses) -> FloatArray:
-    """Return the level of the direct path with the loss of woods, without buildings and antennas, shape (n,) [dBm]."""
+    """Return the level (n,) [dBm] of the direct path with the loss of woods, but without buildings and antennas."""
     plain = {"uav": ArraySettings(), "tower": ArraySettings(), "towers": {}}
     link = series.link.model_copy(update=plain).build([series.tower], data.folder)
     rt = data.settings.rt.model_copy(update={"max_depth": 0, "diffraction": "none"})

@@ -1,8 +1,7 @@
 """Planned routes: patterns within an area, and files for ground stations.
 
-Routes are lawnmowers and crosses, with the nose along the track, fixed, or rotated from leg to leg.
-
-They are written as a QGroundControl plan and as a table of waypoints.
+Routes are lawnmowers and crosses. The nose of the UAV points along the track, stays fixed, or turns from leg to leg.
+Routes are written as a QGroundControl plan and as a table of waypoints.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ from ..common.units import FloatArray, spread_out
 from .track import interpolated
 
 Nose = Literal["along", "fixed", "four headings"]
-# Directions of the nose: along the track, rotated by 90 degrees from leg to leg, or north.
+# Directions of the nose: along the track, turned by 90 degrees per leg, or north.
 NOSES: tuple[Nose, ...] = ("along", "four headings", "fixed")
 
-# Distance from the border of the area.
+# Distance that routes keep from the border of the area.
 MARGIN_M = 3.0
 
 # Shorter legs are skipped.
@@ -38,7 +37,7 @@ _LEAST_LEG_M = 40.0
 _CLOSEST_M = 15.0
 
 _TURN_STEPS = 8
-# A slow rotation stays at each eighth of the compass for this long.
+# Duration at each of the eight headings of a slow rotation.
 _TURN_HOLD_S = 8.0
 
 _TURN_POINTS = 4
@@ -46,7 +45,7 @@ _TURN_POINTS = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Waypoint:
-    """A waypoint, whose yaw [deg from north] is kept there for ``hold_s`` and on the way to the next one."""
+    """A waypoint. The UAV keeps its yaw [deg from north] for ``hold_s`` and on the way to the next waypoint."""
 
     east_m: float
     north_m: float
@@ -57,7 +56,7 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Route:
-    """A candidate flight with a point per second.
+    """A candidate flight, sampled once per second.
 
     Parameters
     ----------
@@ -85,7 +84,7 @@ class Route:
 
 
 def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float) -> Route:
-    """Return the route along waypoints at one speed.
+    """Return the route along waypoints at constant speed.
 
     Parameters
     ----------
@@ -97,16 +96,16 @@ def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float) -> Route:
     Returns
     -------
     Route
-        Route with a point every second.
+        Route, sampled once per second.
     """
     place = np.array([(w.east_m, w.north_m, w.height_m) for w in waypoints])
-    spans = np.zeros(2 * len(place))  # time to each waypoint, and until it is left
+    spans = np.zeros(2 * len(place))  # durations of the way to each waypoint, and of the stay there
     spans[1::2] = [w.hold_s for w in waypoints]
     spans[2::2] = [float(np.linalg.norm(step)) / speed_mps for step in np.diff(place, axis=0)]
     time, yaw = np.cumsum(spans), np.repeat([w.yaw_deg for w in waypoints], 2)
-    # slightly longer, so that the last second of a flight of full seconds is included
+    # slightly longer, so that the last sample is included if the duration is a full number of seconds
     seconds = np.arange(0.0, time[-1] + 1e-9, 1.0)
-    # a yaw is kept from its waypoint to the next, so a time has the yaw of the step before
+    # a yaw is kept from its waypoint to the next, so each time has the yaw of the waypoint before it
     before = np.maximum(np.searchsorted(time, np.minimum(seconds, time[-1])) - 1, 0)
     position = interpolated(seconds, time, np.repeat(place, 2, axis=0))
     return Route(
@@ -148,11 +147,11 @@ def allowed_area(fence: Any, avoid: Sequence[Any], towers_m: FloatArray, distanc
 
 
 def lawnmower(area: Any, azimuth_deg: float, spacing_m: float) -> list[FloatArray]:
-    """Return legs (2, 2) back and forth across an area at a course clockwise from north, without short ones."""
+    """Return legs (2, 2) back and forth across an area at a course clockwise from north. Short legs are omitted."""
     centre = area.centroid
     turned = shapely.affinity.rotate(area, azimuth_deg, origin=centre)  # legs now run north
     west, south, east, north = turned.bounds
-    # evenly over the width, because the last leg would otherwise be anywhere between two
+    # divide the width evenly, because otherwise the last leg could be at any distance from the border
     count = max(int((east - west) // spacing_m), 1)
     at = west + (np.arange(count) + 0.5) * (east - west) / count
     legs, up = [], True
@@ -172,7 +171,7 @@ def lawnmower(area: Any, azimuth_deg: float, spacing_m: float) -> list[FloatArra
 
 def cross(area: Any, azimuth_deg: float) -> list[FloatArray]:
     """Return two legs (2, 2) at right angles through the middle of an area."""
-    # the centroid of a bent area may be outside
+    # the centroid of a concave area may be outside it
     middle = area.centroid if area.contains(area.centroid) else area.representative_point()
     # longer than the area from any of its points
     reach = 2.0 * math.hypot(area.bounds[2] - area.bounds[0], area.bounds[3] - area.bounds[1])
@@ -187,9 +186,9 @@ def cross(area: Any, azimuth_deg: float) -> list[FloatArray]:
 
 
 def path_within(area: Any, begin: FloatArray, end: FloatArray) -> list[FloatArray]:
-    """Return the corners between two points of an area, along its border where the straight line is outside."""
+    """Return the corners of a path between two points of an area. It follows the border where the line is outside."""
     line = shapely.LineString([begin, end])
-    # ends of legs are on the border, except for rounding
+    # a small buffer, because legs end on the border and may be outside by rounding
     if area.buffer(0.1).covers(line):
         return []
     corners: list[FloatArray] = []
@@ -204,7 +203,7 @@ def path_within(area: Any, begin: FloatArray, end: FloatArray) -> list[FloatArra
         first, last = min(begin_m, end_m), max(begin_m, end_m)
         back = shapely.LineString([*substring(ring, last, ring.length).coords, *substring(ring, 0.0, first).coords])
         back = back if begin_m > end_m else back.reverse()
-        # corners less than a metre from their line are not turns
+        # omit corners that deviate from a straight line by less than a metre
         arc = min((forth, back), key=lambda a: a.length).simplify(1.0)
         corners += [np.array(c) for c in arc.coords]
     return sorted(corners, key=lambda c: float(np.linalg.norm(c - begin))) if len(area.interiors) > 1 else corners
@@ -241,7 +240,7 @@ def waypoints_of(legs: Sequence[FloatArray], area: Any, height_m: float, nose: N
 
 
 def with_turns(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
-    """Return the route with a slow rotation through all headings at some of its points."""
+    """Return waypoints with slow rotations through all headings at some points of the route."""
     at = set(spread_out(len(waypoints), _TURN_POINTS).tolist())
     out: list[Waypoint] = []
     for i, w in enumerate(waypoints):
@@ -254,7 +253,7 @@ def with_turns(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pattern:
-    """The parameters of a route: ``shape`` lawnmower or cross, course of its legs, height, nose, and slow rotations."""
+    """The parameters of a route: ``shape`` (lawnmower or cross), course of legs, height, nose and slow rotations."""
 
     shape: Literal["lawnmower", "cross"]
     azimuth_deg: float
@@ -284,7 +283,7 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
         Area of :func:`allowed_area`.
     speed_mps : float
     most_s : float
-        Longest flight [s]. A cross is repeated as often as it allows.
+        Longest flight [s]. A cross is repeated until this time is used.
 
     Returns
     -------
@@ -310,14 +309,14 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
     if pattern.shape == "cross":
         legs = cross(area, pattern.azimuth_deg)
         route, more = made(legs), list(legs)
-        # limit the repetitions, because a short cross in a long flight would take hours
+        # limit the repetitions, because a short cross in a long flight would take hours to compute
         while route.duration_s < most_s and len(more) < 60:
             more += [leg[::-1] for leg in legs] if (len(more) // max(len(legs), 1)) % 2 else list(legs)
             route = made(more)
         return cut(route, most_s, speed_mps)
     low, high = _CLOSEST_M, widest
     for _ in range(14):
-        # spacings are searched by their ratio, with 14 bisections from hundreds of metres
+        # geometric bisection: 14 steps suffice from hundreds of metres
         middle = math.sqrt(low * high)
         longer = made(lawnmower(area, pattern.azimuth_deg, middle)).duration_s > most_s
         low, high = (middle, high) if longer else (low, middle)
@@ -325,7 +324,7 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
 
 
 def cut(route: Route, most_s: float, speed_mps: float) -> Route:
-    """Return the part of a route within the battery time: waypoints and samples."""
+    """Return the part of a route, both waypoints and samples, that can be flown within the battery time."""
     if route.duration_s <= most_s:
         return route
     within: list[Waypoint] = []
@@ -356,7 +355,7 @@ def _places(waypoints: Sequence[Waypoint], frame: SiteFrame) -> list[tuple[float
 
 
 def plan_text(waypoints: Sequence[Waypoint], frame: SiteFrame, speed_mps: float) -> str:
-    """Return a QGroundControl plan for ArduPilot: each waypoint, then the yaw until the next one.
+    """Return a QGroundControl plan for ArduPilot. Each waypoint is followed by the yaw until the next one.
 
     Parameters
     ----------
@@ -368,13 +367,13 @@ def plan_text(waypoints: Sequence[Waypoint], frame: SiteFrame, speed_mps: float)
     Returns
     -------
     str
-        JSON. The pilot adds take-off, landing and the ways there.
+        JSON text. The pilot adds take-off, landing, and the ways to and from the route.
     """
     # 1 is ground speed, and -1 keeps the throttle
     items: list[dict[str, Any]] = [_item(_SPEED, [1, speed_mps, -1, 0, 0, 0, 0], frame=2)]
     for latitude, longitude, w in _places(waypoints, frame):
         items.append(_item(_WAYPOINT, [w.hold_s, 0, 0, None, latitude, longitude, w.height_m]))
-        # a separate command, because ArduPilot ignores the yaw of a waypoint
+        # set the yaw by a separate command, because ArduPilot ignores the yaw of a waypoint
         items.append(_item(_YAW, [w.yaw_deg, 0, 0, 0, 0, 0, 0], frame=2))
     for number, item in enumerate(items, start=1):
         item["doJumpId"] = number
@@ -396,6 +395,6 @@ def _item(command: int, params: list[float | None], frame: int = _FRAME_ABOVE_HO
 
 
 def waypoints_csv(waypoints: Sequence[Waypoint], frame: SiteFrame) -> str:
-    """Return waypoints as a table: position, height above take-off, yaw until the next one, hold time."""
+    """Return waypoints as a CSV table: position, height above take-off, yaw until the next waypoint, hold time."""
     rows = [f"{a:.7f},{b:.7f},{w.height_m:g},{w.yaw_deg:.1f},{w.hold_s:g}" for a, b, w in _places(waypoints, frame)]
     return "\n".join(["latitude_deg,longitude_deg,altitude_m,yaw_deg,hold_s", *rows]) + "\n"

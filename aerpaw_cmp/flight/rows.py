@@ -1,10 +1,10 @@
-"""The rows of a log that are scored: rows without excluding flags, times of receiver lock, and frozen levels.
+"""Selection of the rows of a log that are scored, by flags, receiver lock and frozen levels.
 
 Rows are scored unless a flag excludes them.
 
-The receiver of the channel sounder of AERPAW is in lock if its quality is near its peak.
+The receiver of AERPAW's channel sounder is in lock if its quality is near the largest possible value.
 
-A level that is equal to all digits while the aircraft moves is frozen, because the receiver or logger stopped.
+A level is frozen if all its digits stay the same while the aircraft moves, because receiver or logger stopped.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from ..logs.records import Stream
 
 
 def unscored(frame: pd.DataFrame) -> BoolArray:
-    """Return rows (n,) with a flag of :data:`~aerpaw_cmp.logs.limits.UNSCORED`."""
+    """Return a mask (n,) of rows with a flag of :data:`~aerpaw_cmp.logs.limits.UNSCORED`."""
     flag = frame["flag"].to_numpy(dtype=object)
     out = np.zeros(len(flag), dtype=np.bool_)
-    # one by one, because few rows have a flag
+    # a loop is fast enough, because few rows have a flag
     for i in np.flatnonzero(flag != ""):
         out[i] = any(word in UNSCORED for word in str(flag[i]).split(";"))
     return out
 
 
 def without_values(stream: Stream, path: str) -> InputError | None:
-    """Return the error of a series without any row to score, or None.
+    """Return an error if a series has no row to score, otherwise None.
 
     A phone writes -1 for each level of a network that it does not receive, while its other series are valid.
     """
@@ -42,7 +42,7 @@ def without_values(stream: Stream, path: str) -> InputError | None:
     except InputError as error:
         return error
     value = frame["rss_db" if stream.kind == "rss" else "rank"]
-    # a row without a signal or CSI has no number either, but its flag is a measurement
+    # a flagged row without a number is also a measurement: there was no signal or no CSI
     if value.notna().any() or (frame["flag"] != "").any() or not len(frame):
         return None
     return InputError(
@@ -54,7 +54,7 @@ def without_values(stream: Stream, path: str) -> InputError | None:
 
 
 def scored_rows(stream: Stream, path: str) -> tuple[pd.DataFrame, dict[str, int]]:
-    """Return the rows that are scored, and the numbers of the others by flag.
+    """Return the rows that are scored, and the number of excluded rows per flag.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ _LOCK_QUALITY_DB, _LOST_QUALITY_DB = 20.0 * float(np.log10(4095.0)), 60.0
 # Level below which the receiver loses its lock and writes noise [dB re full scale].
 LOCK_FLOOR_DB = -15.0
 
-# Largest time difference between a level and a quality in another log.
+# Largest time difference between a level and a quality from another log [s].
 _WITHIN_S = 0.1
 
 
@@ -103,7 +103,7 @@ def may_lose_lock(stream: Stream) -> bool:
 
 
 def is_sounder_power(stream: Stream) -> bool:
-    """Check whether a stream may be the level of such a quality."""
+    """Check whether a stream is a level of the sounder, which may have a lock quality."""
     return stream.kind == "rss" and stream.name == "power" and stream.attributes.get("unit") == "dB re full scale"
 
 
@@ -114,13 +114,14 @@ def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | N
     ----------
     power : Stream
     candidates : iterable of Stream
-        Streams of the flight, those of the same file first. The first lock quality that shares time with the level is
-        used.
+        Streams of the flight, starting with those of the same file. The first lock quality that overlaps in time with
+        the level is used.
 
     Returns
     -------
     (n,) or None, str
-        1 in lock, 0 without lock, NaN unknown, for each row of the level, and a remark about the times of the quality.
+        Lock state per row of the level (1 in lock, 0 without lock, NaN unknown), and a remark about the times of the
+        quality. None if there is no such quality.
     """
     if not is_sounder_power(power):
         return None, ""
@@ -138,7 +139,7 @@ def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | N
                     "are used, 0.032768 s per row"
                 )
         else:
-            order = np.argsort(at, kind="stable")  # a log may have been joined from parts
+            order = np.argsort(at, kind="stable")  # sort, because a log may have been joined from parts
             quality = at_times(time, at[order], quality[order], within_s=_WITHIN_S)
         if np.isfinite(quality).any():
             return np.where(np.isfinite(quality), (quality > _LOST_QUALITY_DB).astype(np.float64), np.nan), remark
@@ -150,27 +151,29 @@ def _seconds(stream: Stream) -> FloatArray:
 
 
 FLAG = "level_frozen"
-# A run of one level is suspicious above this duration [s], number of samples and flown distance [m].
+# A run of equal levels may be frozen above this duration [s], number of samples and flown distance [m].
 _LEAST_S, _LEAST, _LEAST_M = 5.0, 10, 15.0
-# Levels in full and half dB repeat in every hover.
+# Levels with this resolution repeat in every hover.
 _COARSE_DB = 0.5
-# Probability of such a run, from the share of equal neighbours elsewhere, below which chance does not explain it.
+# A run is not explained by chance if its probability is below this value. The probability follows from the share of
+# equal neighbours in the rest of the series.
 _CHANCE = 1e-6
-# Second differences of noise exceed its differences (by the root of 3), and those of a smooth level are smaller.
+# A level is noisy if its second differences exceed its differences by this factor. For white noise it is the root of 3,
+# for a smooth level it is below 1.
 _NOISY, _LEAP = 1.2, 3.0
 
 
 def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> BoolArray:
-    """Return a mask of samples that repeat a frozen level, without the first of each run, shape (n,).
+    """Return a mask (n,) of samples that repeat a frozen level. The first sample of each run is not marked.
 
-    A smooth level is also constant at its maximum or at the end of its scale, and continues from there. It is frozen
-    only if it jumps at the end of the run, or if the series ends there with higher and lower levels before. A noisy
-    level is frozen if chance does not explain the run.
+    A smooth level can be constant at its maximum or at the end of its scale, and then continue smoothly. It is frozen
+    only if it jumps at the end of the run, or if the series ends with the run and had both higher and lower levels
+    before. A noisy level is frozen if chance does not explain the run.
 
     Parameters
     ----------
     time : (n,)
-        Times in order, datetime64[ns].
+        Ascending times, datetime64[ns].
     level_db : (n,)
         Level; NaN out of coverage.
     position_m : (n, 3)
@@ -178,7 +181,7 @@ def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> Bool
     """
     out = np.zeros(len(level_db), dtype=np.bool_)
     same = np.diff(level_db) == 0
-    # use distinct levels, so that a frozen run at a half dB does not make a fine series coarse
+    # count distinct levels only, so that a frozen run at a half dB does not make a fine series look coarse
     levels = np.unique(level_db[np.isfinite(level_db)]) / _COARSE_DB
     if same.sum() < _LEAST or (np.abs(levels - np.round(levels)) > 1e-6).mean() < 0.5:
         return out
@@ -202,13 +205,13 @@ def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> Bool
 
 
 def _large(difference_db: FloatArray) -> float:
-    """Return the magnitude below which nine of ten differences (n,) are [dB], or 0 without differences."""
+    """Return the magnitude [dB] that nine of ten differences (n,) do not exceed, or 0 without differences."""
     known = np.abs(difference_db[np.isfinite(difference_db)])
     return float(np.quantile(known, 0.9)) if len(known) else 0.0
 
 
 def _is_noisy(level_db: FloatArray) -> bool:
-    """Check whether a level (n,) varies by noise and not smoothly. Rounding of a smooth level is not noise."""
+    """Check whether a level (n,) varies by noise and not smoothly. Rounding does not count as noise."""
     step = np.diff(level_db[np.isfinite(level_db)])
     sizes = np.abs(step[step != 0])
     if not len(sizes):

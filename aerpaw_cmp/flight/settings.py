@@ -1,7 +1,8 @@
 """Checked settings of a flight.yaml.
 
-Unknown and duplicate keys are errors that name the nearest valid key. Relative paths resolve against the file's
-folder, or ``--logs-root``. Overrides change single keys in dotted form: ``rt.max_depth``, ``link.rss.tower.yaw_deg``.
+An unknown or duplicate key is an error, whose message names the nearest valid key. Relative paths resolve against the
+file's folder, or ``--logs-root``. Overrides change single keys, which are written in dotted form, such as
+``rt.max_depth`` or ``link.rss.tower.yaw_deg``.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class AntennaSettings(StrictModel):
     elevation: str | None = None
     """CSV of the elevation cut, if ``file`` contains the azimuth cut."""
     learned: LearnedAntenna | None = None
-    """SHA-256 and error model of a learned ``sphere``."""
+    """SHA-256 and error model of the file, if the model is a learned ``sphere``."""
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
@@ -75,9 +76,9 @@ class ArraySettings(StrictModel):
     """The antenna elements of one device.
 
     Layouts are ``single``, ``linear`` (``elements`` at half a wavelength, along the device's left axis) and ``custom``
-    (``positions_m``). ``tower_comparison`` (60 mm / 1.68 m / 60 mm) and ``uav_comparison`` (2 x 2 at half a
-    wavelength) are those of arXiv 2502.10324. ``yaw_deg`` is counter-clockwise from east (tower) or from the
-    aircraft's nose (UAV with logged attitude). Positive ``pitch_deg`` turns the boresight down.
+    (``positions_m``). ``tower_comparison`` (60 mm / 1.68 m / 60 mm) and ``uav_comparison`` (2 x 2 at half a wavelength)
+    are the arrays of arXiv 2502.10324. ``yaw_deg`` is counter-clockwise from east (tower) or from the aircraft's nose
+    (UAV with logged attitude). Positive ``pitch_deg`` turns the boresight down.
     """
 
     layout: Literal["single", "linear", "tower_comparison", "uav_comparison", "custom"] = "single"
@@ -112,7 +113,7 @@ class ArraySettings(StrictModel):
     def build(self, wavelength: float, folder: Path) -> Array:
         """Return the array, with patterns loaded from files relative to ``folder``."""
         positions = self.positions(wavelength)
-        # one slant for all, or one for each element
+        # one slant for all elements, or one per element
         slant = np.atleast_1d(np.asarray(self.slant_deg, dtype=np.float64))
         if len(slant) not in (1, len(positions)):
             raise UsageError(
@@ -124,7 +125,7 @@ class ArraySettings(StrictModel):
         return Array(
             positions,
             np.radians(np.broadcast_to(slant, (len(positions),)).copy()),
-            # one pattern for all elements; a measured file can contain several carriers
+            # one pattern for all elements; the carrier selects the frequency in a measured file
             (load_pattern(self.antenna, folder, SPEED_OF_LIGHT_MPS / wavelength),),
             mount,
         )
@@ -134,7 +135,7 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
     """Return the element pattern. Files are relative to ``folder``, and the carrier selects the frequency."""
     from ..site import antennas
 
-    # not opened for models without a file
+    # named models have no file, and do not use this path
     file = folder / str(settings.file)
     if settings.model == "dipole":
         return antennas.HalfWaveDipole()
@@ -156,7 +157,7 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
 
 
 def _sphere(settings: AntennaSettings, file: Path, folder: Path) -> Pattern:
-    """Return the pattern of a full sphere. A learned one is verified and has its error model."""
+    """Return the pattern of a full sphere. If it is learned, check its SHA-256 and attach its error model."""
     known = settings.learned
     if known is None:
         return read_sphere_csv(file)
@@ -175,7 +176,7 @@ class LinkSettings(StrictModel):
     transmit_power_dbm: float = 40.0
     uav_transmits: bool = True
     bandwidth_hz: Positive | None = None
-    """A link is out of coverage below the noise of this bandwidth."""
+    """Bandwidth of the receiver. A link is out of coverage below the noise in this bandwidth."""
     noise_figure_db: float | None = None
     tower: ArraySettings = ArraySettings()
     towers: dict[str, ArraySettings] = {}
@@ -189,7 +190,7 @@ class LinkSettings(StrictModel):
 
     @property
     def floor_dbm(self) -> float:
-        """The noise floor of the receiver [dBm] in its bandwidth, or in 1 Hz."""
+        """The noise floor of the receiver [dBm] in its bandwidth, or in 1 Hz if the bandwidth is unknown."""
         return noise_floor_dbm(self.bandwidth_hz or 1.0, self.noise_figure_db or 0.0)
 
     def build(self, tower_names: list[str], folder: Path) -> Link:
@@ -207,7 +208,7 @@ class LinkSettings(StrictModel):
 
 
 class LinksSettings(StrictModel):
-    """The RSS link (single elements, 3.3 GHz) and the rank link (4 x 4, 3.4 GHz) of the paper as defaults."""
+    """The RSS and rank links. The defaults are those of the paper: single elements at 3.3 GHz, and 4 x 4 at 3.4 GHz."""
 
     rss: LinkSettings = LinkSettings(carrier_hz=3.3e9)
     channels: dict[str, LinkSettings] = {}
@@ -215,7 +216,7 @@ class LinksSettings(StrictModel):
     rank: LinkSettings = LinkSettings(
         carrier_hz=3.4e9,
         uav_transmits=False,
-        bandwidth_hz=20e6,  # a modem reports rank above the noise of its channel, not of 1 Hz
+        bandwidth_hz=20e6,  # a modem reports a rank above the noise in its channel, not in 1 Hz
         tower=ArraySettings(layout="tower_comparison", slant_deg=[45.0, -45.0, 45.0, -45.0], yaw_deg=45.0),
         uav=ArraySettings(layout="uav_comparison", slant_deg=[45.0, -45.0, -45.0, 45.0], yaw_deg=315.0, roll_deg=90.0),
     )
@@ -237,23 +238,23 @@ class LogSettings(StrictModel):
     clock: Literal["local", "utc", "local_as_utc"] | None = None
     time_origin: str | None = None
     gps_rollovers: Annotated[int, Field(ge=0, le=3)] = 0
-    """Rollovers of the week number of the log's GPS receiver. Each adds 1 024 weeks to the times."""
+    """Number of rollovers of the GPS week number in this log. Each rollover adds 1 024 weeks to the times."""
     ri_base: Literal["zero", "one"] | None = None
     columns: dict[str, str] = {}
     kind: Kind | None = None
     unit: str | None = None
     floor_db: float = -200.0
     cells: dict[Annotated[int | str, Field(union_mode="left_to_right")], str] = {}
-    """Tower of each cell, by PCI or by the stream's name. Other cells are ignored."""
+    """Tower of each cell, by PCI or name of the stream. Cells that are not listed are ignored."""
     height_m: float | None = Field(default=None, ge=-1000.0, le=20_000.0)
-    """Height above take-off of a complete track whose log has no altitude [m]."""
+    """Height above take-off of the whole track [m], for a log without altitudes."""
     skip: list[str] = []
-    """Names of streams of the file to ignore."""
+    """Names of the streams of the file to ignore."""
     receiver: str = ""
     """Name of the receiver that wrote the log, if the log does not contain it. Learned levels belong to a receiver."""
 
     def options(self, timezone: str | None) -> ReadOptions:
-        """Return the reader options, with the flight's zone as default."""
+        """Return the options of the log's reader. The default time zone is that of the flight."""
         return ReadOptions(
             timezone=self.timezone or timezone,
             ri_base=self.ri_base,
@@ -264,7 +265,7 @@ class LogSettings(StrictModel):
 
 
 class Waypoint(StrictModel):
-    """A planned point: ``height_m`` above the ground at the origin, where the UAV waits ``hold_s`` seconds."""
+    """A planned point, ``height_m`` above the ground at the origin. The UAV waits there for ``hold_s`` seconds."""
 
     label: str = ""
     east_m: float
@@ -274,10 +275,10 @@ class Waypoint(StrictModel):
 
 
 class PlanSettings(StrictModel):
-    """The ground truth of simulated logs. ``aerpaw-cmp simulate`` writes all of it to truth.json."""
+    """The plan and the true errors of simulated logs. ``aerpaw-cmp simulate`` writes them to truth.json."""
 
     start: datetime
-    """Local time in the flight's zone."""
+    """Local time in the time zone of the flight."""
     waypoints: Annotated[list[Waypoint], Field(min_length=2)]
     speed_mps: Positive = 8.0
     climb_mps: Positive = 3.0
@@ -286,7 +287,7 @@ class PlanSettings(StrictModel):
     rss_interval_s: Positive = 0.1
     rank_interval_s: Positive = 0.5
     offsets_db: dict[str, dict[str, float]] = {}
-    """Offset that the comparison should recover (added to the measurement), by tower and channel."""
+    """Offset that is added to the measurement, by tower and channel. The comparison should recover it."""
     fading_db: Annotated[float, Field(ge=0)] = 0.0
     """Standard deviation of log-normal fading."""
     fading_correlation_s: Positive = 2.0
@@ -297,7 +298,7 @@ class PlanSettings(StrictModel):
     rank_k: Positive = 100.0
     """Singular-value ratio of the simulated modem."""
     rank_error_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of reports that are one layer off."""
+    """Share of reports whose rank is wrong by one layer."""
     no_csi_share: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Share of reports with RI 0 (no CSI)."""
 
@@ -314,27 +315,27 @@ class FlightSettings(StrictModel):
 
 
 class SiteChoice(StrictModel):
-    """A site, and the changes of this flight."""
+    """The site of a flight, and changes to it for this flight."""
 
     file: str = "lake_wheeler"
     coordinates: str | None = None
     """Name of a published coordinate set of the packaged site."""
     antenna_height_m: Positive | None = None
-    """Antenna height of every tower instead of the site's [m]."""
+    """Antenna height of every tower [m], replacing the heights of the site."""
     without_buildings: bool = False
     tower_ground: Literal["flat", "offsets", "surface", "dem"] | None = None
-    """Ground at the towers and below the paths, instead of the site's."""
+    """Model of the ground at the towers and below the paths, replacing that of the site."""
 
 
 class GroundNode(StrictModel):
-    """A node of this flight that is not in the site, such as a rover or a second UAV: its position, or its track."""
+    """The position or track of a node that is not in the site, such as a rover or a second UAV."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
     track: LogSettings | None = None
-    """Log with its positions. A node that stays within ``STANDS_STILL_M`` is at their median."""
+    """Log with the positions of the node. A node that stays within ``STANDS_STILL_M`` is placed at their median."""
     height: Literal["ground", "logged"] = "ground"
-    """``ground``: the antenna is ``antenna_height_m`` above the ground plane. ``logged``: at the track's height."""
+    """``ground``: the antenna is ``antenna_height_m`` above the ground. ``logged``: at the height of the track."""
     antenna_height_m: Positive = 1.5
 
     @field_validator("track", mode="before")
@@ -358,12 +359,12 @@ class AdvancedRt(StrictModel):
     """Settings of a replay that few flights need."""
 
     samples: Literal["auto"] | Annotated[int, Field(ge=1, le=100_000_000)] = "auto"
-    """Rays per tower of Sionna. ``auto`` increases the number until two pilot runs find the same paths."""
+    """Number of Sionna's rays per tower. ``auto`` increases it until two pilot runs find the same paths."""
     gamma_db_per_m: Positive | None = None
     maximum_loss_db: Positive | None = None
-    """Values instead of P.833's specific attenuation and largest loss at the carrier."""
+    """Specific attenuation and largest loss, replacing the values of P.833 at the carrier."""
     maximum_gap_s: Positive = 3.0
-    """Positions are not interpolated in telemetry gaps longer than this."""
+    """Longest telemetry gap in which positions are interpolated."""
 
 
 class RtSettings(StrictModel):
@@ -372,21 +373,21 @@ class RtSettings(StrictModel):
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
     diffraction: Diffraction = "none"
-    """Paths over one edge of a building, in H, levels and ranks."""
+    """Diffraction over one edge of a building. It is included in H, levels and ranks."""
     attitude: Literal["logged", "level", "ignored"] = "ignored"
-    """``logged``: the UAV array rotates with the aircraft. ``level``: heading only. ``ignored``: fixed in the site."""
+    """``logged``: the UAV array rotates with the aircraft. ``level``: with the heading only. ``ignored``: never."""
     foliage: Literal["none", "attenuating", "opaque"] = "none"
     foliage_model: Literal["p833", "weissberger"] = "p833"
     leaves: Literal["in", "out"] = "in"
     reflection_loss_db: Annotated[float, Field(ge=0)] = 0.0
-    """Further loss of every reflection (rough surfaces), fitted on other flights."""
+    """Additional loss per reflection, for example by rough surfaces. Fit it on other flights."""
     ground_roughness_m: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Standard deviation of the ground's height. It weakens the specular reflection by Ament's factor."""
+    """Standard deviation of the height of the ground. It reduces the specular reflection by Ament's factor."""
     audit_links: Annotated[int, Field(ge=0)] = 200
     advanced: AdvancedRt = AdvancedRt()
 
 
-# Offsets are tried in steps of 0.1 dB.
+# Widest span of offsets [dB], which are tried in steps of 0.1 dB.
 _WIDEST_DB = 100_000.0
 
 
@@ -394,7 +395,7 @@ class AdvancedRss(StrictModel):
     """Settings of the RSS comparison that few flights need."""
 
     lag_window_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
-    """Largest clock difference of the search."""
+    """Largest clock difference that is searched."""
 
 
 class RssSettings(StrictModel):
@@ -402,11 +403,11 @@ class RssSettings(StrictModel):
 
     span_db: tuple[float, float] = (-50.0, 50.0)
     lag: Literal["off", "estimate", "apply"] | float = "estimate"
-    """Radio minus telemetry clock: ``off``, ``estimate`` (shown only), ``apply``, or a value to subtract [s]."""
+    """Radio minus telemetry clock: ``off``, ``estimate`` (only shown), ``apply``, or a value to subtract [s]."""
     field: Literal["coherent", "power"] = "coherent"
-    """Simulated RSS that is compared."""
+    """Kind of simulated RSS that is compared."""
     minimum_height_m: float | None = None
-    """Samples below this height are excluded from the comparison, and counted."""
+    """Lowest height of a compared sample. Samples below it are excluded and counted."""
     advanced: AdvancedRss = AdvancedRss()
 
     @field_validator("span_db")
@@ -425,9 +426,9 @@ class RankSettings(StrictModel):
     tower: str = "LW1"
     k: Annotated[list[Positive], Field(min_length=1, max_length=64)] = [10.0, 100.0, 1000.0]
     minimum_height_m: float | None = None
-    """Samples below this height are excluded, and counted (the README of a data set can require it)."""
+    """Lowest height of a compared sample. Samples below it are excluded and counted. Some data sets require this."""
     receiver: str | None = None
-    """Receiver file of ``calibrate``, for the probability of each rank."""
+    """Receiver file written by ``calibrate``, for the probability of each rank."""
 
     @field_validator("k")
     @classmethod
@@ -438,7 +439,7 @@ class RankSettings(StrictModel):
 
 
 class ReportSettings(StrictModel):
-    """The contents of the report."""
+    """Settings of the contents of the report."""
 
     waypoints: list[Waypoint] = []
 
@@ -450,9 +451,9 @@ class Caution:
     key: str
     """Key of the flight file, such as ``antennas.uav``."""
     channel: str | None
-    """Channel to which it does not apply. None for all channels that ``link.channels`` does not name."""
+    """Channel that the caution concerns. None for all channels that ``link.channels`` does not name."""
     text: str
-    """The antenna or receiver that is not used, the reason and its replacement, or the setting that it replaces."""
+    """The antenna or receiver that is not used, with reason and substitute, or the setting that it replaces."""
     used: bool = False
 
 
@@ -465,13 +466,13 @@ class FlightFile(StrictModel):
     """Nodes of this flight that are not in the site, such as a rover."""
     timezone: str | None = None
     trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = []
-    """SHA-256 of the logs from which settings of this file were learned. They are not scored."""
+    """SHA-256 of the logs from which settings of this file were learned. These logs are not scored."""
     marks: list[str] = []
     """Fingerprints of the same logs, to recognise copies."""
     logs: list[LogSettings]
     """Logs of the flight. An empty list is sufficient for a plan or a route."""
     antennas: dict[str, str] = {}
-    """Names of learned antennas for ``uav`` and ``TOWER.CHANNEL``, instead of those in link."""
+    """Names of learned antennas for ``uav`` and ``TOWER.CHANNEL``, replacing the antennas in ``link``."""
     link: LinksSettings = LinksSettings()
     rt: RtSettings = RtSettings()
     rss: RssSettings = RssSettings()
@@ -482,18 +483,18 @@ class FlightFile(StrictModel):
 
     @property
     def cautions(self) -> tuple[Caution, ...]:
-        """The warnings about learned antennas and receivers in this file. Those that do not fit are not used."""
+        """The warnings about named learned antennas and receivers. Those that do not fit are not used."""
         return self._cautions
 
     @property
     def lent(self) -> frozenset[str]:
-        """The channels of ``link.channels`` from a calibration or an override. Another flight may have them."""
+        """The channels of ``link.channels`` from a calibration or an override, which this flight may not have."""
         return self._lent
 
     def changed(
         self, content: Mapping[str, Any], *, cautions: Iterable[Caution] | None = None, lent: Iterable[str] = ()
     ) -> FlightFile:
-        """Return the settings with other values for some top-level keys. They are not checked again."""
+        """Return a copy of the settings with new values for some top-level keys, which are not checked."""
         other = self.model_copy(update=dict(content))
         other._cautions = self._cautions if cautions is None else tuple(cautions)
         other._lent = self._lent | frozenset(lent)
@@ -525,7 +526,7 @@ class FlightFile(StrictModel):
 
 
 class LearnedLink(StrictModel):
-    """The links of calibrated.yaml, which has channels only."""
+    """The links of a calibrated.yaml, which contains only channels."""
 
     channels: dict[str, dict[str, Any]] = {}
 
@@ -555,13 +556,13 @@ def load_flight(path: str | Path) -> FlightFile:
     Raises
     ------
     UsageError
-        With line and nearest valid key, for unknown or duplicate keys, wrong types and wrong ranges.
+        For unknown or duplicate keys, wrong types and values out of range, with the line and the nearest valid key.
     """
     return load_yaml(Path(path), FlightFile)
 
 
 def files_of(content: Mapping[str, Any], folder: Path, learned: Path | None = None) -> dict[str, Any]:
-    """Return settings with the files that they name as absolute paths.
+    """Return settings in which the paths of files are absolute.
 
     Files that a calibrated.yaml (``learned``) names must be in its folder or below.
     """
@@ -579,12 +580,12 @@ def files_of(content: Mapping[str, Any], folder: Path, learned: Path | None = No
 
 
 def joined(settings: FlightFile, learned: Path) -> FlightFile:
-    """Return the settings of a flight with those of a calibrated.yaml instead of its own.
+    """Return the settings of a flight, with those of a calibrated.yaml replacing its own.
 
     Parameters
     ----------
     settings : FlightFile
-        Settings with their learned antennas. Those of the same end, tower and channel are replaced.
+        Settings with their learned antennas. An antenna of the same end, tower and channel is replaced.
     learned : Path
         A calibrated.yaml, with its files in the same folder.
 
@@ -597,9 +598,9 @@ def joined(settings: FlightFile, learned: Path) -> FlightFile:
         check_seal(learned)
     known = files_of(load_yaml(learned, LearnedSettings).model_dump(exclude_unset=True), learned.parent, learned)
     taught: dict[str, Any] = known.get("link", {}).get("channels", {})
-    # only stated values, because a default must not replace a learned value
+    # only values that the user wrote, because a default must not replace a learned value
     stated: dict[str, Any] = settings.model_dump(mode="json", exclude_unset=True)
-    # a channel begins as the RSS link, as with overrides, and learned values come last
+    # as with overrides, a new channel starts as a copy of the RSS link; learned values then replace its values
     rss_link = settings.link.rss.model_dump(mode="json", exclude_unset=True)
     channels = dict(stated.get("link", {}).get("channels", {}))
     for name, channel in taught.items():
@@ -639,7 +640,7 @@ Overrides = Mapping[str, Any]
 
 
 def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
-    """Return checked flight settings with dotted keys changed.
+    """Return flight settings with the values of dotted keys changed, and check them.
 
     A new channel of ``link.channels`` starts as a copy of ``link.rss``, and a new tower of ``towers`` as a copy of
     ``tower``.
@@ -660,7 +661,7 @@ def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        # name the override that was typed, also if the error is above or below it
+        # name the override that the user wrote, even if the error is at a key above or below it
         key = next((k for k in overrides if k.startswith(where) or where.startswith(k)), where)
         message = str(first["msg"]).removeprefix("Value error, ")
         raise UsageError(f"the override {key!r}: found {first['input']!r} at {where}", expected=message) from None
@@ -681,7 +682,7 @@ def _set(plain: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _add(plain: dict[str, Any], level: dict[str, Any], above: list[str], part: str, key: str) -> None:
-    """Create an entry of a mapping with free names. Refuse all other unknown keys."""
+    """Create an entry in a mapping whose keys are free names, or refuse an unknown key."""
     if above == ["link", "channels"]:
         level[part] = deepcopy(plain["link"]["rss"])
         return

@@ -1,8 +1,8 @@
-"""Simulation of a planned flight as logs of the real formats, with a file of the true values.
+"""Simulation of a planned flight: logs in the formats of real loggers, and a file of the true values.
 
 ``flight.plan`` of a flight.yaml specifies the route and the simulated errors (offsets, fading, clock shifts, bad
-lines). Its ``logs`` specify the files and their formats (by ``reader``). The written folder contains a flight.yaml for
-``aerpaw-cmp report``, which must recover the simulated errors.
+lines). The ``logs`` of that file specify the names and formats (by ``reader``) of the logs. The written folder contains
+a flight.yaml for ``aerpaw-cmp report``, which must recover the simulated errors.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from .track import interpolated
 
 # File of the true values.
 _TRUTH = "truth.json"
-# Flight file in the folder of the logs that it names.
+# Flight file, written to the folder of its logs.
 FLIGHT = "flight.yaml"
 # Readers whose logs can be written.
 _WRITTEN = ("vehicle_out", "sounder_log", "quectel_ri")
-# Simulated levels below this mean that there is no signal.
+# Simulated levels below this count as no signal.
 _LOWEST_DBM = -400.0
 
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """A planned trajectory as corner points in time.
+    """A planned trajectory, stored as corner points with times.
 
-    ``time_s`` (corners,) counts from the start. ``position_m`` (corners, 3) is east, north, and height above the ground
-    at the origin. Between corners the UAV moves in a straight line at constant speed.
+    ``time_s`` (corners,) is relative to the start. ``position_m`` (corners, 3) is east, north, and height above the
+    ground at the origin. Between corners the UAV moves in a straight line at constant speed.
     """
 
     time_s: FloatArray
@@ -65,18 +65,18 @@ class Trajectory:
         return interpolated(time_s, self.time_s, self.position_m)
 
     def velocity_at(self, time_s: FloatArray) -> FloatArray:
-        """Return velocities (n, 3) east, north, up [m/s], which are zero while the UAV waits."""
+        """Return velocities (n, 3) to east, north and up [m/s]. They are zero while the UAV waits."""
         # the last corner belongs to the last leg
         leg = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.time_s) - 2)
         return np.asarray((np.diff(self.position_m, axis=0) / np.diff(self.time_s)[:, None])[leg])
 
 
-# Largest number of samples of a simulated log: 140 h at ten per second.
+# Largest number of samples of a simulated log: 140 h at 10 samples per second.
 _MAXIMUM_SAMPLES = 5_000_000
 
 
 def plan_trajectory(plan: PlanSettings) -> Trajectory:
-    """Return the trajectory with corner times from speeds, climb rates and waiting times.
+    """Return the trajectory of a plan. Its corner times follow from speeds, climb rates and waiting times.
 
     Examples
     --------
@@ -109,18 +109,18 @@ def plan_trajectory(plan: PlanSettings) -> Trajectory:
     return Trajectory(np.array(times), np.array(positions, dtype=np.float64))
 
 
-# Tilt of multicopters per speed. Least squares over nine flights of two airframes gave 0.51 to 0.62, plus that of wind.
+# Tilt of multicopters per speed, without wind. Least squares over nine flights of two airframes gave 0.51 to 0.62.
 LEAN_DEG_PER_MPS = 0.6
 
 
 def plan_attitude(trajectory: Trajectory, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return roll, pitch, yaw [deg] of a multirotor with its nose along the course, tilted into the motion.
+    """Return roll, pitch and yaw [deg] of a multirotor whose nose points along the course and which leans forward.
 
-    While the UAV waits it has its last heading.
+    While the UAV waits, it keeps its last heading.
     """
     velocity = trajectory.velocity_at(time_s)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    # a hover has no course, so the nose stays, and before the first leg it has the direction of that leg
+    # a hover has no course, so it keeps the heading of the leg before it, or else of the first leg
     yaw = pd.Series(np.where(speed > 0.1, bearing_deg(velocity), np.nan))
     return np.zeros(len(time_s)), -LEAN_DEG_PER_MPS * speed, yaw.ffill().bfill().fillna(0.0).to_numpy()
 
@@ -128,7 +128,7 @@ def plan_attitude(trajectory: Trajectory, time_s: FloatArray) -> tuple[FloatArra
 def planned_poses(plan: PlanSettings, ground_m: float, step_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return times (n,) [s], positions (n, 3) [m] and headings (n,) [deg] of a plan. Take-off is at ``ground_m``."""
     trajectory = plan_trajectory(plan)
-    # slightly longer, so that the end is a sample if the step divides the flight
+    # slightly longer, so that the end of the flight is sampled if the duration is a multiple of the step
     time_s = np.arange(0.0, trajectory.duration_s + 1e-9, step_s)
     position = trajectory.position_at(time_s)
     position[:, 2] = np.maximum(position[:, 2] + ground_m, MINIMUM_HEIGHT_M)
@@ -138,7 +138,7 @@ def planned_poses(plan: PlanSettings, ground_m: float, step_s: float) -> tuple[F
 def telemetry_frame(
     trajectory: Trajectory, start_utc: pd.Timestamp, interval_s: float, frame: SiteFrame
 ) -> pd.DataFrame:
-    """Return telemetry records of the trajectory, whose altitude counts from the first position.
+    """Return telemetry records of the trajectory. Altitudes are relative to the first position.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def telemetry_frame(
     Returns
     -------
     DataFrame
-        Columns of a telemetry stream (:mod:`aerpaw_cmp.logs.records`), a row per time.
+        Columns of a telemetry stream (:mod:`aerpaw_cmp.logs.records`), one row per time.
     """
     time_s = np.arange(0.0, trajectory.duration_s + 1e-9, interval_s)
     position = trajectory.position_at(time_s)
@@ -219,9 +219,9 @@ def correlated_noise(
 
 
 def _local_start(start: datetime, timezone: str) -> pd.Timestamp:
-    """Return the start in its zone. A local time that does not exist, or is ambiguous, is refused."""
+    """Return the start in its time zone. Refuse a local time that does not exist or is ambiguous."""
     try:
-        # NaT for both, because pandas would raise different exceptions
+        # NaT in both cases, because pandas would raise two kinds of exceptions
         local: Any = pd.Timestamp(start.replace(tzinfo=None)).tz_localize(timezone, ambiguous="NaT", nonexistent="NaT")
         if not 1980 <= start.year <= 2200:
             why = "a year outside 1980 to 2200"
@@ -261,18 +261,18 @@ class FlightSimulator:
     def run(
         self, out: Path, *, inputs: Iterable[Path] = (), force: bool = False, stages: Stages | None = None
     ) -> list[Path]:
-        """Write a folder with every log of the flight file, the file and truth.json, and return the written paths.
+        """Write a folder with all logs of the flight file, a flight file and truth.json, and return the written paths.
 
         Parameters
         ----------
         out : Path
             Folder that is created or replaced; see :class:`~aerpaw_cmp.common.outputs.OutputFolder`.
         inputs : iterable of Path
-            Files that must not be inside: the flight file and the files that it names.
+            Files that must not be in this folder: the flight file and the files that it names.
         force : bool
             True to replace files that were changed after this tool wrote them.
         stages : Stages, optional
-            Stages whose progress is called with the path of each log.
+            Receives the path of each log as progress.
 
         Returns
         -------
@@ -293,7 +293,7 @@ class FlightSimulator:
         if self.settings.timezone is None:
             raise UsageError("the flight file names no time zone", expected="such as timezone: America/New_York")
         self.plan = plan
-        # the seed includes the name, because equal fading would make two flights copies of one log
+        # the seed includes the name: with equal fading, two flights would be recognised as copies of one log
         self.generator = np.random.default_rng([plan.seed, *self.settings.flight.name.encode()])
         self.trajectory = plan_trajectory(plan)
         start = _local_start(plan.start, self.settings.timezone)
@@ -318,22 +318,22 @@ class FlightSimulator:
             }
             with output.filling() as folder:
                 for name, content in contents.items():
-                    # below the folder only: one that was removed during the run must not be created again
+                    # create only subfolders: if the folder was removed during the run, it must not be created again
                     for parent in reversed(Path(name).parents[:-1]):
                         (folder / parent).mkdir(exist_ok=True)
                     (folder / name).write_bytes(content)
             return [out / name for name in contents]
 
     def _flight_file(self) -> dict[str, Any]:
-        """Return the settings for another folder, with absolute paths of site and antenna files."""
-        # only settings of the user, because defaults may change
+        """Return the settings for a flight file in another folder: paths of site and antenna files are absolute."""
+        # write only the settings of the user, because defaults may change
         content: dict[str, Any] = self.settings.model_dump(mode="json", exclude_unset=True)
         place = site_place(self.settings.site.file, self.folder)
         content["site"] = {**content.get("site", {}), "file": place if isinstance(place, str) else str(place.resolve())}
         return content | files_of({"link": content["link"]} if "link" in content else {}, self.folder)
 
     def _check_names(self, out: Path) -> None:
-        """Refuse logs of the flight file outside ``out``, or named twice."""
+        """Refuse a log whose path is outside ``out``, and two logs with the same name."""
         names = [log.path for log in self.settings.logs]
         for name in names:
             inside(out, name, out / FLIGHT, error=UsageError)
@@ -341,7 +341,7 @@ class FlightSimulator:
                 raise UsageError(f"two files of this flight are named {name!r}", expected="different names")
 
     def _check_plan(self) -> None:
-        """Refuse offsets and clock shifts of logs that are not simulated."""
+        """Refuse offsets and clock shifts for towers or channels that no simulated log has."""
         links = [f"{log.node}.{log.channel}" for log in self.settings.logs if log.node and log.channel]
         towers = [log.node for log in self.settings.logs if log.node]
         asked = {f"{tower}.{channel}": links for tower, each in self.plan.offsets_db.items() for channel in each}
@@ -354,7 +354,7 @@ class FlightSimulator:
                 )
 
     def _writer(self, log: LogSettings) -> Callable[[], bytes]:
-        """Return the function that computes a log, or raise UsageError."""
+        """Return the function that computes a log. Raise UsageError if the log cannot be simulated."""
         if log.reader not in _WRITTEN:
             raise UsageError(
                 f"no writer for log {log.path!r} with reader {log.reader!r}", expected="one of " + ", ".join(_WRITTEN)
@@ -372,7 +372,7 @@ class FlightSimulator:
         return partial(self._rss_log, log, tower, link)
 
     def _tried(self, link: Link) -> Link:
-        """Return a link after one replay with it, so that a dry run refuses what the simulation would refuse."""
+        """Replay one pose with a link and return the link, so that a dry run finds the errors of the simulation."""
         replay_poses(self.site, self.settings.rt, link, self._poses(np.zeros(1)))
         return link
 
@@ -382,7 +382,7 @@ class FlightSimulator:
 
     def _poses(self, time_s: FloatArray) -> Poses:
         position = self.trajectory.position_at(time_s)
-        # as the replay does, because the two rays cancel on the ground
+        # as in the replay, because direct and reflected ray cancel on the ground
         position[:, 2] = np.maximum(position[:, 2], MINIMUM_HEIGHT_M)
         if self.settings.rt.attitude == "ignored":
             return Poses(position, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)))
@@ -401,7 +401,7 @@ class FlightSimulator:
             self.generator, len(level), plan.fading_db, plan.rss_interval_s, plan.fading_correlation_s
         )
         out_of_coverage = ~np.isfinite(level) | (level < _LOWEST_DBM)
-        # times are those of the clock of the tower, and levels those of the true time
+        # write times of the tower's clock, with the levels at the true times
         shift = plan.clock_shift_s.get(tower, 0.0)
         self.truth_["rss"].setdefault(tower, {})[str(log.channel)] = {
             "offset_db": offset,
@@ -443,11 +443,11 @@ class FlightSimulator:
         return format_ri_csv(records, str(log.timezone or self.settings.timezone))
 
     def _reported(self, rank: IntArray, layers: int) -> IntArray:
-        """Return the rank that the modem reports: sometimes one layer off, and 0 without CSI."""
+        """Return the rank that the modem reports: sometimes wrong by one layer, and 0 without CSI."""
         generator, plan = self.generator, self.plan
         off = generator.random(len(rank)) < plan.rank_error_share
         step = np.where(generator.random(len(rank)) < 0.5, -1, 1)
-        # no rank below 1, because a modem without a channel reports no CSI and not 0 layers
+        # at least 1, because 0 means no CSI
         reported = np.where(off, np.clip(rank + step, 1, layers), rank)
         return np.where(generator.random(len(rank)) < plan.no_csi_share, 0, reported)
 
@@ -455,7 +455,7 @@ class FlightSimulator:
         """Insert ``plan.bad_lines`` broken lines at random positions, but not in the first line."""
         count = self.plan.bad_lines
         lines = data.splitlines(keepends=True)
-        # too few lines for a log with damage
+        # a shorter log would consist mainly of broken lines
         if count == 0 or len(lines) < 20:
             return data, []
         end = b"\r\n" if lines[0].endswith(b"\r\n") else b"\n"
@@ -464,7 +464,7 @@ class FlightSimulator:
         )
         damage = []
         for number, place in enumerate(places):
-            # lines of a killed logger, and console output in between
+            # a line cut off by a killed logger, or console output
             torn = lines[place].rstrip()[: max(4, len(lines[place]) // 3)]
             text = torn if number % 2 == 0 else b"Killed by signal 15 " + torn[:8]
             lines.insert(place, text + end)

@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 
 
 Ground = Callable[[FloatArray, FloatArray], FloatArray]
-"""Height of the ground [m] at east and north, each (n,)."""
+"""Function that returns the height of the ground [m] at east and north coordinates, each (n,)."""
 
-# Drift of heights above take-off during a flight [m]. Real logs end at -3.9 m after landing.
+# Largest drift of heights above take-off during a flight [m]. Real logs end as low as -3.9 m after landing.
 _DRIFT_M = 5.0
 
 
 def raised(up_m: FloatArray, ground_m: FloatArray, takeoff_m: float) -> tuple[FloatArray, BoolArray]:
-    """Return heights of poses raised to just above the ground, and which poses are below the ground.
+    """Return heights, raised to just above the ground after a drift, and a mask of poses below the ground.
 
-    A height slightly below ground that is about as high as the take-off point is a drift. Other heights below the
-    ground are wrong, or the ground is.
+    A height slightly below the ground is a drift if it is close to the height of the take-off point. Any other height
+    below the ground means that either the height or the ground is wrong.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ _IN_NAME = re.compile(r"(?<![A-Za-z0-9.])(\d{1,3}) ?(?:m|meters|metres)(?![A-Za-
 
 
 def lacks_height(stream: Stream) -> bool:
-    """Check whether a stream has positions and no altitude in any row."""
+    """Check whether a stream has positions but no altitudes."""
     frame = stream.frame
     if "latitude_deg" not in frame or not frame["latitude_deg"].notna().any():
         return False
@@ -76,7 +76,7 @@ def lacks_height(stream: Stream) -> bool:
 
 
 def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
-    """Return a log whose positions without altitude are at the ``height_m`` of the flight file.
+    """Return a log with missing altitudes replaced by ``height_m`` of the flight file.
 
     Parameters
     ----------
@@ -87,12 +87,12 @@ def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
     Returns
     -------
     IngestedFile
-        The same log if the flight file has no height.
+        The unchanged log if the flight file has no ``height_m``.
 
     Raises
     ------
     UsageError
-        If the flight file has a height, but every stream with positions has altitudes.
+        If the flight file has ``height_m``, but every stream with positions has altitudes.
     """
     if log.height_m is None:
         return file
@@ -107,7 +107,7 @@ def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
             cause="the log has altitudes, or no positions",
         )
     note = f"no altitude in the log: {log.height_m:g} m above take-off everywhere (height_m)"
-    # height_m answers the reader's question about the missing height
+    # omit the reader's warning about the missing height, because height_m supplies it
     warnings = [text for text in file.result.warnings if not text.startswith("no column is known as a height")]
     return replace(file, result=replace(file.result, streams=tuple(streams), warnings=(*warnings, note)))
 
@@ -120,20 +120,20 @@ def height_in_name(path: str) -> float | None:
     >>> height_in_name("urban/60m.csv"), height_in_name("run2_120m_5G.csv"), height_in_name("phone.csv")
     (60.0, 120.0, None)
     """
-    # as a set: flight_60m_60m contains one height, 40m_to_60m contains two
+    # count distinct heights: flight_60m_60m contains one height, 40m_to_60m two
     heights = {float(text) for text in _IN_NAME.findall(Path(path).stem.replace("_", " "))}
     return heights.pop() if len(heights) == 1 else None
 
 
-# Longer gaps of the telemetry are not bridged [s]. Rows of vehicleOut have a spacing of 1.0 s.
+# Longest telemetry gap that is interpolated [s]. Rows of vehicleOut are 1.0 s apart.
 _MAXIMUM_GAP_S = 3.0
 
-# Sparse telemetry is joined by straight lines if nine of ten fixes are no farther apart than this [m], which is the
-# distance of 14 s at 2 m/s. On a faster flight only its steady legs are joined. One end of such an interval is this
-# close to the line between the neighbouring fixes (7.7 m for nine of ten in the field data).
+# Sparse telemetry is interpolated by straight lines. All intervals are, if nine of ten fixes are at most this far apart
+# [m] (28 m for 14 s at 2 m/s). On a faster flight, an interval is interpolated only if one of its ends is this close
+# [m] to the line between the neighbouring fixes. In the field data, nine of ten are within 7.7 m.
 _SPARSE_APART_M, _SPARSE_ERROR_M = 100.0, 10.0
 
-# An interval of sparse telemetry longer than this multiple of the usual one is a gap.
+# In sparse telemetry, an interval longer than this multiple of the usual interval is a gap.
 _SPARSE_GAP = 2.0
 
 # Below this ground speed the course does not indicate the heading [m/s].
@@ -142,7 +142,7 @@ _COURSE_SPEED_MPS = 1.0
 # Number of times whose poses are computed together, which limits the memory on flights over half an hour.
 AT_ONCE = 100_000
 
-# Time before and after for a velocity from positions [s].
+# Velocities are computed from the positions this long before and after [s].
 _COURSE_SPAN_S = 2.0
 
 # Reasons why a pose is not valid. Index 0 means a valid pose.
@@ -170,34 +170,35 @@ MISREAD = {
 
 @dataclass(frozen=True, slots=True)
 class TrackAccount:
-    """Counts of the telemetry rows by their use.
+    """The numbers of telemetry rows that are used, and that are not used, by reason.
 
     Parameters
     ----------
     rows : int
         Rows of the telemetry frame.
     no_time, duplicate_time, backward_time, bad_position : int
-        Rows that are not used for positions. They have no time stamp, the stamp of the row before, a stamp earlier than
-        one before it, or impossible coordinates (also NaN and -999). If this excludes fewer rows, a stamp later than a
-        following stamp is excluded instead.
+        Rows that are not used for positions, by reason: no time stamp, the same stamp as the row before, an earlier
+        stamp than some row before, or impossible coordinates (including NaN and -999). If it excludes fewer rows,
+        stamps later than some row after them count as backward instead.
     steps_sorted : int
-        Steps back in time of a shuffled file, whose rows were sorted because the path is then shorter.
+        Number of steps back in time in a shuffled file. Its rows are sorted by time, because that makes the path
+        shorter.
     unknown_attitude : int
         Used rows without attitude (NaN, or exactly 0, 0, 0, which converters write for "unknown").
     heading_alone : int
-        Used rows with a heading and without roll and pitch.
+        Used rows with a heading but without roll and pitch.
     below_ground : int
         Used rows below the ground plane of the site.
     sparse_s : float
-        Usual interval of sparse telemetry whose fixes are joined by straight lines [s]; 0 for other telemetry.
+        Usual interval of sparse telemetry that is interpolated by straight lines [s]; 0 for other telemetry.
     sparse_error_m : (median, ninth of ten)
         Error of these lines: half the distance of each fix from the line between its neighbours [m].
     gaps : int
-        Intervals between used rows that exceed the limit.
+        Number of intervals between used rows that exceed the limit.
     longest_gap_s : float
         Longest interval [s].
     hour_steps : int
-        Steps of full hours between neighbouring rows: a change to or from daylight saving time.
+        Number of steps of full hours between neighbouring rows, as at a change to or from daylight saving time.
     """
 
     rows: int
@@ -257,7 +258,7 @@ class TrackPoses:
     reason_code : (n,) int8
         Index into :data:`REASONS`; 0 if valid.
     attitude_known : (n,) bool
-        False if level flight along the course replaces the attitude.
+        False if the attitude is unknown and replaced by level flight along the course.
     """
 
     position_m: FloatArray
@@ -276,7 +277,7 @@ class TrackPoses:
         return TrackPoses(**{field.name: getattr(self, field.name)[rows] for field in dataclasses.fields(self)})
 
     def where(self, known: BoolArray) -> TrackPoses:
-        """Return poses that are not valid at times without a known position of a tower that moves (n,)."""
+        """Return the poses, marked as not valid at times when the position of a moving tower is not ``known`` (n,)."""
         if known.all():
             return self
         lost = self.valid & ~known
@@ -303,7 +304,7 @@ def nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
 
     NaT becomes the smallest integer. Floats are epoch seconds.
     """
-    # convert to ns here, because default units differ between versions of pandas and NumPy
+    # convert to ns explicitly, because default units differ between versions of pandas and NumPy
     array = np.asarray(times)
     if array.dtype.kind == "M":
         return np.asarray(array.astype("datetime64[ns]").astype(np.int64))
@@ -321,15 +322,16 @@ def nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
 # Value of an unknown time.
 NO_TIME = np.iinfo(np.int64).min
 
-# Times closer than this are equal, because epoch seconds as floats have 0.2 microseconds [s].
+# Times closer than this are equal [s], because epoch seconds as floats have a resolution of 0.2 microseconds.
 _SAME_S = 1e-6
 
 
 def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
-    """Return the rows of a strictly increasing clock, and the numbers of duplicate and backward rows.
+    """Return a mask of rows with strictly increasing times, and the numbers of duplicate and backward rows.
 
-    A stamp is backward if an earlier row is later. With this rule a wrong stamp in the future excludes all rows after
-    it. If it excludes fewer rows, the mirrored rule is used: a stamp later than that of a later row is wrong.
+    A row is backward if any row before it has a later time. With this rule, a wrong time in the future excludes all
+    rows after it. The mirrored rule (a row is wrong if any row after it has an earlier time) is used if it excludes
+    fewer rows.
     """
     if not len(stamp):
         return np.zeros(0, dtype=bool), 0, 0
@@ -337,7 +339,7 @@ def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
     before = np.concatenate([[NO_TIME], np.maximum.accumulate(stamp)[:-1]])
     after = np.concatenate([np.minimum.accumulate(stamp[::-1])[::-1][1:], [np.iinfo(np.int64).max]])
     onward, mirrored = stamp >= before, stamp <= after
-    # in a tie the first rule is used, because earlier rows are more likely right
+    # in a tie use the first rule, because earlier rows are more likely to be right
     ordered = onward if onward.sum() >= mirrored.sum() else mirrored
     keep = ordered.copy()
     rows = np.flatnonzero(ordered)
@@ -347,12 +349,12 @@ def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
 
 
 def _order(stamp: AnyArray, position: FloatArray) -> tuple[IntArray, int]:
-    """Return the order of rows, and the number of steps back in time that sorting removes.
+    """Return the order in which rows are used, and the number of steps back in time that sorting removes.
 
     Rows are sorted by time only if the file is shuffled.
 
-    A clock that stepped leaves the rows in flown order. Sorting them would mix two parts of the flight and lengthen the
-    path. A file that was sorted by another column, or joined from parts, has a longer path before sorting.
+    If only the clock stepped back, the rows are in flown order. Sorting would mix two parts of the flight and make the
+    path longer. In a file that was sorted by another column or joined from parts, sorting makes the path shorter.
     """
     steps, written = int((np.diff(stamp) < 0).sum()), np.arange(len(stamp))
     if not steps:
@@ -362,21 +364,21 @@ def _order(stamp: AnyArray, position: FloatArray) -> tuple[IntArray, int]:
     def length_m(path: FloatArray) -> float:
         return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
-    # the path of a reversed file has the same length, except for rounding
+    # allow for rounding, because the path of a reversed file has the same length
     shorter = length_m(position[order]) <= length_m(position) * (1 + 1e-9)
     return (order, steps) if shorter else (written, 0)
 
 
 def _hour_steps(stamp: AnyArray) -> int:
-    """Return the number of steps between rows of full hours, forward or back, within five seconds."""
+    """Return the number of time steps between rows that are full hours within five seconds, forward or back."""
     step = np.diff(stamp) * 1e-9
     hours = np.round(step / 3600.0)
-    # clocks change by one hour, and in Antarctica by two
+    # daylight saving time is one hour, in Antarctica two
     return int(((hours != 0) & (np.abs(hours) <= 2) & (np.abs(step - 3600.0 * hours) < 5.0)).sum())
 
 
 def good_positions(latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> BoolArray:
-    """Check coordinates: finite, in range, not (0, 0) and not -999, which loggers write without a fix."""
+    """Check that coordinates are finite, in range, and neither (0, 0) nor -999, which loggers write without a fix."""
     finite = np.isfinite(latitude) & np.isfinite(longitude) & np.isfinite(altitude)
     with np.errstate(invalid="ignore"):
         possible = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0) & (altitude > -900.0)
@@ -403,7 +405,8 @@ class Track:
     ground_m : float
         Height of the take-off point above the site origin [m], added to ``altitude_m``.
     ground : callable, optional
-        Returns the height of the ground of the site at east and north [m]; by default that of the take-off point.
+        Function that returns the height of the site's ground at east and north [m]. By default it is the height of the
+        take-off point everywhere.
 
     Attributes
     ----------
@@ -435,7 +438,7 @@ class Track:
         stamp = nanoseconds(telemetry["time"])
         latitude, longitude, altitude = column("latitude_deg"), column("longitude_deg"), column("altitude_m")
         timed = stamp != NO_TIME
-        # positions are interpolated between complete rows, and the account counts the others
+        # positions are interpolated between complete rows, and the account counts all other rows
         placed = timed & good_positions(latitude, longitude, altitude)
         rows = np.flatnonzero(placed)
         east, north = self.frame.to_local(latitude[rows], longitude[rows])
@@ -455,14 +458,14 @@ class Track:
         self._course_deg = _courses(self._velocity)
         self._attitude = np.column_stack([column("roll_deg"), column("pitch_deg"), column("yaw_deg")])[rows]
         turn, yaw = self._attitude[:, :2], self._attitude[:, 2]
-        # all zeros are not a heading, because converters write them for "unknown"
+        # a column of zeros is not a heading, because converters write 0 for "unknown"
         heading_alone = np.isfinite(yaw) & ~np.isfinite(turn).any(axis=1) & bool(np.nan_to_num(yaw).any())
         turn[heading_alone] = 0.0
         known = np.isfinite(self._attitude).all(axis=1) & (np.any(self._attitude != 0.0, axis=1) | heading_alone)
         self._known = known
         interval = np.diff(self._time_s)
         sparse_s, self._turns, sparse_error_m = self._sparse(interval)
-        # last, because the requested limit decides what is sparse
+        # change the limit last, because the requested limit decides whether telemetry is sparse
         self.maximum_gap_s = max(self.maximum_gap_s, _SPARSE_GAP * sparse_s)
         self._gap = (interval > self.maximum_gap_s) | self._turns
         self._asked = np.zeros(0, np.int64), self._pose_at(np.zeros(0, np.int64))
@@ -503,7 +506,7 @@ class Track:
             if not np.array_equal(instant, self._asked[0]):  # channels of a log share their times
                 poses = self._pose_at(instant)
                 for field in dataclasses.fields(poses):
-                    getattr(poses, field.name).flags.writeable = False  # later callers get the same arrays
+                    getattr(poses, field.name).flags.writeable = False  # callers share these arrays
                 self._asked = instant, poses
             return self._asked[1]
         parts = [self._pose_at(part) for part in np.array_split(instant, -(-len(instant) // AT_ONCE))]
@@ -511,7 +514,7 @@ class Track:
         return TrackPoses(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
     def rotations_if(self, misread: str, times: ArrayLike | pd.Series) -> FloatArray:
-        """Return rotations (n, 3, 3) at times for a meaning of the logged angles in :data:`MISREAD`."""
+        """Return rotations (n, 3, 3) at times if the logged angles had an alternative meaning of :data:`MISREAD`."""
         order, signs, east_deg = MISREAD[misread]
         other = copy.copy(self)
         other._attitude = self._attitude[:, order] * signs + [0.0, 0.0, east_deg]
@@ -531,14 +534,14 @@ class Track:
     def _pose_at(self, instant: AnyArray) -> TrackPoses:
         """Return poses at times (n,) [ns since 1970]."""
         timed = instant != NO_TIME
-        # from the first row, because seconds since 1970 as float64 have only 0.2 microseconds
+        # relative to the first row, because float64 seconds since 1970 have a resolution of only 0.2 microseconds
         t = np.where(timed, instant - self.start_ns, 0) * 1e-9
         code = self._codes(t)
         code[~timed] = REASONS.index("no time")
         valid = code == 0
         n = len(t)
         if len(self):
-            # a time that rounding moves before the first row is at the first row
+            # rounding may move a time before the first row
             t = np.clip(t, self._time_s[0], self._time_s[-1])
         position = np.full((n, 3), np.nan)
         rotation = np.full((n, 3, 3), np.nan)
@@ -555,14 +558,14 @@ class Track:
         )
 
     def _sparse(self, interval_s: FloatArray) -> tuple[float, BoolArray, tuple[float, float]]:
-        """Return the usual interval of sparse telemetry, its turns, and the error of lines between fixes."""
+        """Return the usual interval of sparse telemetry, a mask of intervals with turns, and the error of lines."""
         usual_s = float(np.median(interval_s)) if len(interval_s) > 1 else 0.0
         turns, step_m = np.zeros(len(interval_s), dtype=bool), np.linalg.norm(np.diff(self._position, axis=0), axis=1)
         if usual_s <= self.maximum_gap_s:
             return 0.0, turns, (0.0, 0.0)
         part = (interval_s[:-1] / (interval_s[:-1] + interval_s[1:]))[:, None]
         line = (1.0 - part) * self._position[:-2] + part * self._position[2:]
-        # half, because a fix is twice as far from the line between its neighbours as positions between fixes
+        # half, because lines between neighbours of a fix are twice as long as lines between fixes
         away_m = 0.5 * np.linalg.norm(line - self._position[1:-1], axis=1)
         if np.quantile(step_m, 0.9) > _SPARSE_APART_M:
             at_ends = np.append(np.inf, away_m), np.append(away_m, np.inf)
@@ -571,7 +574,7 @@ class Track:
             turns, away_m = nearer_m > _SPARSE_ERROR_M, nearer_m[nearer_m <= _SPARSE_ERROR_M]
             if not len(away_m):
                 return 0.0, ~turns, (0.0, 0.0)
-            # return the limit, because intervals that are selected by the nearer of two ends look too straight
+            # use the limit as the second error, because intervals selected by their nearer end look too straight
             return usual_s, turns, (float(np.median(away_m)), _SPARSE_ERROR_M)
         return usual_s, turns, (float(np.median(away_m)), float(np.quantile(away_m, 0.9)))
 
@@ -595,7 +598,7 @@ class Track:
         at = self._time_s[self._known]
         near = np.zeros(len(t), dtype=bool)
         if len(at):
-            # attitudes may end before positions, and have their own gaps
+            # attitudes may end before positions and have other gaps
             near = (t >= at[0]) & (t <= at[-1]) & ~_in_gap(t, at, np.diff(at) > self.maximum_gap_s)
         if near.all() and len(t):
             return _slerp(t, at, self._attitude[self._known]), near
@@ -606,18 +609,18 @@ class Track:
 
     def _course_at(self, t: FloatArray) -> FloatArray:
         """Return the course over ground [deg], interpolated as a direction."""
-        # by sine and cosine, because north is between 350 and 10 degrees
+        # interpolate sine and cosine, because north is between 350 and 10 degrees
         angle = np.radians(self._course_deg)
         return bearing_deg(interpolated(t, self._time_s, np.column_stack([np.sin(angle), np.cos(angle)])))
 
 
 def interpolated(t: FloatArray, at: FloatArray, values: FloatArray) -> FloatArray:
-    """Interpolate columns (rows, m) at ascending ``at`` (rows,) linearly to t (n,), shape (n, m)."""
+    """Return columns (rows, m) at ascending times ``at`` (rows,), interpolated linearly to times t (n,)."""
     return np.column_stack([np.interp(t, at, values[:, i]) for i in range(values.shape[1])])
 
 
 def _in_gap(t: FloatArray, at: FloatArray, gap: BoolArray) -> BoolArray:
-    """Check whether times are strictly inside an interval (rows - 1,) that is a gap."""
+    """Check whether times are strictly inside a gap. ``gap`` (rows - 1,) marks the intervals that are gaps."""
     later = np.clip(np.searchsorted(at, t, side="left"), 0, len(at) - 1)
     earlier = np.maximum(later - 1, 0)
     # the pose at a row is known, even if a gap follows
@@ -626,10 +629,10 @@ def _in_gap(t: FloatArray, at: FloatArray, gap: BoolArray) -> BoolArray:
 
 
 def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArray:
-    """Return rotations at t (n, 3, 3) from roll, pitch, yaw (rows, 3) at ``at``."""
+    """Interpolate roll, pitch and yaw (rows, 3), known at times ``at``, as rotations (n, 3, 3) at times t."""
     from scipy.spatial.transform import Rotation, Slerp
 
-    # use only rows around t, because a part of a long flight needs few rotations
+    # use only the rows around t, because ``t`` may be a small part of a long flight
     part = slice(max(int(np.searchsorted(at, t.min(), side="right")) - 1, 0), int(np.searchsorted(at, t.max())) + 1)
     at, attitude_deg = at[part], attitude_deg[part]
     matrices = rotation_from_aircraft(attitude_deg[:, 0], attitude_deg[:, 1], attitude_deg[:, 2])
@@ -639,9 +642,9 @@ def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArra
 
 
 def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> FloatArray:
-    """Return logged velocities (east, north, up), or differences of positions over 4 s if they are missing or constant.
+    """Return logged velocities (east, north, up). Replace missing ones by differences of positions over 4 s.
 
-    Over shorter times, differences are mainly noise of the position: at 10 Hz a hover then has a speed.
+    Over shorter times, the differences are mainly noise of the positions: at 10 Hz, a hover would have a speed.
     """
     if len(t) < 2:
         return np.where(np.isfinite(logged), logged, 0.0)
@@ -653,7 +656,7 @@ def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> Floa
 
 
 def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1.0, gap_s: float = 3.0) -> FloatArray:
-    """Return the velocity (n, 3) by central differences of positions over twice ``span_s``, linear between them.
+    """Return the velocity (n, 3) from central differences of interpolated positions over twice ``span_s``.
 
     Parameters
     ----------
@@ -661,7 +664,7 @@ def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1
         Ascending times [s].
     position_m : (n, 3)
     span_s : float
-        Time before and after [s]; at the ends and next to gaps only one side.
+        Time before and after [s]. At the ends and next to gaps, only one side is used.
     gap_s : float
         Longer steps are not bridged [s].
 
@@ -678,16 +681,16 @@ def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1
 
 
 def _differences_mps(t: FloatArray, position_m: FloatArray, span_s: float) -> FloatArray:
-    """Return the velocity (n, 3) at ascending times from positions some seconds, or a row, before and after."""
+    """Return the velocity (n, 3) at ascending times from positions ``span_s``, or one row, before and after."""
     early, late = np.maximum(t - span_s, t[0]), np.minimum(t + span_s, t[-1])
-    # at least one row on each side, because sparse telemetry has none within the span
+    # at least one row on each side, because sparse telemetry has no row within the span
     early, late = np.minimum(early, np.append(t[0], t[:-1])), np.maximum(late, np.append(t[1:], t[-1]))
     moved = interpolated(late, t, position_m) - interpolated(early, t, position_m)
     return np.asarray(moved / (late - early)[:, None])
 
 
 def _courses(velocity: FloatArray) -> FloatArray:
-    """Return the course over ground [deg clockwise from north]. At rest the last course is used, or else the first."""
+    """Return the course over ground [deg clockwise from north]. At rest, it is the last course, or else the first."""
     course = bearing_deg(velocity)
     moving = np.flatnonzero(np.hypot(velocity[:, 0], velocity[:, 1]) >= _COURSE_SPEED_MPS)
     if not len(moving):

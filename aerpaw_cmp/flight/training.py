@@ -1,6 +1,6 @@
-"""Series whose logs are training data of antennas, receiver or settings, recognised by fingerprints.
+"""Recognition of series whose logs were training data of antennas, receivers or settings, by fingerprints.
 
-A fingerprint recognises a changed copy of a log, but not a second flight of the same route.
+A fingerprint matches a changed copy of a log, but not a second flight on the same route.
 
 A fingerprint ``<start>f<digits>f<runs>`` has three parts:
 
@@ -10,8 +10,9 @@ A fingerprint ``<start>f<digits>f<runs>`` has three parts:
 - ``runs``: the smallest hashes of short runs of raw readings (a bottom-k sketch, Broder 1997), 8 hex digits each.
 
 Two fingerprints belong to one log if they share runs, or if their clocks agree and their digits correlate at some lag.
-The digits of a part and of a thinned, resampled, rounded or scaled copy correlate. Those of repeated flights on one
-route also correlate, by the ripple of the ground reflection. Only the clock or the raw readings distinguish them.
+The digits of a log correlate with those of a part of it, and with those of a thinned, resampled, rounded or scaled
+copy. The digits of repeated flights on one route also correlate, because of the ripple of the ground reflection. Only
+the clock and the raw readings distinguish such flights.
 """
 
 from __future__ import annotations
@@ -37,29 +38,29 @@ from .data import FlightData, RankSeries, RssSeries
 from .settings import FlightFile
 
 _STEP_S, _MEAN_S, _TREND_S = 0.5, 1.0, 10.0
-_LONGEST_S = 4 * 3600.0  # longer logs have a fingerprint of their beginning
+_LONGEST_S = 4 * 3600.0  # only the beginning of longer logs is used
 
 # Digits of a change: 7 means unchanged, and dots are half seconds without readings.
 _DIGITS, _MIDDLE, _PER_SD, _GAP = "0123456789abcde", 7, 2.5, "."
 
 _BEGIN = "f"
 
-# Clocks of one log differ by at most a minute, plus full hours of a wrong time zone [half seconds].
+# The clocks of two copies differ by at most a minute, plus full hours for a wrong time zone [half seconds].
 _SLACK, _HOUR = 120, 7200
 
-# Smallest number of common half seconds, correlation, and z value of Fisher above which two fingerprints belong to one
-# log. The largest z of two logs of the field is 7.3, and the next 5.7. The smallest for a changed copy is 8.6.
+# Two fingerprints belong to one log if common half seconds, correlation and Fisher's z reach these values. In the field
+# data, the largest z values of two different logs are 7.3 and 5.7, and the smallest of a changed copy is 8.6.
 _FEWEST, _LEAST_R, _LEAST_Z = 80, 0.5, 7.5
 
-# Readings of a run, changes in it (a constant level repeats in every log), and strides of readings. A copy with half or
-# a quarter of the rows has the same runs.
+# Number of readings per run, smallest number of changes in it (constant levels occur in every log), and strides.
+# Because of the strides, a copy with half or a quarter of the rows has the same runs.
 _RUN, _LEAST_CHANGES, _STRIDES = 24, 8, (1, 2, 4)
 
 # A series with fewer different values has no runs, because ranks along one route change similarly on every flight.
 _FEWEST_VALUES = 6
 
-# Runs in a fingerprint, and common runs above which two belong to one log. A tenth of a log has about 6 of 64 in
-# common.
+# Number of runs in a fingerprint, and number of common runs that shows one log. A tenth of a log has about 6 of 64 runs
+# in common with the log.
 _RUNS, _LEAST_SHARED = 64, 3
 
 # Multiplier of the hashes: 2^64 divided by the golden ratio, odd, so that it has an inverse.
@@ -68,14 +69,15 @@ _ODD = 0x9E3779B97F4A7C15
 # Positive readings below one, or over more decades than this, are powers.
 _POWER_RATIO = 1e3
 
-# Standard deviation of the changes below which a fingerprint describes only the route. Real logs have 0.26 or more.
+# Smallest standard deviation of the changes. With less, a fingerprint would describe only the route. Real logs have
+# 0.26 or more.
 _LEAST_SD = 0.2
 
 
 def mark_of(time: AnyArray, readings: FloatArray) -> str:
     """Return the fingerprint of the readings (n,) of a series at times (n,).
 
-    It is empty for readings with too few changes, and for periodic readings.
+    The fingerprint is empty for readings with too few changes and for periodic readings.
     """
     known = np.flatnonzero(np.isfinite(readings) & ~np.isnat(time))
     # a stable sort, because a fingerprint must not depend on the order of equal times
@@ -85,7 +87,7 @@ def mark_of(time: AnyArray, readings: FloatArray) -> str:
     seconds, values = (time[known] - time[known[0]]) / np.timedelta64(1, "s"), readings[known]
     if values.min() > 0.0 and (values.max() < 1.0 or values.max() > _POWER_RATIO * values.min()):
         values = 10.0 * np.log10(values)
-    # relative to the mean, because sums of levels near -90 dB over hours would lose the digits of a change
+    # subtract the mean, because sums of levels near -90 dB over hours would lose precision
     total = np.concatenate([[0.0], np.cumsum(values - values.mean())])
     at = np.arange(0.0, min(float(seconds[-1]), _LONGEST_S), _STEP_S)
 
@@ -94,38 +96,38 @@ def mark_of(time: AnyArray, readings: FloatArray) -> str:
         return (total[end] - total[begin]) / np.maximum(end - begin, 1), end - begin
 
     (level, near), (trend, around) = mean(_MEAN_S), mean(_TREND_S)
-    told = (near > 0) & (around > 1)
-    change = (level - trend)[told]
+    covered = (near > 0) & (around > 1)
+    change = (level - trend)[covered]
     if len(change) < _FEWEST or not change.std() > _LEAST_SD:
         return ""
     spread = 1.4826 * float(np.median(np.abs(change)))
-    # the median of the changes of ranks is 0
+    # use the standard deviation if the median is about 0, as for ranks
     spread = spread if spread > 0.05 * change.std() else float(change.std())
     digits = np.clip(np.rint(change / spread * _PER_SD) + _MIDDLE, 0, len(_DIGITS) - 1).astype(np.int64)
     text = np.full(len(at), _GAP)
-    text[told] = np.array(list(_DIGITS))[digits]
+    text[covered] = np.array(list(_DIGITS))[digits]
     digits, apart = "".join(text), int(_TREND_S / _STEP_S)
-    # a series that is equal to itself at another time (a test tone) would match others of its kind
+    # a periodic series (a test tone) correlates with itself at other lags, and would match all similar series
     if (_evidence(digits, digits) >= _LEAST_Z)[apart:-apart].any():
         return ""
-    # in half seconds, so that it counts in steps of the fingerprint
+    # in half seconds, the step of the fingerprint
     first = time[known[0]]
     start = round((first - np.datetime64(0, "ns")) / np.timedelta64(500, "ms")) if has_wall_clock(first) else ""
     return f"{start}{_BEGIN}{digits}{_BEGIN}{_runs(values)}"
 
 
 def _runs(values: FloatArray) -> str:
-    """Return the smallest hashes of runs of changes [1/1000], which a gain does not alter."""
+    """Return the smallest hashes of runs of changes [1/1000]. A constant gain does not alter changes."""
     if len(np.unique(values)) < _FEWEST_VALUES:
         return ""
     found = np.concatenate([_hashes(values[phase::stride]) for stride in _STRIDES for phase in range(stride)])
-    # sort only a few of them, because millions would take a second
+    # sort only the smallest, because sorting millions of hashes would take a second
     least = np.partition(found, 10 * _RUNS)[: 10 * _RUNS] if len(found) > 10 * _RUNS else found
     return "".join(f"{code:08x}" for code in np.unique(least)[:_RUNS].tolist())
 
 
 def _hashes(values: FloatArray) -> AnyArray:
-    """Return the hash of each run of readings with enough changes, a rolling polynomial modulo 2^64."""
+    """Return the hash of each run of readings with enough changes: a rolling polynomial modulo 2^64."""
     steps = np.rint(np.diff(values) * 1e3).astype(np.int64).view(np.uint64)
     if len(steps) < _RUN:
         return np.zeros(0, dtype=np.uint64)
@@ -140,13 +142,13 @@ def _hashes(values: FloatArray) -> AnyArray:
 
 
 def _before(values: AnyArray) -> AnyArray:
-    """Return the sums of the values before each position, and of all."""
+    """Return cumulative sums, starting with 0: the sum of the values before each position, and of all values."""
     total = np.cumsum(values)
     return np.concatenate([np.zeros(1, dtype=total.dtype), total])
 
 
 def among(mark: str, marks: Iterable[str]) -> bool:
-    """Check whether one of the fingerprints of a learned file belongs to the log of this fingerprint."""
+    """Check whether any of the fingerprints ``marks`` belongs to the same log as ``mark``."""
     return bool(mark) and any(_same(other, mark) for other in marks)
 
 
@@ -174,8 +176,8 @@ def _parts(mark: str) -> tuple[int | None, str, frozenset[str]]:
 
 
 def _evidence(first: str, second: str) -> FloatArray:
-    """Return Fisher's z relative to its SD at each circular lag, and 0 for few or weakly correlated pairs."""
-    # sufficient length for every lag, forwards and backwards
+    """Return Fisher's z relative to its SD at each circular lag, or 0 if pairs are few or weakly correlated."""
+    # zero padding, so that all lags in both directions fit
     size = 1 << (len(first) + len(second) - 1).bit_length()
     left, right = _spectra(first, size), _spectra(second, size)
 
@@ -186,21 +188,21 @@ def _evidence(first: str, second: str) -> FloatArray:
     ours, theirs = at_lags(1, 0), at_lags(0, 1)
     variances = (at_lags(2, 0) - ours**2 / count) * (at_lags(0, 2) - theirs**2 / count)
     covariance = np.abs(at_lags(1, 1) - ours * theirs / count)
-    # below 1, because arctanh of a log with itself would be infinite
+    # limit r below 1, because arctanh would be infinite for identical logs
     r = np.minimum(covariance / np.sqrt(np.maximum(variances, (0.01 * count) ** 2)), 0.9999)
     z = np.arctanh(r) * np.sqrt(np.maximum(count / _memory(left[1], right[1], size) - 3.0, 0.0))
     return np.where((count >= _FEWEST) & (r >= _LEAST_R), z, 0.0)
 
 
 def _memory(left: AnyArray, right: AnyArray, size: int) -> float:
-    """Return the digits per independent pair (Bartlett 1935), which are more for a rank than for a level."""
+    """Return the number of digits per independent pair (Bartlett 1935). It is larger for ranks than for levels."""
     ours, theirs = (np.fft.irfft(np.abs(x) ** 2, size)[: round(_TREND_S / _STEP_S)] for x in (left, right))
     return 2.0 * float((ours * theirs).sum() / max(ours[0] * theirs[0], 1.0)) - 1.0
 
 
 @lru_cache(maxsize=32)
 def _spectra(mark: str, size: int) -> AnyArray:
-    """Return spectra of the known digits of a fingerprint, its changes and their squares. Other characters are gaps."""
+    """Return the spectra of three sequences of a fingerprint: mask of known digits, changes, and squared changes."""
     code = np.frombuffer(mark.encode("ascii", "replace"), dtype=np.uint8)
     digit = np.full(256, np.nan)
     digit[list(_DIGITS.encode())] = np.arange(len(_DIGITS)) - _MIDDLE
@@ -221,7 +223,7 @@ def flight_logs(data: FlightData) -> tuple[str, ...]:
 
 
 def learned_patterns(link: Link, folder: Path, site: str | Path) -> list[MeasuredPattern]:
-    """Return the antennas of both ends that were learned from flights, according to their files or their numbers.
+    """Return the antennas of a link that were learned from flights, recognised by their files or their gains.
 
     Parameters
     ----------
@@ -229,7 +231,7 @@ def learned_patterns(link: Link, folder: Path, site: str | Path) -> list[Measure
     folder : Path
         Folder of the antenna files and of calibrations.
     site : str or Path
-        Site whose learned tables may contain an antenna that does not name its logs.
+        Site among whose learned tables an antenna is searched whose file does not name its logs.
 
     Returns
     -------
@@ -242,7 +244,7 @@ def learned_patterns(link: Link, folder: Path, site: str | Path) -> list[Measure
 
 
 def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, ...]:
-    """Return the logs of a series that are training data of its antennas or of the settings of its flight file."""
+    """Return the logs of a series from which its antennas or the settings of its flight file were learned."""
     logs, settings = logs_of(data, series), data.settings
     patterns = learned_patterns(link, data.folder, data.site_place)
     if among(series_mark(series), union(settings.marks, *(p.marks for p in patterns))):
@@ -269,12 +271,12 @@ def marks_of(flights: Iterable[FlightData]) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def _original(pattern: MeasuredPattern, folder: Path, memory: Path) -> SpherePattern | None:
-    """Return the learned table with the numbers of an antenna whose file names no log, or None.
+    """Return the learned table with the same gains as an antenna whose file does not name its logs, or None.
 
-    The search includes learned tables of the site and of packaged sites, and calibrations in the folder.
+    It is searched among the learned tables of the site and of packaged sites, and the calibrations in the folder.
     """
     packaged = folder_of("lake_wheeler").parent.glob("*.learned/*.csv.gz")
-    # learned tables of the site first, because they contain most of the tables that are looked up
+    # the site's learned tables first, because most antennas are found there
     places = dict.fromkeys([*memory.glob("*.csv.gz"), *packaged, *folder.glob("*.csv"), *folder.glob("*/*.csv")])
     tables = (table for place in places if (table := _learned_table(place)) is not None)
     return next((table for table in tables if _same_numbers(pattern, table)), None)
@@ -282,7 +284,7 @@ def _original(pattern: MeasuredPattern, folder: Path, memory: Path) -> SpherePat
 
 @lru_cache(maxsize=64)
 def _learned_table(place: Path) -> SpherePattern | None:
-    """Return the table of a calibration, or None for another file."""
+    """Return the learned table in a file, or None if the file is not one."""
     with suppress(InputError, OSError, EOFError, zlib.error):
         with gzip.open(place) if place.suffix == ".gz" else place.open("rb") as book:
             learned = book.read(len(LEARNED)) == LEARNED.encode()
@@ -291,30 +293,30 @@ def _learned_table(place: Path) -> SpherePattern | None:
 
 
 def _same_numbers(pattern: MeasuredPattern, table: SpherePattern) -> bool:
-    """Check whether two antennas agree on both principal cuts within 0.1 dB, except for a level.
+    """Check whether two antennas agree on both principal cuts within 0.1 dB, apart from a constant level.
 
-    Every third degree is compared, because files of cuts are interpolated by splines in between.
+    Only every third degree is compared, because splines interpolate files of cuts in between.
     """
     angle = np.radians(np.arange(3.0, 358.0, 3.0))
     theta = np.concatenate([np.full(len(angle), np.pi / 2), np.where(angle < np.pi, angle, 2 * np.pi - angle)])
     phi = np.concatenate([angle, np.where(angle < np.pi, 0.0, np.pi)])
     gain, other = pattern.gain_dbi(theta, phi), table.gain_dbi(theta, phi)
-    # except for a level, because programs normalise patterns to their maximum
+    # ignore a constant level, because programs normalise patterns to their maximum
     apart = np.abs(gain - other - np.median(gain - other))
-    # a flat pattern would agree with many others
+    # reject flat patterns, because they would agree with many others
     return bool(np.ptp(other) > 1.0 and np.mean(apart < 0.06) > 0.95)
 
 
 def common(logs: Sequence[str], learned: Iterable[Iterable[str]]) -> tuple[str, ...]:
-    """Return the logs that are training data of any of ``learned``."""
+    """Return those of ``logs`` that are training logs in any of ``learned``."""
     known = set(union(*learned))
     return tuple(digest for digest in logs if digest in known)
 
 
 def counted_once(flights: Sequence[FlightData]) -> tuple[list[FlightData], list[str]]:
-    """Return flights without series whose log an earlier flight contains, and remarks about them.
+    """Return flights without the series whose log is also in an earlier flight, and remarks about these series.
 
-    A log that occurs twice (renamed, copied or packed) would be predicted from itself.
+    If a log occurred twice (renamed, copied or packed), it would be predicted from itself.
     """
     home: dict[str, str] = {}
     counted: list[FlightData] = []

@@ -113,7 +113,9 @@ class Memories:
     freedom: FloatArray
 
     @classmethod
-    def of(cls, covariances: FloatArray, beyond: ArrayLike = 0.0, freedom: ArrayLike = np.inf) -> Memories:
+    def of(
+        cls, covariances: FloatArray, beyond: float | FloatArray = 0.0, freedom: float | FloatArray = np.inf
+    ) -> Memories:
         """Return the record for covariances of mean and terms (m, terms + 1, terms + 1)."""
         whiten = np.linalg.inv(np.linalg.cholesky(covariances[:, 1:, 1:]))
         cross = covariances[:, 0, 1:]

@@ -126,6 +126,7 @@ OWN = {
     "common/native.py": "the child, whose every exception becomes a message",
     "common/yamlfile.py": "settings: errors of their own, at the line",
     "compare/gains.py": "bytes of its own keys",
+    "jobs/bench.py": "lines that it wrote itself",
     "compare/statistics.py": "a packaged table",
     "flight/training.py": "text that is compared, never parsed; any file is asked for its head; what cannot be read names no log",
     "logs/files.py": "inside ingest and map files; its own list of what archives raise; inside ingest",

@@ -349,7 +349,7 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     certain = lead >= _CERTAIN and least_share <= _LEAST_SHARE and share <= 1.0 - 0.5 * _LEAST_SHARE
     if need.follows and any(m.residual_db.std() >= need.follows * m.evidence.measured_db.std() for m in alone):
         return False
-    if name == _CATCH_ALL and lead < _SURE_GAIN and not _holds_in_halves(alone):
+    if name == _CATCH_ALL and (known_db < _LEAST_DB or (lead < _SURE_GAIN and not _holds_in_halves(alone))):
         return False
     # a floor that the settings remove is known, and explains why the remaining low links look too strong
     if (name == "floor" and sound[0].evidence.floored) or known_db - alone_db < SHOWN_DB:
@@ -385,8 +385,9 @@ def _holds_in_halves(models: Sequence[_Model]) -> bool:
 
 
 # Number of means per independent sample of the error, and largest ratio of the error of the other half with and without
-# the gain. Halves may show different directions, so a pattern with the last log odds per channel is not tested.
-_CORRELATED_BINS, _MOST_IN_HALVES, _SURE_GAIN = 10.0, 0.85, 20.0
+# the gain. Halves may show different directions, so a pattern with the next log odds per channel is not tested. Learned
+# antennas leave an error of 3 dB and more, so a pattern is not the cause of an error below the last number [dB].
+_CORRELATED_BINS, _MOST_IN_HALVES, _SURE_GAIN, _LEAST_DB = 10.0, 0.85, 20.0, 2.5
 
 
 def _usual_db(shown: Sequence[_Models]) -> tuple[float, float] | None:

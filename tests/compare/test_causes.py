@@ -217,10 +217,19 @@ def test_two_channels_are_one_flight_and_a_second_trouble_hides_none() -> None:
 
 @pytest.mark.parametrize(("antenna", "named"), [("measured", "pattern"), ("learned", NONE)])
 def test_what_learned_antennas_miss_on_any_flight_is_no_cause(antenna: str, named: str) -> None:
-    """A smooth error of 1.2 dB with noise of 1 dB is almost a quarter of the RMSE: usual for learned antennas only."""
+    """A smooth error that is almost a quarter of the RMSE is usual for learned antennas only."""
     sound = _sound()
-    wave = 1.2 * np.sin(np.radians(2 * sound.uav_azimuth_deg))
-    assert _named(replace(sound, measured_db=sound.measured_db + wave, antenna=antenna)) == named
+    error = 2.0 * (sound.measured_db - sound.predicted_db) + 2.4 * np.sin(np.radians(2 * sound.uav_azimuth_deg))
+    assert _named(replace(sound, measured_db=sound.predicted_db + error, antenna=antenna)) == named
+
+
+def test_a_calibration_is_not_the_remedy_of_a_small_error() -> None:
+    """Antennas that were learned leave 3 dB and more, and levels that are means over seconds have less."""
+    sound = _sound()
+    noise = 0.3 * (sound.measured_db - sound.predicted_db)
+    wave = np.sin(np.radians(2 * sound.uav_azimuth_deg))
+    assert _named(replace(sound, measured_db=sound.predicted_db + noise + 3.0 * wave)) == NONE
+    assert _named(replace(sound, measured_db=sound.predicted_db + noise + 4.0 * wave)) == "pattern"
 
 
 def test_causes_that_explain_the_same_error_are_both_named(monkeypatch: pytest.MonkeyPatch) -> None:

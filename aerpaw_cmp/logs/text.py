@@ -298,10 +298,11 @@ ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
 # Ambiguous abbreviations: winter time that is also written in summer, and names that several countries use. Each has
 # hours east of UTC and a zone with summer time.
 WINTER = {
-    "EST": ((-5.0, "America/New_York"),), "CST": ((-6.0, "America/Chicago"),), "MST": ((-7.0, "America/Denver"),),
+    "EST": ((-5.0, "America/New_York"),), "MST": ((-7.0, "America/Denver"),),
     "PST": ((-8.0, "America/Los_Angeles"),), "AKST": ((-9.0, "America/Anchorage"),), "CET": ((1.0, "Europe/Berlin"),),
     "MEZ": ((1.0, "Europe/Berlin"),), "EET": ((2.0, "Europe/Athens"),), "WET": ((0.0, "Europe/Lisbon"),),
     "AEST": ((10.0, "Australia/Sydney"),), "NZST": ((12.0, "Pacific/Auckland"),),
+    "CST": ((-6.0, "America/Chicago"), (8.0, "Asia/Shanghai")),
     "IST": ((5.5, "Asia/Kolkata"), (1.0, "Europe/Dublin"), (2.0, "Asia/Jerusalem")),
 }  # fmt: skip
 

@@ -68,7 +68,7 @@ _IN_NAME = (
     re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
 )
 # Hours east of UTC of unambiguous abbreviations. Winter zones are in text.WINTER, because EST in summer is doubtful and
-# CST is used in several countries.
+# CST is the name of two zones.
 _HOURS = {
     "Z": 0.0, "UT": 0.0, "UTC": 0.0, "GMT": 0.0, "EDT": -4.0, "CDT": -5.0, "MDT": -6.0, "PDT": -7.0,
     "HST": -10.0, "CEST": 2.0, "MESZ": 2.0, "EEST": 3.0, "BST": 1.0, "JST": 9.0, "KST": 9.0, "AKDT": -8.0, "AEDT": 11.0,
@@ -271,6 +271,8 @@ class _Zones:
             doubt = f"but on {date[:10]} the clocks of that zone show {here[1]}"
             ways = [f"{_shown(hours)} as written", f"{_shown(here[0])} ({here[1]})"]
         expected = f"{' or '.join(ways)}: put the offset in place of {word} in the file"
+        if len(candidates) > 1:
+            expected += ", or state the zone of the log with --timezone"
         raise UsageError(f"the times say {word}, {doubt}", expected=expected)
 
 

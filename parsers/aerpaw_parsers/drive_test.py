@@ -432,6 +432,13 @@ def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: li
             if listed:
                 shown = ", ".join(repr(sheet.names[i]) for i in listed)
                 rows.warnings.append(f"the level of the cell is {sheet.names[level]!r}; read as {what}: {shown}")
+        # the header has one name twice: the second of them is called "RSRP 2"
+        level_name = sheet.names[cell.columns["rsrp_dbm"]]
+        if repeated := [
+            sheet.names[i] for i in others if re.fullmatch(re.escape(level_name) + r" \d+", sheet.names[i])
+        ]:
+            shown = " and ".join(map(repr, [level_name, *repeated]))
+            rows.warnings.append(f"{shown} are separate series: nothing in the table says whose levels they are")
 
 
 def _renamed(stream: Stream | None, suffix: str) -> Stream | None:

@@ -150,6 +150,7 @@ SHIFTED = "the rows do not fit the header"
 BAD: dict[str, tuple[str, type[Exception], str]] = {
     "EST in summer": (phone("Time (EST)", LOCAL), UsageError, "-05:00 as written or -04:00"),
     "a zone of several countries": (phone("Time", f"{LOCAL} IST"), UsageError, "several countries"),
+    "a zone of America and of China": (phone("Time", f"{LOCAL} CST"), UsageError, r"\+08:00 \(Asia/Shanghai\)"),
     "minutes of a spreadsheet": (phone("Time", "47:3{i}.2"), InputError, "without the hour"),
     "shifted by a column": (table("time,pci,lat,lon,rsrp", EPOCH + ",35.728,-78.696,{l},11"), InputError, SHIFTED),
     "a PCI with a fraction": (table("time,lat,lon,pci,rsrp,rsrq", EPOCH + ",35.7,-78.7,1234.5,11,{l}"), InputError, SHIFTED),

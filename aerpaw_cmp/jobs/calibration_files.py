@@ -171,6 +171,11 @@ def learned_settings(
         Content of the antenna files by name.
     command : str
         Command that makes them.
+
+    Returns
+    -------
+    dict
+        Content of the file.
     """
     channels: dict[str, dict[str, Any]] = {}
     towers = [antenna.partition(".")[::2] for antenna in calibration.fit.antennas]

@@ -1,8 +1,8 @@
 """Far fields of antenna elements: formulas and measured files.
 
-Every pattern has a ``name`` and ``field(theta_rad, phi_rad) -> (E_theta, E_phi)``: complex, of the broadcast shape,
-scaled so that ``|E_theta|^2 + |E_phi|^2`` is the gain over isotropic (linear). theta is the zenith angle (0 to pi) and
-phi the azimuth from x towards y in the device frame: x boresight, y left, z up.
+Every pattern has a ``name`` and ``field(theta_rad, phi_rad) -> (E_theta, E_phi)``. The result is complex, has the
+broadcast shape and is scaled so that ``|E_theta|^2 + |E_phi|^2`` is the gain over isotropic (linear). theta is the
+zenith angle (0 to pi) and phi the azimuth from x towards y in the device frame: x boresight, y left, z up.
 
 Measured fields are interpolated on a torus: a full circle of theta (through both poles) times a full circle of phi.
 Along a great circle through a pole, ``E_theta`` and ``E_phi`` are smooth if the sign of the second half is inverted.
@@ -39,13 +39,14 @@ from ..logs.matfile import read_arrays
 # Peak directivity of a half-wave dipole (2.15 dBi): 4 / Cin(2 pi).
 _HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
 
-# A mean gain below -20 dB is a field in other units, or normalised. Measured antennas are near 0.5.
+# Smallest plausible mean gain (-20 dB). A lower value means other units or normalised fields. Measured antennas have
+# about 0.5.
 _MINIMUM_EFFICIENCY = 0.01
 
 # Likely cause of a mean gain that no antenna has, unless the values are linear.
 NOT_GAIN = "the values are not gain over isotropic"
 
-# No element has more gain. A file with more has other units.
+# No element has a higher gain. A file with a higher gain has other units.
 HIGHEST_DBI = 60.0
 
 
@@ -92,7 +93,7 @@ class TR38901:
     name: str = "tr38901"
 
     def field(self, theta_rad: FloatArray, phi_rad: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """Return all of the field in E_theta, because the slant belongs to the array."""
+        """Return the complete field in E_theta, because the slant belongs to the array."""
         zeros = _zeros(theta_rad, phi_rad)
         theta_deg = np.degrees(np.asarray(theta_rad, dtype=np.float64))
         phi_deg = wrap_degrees(np.degrees(phi_rad))
@@ -164,7 +165,7 @@ class MeasuredPattern:
         theta, phi = np.broadcast_arrays(np.asarray(theta_rad, dtype=float), np.asarray(phi_rad, dtype=float))
         rows, columns = self._layers[0].shape
         full = 2 * np.pi
-        # in units of rows and columns of the torus
+        # convert the angles to rows and columns of the torus
         at = np.stack([(theta % full).ravel() * (rows / full), (phi % full).ravel() * (columns / full)])
         parts = [
             map_coordinates(layer, at, order=3, mode="grid-wrap", prefilter=False).reshape(theta.shape)
@@ -197,7 +198,7 @@ def _sphere_mean(gain: FloatArray) -> float:
     """Return the mean over the sphere of rows theta = 0..pi, exact if the gain is linear in cos theta between rows."""
     theta = np.linspace(0, np.pi, gain.shape[0])
     edges = np.concatenate([[0.0], (theta[1:] + theta[:-1]) / 2, [np.pi]])
-    # area of the band around each row, which is not zero at a pole
+    # weight each row by the area of the band around it, which is not zero at a pole
     weight = np.cos(edges[:-1]) - np.cos(edges[1:])
     return float((gain.mean(axis=1) * weight).sum() / 2)
 
@@ -213,7 +214,7 @@ def _pole_vectors(e_theta: ComplexArray, e_phi: ComplexArray, row: int, slope: f
 
 
 def _single_valued_poles(e_theta: ComplexArray, e_phi: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Replace the rows of the poles by the one field vector that they measure from many sides."""
+    """Replace the rows of the poles by the single field vector that all samples of a pole measure."""
     e_theta, e_phi = e_theta.copy(), e_phi.copy()
     phi = np.arange(e_theta.shape[1]) * (2 * np.pi / e_theta.shape[1])
     for row, next_row, slope in ((0, 1, 1.0), (-1, -2, -1.0)):
@@ -228,13 +229,13 @@ def _single_valued_poles(e_theta: ComplexArray, e_phi: ComplexArray) -> tuple[Co
 
 # ---------------------------------------------------------------- AERPAW text files
 
-# Begin of the column names without spaces and points, which differ between files of one lab.
+# Start of each column name. Spaces and points are removed, because they differ between files of one lab.
 _COLUMNS = ("phi", "theta", "etotal", "e(phi)amp", "e(theta)amp", "e(phi)phase", "e(theta)phase")
 
 
 @dataclass(slots=True)
 class _Rows:
-    """The numbers of a text file (rows, 7) with their lines."""
+    """The numbers of a text file (rows, 7) with their line numbers."""
 
     values: FloatArray
     lines: list[int] = field(default_factory=list)
@@ -259,14 +260,15 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
     Raises
     ------
     InputError
-        For missing angles, wrong units, a truncated line, or more power out than in; the message has the line.
+        If angles are missing, units are wrong, a line is truncated, or more power is radiated than accepted. The
+        message contains the line.
 
     Notes
     -----
-    The sense of phi follows from the poles, where the two components must be one vector seen from all sides. This shows
-    whether E_phi points along increasing phi. If it points against it, as in files of AERPAW, phi is the angle of a
-    turntable and azimuth is -phi (``rad_pat.mat`` lists the same measurement in this way). If the poles radiate too
-    little to decide, the sense of AERPAW is used.
+    The direction of phi follows from the poles, where the two components must describe the same vector for all phi.
+    This shows whether E_phi points along increasing phi. If it points the other way, as in AERPAW's files, phi is the
+    angle of a turntable and azimuth is -phi (``rad_pat.mat`` lists the same measurement in this way). If the poles
+    radiate too little to decide, the direction of AERPAW's files is used.
     """
     path = Path(path)
     rows = _read_rows(path)
@@ -276,7 +278,7 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
     fields = np.moveaxis(amplitude_from_db(amplitude_db) * np.exp(1j * phase), -1, 0)
     e_theta, e_phi = _unfold(fields) if folded else fields
     along = _points_along_phi(e_theta.T, e_phi.T)
-    # phi is then the angle of a turntable, and azimuth has the opposite sense
+    # phi is then the angle of a turntable, and azimuth has the opposite direction
     if not along:
         e_theta, e_phi = _mirrored(e_theta), _mirrored(e_phi)
     pattern = MeasuredPattern(path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
@@ -298,9 +300,9 @@ _FOREIGN = (
     (r"(?s)\s*##File Type: Far Field", "a far field of FEKO (.ffe): save gain in dBi as a sphere CSV"),
     (r"(?s).{0,200}?Freq\w*\s*\d+\s*\n.{0,200}?rETheta", "a far field of HFSS: save gain in dBi as a sphere CSV"),
     (r"(?s)\s*(<\?xml|<antenna)", "an antenna in XML: save it as MSI Planet"),
-    (r"\s*(azimuth|elevation|theta)_deg", "one cut of two: 'elevation' names the other"),
-    (r"[^\n]*(?i:angle|azimuth|elevation|theta|phi)[^\n]*,", "one cut of two ('elevation' names "
-     "the other), or a table with other names of columns"),
+    (r"\s*(azimuth|elevation|theta)_deg", "one of two cuts: name the other file with 'elevation'"),
+    (r"[^\n]*(?i:angle|azimuth|elevation|theta|phi)[^\n]*,", "one of two cuts (name the other file "
+     "with 'elevation'), or a table with unknown column names"),
 )  # fmt: skip
 
 
@@ -386,7 +388,7 @@ def _check_units(rows: _Rows) -> None:
     for columns, what in (((0, 1), "angles"), ((5, 6), "phases")):
         largest = np.abs(values[:, columns]).max(axis=1)
         worst = int(largest.argmax())
-        # 0.1 beyond a full circle is rounding of a table, and more means degrees
+        # accept 0.1 rad beyond a full circle as rounding of the table: larger angles are degrees
         if largest[worst] > 2 * np.pi + 0.1:
             raise InputError(
                 f"{what} reach {largest[worst]:g}",
@@ -420,7 +422,7 @@ def _as_grid(rows: _Rows) -> tuple[bool, FloatArray]:
     theta, at_theta = np.unique(key[:, 1], return_inverse=True)
     if (
         len(theta) < 3 or len(phi) * len(theta) > 2 * len(key) + 1000
-    ):  # not a grid, and a table of the angles could be too large
+    ):  # not a grid, whose table of angles could be too large
         raise InputError(
             f"{len(key)} rows with {len(phi)} values of phi and {len(theta)} of theta",
             expected="a grid over the sphere: every phi with every theta",
@@ -463,8 +465,8 @@ def _unfold(folded: ComplexArray) -> ComplexArray:
 
     Negative theta is the meridian at phi + pi.
 
-    Some files have spherical components there, and some those of the cut, which differ in sign. The field is smooth
-    where phi wraps around, and along each meridian next to the poles, which distinguishes both cases.
+    There, some files contain spherical components, and other files the components of the cut, which differ in sign. The
+    field is smooth where phi wraps around, and along each meridian next to the poles, which distinguishes both cases.
     """
     # theta is zero here
     middle = folded.shape[2] // 2
@@ -499,18 +501,19 @@ def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
             power = float((np.abs(e_theta[row]) ** 2 + np.abs(e_phi[row]) ** 2).mean())
             score += power * _pole_vectors(e_theta, sign * e_phi, row, slope)[2]
         scores.append(score)
-    # without a clear difference the sense of AERPAW is used
+    # without a clear difference the direction of AERPAW's files is used
     return scores[0] > 1.05 * scores[1] + 1e-6
 
 
 def check_power(pattern: MeasuredPattern, *, most_db: float = 0.5, cause: str = NOT_GAIN) -> None:
-    """Refuse a pattern that radiates more power than it is fed, or almost none, or whose numbers are linear.
+    """Refuse a pattern that radiates more power than it accepts or almost no power, or whose gains are linear.
 
     Parameters
     ----------
     pattern : MeasuredPattern
     most_db : float
-        Largest mean gain over the sphere. An antenna without loss has 0 dB, and the rest is measurement error.
+        Largest accepted mean gain over the sphere. A lossless antenna has 0 dB, and the rest allows for measurement
+        errors.
     cause : str
         Likely cause of a mean gain out of range, if the values are not linear.
     """
@@ -547,7 +550,8 @@ def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
     Raises
     ------
     InputError
-        For another file, missing angles, mixed degrees and radians, or more power out than in.
+        If the file is of another kind, angles are missing, degrees and radians are mixed, or more power is radiated
+        than accepted.
     UsageError
         If there is no such grid.
     """

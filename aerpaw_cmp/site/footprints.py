@@ -1,9 +1,10 @@
 """Buildings, forests and geofences from map files: classified, projected, repaired, with a list of all actions.
 
-The height of a building is that of the ``height`` tag, or ``building:levels`` times 3 m, or that of the outline around
-a part, or a default that is counted. Parts of a building replace its outline on their ground. Overlapping buildings of
-equal height are joined; otherwise the higher one covers the ground. Holes are retained. Slivers and duplicates are
-removed. Single trees have their tagged sizes, and tree rows become trees along their line.
+The height of a building is its ``height`` tag, else ``building:levels`` times 3 m, else the height of the outline
+around a part, else a default. The number of default heights is reported. Parts of a building replace its outline where
+they are. Overlapping buildings of equal height are joined; otherwise the higher one covers the ground. Holes are
+retained. Slivers and duplicates are removed. Single trees have their tagged sizes, and tree rows become trees along
+their line.
 """
 
 from __future__ import annotations
@@ -57,13 +58,15 @@ TALLEST_M = 300.0
 # Outlines farther from the origin do not belong to the site.
 FAR_M = 20_000.0
 
-# Area of a site without a base: the map within this square around the first tower, and this distance from each tower.
+# Area of a site without a base: the map up to the first distance from the first tower in each direction, and the second
+# distance around each tower.
 _AROUND_M, _NEAR_TOWER_M = 2000.0, 500.0
 
-# Least and largest number of elevations for a surface (its time grows with the cube), and their error [m].
+# Smallest and largest number of elevations for a surface (its computing time grows with the cube of the number), and
+# the standard deviation of an elevation [m].
 _FEWEST_ELEVATIONS, _MOST_ELEVATIONS, _ELEVATION_SD_M = 3, 300, 1.0
 
-# Grid of coordinates.
+# Coordinates are rounded to this grid [m].
 _GRID_M = 0.001
 
 # Narrower areas are drawing errors, and vertices closer to a straight line are removed.
@@ -72,17 +75,17 @@ _SLIVER_M = 0.3
 _MINIMUM_AREA_M2 = 2.0
 _SAME_HEIGHT_M = 0.25
 
-# Height of a wood without a stated height: the mean of all forest stands by LiDAR at Lake Wheeler.
+# Height of a wood if the map does not state it: the mean LiDAR height of all forest stands at Lake Wheeler.
 _DEFAULT_CANOPY_M = 20.0
-# Share of evergreen trees by tags of OpenStreetMap.
+# Share of evergreen trees for each tag of OpenStreetMap.
 _EVERGREEN = {"evergreen": 1.0, "needleleaved": 1.0, "mixed": 0.5}
 
-# Margin of forests outside the area of the site, beyond which trees shade no path.
+# Margin of forests around the area of the site. Trees farther away do not shade any path.
 _FOREST_MARGIN_M = 1000.0
 
 # The thickest known trunk has a girth of 42 m.
 _WIDEST_GIRTH_M = 45.0
-# Distance of the trees of a row without a tagged crown diameter, at which default crowns touch.
+# Distance between the trees of a row without a tagged crown diameter. At this distance default crowns touch.
 _ROW_SPACING_M = 10.0
 
 _MAXIMUM_ROW_TREES = 10_000
@@ -164,7 +167,8 @@ def import_footprints(
     Raises
     ------
     InputError
-        For an unreadable file, swapped coordinates, a file of another place, heights that cannot be metres, or no area.
+        If a file cannot be read, coordinates are swapped, the file is of another place, heights cannot be metres, or
+        there is no area.
     UsageError
         If ``untagged`` is not a kind of area.
     """
@@ -220,7 +224,7 @@ def _sort(
             continue
         actions += [f"{outline.source}: {problem}" for problem in dict.fromkeys(outline.broken)]
         if kind == "geofence" and "height" in outline.tags and kind_of(outline.tags) is None and untagged is None:
-            text = f"an area {outline.tags['height']} m high without a tag: taken as a geofence"
+            text = f"an area {outline.tags['height']} m high without a tag: used as a geofence"
             actions.append(f"{outline.source}: {text}; '--untagged building' makes it a building")
         shape = _project(outline, frame, actions)
         if shape is not None:
@@ -242,7 +246,7 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
     height = _size(tree.tags, ("height", "est_height"), TALLEST_TREE_M, "a tree {:g} m high", notes)
     crown = _size(tree.tags, ("diameter_crown", "crown_diameter"), WIDEST_CROWN_M, "a crown {:g} m wide", notes)
     tags, written = dict(tree.tags), tree.tags.get("circumference", "").strip()
-    # a number without unit that no tree reaches in metres or feet is in centimetres
+    # read a number without unit as centimetres if no tree reaches it in metres or feet
     if 3.3 * _WIDEST_GIRTH_M < (metres(f"{written} m") or 0.0) <= 100.0 * _WIDEST_GIRTH_M:
         notes.append(f"the circumference '{written}' is taken as centimetres")
         tags["circumference"] = f"{written} cm"
@@ -263,7 +267,7 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
 
 
 def _size(tags: Mapping[str, str], keys: tuple[str, ...], most_m: float, what: str, notes: list[str]) -> float | None:
-    """Return a size of a tree or a wood [m]. One that is too large adds a sentence to ``notes`` and is not used."""
+    """Return a size of a tree or a wood [m]. If too large, it is noted and not used."""
     size = positive_metres(tags, keys, notes)
     if size is None or size <= most_m:
         return size
@@ -272,7 +276,7 @@ def _size(tags: Mapping[str, str], keys: tuple[str, ...], most_m: float, what: s
 
 
 def _along(line_m: FloatArray, spacing_m: float) -> FloatArray:
-    """Return points on a line (corners, 2) from its begin to its end, about ``spacing_m`` apart, shape (n, 2)."""
+    """Return points on a line (corners, 2) from its start to its end, about ``spacing_m`` apart, shape (n, 2)."""
     line = LineString(line_m)
     count = min(max(round(line.length / max(spacing_m, 0.5)), 1), _MAXIMUM_ROW_TREES)
     return np.asarray(shapely.get_coordinates(line.interpolate(np.linspace(0.0, 1.0, count + 1), normalized=True)))
@@ -298,7 +302,7 @@ def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> 
 def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float | None) -> None:
     actions = result.actions
     buildings = _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions)
-    # the first wood in the file covers the ground, because woods have no height that could decide
+    # where woods overlap, keep the first one in the file, because woods have no heights to compare
     woods = _first_keeps(_without_duplicates(shapes["forest"], actions), actions)
     for name, shape, area in _parts(buildings, actions):
         result.buildings.append(
@@ -484,7 +488,7 @@ def _inherit(shapes: list[_Shape], actions: list[str]) -> None:
 
 
 def _assumed_heights(shapes: list[_Shape]) -> str:
-    """Return one line about buildings whose height is in no map."""
+    """Return one line about buildings whose height is not in any map."""
     assumed = [shape for shape in shapes if shape.assumed]
     if not assumed:
         return ""
@@ -541,7 +545,7 @@ def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
         return []
     areas = np.array([shape.area for shape in shapes], dtype=object)
     first, second = shapely.STRtree(areas).query(areas, predicate="intersects")
-    # neighbours share a wall, and rounding errors along it
+    # ignore tiny overlaps: neighbours share a wall, with rounding errors along it
     overlap = shapely.area(shapely.intersection(areas[first], areas[second])) > 0.01
     pairs = coo_array((overlap[overlap], (first[overlap], second[overlap])), shape=(len(shapes), len(shapes)))
     groups: dict[int, list[_Shape]] = {}
@@ -551,7 +555,7 @@ def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
 
 
 def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
-    """Return outlines without the ground of their parts, because parts have better heights."""
+    """Return outlines with their parts cut out, because the heights of parts are more accurate."""
     parts = [shape for shape in shapes if shape.part]
     if not parts:
         return shapes
@@ -560,7 +564,7 @@ def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
         inside = [] if shape.part else [parts[int(i)].area for i in tree.query(shape.area, predicate="intersects")]
         remainder = _areas_only(shape.area.difference(shapely.union_all(inside))) if inside else shape.area
         if remainder.area < 0.98 * shape.area.area:
-            actions.append(f"{shape.source}: gives way to its mapped parts")
+            actions.append(f"{shape.source}: replaced by its mapped parts")
             shape.area = remainder
         if not remainder.is_empty:
             disjoint.append(shape)
@@ -657,8 +661,8 @@ def import_site(
     files : sequence of paths
         Map files.
     base : str or path, optional
-        Packaged site or site.yaml that provides towers and settings. Without ``towers`` the default is Lake
-        Wheeler, if the map is there.
+        Packaged site or site.yaml that provides towers and settings. Without ``towers`` the default is Lake Wheeler, if
+        the map is of that area.
     towers : sequence of str
         ``NAME=LATITUDE,LONGITUDE,HEIGHT``: antennas [deg, deg, m above the ground]. They replace those of ``base``.
         Without a base the first one is the origin. The ground is then a smooth surface through the elevations in the
@@ -678,7 +682,8 @@ def import_site(
     Raises
     ------
     UsageError
-        If no file or no tower is known, a tower is not ``NAME=LATITUDE,LONGITUDE,HEIGHT``, or elevations contradict.
+        If no file or no tower is known, a tower is not ``NAME=LATITUDE,LONGITUDE,HEIGHT``, or elevations contradict
+        each other.
     InputError
         If the map or the elevation model cannot be read, or is not at the site.
     """
@@ -701,7 +706,7 @@ def import_site(
     actions = _from_maps(content, import_footprints(files, frame, area_m=extent_m(model, frame), **options))
     imported = SiteModel.model_validate(content)
     if relief:
-        build_site(imported)  # reports an elevation model of another place now
+        build_site(imported)  # fails now if the elevation model is elsewhere
     return imported, [_kept_of_base(imported, base), *actions]
 
 
@@ -732,7 +737,7 @@ def _site_around(
              reach.contains(Point(point[:2]))]  # fmt: skip
     ground = "flat (the map has fewer than three elevations; --dem FILE names an elevation model)"
     if relief:
-        ground = f"the elevation model {relief['dem']['path']}, whose heights count from the sea (dem.reference)"
+        ground = f"the elevation model {relief['dem']['path']}, whose heights are above sea level (dem.reference)"
     elif len(known) >= _FEWEST_ELEVATIONS:
         content |= {"ground_points": known[:: 1 + len(known) // _MOST_ELEVATIONS], "tower_ground": "surface"}
         ground = f"a smooth surface through {len(content['ground_points'])} elevations of the map (tag ele)"
@@ -744,7 +749,7 @@ def _site_around(
     )
     model = SiteModel.model_validate(content)
     if relief or model.ground_points:
-        build_site(model)  # reports elevations that contradict, or lie elsewhere, now
+        build_site(model)  # fails now if elevations are wrong or elsewhere
     return model, [about, *actions]
 
 

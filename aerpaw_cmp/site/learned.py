@@ -1,11 +1,11 @@
 """Calibrations of a site from flights, in the folder of its file: ``NAME.learned/learned.yaml`` and its tables.
 
-Each entry is a campaign: learned antennas by tower and channel, their airframe, or a rank receiver. It has their band,
-their training logs (SHA-256), errors on held-out flights, the source of the flights and the command that learns them
-again. Every table and every entry is verified by its SHA-256 when it is read.
+Each entry is a campaign: learned antennas by tower and channel, their airframe, or a rank receiver. It contains the
+band, the training logs (SHA-256), errors on held-out flights, the source of the flights and the command that learns the
+entry again. Every table and every entry is verified by its SHA-256 when it is read.
 
 There are three kinds of tables: the gain over the full sphere with its standard deviation (also as cuts for planning
-tools), the gain towards both ends at once, and the directions that determine a gain, with its covariance.
+tools), the gain towards both ends at once, and the directions in which a gain is known, with its covariance.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from .antennas import HIGHEST_DBI, MeasuredPattern, check_power
 _INDEX = "learned.yaml"
 
 # Relative difference of carriers up to which an antenna of a tower is used.
-# The bands of Lake Wheeler at 3.3, 3.4 and 3.51 GHz differ by 3 % and have other antennas and gains.
+# The bands of Lake Wheeler at 3.3, 3.4 and 3.51 GHz differ by 3 % and have different antennas and gains.
 BAND = 0.02
 
 # Limit for an airframe. 3.3 and 3.51 GHz share 90 % of the variance of its gain. There are no data for other bands.
@@ -61,7 +61,8 @@ class Errors(StrictModel):
     """Mean errors over held-out series: RMSE after one offset [dB], and the share inside 90 % intervals.
 
     ``rmse_db`` is that of held-out flights. ``height_rmse_db``, ``sector_rmse_db`` and ``heading_rmse_db`` are those of
-    heights, sectors of azimuth at the tower and headings that no other flight has. ``heights_m`` are cruise heights.
+    heights, azimuth sectors at the tower and headings that are not in the training flights. ``heights_m`` are cruise
+    heights.
     """
 
     series: int
@@ -77,7 +78,7 @@ class Errors(StrictModel):
     heights_m: list[float] = Field(default_factory=list)
 
     def expected(self, height_m: float, *, unseen: bool) -> tuple[Errors, str]:
-        """Return the errors with the RMSE of the kind of a flight, and the kind.
+        """Return the errors with the RMSE for a kind of flight, and the name of the kind.
 
         Parameters
         ----------
@@ -106,10 +107,10 @@ class LearnedLock(StrictModel):
     """The lock probability of a receiver: P = 1 / (1 + exp(-per_db (path gain - gain_db))) [path gain in dB].
 
     Levels in lock have mean ``locked_db`` at ``gain_db`` and the SD ``locked_sd_db`` in a flight. They increase by
-    ``locked_per_db`` for each dB of path gain, which is less than 1, because only the stronger of weak levels have
-    lock. Levels without lock have mean ``lost_db`` and so on [unit of the measurement]. The scores are means over
-    held-out flights. They are the Brier and the log score (nat), those of a constant share, and the RMSE of all samples
-    with the floor in place of levels below it [dB].
+    ``locked_per_db`` for each dB of path gain. This is less than 1, because weak levels are in lock only if they are
+    stronger than expected. The values that begin with ``lost`` describe levels without lock [unit of the measurement].
+    The scores are means over held-out flights: the Brier and log score (nat) of the model and of a constant share, and
+    the RMSE of all samples if levels below the floor are replaced by the floor [dB].
     """
 
     gain_db: float
@@ -161,7 +162,7 @@ class LearnedPair(StrictModel):
 
 
 class LearnedAntenna(StrictModel):
-    """Properties of a learned antenna other than its table, as a flight file or calibrated.yaml contains them."""
+    """Properties of a learned antenna other than its table, as stored in a flight file or in calibrated.yaml."""
 
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     """SHA-256 of the table. Another table is refused."""
@@ -206,22 +207,22 @@ class LearnedSeries(StrictModel):
 
     tower: str
     channel: str
-    """Label of the antenna in the training flights. It is a name, not a condition."""
+    """Label of the antenna in the training flights. Other flights may use another label."""
     receiver: str = ""
     """Receiver to which ``level`` and ``lock`` apply, as ``receiver`` of a flight file. Empty if not named."""
     carrier_hz: float
     tower_file: str
     uav_file: str
     known_file: str
-    """Directions at the UAV that determine its gain, and the covariance of the gain there."""
+    """Name of the table of directions at the UAV in which its gain is known, with the covariance of the gain."""
     tower_known_file: str
-    """Directions at the tower that determine the gain of its antenna, and their covariance."""
+    """Name of the table of directions at the tower in which its antenna gain is known, with the covariance."""
     pair: LearnedPair | None = None
     spread: LearnedSpread
     sd_db: float
     """Mean standard deviation of the level over flown directions."""
     shares_airframe: bool = True
-    """False if the gain of the UAV does not predict held-out flights of its campaign. It is then not used elsewhere."""
+    """False if the gain of the UAV does not predict held-out flights of its campaign. Then it is not used elsewhere."""
     lock: LearnedLock | None = None
     level: LearnedLevel | None = None
     """Level above free space, or the level in lock for receivers that lose it."""
@@ -235,7 +236,7 @@ class LearnedSeries(StrictModel):
 
 
 class LearnedReceiver(StrictModel):
-    """A rank receiver of one tower, with kappa and log score on held-out flights and of the constant forecast."""
+    """A rank receiver of one tower, with kappa and log score on held-out flights and for a constant forecast."""
 
     tower: str
     quantity: str
@@ -292,7 +293,7 @@ class Entry(StrictModel):
 
 
 class _Foreign(BaseModel, extra="allow"):
-    """An entry of another version, which is not read but is kept when others are replaced."""
+    """An entry of another version. It is not read, but is preserved when other entries are replaced."""
 
     tables: dict[str, str] = Field(default_factory=dict)
 
@@ -324,14 +325,14 @@ def folder_of(site: str | Path) -> Path:
 
 
 def read_learned(site: str | Path) -> Learned:
-    """Read the learned models of a site, which are empty if it has none.
+    """Read the learned models of a site. The result is empty if the site has none.
 
     Raises
     ------
     UsageError
         If the index is damaged, has another version, or was edited.
     InputError
-        If it names a file outside its folder.
+        If the index names a file outside its folder.
     """
     folder = folder_of(site)
     memory = _read(folder, Learned)
@@ -373,10 +374,10 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
     ----------
     site : str or Path
     name : str
-        Name of the entry, which replaces one of this name.
+        Name of the entry. An existing entry of this name is replaced.
     entry : Entry
     files : mapping of str to bytes
-        Content of the tables by name, with the ending ``.gz``; compressed here.
+        Uncompressed content of the tables, by name with the ending ``.gz``.
 
     Returns
     -------
@@ -395,7 +396,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
     tables = {file: hashlib.sha256(content).hexdigest() for file, content in packed.items()}
     with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)
-        # with two calibrations of one site at once, each must see the entry of the other
+        # if two calibrations of one site run at once, each must see the entry of the other
         with locked(folder):
             memory = _read(folder, _Index)
             # files with a digest in an entry are ours, and so are an edited table and tables of a killed calibration
@@ -415,11 +416,11 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
             made = made.model_copy(update={"sha256": made.digest})
             entries = dict(sorted({**memory.entries, name: made}.items()))
             text = dump_yaml(memory.model_copy(update={"entries": entries}).model_dump(mode="json", exclude_none=True))
-            # after its tables, so that no entry is without files
+            # write the index after the tables, so that every entry has its files
             write_whole(folder / _INDEX, text)
             used = {file for known in entries.values() for file in files_of(known)}
             for file, digest in sorted(written):
-                # a table that was changed later stays
+                # do not remove a table that was changed later
                 if file not in used and (folder / file).is_file() and file_digest(folder / file) == digest:
                     (folder / file).unlink()
     return [folder / _INDEX, *(folder / file for file in files)]
@@ -433,7 +434,7 @@ def carry_memory(base: str | Path, site: Path) -> list[str]:
     entries = read_learned(base).entries
     with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)
-        # the index last, because without it the new site has no learned models
+        # copy the index last, because without it the new site has no learned models
         for name in [*sorted(set().union(*map(files_of, entries.values()))), _INDEX]:
             place = inside(origin, name, origin / _INDEX, plain=True)
             if place.is_file() and not (folder / name).exists():
@@ -463,7 +464,7 @@ def files_of(entry: Entry | _Foreign) -> set[str]:
     return {file for s in entry.series for file in s.files} | {r.file for r in entry.receivers}
 
 
-# Begin of the comment with the calibration and, after ``, from``, its flights.
+# Start of the comment that contains the calibration and, after ``, from``, its flights.
 LEARNED = "# aerpaw-cmp calibrate: "
 
 
@@ -538,7 +539,7 @@ class Named(StrictModel):
 
 
 class UnknownName(UsageError):  # noqa: N818  # a case of its base, which is the error
-    """A name of the learned models of a site that can never apply."""
+    """The error that no learned model has a given name."""
 
 
 def find_named(name: str, folder: Path, end: str = "") -> Named:
@@ -572,7 +573,7 @@ def find_named(name: str, folder: Path, end: str = "") -> Named:
                 return Named(entry=entry, part=part, folder=folder_of(place))
             fitting.append(f"{site}/{full}")
     raise UnknownName(
-        f"nothing learned is called {name!r}" + (f" for {_WANTED[end]}" if end else ""),
+        f"no learned model is called {name!r}" + (f" for {_WANTED[end]}" if end else ""),
         expected="one of " + ", ".join(fitting) if fitting else "SITE/ENTRY of a site with learned models",
         cause=None if fitting else f"there is no such learned model in {folder_of(place)}",
     )
@@ -592,7 +593,7 @@ def _parts(name: str, entry: Entry, end: str) -> dict[str, str]:
 
 
 # Share of the variance by which rounded values may differ from the function.
-# The table has gains to 0.01 dB and angles to 0.1 deg, so neighbours may contradict by this.
+# The table has gains to 0.01 dB and angles to 0.1 deg, so the gains of close directions may contradict each other.
 _NUGGET = 1e-3
 
 
@@ -603,7 +604,8 @@ class PairGain:
     Parameters
     ----------
     directions : (k, 6)
-        Unit vectors from the UAV to the tower in the body frame, and from the tower to the UAV at the mast.
+        Unit vectors from the UAV to the tower in the body frame, and from the tower to the UAV in the frame of the
+        mast.
     gain_db : (k,)
         Part of the gain that the antennas of both ends do not explain separately [dB].
     sd_db : (k,)
@@ -633,7 +635,7 @@ class PairGain:
         Parameters
         ----------
         directions : (n, 6)
-            Directions in the form of the record.
+            Directions, in the form of ``directions``.
         apart_sd_db : (n,)
             Standard deviation of both antennas if each were learned separately [dB].
 
@@ -643,8 +645,8 @@ class PairGain:
 
         Notes
         -----
-        The variance is a weighted mean of that of the record and of the sum of the variances of antennas and prior. The
-        weight of the record is the share of the process that known directions determine.
+        The variance is a weighted mean of the variance of the record and of the sum of the variances of antennas and
+        prior. The weight of the record is the share of the process that known directions determine.
         """
         gain, sd = np.empty(len(directions)), np.empty(len(directions))
         white = self._factor.whiten(self.gain_db)
@@ -691,7 +693,8 @@ def read_pair(path: Path, length: float, prior_sd_db: float, written: Written | 
     Raises
     ------
     InputError
-        For other columns, no row, values that are not finite, or a table that is not as it was written.
+        If the columns are wrong, there are no rows, a value is not finite, or the table has changed since it was
+        written.
     """
     rows = _numbers(path, "a table of the gain towards both ends", PAIR_COLUMNS, written)
     if any(len(row) != len(PAIR_COLUMNS) for row in rows):
@@ -707,7 +710,7 @@ def read_pair(path: Path, length: float, prior_sd_db: float, written: Written | 
 
 
 def _numbers(path: Path, what: str, columns: Sequence[str], written: Written | None) -> list[list[float]]:
-    """Return the rows of a table with these columns. InputError for other columns, no row, or values not finite."""
+    """Return the rows of a table. Raise InputError for other columns, no rows, or values that are not finite."""
     text = read_table(path, what, written).decode("utf-8-sig")
     lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
     rows = [[float(cell) for cell in line.split(",")] for line in lines[1:]]
@@ -781,7 +784,7 @@ class SpherePattern(MeasuredPattern):
 
 def sphere_grid(step_deg: float = 5.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return zenith angles (t,) and azimuths (p,) [deg] of a full sphere, and unit vectors (t, p, 3)."""
-    # both poles, but not 360 deg, which is 0
+    # include both poles, but not 360 deg, which is equal to 0
     theta, phi = np.arange(0.0, 180.0 + step_deg / 2, step_deg), np.arange(0.0, 360.0, step_deg)
     t, p = np.radians(theta)[:, None], np.radians(phi)[None, :]
     vectors = np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
@@ -841,16 +844,16 @@ def read_sphere_csv(path: str | Path, written: Written | None = None) -> SphereP
     Raises
     ------
     InputError
-        For missing columns or directions, values that are not gains, and a file that is not as it was written.
+        If columns or directions are missing, a value is not a gain, or the file has changed since it was written.
     """
     path = Path(path)
-    # shallow, because the pattern of a text is cached, and pair and spread belong to one use of it
+    # return a copy, because the pattern is cached, but ``pair`` and ``spread`` belong to one use of it
     return copy.copy(_pattern_of(read_table(path, "an antenna file", written).decode("utf-8-sig"), path))
 
 
 @lru_cache(maxsize=64)
 def _pattern_of(text: str, path: Path) -> SpherePattern:
-    """Return the antenna of the text of a file, cached because each draft reads all learned models of a site."""
+    """Return the antenna in the text of a file. It is cached, because each draft reads all learned models of a site."""
     numbered = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if line.strip() and line[0] != "#"]
     header = [cell.strip() for cell in numbered[0][1].split(",")] if numbered else []
     if header[:3] != list(SPHERE_COLUMNS[:3]):
@@ -880,10 +883,10 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
 
 
 def _values(numbered: Sequence[tuple[int, str]], width: int, path: Path) -> FloatArray:
-    """Return the cells of numbered lines (lines, width). Lines are read one by one only to find a wrong one."""
+    """Return the cells of numbered lines (lines, width). Lines are read one by one only to find an error."""
     with suppress(ValueError):
         if numbered:
-            # fast for valid files, which most are
+            # read all lines at once, which is fast and works for valid files
             values = np.loadtxt([line for _, line in numbered], delimiter=",", comments=None, ndmin=2)
             if values.shape == (len(numbered), width) and not _refused(values).any():
                 return values
@@ -990,7 +993,7 @@ def read_known(path: Path, written: Written | None = None) -> KnownDirections:
     Raises
     ------
     InputError
-        For other columns or lengths, values that are not finite, or a table that is not as it was written.
+        If columns or lengths of rows are wrong, a value is not finite, or the table has changed since it was written.
     """
     rows = _numbers(path, _WHAT, _COLUMNS, written)
     if [len(row) for row in rows] != [*range(3, len(rows) + 3)]:
@@ -1017,7 +1020,7 @@ def learned_antenna(named: Named, end: str, carrier_hz: float) -> tuple[Path, Le
     UsageError
         If there is no antenna of that name for this end, or it has another band.
     InputError
-        If the table is damaged, not as it was written, or learned from other logs than its entry names.
+        If the table is damaged or changed, or was learned from logs that its entry does not name.
     """
     series = named.antenna(end, carrier_hz)
     if series is None:
@@ -1042,8 +1045,8 @@ def learned_antenna(named: Named, end: str, carrier_hz: float) -> tuple[Path, Le
 def _airframe_spread(errors: Errors | None, spread: LearnedSpread) -> LearnedSpread:
     """Return the error model of a level with the learned airframe alone.
 
-    The unknown gain of the other end is a part of the nuisance. Together with the noise it has the error of the
-    airframe alone on held-out campaigns, or that of free space if no campaign was held out.
+    The unknown gain of the other end becomes part of the error model. The total error is the RMSE of the airframe alone
+    on held-out campaigns, or the RMSE of free space if no campaign was held out.
     """
     if errors is None:
         return spread
@@ -1061,7 +1064,7 @@ def _check_band(learned_hz: float, used_hz: float, band: float) -> None:
 
 
 def receiver_file(named: Named, carrier_hz: float) -> Path:
-    """Return the file of a learned rank receiver of the same band, which was made from the logs that its entry names.
+    """Return the file of a learned rank receiver. Check its band, and that it was learned from the logs of its entry.
 
     Parameters
     ----------
@@ -1075,7 +1078,7 @@ def receiver_file(named: Named, carrier_hz: float) -> Path:
     UsageError
         If the receiver has another band.
     InputError
-        If the table is damaged, or learned from other logs than its entry names.
+        If the table is damaged, or was learned from logs that its entry does not name.
     """
     _check_band(named.entry.receivers[0].carrier_hz, carrier_hz, BAND)
     path = named.folder / named.entry.receivers[0].file
@@ -1086,7 +1089,7 @@ def receiver_file(named: Named, carrier_hz: float) -> Path:
 
 
 def check_logs(trained_on: Sequence[str], named: Named, path: Path) -> None:
-    """Refuse a table that was learned from logs which its entry does not name, because scores rely on them."""
+    """Refuse a table that was learned from logs that its entry does not name, because scores rely on this list."""
     strange = set(trained_on) - set(named.entry.trained_on)
     if strange:
         raise InputError(

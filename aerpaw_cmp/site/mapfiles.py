@@ -39,7 +39,7 @@ OSM_CREDIT = "(c) OpenStreetMap contributors, ODbL"
 # Latitude and longitude [deg].
 Position = tuple[float, float]
 
-# Exceptions of an element that cannot be read. It is skipped and listed, and the others are used.
+# Exceptions of an element that cannot be read. The element is skipped and listed, and other elements are used.
 BROKEN_ELEMENT = (InputError, TypeError, KeyError, AttributeError, IndexError, ValueError, OverflowError)
 
 
@@ -97,7 +97,7 @@ class MapFile:
         self.notes += other.notes
 
     def note_no_areas(self, name: str, lines: Counter[str]) -> None:
-        """Add a note about elements of a file ``name`` that bound no area, counted by kind."""
+        """Add a note about elements of a file ``name`` that do not enclose an area, counted by kind."""
         if lines:
             listed = ", ".join(f"{count} {what}" for what, count in lines.most_common())
             self.notes.append(f"{name}: left out, not areas: {listed}")
@@ -108,10 +108,10 @@ MAX_CROSSINGS = 1000
 
 
 def is_tangled(ring: Polygon) -> bool:
-    """Check whether a ring has more than :data:`MAX_CROSSINGS` self-intersections, in pieces and with an early end."""
+    """Check whether a ring has more than :data:`MAX_CROSSINGS` self-intersections. Counting stops at this number."""
     line = np.asarray(ring.exterior.coords)[:, :2]
     segments = shapely.linestrings(np.stack([line[:-1], line[1:]], axis=1))
-    # there are not more pairs of segments than allowed intersections
+    # a short ring has fewer pairs of segments than allowed intersections
     if len(segments) * (len(segments) - 1) // 2 <= MAX_CROSSINGS:
         return False
     tree, crossings = shapely.STRtree(segments), 0
@@ -147,7 +147,7 @@ _FOREST_TAGS = (("landuse", "forest"), ("natural", "wood"), ("landcover", "trees
 _NOT = ("no", "", "none", "false", "0")
 _UNITS_M = {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT_M}
 _UNIT_WORDS = {"metre": "m", "meter": "m", "foot": "ft", "feet": "ft"}
-# Words of OpenStreetMap for materials that P.2040 has under another or a similar name.
+# Words of OpenStreetMap for materials that have another name in P.2040.
 _MATERIAL_WORDS = {
     "steel": "metal",
     "aluminium": "metal",
@@ -288,7 +288,7 @@ _STOREYS = re.compile(r"(building)?levels|(n|num|no|noof|numberof)?(floors|stor(
 
 
 def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
-    """Return the height of a building by any of the names that programs use, in the unit of the name or value [m].
+    """Return the height of a building [m] from any of the tags that programs use. The unit is that of tag or value.
 
     Examples
     --------
@@ -438,7 +438,7 @@ def _way_outline(identity: str, way: Element, data: _Data, result: MapFile, line
 
 
 def _points(way: Element, data: _Data, outline: Outline) -> list[Position]:
-    """Return the known positions of a way. Missing ones are added to ``outline.broken``."""
+    """Return the known positions of a way. Missing positions are reported in ``outline.broken``."""
     if isinstance(way.get("geometry"), list):
         points = [point for point in way["geometry"] if point]
         if len(points) < len(way["geometry"]):
@@ -473,7 +473,7 @@ def _relations(data: _Data, result: MapFile, lines: Counter[str]) -> set[str]:
         outer = [str(m.get("ref")) for m in relation.get("members") or [] if m.get("role") in ("outer", "", None)]
         own = {ref: words for ref in outer if (words := _words((data.ways.get(ref) or {}).get("tags")))}
         kind = kind_of({k: v for k, v in tags.items() if k != "type"})
-        if kind is None:  # multipolygons of before 2017 have their tags on the outer way
+        if kind is None:  # multipolygons from before 2017 have their tags on the outer way
             kinds = {kind_of(words) for words in own.values()} - {None}
             if len(kinds) != 1 or tags.get("type") == "boundary":
                 lines[f"relations of type '{tags['type']}' without tags of a building or forest"] += 1
@@ -499,7 +499,7 @@ def _multipolygon(relation: Element, data: _Data, outline: Outline) -> None:
             if member.get("type") == "relation":
                 outline.broken.append(f"its member relation {member.get('ref')} was left out")
             continue
-        # Overpass has the line of a member in the relation, XML by its id
+        # Overpass contains the line of a member in the relation, whereas XML refers to it by its id
         way = member if isinstance(member.get("geometry"), list) else data.ways.get(str(member.get("ref")))
         if way is None:
             outline.broken.append(f"way {member.get('ref')} is not in the file")
@@ -530,7 +530,7 @@ def _inside(ring: list[Position], shell: list[Position]) -> bool:
 
 
 def _by_nesting(rings: list[list[Position]]) -> tuple[list[list[Position]], list[list[Position]]]:
-    """Split rings into outer rings and holes. A ring inside an odd number of others is a hole."""
+    """Split rings into outer rings and holes. A ring inside an odd number of other rings is a hole."""
     depth = [sum(_inside(ring, other) for other in rings if other is not ring) for ring in rings]
     return (
         [ring for ring, around in zip(rings, depth, strict=True) if around % 2 == 0],
@@ -543,7 +543,7 @@ def _join_rings(lines: list[list[Position]], outline: Outline) -> list[list[Posi
     rings, open_ = [], [list(line) for line in lines if len(line) > 1]
     while open_:
         ring = open_.pop()
-        # pieces have any order and direction
+        # pieces may be in any order and direction
         while ring[0] != ring[-1] and (index := _next_piece(ring, open_)) is not None:
             piece = open_.pop(index)
             if ring[-1] in (piece[0], piece[-1]):
@@ -563,7 +563,7 @@ def _next_piece(ring: list[Position], pieces: list[list[Position]]) -> int | Non
     return next((i for i, piece in enumerate(pieces) if ends & {piece[0], piece[-1]}), None)
 
 
-# A map of a county is smaller, and a site needs a few kilometres.
+# Largest size of a map file. A map of a county is smaller, and a site needs a few kilometres.
 MAX_BYTES = 256 * 1024 * 1024
 
 # Largest number of begin and end tags of an XML map file, because each becomes an object in memory.
@@ -571,7 +571,7 @@ MAX_TAGS = 1_500_000
 
 FORMATS = "GeoJSON, OSM XML, Overpass JSON, KML or KMZ"
 
-# Marks of GeoJSON and KML that come from OpenStreetMap: its name, its ids, its tags of ids.
+# Text that shows that GeoJSON or KML comes from OpenStreetMap: its name or its ids.
 _OF_OSM = re.compile(rb'openstreetmap|"osm_(way_)?id"|"(way|relation|node)/[0-9]+"', re.IGNORECASE)
 
 _OTHER_KINDS: tuple[tuple[bytes, str, str], ...] = (
@@ -591,7 +591,7 @@ def read_map_file(path: str | Path) -> MapFile:
     Raises
     ------
     InputError
-        If there is no such file, it has none of the formats, or is not WGS84.
+        If there is no such file, its format is unknown, or it is not in WGS84.
     """
     path = Path(path)
     data = read_input(path, MAX_BYTES, "a map file")
@@ -648,7 +648,7 @@ def _from_json(data: bytes, path: Path) -> MapFile:
         result = read_elements("Overpass JSON", content["elements"], path)
         # Overpass answers with status 200 and a remark if it ran out of time
         if remark := content.get("remark"):
-            result.notes.append(f"warning: {path.name}: the Overpass server says: {str(remark)[:200]}")
+            result.notes.append(f"warning: {path.name}: the Overpass server reports:  {str(remark)[:200]}")
         return result
     if isinstance(content, dict) and "type" in content:
         return _geojson(content, path)
@@ -684,7 +684,7 @@ def _geojson(content: dict[str, Any], path: Path) -> MapFile:
 
 
 def _check_crs(crs: Any) -> None:
-    """Refuse coordinate systems other than WGS84, which GeoJSON of before RFC 7946 may name."""
+    """Refuse coordinate systems other than WGS84, which GeoJSON from before RFC 7946 may name."""
     named = crs.get("properties") if isinstance(crs, dict) else crs
     name = str(named.get("name", "CRS84") if isinstance(named, dict) else named or "CRS84")
     # 4979 is WGS84 with heights

@@ -62,7 +62,7 @@ class Material:
         low, high, *_ = self.band
         if low <= frequency_ghz <= high:
             return self.band
-        # constants of the nearest frequency in the table, as a line to paste
+        # suggest the constants at the nearest frequency in the table, as text to paste
         edge = low if frequency_ghz < low else high
         near = stated_name(self.relative_permittivity(edge * 1e9).real, self.conductivity_s_per_m(edge * 1e9), None)
         raise UsageError(
@@ -80,7 +80,7 @@ class Material:
         return float(c * (frequency_hz / 1e9) ** d)
 
     def relative_permittivity(self, frequency_hz: float) -> complex:
-        """Return the complex relative permittivity at a frequency, whose imaginary part is negative (loss).
+        """Return the complex relative permittivity at a frequency. Its imaginary part is negative (loss).
 
         Source: arXiv 2502.10324 eq. 5; ITU-R P.2040 table 3.
 
@@ -102,7 +102,7 @@ CROWN = "vegetation"
 
 
 def material(name: str) -> Material:
-    """Return a material of ITU-R P.2040 by name, or one that its name describes.
+    """Return a material of ITU-R P.2040 by name, or a material whose name contains its properties.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def _stated(plain: str, numbers: str, name: str) -> Material:
     return Material(stated_name(band[2], band[4], thickness), band, None if thickness is None else thickness or 1e-9)
 
 
-# Begin of the name of a material that is not in ITU-R P.2040; its numbers follow.
+# Start of the name of a material that is not in ITU-R P.2040. Its properties follow.
 CONSTANT = "constant"
 
 

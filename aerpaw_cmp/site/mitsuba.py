@@ -66,11 +66,11 @@ class _Element:
     name: str
     count: int
     properties: tuple[tuple[str, str, str], ...]
-    """Name, type, and type of the length of a list or an empty text."""
+    """Name and type. For lists, the type of the length follows, otherwise an empty text."""
 
 
 def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
-    """Return a PLY file and its bytes (for a digest).
+    """Return the mesh of a PLY file, and the bytes of the file (for a digest).
 
     Raises
     ------
@@ -166,7 +166,7 @@ class _Body:
 
     def take(self, kind: Any, count: int, element: _Element) -> AnyArray:
         """Return the next ``count`` items of a type."""
-        # the order of numpy is that of this machine
+        # NumPy's default is the byte order of this machine
         what = np.dtype(kind).newbyteorder(self.order)
         if count < 0 or self.place + count * what.itemsize > len(self.data):
             raise InputError(
@@ -184,7 +184,7 @@ class _Body:
         if not element.count or not least:
             return {name: np.zeros((0, 1)) for name, *_ in element.properties}
         # a header that promises more than the file contains fails here, before memory is requested
-        self.take(("V", least), element.count, element)  # fail before a row is read
+        self.take(("V", least), element.count, element)
         self.place = begun
         # most meshes have triangles only, so lists as long as the first are read as one table
         first, fields = self._row(element), list[Any]()
@@ -223,7 +223,7 @@ def _polygons(element: _Element, columns: dict[str, Any]) -> list[IntArray]:
     corners, by_size = columns[which], dict[int, list[AnyArray]]()
     for row in [corners] if isinstance(corners, np.ndarray) else corners:
         by_size.setdefault(row.shape[-1], []).append(row.reshape(-1, row.shape[-1]))
-    # no index is so large: a value that is not a number becomes an index that no vertex has
+    # replace a value that is not a number by an index that no vertex has
     polygons = {size: np.concatenate(rows) for size, rows in by_size.items() if size >= 3}
     return [np.where(np.abs(rows) < 2**53, rows, -1).astype(np.int64) for rows in polygons.values()]
 
@@ -254,11 +254,11 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
     return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(triangles)
 
 
-# Thickness of a slab without a stated one, as in Sionna RT.
+# Default thickness of a slab, as in Sionna RT.
 _DEFAULT_THICKNESS_M = 0.1
 
 _LARGEST_XML = 256 * 2**20
-# The scene Munich of Sionna RT has 40 000.
+# Largest number of triangles of a scene. The scene Munich of Sionna RT has 40 000.
 _MOST_TRIANGLES = 20_000_000
 
 # Names and materials of vegetation, as complete words, so that "street" and "treehouse" do not match.
@@ -393,7 +393,7 @@ def _materials(
     radio: dict[str, str] = {}
     unknown: dict[str, str] = {}
     rough: list[str] = []
-    # materials of the scene first, because a shape may have its own material without a name
+    # read the materials of the scene first, because a shape may contain a material without a name
     for number, bsdf in enumerate((*root.findall("./bsdf"), *root.findall(".//shape/bsdf"))):
         name = bsdf.get("id") or bsdf.get("name") or f"unnamed {number + 1}"
         bsdf.set("id", name)

@@ -2,8 +2,9 @@
 
 The formats for writing are the custom pattern of Sionna RT, cuts of MSI Planet, and a table over the sphere.
 
-Cuts contain no values between them. A sphere is computed from a horizontal and a vertical cut by horizontal projection
-interpolation (F. Gil et al., IEEE Trans. Antennas Propag. 47, 1999, doi:10.1109/8.774131), which retains both cuts.
+Two cuts do not contain the directions between them. A sphere is therefore computed from a horizontal and a vertical cut
+by horizontal projection interpolation (F. Gil et al., IEEE Trans. Antennas Propag. 47, 1999, doi:10.1109/8.774131),
+which retains both cuts.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> M
     Raises
     ------
     InputError
-        For another kind of file, and missing angles or units; the message has the line if there is one.
+        If the file is of another kind, or angles or units are missing. The message contains the line if possible.
     """
     path = Path(path)
     text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
@@ -156,7 +157,7 @@ def _each_degree(rows: FloatArray, cut: str) -> FloatArray:
     if np.ptp(rows[:, 0]) <= 180.0 and np.abs(rows[:, 0]).max() <= 90.0:  # a front half is used for the back, too
         angle, value = np.concatenate((angle, (180.0 - rows[:, 0]) % 360.0)), np.concatenate((value, value))
     order = np.argsort(angle, kind="stable")
-    # the gap across the front counts, too
+    # include the gap across the front
     if np.diff(np.append(angle[order], angle[order][0] + 360.0)).max() > 15.0:
         raise InputError(f"cut {cut} has gaps above 15 deg", expected="a full circle")
     return np.asarray(np.interp(np.arange(360.0), angle[order], value[order], period=360.0))
@@ -217,7 +218,7 @@ def _pattern(
 
 
 def _great_circle(text: str, name: str, carrier_hz: float | None) -> MeasuredPattern:
-    """Return total gain of AERPAW along one great circle at several frequencies, with both halves blended."""
+    """Return the pattern of an AERPAW file of total gain along one great circle. Both halves are blended."""
     rows = [line.split() for line in text.splitlines() if re.match(r"\s*\d{6,}(?:\.\d+)?\s", line)]
     table = np.array([[float(cell) for cell in row[:3]] for row in rows if len(row) >= 3])
     if not len(table):
@@ -229,7 +230,7 @@ def _great_circle(text: str, name: str, carrier_hz: float | None) -> MeasuredPat
             raise InputError(f"{len(frequencies)} frequencies", expected="the carrier frequency, to choose one of them")
         frequency = float(frequencies[np.argmin(np.abs(frequencies - carrier_hz))])
     cut = table[table[:, 0] == frequency]
-    # -pi and pi, or a repeated row: interpolation needs ascending angles
+    # drop repeated angles, such as -pi and pi, because interpolation needs ascending angles
     _, once = np.unique(np.round(cut[:, 1], 6), return_index=True)
     angle, gain = cut[once, 1], cut[once, 2]
     if len(angle) < 8 or angle[0] > -3.1 or angle[-1] < 3.1 or np.diff(angle).max() > 0.3:
@@ -266,7 +267,7 @@ def read_cut_files(azimuth: Path, elevation: Path) -> MeasuredPattern:
     Raises
     ------
     InputError
-        For other columns, gaps, and cuts that differ in front.
+        If columns are wrong, a cut has gaps, or the cuts differ in front.
     """
     cuts = {"HORIZONTAL": _cut_file(azimuth, ("az", "phi")), "VERTICAL": _cut_file(elevation, ("el", "th", "zen"))}
     apart = abs(float(cuts["HORIZONTAL"][0] - cuts["VERTICAL"][0]))
@@ -274,7 +275,7 @@ def read_cut_files(azimuth: Path, elevation: Path) -> MeasuredPattern:
         raise InputError(
             f"in front the cuts of {azimuth.name} and {elevation.name} differ by {apart:.1f} dB",
             expected="two cuts of one antenna through its front, gains in dBi",
-            cause="one of them is relative to its own peak, or the files are exchanged",
+            cause="one of them is relative to its own peak, or the files are swapped",
             path=elevation,
         )
     return _from_cuts(cuts, azimuth.stem, None)
@@ -317,7 +318,7 @@ def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: floa
     Raises
     ------
     UsageError
-        For another ending, and for ``.msi`` without a frequency.
+        If the ending is not supported, or ``.msi`` has no frequency.
     """
     notes = getattr(pattern, "notes", "") or f"trained_on: {' '.join(pattern.trained_on)}" * bool(pattern.trained_on)
     lines = tuple(line.lstrip("# ") for line in notes.splitlines())
@@ -329,7 +330,7 @@ def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: floa
         return planning_cuts(pattern, name, frequency, lines)
     theta, phi, _ = sphere_grid(STEP_DEG)
     if target.suffix == ".csv":
-        with about_file(target):  # the reader of spheres requires it: two cuts may radiate more power than is fed
+        with about_file(target):  # as the reader of spheres does: a sphere of two cuts may have too much power
             check_power(pattern)
         at = np.meshgrid(np.radians(theta), np.radians(phi), indexing="ij")
         sd = pattern.gain_sd_db(*at) if isinstance(pattern, SpherePattern) else np.zeros(at[0].shape)

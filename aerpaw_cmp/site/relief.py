@@ -1,6 +1,7 @@
 """Ground heights: digital elevation models, and a smooth surface through points.
 
-A digital elevation model has ground heights, profiles below straight lines, and a test which lines the ground blocks.
+A digital elevation model provides ground heights, profiles below straight lines, and a check which lines the ground
+blocks.
 
 Reflections from this ground are in :mod:`aerpaw_cmp.propagation.search.terrain`.
 
@@ -245,7 +246,7 @@ class Dem:
             # height of the curved Earth above the chord, because up is measured from a plane
             bulge = share * (1 - share) * np.hypot(*way[:, :2].T) ** 2 / (2 * EARTH_RADIUS_M)
             intrusion = ground + bulge - (start[:, 2] + share * way[:, 2])
-            # an antenna may be in a cell whose mean is above its foot
+            # ignore both ends, because the mean height of a cell may be above the foot of an antenna in it
             free[some] = ~((intrusion > tolerance[some]) & (share > 0.0) & (share < 1.0)).any(axis=0)
         return free
 
@@ -395,7 +396,8 @@ _LENGTHS_M = np.geomspace(30.0, 2000.0, 9)
 # Both have steps of about 65 %.
 _DEVIATIONS_M = np.geomspace(1.0, 50.0, 9)
 
-# Heights at positions this close belong to one position. They contradict above this many standard deviations.
+# Heights at positions this close belong to one position. They contradict each other if they differ by more than this
+# number of standard deviations.
 _SAME_PLACE_M, _CONTRADICTION = 1.0, 4.0
 
 # Number of waves in a drawn surface.
@@ -432,7 +434,7 @@ class Surface:
     reach_m: tuple[float, float, float, float]
 
     def dem(self, drawn: np.random.Generator | None = None) -> Dem:
-        """Return the most likely surface as an elevation model, or one that is drawn from its distribution."""
+        """Return the most likely surface as an elevation model, or a random surface from its distribution."""
         return next(self.dems([drawn]))
 
     def dems(self, draws: Iterable[np.random.Generator | None]) -> Iterator[Dem]:
@@ -475,8 +477,8 @@ class Surface:
         return Factor.of(self._between(self.place_m) + np.diag(self.error_m**2))
 
     def _waves(self, random: np.random.Generator) -> _Waves:
-        """Return a draw of the process without points: waves whose vectors have its spectrum, Student's t of 3."""
-        # order 3/2 in the plane: a normal divided by the root of chi-squared of 3 by 3
+        """Return a random draw of the process, without the points: waves whose vectors follow its spectrum."""
+        # the spectrum of order 3/2 is Student's t with 3 degrees of freedom: a normal divided by sqrt(chi-squared / 3)
         vector = random.standard_normal((2, _WAVES)) / (self.length_m * np.sqrt(random.chisquare(3, _WAVES) / 3.0))
         height = self.deviation_m * np.sqrt(2.0 / _WAVES)
         return _Waves(vector, random.uniform(0.0, 2.0 * np.pi, _WAVES), height)
@@ -494,7 +496,7 @@ class _Waves:
         return np.asarray(self.height_m * np.cos(place_m @ self.vector + self.phase).sum(axis=1))
 
     def on_grid(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Return the sum on a grid (north, east), from cosines of its lines, by cos(a + b)."""
+        """Return the sum on a grid (north, east), from the cosines and sines of rows and columns by cos(a + b)."""
         east, north = east_m[:, None] * self.vector[0], north_m[:, None] * self.vector[1] + self.phase
         return np.asarray(self.height_m * (np.cos(north) @ np.cos(east).T - np.sin(north) @ np.sin(east).T))
 
@@ -560,6 +562,6 @@ def _likeliest(points: bytes) -> tuple[float, float, float]:
 def _likelihood(covariance: FloatArray, height_m: FloatArray, error_m: FloatArray) -> tuple[float, float]:
     """Return the log likelihood of the points under a process, and its most likely mean [m]."""
     factor = Factor.of(covariance + np.diag(error_m**2))
-    # generalised least squares, in which close points count as one
+    # use generalised least squares, in which several close points together have the weight of one point
     level = float(np.average(height_m, weights=factor.solve(np.ones(len(height_m)))))
     return factor.log_likelihood(height_m - level), level

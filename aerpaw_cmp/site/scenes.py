@@ -50,7 +50,7 @@ def building_mesh(building: Building) -> Mesh:
     roof = np.stack([np.asarray(part.exterior.coords)[:3, :2] for part in parts])
     flat = roof.reshape(-1, 2)
     edge, other_edge = roof[:, 1] - roof[:, 0], roof[:, 2] - roof[:, 0]
-    # the triangulation has no defined sense, and the normal of a roof must point up
+    # the triangulation has no defined direction, but the normal of a roof must point up
     turn = edge[:, 0] * other_edge[:, 1] < edge[:, 1] * other_edge[:, 0]
     order = np.arange(len(flat)).reshape(-1, 3)
     order[turn] = order[turn][:, ::-1]
@@ -163,7 +163,7 @@ def placed_scene(
 def with_ground(scene: TriangleScene, name: str) -> TriangleScene:
     """Return the scene on a horizontal rectangle at its lowest point, which extends far beyond it."""
     low, high = bounds(scene)
-    # so far that no reflection between points of the scene misses it
+    # extend it so far that no reflection between points of the scene misses it
     reach = _PLANE_MARGIN * float(max(*(high - low)[:2], 100.0))
     mesh = rectangle(low[0] - reach, high[0] + reach, low[1] - reach, high[1] + reach, low[2])
     return added(scene, *mesh, "ground plane", material(name).name)
@@ -210,7 +210,7 @@ def ground_share(scene: TriangleScene) -> float:
     corners = scene.vertices_m[scene.triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(across, axis=1)
-    # either side may be up, because files have both senses
+    # accept both signs, because either side of a triangle in a file may be up
     level = corners[np.abs(across[:, 2]) > LEVEL * np.maximum(size, 1e-300)]
     low, high = bounds(scene)
     return float(shapely.union_all(shapely.polygons(level[:, :, :2])).area / (high - low)[:2].prod())
@@ -272,7 +272,7 @@ def without_traps(
 
 
 def _encloses(corners_m: FloatArray, place_m: FloatArray) -> bool:
-    """Check whether a point is in a mesh of triangles (n, 3, 3), which lines upward cross an odd number of times."""
+    """Check whether a point is inside a mesh (n, 3, 3): upward lines from it cross an odd number of triangles."""
     across = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
     # the area vectors of a closed mesh add up to zero
     if np.linalg.norm(across.sum(axis=0)) > 1e-3 * np.linalg.norm(across, axis=1).sum():
@@ -303,7 +303,7 @@ def _media(scene: TriangleScene, number: int) -> Iterator[Forest]:
         low, high = float(mine[..., 2].min()), float(mine[..., 2].max())
         if outline.geom_type != "Polygon" or not high > low:
             continue
-        # one sixth of determinants about any point, by the divergence theorem
+        # by the divergence theorem the volume is one sixth of the sum of determinants, about any point
         volume = abs(float(np.linalg.det(mine - mine.mean(axis=(0, 1))).sum())) / 6.0
         yield Forest(
             name=scene.shapes[number] if index == 0 else f"{scene.shapes[number]} ({index + 1})", area=outline,
@@ -325,8 +325,8 @@ _GROUND_PART = 0.25
 def drawn_buildings(site: Site) -> tuple[Building, ...]:
     """Return buildings for pictures: those of the site, and the outlines of the shapes of a scene of triangles.
 
-    Prisms extend from the lowest to the highest corner of each part. Horizontal shapes and those below most of the plan
-    are ground. Only pictures use them.
+    Prisms extend from the lowest to the highest corner of each part. Horizontal shapes and shapes below most of the
+    plan are ground. Only pictures use these prisms.
     """
     return site.buildings if site.scene is None else (*site.buildings, *_outlines(site.scene))
 
@@ -349,7 +349,7 @@ def _outlines(scene: TriangleScene) -> tuple[Building, ...]:
             simple = outline.simplify(_DRAWN_SIMPLER_M)
             if mine.size and simple.geom_type == "Polygon" and _DRAWN_M2 < simple.area < _GROUND_PART * ground_m2:
                 outlines.append((scene.shapes[shape], simple, float(mine.max())))
-    # only the largest, because a browser cannot draw 100 000 prisms
+    # keep only the largest, because a browser cannot draw 100 000 prisms
     outlines = sorted(outlines, key=lambda drawn: -drawn[1].area)[:_DRAWN_MOST]
     # extend to the lowest corner of anything below, because roofs are often separate shapes
     feet = np.array([top for *_, top in outlines])

@@ -127,7 +127,7 @@ class Trees:
 
     @classmethod
     def none(cls) -> Trees:
-        """Return trees without any tree."""
+        """Return an empty set of trees."""
         return cls(**{column.name: np.zeros(0) for column in fields(cls)})
 
 
@@ -156,7 +156,7 @@ class Site:
     trees : Trees
         Placed trees (from forests without a height and single points).
     opaque_trees : Trees
-        Placed trees, and those of forest stands that have trees.
+        Placed trees, and the trees of forest stands that also have single trees.
     ground_material : str
         Name of a material in ``site.materials``.
     area_m : (east_min, east_max, north_min, north_max)
@@ -211,10 +211,11 @@ class Site:
     def ground_under_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
         """Return the height of the ground, shape (n,) [m].
 
-        This is the height of the terrain if it is known. Otherwise it is that of the plane of the nearest tower, and in
+        This is the height of the terrain if it is known. Otherwise it is the ground height of the nearest tower, or in
         a scene that of the take-off point.
 
-        A plane above up = 0 ends at its tower, because a UAV below it flies over lower ground between towers.
+        The ground height of a tower counts only up to 0, because the ground between towers is lower and a UAV may be
+        there.
         """
         ground = np.full(len(east_m), self.takeoff_ground_m if self.scene is not None else 0.0)
         if self.scene is None and self.towers:

@@ -54,7 +54,7 @@ OVERLAP_M = 0.5
 # A tower is outside the map if no object of the map is nearer.
 _MAPPED_M = 500.0
 
-# No tree is placed at random closer to a tower, because masts are free of trees.
+# Smallest distance of random trees from a tower, because there are no trees around masts.
 MAST_CLEARANCE_M = 8.0
 
 # A building or mast above this is in feet or centimetres, because no structure on Earth is so high.
@@ -215,7 +215,7 @@ class BuildingModel(PolygonModel):
 
 
 class ForestModel(PolygonModel):
-    """A wooded area, which is a medium if it has a height, and then has single trees if ``trees`` is true."""
+    """A wooded area. With a height it is a medium, which also has single trees if ``trees`` is true."""
 
     trees_per_hectare: _NotNegative = 100.0
     minimum_spacing_m: _NotNegative = 4.0
@@ -347,7 +347,7 @@ class _PlacedError(UsageError):
 
 @contextmanager
 def _at(*location: Any) -> Iterator[None]:
-    """Attach this key to errors from inside, unless they name a file or a nearer key."""
+    """Attach this key to errors raised in the block, unless they name a file or a nearer key."""
     try:
         yield
     except UsageError as error:
@@ -464,7 +464,7 @@ def _ground_above_sea_m(model: SiteModel, dem: Dem | None) -> float | None:
     return None if dem is None else float(dem.absolute_m(0.0, 0.0))
 
 
-# Largest difference between elevation models and surveys [m]. That of geoid and ellipsoid is larger.
+# Largest difference between elevation models and surveys [m]. The difference between geoid and ellipsoid is larger.
 _HEIGHTS_AGREE_M = 5.0
 
 
@@ -698,7 +698,7 @@ def _trees(
     towers: Mapping[str, Tower],
     notes: list[str],
 ) -> tuple[Trees, Trees]:
-    """Return the trees of the site, and the trees of forest stands, which only opaque foliage uses."""
+    """Return the trees of the site, and separately those of forest stands, which only opaque foliage uses."""
     # do not place trees inside houses or on masts
     clear = shapely.union_all(
         [building.footprint for building in buildings]
@@ -933,7 +933,7 @@ def site_files(name: str, folder: Path) -> Iterator[tuple[str, str, Path]]:
         yield text, f"site: {key}", place
 
 
-# the key has size and time, so that a site that is edited between two tasks is read again
+# size and time are arguments, so that a site that is edited between two tasks is read again
 @lru_cache(maxsize=16)
 def _site_model(site: str | Path, _size: int, _mtime_ns: int) -> SiteModel:
     """Return a checked site file, cached because a campaign requests it with every task."""

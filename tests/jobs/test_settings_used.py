@@ -91,7 +91,7 @@ def test_an_antenna_of_another_band_is_the_first_caution(tmp_path: Path, capsys:
     [
         ({"antennas": {"LW9.A": "lake_wheeler/dataset12_LW1.USRP1"}}, "no tower 'LW9'", "uav, LW1.A, LW2.B"),
         ({"antennas": {"LW1.B": "lake_wheeler/dataset12_LW1.USRP1"}}, "no channel 'LW1.B'", "uav, LW1.A, LW2.B"),
-        ({"antennas": {"uav": "lake_wheeler/dataset13_uav"}}, "nothing learned is called", "lake_wheeler/dataset12_uav"),
+        ({"antennas": {"uav": "lake_wheeler/dataset13_uav"}}, "no learned model is called", "lake_wheeler/dataset12_uav"),
         ({"link": {"channels": {"USRP1": {"carrier_hz": 3.3e9}}}}, "no channel 'USRP1'", "one of A, B"),
         ({"link": {"rss": {"carrier_hz": 3.3e9, "towers": {"LW9": {}}}}}, "no tower 'LW9'", "LW1, LW2, LW3"),
         ({"rank": {"tower": "LW9"}}, "no tower 'LW9'", "LW1, LW2, LW3"),

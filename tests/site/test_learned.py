@@ -106,7 +106,10 @@ def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("antennas", "said"),
     [
-        ({"uav": "mine/d13_uav"}, "nothing learned is called 'mine/d13_uav' for the UAV; expected one of mine/d12_uav"),
+        (
+            {"uav": "mine/d13_uav"},
+            "no learned model is called 'mine/d13_uav' for the UAV; expected one of mine/d12_uav",
+        ),
         ({"uav": "mine/d12_LW1.A"}, "expected one of mine/d12_uav"),
         ({"LW1.A": "mine/d12_uav"}, "expected one of mine/d12_LW1.A"),
         ({"uav": "other/d12_uav"}, "there is no such learned model in .*other.learned"),

@@ -237,7 +237,7 @@ def test_parts_of_a_building_have_their_own_heights(tmp_path: Path) -> None:
         (400, 20),
         (400, 20),
     ]
-    assert said(footprints, "feature 1: gives way to its mapped parts")
+    assert said(footprints, "feature 1: replaced by its mapped parts")
     assert said(footprints, "feature 3: it begins above the ground")
 
 

@@ -108,7 +108,7 @@ def test_a_solid_without_a_tag_is_said_to_be_no_building(tmp_path: Path) -> None
     (tmp_path / "a.kml").write_text(bare)
     content = import_footprints([tmp_path / "a.kml"], FRAME)
     assert len(content.geofences) == 1
-    assert any("9.5 m high without a tag: taken as a geofence" in text for text in content.actions)
+    assert any("9.5 m high without a tag: used as a geofence" in text for text in content.actions)
     assert heights(import_footprints([tmp_path / "a.kml"], FRAME, untagged="building")) == [9.5]
 
 

@@ -137,7 +137,7 @@ def test_an_elevation_file_is_the_ground(tmp_path: Path) -> None:
     (tmp_path / "site.yaml").write_text(site_yaml(model, header=actions))
     roof, mast = load_site(tmp_path / "site.yaml").towers.values()
     assert mast.position_m[2] - roof.position_m[2] == pytest.approx(4.0 + 12.0 - 25.0, abs=0.1)
-    assert "heights count from the sea" in actions[0]
+    assert "heights are above sea level" in actions[0]
     with pytest.raises(UsageError, match="names no coordinate system"):
         import_site([campus(tmp_path / "c.geojson")], **chosen)
     (tmp_path / "ground.asc").write_text(head.replace("151.17", "12.17") + rows)

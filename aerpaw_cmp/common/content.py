@@ -1,9 +1,10 @@
 """SHA-256 of the content of records, arrays and shapes, used as cache key.
 
-The logs that a file was learned from, by SHA-256 and by marks: how a learned file lists them, and how they are read.
+The module also reads the list of training logs in a learned file, which contains their SHA-256 and fingerprints
+(marks).
 
-No learned model is scored on its training logs. Names, folders and archives of a log may change: its SHA-256 identifies
-it, and if its bytes were changed, its fingerprints do (:mod:`aerpaw_cmp.flight.training`).
+No learned model is scored on its training logs. The name, folder or archive of a log may change. It is therefore
+identified by its SHA-256, or by its fingerprints if its bytes were changed (:mod:`aerpaw_cmp.flight.training`).
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ def trained_on(text: str) -> tuple[str, ...]:
 
 
 def marks(text: str) -> tuple[str, ...]:
-    """Return marks of the logs that a learned file was learned from, as :func:`trained_on`.
+    """Return the fingerprints of every log that a learned file lists, like :func:`trained_on`.
 
     Examples
     --------

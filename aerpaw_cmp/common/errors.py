@@ -162,8 +162,8 @@ def parsing(
     """Convert exceptions that a parser raises because of a file's content into :class:`InputError` about that file.
 
     Libraries raise two dozen kinds of exceptions for damaged files, such as RecursionError for a nested JSON, csv.Error
-    for a long cell, struct.error, and MemoryError for a forged length. Only reading belongs inside this context, no
-    computation.
+    for a long cell, struct.error, and MemoryError for a forged length. Only use this context for reading, not for
+    computations.
 
     Parameters
     ----------

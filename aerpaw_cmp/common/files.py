@@ -20,7 +20,7 @@ LARGEST_TABLE = 64 << 20
 def inside(
     folder: Path, name: str, source: Path, *, plain: bool = False, error: type[AerpawCmpError] = InputError
 ) -> Path:
-    """Return the path of a file that another file names, below a folder. Use no other way from such a name to a path.
+    """Return the path, below a folder, of a file that another file names. Use this function for all such names.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
         size = os.fstat(file.fileno()).st_size
         chunks: list[bytes] = []
         total = 0
-        # counted too: pipes, devices and files of /proc report a size of 0 bytes
+        # count the bytes, because pipes, devices and files of /proc report a size of 0 bytes
         while size <= most and total <= most and (chunk := file.read(_CHUNK)):
             chunks.append(chunk)
             total += len(chunk)
@@ -158,7 +158,7 @@ def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
 
 
 def read_input(path: Path, most: int, expected: str = "a file") -> bytes:
-    """Return the content of a file of at most ``most`` bytes. InputError if it is larger or cannot be read."""
+    """Return the content of a file of at most ``most`` bytes. Raise InputError if it is larger or unreadable."""
     try:
         return read_bounded(path, most, expected)
     except OSError as error:
@@ -215,7 +215,7 @@ def read_sealed(path: Path, mark: bytes) -> bytes | None:
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file atomically. OutputError if it cannot be written."""
+    """Write a file atomically. Raise OutputError if it cannot be written."""
     try:
         with atomic_path(path) as part:
             part.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)

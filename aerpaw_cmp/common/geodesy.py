@@ -63,7 +63,7 @@ class SiteFrame:
 
 
 def bearing_deg(vectors: FloatArray) -> FloatArray:
-    """Compass bearing (...) of vectors (..., 2 or more) of east and north: clockwise from north, (-180, 180] deg.
+    """Return compass bearings (...) of vectors (..., 2 or more) east, north: clockwise from north, (-180, 180] deg.
 
     Examples
     --------
@@ -74,7 +74,7 @@ def bearing_deg(vectors: FloatArray) -> FloatArray:
 
 
 def azimuth_rad(vectors: FloatArray) -> FloatArray:
-    """Mathematical azimuth (...) of vectors (..., 2 or more): from the first axis towards the second, (-pi, pi] rad.
+    """Return azimuths (...) of vectors (..., 2 or more) from the first axis towards the second, in (-pi, pi] rad.
 
     Examples
     --------

@@ -10,7 +10,7 @@ second thread then ends the process.
 
 scancel, systemd and docker send SIGTERM, and a closed terminal sends SIGHUP. Both end a command as Ctrl-C does.
 
-Standard streams that are closed, full or gone are not bugs of the program.
+A standard stream that is closed, full or gone is not treated as a bug of the program.
 
 The streams of a command store the first error of their descriptor and then discard output; :func:`output_fault` returns
 it.
@@ -63,7 +63,7 @@ def raise_interrupt() -> None:
     Raises
     ------
     KeyboardInterrupt
-        If one came.
+        If an interrupt was swallowed.
     """
     if _signalled:
         raise KeyboardInterrupt
@@ -105,7 +105,7 @@ def noted() -> Iterator[None]:
 
 
 def _set(numbers: tuple[int, ...], handler: _Handler, *untouched: _Handler) -> list[tuple[int, _Handler]]:
-    """Set a handler for signals whose handler is in ``untouched`` (default: Python's). Return the previous ones."""
+    """Set a handler for signals whose handler is in ``untouched`` (default: Python's). Return the previous handlers."""
     if threading.current_thread() is not threading.main_thread():
         return []
     # a program that embeds this one may handle its signals, so keep its handlers
@@ -150,7 +150,7 @@ def _watch(signals: int, ended: threading.Event) -> None:
     while number := os.read(signals, 1):
         if not ended.wait(PATIENCE_S) and not _signalled and signal.getsignal(number[0]) is _note:
             _clear()
-            # not print: the blocked thread may hold the lock of the stream
+            # do not use print, because the blocked thread may hold the lock of the stream
             os.write(2, f"aerpaw-cmp: {said(number[0])} in a long calculation; its output was not written\n".encode())
             # sys.exit would end only this thread
             os._exit(SIGNALLED + number[0])
@@ -172,7 +172,7 @@ def held() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in SIGNALS}
     ours = {number: handler for number, handler in before.items() if callable(handler)}
     for number in ours:
-        # not blocked by a mask: a thread of a library would receive the signal instead
+        # do not block signals by a mask, because a thread of a library would receive them instead
         signal.signal(number, lambda number, _frame: signals.append(number))
     try:
         yield
@@ -199,7 +199,7 @@ class _Descriptor(io.FileIO):
 
 
 def guard() -> None:
-    """Replace the standard streams of this process by such streams, but not streams of tests or other programs.
+    """Replace the standard streams of this process by :class:`_Descriptor`, except streams of tests or other programs.
 
     Closed descriptors are opened first: otherwise the next files would get their numbers and receive the printed
     output. Writing to them fails as before.

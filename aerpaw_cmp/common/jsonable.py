@@ -62,7 +62,7 @@ def json_object(**entries: Any) -> dict[str, Any]:
 
 
 def _listed(array: AnyArray) -> Any:
-    if array.dtype.kind == "f":  # large maps: one pass, not one call per number
+    if array.dtype.kind == "f":  # convert large maps in one pass
         # Python's floats: JSON writes them with the fewest digits that restore the same value
         boxed = array.astype(object)
         boxed[~np.isfinite(array)] = None

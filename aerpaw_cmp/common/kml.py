@@ -35,7 +35,7 @@ def xml_root(data: bytes, path: Path | None, expected: str) -> ElementTree.Eleme
     if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
         raise InputError("the XML declares entities, or is not UTF-8", expected=expected, path=path)
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()  # a KML with gx:Track and no xmlns:gx is common
-    # one piece of text for an element: otherwise expat returns it line by line
+    # request the text of an element in one piece: otherwise expat returns it line by line
     parser.buffer_text = True
     parser.StartElementHandler = builder.start
     parser.EndElementHandler, parser.CharacterDataHandler = builder.end, builder.data
@@ -72,7 +72,7 @@ def outermost(root: ElementTree.Element, names: set[str]) -> Iterator[ElementTre
             walk += reversed(element)
 
 
-# Resolution of legends.
+# Resolution of legends [dots per inch].
 _DPI = 110
 
 # --- reading -------------------------------------------------------------------------------------------------------
@@ -150,9 +150,9 @@ def _in_threes(numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
 
 # --- writing -------------------------------------------------------------------------------------------------------
 
-# Z grey, then ranks 1 to 4 from dark to light (viridis), then spare ones.
+# Colours of the classes: Z grey, then ranks 1 to 4 from dark to light (viridis), then spare colours.
 CLASS_COLOURS = ("#9e9e9e", "#440154", "#31688e", "#35b779", "#fde725", "#e66101", "#b2182b")
-# Fixed, so that the same content gives the same bytes.
+# Date of all entries, which is fixed so that the same content has the same bytes.
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -269,7 +269,7 @@ def list_legend(title: str, colours: Mapping[str, str], width: float = 2.6) -> b
     import matplotlib
     from PIL import Image, ImageDraw, ImageFont
 
-    # drawn without a figure of matplotlib, which takes 0.1 s; partly transparent, so that the ground is visible
+    # do not use a figure of matplotlib, which takes 0.1 s; keep the ground visible by partial transparency
     size = round(width * _DPI), round((0.38 + 0.155 * len(colours)) * _DPI)
     picture = Image.new("RGBA", size, (255, 255, 255, 230))
     pen = ImageDraw.Draw(picture)

@@ -70,7 +70,7 @@ def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
 
 def _in_child(kind: str, data: bytes) -> tuple[int, bytes, bytes]:
     """Return exit code, standard output and standard error of the child."""
-    # isolated, with the paths of this process: an untrusted working folder may contain a numpy.py
+    # use isolated mode with the paths of this process: an untrusted working folder may contain a numpy.py
     command = [sys.executable, "-I", "-c", _CHILD, kind, *(path for path in sys.path if path)]
     try:
         # limits of processor time do not end a child that only waits
@@ -80,7 +80,8 @@ def _in_child(kind: str, data: bytes) -> tuple[int, bytes, bytes]:
     return child.returncode, child.stdout, child.stderr
 
 
-# The environment variables of the child process: no HDF5_PLUGIN_PATH, no GDAL_DRIVER_PATH; threads cost memory limits.
+# The environment variables of the child process: no HDF5_PLUGIN_PATH, no GDAL_DRIVER_PATH, and one thread, because each
+# needs memory.
 _ENVIRON = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
 
 
@@ -222,7 +223,7 @@ def _data_sets(group: Any, depth: int, kinds: str, path: str = "", seen: set[Any
             raise InputError(f"the file has more than {_MOST_ITEMS} items", expected="a log", cause="no log")
         address = h5py.h5o.get_info(item.id).addr
         if address in seen:
-            continue  # the file is linked twice, or contains itself
+            continue  # the group is linked twice, or contains itself
         seen.add(address)
         if isinstance(item, h5py.Group) and depth > 1:
             found |= _data_sets(item, depth - 1, kinds, f"{place}/", seen)

@@ -350,8 +350,8 @@ class OutputFolder:
             working_folder = Path.cwd().resolve()
             if self.target == working_folder or self.target in working_folder.parents or os.path.ismount(self.target):
                 raise UsageError(
-                    "the folder is replaced as a whole, and that cannot be done to one that a command runs in or that "
-                    "a file system is mounted on",
+                    "a result folder is replaced as a whole, which is not possible for the working folder, a folder "
+                    "above it or a mount point",
                     expected=f"a folder inside it, such as {one_line(str(self.named / self._job))}",
                     path=self.named,
                 )
@@ -413,7 +413,7 @@ class OutputFolder:
         head = f"{_SUMS_HEAD} the files of one run of '{self._job}'; 'sha256sum -c {SUMS}' checks them\n"
         (place.part / SUMS).write_text(head + sums, encoding="utf-8")
         _sync_tree(place.part)
-        self._refuse_content()  # a file that was created meanwhile
+        self._refuse_content()  # refuse a file that was created meanwhile
         replaced = self.target.is_dir()
         for folder in (place.part, *(entry for entry in place.part.rglob("*") if entry.is_dir())):
             before = self.target / folder.relative_to(place.part)
@@ -506,7 +506,7 @@ class _Place:
             _clear(self.part, keep=True)
         if foreign := next(self.part.iterdir(), None):
             raise UsageError(
-                f"the hidden place {one_line(str(self.part))} holds what is not this tool's: {one_line(foreign.name)}",
+                f"the path {one_line(str(self.part))} contains files of other programs: {one_line(foreign.name)}",
                 expected="no other files there: move them away",
                 path=self.named,
             )
@@ -529,7 +529,7 @@ class _Place:
             if not _is_own(os.fstat(descriptor)):
                 os.close(descriptor)
                 raise UsageError(
-                    f"the hidden place {one_line(str(self.part))} belongs to another user",
+                    f"the temporary path {one_line(str(self.part))} belongs to another user",
                     expected="your own temporary path: remove this one, or name another output",
                     cause="a shared folder, whose other user could replace the results before they are complete",
                     path=self.named,
@@ -581,7 +581,7 @@ def _is_own(status: os.stat_result) -> bool:
 
 
 def _lock(descriptor: int) -> bool:
-    """Check whether the lock was obtained. True also on systems and disks without locks."""
+    """Lock a file. Return whether the lock was obtained, which is also true on systems and disks without locks."""
     try:
         import fcntl
 

@@ -123,7 +123,7 @@ class Stages:
     plan: Plan | None = None
 
     def checked(self, rest: Callable[[], Iterable[PlannedStage]]) -> None:
-        """End a dry run by :class:`NotRun`: a job calls it when only computing is left, the stages of ``rest``."""
+        """End a dry run with :class:`NotRun`. A job calls this before it computes the remaining stages ``rest``."""
         if self.plan is not None:
             done = (PlannedStage(name, "done", seconds) for name, seconds in self.seconds.items())
             raise NotRun(replace(self.plan, stages=(*done, *rest())))
@@ -134,12 +134,12 @@ class Stages:
         raise_interrupt()
         if name not in self.seconds:
             self.progress(name)
-        # a monotonic clock: the time of day may be set while a job runs
+        # use a monotonic clock, because the time of day may be set while a job runs
         start = time.perf_counter()
         try:
             yield
         finally:
-            # also after a failure or an interrupt: the page reports the time spent
+            # store it also after a failure or an interrupt, because the page reports the time spent
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
             give_memory_back()
 

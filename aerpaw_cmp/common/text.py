@@ -1,8 +1,8 @@
 """Short texts: the commands and their help, counts with nouns, cells of CSV files, HTML tables.
 
-The commands and their one-line help, for ``--help`` without loading anything and for the command line itself.
+The commands and their one-line help are in this module, so that ``--help`` does not load anything else.
 
-The module also formats numbers of things as words.
+The module also writes counts with their nouns.
 
 Text cells of CSV files are guarded: names come from third-party logs, and a spreadsheet runs cells that begin with = +
 - or @.
@@ -55,12 +55,12 @@ def counted(number: int, noun: str, plural: str = "") -> str:
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 
 
-# also behind a semicolon: where it separates cells, the next character begins a cell, and unguarded() would remove an
-# apostrophe of the log
+# Begin of a cell, which may also follow a semicolon. An apostrophe of the log is guarded, too, because unguarded()
+# would otherwise remove it
 _BEGINNING = re.compile(r"(^|;)(?=[=+\-@\t\r'])")
 _GUARDED = re.compile(r"(^|;)'")
-# within a comment a separator begins a cell, too; numbers stay as they are, because some comments contain tables of
-# numbers
+# In a comment a cell also begins after a separator. Numbers are not guarded, because some comments contain tables of
+# numbers.
 _IN_COMMENT = re.compile(r"([,;\t]\s*)(?=[=@]|[+\-](?![\d.]|inf|nan))")
 
 
@@ -72,7 +72,7 @@ def guarded(table: Any) -> Any:
     guarded_columns = {}
     for name in table.columns:
         if table[name].dtype.kind == "O" or str(table[name].dtype).startswith("str"):
-            # by distinct word: a million rows contain a few names
+            # check each distinct word once, because a million rows contain a few names
             words = [word for word in table[name].unique() if isinstance(word, str) and _BEGINNING.search(word)]
             if words:
                 texts = table[name].astype(object)

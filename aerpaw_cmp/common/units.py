@@ -55,7 +55,8 @@ class Printed(float):
 def unmasked(values: ArrayLike, dtype: Any = np.float64) -> AnyArray:
     """Return an array of numbers with NaN instead of masked values, such as gaps of NetCDF and GeoTIFF.
 
-    Each function that receives arrays from callers calls it first: ``np.asarray`` would give what lies under the mask.
+    Each function that receives arrays from callers calls it first: ``np.asarray`` would return the values under the
+    mask.
 
     Examples
     --------
@@ -69,7 +70,7 @@ def unmasked(values: ArrayLike, dtype: Any = np.float64) -> AnyArray:
 
 
 def noise_floor_dbm(bandwidth_hz: float, noise_figure_db: float = 0.0) -> float:
-    """Noise power of a receiver [dBm]: k T B F at 290 K (ITU-R P.372, eq. 1 to 4).
+    """Return the noise power of a receiver [dBm]: k T B F at 290 K (ITU-R P.372, eq. 1 to 4).
 
     Examples
     --------
@@ -80,7 +81,7 @@ def noise_floor_dbm(bandwidth_hz: float, noise_figure_db: float = 0.0) -> float:
 
 
 def wavelength_m(frequency_hz: float) -> float:
-    """Free-space wavelength [m] of a frequency [Hz]."""
+    """Return the free-space wavelength [m] of a frequency [Hz]."""
     return SPEED_OF_LIGHT_MPS / frequency_hz
 
 
@@ -113,7 +114,7 @@ def amplitude_from_db(level_db: ArrayLike) -> FloatArray:
 
 
 def wrap_degrees(angle_deg: ArrayLike) -> FloatArray:
-    """Angle wrapped to [-180, 180) degrees."""
+    """Return angles wrapped to [-180, 180) degrees."""
     return np.asarray((unmasked(angle_deg) + 180.0) % 360.0 - 180.0)
 
 
@@ -131,7 +132,7 @@ def finite_mean(values: ArrayLike) -> float:
 
 
 def spread_out(count: int, most: int) -> IntArray:
-    """Return indices of at most ``most`` of ``count`` items, evenly apart, the first and the last among them.
+    """Return indices of at most ``most`` of ``count`` items, evenly spaced, including the first and the last.
 
     Examples
     --------

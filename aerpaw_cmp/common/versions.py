@@ -1,4 +1,4 @@
-"""Versions of everything that shapes a number."""
+"""Versions of this program and of the libraries that affect its results."""
 
 from __future__ import annotations
 

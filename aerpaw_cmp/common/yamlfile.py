@@ -8,7 +8,7 @@ expand to more than :data:`_MAX_NODES` nodes and nesting deeper than :data:`_MAX
 
 Values of some keys can be edited in a YAML file: every other line, its comments and its order stay unchanged.
 
-Files that a settings file names: inputs, which no output may replace.
+The module also lists the files that a settings file names. These are inputs, which no output may replace.
 
 There is no list of keys: every text that names an existing file counts, so that a new key is not forgotten.
 """
@@ -65,8 +65,8 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 class StrictModel(pydantic.BaseModel):
     """The base class of all settings: no unknown keys, only finite numbers, and no change after loading."""
 
-    # neither NaN nor infinity: comparisons do not refuse NaN, and JSON contains neither. Deferred: the validators of
-    # all parts are built together on first use.
+    # Refuse NaN and infinity, because comparisons do not refuse NaN, and JSON has neither. Defer the build, so that the
+    # validators of all parts are built together on first use.
     model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True
     )
@@ -120,7 +120,7 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
     Raises
     ------
     InputError
-        There is no such file, or it cannot be read.
+                If there is no such file, or it cannot be read.
     UsageError
         With path and line, if the file is not text or YAML, has duplicate or unknown keys (with the nearest valid key),
         or wrong or missing values.
@@ -131,7 +131,7 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
 def load_yaml_and_lines(path: str | Path, model: type[ModelT]) -> tuple[ModelT, LineOf]:
     """Return the settings of :func:`load_yaml`, and a function that returns the line of a key as ``("towers", "LW1")``.
 
-    It is for checks that need more than the file and whose messages must also contain the line.
+    Use it for checks that need more than the file, if their messages must contain the line.
     """
     document = _parse(_read_text(Path(path)), path)
     return _checked(document, model, path), document.line
@@ -140,7 +140,7 @@ def load_yaml_and_lines(path: str | Path, model: type[ModelT]) -> tuple[ModelT, 
 def dump_yaml(content: Mapping[str, Any]) -> str:
     """Return settings as YAML text that :func:`load_yaml` reads back to the same values.
 
-    PyYAML writes for YAML 1.1, where ``1e3`` is a word; words that YAML 1.2 reads as something else are quoted here.
+    PyYAML writes YAML 1.1, where ``1e3`` is text. Text that YAML 1.2 reads as another type is therefore quoted here.
     """
     return str(
         yaml.dump(content, Dumper=_dumper(), sort_keys=False, allow_unicode=True, default_flow_style=None, width=118)
@@ -280,7 +280,7 @@ class _Builder:
             self._fail(event, f"the file unfolds to more than {_MAX_NODES} values (aliases of aliases?)")
 
     def _value(self, event: Any, location: Location) -> Any:
-        """Return the scalar, list or mapping that begins with an event. An anchor is known from its end on."""
+        """Return the scalar, list or mapping that begins with an event. Its anchor can be used after its end."""
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in self.anchors:
                 self._fail(event, f"the alias '*{event.anchor}' names no anchor above it, or contains itself")
@@ -366,7 +366,7 @@ def _explain(
     for item in error.errors(include_url=False):
         problem, cause = _finding(item, model)
         findings.append((document.line(item["loc"]), problem, cause))
-    # in the order of the file; pydantic reports them in the order of the model
+    # sort by line, because pydantic reports errors in the order of the model
     findings.sort(key=lambda finding: finding[0] or 0)
     if len(findings) == 1:
         line, problem, cause = findings[0]
@@ -537,7 +537,8 @@ def _edited(text: str, path: KeyPath, value: Any) -> str:
 
 def _flow(value: Any) -> str:
     """Return a value as YAML on one line."""
-    # a width that no line reaches, because wrapped lines would need an indent. PyYAML ends a plain scalar with "..."
+    # use a width that no line reaches, because wrapped lines would need an indent. Remove the "..." that PyYAML writes
+    # after a plain scalar.
     line: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6)
     return line.removesuffix("\n").removesuffix("\n...")
 

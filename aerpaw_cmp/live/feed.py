@@ -164,7 +164,7 @@ class Feed:
         self._ended: Mapping[str, Any] | None = None
 
     def put(self, modem: int, item: Record | TapStatus) -> None:
-        """Add a record or a status, without blocking. The oldest is dropped if too many wait."""
+        """Add a record or a status, without blocking. The oldest item is dropped if too many wait."""
         self._pending.append((modem, item))
 
     def end(self, ended: Mapping[str, Any]) -> None:
@@ -342,7 +342,7 @@ class Feed:
         return alarm
 
     def _update_alarms(self) -> bool:
-        """Open and close alarms according to the present state. Return whether one changed."""
+        """Open and close alarms according to the present state. Return whether an alarm changed."""
         changed = False
         for modem in self._modems:
             conditions = {} if modem.ended or self._ended else _alarms_of(modem, self.now())

@@ -33,7 +33,7 @@ from ..logs.files import Record, encode_record
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """The wall and monotonic clock [ns]. A test supplies others."""
+    """The wall and monotonic clock [ns]. Tests use other clocks."""
 
     utc_ns: Callable[[], int] = time.time_ns
     mono_ns: Callable[[], int] = time.monotonic_ns
@@ -139,7 +139,7 @@ class TapLog:
 
     @property
     def lost(self) -> int:
-        """Records that memory could not hold while the disk did not accept any."""
+        """Number of records that were lost, because the disk did not accept them and memory was full."""
         return self._dropped + self._refused
 
     def open(self) -> None:
@@ -266,13 +266,13 @@ class TapLog:
         return True
 
     def _put(self, record: Record) -> None:
-        """Write a record as one line. Its number in the session also counts lost records, so that readers miss them."""
+        """Write a record as one line. Its number also counts lost records, so that readers notice the loss."""
         record["n"] = self.records + self.lost
         line = encode_record(record)
-        # a part of a line that could not be cut off becomes a separate line, which its checksum refuses
+        # if a truncated line could not be removed, end it, so that its checksum refuses only that line
         data = b"\n" + line if self._torn else line
         written = os.write(self._fd, data)
-        # the disk became full within the line: no truncated line may stay inside the file
+        # if the disk became full within the line, remove the truncated line from the file
         if written < len(data):
             try:
                 os.ftruncate(self._fd, self._size)
@@ -315,7 +315,7 @@ class TapLog:
 
     def _new_segment(self) -> None:
         path = self._folder / f"{self._stem}_{len(self.paths) + 1:04d}.jsonl"
-        # O_EXCL: never into the segment of another session
+        # O_EXCL: never write into the segment of another session
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o644)
         self._size, self._torn = 0, False
         try:

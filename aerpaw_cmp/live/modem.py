@@ -319,7 +319,7 @@ def _decode_csi_ctrl(lines: Sequence[str], flags: list[str]) -> Values:
 
 
 def _decode_identity(lines: Sequence[str], flags: list[str]) -> Values:
-    """``ATI``: maker, model, ``Revision:``."""
+    """Decode the answer to ``ATI``: maker, model and ``Revision:``."""
     values: Values = {"text": [line for line in lines if not line.startswith("Revision:")]}
     for line in lines:
         if line.startswith("Revision:"):
@@ -367,7 +367,7 @@ def encode(command: str, *, allow_csi: bool = False) -> bytes:
     Raises
     ------
     UsageError
-        If the command is not on the list, holds CR, LF or ``;``, or writes without ``allow_csi``.
+        If the command is not on the list, contains CR, LF or ``;``, or writes without ``allow_csi``.
 
     Examples
     --------
@@ -412,7 +412,7 @@ _CUT_NUMBER = re.compile(r"\d{5,}$")
 
 
 class Redactor:
-    """Removes IMEI, IMSI, ICCID, telephone numbers and message texts from lines, in their order of arrival.
+    """A filter that removes IMEI, IMSI, ICCID, telephone numbers and message texts from lines, in order of arrival.
 
     Examples
     --------
@@ -482,7 +482,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Unsolicited:
-    """A line that belongs to no command. ``dropped`` is the number of its bytes that were not stored."""
+    """A line that does not belong to a command. ``dropped`` is the number of its bytes that were not stored."""
 
     text: str
     dropped: int = 0
@@ -490,7 +490,7 @@ class Unsolicited:
 
 @dataclass(frozen=True, slots=True)
 class Late:
-    """An answer that came after its time-out: kept, matched to nothing."""
+    """An answer that came after its time-out. It is stored, but not assigned to a query."""
 
     lines: tuple[str, ...]
     status: Status
@@ -529,7 +529,7 @@ def _final_result(text: str) -> tuple[Status, str | None] | None:
 
 
 def is_unsolicited(text: str) -> bool:
-    """Check whether a line is of a kind that modems send unasked (some are answers too, to their own query)."""
+    """Check whether a line is of a kind that modems send unasked (some are also answers to a query)."""
     return _UNSOLICITED.match(text) is not None
 
 
@@ -560,7 +560,7 @@ def unglue(text: str) -> tuple[str, ...]:
 
 @dataclass(slots=True)
 class _Open:
-    """The command in flight, and what came for it."""
+    """The command in flight, and the lines received for it."""
 
     command: str
     prefixes: tuple[str, ...] | None
@@ -577,7 +577,7 @@ def _matches(text: str, prefixes: tuple[str, ...] | None) -> bool:
 
 
 class Framer:
-    r"""Answers to known commands, one in flight at a time.
+    r"""A parser of the answers to known commands, one of which is in flight at a time.
 
     A command that timed out may still be answered. A late answer becomes a :class:`Late` event. It is distinguished
     from the next command's answer by its prefix, or by the echo if the modem echoes.
@@ -648,7 +648,7 @@ class Framer:
     def give_up(self, status: Literal["timeout", "lost"] = "timeout") -> Answer:
         """End the command in flight without a final result.
 
-        After ``timeout`` its answer is owed and may come late; after ``lost`` the buffer is emptied.
+        After ``timeout`` the answer is still expected and may come late. After ``lost`` the buffer is emptied.
         """
         assert self._open is not None
         now, self._open = self._open, None
@@ -666,14 +666,14 @@ class Framer:
         return answer
 
     def leave(self) -> tuple[tuple[str, ...], str]:
-        """Return and forget what is held and belongs to nothing: lines of owed answers, and the unfinished line."""
+        """Return and remove the stored lines that do not belong to an answer, and the unfinished line."""
         lines, self._stray = tuple(self._stray), []
         self._owed.clear()
         self._dropped = 0
         return lines, self._take_partial()
 
     def settle(self) -> list[Event]:
-        """Forget what is owed (a probe was answered, so the modem is in step again)."""
+        """Expect no more late answers, because a probe was answered after all earlier commands."""
         self._owed.clear()
         if not self._stray:
             return []
@@ -705,7 +705,7 @@ class Framer:
             events.append(Unsolicited(text, dropped))
 
     def _is_echo(self, text: str, now: _Open) -> bool:
-        # rubbish from before may come before the echo on the same line
+        # remains of earlier output may precede the echo on the same line
         upper, command = text.upper(), now.command.upper()
         # many lines that are not an echo end with a short command such as AT
         if now.echoed or not (upper == command or (len(command) > 6 and upper.endswith(command))):
@@ -720,7 +720,7 @@ class Framer:
     def _final(self, status: Status, code: str | None, events: list[Event]) -> None:
         now = self._open
         if now is None or self._is_owed_final(now, status):
-            if now is not None:  # before the echo of our command: not ours
+            if now is not None:  # before the echo of our command, so it belongs to another command
                 self._stray += now.lines
                 now.lines.clear()
             events.append(Late(tuple(self._stray), status, code))
@@ -738,7 +738,7 @@ class Framer:
         self._open = None
 
     def _is_owed_final(self, now: _Open, status: Status) -> bool:
-        """Check whether a final result ends an owed answer (a modem works off its commands in order)."""
+        """Check whether a final result ends a late answer, because a modem answers its commands in order."""
         if not self._owed:
             return False
         if self._echo_seen and not now.echoed:

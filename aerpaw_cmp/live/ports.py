@@ -2,11 +2,12 @@
 
 The port is opened with ``termios`` directly. pyserial empties the input queue when it opens, which would lose waiting
 answers. It requires a DTR ioctl that some USB paths refuse, and reports an unplugged cable by three
-unrelated exceptions (its issues 401 and 417). Here it is always :class:`PortGoneError`.
+unrelated exceptions (its issues 401 and 417). Here an unplugged cable always raises :class:`PortGoneError`.
 
 The module also contains settings, status and summary of a session of the tap.
 
-A separate thread writes the status to the terminal: a hanging terminal (Ctrl-S, a lost ssh connection) delays no poll.
+A separate thread writes the status to the terminal, so that a hanging terminal (Ctrl-S, a lost ssh connection) does not
+delay a poll.
 
 A schedule determines which query is due when.
 
@@ -62,7 +63,7 @@ class PortInfo:
     path : Path
         Path of the port: a stable name if there is one.
     device : Path
-        The node it leads to now.
+        The device node to which the path leads now.
     how : str
         ``given``, ``by-id`` or ``usb``.
     interface : str or None
@@ -140,15 +141,15 @@ def find_candidates(roots: Roots) -> list[PortInfo]:
 
 
 def find_port(path: Path, roots: Roots) -> PortInfo:
-    """Return what is known of a port.
+    """Return what is known about a port.
 
-    A given ``/dev/ttyUSB*`` that a by-id name leads to is followed by that name, so that it is found again when the
-    modem comes back under another number.
+    If a by-id name leads to the given ``/dev/ttyUSB*``, the port is followed by that name. It is then found again when
+    the modem comes back under another number.
 
     Raises
     ------
     PortGoneError
-        If it is not there.
+        If the port does not exist.
     """
     if not path.exists():
         raise PortGoneError(f"{path} is not there")
@@ -234,7 +235,7 @@ class SerialPort:
 
     @classmethod
     def open(cls, path: Path) -> SerialPort:
-        """Open a port for us alone.
+        """Open a port exclusively.
 
         Raises
         ------
@@ -309,7 +310,7 @@ class SerialPort:
                 poller = select.poll()
                 poller.register(self._fd, select.POLLOUT)
                 if not poller.poll(max(0.0, deadline - time.monotonic()) * 1e3):
-                    raise PortGoneError(f"{self.path} takes no bytes") from None
+                    raise PortGoneError(f"{self.path} does not accept bytes") from None
             except OSError as error:
                 raise PortGoneError(f"{self.path} is gone ({error.strerror})") from None
 

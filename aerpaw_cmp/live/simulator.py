@@ -1,6 +1,6 @@
 """A simulated modem: a pseudo-terminal that answers like an RM502Q-AE during a simulated flight.
 
-It speaks to whatever opens the port, so the tap, a terminal program and the tests all use the same thing.
+It answers any program that opens the port, so the tap, a terminal program and the tests use the same simulator.
 """
 
 from __future__ import annotations

@@ -240,7 +240,7 @@ class Tap:
             with contextlib.suppress(ports.PortGoneError):
                 if self._exchange("csi_ctrl", modem.csi_write(*self._csi_before))["status"] == "ok":
                     return True
-        self._say("CSI reporting stays on: the modem could not be asked to switch it back")
+        self._say("CSI reporting stays on: the command to restore it did not reach the modem or failed")
         return False
 
     # the port ---------------------------------------------------------------------------------------------
@@ -295,7 +295,7 @@ class Tap:
         self._last_final_ns = self._last_csi_ns = self._clock.mono_ns()
 
     def _probe(self) -> bool:
-        """Send a bare ``AT``. Its answer shows that all earlier commands were answered, so that none is mixed up."""
+        """Send a bare ``AT``. Its answer shows that no answer to an earlier command is pending."""
         if self._exchange("sync", timeout_s=self._settings.probe_timeout_s)["status"] in ("timeout", "lost"):
             return False
         self._in_step = True
@@ -448,7 +448,7 @@ class Tap:
         data = self._port.read()
         self._received += len(data)
         if self._first_bytes is not None:
-            # enough to distinguish NMEA from DIAG, however much a wrong port sends
+            # keep enough bytes to distinguish NMEA from DIAG, but not all that a wrong port sends
             self._first_bytes += data[: 4096 - len(self._first_bytes)]
         answer = None
         for event in self._framer.feed(data):
@@ -510,7 +510,7 @@ class Tap:
             self._last["rsrp_dbm"], self._last["sinr_db"] = nr.get("rsrp_dbm"), nr.get("sinr_db")
 
     def _other(self, event: modem.Event) -> None:
-        """Record a line or an answer that belongs to no command in flight."""
+        """Record a line or an answer that does not belong to the command in flight."""
         if isinstance(event, modem.Late):
             lines = [self._redactor.clean(line) for line in event.lines]
             self._event("late", lines=lines, status=event.status, code=event.code)
@@ -536,7 +536,7 @@ class Tap:
             poller.register(self._stop.fileno(), select.POLLIN)
         if self._port is not None:
             poller.register(self._port.fileno(), select.POLLIN)
-        # wake for the periodic tasks too
+        # also wake for the periodic tasks
         ready = poller.poll(max(0.0, min(timeout_s, self._settings.status_s)) * 1e3)
         return any(fd != self._stop.fileno() for fd, _ in ready)
 

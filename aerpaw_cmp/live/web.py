@@ -148,8 +148,8 @@ class WebServer(ThreadingHTTPServer):
         self.feed, self.page, self.limits = feed, page, limits or Limits()
         self._printed = not token
         self.token = token or secrets.token_urlsafe(12)
-        # not the token itself, and below a path that only this server knows: a browser sends cookies of 127.0.0.1 to
-        # every port of this computer, where another user may listen
+        # The cookie is not the token itself and is below a path that only this server knows: a browser sends cookies of
+        # 127.0.0.1 to every port of this computer, and another user may listen on one of them.
         self.pass_word = hmac.new(self.token.encode(), b"cookie", "sha256").hexdigest()
         self.base = f"/{hmac.new(self.token.encode(), b'path', 'sha256').hexdigest()[:32]}/"
         self._secrets = quote(self.token).encode(), self.pass_word.encode()

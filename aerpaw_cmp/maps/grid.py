@@ -367,7 +367,7 @@ class MapResult:
         return np.asarray(self.of_tower(self.rank, tower), dtype=np.int8)
 
     def rank_shares(self, tower: str | None = None) -> FloatArray:
-        """Return shares (altitudes, K, 1 + highest rank) of out of coverage and of ranks 1, 2, ... as in the paper."""
+        """Return the shares (altitudes, K, 1 + highest rank) of positions out of coverage and with rank 1, 2, ..."""
         rank = self.ranks(tower)
         return np.stack([(rank == number).mean(axis=-1) for number in range(HIGHEST_RANK + 1)], axis=-1)
 
@@ -485,7 +485,7 @@ def _ratios_db(singular_values: FloatArray) -> FloatArray:
 
 
 def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
-    """Return maps of a result as layers: joint ones, and with ``towers_too`` those of each tower alone."""
+    """Return the maps of a result as layers: joint maps, and with ``towers_too`` also the maps of each tower."""
     layers = [Layer("serving_tower", result.serving, "1", "Serving tower", result.tower_names)]
     kinds: tuple[Antennas, ...] = ("siso", "mimo")
     for tower in (None, *(result.tower_names if towers_too else ())):
@@ -509,7 +509,7 @@ def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
 
 def in_name(number: float, digits: int = 3) -> str:
     """Return a height or K as part of a layer's name: 030 for 30, 12p5 for 12.5."""
-    # padded with zeros, so that layers in the order of their names are in the order of their heights
+    # pad with zeros, so that layers sorted by name are also sorted by height
     return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")
 
 
@@ -597,7 +597,7 @@ class LinkBudget:
         return self.threshold_dbm
 
     def covered(self, level_dbm: FloatArray) -> FloatArray:
-        """Return 1 for covered positions and 0 for others, in the shape of the levels [dBm]. NaN is not covered."""
+        """Return 1 for covered and 0 for other positions, in the shape of the levels [dBm]. NaN is not covered."""
         lowest = -math.inf if self.level_dbm is None else self.level_dbm
         return (level_dbm >= lowest).astype(float)
 

@@ -29,7 +29,7 @@ An interpolator may use the M nearest samples within a radius, or M random sampl
 
 The tie rule: distances that agree to a micrometre are tied. Tied samples are ordered by their offset from the target:
 lower first, then southern, then western. On a regular grid every inner target therefore has the same pattern of
-neighbours, in whatever order the samples were given.
+neighbours, regardless of the order of the samples.
 """
 
 from __future__ import annotations
@@ -242,8 +242,9 @@ LARGEST_WEIGHTS = 100.0
 _SHARE_M = 1e-9
 # Below this condition number a Cholesky solution has at least 9 digits, so no second solution is needed.
 SOUND_CONDITION = 1e6
-# Bound by the pivots below which the condition number is not computed, which would take as long as the solution. Among
-# 40 000 systems of six correlations, including samples in lines and clusters, such systems stayed below 1e5.
+# If the bound by the pivots is below this, the condition number is not computed, because that takes as long as the
+# solution. Among 40 000 systems of six correlations, including samples in lines and clusters, such systems stayed below
+# 1e5.
 PLAINLY_SOUND = 3e3
 # Number of targets that may share weights and whose systems are factored together. It is smaller for systems with many
 # neighbours, so that a factor has at most the second number of elements.

@@ -46,7 +46,7 @@ from .grid import Grid, MapResult, serving_tower, voronoi_borders
 # A building within this distance of a hull counts [m]. It is far above rounding errors.
 NEAR_M = 0.01
 
-# Largest level above free space [dB], that of ten paths in phase, each as strong as the direct one.
+# Largest level above free space [dB]: that of ten paths in phase, each as strong as the direct path.
 _IN_PHASE_DB = 20.0
 
 # Fields of a :class:`~aerpaw_cmp.maps.grid.MapResult` with a value per position.
@@ -55,7 +55,7 @@ PLANES = ("rss_siso_dbm", "rss_mimo_dbm", "level_sd_db", "rank", "spread_db", "c
 
 @dataclass(frozen=True, slots=True)
 class Tiling:
-    """A grid in square tiles with ``cells`` positions per side, numbered like positions. The last may be smaller."""
+    """A grid in square tiles with ``cells`` positions per side, numbered like positions. The last can be smaller."""
 
     grid: Grid
     cells: int

@@ -188,7 +188,7 @@ def test_what_comes_between_check_and_exchange_is_kept(tmp_path: Path, monkeypat
     assert content(target)["a"] == b"2"
     (hidden,) = tmp_path.glob(".*")
     assert (hidden / "mine").read_text() == "mine"
-    with pytest.raises(UsageError, match="holds what is not this tool's: mine"):
+    with pytest.raises(UsageError, match="contains files of other programs: mine"):
         write_folder(target, {"a": "3"})
     assert (hidden / "mine").read_text() == "mine"
 

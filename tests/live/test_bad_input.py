@@ -133,7 +133,7 @@ def test_reading_and_writing_a_gone_port():
 
 
 def test_a_port_that_takes_no_bytes():
-    with line() as (port, _), pytest.raises(PortGoneError, match="takes no bytes"):
+    with line() as (port, _), pytest.raises(PortGoneError, match="does not accept bytes"):
         port.write(b"x" * 10_000_000, timeout_s=0.1)
 
 

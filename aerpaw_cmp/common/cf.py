@@ -85,7 +85,7 @@ class Variable:
 
 
 class Dataset:
-    """The variables and attributes of a file, like ``xarray.Dataset``, whose import takes a second.
+    """The variables and attributes of a file, like ``xarray.Dataset``, but without its import, which takes a second.
 
     Parameters
     ----------

@@ -71,7 +71,7 @@ def locked(folder: Path) -> Iterator[None]:
     """Lock a folder for one process at a time. This has no effect on systems and disks without locks."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        # no fcntl on Windows, no locks on some network disks
+        # Windows has no fcntl, and some network disks have no locks
         with contextlib.suppress(ImportError, OSError):
             import fcntl
 

@@ -28,7 +28,9 @@ def gaussian_kernel(first: FloatArray, second: FloatArray, length: float) -> Flo
     from scipy.spatial.distance import cdist
 
     kernel = np.asarray(cdist(first, second, "sqeuclidean"))
-    kernel /= -2.0 * length**2  # in place: two more matrices of this size would take as long as the exponentials
+    kernel /= (
+        -2.0 * length**2
+    )  # compute in place: two more matrices of this size would take as long as the exponentials
     np.exp(kernel, out=kernel)
     return kernel
 
@@ -130,7 +132,7 @@ def determining(
     share : float
         Largest share of the variance that remains at any point.
     most : int
-        Largest number of points. If they are too few, more than the share remains.
+        Largest number of points. If it is reached first, more than ``share`` of the variance remains.
 
     Returns
     -------

@@ -173,5 +173,5 @@ def give_memory_back() -> None:
 def _library() -> ctypes.CDLL | None:
     try:
         return ctypes.CDLL(None)
-    except (OSError, TypeError):  # not possible there: the symbols of the running program are not available
+    except (OSError, TypeError):  # this system does not provide the symbols of the running program
         return None

@@ -120,7 +120,7 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
     Raises
     ------
     InputError
-                If there is no such file, or it cannot be read.
+        If there is no such file, or it cannot be read.
     UsageError
         With path and line, if the file is not text or YAML, has duplicate or unknown keys (with the nearest valid key),
         or wrong or missing values.
@@ -428,7 +428,7 @@ def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | Non
         message = words.format(**item.get("ctx", {})) if re.fullmatch(kind, item["type"]) else message
     if item["type"] in ("value_error", "assertion_error"):
         return (f"{where}: {message}" if where else message), None
-    message = re.sub(r"<\w+\.\w+: ('[^']*')>", r"\1", message)  # members of an Enum, as they are written
+    message = re.sub(r"<\w+\.\w+: ('[^']*')>", r"\1", message)  # write members of an Enum as in the file
     shown = repr(item["input"])
     shown = shown if len(shown) <= 60 else shown[:57] + "..."
     return f"{where}: found {shown}; expected {message}", None

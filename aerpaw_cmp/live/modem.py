@@ -120,7 +120,7 @@ _RANGES: Mapping[str, tuple[int, int]] = {
     "uplink_bandwidth_code": (0, 16),
     "tx_power_tenth_dbm": (-600, 300),
 }
-# Quectel's value for "unknown", the same divided by ten, and other such values of single fields.
+# Quectel's value for "unknown", and this value divided by ten. Some fields have additional values for "unknown".
 _MISSING = (-32768, -3276)
 _MISSING_OF = {"cqi": 255, "pcid": 65_535}
 

@@ -42,9 +42,9 @@ class FlightModem:
     Parameters
     ----------
     rank : callable, optional
-        ``rank(seconds) -> int``, 0 for no CSI; None: that of a built-in flight.
+        ``rank(seconds) -> int``, where 0 means no CSI. Default: the rank of a built-in flight.
     rsrp : callable, optional
-        ``rsrp(seconds) -> dBm``; None: that of a built-in flight.
+        ``rsrp(seconds) -> dBm``. Default: the RSRP of a built-in flight.
     """
 
     def __init__(

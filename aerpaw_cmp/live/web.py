@@ -221,7 +221,7 @@ class WebServer(ThreadingHTTPServer):
             request.close()
 
     def _accept(self, ready: selectors.BaseSelector) -> None:
-        """Let a connection wait for its request. If too many wait, close the oldest of the most frequent address."""
+        """Let a connection wait for its request. If too many wait, close the oldest one of the address with most."""
         try:
             request, address = self.socket.accept()
         except OSError:  # the listening socket is closed, or too many files are open

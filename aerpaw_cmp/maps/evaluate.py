@@ -140,7 +140,7 @@ def _not_a_knot_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
         right[..., end, :] = (
             (near + 2 * span)[..., None] * far[..., None] * slope[..., a, :] + near[..., None] ** 2 * slope[..., b, :]
         ) / span[..., None]
-    # dense, because NumPy solves many small systems at once and SciPy's banded solver one at a time
+    # use dense matrices, because NumPy solves many small systems at once, but SciPy's banded solver only one
     return np.asarray(np.linalg.solve(system, right))
 
 
@@ -281,11 +281,11 @@ class InverseDistance(_Local):
 
     def _combine(self, near: _Near) -> FloatArray:
         at = near.distance_m < kriging.TIE_M
-        # relative to the nearest sample, to prevent overflow
+        # use distances relative to the nearest sample, to prevent overflow
         ratio = near.distance_m[:, :1] / np.where(at, 1.0, near.distance_m)
         weight = np.where(at.any(axis=1, keepdims=True), at.astype(np.float64), ratio**2)
         weight /= weight.sum(axis=1, keepdims=True)
-        # relative to one sample, so that equal values stay equal
+        # average differences from one sample, so that equal values stay equal
         first = near.values[:, :1]
         return np.asarray(first[:, 0] + (weight[:, :, None] * (near.values - first)).sum(axis=1))
 
@@ -518,7 +518,7 @@ def paper_scores(grid: Grid, values: FloatArray, fit: variogram.BiExponential, s
     fit : BiExponential
         Correlation that Kriging uses.
     sampling : Sampling
-        Samples that each of them uses.
+                Samples that each interpolator uses.
 
     Returns
     -------

@@ -90,7 +90,7 @@ def write_csv(path: str | Path, maps: MapLayers) -> Path:
         "latitude_deg": np.round(latitude, 9), "longitude_deg": np.round(longitude, 9),
         **{layer.name: layer.values for layer in maps.layers},
     }  # fmt: skip
-    # guarded, because names of towers may be third-party input, and a spreadsheet executes a cell that begins with =
+    # guard text, because names of towers may be third-party input, and a spreadsheet executes a cell that begins with =
     target = Path(path)
     guarded(pd.DataFrame(table)).to_csv(target, index=False, lineterminator="\n")
     return target
@@ -179,7 +179,7 @@ def _picture(grid: Grid, layer: Layer, low: float, high: float) -> bytes:
     from PIL import Image
 
     colours = (255 * _colours(layer, low, high)).round().astype(np.uint8)
-    cells = Image.fromarray(np.ascontiguousarray(grid.raster(colours)[::-1]))  # pictures begin in the north
+    cells = Image.fromarray(np.ascontiguousarray(grid.raster(colours)[::-1]))  # rows of pictures begin in the north
     picture = cells.resize((PIXELS_PER_CELL * cells.width, PIXELS_PER_CELL * cells.height), Image.Resampling.NEAREST)
     buffer = io.BytesIO()
     picture.save(buffer, "PNG")

@@ -533,7 +533,7 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
     the condition number of C by ``m trace``. The trace is computed only if the pivots do not exclude a large bound.
     """
     m, t = to_target.shape
-    # by columns, so that a step adds contiguous planes of memory; the two additional rows are L^-1 c and L^-1 1
+    # store by columns, so that a step adds contiguous planes of memory; the two additional rows are L^-1 c and L^-1 1
     factor, weight, inverse_pivot = np.empty((m, m + 2, t)), np.empty((m, t)), np.empty((m, t))
     # a slice of ``gamma`` is one column of the lower triangle, in the order of _between
     end = 0

@@ -199,7 +199,7 @@ class Reach:
         tile = np.array([[west, south], [east, south], [east, north], [west, north]])
         lines = [shapely.linestrings(np.vstack([at, tile])[None])]
         if self._depth:
-            # only walls, because a path over ground or roof is on the line between its ends, seen from above
+            # consider only walls: seen from above, a path over ground or roof is on the line between its ends
             lit = self._mirrors.toward(tower.position_m, box_m)
             lit = lit[self._is_wall[lit]]
             lines += [self._way_in(at, lit), self._way_out(at, lit, tile)]
@@ -379,7 +379,7 @@ class TileStore:
         return path
 
     def remove(self) -> None:
-        """Remove all tile files, those of killed runs with other settings too, and the folder if it is then empty."""
+        """Remove all tile files, also those of killed runs with other settings, and the folder if it is then empty."""
         with suppress(OSError):  # the results are complete, and the next run removes the files
             for place in self.folder.iterdir():
                 if _TILE_FILE.fullmatch(place.name):

@@ -126,7 +126,7 @@ def thread_count() -> int:
     """Return the number of cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS and Windows
+    except AttributeError:  # this function does not exist on macOS and Windows
         return os.cpu_count() or 1
 
 

@@ -397,7 +397,7 @@ def singular_values_of(
     geometries : sequence of Geometry
         Geometries, grouped by mount: each group needs one evaluation of the field, or two with the ground.
     tower : Array
-        Array of the tower. Its slants are replaced by those of the geometry.
+        Positions, pattern and mount of the tower. The slants are replaced by those of the geometry.
     tower_m : (3,)
         Array centre, east, north, up over flat ground at 0 [m].
     uav : Array
@@ -442,7 +442,7 @@ def basis_fields(
     tower, uav : Array
         Their slants are not used.
     tower_m : (3,)
-                Centre of the tower's array [m].
+        Centre of the tower's array [m].
     poses : Poses
     carrier_hz : float
     with_ground : bool

@@ -73,11 +73,11 @@ def wedge(
 
     Notes
     -----
-    ``-e^{-j pi/4} / (2 n sqrt(2 pi) sin_beta) [(T(pi + d) + T(pi - d)) I + T(pi + u) R_n + T(pi - u) R_0]`` with ``d =
-    phi_out - phi_in``, ``u = phi_out + phi_in`` and ``T(x) = cot(x / 2n) F(2 distance cos^2(...))`` (Kouyoumjian and
-    Pathak, eq. 25). As in Luebbers' method, reflection matrices ``R`` of the faces replace the factors +1 and -1 of a
-    perfect conductor. A perfectly conducting screen therefore has the original coefficients, and the sum with direct
-    and reflected waves is continuous at any obliquity.
+    ``-e^{-j pi/4} / (2 n sqrt(2 pi) sin_beta) [(T(pi + d) + T(pi - d)) I + T(pi + u) R_n + T(pi - u) R_0]`` with
+    ``d = phi_out - phi_in``, ``u = phi_out + phi_in`` and ``T(x) = cot(x / 2n) F(2 distance cos^2(...))``
+    (Kouyoumjian and Pathak, eq. 25). As in Luebbers' method, reflection matrices ``R`` of the faces replace the
+    factors +1 and -1 of a perfect conductor. A perfectly conducting screen therefore has the original coefficients,
+    and the sum with direct and reflected waves is continuous at any obliquity.
     """
     less, more = phi_out - phi_in, phi_out + phi_in
     shadow = edge_term(np.pi + less, exterior, distance) + edge_term(np.pi - less, exterior, distance)
@@ -383,7 +383,7 @@ def _of_solid(
     faces: Faces, solid: int, ground_m: float, least_m: float
 ) -> list[tuple[FloatArray, FloatArray, tuple[int, int]]]:
     """Return start, end and faces of each edge, in the order that the axes of :class:`Edges` require."""
-    # only edges between faces of one building: an edge between two touching buildings is not listed
+    # list only edges between faces of one building, not edges between two touching buildings
     members = np.flatnonzero(faces.solid == solid)
     walls = [int(i) for i in members if faces.normal[i, 2] == 0.0]
     roofs = {float(faces.offset_m[i]): int(i) for i in members if faces.normal[i, 2] == 1.0}
@@ -654,7 +654,7 @@ def _round_edge(
     toward, normal = parts_of(way), parts_of(end.normal)
     mirror = coefficients(dyads.incidence(toward, normal), parts_of(end.face))
     slant_cosine, slant_sine = end.slants[:, 0], end.slants[:, 1]
-    # the pattern is that of the centre's direction; each element keeps its own slant
+    # evaluate the pattern in the direction of the array centre, with the slant of each element
     e_theta, e_phi = dyads.slant_rotation(*pattern, slant_cosine, slant_sine)
     beta: ComplexArray = np.zeros(1, complex)
     phi: ComplexArray = np.zeros(1, complex)

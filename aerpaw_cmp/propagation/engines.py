@@ -84,10 +84,14 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
         paths = pilot(samples)
         # compare the paths, not their number: one path may be lost while another is found
         if set(mirror.plane_keys(paths, plane)) == set(mirror.plane_keys(before, plane)):
-            words = f"{samples // _FACTOR:,} and {samples:,} rays a tower found the same {counted(len(paths), 'path')}"
+            words = (
+                f"{samples // _FACTOR:,} and {samples:,} rays per tower found the same {counted(len(paths), 'path')}"
+            )
             return Choice(samples, f"{words} at {counted(poses, 'pose')}".replace(",", " "))
         before = paths
-    words = f"{samples:,} rays a tower still found other paths than {samples // _FACTOR:,} at {counted(poses, 'pose')}"
+    words = (
+        f"{samples:,} rays per tower still found other paths than {samples // _FACTOR:,} at {counted(poses, 'pose')}"
+    )
     return Choice(samples, words.replace(",", " "))
 
 

@@ -63,8 +63,9 @@ _WORDS = ("material", "label", "polygon")
 class Faces:
     """Planar reflecting faces of a scene.
 
-    A point ``x`` on a face has the in-plane coordinates ``(along . x, across . x)`` [m]. Only the first four
-    columns determine fields. The others determine which points belong to a face; without them, faces are planes.
+    A point ``x`` on a face has the in-plane coordinates ``(along . x, across . x)`` [m]. Only the first four columns
+    determine fields. The other columns determine which points belong to a face. Without these columns, faces are
+    unbounded planes.
 
     Parameters
     ----------
@@ -357,8 +358,8 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
     ----------
     site : Site
     towers : sequence of str, optional
-        Towers whose ground heights need a plane. Default: all towers of the site. Without towers the plane is ``up =
-        0``.
+        Towers whose ground heights need a plane. Default: all towers of the site. If there are no towers, the
+        plane is ``up = 0``.
 
     Returns
     -------
@@ -522,7 +523,7 @@ def triangles(faces: Faces, reach_m: float) -> tuple[FloatArray, IntArray, IntAr
     ----------
     faces : Faces
     reach_m : float
-                In-plane coordinate at which infinite faces are cut [m].
+        In-plane coordinate at which infinite faces are cut [m].
 
     Returns
     -------
@@ -747,7 +748,7 @@ def _mounted(
     roll_deg: float = 0.0,
 ) -> Array:
     """Return an array of elements with one pattern in a device that is rotated by yaw and roll."""
-    # no pitch: the arrays of the paper and of maps point horizontally
+    # the pitch is 0, because the arrays of the paper and of maps point horizontally
     mount = rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, 0.0, roll_deg]))
     return Array(positions_m, np.radians(np.array(slant_deg)), (pattern or Isotropic(),), mount)
 

@@ -28,7 +28,7 @@ from ..common.errors import CheckError
 from ..common.files import cache_folder
 from ..common.versions import version
 
-# 14 is refused by Dr.Jit; 15 and 16 abort on AVX-512. 19 and 22 were tried on such a machine.
+# Dr.Jit refuses LLVM 14, and LLVM 15 and 16 abort on AVX-512. LLVM 19 and 22 were tested on a machine with AVX-512.
 MINIMUM_MAJOR = 17
 
 # Variable that Dr.Jit reads. A path that the user has set is tried and never replaced.
@@ -194,7 +194,7 @@ def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
     else:
         paths = _system_paths()
     by_path: dict[Path, Library] = {}
-    # for one file under several names keep the name with the release
+    # if one file has several names, keep the name with the release
     for library in filter(None, map(_library, paths)):
         by_path[library.path] = max(by_path.get(library.path, library), library, key=lambda file: file.version)
     # an empty version sorts below every number, so unknown files come last

@@ -16,7 +16,8 @@ Engine = Literal["image", "sionna"]
 # Values of ``rt.diffraction``. Their searches are in :data:`aerpaw_cmp.propagation.edges.DIFFRACTION`.
 Diffraction = Literal["none", "edges"]
 Samples = int | Literal["auto"]
-# ``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target.
+# ``loss(paths, sources_m, targets_m) -> (paths,)`` [dB], for the segments from source over ``paths.vertices_m`` to
+# target.
 Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
 
 

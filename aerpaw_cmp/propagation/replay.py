@@ -213,7 +213,7 @@ def path_table(
         # use the array centres: delays and directions are per path, but gains are per element pair
         places = sources_of(lines, ends.sources_m), lines.vertices_m, ends.poses.position_m[lines.pose]
         away = list(legs(*places))
-        back = next(legs(places[2], lines.vertices_m[:, ::-1], places[0]))  # from the UAV
+        back = next(legs(places[2], lines.vertices_m[:, ::-1], places[0]))  # the first leg from the UAV
         pieces.append(
             {
                 "pose": item.pose,
@@ -278,7 +278,7 @@ def impulse_responses(
     if velocity_mps is not None:
         cycles = table.doppler_hz(ends.link.carrier_hz, velocity_mps)[:, None] * unmasked(times_s)
         turned = turned * np.exp(2j * np.pi * cycles)[:, None, None, :]
-    # by path, pose, tower (, rx_ant, tx_ant, time)
+    # axes: path, pose, tower (, rx_ant, tx_ant, time)
     rx, tx = (2, 1) if ends.link.uav_transmits else (1, 2)
     a, tau = (table.by_link(values, ends, 0.0) for values in (turned, table.delay_s))
     return np.ascontiguousarray(a.transpose(rx, 3, tx, 4, 0, 5)), np.ascontiguousarray(tau.transpose(rx, tx, 0))
@@ -426,7 +426,7 @@ class Replay:
         )
 
     def path_table(self, names: dict[str, int] | None = None) -> PathTable:
-        """Return every path with delay, gain per element pair and directions. ``names`` are those of earlier poses."""
+        """Return every path with delay, gain per element pair and directions. ``names``: see :func:`path_table`."""
         return path_table(self.contributions, self.faces, self.ends, self.has_path, {"": 0} if names is None else names)
 
     def paths_frame(self) -> Any:
@@ -506,7 +506,7 @@ def replay(
     field : Field
         Further losses of the paths.
     run : Run
-        Cache, progress.
+                Options that do not change the result, such as cache and progress.
 
     Returns
     -------
@@ -665,7 +665,7 @@ def _channels(
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle
     has_path[paths.pose[open_], paths.tower[open_]] = True
     for item in further:
-        # path_power remains that of the reflections; other kinds are separate
+        # path_power contains only the reflections, because other kinds have separate powers
         fields = Fields(fields.h + item.h, fields.path_power, fields.power + item.power)
         has_path |= item.power > 0.0
     return fields, has_path

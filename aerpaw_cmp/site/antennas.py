@@ -145,7 +145,7 @@ class MeasuredPattern:
         self.efficiency = _sphere_mean(samples)
         if e_phi is None:
             amplitude = np.abs(e_theta)
-            for row in (0, -1):  # a pole is one direction
+            for row in (0, -1):  # a pole is one direction, so its row has one value
                 amplitude[row] = np.sqrt((amplitude[row] ** 2).mean())
             # an amplitude without polarisation has no direction to rotate
             self._layers = [_spline(_torus(amplitude, +1).real)]
@@ -357,7 +357,7 @@ def _check_last_line(text: str, rows: _Rows) -> None:
 
 
 def _check_header(line: str, number: int) -> None:
-    # headers differ in blanks and points between files
+    # remove blanks and points, in which the headers of files differ
     columns = [re.sub(r"[\s.]", "", cell.lower()) for cell in line.split("\t")]
     if len(columns) != 7 or not all(cell.startswith(column) for cell, column in zip(columns, _COLUMNS, strict=True)):
         cause = "the columns are not separated by tabs" if len(columns) == 1 else None
@@ -603,7 +603,7 @@ def _check_angles(elevation: FloatArray, azimuth: FloatArray) -> None:
         ("elevation (theta2)", np.sort(elevation), wanted_elevation),
         ("azimuth (phi2)", np.sort(np.round(azimuth % 360.0, 6) % 360.0), wanted_azimuth),
     ):
-        if len(axis) >= 3 and np.abs(axis - grid).max() <= 0.05:  # also false for NaN
+        if len(axis) >= 3 and np.abs(axis - grid).max() <= 0.05:  # this test is also false for NaN
             continue
         causes = (
             (len(axis) >= 3 and 0 < np.abs(axis).max() < 7, "radians instead of degrees"),

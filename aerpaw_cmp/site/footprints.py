@@ -364,7 +364,9 @@ def _check_place(content: MapFile, frame: SiteFrame) -> None:
 def _distance_m(latitude: Any, longitude: Any, frame: SiteFrame) -> Any:
     """Return the approximate distance from the origin [m], or inf for an impossible position."""
     good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
-    north = np.where(good, latitude, 0.0) - frame.latitude_deg  # a truncated number may be 1e306
+    north = (
+        np.where(good, latitude, 0.0) - frame.latitude_deg
+    )  # replace invalid values, because a truncated number may be 1e306
     # use the shorter way around the Earth
     turn = (np.where(good, longitude, 0.0) - frame.longitude_deg + 180) % 360 - 180
     east = turn * math.cos(math.radians(frame.latitude_deg))
@@ -375,7 +377,7 @@ def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape |
     """Return the valid outline in metres, or None and a line in ``actions`` if nothing remains."""
     areas, notes = [], []
     for outer, holes in outline.parts:
-        # no outline spans half of the Earth, so it crosses 180 degrees
+        # no outline spans half of the Earth, so a larger jump means that it crosses the antimeridian
         if max(np.abs(np.diff([p[1] for p in outer])), default=0) > 180:
             notes.append("crosses the antimeridian; its parts were joined")
         ring = _ring(outer, frame)
@@ -572,7 +574,7 @@ def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
 
 
 def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
-    """Return disjoint shapes: equal height and material are joined, lower ones are cut below higher ones."""
+    """Return disjoint shapes: join shapes of equal height and material, and cut lower shapes below higher ones."""
     disjoint: list[_Shape] = []
     for group in _groups(shapes):
         disjoint += group if len(group) == 1 else _higher_first(group, actions)

@@ -194,7 +194,7 @@ class LearnedHealth(StrictModel):
     below_lock_share: float | None = None
     """Mean share of samples without lock. None for receivers that do not report their lock."""
     run_s: float
-    """Usual longest time in which all readings are equal."""
+    """Typical length of the longest run of equal readings [s]."""
 
     @property
     def most_rmse_db(self) -> float:
@@ -635,7 +635,7 @@ class PairGain:
         Parameters
         ----------
         directions : (n, 6)
-            Directions, in the form of ``directions``.
+            Directions, as in the parameter ``directions`` of the class.
         apart_sd_db : (n,)
             Standard deviation of both antennas if each were learned separately [dB].
 

@@ -42,16 +42,16 @@ from .site import Building, Forest, Geofence, Site, Tower, Trees
 # Packaged sites by name.
 PACKAGED = ("lake_wheeler",)
 
-# A tower is refused if it is farther from the origin and from the area.
+# A tower is refused if it is farther than this from both the origin and the area.
 _FAR_TOWER_M = 10_000.0
 
-# An outline is refused if it extends farther from the origin.
+# An outline is refused if it extends farther than this from the origin.
 _FAR_POLYGON_M = 100_000.0
 
 # Overlaps of buildings up to this width cause no warning.
 OVERLAP_M = 0.5
 
-# A tower is outside the map if no object of the map is nearer.
+# A tower is outside the map if no object of the map is within this distance.
 _MAPPED_M = 500.0
 
 # Smallest distance of random trees from a tower, because there are no trees around masts.

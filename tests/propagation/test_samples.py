@@ -32,7 +32,7 @@ def test_rays_are_raised_until_two_pilots_agree():
     choice = enough_samples(pilot, FACES, 50)
     assert asked == [10_000, 40_000, 160_000, 640_000]
     assert choice.samples == 640_000
-    assert choice.reason == "160 000 and 640 000 rays a tower found the same 3 paths at 50 poses"
+    assert choice.reason == "160 000 and 640 000 rays per tower found the same 3 paths at 50 poses"
 
 
 def test_pilots_that_never_agree_end_and_say_so():

@@ -346,7 +346,7 @@ def _mirror_of(reference: Reference, faces: Faces, face: int, vertex: FloatArray
     normal, offset = faces.normal[face], float(faces.offset_m[face])
     solid = int(faces.solid[face])
     point = tuple(vertex.tolist())
-    # by plane and building, because the replay has its own face numbers
+    # compare plane and building, because the replay has its own face numbers
     same = [
         m
         for m in reference.mirrors
@@ -500,7 +500,7 @@ def _paths_against_sionna(
     phase, near = np.abs(np.angle(turn)), theirs.length_m < _PHASE_RANGE_M
     # float32 has too few digits for a weak entry, so errors are relative to the path's strongest entry
     strongest = np.abs(theirs.gain).max(axis=(1, 2))
-    # phases are compared separately: over 1 km float32 has lost them
+    # remove the phase, which is compared separately, because float32 is too coarse for it beyond 1 km
     aligned = h * (turn.conj() / np.abs(turn))[:, None, None]
     share = np.abs(aligned - theirs.gain).max(axis=(1, 2)) / np.where(strongest > 0.0, strongest, 1.0)
     power = 20.0 * np.log10(1.0 + share)
@@ -580,7 +580,7 @@ def _lacking(
     site: Site, replay: Replay, theirs: PathSet, faces: Faces, rows: IntArray, few: Poses, expected: Expected
 ) -> FieldAudit:
     """Count paths that only Sionna has: missing if they certainly exist, else doubtful because of its float32."""
-    # with a wider margin, because float32 may differ within 2 mm
+    # use a wider margin, because float32 may differ within 2 mm
     verdicts = _verdicts(site, replay, theirs, faces, few, rows, expected, _SIONNA_MARGIN_M)
     missing = verdicts.count(True)
     doubtful = len(verdicts) - missing
@@ -703,7 +703,7 @@ def audit(
     chosen = _spread(poses, None if second.links is None else -(-second.links // max(1, len(replay.towers))))
     engine: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
     search = replace(search, engine=engine)
-    # on few poses, because the other engine is some hundred times slower
+    # check only a few poses, because the other engine is some hundred times slower
     few = poses[chosen]
     checked = run_replay(site, link, few, search, field, run)
     rays = checked.samples or (_FIELD_SAMPLES if search.samples == "auto" else search.samples)

@@ -162,7 +162,7 @@ def _explained(
     waves = [value for name, value in recorded if name == "wave"]
     spreading = next(value for name, value in recorded if name == "spreading") ** 2
     uav = next(value for name, value in recorded if name == "uav")
-    # spreading and the UAV's pattern multiply powers; the rest of the received power is polarisation
+    # spreading and the UAV's pattern multiply the power, and the remaining ratio to the received power is polarisation
     powers = [*waves, waves[-1] * spreading, waves[-1] * spreading * uav, np.abs(field) ** 2]
     mean = np.array([1.0, *(float(power.mean()) for power in powers)])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -254,7 +254,7 @@ def why_not(
         return _why_not_there(surfaces, source_m, target_m, sequence)
     sequence = sequence[sequence >= 0]
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
-    # on unbounded planes, so that the message can give the distance in metres by which a point misses its face
+    # retrace on unbounded planes, so that the message can state by how many metres a point misses its face
     planes = Faces(faces.normal, faces.offset_m, faces.material, faces.label)
     points, ahead = retraced(planes, sequence[None], source_m[None], target_m[None], tolerance)
     if not ahead[0]:

@@ -472,7 +472,7 @@ class Reference:
             with np.errstate(divide="ignore", invalid="ignore"):
                 at = image - (behind / through)[:, None] * (at - image)
             inside = (at >= planes.low_m[face] - _SLACK_M) & (at <= planes.high_m[face] + _SLACK_M)
-            # nearly in the plane, the point is undefined: the verdict decides about such a sequence
+            # if the target is nearly in the plane, the point is undefined, so keep the sequence for the verdict
             good &= (np.abs(through) < MARGIN_M) | (inside.all(axis=1) & (through > 0.0))
         return good
 
@@ -527,7 +527,7 @@ class Reference:
             image = mirror.mirrored(image)
         way = _plus(end, image, -1.0)
         length = math.sqrt(_dot(way, way))
-        # two elements at one position have no direction between them
+        # two elements at the same position have no direction between them
         if length == 0:
             return 0j
         rays = [_unit(way)]

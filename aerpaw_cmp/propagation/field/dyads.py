@@ -54,7 +54,7 @@ def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector
     ends = zip(place_m, turned_back(axes, uav_m), image_m, turned_back(frame, tower_m), strict=True)
     x, y, z = (place + uav - (image + tower) for place, uav, image, tower in ends)
     length = np.sqrt(x * x + y * y + z * z)
-    # both branches are evaluated: the divisor must not be zero
+    # np.where evaluates both branches, so the divisor must not be zero
     scale = np.where(length > 0.0, 1.0 / np.maximum(length, 1e-300), 0.0)
     return x * scale, y * scale, z * scale, length
 
@@ -97,7 +97,7 @@ def field_vector(m: Rotation, toward: Vector, e_theta: Number, e_phi: Number) ->
     """
     x, y, z = turned(m, toward)
     across = np.sqrt(x * x + y * y)
-    # at a pole phi is undefined: use 0, as atan2(0, 0)
+    # at a pole phi is undefined: use 0, like atan2(0, 0)
     off_pole = across > 0.0
     scale = np.where(off_pole, 1.0 / np.maximum(across, 1e-300), 0.0)
     cosine, sine = np.where(off_pole, x * scale, 1.0), y * scale

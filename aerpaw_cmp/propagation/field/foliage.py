@@ -232,7 +232,7 @@ def foliage_loss_db(
     trees : Trees or CrownIndex
         Pass an index if many batches of paths meet the same trees.
     model : FoliageModel
-                Model that converts depth into loss.
+        Model that converts depth into loss.
 
     Returns
     -------
@@ -295,7 +295,7 @@ class CrownIndex:
     Parameters
     ----------
     trees : Trees
-                Trees to index; there may be none.
+        Trees to index; there may be none.
     shape : {"cone", "cylinder"}
         Form of all bodies.
     """
@@ -389,7 +389,7 @@ class CrownIndex:
         width = (last - first) / pieces
         piece, body = self._candidates(start, move, first[segment] + (number + 0.5) * width[segment], segment)
 
-        # only the piece that contains the point nearest to the body's axis adds the chord, for the whole segment
+        # the chord of the complete segment is added by the one piece that contains the point nearest to the body's axis
         owner = segment[piece]
         low, wide = first[owner], width[owner]
         step_east, step_north = move[owner, 0], move[owner, 1]
@@ -461,7 +461,7 @@ def _chord_share(start: FloatArray, move: FloatArray, bodies: FloatArray, shape:
     c = east**2 + north**2
     if shape == "cone":  # r = slope (top - up)
         slope, below = radius / (top - base), start[:, 2] - top
-        # below zero where the segment rises steeper than the cone's side
+        # this is negative if the segment is steeper than the cone's side
         a = a - (slope * move[:, 2]) ** 2
         b = b - slope**2 * below * move[:, 2]
         c = c - (slope * below) ** 2
@@ -659,10 +659,10 @@ def _corners(stand: Forest) -> tuple[FloatArray, IntArray]:
 def _pieces(start: FloatArray, end: FloatArray, corner: FloatArray, last: IntArray) -> tuple[IntArray, FloatArray]:
     """Return pieces of lines (k, 2) inside rings of corners: their lines (n,), and where they begin and end (n, 2)."""
     way = end - start
-    # on which side of each line a corner lies
+    # test on which side of each line a corner lies
     left = way[:, :1] * (corner[:, 1] - start[:, 1:]) - way[:, 1:] * (corner[:, 0] - start[:, :1]) > 0
     crosses = left[:, 1:] != left[:, :-1]  # a corner belongs to only one of its sides
-    # from one ring to the next there is no side
+    # there is no side from the last corner of one ring to the first corner of the next
     crosses[:, last] = False
     line, edge = np.divmod(np.flatnonzero(crosses), crosses.shape[1])  # nonzero of a table takes five times as long
     (east, north), (side_east, side_north) = (corner[edge] - start[line]).T, (corner[edge + 1] - corner[edge]).T
@@ -697,7 +697,7 @@ def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wa
     depth_m = crossing.depth_m(np.where(outside, np.maximum((zone - intrusion).min(axis=0), 0.0), 0.0))
     through = model.loss_db(depth_m)
     if stand.evergreen_share:
-        # average decibels, not powers, because the share is that of trees along each path, not of paths
+        # average decibels, not powers, because the share is a share of the trees along each path, not of the paths
         through = through + stand.evergreen_share * (in_leaf.loss_db(depth_m) - through)
     # a path without loss does not need a detour
     passed, some = np.zeros(count), np.flatnonzero(outside & (through > 0.0))

@@ -86,7 +86,7 @@ def reflection_coefficients(
     permittivity : (...) complex
         Relative permittivity. Its imaginary part is negative.
     thickness_m : (...)
-                Thickness of the slab, infinite for a half-space.
+        Thickness of the slab, infinite for a half-space.
     wavelength : float
         Wavelength in air [m].
 

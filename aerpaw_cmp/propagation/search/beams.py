@@ -1,15 +1,15 @@
 """A compiled search for all specular paths among thousands of faces, which grows sequences along beams.
 
 The source is mirrored at a first face. The beam from that image through the face's outline meets the tree of faces. The
-faces that it meets are second faces, and so on. At each step, the side planes of the beam (those of the last
-face and the mirrored planes of earlier faces) select receivers from a separate tree. For the remaining receivers
-the search computes the reflection points, whether each lies in its face, and whether a triangle cuts a segment. All
-cuts are conservative, so the paths do not depend on them. Pairs are streamed: memory does not grow with their number.
+faces that it meets are second faces, and so on. At each step, the side planes of the beam (those of the last face and
+the mirrored planes of earlier faces) select receivers from a separate tree. For the remaining receivers the search
+computes the reflection points, whether each lies in its face, and whether a triangle cuts a segment. All cuts are
+conservative, so the paths do not depend on them. Pairs are streamed, so that memory does not grow with their number.
 
 For thousands of prisms, compiled beams find candidates, and the exact rules of the image engine decide.
 
 The tolerances of the beams are a thousand times wider than those of the image engine. A candidate is rejected only if a
-segment runs through the middle of a wall or roof. Few of the remaining candidates are not paths. They are tested as in
+segment runs through the middle of a wall or roof. Nearly all remaining candidates are paths. They are tested as in
 :mod:`aerpaw_cmp.propagation.search.mirror`, so both searches find the same paths.
 """
 
@@ -166,7 +166,7 @@ _COINCIDENT_M = 5e-3
 
 
 def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
-    """Keep one of several paths over the same planes, or over planes within a few merge tolerances of each other."""
+    """Keep only one of several paths over the same planes, or over planes that differ by a few merge tolerances."""
     if not len(paths):
         return paths
     plane = np.append(surfaces.plane, -1)[paths.faces]
@@ -691,7 +691,7 @@ def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -
     lower, upper = outline.min(axis=1) - OVERLAP_M, outline.max(axis=1) + OVERLAP_M
     obstacles = np.ascontiguousarray(points[hides])
     if not len(obstacles):
-        obstacles = np.full((1, 3, 3), 1e9)  # no obstacles: a single tiny triangle far below the scene
+        obstacles = np.full((1, 3, 3), 1e9)  # without obstacles, use a single tiny triangle far from the scene
     return Surfaces(
         faces=faces,
         corners_m=obstacles,

@@ -222,8 +222,8 @@ def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-de
     return total
 
 
-# Triangles whose corners lie within this of one plane [m] are one face. Files contain float32 coordinates: 0.1 mm at 1
-# km.
+# Triangles form one face if their corners are within this distance of one plane [m]. Coordinates in files are float32,
+# which has steps of 0.1 mm at 1 km.
 _MERGE_M = 1e-3
 
 # Corners of one shape closer than this are one corner [m].

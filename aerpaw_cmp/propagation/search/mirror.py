@@ -72,7 +72,8 @@ class Occlusion:
         if len(rows):
             self.low = np.minimum.reduceat(box.min(axis=1), starts) - tolerance_m
             self.high = np.maximum.reduceat(box.max(axis=1), starts) + tolerance_m
-        # for each convex piece: outward normals (planes, 3) and offsets (planes,); top and bottom come first
+        # ``pieces`` contains the outward normals (planes, 3) and offsets (planes,) of each convex piece, top and bottom
+        # first
         solid, footprint, self.pieces = _prisms(faces, rows, starts)
         # pieces of each solid
         self.parts = [range(*ends) for ends in pairwise(np.searchsorted(solid, np.arange(len(starts) + 1)).tolist())]
@@ -125,7 +126,7 @@ class Occlusion:
                     touching = rows[~hit][along]
                     seams.append((touching, enter[along], leave[along], np.full(len(touching), piece)))
                 rows = rows[~hit]
-        # a single piece has no seam
+        # a seam needs at least two pieces
         if len(seams) > 1:
             row, enter, leave, pieces = (np.concatenate(column) for column in zip(*seams, strict=True))
             order = np.argsort(row, kind="stable")
@@ -213,7 +214,7 @@ def _prisms(
     number = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(rows)))
     # compare exactly, because roofs are created with this normal
     level = faces.normal[rows, 2] == 1.0
-    # the lowest wall of each building; roofs do not count
+    # the foot is that of the lowest wall of each building, without roofs
     foot = np.minimum.reduceat(np.where(level, np.inf, faces.lower[rows, 1]), starts)
     roofs = rows[level]
     footprints = _footprints(faces, roofs)
@@ -694,7 +695,7 @@ def _passes_first_faces(faces: Faces, sequence: IntArray, image: FloatArray, tar
                 place = start + share * (end - start)
                 meets &= place >= faces.lower[face, which, None] - REACH_SLACK_M
                 meets &= place <= faces.upper[face, which, None] + REACH_SLACK_M
-        # exact tracing decides if the reflection point is uncertain
+        # keep the pair if the reflection point is uncertain, because exact tracing decides later
         good &= meets | (abs(below - height) < _SURE_M)
     return good
 
@@ -718,7 +719,7 @@ def trace_back(
     images_m : (paths, depth, 3)
     targets_m : (paths, 3)
     tolerance_m : float
-                Tolerance of side tests [m].
+        Tolerance of side tests [m].
     edge_m : float, optional
         How far outside its face a point may lie (default: ``tolerance_m``).
 

@@ -457,7 +457,7 @@ def _each_batch(
 ) -> Iterator[tuple[_Finder, IntArray, IntArray]]:
     """Yield finder, towers and poses of every batch of links that are ``alive`` (towers, poses).
 
-    Only one scene exists at a time: that of ``make(towers, faces)`` for a group of towers that share it.
+    Only one scene exists at a time. ``make(towers, faces)`` creates it for a group of towers that share it.
     """
     for towers, chosen in groups:
         poses = np.flatnonzero(alive[towers].any(axis=0))
@@ -713,7 +713,7 @@ def _relocate(
     everywhere, result = retraced(faces, sequence, sources_m, targets_m, tolerance_m, np.inf)[0], sequence.copy()
     for step in range(sequence.shape[1]):
         used = np.flatnonzero(sequence[:, step] >= 0)
-        # only if the face that Sionna named does not contain the point
+        # relocate only points that are not in the face that Sionna named
         outside = used[~inside(faces, sequence[used, step], everywhere[used, step], _EDGE_TOLERANCE_M)]
         for row in outside:  # rarely used, only in scenes with disjoint coplanar faces
             twins = np.flatnonzero(plane == plane[sequence[row, step]])

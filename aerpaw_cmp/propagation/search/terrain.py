@@ -3,11 +3,11 @@
 At a specular point the length of the path over the ground is stationary. Along the profile between the ends the ground
 is a polyline. Its pieces are mirrors in closed form, and the length can also be stationary at a crease between two
 pieces. Across the profile the point is found by iteration on the bilinear surface. Points whose path lengths differ by
-less than half a wavelength lie in one Fresnel zone and count as one mirror, that of the shortest path. Its plane is
-tangent to the surface; on a crease it is the plane between both sides that mirrors one end into the other. Where curved
-ground leaves the Fresnel zone of that plane, the reflection is reduced to the part of the zone that remains along the
-profile. It is never focused, and the crest of a ridge reflects nothing. Level ground at the height of the tower's
-ground is the same plane as without an elevation model.
+less than half a wavelength lie in one Fresnel zone and count as one mirror, which is the mirror of the shortest path.
+Its plane is tangent to the surface; on a crease it is the plane between both sides that mirrors one end into the other.
+Where curved ground leaves the Fresnel zone of that plane, the reflection is reduced to the part of the zone that
+remains along the profile. It is never focused, and the crest of a ridge reflects nothing. Level ground at the height of
+the tower's ground is the same plane as without an elevation model.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def _ends_seen_from(
     faces: Faces, sequence: IntArray, slot: IntArray, source: FloatArray, target: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return both ends mirrored at the faces between them and the ground at ``slot``."""
-    # from the tower up to the ground's place, and from the UAV back to it
+    # mirror the tower at the faces before the ground, and the UAV at the faces after it
     steps = range(sequence.shape[1])
     for end, order, side in ((source, steps, -1), (target, reversed(steps), 1)):
         for step in order:

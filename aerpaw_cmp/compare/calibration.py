@@ -1,4 +1,4 @@
-"""The antenna gain learned from flights, its scores on held-out data, and the choice of a prediction.
+"""Antenna gain learned from flights, its scores on held-out data, and the choice of a prediction.
 
 Learned antennas are scored on held-out flights, heights, sectors and headings.
 
@@ -56,7 +56,7 @@ SPLITS = ("flight_left_out", "altitude_left_out", "heading_left_out", "sector_le
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """The samples of a series with the further data of a score.
+    """The samples of a series, with additional data that are needed to score it.
 
     ``free_space_db`` (n,): level of free space for the transmit power ``sent_dbm`` [dB]. ``heading_deg`` (n,): heading
     of the nose [deg]. ``tower_m`` (n, 3): positions of a moving tower [m]. ``start``: time of ``time_s`` 0 (UTC) or
@@ -85,12 +85,12 @@ class Observed:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """A definition of the quantities to learn.
+    """A specification of what to learn.
 
     Parameters
     ----------
     model : GainModel
-        Terms and the initial values of their strengths.
+        Terms, and initial values of their strengths.
     patterns : mapping of str to callable
         Gain of measured patterns in the device frame, for ``uav`` and antennas (``tower.channel``). It can be empty.
     """
@@ -101,15 +101,15 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True)
 class Mounted:
-    """The measured patterns by name, and the fitted mounts of those that a flight used."""
+    """The measured patterns by name, and the fitted mounts of the patterns that a flight used."""
 
     patterns: Mapping[str, GainOf]
     mounts: Mapping[str, MountFit]
 
     def pattern_db(self, name: str, direction: FloatArray) -> FloatArray:
-        """Return the gain (n,) of a measured pattern as mounted, towards directions (n, 3) of body or mast.
+        """Return the gain (n,) of a mounted pattern towards directions (n, 3) in the frame of body or mast.
 
-        The gain is 0 if there is no pattern.
+        The gain is 0 for an antenna without a pattern.
         """
         pattern = self.patterns.get(name)
         if pattern is None:
@@ -128,7 +128,7 @@ class Learned(Mounted):
 
     fit: GainFit
     fading: Mapping[str, tuple[float, float]]
-    """The :func:`~aerpaw_cmp.compare.gains.fading_of` the training flights, by antenna."""
+    """Fading of the training flights by antenna, from :func:`~aerpaw_cmp.compare.gains.fading_of`."""
 
     @property
     def model(self) -> GainModel:
@@ -136,7 +136,7 @@ class Learned(Mounted):
         return self.fit.model
 
     def spread(self, antenna: str) -> Spread:
-        """Return the error model of a level at an antenna, except for the standard deviation of the gain."""
+        """Return the error model of a level at an antenna, excluding the standard deviation of the gain."""
         model = self.model
         sd_db, kurtosis = self.fading.get(antenna, (0.0, 0.0))
         campaign = next((s.campaign for s in self.fit.rows if s.antenna == antenna), "")
@@ -150,12 +150,12 @@ class Learned(Mounted):
         )
 
     def predict(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
-        """Return the gain of both ends and its standard deviation (n,) [dB], up to a constant in the offset."""
+        """Return the gain of both ends and its standard deviation (n,) [dB], up to a constant."""
         gain, sd = self.fit.predict(samples)
         return self.patterns_db(samples) + gain, sd
 
     def mean_error(self, samples: LinkSamples) -> float:
-        """Return the mean of measured minus :meth:`mean` [dB], NaN if no sample has both."""
+        """Return the mean of measured level minus :meth:`mean` [dB], NaN if no sample has both."""
         error = samples.residual_db - self.mean(samples)
         return float(np.nanmean(error)) if np.isfinite(error).any() else math.nan
 
@@ -164,16 +164,16 @@ class Learned(Mounted):
         return self.patterns_db(samples) + _mean_along(self.fit, samples)
 
 
-# Time within which a UAV hardly turns [s].
+# Averaging time within which a UAV hardly turns [s].
 _FINE_S = 0.5
 
 
 def _mean_along(fit: GainFit, samples: LinkSamples) -> FloatArray:
-    """Return the gain (n,) along a flight [dB], computed for means over :data:`_FINE_S` and linear between them."""
+    """Return the gain (n,) along a flight [dB], interpolated linearly between means over :data:`_FINE_S`."""
     at = dataclasses.replace(samples, residual_db=np.zeros(len(samples))).binned(_FINE_S)
     if not len(at):
         return np.full(len(samples), np.nan)
-    # interpolate between half seconds: each mean requires a row of kernels
+    # compute few means, because each mean requires a row of kernels
     gain = np.interp(samples.time_s, at.time_s, fit.mean(at))
     return np.where(np.isfinite(samples.at_uav).all(axis=1), gain, np.nan)
 
@@ -184,17 +184,17 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None
     Parameters
     ----------
     series : sequence of LinkSamples
-        Residuals against free space of the training flights alone.
+        Residuals of the training flights relative to free space.
     recipe : Recipe
     model : GainModel, optional
-        Strengths that were fitted to the same flights. The default fits them.
+        Model whose strengths were already fitted to the same flights. By default they are fitted here.
     """
     names = ["uav", *dict.fromkeys(s.antenna for s in series)]
     patterns = {name: recipe.patterns[name] for name in names if name in recipe.patterns}
     mounted = Mounted(recipe.patterns, fit_mounts(series, patterns) if patterns else {})
     residuals = [dataclasses.replace(s, residual_db=s.residual_db - mounted.patterns_db(s)) for s in series]
     fit = chosen_fit(residuals, recipe.model) if model is None else fit_gain(residuals, model)
-    if any(s.floor_db is not None for s in series):  # a second fit; a third does not change held-out flights
+    if any(s.floor_db is not None for s in series):  # a third fit would not change held-out errors
         fit = fit_gain([_at_floor(s, mounted.patterns_db(s), fit) for s in series], fit.model)
     antennas = dict.fromkeys(s.antenna for s in series)
     fading = {name: fading_of([s for s in series if s.antenna == name], fit.model.bin_s) for name in antennas}
@@ -204,7 +204,7 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None
 def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkSamples:
     """Subtract ``known_db`` from the residual, and replace samples below the floor.
 
-    They get the value that the fit predicts, limited to the floor.
+    Samples below the floor get the value that the fit predicts, limited to the floor.
     """
     residual = samples.residual_db - known_db
     if samples.floor_db is None:
@@ -219,12 +219,12 @@ def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkS
 class Score:
     """The error of one held-out flight and channel after one offset [dB].
 
-    ``rmse_4s_db``: both sides averaged in power over 4 s. ``inside_50``, ``inside_90``, ``inside_95``: share of some
-    hundred samples inside the 50, 90 and 95 % interval. ``offset_db``: mean of measured minus predicted.
+    ``rmse_4s_db``: RMSE after averaging the power of both sides over 4 s. ``inside_50``, ``inside_90``, ``inside_95``:
+    share of a few hundred samples inside the 50, 90 and 95 % interval. ``offset_db``: mean of measured minus predicted.
     ``rmse_shared_offset_db``: RMSE with the mean offset of the training flights. ``constant_rmse_db``,
-    ``log_distance_rmse_db``: RMSE of a constant, and of a line over log distance. The slope of the line in each of
-    eight areas comes from the other areas of the flight. If parts of a flight are scored, the offset of every model and
-    the slope of the line come from outside the part.
+    ``log_distance_rmse_db``: RMSE of a constant, and of a straight line over log distance. The flight is divided into
+    eight areas, and the slope of the line in each area is fitted to the other areas. If parts of a flight are scored,
+    the offset of every model and the slope of the line are fitted outside the part.
     """
 
     flight: str
@@ -252,8 +252,8 @@ def score(observed: Observed, gain_db: FloatArray, simple: Simple | None = None)
     gain_db : (n,)
         Predicted level above free space [dB]. NaN is not scored.
     simple : Simple, optional
-        Baselines whose offset in each scored part comes from samples outside the part, like that of ``gain_db``. By
-        default they have one offset for the whole flight.
+        Baselines with offsets fitted outside each scored part, as for ``gain_db``. By default, every baseline has one
+        offset for the whole flight.
 
     Returns
     -------
@@ -287,7 +287,7 @@ def score(observed: Observed, gain_db: FloatArray, simple: Simple | None = None)
     )
 
 
-# Largest slope of a line over log distance, as a multiple of free space.
+# Largest slope of a line over log distance, as a multiple of the slope of free space.
 STEEPEST = 3.0
 
 
@@ -300,13 +300,13 @@ class Simple:
     line_db: FloatArray
 
     def predict(self, o: Observed, inside: BoolArray, outside: BoolArray) -> None:
-        """Fill in the samples of a part from samples outside it."""
+        """Predict the samples of a part from samples outside it."""
         measured = o.samples.residual_db + o.free_space_db
         known = outside & np.isfinite(measured)
         free, level = o.free_space_db[known], measured[known]
         spread = float(((free - free.mean()) ** 2).sum())
         slope = float(((free - free.mean()) * (level - level.mean())).sum()) / spread if spread else 0.0
-        # limit it to 0 to 60 dB per decade: samples of one height do not determine the slope
+        # limit the slope to 0 to 60 dB per decade, because samples of one height hardly determine it
         slope = min(max(slope, 0.0), STEEPEST)
         self.free_db[inside] = o.samples.residual_db[known].mean()
         self.constant_db[inside] = level.mean()
@@ -314,7 +314,7 @@ class Simple:
 
 
 def mean_rmse(scores: Sequence[Score], name: str = "rmse_db") -> float:
-    """Return the mean over flights and channels [dB], NaN if there are none."""
+    """Return the mean of a score over flights and channels [dB], NaN if there are none."""
     return float(np.mean([getattr(s, name) for s in scores])) if scores else math.nan
 
 
@@ -323,23 +323,23 @@ def flights_of(observed: Sequence[Observed]) -> list[str]:
     return list(dict.fromkeys(o.samples.flight for o in observed))
 
 
-# Largest number of groups of held-out flights. Up to this number, each flight is held out alone.
+# Largest number of groups of held-out flights. Up to this number of flights, each is held out alone.
 MOST_GROUPS = 6
 
 
 def groups_of(flights: Sequence[str]) -> list[list[str]]:
-    """Return the flights that are held out together: each alone, or spread over :data:`MOST_GROUPS` groups."""
+    """Return groups of flights that are held out together: each flight alone, or at most :data:`MOST_GROUPS` groups."""
     count = min(len(flights), MOST_GROUPS)
-    # a stride spreads the flights of one day over the groups
+    # use a stride, so that the flights of one day are in different groups
     return [list(flights[i::count]) for i in range(count)]
 
 
 def flight_left_out(
     observed: Sequence[Observed], recipe: Recipe, without: dict[str, Learned] | None = None
 ) -> tuple[Score, ...]:
-    """Score each flight as predicted from others (:func:`groups_of`).
+    """Score the prediction of each flight from other flights (:func:`groups_of`).
 
-    ``without`` receives what was learned without each flight.
+    ``without`` receives the gains that were learned without each flight.
     """
     scores: list[Score | None] = []
     for group in groups_of(flights_of(observed)):
@@ -357,7 +357,7 @@ def flight_left_out(
 
 
 def campaign_left_out(observed: Sequence[Observed], recipe: Recipe, turn_deg: float = 0.0) -> tuple[Score, ...]:
-    """Score each campaign as predicted by the airframe of the others alone. Empty for a single campaign.
+    """Score the prediction of each campaign by the airframe of the other campaigns only. Empty for a single campaign.
 
     Parameters
     ----------
@@ -379,7 +379,7 @@ def campaign_left_out(observed: Sequence[Observed], recipe: Recipe, turn_deg: fl
 
 
 def score_with(learned: Learned, unseen: Sequence[Observed], train: Sequence[Observed]) -> tuple[Score, ...]:
-    """Score held-out flights at antennas of the training flights."""
+    """Score held-out flights with the antennas of the training flights."""
     return tuple(_scored_with(unseen, learned, _offsets([o.samples for o in train], learned)))
 
 
@@ -391,12 +391,12 @@ def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]
     return {antenna: float(np.nanmean(values)) for antenna, values in each.items() if np.isfinite(values).any()}
 
 
-# Samples of a series whose standard deviations are checked: one takes a thousand times longer than a mean.
+# Number of samples per series whose standard deviation is checked: it takes a thousand times longer than a mean.
 _SPREAD_SAMPLES = 400
 
 
 def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[str, float]) -> Iterator[Score]:
-    """Yield the scores at antennas that have an offset, with their own and with that of the other flights."""
+    """Yield scores at antennas with a known offset, with their own offset and with that of the other flights."""
     for o in unseen:
         if o.samples.antenna not in offsets:
             continue
@@ -404,19 +404,19 @@ def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[
         fitted = score(o, gain)
         if fitted is None:
             continue
-        # spread over the flight, because neighbours have the same standard deviation
+        # spread over the flight, because neighbouring samples have nearly the same standard deviation
         some = spread_out(len(gain), _SPREAD_SAMPLES)
         stated = StatedSpread(
             gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
         )
         error = o.samples.residual_db - gain - fitted.offset_db
         fitted = dataclasses.replace(fitted, **inside_shares(error[some], stated))  # type: ignore[arg-type]
-        # the mean square about another offset is the variance plus the square of the difference of the offsets
+        # RMSE with another offset: mean square plus the squared difference of the offsets
         shared = math.hypot(fitted.rmse_db, fitted.offset_db - offsets[o.samples.antenna])
         yield dataclasses.replace(fitted, rmse_shared_offset_db=shared)
 
 
-# Largest number of flights that are scored part by part. If there are more, some are taken at even steps.
+# Largest number of flights that are scored part by part. Of more flights, an evenly spaced selection is scored.
 _MOST_SCORED = 6
 
 
@@ -433,9 +433,9 @@ Parts = Callable[[Observed, Observed], list[tuple[BoolArray, BoolArray]]]
 def parts_left_out(
     observed: Sequence[Observed], recipe: Recipe, without: Mapping[str, Learned], parts: Parts
 ) -> tuple[Score, ...]:
-    """Score each flight as predicted part by part, from other flights without samples that are like the part.
+    """Score predictions of each part of a flight from other flights, without their samples that resemble the part.
 
-    The offset of a part comes from the flight's samples outside it, so that no number is fitted to the part.
+    The offset is fitted to samples of the flight outside the part, so that nothing is fitted to the part itself.
 
     Parameters
     ----------
@@ -443,7 +443,7 @@ def parts_left_out(
         Samples of all flights.
     recipe : Recipe
     without : mapping of str to Learned
-        What was learned without each flight. Its strengths are used again.
+        Gains learned without each flight. Their strengths are used again.
     parts : callable
         :func:`altitude_parts`, :func:`heading_parts` or :func:`sector_parts`.
 
@@ -456,7 +456,7 @@ def parts_left_out(
     of = {flight: [o for o in observed if o.samples.flight == flight] for flight in flights}
     stitched = {flight: [np.full(len(o.samples), np.nan) for o in of[flight]] for flight in flights}
     simple = {flight: [Simple(*np.full((3, len(o.samples)), np.nan)) for o in of[flight]] for flight in flights}
-    # loop over parts first: the training data of the flights are nearly the same, and their kernels are cached
+    # loop over parts first, because the flights have nearly the same training data, whose kernels are cached
     for k in range(max(len(parts(mine[0], mine[0])) for mine in of.values())):
         for flight, mine in of.items():
             sources = (o for o in observed if o.samples.flight != flight)
@@ -487,7 +487,7 @@ def parts_left_out(
 
 
 def altitude_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
-    """Return the most frequent height of the scored flight as one part, with all other heights for learning."""
+    """Return one part: the most frequent height of the scored flight. All other heights are used for learning."""
     height, cruise = scored.samples.position_m[:, 2], cruise_height_m(scored)
     mine = np.abs(height - cruise) < _CRUISE_M
     return [(mine, np.abs(source.samples.position_m[:, 2] - cruise) >= _CRUISE_M)]
@@ -500,7 +500,7 @@ def cruise_height_m(observed: Observed) -> float:
 
 
 def sector_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
-    """Return sectors of azimuth at the tower, with a guard."""
+    """Return one part per sector of azimuth at the tower, with guards that are not used for learning."""
 
     def azimuth(o: Observed) -> FloatArray:
         return np.degrees(azimuth_rad(o.samples.at_tower))
@@ -509,7 +509,7 @@ def sector_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, Bo
 
 
 def heading_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
-    """Return eighths of the compass for the heading, with a guard."""
+    """Return one part per eighth of the compass for the heading, with guards that are not used for learning."""
     return _angular(scored.heading_deg, source.heading_deg, 8, _GUARD_DEG)
 
 
@@ -525,7 +525,7 @@ def _angular(mine: FloatArray, sources: FloatArray, count: int, guard_deg: float
 
 
 def world_frame(observed: Sequence[Observed]) -> list[Observed]:
-    """Return the samples with the UAV's directions in world axes, as a control: no antenna is fixed there."""
+    """Return the samples with the UAV's directions in world axes, as a control: no antenna is fixed in them."""
     return [_with_uav(o, -o.samples.at_tower) for o in observed]
 
 
@@ -534,7 +534,7 @@ def wrong_way(observed: Sequence[Observed]) -> list[Observed]:
     out = []
     for o in observed:
         body = o.samples.at_uav
-        # the azimuth in the body is bearing less heading: this is bearing plus heading
+        # azimuth in the body frame is bearing minus heading; the control uses bearing plus heading
         turned = 2.0 * azimuth_rad(-o.samples.at_tower) - azimuth_rad(body)
         across = np.hypot(body[:, 0], body[:, 1])
         out.append(_with_uav(o, np.stack([across * np.cos(turned), across * np.sin(turned), body[:, 2]], axis=1)))
@@ -545,10 +545,10 @@ def _with_uav(o: Observed, at_uav: FloatArray) -> Observed:
     return dataclasses.replace(o, samples=dataclasses.replace(o.samples, at_uav=at_uav))
 
 
-# Function that predicts level above free space (n,) and its standard deviation (n,) [dB]. It does not use residuals.
+# Function that predicts the level above free space (n,) and its standard deviation (n,) [dB], without using residuals.
 Predictor = Callable[[LinkSamples], tuple[FloatArray, FloatArray]]
 
-# Function that learns from samples whose residual is measured minus free space.
+# Function that learns from samples with residuals relative to free space, and returns a predictor.
 Base = Callable[[Sequence[LinkSamples]], Predictor]
 
 _HeldOut = tuple[FloatArray, FloatArray]
@@ -559,16 +559,16 @@ BIN_S = 4.0
 # Side of the held-out blocks of a single flight [m].
 BLOCK_M = 300.0
 
-# Number of groups that are held out in turn if there are more flights than :data:`MOST_GROUPS`. A residual field is
-# then fitted once, without the first group. One flight among many hardly changes it.
+# Number of groups that are held out in turn if there are more flights than :data:`MOST_GROUPS`. The parameters of a
+# residual field are then fitted only once, without the first group, because single flights hardly change them.
 _SCORED_GROUPS = 3
 
 OFF = "no correction"
 
 _NUISANCE = ("drift_sd_db", "drift_s", "noise_sd_db")
 
-# Scales of the field over positions. Drift and noise are always fitted. With few flights the likelihood confuses
-# position with direction and height: free lengths increased the error on held-out flights by 0.3 dB.
+# Lengths of the field over positions. Drift and noise are always fitted. With few flights, the likelihood confuses
+# position with direction and height: fitted lengths increased the error on held-out flights by 0.3 dB.
 _STARTS: dict[str, FieldModel | None] = {
     OFF: FieldModel(place_sd_db=1e-3, turn=math.inf, drift_s=8.0),
     "field of 2 dB, 30 m": FieldModel(place_sd_db=2.0, length_m=30.0, height_m=20.0, turn=0.35, drift_s=8.0),
@@ -580,7 +580,7 @@ _STARTS: dict[str, FieldModel | None] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Channel:
-    """The binned rows of one tower and channel over all flights, and the residuals (n,) of a base there [dB]."""
+    """The binned rows of one tower and channel over all flights, and a base's residuals (n,) at these rows [dB]."""
 
     rows: Rows
     left_db: FloatArray
@@ -589,7 +589,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Correction:
-    """The chosen base and residual field, conditioned on all known flights.
+    """The chosen base and residual field, fitted to all known flights.
 
     Parameters
     ----------
@@ -602,18 +602,18 @@ class Correction:
     channels : mapping of str to Channel
         Channels by antenna (``tower.channel``).
     flights : tuple of str
-        Names, whose indices are the codes of :class:`Rows`.
+        Names of the flights. Their indices are the flight codes of :class:`Rows`.
     crps_db, rmse_db : mapping of (base, title) to float
         CRPS and RMSE of held-out errors.
     held_out : mapping of (base, title) to ((n,), (n,))
-        Held-out errors, in one order for all, and their standard deviations. NaN if there is no prediction.
+        Held-out errors and their standard deviations, in the same order for all candidates. NaN without a prediction.
     held_out_place_m : (n, 3), optional
         Positions of the samples of ``held_out`` [m].
     held_out_parts : tuple of (str, int)
         Flight and number of samples of each tower and channel in ``held_out``, in its order.
     sd_factor : float
-        Factor of all standard deviations, which makes the held-out errors as large as stated. Each candidate of
-        ``held_out`` has its own.
+        Factor applied to all standard deviations, so that they agree with the held-out errors. Each candidate of
+        ``held_out`` has its own factor.
     """
 
     base: str
@@ -641,15 +641,15 @@ class Correction:
     ) -> tuple[FloatArray, FloatArray]:
         """Return level above free space (n,) and its standard deviation (n,) for means over :data:`BIN_S` [dB].
 
-        The standard deviation contains base, field, drift and noise. It contains the offset between flights unless
-        errors count about the ``own_mean`` of the samples.
+        The standard deviation includes base, field, drift and noise. It also includes the offset between flights,
+        unless ``own_mean`` is set: errors are then relative to the mean of the samples.
         """
         return self.over_headings([samples], flight, own_mean=own_mean)
 
     def over_headings(
         self, each: Sequence[LinkSamples], flight: str | None = None, *, own_mean: bool = False, all_targets: int = 0
     ) -> tuple[FloatArray, FloatArray]:
-        """Predict as :meth:`predict` for an aircraft with unknown heading, giving equal weight to several headings.
+        """Return the mean of :meth:`predict` over several headings, for an aircraft with unknown heading.
 
         Parameters
         ----------
@@ -658,7 +658,8 @@ class Correction:
         flight : str, optional
         own_mean : bool
         all_targets : int
-            Number of targets of the run, if these are a part of it. All parts are then solved in the same way.
+            Number of targets of the whole run, if ``each`` is a part of it, so that all parts are solved in the same
+            way.
 
         Returns
         -------
@@ -674,24 +675,24 @@ class Correction:
         if len(each) > 1:
             targets = dataclasses.replace(targets, direction=np.stack([s.at_uav for s in each], axis=1))
         if not self.on and flight not in self.flights and len(targets):
-            # without a field, one target with a position has the solution of all
+            # without a field, all targets have the same solution, so one is enough
             targets = targets.part(np.array([np.isfinite(targets.position_m).all(axis=1).argmax()]))
         # solve once for each antenna, because maps are predicted tile by tile
         fit = self.fits.setdefault(samples.antenna, FieldFit(self.model, channel.rows, channel.left_db))
         exact = fit.fits(max(len(targets), all_targets))
         mean, sd = fit.predict(targets, exact=exact)
         if own_mean:
-            # the offset of a flight does not change errors about its own mean
+            # errors relative to a flight's own mean do not contain its offset
             _, sd = fit.predict(targets, ("place", "drift"), exact=exact)
         variance = sd**2 + (gain_sds**2).mean(axis=0) + gains.var(axis=0) + self.model.noise_sd_db**2
         return gains.mean(axis=0) + mean, self.sd_factor * np.sqrt(variance)
 
 
 def between_blocks_db(channel: Channel) -> float:
-    """Return the standard deviation of a base's residual between blocks of :data:`BLOCK_M` [dB], 0 for one block."""
+    """Return the SD of a base's residual between blocks of :data:`BLOCK_M` [dB], or 0 for a single block."""
     cell = np.floor(channel.rows.position_m[:, :2] / BLOCK_M).astype(np.int64)
     member = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
-    # blocks have equal weights, so that a hover counts no more than a pass
+    # give blocks equal weights, so that a hover does not count more than a pass
     means = np.bincount(member, weights=channel.left_db) / np.bincount(member)
     return float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
 
@@ -735,7 +736,7 @@ class _Fold:
 
 
 def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
-    """Return the folds: each flight held out, or three of six groups, or blocks of a single flight."""
+    """Return the cross-validation folds: single flights, three of six groups of flights, or blocks of one flight."""
     names = list(dict.fromkeys(s.flight for s in series))
     if len(names) > 1:
         return [
@@ -756,14 +757,14 @@ def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
 def _score_fold(
     fold: _Fold, base: Base, models: dict[str, FieldModel | None], tallies: Mapping[str, list[_HeldOut]], *, keep: bool
 ) -> None:
-    """Add the errors of every residual field of a base in one fold. Errors of new flights count about their own mean.
+    """Add the errors of every residual field of a base in one fold. Errors of a new flight are relative to its mean.
 
     Parameters
     ----------
     fold : _Fold
     base : callable
     models : dict of str to FieldModel or None
-        Models by title. The value None requests a model whose strengths are fitted here.
+        Models by title. A model that is None is fitted here.
     tallies : mapping of str to list
         Lists to which the errors are appended.
     keep : bool
@@ -794,21 +795,21 @@ def _score_fold(
             tallies[title].append((error, np.sqrt(sd**2 + gain_sd**2 + model.noise_sd_db**2)))
 
 
-# Titles of the residual fields with stated lengths. Fitted lengths are not valid far from the flown positions.
+# Titles of the residual fields with fixed lengths. Fitted lengths are not valid far from the flown positions.
 STATED_FIELDS = tuple(title for title, start in _STARTS.items() if start is not None)
 
 
 def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Sequence[str] = ()) -> Correction:
-    """Choose the base and residual field with the lowest held-out CRPS, and learn them from all known flights.
+    """Choose the base and residual field with the lowest held-out CRPS, and fit them to all known flights.
 
     Parameters
     ----------
     series : sequence of LinkSamples
-        Measured minus free space of every known flight, tower and channel.
+        Samples of every known flight, tower and channel, with residuals relative to free space.
     bases : mapping of str to callable
         Bases in order of preference for equal scores.
     titles : sequence of str
-        Titles of the residual fields that are tried, including :data:`OFF`. The default is all.
+        Titles of the residual fields to try, including :data:`OFF`. By default, all are tried.
 
     Returns
     -------
@@ -838,7 +839,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
     held_out = {key: (error, factors[key] * sd) for key, (error, sd) in joined.items()}
     crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*errors)) for key, errors in held_out.items()}
     sure = [key for key in held_out if key[1] == OFF or crps_difference(held_out, key, place)[1][1] < 0.0]
-    # compare to a thousandth of a decibel, then in the order of preference
+    # round to a thousandth of a decibel, so that equal scores follow the order of preference
     best = min(sure or crps, key=lambda key: (round(crps[key], 3), list(tallies).index(key)))
     flights = tuple(dict.fromkeys(s.flight for s in series))
     predictor = bases[best[0]](series)
@@ -868,10 +869,10 @@ def crps_difference(
     Parameters
     ----------
     held_out : mapping of (base, title) to ((n,), (n,))
-        Errors and their standard deviations, as :class:`Correction` has them.
+        Errors and their standard deviations, as in :class:`Correction`.
     key : (base, title)
     place_m : (n, 3) or None
-        Positions [m]: the interval considers correlation over place, too.
+        Positions [m]. If they are given, the interval also allows for correlation over position.
     """
     difference = crps_normal(*held_out[key]) - crps_normal(*held_out[key[0], OFF])
     good = np.isfinite(difference)
@@ -880,10 +881,11 @@ def crps_difference(
 
 
 def _sd_factor(flights: Sequence[str], parts: Sequence[_HeldOut]) -> float:
-    """Return the ratio of seen to stated errors of held-out parts, between 0.8 and 1.6. 1 if there is no error.
+    """Return the ratio of actual to stated errors of held-out parts, limited to 0.8 to 1.6, or 1 without errors.
 
-    It is a geometric mean over the flights of the parts: a model of quiet flights states too little for a restless one,
-    and the reverse. An arithmetic mean would count the first case more, although the final model knows both kinds.
+    It is a geometric mean over flights. A model learned from flights with small errors states too little for a flight
+    with large errors, and the reverse. An arithmetic mean would give the first case more weight, although the final
+    model is fitted to both kinds.
     """
     squares: dict[str, list[FloatArray]] = {}
     for flight, (error, sd) in zip(flights, parts, strict=True):
@@ -899,13 +901,13 @@ def _joined(parts: Sequence[_HeldOut]) -> _HeldOut:
 
 
 def _mean(values: FloatArray) -> float:
-    """Return the mean of the finite values, infinite if there are none."""
+    """Return the mean of the finite values, or infinity if there are none."""
     good = values[np.isfinite(values)]
     return float(good.mean()) if len(good) else math.inf
 
 
 def fixed_base(gain: Callable[[LinkSamples], FloatArray]) -> Base:
-    """Return a base with a known level above free space, which learns nothing."""
+    """Return a base whose level above free space is known, so that nothing is learned."""
 
     def learn(_: Sequence[LinkSamples]) -> Predictor:
         return lambda samples: (gain(samples), np.zeros(len(samples)))
@@ -920,8 +922,8 @@ MOST_DIRECTIONS = 5_000
 def by_degree(predictor: Predictor) -> Predictor:
     """Return a predictor that evaluates a model of directions once per degree if there are many samples.
 
-    Gains have correlation lengths of 11 degrees and more. Results are cached, because later parts of a run and other
-    headings have nearly the same directions.
+    One degree is enough, because gains have correlation lengths of 11 degrees and more. Results are cached, because
+    later parts of a run and other headings have nearly the same directions.
     """
     known: dict[str, tuple[IntArray, FloatArray]] = {}
 
@@ -931,7 +933,7 @@ def by_degree(predictor: Predictor) -> Predictor:
         cells = np.zeros(len(samples), dtype=np.int64)
         for ray in (samples.at_tower, samples.at_uav):
             for angle in (azimuth_rad(ray), elevation_rad(ray)):
-                # one integer for both directions, to a degree
+                # combine both directions, rounded to a degree, into one integer
                 cells = 361 * cells + np.round(np.degrees(angle)).astype(np.int64) + 180
         degrees, first, member = np.unique(cells, return_index=True, return_inverse=True)
         keys, values = known.get(samples.antenna, (np.zeros(0, dtype=np.int64), np.zeros((2, 0))))

@@ -1,19 +1,21 @@
-"""The residual of a prediction as a Gaussian process over position, height, direction and time of flight.
+"""Gaussian process of the residual of a prediction over position, height, direction and time of flight.
 
-One covariance serves a map, a route, held-out blocks and the rest of a flight::
+The same covariance is used for maps, routes, held-out blocks and the rest of a flight::
 
     residual = mean + place(east, north, up, direction) + offset(flight) + drift(flight, time) + noise
 
-``mean`` is unknown. All flights share ``place``: ``sd^2 exp(-d / length) exp(-dz / height) exp(-chord^2 / 2 turn^2)``.
-Each flight has its own ``offset`` and ``drift`` (``sd^2 exp(-dt / drift_s)``). The lengths have physical bounds
-(:data:`BOUNDS`), because an unbounded fit takes fading for a field over positions. Channels are fitted separately.
+``mean`` is an unknown constant. All flights share ``place``, with covariance ``sd^2 exp(-d / length) exp(-dz / height)
+exp(-chord^2 / 2 turn^2)``. Each flight has its own ``offset``, and its own ``drift`` with covariance ``sd^2 exp(-dt /
+drift_s)``. The lengths have physical bounds (:data:`BOUNDS`), because an unbounded fit would mistake fading for a field
+over positions. Channels are fitted separately.
 
-:class:`Known` computes the standard deviation after a planned flight. A Gaussian process needs no levels for that: the
-directions and positions of the route are enough. Antennas are those of :mod:`.gains`, with a field for their residual.
+:class:`Known` computes the standard deviation after a planned flight. For that, a Gaussian process needs only the
+directions and positions of the route, not the levels. The antennas are modelled by :mod:`.gains`, and their residual by
+a field.
 
-:class:`RouteAhead` predicts the rest of a flight each time levels arrive, by a trend and a Gaussian process of its
-residual. The trend with the lowest CRPS of earlier predictions is used, and can be zero. Only the latest :data:`KEEP`
-means over :data:`BIN_S` are used, so that an update takes the same time throughout the flight.
+:class:`RouteAhead` predicts the rest of a flight whenever levels arrive, from a trend and a Gaussian process of its
+residual. The trend is the one whose earlier predictions had the lowest CRPS. It can be zero. Only the latest
+:data:`KEEP` means over :data:`BIN_S` are used, so that an update takes the same time throughout the flight.
 """
 
 from __future__ import annotations
@@ -36,34 +38,35 @@ from .level import crps_normal
 Part = Literal["mean", "place", "offset", "drift"]
 PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
 
-# Standard deviation of the unknown mean: large enough not to restrict it, and still a proper covariance.
+# Prior standard deviation of the unknown mean. It is so large that it does not restrict the mean.
 MEAN_SD_DB = 100.0
 
-# Largest number of rows of the exact solution, whose matrix then takes 72 MB.
+# Largest number of rows of the exact solution. Its matrix then takes 72 MB.
 _EXACT_ROWS = 3000
 
-# Rows squared times targets above which (about ten seconds) a target is predicted from its nearest rows.
+# Largest product of squared rows and targets for the exact solution (about ten seconds). Larger problems use only the
+# nearest rows.
 _EXACT_WORK = 2.0e11
 
-# Nearest rows of a single target, and the largest number of rows that several targets share.
+# Number of nearest rows of a single target, and largest number of rows that several targets share.
 _NEAREST, _MOST_NEAREST = 40, 160
 
-# Side of the cells in scaled space whose targets share their rows.
+# Side of the cells in scaled space. Targets in a cell share their rows.
 _TOGETHER = 0.25
 
-# Rows of one channel from which scales are learned.
+# Largest number of rows per channel from which scales are fitted.
 FIT_ROWS = 700
 
-# Targets per block, which limits memory.
+# Number of targets per block, which limits the memory.
 AT_ONCE = 1024
 
-# Code of a new flight, without rows.
+# Code of a new flight, which has no rows.
 NEW_FLIGHT = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldModel:
-    """Strengths [dB] and scales of the covariance.
+    """The strengths [dB] and scales of the covariance.
 
     Parameters
     ----------
@@ -71,7 +74,7 @@ class FieldModel:
         The field over positions: its standard deviation, horizontal and vertical length [m], and chord of the
         direction. With an infinite ``turn`` the field does not depend on direction.
     offset_sd_db : float
-        Standard deviation between flights.
+        Standard deviation of the offset between flights.
     drift_sd_db, drift_s : float
         Standard deviation and correlation time [s] of the drift within a flight.
     noise_sd_db : float
@@ -88,7 +91,7 @@ class FieldModel:
     noise_sd_db: float = 1.5
 
 
-# Bounds of the parameters that can be fitted.
+# Bounds of the parameters that can be fitted, by name.
 BOUNDS: dict[str, tuple[float, float]] = {
     "place_sd_db": (0.05, 12.0),
     "length_m": (10.0, 300.0),
@@ -113,7 +116,7 @@ class Rows:
     time_s : (n,)
         Time since the start of the row's flight [s].
     flight : (n,) int
-        Code of the flight: :data:`NEW_FLIGHT` for a flight without rows.
+        Code of the flight, or :data:`NEW_FLIGHT` for a flight without rows.
     """
 
     position_m: FloatArray
@@ -126,12 +129,12 @@ class Rows:
 
     @classmethod
     def of(cls, samples: LinkSamples, flight: int) -> Rows:
-        """Return the rows of the samples of one flight, whose code is ``flight``."""
+        """Return the rows for the samples of the flight with the code ``flight``."""
         codes = np.full(len(samples), flight)
         return cls(position_m=samples.position_m, direction=samples.at_uav, time_s=samples.time_s, flight=codes)
 
     def part(self, keep: Any) -> Rows:
-        """Return some of the rows. An index with two dimensions adds a dimension to every array."""
+        """Return the selected rows. An index with two dimensions adds a dimension to every array."""
         return Rows(**{f.name: getattr(self, f.name)[keep] for f in dataclasses.fields(self)})
 
     @classmethod
@@ -166,7 +169,7 @@ class _Apart:
         return cls(
             across,
             up,
-            # the product of equal unit vectors can round above 1
+            # rounding can make the product of equal unit vectors exceed 1
             np.maximum(2.0 - 2.0 * inner, 0.0),
             np.abs(rows.time_s[..., :, None] - columns.time_s[..., None, :]),
             (rows.flight[..., :, None] == columns.flight[..., None, :]).astype(np.float64),
@@ -176,7 +179,7 @@ class _Apart:
 def _place(model: FieldModel, apart: _Apart) -> FloatArray:
     """Return the covariance (..., n, m) of the field over positions.
 
-    Several headings count equally: their mean is the covariance of a level whose heading is not known.
+    The covariance is averaged over several headings, which is the covariance of a level with unknown heading.
     """
     near = np.exp(-apart.across_m / model.length_m - apart.height_m / model.height_m)
     if math.isfinite(model.turn):
@@ -190,7 +193,7 @@ def _drift(model: FieldModel, apart: _Apart) -> FloatArray:
 
 
 def covariance(model: FieldModel, rows: Rows, columns: Rows, parts: Collection[Part] = PARTS) -> FloatArray:
-    """Return the covariance of some parts of the residual between rows (..., n, m), without noise [dB^2].
+    """Return the covariance (..., n, m) between rows of the selected parts of the residual, without noise [dB^2].
 
     Parameters
     ----------
@@ -216,7 +219,7 @@ def covariance(model: FieldModel, rows: Rows, columns: Rows, parts: Collection[P
 
 
 def prior_sd_db(model: FieldModel, parts: Collection[Part]) -> float:
-    """Return the standard deviation of some parts before any sample is known [dB]."""
+    """Return the prior standard deviation of the selected parts, before any sample is known [dB]."""
     each = {
         "mean": MEAN_SD_DB,
         "place": model.place_sd_db,
@@ -231,7 +234,7 @@ def prior_sd_db(model: FieldModel, parts: Collection[Part]) -> float:
 
 @dataclass(frozen=True)
 class FieldFit:
-    """The process conditioned on rows. Standard deviations do not need ``value_db`` (n,)."""
+    """The process conditioned on rows. Standard deviations do not depend on the values ``value_db`` (n,)."""
 
     model: FieldModel
     rows: Rows
@@ -244,16 +247,16 @@ class FieldFit:
     def predict(
         self, targets: Rows, parts: Collection[Part] = PARTS, *, exact: bool | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the mean and standard deviation (m,) of some parts at targets [dB], NaN where a target has NaN.
+        """Return mean and standard deviation (m,) of the selected parts at targets [dB]. NaN for targets with a NaN.
 
         Parameters
         ----------
         targets : Rows
         parts : collection of str
-            Parts of the residual. ``("place", "drift")`` is a flight about its own mean.
+            Parts of the residual. ``("place", "drift")`` is the residual of a flight relative to its own mean.
         exact : bool, optional
-            True uses all rows, False the nearest rows of each target. The default is the exact solution if its
-            matrices fit (:data:`_EXACT_ROWS`, :data:`_EXACT_WORK`).
+            True to use all rows, False to use only the nearest rows of each target. By default, the exact solution is
+            used if its matrices are small enough (:data:`_EXACT_ROWS`, :data:`_EXACT_WORK`).
 
         Returns
         -------
@@ -263,8 +266,8 @@ class FieldFit:
         -----
         In the approximation, evenly thinned rows determine the common mean and the offset of each flight. A target is
         predicted from its :data:`_NEAREST` rows in the scaled space (Vecchia's conditioning: Datta et al. 2016, doi
-        10.1080/01621459.2015.1044091). Targets of one cell share the rows nearest to their centre. More targets share
-        more rows (Guinness 2018, doi 10.1080/00401706.2018.1437476).
+        10.1080/01621459.2015.1044091). Targets in one cell share the rows nearest to their centre. The more targets,
+        the more rows they share (Guinness 2018, doi 10.1080/00401706.2018.1437476).
         """
         mean, sd = np.full((2, len(targets)), np.nan)
         ends = targets.direction.reshape(len(targets), -1)
@@ -306,10 +309,10 @@ class FieldFit:
         value = np.zeros(len(self.rows)) if self.value_db is None else self.value_db - row_levels
         near: list[Part] = ["place", "drift"]
         near_parts = [part for part in near if part in parts]
-        # The mean and the offsets use all rows. The error of the level of another flight does not affect the targets.
+        # The mean and the offsets use all rows. The error of another flight's level does not affect the targets.
         row_sd = row_sd * (np.isin(self.rows.flight, targets.flight) & bool(near_parts))
         prior = prior_sd_db(self.model, near_parts) ** 2 if near_parts else 0.0
-        # several headings have no single direction to which a row is near
+        # with several headings, nearness cannot be measured by direction
         turned = math.isfinite(self.model.turn) and targets.direction.ndim == 2
         tree, places = cKDTree(self._scaled(self.rows, turned)), self._scaled(targets, turned)
         for part, shared in _cells(places, step):
@@ -317,7 +320,7 @@ class FieldFit:
             count = np.arange(1, min(round(most), len(self.rows)) + 1)
             index = tree.query(places[part].mean(axis=0) if shared else places[part], k=count)[1]
             rows, some, sd = self.rows.part(index), targets.part(part), row_sd[index]
-            # the error of a flight's level is common to the residuals of its rows
+            # all residuals of a flight have the error of its level in common
             common = sd[..., :, None] * sd[..., None, :] * (rows.flight[..., :, None] == rows.flight[..., None, :])
             matrix = _noisy(self.model, covariance(self.model, rows, rows, near) + common)
             own = level_sd[part][:, None] * sd * (some.flight[:, None] == rows.flight)
@@ -332,7 +335,7 @@ class FieldFit:
             yield part, mean, np.sqrt(np.maximum(variance, 0.0))
 
     def _scaled(self, rows: Rows, turned: bool) -> FloatArray:
-        """Return coordinates in which the field has a length of 1, with or without the direction."""
+        """Return coordinates in which the correlation length of the field is 1, with or without the direction."""
         m = self.model
         place = rows.position_m / (m.length_m, m.length_m, m.height_m)
         return np.column_stack([place, rows.direction / m.turn]) if turned else place
@@ -350,7 +353,7 @@ class FieldFit:
         return mean_of[member], sd_of[member]
 
 
-# Number of targets per cell from which they share rows. Smaller cells would not save time.
+# Smallest number of targets in a cell that share rows. Sharing between fewer would not save time.
 FEWEST_TOGETHER = 8
 
 
@@ -424,7 +427,7 @@ def fit_field(
             total, slope = total - value_nat, slope - gradient
         return total, slope
 
-    # search over logarithms: strengths and lengths are positive, and their ratios matter
+    # search over logarithms, because strengths and lengths are positive and vary by ratios
     limits = [(math.log(BOUNDS[name][0]), math.log(BOUNDS[name][1])) for name in names]
     first = np.clip([math.log(getattr(start, name)) for name in names], *np.array(limits).T)
     best = minimize(misfit, first, jac=True, bounds=limits, method="L-BFGS-B", options={"maxiter": 40})
@@ -437,7 +440,7 @@ def _with(model: FieldModel, names: Sequence[str], logs: FloatArray) -> FieldMod
 
 
 def _evenly(rows: Rows, value: FloatArray) -> tuple[Rows, FloatArray]:
-    """Return uninterrupted segments with at most :data:`FIT_ROWS` rows: thinning would hide short scales."""
+    """Return at most :data:`FIT_ROWS` rows as uninterrupted segments, because thinning would hide short scales."""
     if len(rows) <= FIT_ROWS:
         return rows, value
     # seven segments over the flight cover near and far, climb and landing
@@ -450,8 +453,8 @@ def _evenly(rows: Rows, value: FloatArray) -> tuple[Rows, FloatArray]:
 def _offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], otherwise_db: float) -> float:
     """Return the standard deviation between the means of flights [dB], shrunk towards a prior guess.
 
-    The guess counts as two observations, because two flights hardly determine a standard deviation (the mean of an
-    inverse-gamma posterior).
+    The result is the mean of an inverse-gamma posterior. The guess counts as two observations, because two flights
+    hardly determine a standard deviation.
     """
     squares, count = 2.0 * otherwise_db**2, 2.0
     for rows, value in channels:
@@ -461,7 +464,7 @@ def _offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], otherwise_db: flo
 
 
 def _likelihood(model: FieldModel, apart: _Apart, value: FloatArray, names: Sequence[str]) -> tuple[float, FloatArray]:
-    """Return the log marginal likelihood up to a constant, and its slope by the logarithm of each named parameter."""
+    """Return the log marginal likelihood, up to a constant, and its gradient in the logarithms of the parameters."""
     place, drift = _place(model, apart), _drift(model, apart)
     factor = Factor.of(_noisy(model, MEAN_SD_DB**2 + place + model.offset_sd_db**2 * apart.same + drift))
     inverse = factor.inverse()
@@ -490,16 +493,16 @@ _PLANNED = "planned"
 
 @dataclass(frozen=True, kw_only=True)
 class Known:
-    """The flights and models that determine how well targets are known.
+    """The flown flights and the models, from which the uncertainty at targets is computed.
 
     Parameters
     ----------
     series : sequence of LinkSamples
-        Samples of the flown flights. If there are none, the antennas have their prior.
+        Samples of the flown flights. Without any, the gains of the antennas have their prior uncertainty.
     model : GainModel
         Gain model: terms and strengths of the antennas, error of a flight and channel, and noise.
     field : FieldModel, optional
-        Model of the residual of the antennas. None adds no field.
+        Model of the residual of the antennas. With None, no field is added.
     """
 
     series: Sequence[LinkSamples]
@@ -507,20 +510,21 @@ class Known:
     field: FieldModel | None = None
 
     def sd_db(self, route: Sequence[LinkSamples], targets: Mapping[str, LinkSamples]) -> dict[str, FloatArray]:
-        """Return the standard deviation (targets,) of the level at each antenna, about its mean over the targets [dB].
+        """Return the SD (targets,) of the level at each antenna, relative to its mean over the targets [dB].
 
         Parameters
         ----------
         route : sequence of LinkSamples
-            Samples of the planned flight at each antenna. Their levels are not used. An empty sequence plans no flight.
+            Samples of the planned flight at each antenna. Their levels are not used. It is empty if no flight is
+            planned.
         targets : mapping of str to LinkSamples
             Targets by antenna.
 
         Returns
         -------
         dict of str to (targets,)
-            Standard deviation of antennas and field. The error and noise of a later flight are not included, because
-            no route reduces them.
+            Standard deviation from antennas and field. Nuisance and noise of a later flight are not included, because
+            no planned flight reduces them.
         """
         # the levels can be arbitrary, because the standard deviation does not depend on them
         planned = [dataclasses.replace(s, flight=_PLANNED, residual_db=np.zeros(len(s))) for s in route]
@@ -547,17 +551,17 @@ class Known:
 
 
 def rms_db(sd_db: Mapping[str, FloatArray]) -> float:
-    """Return the root mean square over all targets and antennas [dB]: the error to expect of a flight's mean there."""
+    """Return the root mean square over all targets and antennas [dB]."""
     return math.sqrt(float(np.mean(np.concatenate([sd**2 for sd in sd_db.values()]))))
 
 
 BIN_S = 2.0
 KEEP = 150
 LEAST = 8
-# A trend is scored by its predictions of levels this much later [s].
+# A trend is scored by its predictions of levels this long ahead [s].
 AHEAD_S = 20.0
 
-# Weight of an error relative to that of the next bin.
+# Weight of an error relative to the error one bin later, so that old errors are forgotten.
 _FORGET = 0.98
 
 LENGTHS_M = (30.0, 120.0)
@@ -581,7 +585,7 @@ _MODELS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ahead:
-    """The predicted rest of the route: index of its points (m,), median, standard deviation of a sample, and trend."""
+    """The predicted rest of the route: indices of its points (m,), median level, SD of a sample, and trend."""
 
     index: IntArray
     level_db: FloatArray
@@ -591,12 +595,12 @@ class Ahead:
     @property
     def interval_db(self) -> tuple[FloatArray, FloatArray]:
         """The 90 % interval of one sample at each point: lower and upper ends (m,)."""
-        # 1.645: the 95 % point of the normal distribution
+        # 1.645 is the 95 % quantile of the normal distribution
         return self.level_db - 1.645 * self.sd_db, self.level_db + 1.645 * self.sd_db
 
 
 class RouteAhead:
-    """A prediction of the rest of a route that learns from every record.
+    """A prediction of the rest of a route, updated with every record.
 
     Parameters
     ----------
@@ -611,12 +615,12 @@ class RouteAhead:
         self._trends = {**{k: np.asarray(v, dtype=np.float64) for k, v in trends.items()},
                         NONE: np.zeros(len(self.route_m))}  # fmt: skip
         self._scores: dict[tuple[str, float], tuple[float, float]] = {}
-        # time, east, north, up, level and each trend, of the closed bins and of the records of the open bin
+        # closed bins, and records of the open bin, each with time, east, north, up, level and all trends
         self._bins, self._open = np.empty((0, 5 + len(self._trends))), list[tuple[float, ...]]()
         self._reached, self.squares, self.samples = 0, 0.0, 0
 
     def add(self, time_s: float, place_m: FloatArray, level_db: float, trends: Mapping[str, float]) -> Ahead | None:
-        """Add a record. Return the prediction of the rest of the route if a bin closed, else None.
+        """Add a record. If this completes a bin, return the prediction of the rest of the route, else None.
 
         Parameters
         ----------
@@ -652,8 +656,8 @@ class RouteAhead:
         self._open.clear()
 
     def _judge(self, closed: FloatArray) -> None:
-        """Score the prediction of every trend for a bin (5 + trends,), made :data:`AHEAD_S` earlier."""
-        # use only earlier bins: neighbouring levels would predict any bin well
+        """Score every trend by its prediction for a bin (5 + trends,), made :data:`AHEAD_S` earlier."""
+        # use only bins that are old enough, because neighbouring levels predict any bin well
         known = self._bins[: int(np.searchsorted(self._bins[:, 0], closed[0] - AHEAD_S))]
         if len(known) < LEAST:
             return
@@ -668,12 +672,12 @@ class RouteAhead:
         """Return the prediction of the rest of the route from the position of the UAV."""
         if len(self._bins) < LEAST:
             return None
-        # search only a little ahead: where a route crosses itself, the nearest point can be on another leg
+        # search only a little ahead, because the nearest point can be on another leg where the route crosses itself
         window = slice(self._reached, self._reached + max(50, len(self.route_m) // 10))
         self._reached += int(np.linalg.norm(self.route_m[window] - place, axis=1).argmin())
         index = np.arange(self._reached, len(self.route_m))
         known = {key: total / weight for key, (total, weight) in self._scores.items()}
-        # before the first score: no trend, and the longer length
+        # before the first score, use no trend and the longest length
         trend, length = min(known, key=lambda key: known[key], default=(NONE, LENGTHS_M[-1]))
         steps = np.linalg.norm(np.diff(self.route_m[index], axis=0, prepend=place[None]), axis=1)
         later = np.column_stack([self._bins[-1, 0] + np.cumsum(steps) / SPEED_MPS, self.route_m[index]])
@@ -687,17 +691,17 @@ class RouteAhead:
 def _moments(
     model: FieldModel, bins: FloatArray, trends: FloatArray, targets: FloatArray
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the mean of the residual of each trend, and the standard deviation of a bin, at targets (m,).
+    """Return, for each trend, mean and standard deviation (m,) of the residual of a bin at targets.
 
-    All trends (n, k) of the bins (n, 5 or more) share one factor. The strengths are scaled to the data: ``s^2 = y'
-    inv(K) y / n``. Bins and targets (m, 4) begin with time and position.
+    All trends (n, k) at the bins (n, 5 or more) use the same matrix factor. The strengths are scaled to the data: ``s^2
+    = y' inv(K) y / n``. Bins and targets (m, 4) begin with time and position.
     """
     rows, ends = _rows(bins), _rows(targets)
     value = bins[:, 4:5] - trends
     factor = Factor.of(_noisy(model, covariance(model, rows, rows)))
     middle = value.mean(axis=0)
     white = factor.whiten(value - middle)
-    # without a lower limit, a level that has been constant so far would make every interval a point
+    # with a lower limit, because after a constant level all intervals would have zero width
     scale = np.maximum((white**2).sum(axis=0) / len(bins), 1e-2)
     mean, explained = factor.condition(covariance(model, ends, rows), white)
     prior = float(covariance(model, ends.part([0]), ends.part([0]))[0, 0])

@@ -4,23 +4,23 @@ The gain over direction at both ends of a link is learned from the residuals of 
 
 ``residual = offset + g_uav(body) + g_tower(mast) + g_pair(body, mast) + own + noise``
 
-``offset`` is free per flight, tower and channel. ``own`` is a nuisance of each flight and channel that is correlated
-over place, so that the shadowing of one flight is not learned as antenna. The gains are Gaussian processes. That of
-the UAV depends on the direction of the tower in the body frame, that of the tower on the direction of the UAV at the
-mast. The third depends on both directions, per channel, and contains the part that the first two do not explain.
+``offset`` is free per flight, tower and channel. ``own`` is an error of each flight and channel that is correlated over
+position (the nuisance), so that the shadowing of one flight is not learned as antenna gain. The gains are Gaussian
+processes. The gain of the UAV depends on the direction of the tower in the body frame, and the gain of the tower on the
+direction of the UAV at the mast. The third gain depends on both directions. It is separate for each channel and
+contains what the first two do not explain.
 
-Mounts of antennas with a known pattern are azimuths of all ends, fitted on several flights at once.
+For antennas with a known pattern, the azimuths of their mounts at both ends are fitted to several flights together.
 
-Pitch and roll are 0, because tilts fitted on one flight of dataset 12 (up to 20 degrees) raised the error of the other
-flight from 3.53 to 4.00 dB.
+Pitch and roll of a mount are 0: tilts that were fitted to one flight of dataset 12 (up to 20 degrees) raised the error
+of the other flight from 3.53 to 4.00 dB.
 
-The error model of a level with learned antennas has parts for gain, nuisance of the flight, noise and fading.
+The error model of a level with learned antennas consists of gain, nuisance of the flight, noise and fading.
 
-Evidence from the levels of a flight shows whether antennas learned on other flights apply to it.
-
-The levels must be more likely with the learned gain than with an unknown gain under the prior of a calibration, and
-more likely than with the learned gain of the UAV rotated by 90, 180 and 270 deg. Offset, nuisance, noise and all gains
-that are not compared are equal in each. Names of readers, files and channels have no effect.
+The levels of a flight are evidence whether antennas learned on other flights apply to it. The levels must be more
+likely with the learned gain than with an unknown gain under the prior of a calibration. They must also be more likely
+than with the learned gain of the UAV rotated by 90, 180 or 270 deg. Offset, nuisance, noise and all other gains are the
+same in each case. Names of readers, files and channels have no effect.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ from .level import crps_normal
 Frame = Literal["body", "mast", "pair"]
 _Sharing = Literal["all", "antenna"]
 
-# Prior of each offset in standard deviations of the noise, so large that the offset is practically free.
+# Prior standard deviation of each offset in units of the noise: so large that the offset is practically free.
 _OFFSET_SD = 100.0
 
-# Largest number of means in a fit (a matrix of 72 MB). With more flights, means are over longer times.
+# Largest number of means in a fit (a matrix of 72 MB). Many flights are averaged over longer times to stay below it.
 MOST_ROWS = 3000
 
-# Candidate strengths of the gains of the tower relative to those of the UAV, selected by likelihood. No other parameter
-# is selected on flights: with length and strength of the nuisance selected, the error on dataset 12 rose by 0.06 dB.
+# Candidate strengths of the tower's gains relative to the UAV's. The likelihood selects one. No other parameter is
+# selected: selecting length and strength of the nuisance raised the error on dataset 12 by 0.06 dB.
 _TOWER_FACTORS = (1.0, 0.5)
 
 
 def link_directions(tower_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return unit vectors (n, 3) of both ends towards each other, in the body frame of the UAV and in that of the mast.
+    """Return unit vectors (n, 3) towards the tower in the UAV's body frame, and towards the UAV in the mast's frame.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def rotated(direction: FloatArray, turn_deg: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class LinkSamples:
-    """The measurements of one flight on one channel of one tower, minus a model without the gain to be learned.
+    """Measured minus predicted levels of one flight and channel of a tower, without the gain that is to be learned.
 
     Parameters
     ----------
@@ -95,11 +95,11 @@ class LinkSamples:
     residual_db : (n,)
         Measured minus model [dB]; NaN is ignored.
     floor_db : (n,), optional
-        Residual of a level at the floor of the receiver [dB]. A smaller residual only means "at most this".
+        Residual that a level at the floor of the receiver would have [dB]. A smaller residual is only an upper limit.
     campaign : str
-        Measurement campaign, whose levels have common parameters of nuisance and noise.
+        Measurement campaign. All its flights have the same parameters of nuisance and noise.
     airframe : str
-        Airframe and band. Different airframes share no gain.
+        Airframe and band. Different airframes have independent gains.
     """
 
     flight: str
@@ -128,7 +128,7 @@ class LinkSamples:
         return len(self.time_s)
 
     def part(self, keep: BoolArray | IntArray) -> LinkSamples:
-        """Return some of the samples."""
+        """Return the selected samples."""
         arrays: dict[str, Any] = {name: getattr(self, name)[keep] for name in _ARRAYS}
         floor_db = None if self.floor_db is None else self.floor_db[keep]
         return dataclasses.replace(self, floor_db=floor_db, **arrays)
@@ -136,14 +136,13 @@ class LinkSamples:
     def binned(self, width_s: float) -> LinkSamples:
         """Return means over bins of time, with normalised directions.
 
-        A bin mixes only the directions that the UAV passes within it, which a few seconds keep below the lengths of the
-        kernels.
+        Within a few seconds, the direction changes by less than the correlation lengths of the gains.
         """
         finite = np.isfinite(self.residual_db) & np.isfinite(self.at_uav).all(axis=1)
         if not finite.any():
             return self.part(finite)
         part = self.part(finite)
-        # count from the first sample, so that bins do not depend on where a log was cut
+        # count from the first sample, so that bins do not depend on the start of the log
         _, member = np.unique(np.floor((part.time_s - part.time_s[0]) / width_s).astype(np.int64), return_inverse=True)
         means: dict[str, Any] = {name: _bin_means(getattr(part, name), member) for name in _ARRAYS}
         for name in ("at_uav", "at_tower"):
@@ -163,21 +162,21 @@ def _bin_means(values: FloatArray, member: IntArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One Gaussian process, whose covariance is exponential, or Gaussian for the pair of ends.
+    """One Gaussian process. Its covariance is exponential, or Gaussian for the pair of ends.
 
     Parameters
     ----------
     frame : {"body", "mast", "pair"}
         Argument of the process: direction of the tower in the body frame, of the UAV at the mast, or both.
     per : {"all", "antenna"}
-        One function for all, or one per tower and channel.
+        One gain for all, or one per tower and channel.
     length : float
         Length of the kernel, as a chord on the unit sphere.
     sd_db : float
         Standard deviation [dB].
     tied : float
-        Share of the variance that campaigns with one airframe have in common. The evidence of dataset 12, LTE and AADM
-        is almost constant from 0.7 to 0.95.
+        Share of the variance that campaigns with the same airframe have in common. The evidence of dataset 12, LTE and
+        AADM is almost constant from 0.7 to 0.95.
     """
 
     frame: Frame
@@ -200,14 +199,14 @@ ANTENNA_TERMS = (Term("body", "all", 1.0, 3.2), Term("mast", "antenna", 0.5, 3.4
 
 @dataclass(frozen=True, slots=True)
 class GainModel:
-    """The parameters that are not learned from directions: terms, strengths and lengths.
+    """The parameters of a fit: the terms with their strengths and lengths, nuisance and noise.
 
     Parameters
     ----------
     terms : tuple of Term
         One or more terms.
     own_sd_db, own_length_m : float
-        Nuisance of a flight and channel: ``sd^2 exp(-distance / length)``.
+        Nuisance of a flight and channel, with covariance ``sd^2 exp(-distance / length)``.
     noise_sd_db : float
         Standard deviation of the noise of a bin [dB].
     bin_s : float
@@ -220,7 +219,7 @@ class GainModel:
     noise_sd_db: float = 1.5
     bin_s: float = 4.0
     campaigns: tuple[tuple[str, float, float], ...] = ()
-    """Name, ``own_sd_db`` and ``noise_sd_db`` of campaigns with other values."""
+    """Name, ``own_sd_db`` and ``noise_sd_db`` of each campaign that has its own values."""
 
     def scales_db(self, campaign: str) -> tuple[float, float]:
         """Return the standard deviations of nuisance and noise of a campaign [dB]."""
@@ -241,7 +240,7 @@ class GainModel:
 
 
 def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
-    """Return the argument of a term of this frame: (n, 3), or (n, 6) for both directions."""
+    """Return the argument of a term: directions (n, 3) in its frame, or (n, 6) for the pair of both."""
     if frame == "pair":
         return np.concatenate([samples.at_uav, samples.at_tower], axis=1)
     return samples.at_uav if frame == "body" else samples.at_tower
@@ -250,7 +249,8 @@ def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
 def term_kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
     """Return the covariance of a term between arguments, shape (n, m) [dB^2].
 
-    Gains of airframes have details of every size: an exponential kernel has an error 0.1 dB below sums of Gaussians.
+    Gains of airframes have details of every angular size. The error is 0.1 dB lower with an exponential kernel than
+    with sums of Gaussians.
     """
     from scipy.spatial.distance import cdist
 
@@ -266,13 +266,13 @@ def term_kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=len(ANTENNA_TERMS))
 def _last_kernel(term: Term, at: bytes, to: bytes) -> FloatArray:
-    """Return :func:`term_kernel` of float64 arguments, cached because channels of one log have the same directions."""
+    """Return :func:`term_kernel` of float64 arrays given as bytes. Cached: channels of a log share directions."""
     width = 6 if term.frame == "pair" else 3
     return term_kernel(term, np.frombuffer(at).reshape(-1, width), np.frombuffer(to).reshape(-1, width))
 
 
 def gain_covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Sequence[LinkSamples]) -> FloatArray:
-    """Return the covariance of the gains between samples of some series and of others, shape (n, m) [dB^2]."""
+    """Return the covariance (n, m) of the gains between the samples of two lists of series [dB^2]."""
     rows, columns = _groups(first), _groups(second)
     out = np.zeros((sum(map(len, first)), sum(map(len, second))))
     for term in terms:
@@ -289,7 +289,7 @@ def gain_covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second:
 
 
 def _groups(series: Sequence[LinkSamples]) -> list[tuple[LinkSamples, slice]]:
-    """Return the first of each run of series that share all gains, and the range of the samples of the run."""
+    """Return, for each run of series that share all gains, its first series and the range of its samples."""
     out, start = [], 0
     for _, some in groupby(series, lambda s: s.group):
         run = list(some)
@@ -302,7 +302,7 @@ def _groups(series: Sequence[LinkSamples]) -> list[tuple[LinkSamples, slice]]:
 def _expected(
     terms: Sequence[Term], samples: LinkSamples, rows: Sequence[LinkSamples], weights: FloatArray
 ) -> FloatArray:
-    """Return the gains along samples from the weights of the rows, shape (n,) [dB]."""
+    """Return the expected gain (n,) along samples from the weights of the rows [dB]."""
     gain, counts = np.zeros(len(samples)), [len(s) for s in rows]
     for term in terms:
         share = np.repeat([term.shared(samples, s) for s in rows], counts)
@@ -328,12 +328,12 @@ def own_covariance(model: GainModel, samples: LinkSamples) -> FloatArray:
 
 
 def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> FloatArray:
-    """Return the covariance of the levels of all rows, with gains, offsets, nuisances and noise, (n, n) [dB^2]."""
+    """Return the covariance (n, n) of the levels of all rows: gains, offsets, nuisances and noise [dB^2]."""
     return _with_blocks(gain_covariance(model.terms, rows, rows), (own_covariance(model, s) for s in rows))
 
 
 def _with_blocks(covariance: FloatArray, blocks: Iterable[FloatArray]) -> FloatArray:
-    """Add the covariance of each series to its block on the diagonal, in place because of the size."""
+    """Add the covariance of each series to its diagonal block. This is done in place, because the matrix is large."""
     start = 0
     for block in blocks:
         part = slice(start, start + len(block))
@@ -349,13 +349,13 @@ class GainFit:
     Parameters
     ----------
     model : GainModel
-        Model with the standard deviations and the bins that were used.
+        Model with the standard deviations and bin duration that were used.
     rows : tuple of LinkSamples
         Means over bins, the training data.
     log_evidence : float
-        Log marginal likelihood, without a constant of the data.
+        Log marginal likelihood, up to a constant of the data.
     common_scale : float
-        Factor on all standard deviations with which they fit the data: ``s^2 = y' C^-1 y / rows``.
+        Factor by which all standard deviations must be multiplied to fit the data: ``s^2 = y' C^-1 y / rows``.
     """
 
     model: GainModel
@@ -364,7 +364,7 @@ class GainFit:
     common_scale: float
     _weights: FloatArray = field(repr=False)
     _factor: Factor = field(repr=False)
-    # mean gain over the rows of each antenna
+    # mean gain of each antenna over its rows
     _zero: Mapping[str, float] = field(repr=False)
 
     @property
@@ -374,7 +374,7 @@ class GainFit:
 
     def scaled(self) -> GainFit:
         """The fit with all standard deviations multiplied by :attr:`common_scale`, and unchanged gains."""
-        # a scale changes no mean, and the factor and the evidence follow in closed form
+        # a common scale does not change the means, and the new factor and evidence follow in closed form
         s, count = self.common_scale, len(self._weights)
         misfit = s**2 * max(count - len(self.rows), 1)
         return dataclasses.replace(
@@ -425,9 +425,9 @@ class GainFit:
         return self.predict(directed(antenna, np.asarray(direction, dtype=np.float64)), (frame,))
 
     def seen(self, frame: Frame, antenna: str) -> FloatArray:
-        """Return the directions of the bins of the fit at one end, (m, 3), or of pairs, (m, 6).
+        """Return the training directions at one end, (m, 3), or of the pair of ends, (m, 6).
 
-        At the UAV they are the directions of all antennas.
+        For the UAV, the directions to all antennas are returned.
         """
         return np.concatenate(
             [argument_of(s, frame) for s in (self.rows if frame == "body" else self._rows_of(antenna))]
@@ -442,7 +442,7 @@ class GainFit:
         return self._moments(self.model.terms, samples, [samples])[1]
 
     def airframe_mean(self, samples: LinkSamples) -> FloatArray:
-        """Return the gain of the UAV alone, for any tower and campaign with an airframe of the fit, shape (n,) [dB]."""
+        """Return the gain (n,) of the UAV alone [dB], for any tower and campaign with an airframe of the fit."""
         return self._gain([t for t in self.model.terms if t.frame == "body"], samples)
 
     def _gain(self, terms: Sequence[Term], samples: LinkSamples) -> FloatArray:
@@ -479,21 +479,21 @@ class GainFit:
     def _moments(
         self, terms: Sequence[Term], at: LinkSamples, about: Sequence[LinkSamples]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return mean and standard deviation (n,) of a sum of terms along samples, relative to its mean over others."""
+        """Return mean and SD (n,) of a sum of terms along ``at``, relative to its mean over ``about``."""
         centre = gain_covariance(terms, about, [at, *self.rows]).mean(axis=0)
         across = gain_covariance(terms, [at], self.rows) - centre[len(at) :]
-        # all terms count between samples of one antenna
+        # ``at`` and ``about`` have one antenna, so all terms are correlated
         prior = sum(t.sd_db**2 for t in terms) - 2.0 * centre[: len(at)] + gain_covariance(terms, about, about).mean()
         spread = self._factor.whiten(across.T)
         return across @ self._weights, np.sqrt(np.maximum(prior - (spread**2).sum(axis=0), 0.0))
 
 
-# Samples that are predicted at a time, which limits the memory.
+# Number of samples that are predicted together, which limits the memory.
 AT_ONCE = 2000
 
 
 def _in_parts(samples: LinkSamples, of: Callable[[LinkSamples], FloatArray], columns: int | None = None) -> FloatArray:
-    """Return values of ``of`` (n,) or (columns, n) along samples, NaN for samples without directions or position."""
+    """Return ``of(samples)``, (n,) or (columns, n), computed in parts. NaN without direction or position."""
     finite = np.isfinite(np.concatenate([samples.at_uav, samples.at_tower, samples.position_m], axis=1)).all(axis=1)
     out = np.full(len(samples) if columns is None else (columns, len(samples)), np.nan)
     for rows in np.array_split(np.flatnonzero(finite), -(-int(finite.sum()) // AT_ONCE) or 1):
@@ -502,7 +502,7 @@ def _in_parts(samples: LinkSamples, of: Callable[[LinkSamples], FloatArray], col
 
 
 def directed(antenna: str, direction: FloatArray) -> LinkSamples:
-    """Return samples of an antenna towards directions (n, 3), equal at both ends, or towards pairs of them (n, 6)."""
+    """Return samples of an antenna with directions (n, 3), the same at both ends, or with pairs (n, 6)."""
     count = len(direction)
     tower, _, channel = antenna.partition(".")
     return LinkSamples(
@@ -538,17 +538,17 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
 
     Notes
     -----
-    ``y = offset + gains + own + noise``, all normal: with the covariance ``C`` of the rows, the gain at directions of
-    covariance ``k`` with them is ``k' C^-1 y`` (:class:`~aerpaw_cmp.common.gaussian.Factor`). The solution is exact
-    except for the average over ``bin_s``.
+    All parts of ``y = offset + gains + own + noise`` are normal. With the covariance ``C`` of the rows, and the
+    covariance ``k`` between rows and requested directions, the gain is ``k' C^-1 y``
+    (:class:`~aerpaw_cmp.common.gaussian.Factor`). The solution is exact except for the averaging over ``bin_s``.
     """
     model, rows = _binned_series(series, model or GainModel())
     return _solved(model, rows, _covariance_of_levels(model, rows))
 
 
 def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArray) -> GainFit:
-    """Return the fit of rows with the covariance of their levels, which is overwritten by its factor."""
-    # in place, because a copy has 72 MB with 3 000 rows
+    """Return the fit of rows with a covariance of their levels. The covariance is overwritten by its factor."""
+    # in place, because a copy takes 72 MB for 3 000 rows
     factor = Factor.of(covariance)
     target = np.concatenate([s.residual_db - s.residual_db.mean() for s in rows])
     weights = factor.solve(target)
@@ -560,7 +560,7 @@ def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArra
         model=model,
         rows=tuple(rows),
         log_evidence=factor.log_likelihood(target),
-        # the offset of each series takes a degree of freedom
+        # the offset of each series uses one degree of freedom
         common_scale=math.sqrt(max(misfit / max(len(target) - len(rows), 1), 1e-6)),
         _weights=weights,
         _factor=factor,
@@ -569,9 +569,9 @@ def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArra
 
 
 def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) -> GainFit:
-    """Return :func:`fit_gain` with the more likely strength of the gains of the tower, and the common scale of all.
+    """Return :func:`fit_gain` with the more likely strength of the tower's gains and scaled standard deviations.
 
-    The scale changes no mean. It makes the standard deviations fit the data: ``s^2 = y' C^-1 y / rows``.
+    The scale makes the standard deviations fit the data (``s^2 = y' C^-1 y / rows``) and does not change the means.
     """
     model, rows = _binned_series(series, model or GainModel())
     model = _with_scales(model, rows)
@@ -589,20 +589,20 @@ def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) ->
     return max(fits, key=lambda fit: fit.log_evidence)
 
 
-# Candidate standard deviations of nuisance and noise for each of several campaigns [dB]. One pair for all of them is 18
-# to 99 nat less likely: 1.2 and 1.0 (dataset 12), 2.0 and 2.2 (LTE), 2.0 and 3.0 (AADM).
+# Candidate standard deviations of nuisance and noise per campaign [dB]. The likeliest are 1.2 and 1.0 for dataset 12,
+# 2.0 and 2.2 for LTE, 2.0 and 3.0 for AADM. One pair for all campaigns is 18 to 99 nat less likely.
 _CAMPAIGN_SCALES_DB = tuple(product((0.8, 1.2, 2.0, 3.0), (1.0, 1.5, 2.2, 3.2)))
 
 
 def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
-    """Return the model with the most likely nuisance and noise of each of several campaigns."""
+    """Return the model with the most likely nuisance and noise per campaign, if there are several campaigns."""
     names = list(dict.fromkeys(s.campaign for s in rows))
     if len(names) == 1 or model.campaigns:
         return model
     chosen = []
     for name in names:
         mine = [s for s in rows if s.campaign == name]
-        # every second mean, because the scales are those of a mean, and a factor then costs an eighth
+        # every second mean is enough to find the scales, and the factor then costs an eighth
         mine = [s.part(np.arange(0, len(s), 2)) for s in mine]
         gains = gain_covariance(model.terms, mine, mine)
         levels = np.concatenate([s.residual_db - s.residual_db.mean() for s in mine])
@@ -622,9 +622,9 @@ def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
 
 
 def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[GainModel, list[LinkSamples]]:
-    """Return the model with its bins, and means over bins of each series.
+    """Return the model with its bin duration, and the means over bins of each series.
 
-    InputError if there are none.
+    Raise InputError if there are no means.
     """
     binned = [s.binned(model.bin_s) for s in series]
     longer = math.ceil(sum(map(len, binned)) / MOST_ROWS)
@@ -635,7 +635,7 @@ def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[Gai
     if not binned:
         raise InputError("no sample has a level and a direction", expected="RSS with positions and attitude")
     groups = [s.group for s in binned]
-    # sort by antenna, so that covariances between antennas without common gains are blocks of zeros
+    # sort by group, so that the covariance between antennas without common gains is a block of zeros
     return model, sorted(binned, key=lambda s: groups.index(s.group))
 
 
@@ -668,11 +668,10 @@ def column_forms(
 # Step between candidate azimuths.
 STEP_DEG = 10.0
 
-# Standard deviation of a bin about the patterns: 4 dB of residual that is correlated over about six bins.
-#
-# Least squares are used, because a covariance with learned gains or with shadowing over place would absorb the broad
-# shape over azimuth that determines a mount. On dataset 12 the azimuth at the UAV then jumps between flights (320 and
-# 120 deg instead of 270 and 270).
+# Standard deviation of a bin about the patterns: a residual of 4 dB that is correlated over about six bins. Least
+# squares are used, because a covariance with learned gains or with shadowing over position would absorb the broad shape
+# over azimuth that determines a mount. With such a covariance, the azimuth at the UAV jumps between flights of dataset
+# 12 (320 and 120 deg instead of 270 and 270).
 _MOUNT_NOISE_DB = 10.0
 
 # Duration over which samples are averaged [s].
@@ -686,7 +685,7 @@ class MountFit:
     Parameters
     ----------
     azimuth_deg : float
-        Azimuth of the most probable mount, as ``yaw_deg`` of flight.yaml.
+        Azimuth of the most probable mount, defined like ``yaw_deg`` in flight.yaml.
     azimuth_sd_deg : float
         Circular standard deviation.
     probability : (azimuths,)
@@ -707,13 +706,13 @@ GainOf = Callable[[FloatArray], FloatArray]
 
 
 def turned(azimuth_deg: float) -> FloatArray:
-    """Return the mount of an antenna with this azimuth of its front, counter-clockwise from above, shape (3, 3)."""
+    """Return the rotation (3, 3) of an antenna whose front has this azimuth, counter-clockwise from above."""
     c, s = np.cos(np.radians(azimuth_deg)), np.sin(np.radians(azimuth_deg))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def fit_mounts(series: Sequence[LinkSamples], patterns: Mapping[str, GainOf]) -> dict[str, MountFit]:
-    """Fit the mounts of all antennas with a pattern together.
+    """Fit the azimuths of all antennas with a known pattern together.
 
     Parameters
     ----------
@@ -728,8 +727,9 @@ def fit_mounts(series: Sequence[LinkSamples], patterns: Mapping[str, GainOf]) ->
 
     Notes
     -----
-    ``log p = -|y - u - t|^2 / (2 s^2)`` for each azimuth of the UAV and of the antenna of a tower. Antennas of towers
-    have no sample in common, so they are independent for a given azimuth of the UAV, which has their best azimuths.
+    For each azimuth of the UAV and of a tower's antenna, ``log p = -|y - u - t|^2 / (2 s^2)``. Antennas of towers have
+    no common samples, so for a given azimuth of the UAV their azimuths are independent. The probability of an azimuth
+    of the UAV is computed with the best azimuth of each tower.
     """
     grid = np.arange(0.0, 360.0, STEP_DEG)
 
@@ -763,12 +763,12 @@ def _normalised(log_p: FloatArray) -> FloatArray:
 
 def _mount(grid: FloatArray, probability: FloatArray, best_deg: float) -> MountFit:
     phasor = complex((probability * np.exp(1j * np.radians(grid))).sum())
-    # circular standard deviation, as for a wrapped normal distribution
+    # circular standard deviation of a wrapped normal distribution
     spread = np.degrees(np.sqrt(-2.0 * np.log(min(max(abs(phasor), 1e-9), 1.0))))
     apart = np.abs(wrap_degrees(grid - best_deg))
     return MountFit(
         azimuth_deg=best_deg,
-        # at least the standard deviation of a uniform step of the grid
+        # at least the standard deviation of a uniform distribution over one step of the grid
         azimuth_sd_deg=float(max(spread, (grid[1] - grid[0]) / np.sqrt(12.0))),
         grid_deg=grid,
         probability=probability,
@@ -779,25 +779,25 @@ def _mount(grid: FloatArray, probability: FloatArray, best_deg: float) -> MountF
 # Nominal shares of samples within an interval.
 SHARES = (0.5, 0.9, 0.95)
 
-# Share of the band in a report.
+# Share of samples inside the band that a report shows.
 BAND = 0.9
 
 
 def student_factor(flights: int) -> float:
-    """Return the SD of the normal distribution with the :data:`BAND` of Student's t with n + 1 degrees of freedom.
+    """Return the SD of a normal distribution whose :data:`BAND` is that of Student's t with n + 1 degrees of freedom.
 
     Notes
     -----
-    The offset of a new flight has this distribution about the mean of n flights. The variance between flights comes
-    from n - 1 differences and a prior that counts as two (Gelman et al., Bayesian Data Analysis, 3.3).
-    Student's t with two degrees of freedom has no variance.
+    The offset of a new flight has this t distribution about the mean of n flights. The variance between flights comes
+    from n - 1 differences and a prior that counts as two (Gelman et al., Bayesian Data Analysis, 3.3). The bands are
+    matched because Student's t with two degrees of freedom has no variance.
     """
     from scipy.special import ndtri, stdtrit
 
     return float(stdtrit(flights + 1.0, 0.5 + 0.5 * BAND) / ndtri(0.5 + 0.5 * BAND))
 
 
-# The expansion of :meth:`Spread.half_width_db` is not valid above this.
+# Largest kurtosis for which the expansion of :meth:`Spread.half_width_db` is valid.
 _MOST_KURTOSIS = 2.0
 
 
@@ -807,7 +807,7 @@ _FADE_SKEWNESS2 = 0.54
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """The error model of a predicted level without the standard deviation of the gain.
+    """The error model of a predicted level, excluding the standard deviation of the gain.
 
     Parameters
     ----------
@@ -828,12 +828,12 @@ class Spread:
     bin_s: float
 
     def total_db(self, gain_sd_db: FloatArray) -> FloatArray:
-        """Return the standard deviation of a sample about its prediction, from that of the gain, shape (n,) [dB]."""
+        """Return the standard deviation (n,) of a sample about its prediction, including that of the gain [dB]."""
         variance = self.own_sd_db**2 + self.noise_sd_db**2 + self.fading_sd_db**2
         return np.asarray(np.sqrt(gain_sd_db**2 + variance))
 
     def half_width_db(self, gain_sd_db: FloatArray, share: float) -> FloatArray:
-        """Return half of the interval that contains a share of the samples, shape (n,) [dB].
+        """Return half the width (n,) of the interval that contains a share of the samples [dB].
 
         Notes
         -----
@@ -861,7 +861,7 @@ NO_SPREAD = Spread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=0.0, fading_kurt
 class LostLock:
     """The error of a prediction for a receiver that may lose its lock.
 
-    It is normal about one level in lock, and about another level without lock.
+    The error is normal about one mean in lock, and about another mean without lock.
 
     Parameters
     ----------
@@ -882,24 +882,24 @@ class LostLock:
 
     @property
     def parts(self) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-        """Share, mean error and standard deviation in lock and without lock, each (n,)."""
+        """Return share, mean error and standard deviation, each (n,), in lock and without lock."""
         one, share = np.ones(len(self.probability)), self.probability
         lost = 1.0 - share, self.lost_db, self.lost_sd_db * one
         return [(share, self.locked_db, self.locked_sd_db * one), lost]
 
     def sd_db(self, about_db: FloatArray) -> FloatArray:
-        """Return the root mean square error about a prediction that is ``about_db`` higher, shape (n,) [dB]."""
+        """Return the root mean square error (n,) of a prediction that is higher by ``about_db`` [dB]."""
         return np.asarray(np.sqrt(sum(share * ((mean - about_db) ** 2 + sd**2) for share, mean, sd in self.parts)))
 
     def quantile_db(self, share: float) -> FloatArray:
-        """Return the error below which a share of the samples lies, to 0.01 dB, shape (n,)."""
+        """Return the error (n,) below which a share of the samples lies, accurate to 0.01 dB."""
         from scipy.special import ndtr
 
         reach = 6.0 * max(self.locked_sd_db, self.lost_sd_db)
         low = np.minimum(self.locked_db, self.lost_db) - reach
         high = np.maximum(self.locked_db, self.lost_db) + reach
         # from some hundred decibels to 0.002 dB
-        for _ in range(16):  # there is no closed form, and each step halves an interval of about 130 dB
+        for _ in range(16):  # bisection, because there is no closed form
             middle = 0.5 * (low + high)
             below = sum(p * ndtr((middle - mean) / sd) for p, mean, sd in self.parts)
             low, high = np.where(below < share, middle, low), np.where(below < share, high, middle)
@@ -913,7 +913,7 @@ class LostLock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatedSpread:
-    """The stated error of one series: standard deviation of the gain (n,) [dB], NaN without a pose, and further parts.
+    """The stated error of one series: standard deviation of the gain (n,) [dB] (NaN without a pose), and other parts.
 
     ``lock`` replaces the error model for a receiver that loses its lock.
     """
@@ -939,7 +939,7 @@ class StatedSpread:
 
         Notes
         -----
-        The score of a mixture of normal distributions in closed form (Grimit, Gneiting, Berrocal and Johnson 2006,
+        This is the closed form for a mixture of normal distributions (Grimit, Gneiting, Berrocal and Johnson 2006,
         doi:10.1256/qj.05.235).
         """
         one = np.ones(len(error_db))
@@ -958,7 +958,7 @@ class StatedSpread:
         return float(np.nanmean(score)) if np.isfinite(score).any() else math.nan
 
     def columns(self, level_dbm: FloatArray) -> dict[str, FloatArray]:
-        """Return parts and 90 % interval about a level (n,), by the names of rss.csv."""
+        """Return the columns of rss.csv with the parts of the error and the 90 % interval about a level (n,)."""
         known = np.where(np.isfinite(self.gain_sd_db), 1.0, np.nan)
         low, high = self.band_db(BAND)
         return {
@@ -973,7 +973,7 @@ class StatedSpread:
 
 
 def inside_shares(error_db: FloatArray, stated: StatedSpread) -> dict[str, float]:
-    """Return the share of errors inside the interval of each nominal share: ``inside_50`` and so on.
+    """Return the shares of errors inside the intervals, by nominal share: ``inside_50`` and so on.
 
     Errors (n,) that are NaN are ignored.
     """
@@ -1018,22 +1018,23 @@ def fading_of(series: Sequence[LinkSamples], bin_s: float) -> tuple[float, float
 
 BODY, MAST, PAIR = ANTENNA_TERMS
 
-# Log odds required of a learned gain against an own gain, and of an airframe against each rotated copy. On field
-# flights 3 accepts the airframe of dataset 12 on LTE and AADM (6.8 to 8.3) and refuses NR everywhere (-11.5 to -1.2).
+# Log odds that a learned gain needs against an unknown gain, and an airframe against each rotated copy. On field
+# flights, the limit of 3 accepts the airframe of dataset 12 for LTE and AADM (6.8 to 8.3) and always refuses that of NR
+# (-11.5 to -1.2).
 LEAST_ODDS = 3.0
 
 _TURNS_DEG = (90.0, 180.0, 270.0)
 
-# Log odds against an own gain that no evidence of names outweighs.
+# Log odds for an unknown gain that no prior from names can outweigh.
 _HOPELESS = 8.0
 
-# Largest number of means by which a flight is tested. With more, means are over longer times.
+# Largest number of means, and shortest averaging time [s], with which a flight is tested.
 _MOST_ROWS, _BIN_S = 700, 4.0
 
 # Candidate standard deviations of nuisance and noise [dB], selected by likelihood for each series.
 _SCALES_DB = (0.7, 1.2, 2.0, 3.5, 6.0)
 
-# Share of the variance of the gain towards both ends that its table does not explain.
+# Share of the variance of the joint gain of both ends that its table does not explain.
 _PAIR_LEFT = 0.5
 
 # Mean (n,) [dB] and covariance (n, n) [dB^2] of a learned gain along samples.
@@ -1042,7 +1043,7 @@ Moments = Callable[[LinkSamples], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """Log odds of a learned gain against an unknown gain, and against its most likely rotated copy [nat]."""
+    """The log odds of a learned gain against an unknown gain, and against its most likely rotated copy [nat]."""
 
     over_own: float
     over_turned: float
@@ -1059,7 +1060,7 @@ class Evidence:
 
 @dataclass(frozen=True, kw_only=True)
 class KnownProcess:
-    """A learned gain over direction: its table, and the covariance at directions that determine it.
+    """A learned gain over direction: its table, and its covariance at the directions that determine it.
 
     Parameters
     ----------
@@ -1080,7 +1081,7 @@ class KnownProcess:
     @cached_property
     def _factor(self) -> Factor:
         prior = term_kernel(self.term, self.directions, self.directions)
-        # directions are rounded to a tenth of a degree, so two may be equal
+        # add a little to the diagonal: directions are rounded to a tenth of a degree, so two may be equal
         prior[np.diag_indices(len(prior))] += 1e-3 * self.term.sd_db**2
         return Factor.of(prior)
 
@@ -1089,9 +1090,10 @@ class KnownProcess:
 
         Notes
         -----
-        The process is ``A g`` and an independent rest, with ``A = K(at, G) K(G, G)^-1`` over the directions G of
-        covariance S. Their covariances are ``A S A'`` and ``K - A K(G, at)`` of the prior. The rest is scaled so that
-        the diagonal is the variance of the table.
+        The process is the sum of ``A g`` and an independent rest. ``g`` is the gain at the directions G, with
+        covariance S, and ``A = K(at, G) K(G, G)^-1`` with the prior K. The covariance of the first part is ``A S A'``,
+        that of the rest ``K - A K(G, at)``. The rest is scaled so that the diagonal of the sum is the variance of the
+        table.
         """
         across = term_kernel(self.term, at, self.directions)
         weights = self._factor.solve(across.T).T
@@ -1103,7 +1105,7 @@ class KnownProcess:
 
 
 class FlightEvidence:
-    """The levels of one flight, by which learned gains are tested.
+    """The levels of one flight, with which learned gains are tested.
 
     Parameters
     ----------
@@ -1123,7 +1125,8 @@ class FlightEvidence:
         """Return the evidence for the learned antennas of both ends of one series, by its number.
 
         ``known`` returns the moments of the gain of both ends, without the part that its table of pairs does not
-        explain. With ``airframe`` they must also be more likely than that airframe at a tower with an unknown gain.
+        explain. If ``airframe`` is given, the antennas must also be more likely than this airframe with a tower of
+        unknown gain.
         """
         rows, noise = self.rows[number], self._noise[number]
         if not len(rows):
@@ -1142,7 +1145,7 @@ class FlightEvidence:
         return judged(own, of)
 
     def of_airframe(self, known: KnownProcess) -> Evidence:
-        """Return the evidence for a learned airframe in all series together, with an unknown gain of each tower."""
+        """Return the evidence for a learned airframe from all series together. The gain of each tower is unknown."""
         rows = [some for some in self.rows if len(some)]
         if not rows:
             return Evidence(over_own=-math.inf, over_turned=-math.inf)
@@ -1164,9 +1167,9 @@ class FlightEvidence:
 
 
 def judged(own: float, of: Callable[[float], float]) -> Evidence:
-    """Return the evidence from the log likelihood of an unknown gain, and of a learned gain by its rotation [deg]."""
+    """Return the evidence from log likelihoods: ``own`` of an unknown gain, ``of(rotation)`` of a learned gain."""
     learned = of(0.0)
-    # copies cost three times as much, so a gain that is clearly worse is not compared with them
+    # skip the three rotated copies if the gain is already clearly worse
     turned = max(map(of, _TURNS_DEG)) if learned > own - _HOPELESS else math.inf
     return Evidence(over_own=learned - own, over_turned=learned - turned)
 
@@ -1175,7 +1178,7 @@ def _noise_covariance(rows: LinkSamples) -> FloatArray:
     """Return the covariance of offset, nuisance and noise of one series with the most likely scales, shape (n, n)."""
     if not len(rows):
         return np.zeros((0, 0))
-    # some hundred rows are sufficient to decide
+    # about 200 rows are enough to select the scales
     some = rows.part(np.arange(0, len(rows), max(1, len(rows) // 200)))
     gains, levels = gain_covariance(ANTENNA_TERMS, [some], [some]), _centred(some)
 
@@ -1197,5 +1200,5 @@ def _log_likelihood(covariance: FloatArray, values: FloatArray) -> float:
 
 
 def _rotated(rows: LinkSamples, turn_deg: float) -> LinkSamples:
-    """Return samples whose directions at the UAV are rotated counter-clockwise."""
+    """Return samples with the directions at the UAV rotated counter-clockwise."""
     return dataclasses.replace(rows, at_uav=rotated(rows.at_uav, turn_deg)) if turn_deg else rows

@@ -1,9 +1,9 @@
 """Cross-validated comparison of models of rising complexity, to find what a scene needs.
 
-All models predict the same samples. The flight is cut into areas; the offset of a model is fitted without one area and
-scored on that area, in turn. Models are compared on the same samples by paired differences. The simplest model within
-one standard error of the best is recommended, because an effect that a flight cannot show should not be modelled
-(Breiman, Friedman, Olshen, Stone 1984, section 3.4.3: the 1 SE rule).
+All models predict the same samples. The flight is divided into areas. In turn, each area is held out: the offset of a
+model is fitted to the other areas, and the model is scored on the held-out area. Models are compared by paired
+differences. The simplest model within one standard error of the best is recommended, because an effect that the flight
+does not show should not be modelled (Breiman, Friedman, Olshen, Stone 1984, section 3.4.3: the 1 SE rule).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import numpy as np
 from ..common.units import BoolArray, FloatArray, IntArray
 from .statistics import NO_INTERVAL, Interval, PairedDifference, paired_difference, pooled_difference
 
-# Areas that a flight is cut into: a power of two, because areas are halved.
+# Number of areas of a flight. It is a power of two, because areas are halved.
 _BLOCKS = 8
 
-# A model that has no level at more than a fifth of the samples cannot be compared with the others.
+# A model is compared only if it has a level at this share of the samples.
 _LEAST_COVERED = 0.8
 
 
@@ -35,8 +35,8 @@ class Rung:
     seconds : float
         Time to compute the levels of the flight [s].
     regressor_db : tuple of (n,), optional
-        Abscissa of a straight line, per series, for models without ray tracing. The slope is fitted together with the
-        offset, without the area that is scored. Zeros make the model a constant.
+        For models without ray tracing: abscissa of a straight line, per series. Its slope is fitted together with the
+        offset, without the held-out area. If all values are 0, the model is a constant.
     """
 
     model: str
@@ -57,12 +57,12 @@ class LadderRow:
     difference_to_best_db, difference_to_best_ci95_db : float, (low, high)
         RMSE minus that of the best model on the same samples [dB].
     n : int
-        Samples that all compared models share.
+        Number of samples that all compared models share.
     seconds : float
         Time to compute the levels of the flight [s].
     recommended : bool
-        True for the simplest model within one standard error of the best, over all series of the flight. If a
-        calibration knows the errors on other flights, the best model on those flights is recommended instead.
+        True for the simplest model within one standard error of the best, over all series of the flight. If the errors
+        on other flights are known from a calibration, the model with the lowest error there is recommended instead.
     elsewhere_db : (float, float), optional
         RMSE of the recommended model and of free space on other flights [dB], if these selected the model.
     """
@@ -91,7 +91,7 @@ class ModelRow:
     difference_to_best_db, difference_to_best_ci95_db : float, (low, high)
         RMSE minus that of the best model on the same samples [dB].
     n : int
-        Samples of all channels that all compared models share.
+        Number of samples of all channels that all compared models share.
     seconds : float
         Time to compute the levels of the flight [s].
     recommended : bool
@@ -113,25 +113,25 @@ class ModelRow:
     elsewhere_db: tuple[float, float] | None = None
 
 
-# Models that differ by less than this on every channel [dB] share one row, because the tables show hundredths.
+# Models that differ by less than this on every channel [dB] are shown as one row, because tables show hundredths.
 _SAME_DB = 0.01
 
 
 def distinct(rows: Sequence[LadderRow], keep: str) -> tuple[list[LadderRow], list[str]]:
-    """Return the rows of models that differ from every model before them, and the names of the others.
+    """Return the rows of models that differ from every model before them, and the names of all other models.
 
     Parameters
     ----------
     rows : sequence of LadderRow
         Rows in the order of the models, with the same channels for each.
     keep : str
-        Model that always has a row, as the recommended model has.
+        Model that always has a row, such as the recommended one.
 
     Returns
     -------
     rows : list of LadderRow
     same : list of str
-        Models whose error is that of a model before them within 0.01 dB on every channel.
+        Models whose error is within 0.01 dB of that of a model before them, on every channel.
     """
     models: dict[str, list[LadderRow]] = {}
     for row in rows:
@@ -163,8 +163,8 @@ class Ladder:
     rmse_db : tuple of float
         RMSE of each model over all series [dB].
     best, best_replay, recommended : int, optional
-        Index of the best model, of the best one that traces rays, and of the recommended one. None if no models were
-        compared.
+        Index of the best model, of the best model with ray tracing, and of the recommended model. None if no models
+        were compared.
     elsewhere_db : (float, float), optional
         RMSE of the recommended model and of free space on other flights [dB], if these selected the model.
     """
@@ -183,8 +183,9 @@ class Ladder:
 def places_of(position_m: FloatArray, blocks: int = _BLOCKS) -> IntArray:
     """Return the area of each sample, shape (n,).
 
-    Areas have equal numbers of samples. They are halved along the longer side of their plan. All visits of an area are
-    held out together; segments in time would keep the other visits in the fit.
+    The positions are halved repeatedly along the longer horizontal side, so that areas have equal numbers of samples.
+    All visits to an area are held out together. If segments in time were held out, other visits to the area would
+    remain in the fit.
 
     Parameters
     ----------
@@ -232,9 +233,9 @@ def climb(
     measured_db : sequence of (n,)
         Level of each series in time order [dB]; NaN is not scored.
     time_s : sequence of (n,)
-        Orders the errors of all series, so that channels with the same times share their correlated errors [s].
+        Times by which the errors of all series are ordered, so that correlated errors of channels are adjacent [s].
     rungs : sequence of Rung
-        Simplest first, because a tie goes to the earlier model.
+        Models, simplest first. Of two equal models, the earlier one is used.
     position_m : sequence of (n, 3)
         Position of each sample [m]; areas are held out (:func:`places_of`).
 
@@ -263,7 +264,7 @@ def climb(
     place = np.concatenate([*position_m, np.zeros((0, 3))])[in_time]
     rmse = tuple(_rmse(e) for e in joined)
     replays = [i for i, rung in enumerate(rungs) if rung.regressor_db is None and np.isfinite(rmse[i])]
-    # a straight line is shown and never recommended, because it predicts no other place
+    # a straight line is never recommended, because it is not valid at other places
     chosen = recommended = min(replays, key=lambda i: rmse[i], default=None)
     if chosen is not None:
         recommended = next(i for i in replays if i == chosen or _as_good(compared(joined[i], joined[chosen], place)))
@@ -331,7 +332,7 @@ def model_rows(ladder: Ladder) -> list[ModelRow]:
         for errors in ladder.error_db
     ]  # fmt: skip
     scored = [i for i, rmse in enumerate(ladder.rmse_db) if np.isfinite(rmse)]
-    # not significant: an interval is known and contains 0; the best model always is
+    # sufficient: the best model, and models whose difference has a known interval that contains 0
     sufficient = [i for i in scored if i == ladder.best or pairs[i].difference_ci95_db[0] <= 0.0]
     fastest = min(sufficient, key=lambda i: ladder.rungs[i].seconds)
     return [
@@ -357,7 +358,7 @@ def held_out_error_db(
     place: IntArray,
     regressor_db: FloatArray | None = None,
 ) -> FloatArray:
-    """Return measured minus predicted level, each area with the offset of all other areas, shape (n,) [dB].
+    """Return measured minus predicted level (n,), where the offset in each area comes from all other areas [dB].
 
     Parameters
     ----------
@@ -391,7 +392,7 @@ def held_out_error_db(
 
 
 def held_out_lines(values: FloatArray, x: FloatArray, block: IntArray, blocks: int) -> tuple[FloatArray, FloatArray]:
-    """Return least-squares lines through all blocks but one.
+    """Return least-squares lines, each fitted to all blocks except one.
 
     Parameters
     ----------
@@ -420,9 +421,9 @@ def held_out_lines(values: FloatArray, x: FloatArray, block: IntArray, blocks: i
 
 
 def log_distance_level_db(measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray) -> FloatArray:
-    """Return the log-distance level about its mean, each area with the slope of the other areas, shape (n,) [dB].
+    """Return the log-distance level (n,) about its mean, where the slope in each area comes from the other areas [dB].
 
-    The comparison fits the offset, as for every other model.
+    The offset is fitted by the comparison, as for every other model.
 
     Parameters
     ----------
@@ -452,7 +453,7 @@ def log_distance_level_db(measured_db: FloatArray, distance_m: FloatArray, posit
 
 
 def compared(error_db: FloatArray, best_db: FloatArray, position_m: FloatArray) -> PairedDifference:
-    """Return the difference in RMSE to the best model, without a further offset."""
+    """Return the difference in RMSE from the best model, without fitting another offset."""
     return paired_difference(error_db, best_db, free_offset=False, place_m=position_m)
 
 

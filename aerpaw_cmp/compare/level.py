@@ -1,11 +1,11 @@
 """Comparison of measured levels with predictions: RSS, detection, serving cells and scores.
 
-The functions take arrays in time order with one entry per sample, NaN if it is missing. They do not depend on files,
-sites or engines.
+The functions take arrays in time order, with one value per sample and NaN for a missing value. They do not depend on
+files, sites or engines.
 
 The module compares the measured and simulated signal strength of one tower and channel. It scores predictions after a
-flight and entries of benchmarks/published, and models receivers that lose a signal or have a floor. It compares the
-predicted strongest cell with the serving cell of a phone, and adds up the numbers of audits of fields.
+flight, and entries of benchmarks/published. It models receivers that lose the signal or have a floor, compares the
+predicted strongest cell with the serving cell of a phone, and sums the results of field audits.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from .offset import SPAN_DB, OffsetFit, grid_offset, offset_grid
 from .receiver import brier_losses, log_losses, out_of_group
 from .statistics import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals, rmse_interval
 
-# Two channels of one receiver count as different if their levels differ by more than this [dB].
+# Two channels of one receiver differ if the difference of their levels is farther than this from its mean [dB].
 PART_DB = 10.0
 # Averaging time of the difference of two channels [s].
 _PART_S = 1.0
 
 
 def seconds(time: ArrayLike) -> FloatArray:
-    """Return the seconds since the first instant, from datetime64 or from seconds."""
+    """Return the seconds since the first time. The input is datetime64 or seconds."""
     array = np.asarray(time)
     if array.dtype.kind == "M":
         stamp = array.astype("datetime64[ns]")
@@ -45,32 +45,33 @@ def seconds(time: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class RssComparison:
-    """Comparison of a simulation with the measured level of one link.
+    """The comparison of a simulation with the measured level of one link.
 
     Parameters
     ----------
     offset_db, rmse_db : float
-        Grid-search offset (added to the measurement) and RMSE with it [dB].
+        Offset from a grid search, added to the measurement, and RMSE with this offset [dB].
     n : int
         Number of compared pairs.
     n_out_of_coverage, n_measured_out, n_simulated_out : int
-        Samples at a known pose with no measured signal or no simulated path (either; each).
+        Numbers of samples with a known pose and no measured signal or no simulated path: either of them, no signal, and
+        no path.
     n_no_pose : int
         Samples without a pose, which are not compared.
     at_edge : bool
-        The offset lies at the edge of the search span.
+        True if the offset is at the edge of the search span.
     correlation : float
-        Pearson; NaN for constant series.
+        Pearson correlation; NaN for constant series.
     intervals : ErrorIntervals
         95 % intervals, and the correlation of the residual.
     baselines : mapping of str to OffsetFit
-        Free space, two-ray and others, each with its own offset, over the same pairs.
+        Simpler models such as free space and two-ray, each with its own offset, on the same pairs.
     baseline_intervals : mapping of str to (low, high)
         95 % interval of each baseline's RMSE [dB].
     lag_s : float
         Applied clock lag [s]; NaN if none was estimated or applied.
     fitted_on_scored : tuple of str
-        Names of the numbers that were fitted on the samples they are scored on.
+        Names of the parameters that were fitted on the scored samples.
     residual_db : (samples,)
         ``measured + offset - simulated``, NaN without a pair.
     """
@@ -114,15 +115,15 @@ def compare_rss(
     time_s : array_like, (n,)
         Times in seconds or datetime64. Samples are sorted by time; unknown times come last.
     measured_db : array_like, (n,)
-        dBm or dB re full scale; NaN without a received signal.
+        Measured level [dBm or dB re full scale]; NaN without a received signal.
     simulated_db : array_like, (n,)
-        NaN where there is no path.
+        Simulated level [dB]; NaN without a path.
     baselines : mapping of str to array_like, (n,), optional
         Levels of simpler models at the same poses [dB].
     posed : array_like of bool, (n,), optional
         True if the pose of the sample is known. A sample without a pose is not out of coverage.
     position_m : (n, 3), optional
-        East, north and up, NaN if unknown [m]: intervals then consider correlation over place, too.
+        East, north and up [m], NaN if unknown. With positions, intervals also allow for correlation over position.
     span_db : (float, float)
         Offset search.
 
@@ -156,12 +157,12 @@ def compare_rss(
     )
 
 
-# Name of the antennas among the numbers that were fitted on the scored samples.
+# Entry of ``fitted_on_scored`` for antennas that were learned from the scored flight.
 LEARNED_HERE = "antennas"
 
 
 def without_errors(score: RssComparison) -> RssComparison:
-    """Return a comparison with offset, counts and baselines alone, for a flight from which antennas were learned."""
+    """Return a comparison with only offset, counts and baselines, for a flight from which antennas were learned."""
     none = (float("nan"), float("nan"))
     return replace(
         score,
@@ -172,18 +173,18 @@ def without_errors(score: RssComparison) -> RssComparison:
     )
 
 
-# Levels are outliers if they are farther than this number of interquartile ranges outside the quartiles. That is one in
-# 10^9 levels of a normal distribution. Deep fades of real flights are nearer.
+# Levels are outliers if they are more than this number of interquartile ranges outside the quartiles. In a normal
+# distribution, that is one in 10^9 levels. Deep fades of real flights are not that far outside.
 _FENCE = 4.0
 
-# Least interquartile range [dB], because a UAV that hovers has almost none.
+# Smallest interquartile range that is used [dB], because levels of a hovering UAV hardly vary.
 _NARROWEST_DB = 5.0
 
 
 def outliers(level_db: ArrayLike) -> BoolArray:
-    """Return the samples (n,) whose level lies far outside the distribution of the flight.
+    """Return a mask (n,) of samples whose level is far outside the distribution of the flight.
 
-    They are flagged, not dropped.
+    The caller flags these samples and does not drop them.
 
     Examples
     --------
@@ -220,16 +221,16 @@ def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> Fl
     Parameters
     ----------
     time_s : array_like, (n,)
-        Instants [s] (or datetime64) in any order.
+        Times, as seconds or datetime64, in any order.
     level_db : array_like, (n,)
         Levels [dB]. NaN is ignored and stays NaN.
     window_s : float
-        Full width [s]. With 0 the levels are returned unchanged.
+        Width of the window [s]. With 0, levels are returned unchanged.
 
     Notes
     -----
-    Averages linear power, as a receiver that integrates longer would. Sums run over powers relative to the
-    strongest one, so a range of 100 dB within one window keeps its digits to 1e-6 dB.
+    Linear power is averaged, as in a receiver that integrates longer. Powers are summed relative to the strongest one,
+    so that levels that differ by 100 dB within one window are accurate to 1e-6 dB.
     """
     time, level = seconds(time_s), _levels(level_db)
     known = np.isfinite(level) & np.isfinite(time)
@@ -242,10 +243,11 @@ def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> Fl
 
 
 def _window_means(time: FloatArray, values: FloatArray, window_s: float) -> FloatArray:
-    """Return the means of values (n,) over windows about their times (n,), which ascend [s]."""
+    """Return the means of values (n,) over windows centred at their ascending times (n,) [s]."""
     first = np.searchsorted(time, time - 0.5 * window_s, side="left")
     last = np.searchsorted(time, time + 0.5 * window_s, side="right")
-    # differences of a running sum would lose weak windows after strong ones: add up each window
+    # sum each window separately, because differences of a cumulative sum lose precision for weak levels after strong
+    # ones
     ends = np.column_stack([first, last]).ravel()
     return np.asarray(np.add.reduceat(np.append(values, 0.0), ends)[::2] / (last - first))
 
@@ -257,7 +259,7 @@ def averaged_fits(
     *,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> dict[str, dict[str, OffsetFit]]:
-    """Return the offset fits of simulations, with the same average on measurement and simulation.
+    """Return the offset fits of simulations after averaging measurement and simulation in the same way.
 
     Parameters
     ----------
@@ -266,7 +268,7 @@ def averaged_fits(
     simulations : mapping of str to array_like (n,)
         Levels by name, such as "coherent", "power_sum" or "local_mean".
     averages : mapping of str to callable
-        Means of levels (n,), such as :func:`local_mean_db`. The levels are NaN if one side is missing.
+        Functions that average levels (n,), such as :func:`local_mean_db`. Their input is NaN if one side is missing.
     span_db : (float, float)
         Offset search.
 
@@ -298,26 +300,26 @@ def link_geometry(
     tower_mount: FloatArray | None = None,
     uav_mount: FloatArray | None = None,
 ) -> dict[str, FloatArray]:
-    """Return the variables on which the residual may depend, for each pose.
+    """Return variables of the geometry on which the residual may depend, for each pose.
 
     Parameters
     ----------
     tower_m : (3,), (1, 3) or (n, 3)
-        Array centre, east-north-up [m]; for each pose if the tower moves.
+        Centre of the tower's array, east-north-up [m]: one position, or one per pose if the tower moves.
     position_m : (n, 3)
-        UAV [m].
+        Position of the UAV, east-north-up [m].
     rotation : (n, 3, 3), optional
-        Aircraft body to east-north-up.
+        Rotation from aircraft body to east-north-up.
     tower_mount, uav_mount : (3, 3), optional
-        Rotation of each array in its carrier (site axes; aircraft body); by default the identity.
+        Rotation of each array relative to site axes (tower) or aircraft body (UAV). The default is the identity.
 
     Returns
     -------
     dict of str to ndarray (n,)
         ``distance_m``, ``elevation_deg`` and ``azimuth_deg`` of the UAV from the tower (clockwise from north).
-        ``tower_azimuth_deg`` and ``tower_elevation_deg`` in the tower's array frame (azimuth from its boresight
-        towards its left). ``height_m``. With ``rotation`` also ``heading_deg``, and ``uav_azimuth_deg`` and
-        ``uav_elevation_deg`` of the tower in the UAV's array frame.
+        ``tower_azimuth_deg`` and ``tower_elevation_deg`` of the UAV in the tower's array frame (azimuth from its
+        boresight towards its left). ``height_m`` of the UAV. If ``rotation`` is given, also ``heading_deg``, and
+        ``uav_azimuth_deg`` and ``uav_elevation_deg`` of the tower in the UAV's array frame.
 
     Examples
     --------
@@ -356,15 +358,15 @@ class ErrorSpan:
     Parameters
     ----------
     start_s, end_s : float
-        Seconds as in the input, or since the first instant of datetime64 input.
+        Start and end [s], as in the input, or relative to the first time of datetime64 input.
     n : int
         Samples.
     mean_db : float
-        Mean residual, positive if the measured level is stronger.
+        Mean residual [dB], positive if the measured level is stronger.
     position_m : tuple of float
         Mean east, north, up of the span [m]; empty if no positions were given.
     geometry : mapping of str to float
-        Median of each context quantity in the span.
+        Median over the segment of each quantity in ``context``.
     """
 
     start_s: float
@@ -385,12 +387,12 @@ def error_spans(
     threshold_db: float | None = None,
     largest: int = 10,
 ) -> list[ErrorSpan]:
-    """Return the segments with the largest error, ordered by mean error times the root of the duration.
+    """Return the segments with the largest errors, ordered by mean error times the square root of the duration.
 
     Parameters
     ----------
     time_s, residual_db : array_like, (n,)
-        Instants and residual.
+        Times and residual.
     position_m : (n, 3), optional
         East, north, up [m].
     context : mapping of str to array_like (n,), optional
@@ -399,9 +401,9 @@ def error_spans(
     window_s : float
         Averaging window of the residual [s].
     threshold_db : float, optional
-        Least average residual of a span; by default 1.5 times the RMSE.
+        Smallest averaged residual of a segment. The default is 1.5 times the RMSE.
     largest : int
-        Largest number of spans.
+        Largest number of segments to return.
 
     Returns
     -------
@@ -434,13 +436,13 @@ def error_spans(
         for a, b in pairwise(bounds)
         if sign[a]
     ]
-    # a segment of one sample has no duration, but must not get the weight 0
+    # add a little, because a segment of one sample has no duration but must not get weight 0
     spans.sort(key=lambda span: -abs(span.mean_db) * np.sqrt(span.end_s - span.start_s + 1e-3))
     return spans[:largest]
 
 
 def _typical(values: Any) -> float:
-    """Return the median without NaN."""
+    """Return the median, ignoring NaN."""
     known = np.asarray(values, dtype=np.float64)
     known = known[np.isfinite(known)]
     return float(np.median(known)) if len(known) else float("nan")
@@ -455,9 +457,9 @@ class ChannelDifference:
     n : int
         Number of samples that both channels have.
     mean_db, std_db, correlation : float
-        Mean and standard deviation of first minus second [dB], and correlation of both.
+        Mean and standard deviation of first minus second level [dB], and correlation of the levels.
     spans : list of ErrorSpan
-        Segments in which the channels differ by more than :data:`PART_DB`, with their geometry.
+        Segments in which the difference is farther than :data:`PART_DB` from its mean, with their geometry.
     """
 
     n: int
@@ -475,16 +477,16 @@ def channel_difference(
     position_m: FloatArray | None = None,
     context: Mapping[str, ArrayLike] | None = None,
 ) -> ChannelDifference:
-    """Return the difference of two channels, and segments in which it is farther than :data:`PART_DB` from its mean.
+    """Return the difference of two channels, with segments where it is farther than :data:`PART_DB` from its mean.
 
     Parameters
     ----------
     time_s : array_like, (n,)
-        Instants: seconds or datetime64.
+        Times, as seconds or datetime64.
     first_db, second_db : array_like, (n,)
-        Levels of the two channels at these instants [dB].
+        Levels of the two channels at these times [dB].
     position_m : (n, 3), optional
-        Positions, for the places at which the channels differ [m].
+        Positions [m], to locate the segments.
     context : mapping of str to array_like (n,), optional
         Geometry that may explain the difference, as in :func:`error_spans`.
 
@@ -498,7 +500,7 @@ def channel_difference(
     if not ok.any():
         return ChannelDifference(n=0)
     difference = first - second
-    # each channel of a receiver has its own gain
+    # subtract the mean, because each channel of a receiver has its own gain
     mean = float(difference[ok].mean())
     residual = difference - mean
     spans = error_spans(
@@ -528,7 +530,7 @@ def crps_normal(error_db: FloatArray, sd_db: FloatArray) -> FloatArray:
     return np.asarray(sd_db * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi)))
 
 
-# Held-out segments of a flight, equally long.
+# Number of held-out segments of a flight. They have equal lengths.
 _SEGMENTS = 10
 
 _PENALTY = 1.0
@@ -548,7 +550,7 @@ class DetectionForecast:
     per_db : float
         Slope of the log odds.
     share : float
-        Share of detected samples, mean over the flights: the forecast without a level.
+        Share of detected samples, averaged over the flights. It is the forecast without a level.
     """
 
     level_db: float
@@ -563,17 +565,17 @@ class DetectionForecast:
 
 
 def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> DetectionForecast | None:
-    """Learn P(detected) from predicted levels, with the same weight for each flight.
+    """Fit P(detected) to predicted levels, giving each flight the same weight.
 
     Parameters
     ----------
     flights : sequence of ((n,), (n,))
-        Predicted levels [dB], finite, and which samples were detected.
+        Finite predicted levels [dB], and a mask of the detected samples.
 
     Returns
     -------
     DetectionForecast or None
-        None if one outcome is rare, or if the detected samples do not have the higher levels.
+        None if one outcome is rare, or if P(detected) does not rise with the level.
     """
     from scipy.optimize import minimize
 
@@ -589,7 +591,7 @@ def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> Detectio
     def loss(c: FloatArray) -> tuple[float, FloatArray]:
         odds = c[0] + c[1] * unit
         over = DetectionForecast(level_db=0.0, per_db=1.0, share=0.0).probability(odds) - detected
-        # a small ridge limits the slope if a level separates the results perfectly
+        # a small ridge penalty limits the slope if a level separates the outcomes perfectly
         value = (weight * (np.logaddexp(0.0, odds) - detected * odds)).sum() + 1e-3 * c[1] ** 2
         return float(value), np.array([(weight * over).sum(), (weight * over * unit).sum() + 2e-3 * c[1]])
 
@@ -609,11 +611,11 @@ class DetectionScore:
     Parameters
     ----------
     floor_db : float
-        Lower levels are raised to this level [unit of the measurement].
+        Floor of the receiver [unit of the measurement]. Lower levels are raised to it.
     n, n_detected : int
     brier, constant_brier, log_score, constant_log_score : float
         Scores of P(detected) from the predicted level, and of the constant share of this flight, which is the best
-        forecast without a level. The Brier score counts one of the two outcomes (0 to 1). The log score is in nat.
+        forecast without a level. The Brier score is between 0 and 1. The log score is in nat.
     learned_on : str
         ``other flights``, or ``held-out segments`` if each segment of this flight is predicted from the others.
     offset_db, rmse_db : float
@@ -623,9 +625,10 @@ class DetectionScore:
     free_space_rmse_db : float
         RMSE of free space with the same floor.
     detected_rmse_db : float
-        RMSE of the detected samples at that offset. They are selected by level, so never show this number alone.
+        RMSE of the detected samples with the same offset. Never show this number alone, because these samples are
+        selected by their level.
     reliability : tuple of (float, float, int)
-        Mean probability, share detected and samples, in fifths of the probability.
+        Mean probability, share detected, and number of samples, per fifth of the range of probability.
     """
 
     floor_db: float
@@ -663,16 +666,17 @@ def score_detection(
     ----------
     time_s : (n,)
     measured_db, simulated_db : (n,)
-        A measured NaN is below the floor. Samples without a simulated level are not scored.
+        Levels. A measured NaN counts as below the floor. Samples without a simulated level are not scored.
     detected : (n,) bool
     floor_db : float
         Floor of the measurement.
     free_space_db : (n,)
         Level of free space, for comparison.
     forecast : DetectionForecast, optional
-        Forecast from ``simulated_db``, learned from other flights. By default each segment is forecast from the others.
+        Forecast learned from other flights, applied to ``simulated_db``. By default, each segment of the flight is
+        predicted from its other segments.
     position_m : (n, 3), optional
-        The same as in :func:`compare_rss`.
+        Positions, as in :func:`compare_rss`.
 
     Returns
     -------
@@ -684,7 +688,7 @@ def score_detection(
     measured = np.maximum(np.nan_to_num(measured_db[finite], nan=floor_db), floor_db)
     if min(int(detected.sum()), int((~detected).sum())) < _FEWEST:
         return None
-    # outcomes as ranks 1 and 2, for the regression of ranks
+    # code outcomes as ranks 1 and 2, to use the regression of ranks
     outcome = detected.astype(np.int64) + 1
     p = _held_out(time, simulated, outcome) if forecast is None else forecast.probability(simulated)
     stated, constant = (np.stack([1.0 - q, q], axis=1) for q in (p, np.full(len(p), detected.mean())))
@@ -710,19 +714,19 @@ def score_detection(
 
 
 def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> FloatArray:
-    """Return P(detected) (n,) in each segment by the level, learned from the other segments."""
+    """Return P(detected) (n,), predicted in each segment by a regression on the level in the other segments."""
     away = (time_s - time_s.min()) / max(np.ptp(time_s), 1e-9)
     segment = np.minimum((away * _SEGMENTS).astype(np.int64), _SEGMENTS - 1)
     stated = out_of_group(level_db[:, None], outcome, segment, _PENALTY)
-    # the regression has four outcomes, of which two are used
+    # the regression has four outcomes, but only two occur
     return np.asarray(stated[:, 1] / stated[:, :2].sum(axis=1))
 
 
 def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: float) -> OffsetFit:
-    """Return the offset with the least RMSE if both levels (n,) are no lower than the floor.
+    """Return the offset with the smallest RMSE after both levels (n,) are raised to at least the floor.
 
-    Pairs with a NaN are ignored. The offset is added to the measurement, and lies within 60 dB of the median above the
-    floor.
+    Pairs with a NaN are ignored. The offset is added to the measurement. It is searched within 60 dB of the median
+    difference of levels above the floor.
     """
     finite = np.isfinite(measured_db) & np.isfinite(simulated_db)
     order = np.flatnonzero(finite)[np.argsort(simulated_db[finite])]
@@ -730,14 +734,14 @@ def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: flo
     above = measured > floor_db
     middle = float(np.median((simulated - measured)[above])) if above.any() else 0.0
     grid = offset_grid(span_db=(middle - _SPAN_DB, middle + _SPAN_DB))
-    # the first k predictions of the order are below the floor and count as the floor; the others move with the offset
+    # in this order, the first k predictions are below the floor and set to it; all others move with the offset
     low = np.concatenate([[0.0], np.cumsum((measured - floor_db) ** 2)])
     difference = simulated - measured
     first, second = (np.concatenate([[0.0], np.cumsum(difference**power)]) for power in (1, 2))
     k = np.searchsorted(simulated, grid + floor_db, side="right")
     n = len(measured)
     moved = (second[n] - second[k]) - 2.0 * grid * (first[n] - first[k]) + (n - k) * grid**2
-    # differences of large sums may fall a little below 0
+    # rounding of large sums may make differences slightly negative
     mse = np.maximum(low[k] + moved, 0.0) / n
     best = int(mse.argmin())
     return OffsetFit(float(grid[best]), float(np.sqrt(mse[best])), n, best in (0, len(grid) - 1))
@@ -749,18 +753,18 @@ def _reliability(stated: FloatArray, detected: BoolArray) -> tuple[tuple[float, 
     return tuple((float(stated[g].mean()), float(detected[g].mean()), int(g.sum())) for g in groups if g.any())
 
 
-# Time between two values of AERPAW's sounder [s]: 4095 chips and the rest of the correlation.
+# Time between two values of AERPAW's sounder [s]: 4095 chips plus overhead of the correlation.
 BASE_S = 0.032768
 
-# Smallest gain of correlation for which the sounder's own time base is used.
+# The sounder's own time base is used if it raises the correlation by more than this.
 _BETTER = 0.1
 
 
 def aligned_quality(time_s: FloatArray, power_db: FloatArray, quality_db: FloatArray) -> tuple[FloatArray, float]:
-    """Return the quality at the times of the power if a merged table paired both by row.
+    """Return the quality at the times of the power, for a table that was merged by row instead of by time.
 
-    When power and telemetry were merged, rows of the power were dropped and rows of the quality were not. Row i then
-    contains the quality at :data:`BASE_S` * i after the first row.
+    When such a table was made, rows of the power were dropped, but rows of the quality were not. Row i then contains
+    the quality at the time :data:`BASE_S` * i after the first row.
 
     Parameters
     ----------
@@ -770,7 +774,8 @@ def aligned_quality(time_s: FloatArray, power_db: FloatArray, quality_db: FloatA
     Returns
     -------
     (n,), float
-        Quality, NaN after its last value, and the largest shift [s], which is 0 if the rows are paired in time.
+        Quality (NaN after its last value), and the largest shift [s]. The shift is 0 if the rows were already paired by
+        time.
     """
     base_s = np.arange(len(time_s)) * BASE_S + time_s[0]
     moved = np.interp(time_s, base_s, quality_db, right=np.nan)
@@ -793,7 +798,7 @@ class ServingComparison:
         Samples by serving cell (row) and predicted strongest cell (column). The last column counts samples without a
         predicted cell.
     n : int
-        Samples with a serving cell among ``cells``.
+        Number of samples with a serving cell among ``cells``.
     """
 
     cells: tuple[str, ...]
@@ -802,12 +807,12 @@ class ServingComparison:
 
     @property
     def hit_share(self) -> float:
-        """Share of the samples whose serving cell is predicted to be the strongest, or NaN without samples."""
+        """Share of samples whose serving cell is predicted to be the strongest. NaN without samples."""
         return float(np.trace(self.confusion) / self.n) if self.n else float("nan")
 
     @property
     def majority_share(self) -> float:
-        """Share of the most frequent serving cell, which a prediction must exceed."""
+        """Share of the most frequent serving cell. A useful prediction must exceed it."""
         return float(self.confusion.sum(axis=1).max() / self.n) if self.n else float("nan")
 
     def as_dict(self) -> dict[str, Any]:
@@ -826,14 +831,14 @@ class ServingComparison:
 
 
 def compare_serving(served: ArrayLike, predicted_dbm: ArrayLike, cells: Sequence[str]) -> ServingComparison:
-    """Count the serving cells that are predicted to be the strongest, and the confusion matrix.
+    """Compare serving cells with the cells that are predicted to be the strongest, as a confusion matrix.
 
     Parameters
     ----------
     served : array_like, int, (n,)
         Index of the serving cell. Samples with a negative index (unknown, or not in ``cells``) are ignored.
     predicted_dbm : array_like, (n, cells)
-        Predicted levels, NaN without a path. The first of equal levels counts as the strongest.
+        Predicted levels; NaN without a path. Of equal levels, the first counts as the strongest.
     cells : sequence of str
 
     Examples
@@ -854,7 +859,7 @@ def compare_serving(served: ArrayLike, predicted_dbm: ArrayLike, cells: Sequence
 
 
 def nearest_in_time(times: AnyArray, of: AnyArray) -> tuple[IntArray, AnyArray]:
-    """Return the index in ``of`` (m,) nearest to each of ``times`` (n,), the earlier one of two, and its distance."""
+    """Return the index in ``of`` (m,) nearest to each of ``times`` (n,) (the earlier of two), and its distance."""
     order = np.argsort(of, kind="stable")
     at = of[order]
     after = np.clip(np.searchsorted(at, times), 0, len(at) - 1)
@@ -864,7 +869,7 @@ def nearest_in_time(times: AnyArray, of: AnyArray) -> tuple[IntArray, AnyArray]:
 
 
 def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s: float) -> FloatArray:
-    """Return values of one clock at the times of another: those of the nearest sample, NaN if none is near.
+    """Return the values of the nearest sample at requested times, NaN if no sample is near.
 
     Parameters
     ----------
@@ -879,7 +884,7 @@ def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s:
     Returns
     -------
     (n,)
-        In the unit of ``values``.
+        Values in the unit of ``values``.
     """
     instants, sampled_s = unmasked(time_s), unmasked(of_s)
     column = unmasked(values)
@@ -891,25 +896,26 @@ def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldAudit:
-    """The differences from two references.
+    """The result of an audit: differences from two references.
 
     Parameters
     ----------
     paths, power_max_db, power_rms_db, phase_max_rad, phase_rms_rad
-        Number of paths compared with Sionna's coefficients, and the largest and root-mean-square differences.
+        Number of paths compared with Sionna's coefficients, and largest and RMS differences in power and phase.
     link_rss_max_db : float
         Largest difference of the coherent RSS from Sionna, for links whose paths are all shorter than 300 m.
     reference_links, reference_paths, h_max_error, rss_max_error_db, rank_differs
         Comparison with the second implementation: largest relative difference of H, largest difference of RSS, and
-        links with another rank.
+        number of links with a different rank.
     attitude_rows, attitude_max_rad
-        Logged attitudes that were converted to rotations a second time.
+        Number of logged attitudes that were converted to rotations a second time, and the largest difference.
     missing_paths, phantom_paths : int
-        Paths that exist for certain and are missing, and paths that cannot exist.
+        Number of paths that certainly exist but are missing, and of paths that cannot exist.
     doubtful : int
-        Paths and links that were not compared because a micrometre decides (float32: two millimetres).
+        Number of paths and links that were not compared, because a micrometre (float32: two millimetres) decides
+        whether they exist.
     failures : tuple of str
-        Values out of tolerance, in words.
+        Sentences about values out of tolerance.
     not_covered : tuple of str
     """
 
@@ -939,7 +945,7 @@ class FieldAudit:
         return len(self.failures)
 
     def __add__(self, other: FieldAudit) -> FieldAudit:
-        """Return the sum of counts and the largest errors of both audits."""
+        """Return both audits as one: sums of counts, and the largest errors."""
         values: dict[str, Any] = {
             name: _together(name, getattr(self, name), getattr(other, name)) for name in self.__slots__
         }
@@ -949,7 +955,7 @@ class FieldAudit:
 
 
 def _together(name: str, mine: Any, theirs: Any) -> Any:
-    """Return distinct texts, the larger of two errors, or the sum of two counts."""
+    """Return the combination of two values: distinct texts, the larger error, or the sum of counts."""
     if isinstance(mine, tuple):
         return tuple(dict.fromkeys((*mine, *theirs)))
     worst = name.endswith(("_max_db", "_max_m", "_max_rad", "_max_error", "_max_error_db"))

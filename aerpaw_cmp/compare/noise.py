@@ -1,4 +1,4 @@
-"""Noise with two correlation times along a flight, and the fit of coefficients under this noise.
+"""Noise with two correlation times along a flight, and least-squares fits under this noise.
 
 The residual of a level is the sum of a slowly and a quickly fading first-order autoregressive sequence.
 
@@ -19,7 +19,7 @@ from ..common.units import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Memories:
-    """Parameters of the noise, as indices into :data:`_SLOW`, :data:`_FAST` and :data:`_SLOW_SHARE`."""
+    """The parameters of the noise, as indices into :data:`_SLOW`, :data:`_FAST` and :data:`_SLOW_SHARE`."""
 
     slow: int
     fast: int
@@ -27,7 +27,7 @@ class Memories:
 
     @property
     def near(self) -> list[Memories]:
-        """These parameters, and those with one index changed by one."""
+        """These parameters, and all parameters with one index changed by one."""
         places, sizes = (self.slow, self.fast, self.share), (len(_SLOW), len(_FAST), len(_SLOW_SHARE))
         steps = [(0, 0), *((i, step) for i in range(3) for step in (-1, 1))]
         moved = [tuple(p + step * (k == i) for k, p in enumerate(places)) for i, step in steps]
@@ -35,9 +35,9 @@ class Memories:
 
     @property
     def log_prior(self) -> float:
-        """Log prior density: log normal in the slow memory if it is longer than usual.
+        """Log prior density of the parameters: log normal in the slow correlation time, if that is longer than usual.
 
-        Without it, fading of minutes explains every error.
+        Without this prior, fading that lasts minutes could explain every error.
         """
         times = -1.0 / math.log(_SLOW[self.slow]) / _FADES_S
         return -0.5 * (math.log(max(times, 1.0)) / _FADES_FACTOR) ** 2 if _SLOW_SHARE[self.share] else 0.0
@@ -46,8 +46,8 @@ class Memories:
 _SLOW = (0.8, 0.87, 0.92, 0.95, 0.97, 0.985, 0.995)
 _FAST = (0.0, 0.3, 0.5, 0.7, 0.8)
 _SLOW_SHARE = (0.0, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
-# The correlation length of shadowing in open land is 37 m (3GPP TR 38.901, table 7.5-6): 7 s at 5 m/s.
-# A factor of three is one standard deviation.
+# The correlation length of shadowing in open land is 37 m (3GPP TR 38.901, table 7.5-6): 7 s at 5 m/s. In the prior, a
+# factor of three is one standard deviation.
 _FADES_S, _FADES_FACTOR = 7.0, math.log(3.0)
 START = Memories(4, 2, 3)
 # The search for the likeliest parameters starts at the middle of the grid and at white noise.
@@ -56,7 +56,7 @@ _STARTS = (START, Memories(0, 0, 0))
 
 @dataclass(frozen=True, slots=True)
 class MemoryFit:
-    """A fit: log likelihood, residual (n,) [dB] and the parameters of the noise."""
+    """The result of a fit: log likelihood, residual (n,) [dB] and parameters of the noise."""
 
     log_likelihood: float
     residual_db: FloatArray
@@ -65,7 +65,7 @@ class MemoryFit:
 
 @cache
 def _whitening(memories: Memories) -> tuple[tuple[float, float, float], float, float]:
-    """Return the coefficients of the whitening filter, ahead (3,) and back, and SD of the innovation over the total SD.
+    """Return the whitening filter (3 coefficients of the input, 1 of the output), and output SD over input SD.
 
     The sum of two first-order autoregressive sequences is an ARMA(2, 1) sequence (Granger and Morris).
     """
@@ -82,7 +82,7 @@ def _whitening(memories: Memories) -> tuple[tuple[float, float, float], float, f
 def fit_with_memories(residual: FloatArray, design: FloatArray, at: Memories, climb: bool) -> MemoryFit:
     """Fit the coefficients of a design (n, k) to a residual (n,) under noise with the given parameters.
 
-    Coefficients have a unit normal prior: the likelihood is integrated over them, and the residual of the fit uses
+    Coefficients have a unit normal prior. The likelihood is integrated over the coefficients, and the residual uses
     their posterior means. The size of the noise is the most likely one.
 
     Parameters
@@ -94,17 +94,17 @@ def fit_with_memories(residual: FloatArray, design: FloatArray, at: Memories, cl
     at : Memories
         Parameters of the noise, or the start of the search.
     climb : bool
-        Search the parameters of highest likelihood, from ``at`` and from fixed starts.
+        True to search the most likely parameters, starting from ``at`` and from fixed starts.
 
     Returns
     -------
     MemoryFit
         Log likelihood, residual and parameters of the noise.
     """
-    from scipy.linalg.lapack import dtbtrs  # scipy.signal would load for 0.4 s
+    from scipy.linalg.lapack import dtbtrs  # scipy.signal takes 0.4 s to load
 
     n, columns = len(residual), np.column_stack([residual, design])
-    # values before the first one are equal to it; Fortran order, because LAPACK solves column by column
+    # assume that values before the first equal the first; Fortran order, because LAPACK solves by column
     before = np.asfortranarray(columns[[0, 0, *range(n)]])
 
     def fit(memories: Memories) -> tuple[float, FloatArray]:
@@ -116,10 +116,10 @@ def fit_with_memories(residual: FloatArray, design: FloatArray, at: Memories, cl
         gram = white.T @ white
         power, axes = np.linalg.eigh(gram[1:, 1:])
         power, along = np.maximum(power, 0.0), axes.T @ gram[1:, 0]
-        # some directions of the coefficients are not determined by the samples
+        # the samples do not determine all directions of the coefficients
         fixed = power > 1e-9 * power[-1]
         left = max(float(gram[0, 0] - (along[fixed] ** 2 / power[fixed]).sum()), n * LEAST_VARIANCE)
-        # each determined coefficient takes one degree of freedom
+        # each coefficient that is determined uses one degree of freedom
         variance = left / max(n - float((power / (power + left / n)).sum()), 1.0)
         mean = along / (power + variance)
         square = float(gram[0, 0] - along @ mean) / variance

@@ -1,16 +1,17 @@
 """Forecasts of the rank that a receiver reports, and its decision, learned from flights.
 
-A forecast is a probability for each rank. It is scored by the log score, a proper score, and compared with the constant
-forecast, which is the histogram of the training flights. Kappa and agreement score the rank that is decided from the
-probabilities, and are compared with the most frequent rank.
+A forecast contains a probability for each rank. It is scored by the log score, which is a proper score, and compared
+with the constant forecast (the histogram of the training flights). The rank that is decided from the probabilities is
+scored by kappa and agreement, and compared with the most frequent rank.
 
-A receiver chooses the rank with the largest throughput at its noise. It uses a codebook and a channel estimate, which
-logs do not contain. The module learns how often each rank is reported for ratios of singular values and a level of the
-modelled channel, by a multinomial logistic regression with a ridge penalty. Simpler rules for comparison are one
-threshold per stream, and an ordered regression (one linear score, and one limit between neighbouring ranks).
+A receiver chooses the rank with the largest throughput at its noise level. Logs contain neither its codebook nor its
+channel estimate. The module therefore learns how often each rank is reported, given the level and the ratios of
+singular values of the modelled channel. The model is a multinomial logistic regression with a ridge penalty. Simpler
+rules for comparison are one threshold per stream, and an ordered regression (one linear score, and one limit between
+neighbouring ranks).
 
 The antenna geometry of the modelled channel is chosen by the log score on held-out sectors of the training flights
-(:func:`choose_features`), and never on the scored flight.
+(:func:`choose_features`), and never by the scored flight.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from ..common.units import FloatArray, IntArray, unmasked
 from .rank import MAX_RANK, cohen_kappa, kappa_influence, one_hot, total_variation
 from .statistics import NO_INTERVAL, Interval, influence_interval
 
-# Probability that the log score uses for a reported rank whose forecast is smaller.
+# Smallest probability of a reported rank that the log score uses.
 _LEAST_PROBABILITY = 1e-6
 
 
@@ -46,7 +47,8 @@ def log_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
 
     Notes
     -----
-    Good (1952), doi:10.1111/j.2517-6161.1952.tb00104.x. Probabilities below :data:`_LEAST_PROBABILITY` count as that.
+    Good (1952), doi:10.1111/j.2517-6161.1952.tb00104.x. Probabilities below :data:`_LEAST_PROBABILITY` are raised to
+    it.
 
     Examples
     --------
@@ -72,7 +74,7 @@ def brier_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
 
 
 def constant_forecast(rank: ArrayLike, ranks: int = MAX_RANK) -> FloatArray:
-    """Return the histogram of training ranks (ranks,) with one more count per rank, so that no rank is impossible."""
+    """Return the histogram of training ranks (ranks,), with one added per rank so that no rank is impossible."""
     values = unmasked(rank)
     count = np.bincount(values[values >= 1].astype(np.int64), minlength=ranks + 1)[1:] + 1.0
     return np.asarray(count / count.sum())
@@ -89,15 +91,15 @@ class ForecastScore:
     kappa, agreement : float
         Scores of the decided rank.
     majority_agreement : float
-        Agreement if the most frequent rank of these samples is always predicted (known only afterwards).
+        Agreement if the most frequent rank of these samples were always predicted. It is known only afterwards.
     log_score, constant_log_score : float
-        Mean of :func:`log_losses` [nat], of the forecast and of the constant one.
+        Means of :func:`log_losses` for the forecast and for the constant forecast [nat].
     log_score_gain : float
-        Share by which the forecast is below the constant one.
+        Share by which the log score of the forecast is below that of the constant forecast.
     log_score_difference_ci95 : (low, high)
-        95 % interval of forecast minus constant on the same samples [nat].
+        95 % interval of log score of forecast minus that of the constant forecast, on the same samples [nat].
     total_variation_expected : float
-        Between the mean probabilities and the measured histogram.
+        Total variation distance between mean probabilities and measured histogram.
     kappa_ci95, log_score_ci95, total_variation_ci95 : (low, high)
     """
 
@@ -128,16 +130,16 @@ def score_forecast(
     measured : array_like, (n,)
         Reported rank, NaN if missing.
     probability : (n, ranks)
-        NaN where there is no forecast.
+        Forecast; NaN without one.
     decided : array_like, (n,)
         Decided rank, 0 without a forecast.
     constant : (ranks,)
-        The constant forecast, from the flights of the fit (:func:`constant_forecast`).
+        The constant forecast of the training flights (:func:`constant_forecast`).
 
     Returns
     -------
     ForecastScore
-        All values are NaN if no sample has both.
+        All values are NaN if no sample has both a report and a forecast.
     """
     ri, decision = unmasked(measured).ravel(), unmasked(decided).ravel()
     counts = (ri >= 1) & (decision >= 1) & np.isfinite(probability).all(axis=1)
@@ -166,10 +168,11 @@ def score_forecast(
     )
 
 
-# Smaller ratios of singular values are raised to this one, because no receiver uses such a stream.
+# Smallest ratio of singular values. Smaller ratios are raised to it, because no receiver uses such a stream.
 FLOOR_DB = -40.0
 
-# Ridge penalties to choose from, on coefficients of standardised features (log likelihood of the whole flight).
+# Candidate ridge penalties on coefficients of standardised features, relative to the log likelihood of the whole
+# flight.
 _PENALTIES = (1.0, 3.0, 10.0, 30.0, 100.0)
 
 # Ridge penalty while geometries are chosen.
@@ -178,17 +181,17 @@ _CHOICE_PENALTY = 10.0
 # Smallest number of training samples for a fit.
 FEWEST = 50
 
-# Numbers in one batch of regressions: bounds memory to some 100 MiB.
+# Numbers in one batch of regressions, which limits the memory to about 100 MiB.
 _HELD = 1 << 22
 
 
 def stream_features(sigma: ArrayLike) -> FloatArray:
-    """Return features on which a receiver may base its decision: ratios of singular values, and level.
+    """Return the features of a channel on which a decision may depend: ratios of singular values, and level.
 
     Parameters
     ----------
     sigma : array_like, (..., m)
-        Singular values, descending, absolute (not scaled per matrix).
+        Singular values in descending order, with their absolute size (not scaled per matrix).
 
     Returns
     -------
@@ -211,7 +214,7 @@ def stream_features(sigma: ArrayLike) -> FloatArray:
 
 
 def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s: float) -> FloatArray:
-    """Return the means of squared singular values over a window around each sample, shifted by some seconds.
+    """Return the means of squared singular values over a window around each sample, shifted in time.
 
     Parameters
     ----------
@@ -222,18 +225,18 @@ def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s:
     shift_s : float
         Positive if the report belongs to a later position than in the log [s].
     average_s : float
-        Length of the centred mean [s]. With 0 the nearest sample in time is used.
+        Length of the window [s]. With 0, the nearest sample in time is used.
 
     Returns
     -------
     (..., n, m)
-        Means. The nearest sample in time is used if the interval contains no sample (a gap, the end of the log).
+        Means. If the window contains no sample (in a gap or at the end of the log), the nearest sample in time is used.
 
     Notes
     -----
-    A receiver uses an estimate that is seconds old, the network grants what was reported before, and the positions of a
-    handset are late as well. A log does not separate these delays. Ripple of a modelled channel within these seconds
-    does not affect a report.
+    A receiver uses a channel estimate that is seconds old, the network schedules the rank that was reported before, and
+    the positions of a handset are also late. A log does not separate these delays. Fast ripple of the modelled channel
+    within these seconds does not affect a report.
 
     Examples
     --------
@@ -242,7 +245,7 @@ def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s:
     """
     order = np.argsort(time_s, kind="stable")
     time, centre = time_s[order], time_s + shift_s
-    # an instant at an end of the interval counts, regardless of rounding
+    # with a margin, so that a sample at an end of the window counts regardless of rounding
     low = np.searchsorted(time, centre - 0.5 * average_s - 1e-9)
     high = np.searchsorted(time, centre + 0.5 * average_s + 1e-9, side="right")
     after = np.searchsorted(time, centre).clip(0, len(time) - 1)
@@ -256,11 +259,12 @@ def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s:
 
 
 def sector_groups(position_m: FloatArray, tower_m: FloatArray, sectors: int = 8) -> IntArray:
-    """Return the sector of directions from the tower of each sample (n,), with about equal numbers of samples.
+    """Return the sector of azimuth from the tower for each sample (n,). Sectors have about equal numbers of samples.
 
-    Held-out sectors are directions that the fit has not seen. Neighbouring samples in time are mostly in one sector.
+    A held-out sector contains directions that the fit has not seen. Samples that are neighbours in time are mostly in
+    the same sector.
     """
-    # count from the largest gap between directions, so that the start does not split a sector
+    # start at the largest gap between directions, so that the start does not split a cluster of samples
     azimuth = azimuth_rad(position_m[:, :2] - np.asarray(tower_m)[:2])
     order = np.sort(azimuth)
     gap = np.diff(np.append(order, order[0] + 2.0 * np.pi))
@@ -272,23 +276,23 @@ def sector_groups(position_m: FloatArray, tower_m: FloatArray, sectors: int = 8)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Receiver:
-    """A fitted multinomial regression of rank.
+    """A fitted multinomial regression of the rank.
 
     Parameters
     ----------
     coefficient : (ranks, 1 + features)
-        Per rank: constant, then one per standardised feature.
+        Coefficients per rank: a constant, then one per standardised feature.
     mean, scale : (features,)
         Mean and scale of the training features.
     decision_weight : (ranks,)
-        The decided rank is that of the largest probability times weight. All ones: the most probable rank. Others are
-        fitted for kappa on out-of-sector forecasts of the training flights (:func:`decision_weights`).
+        The decided rank has the largest product of probability and weight. With ones, it is the most probable rank.
+        Other weights maximise kappa on held-out sectors of the training flights (:func:`decision_weights`).
     penalty : float
         Ridge penalty.
     constant : (ranks,)
         Histogram of the training ranks: the constant forecast.
     n : int
-        Training samples.
+        Number of training samples.
     """
 
     coefficient: FloatArray
@@ -314,7 +318,7 @@ class Receiver:
         Raises
         ------
         ValueError
-            If a part is missing or has another shape than the others.
+            If a field is missing, or the shapes of the fields do not agree.
         """
         names = ("coefficient", "mean", "scale", "decision_weight", "constant")
         if missing := [name for name in (*names, "penalty", "n") if name not in numbers]:
@@ -361,7 +365,7 @@ def _training(features: FloatArray, rank: ArrayLike, groups: IntArray) -> tuple[
 
 def _standard(x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return mean and scale per feature. A constant feature has scale 1 and no effect."""
-    # the axis of the samples is the last but one
+    # samples are on the second-last axis
     scale = x.std(axis=-2)
     return x.mean(axis=-2), np.asarray(np.where(scale > 1e-9, scale, 1.0))
 
@@ -376,25 +380,25 @@ def _design(x: FloatArray) -> FloatArray:
 
 
 def _softmax(score: FloatArray) -> FloatArray:
-    # subtract the largest score, because exp would overflow
+    # subtract the largest score, because exp would otherwise overflow
     e = np.exp(score - _over_ranks(np.maximum, score)[..., None])
     return np.asarray(e / _over_ranks(np.add, e)[..., None])
 
 
 def _over_ranks(operation: np.ufunc, values: FloatArray) -> FloatArray:
-    """Reduce the last axis, which has few elements, ten times as fast as ``operation.reduce``, with the same result."""
+    """Return ``operation.reduce`` over the last axis, which has few elements. A loop over them is ten times faster."""
     return np.asarray(reduce(operation, np.moveaxis(values, -1, 0)))
 
 
 def out_of_group(x: FloatArray, rank: IntArray, groups: IntArray, penalty: float) -> FloatArray:
-    """Return the forecast (..., n, ranks) of each group by a regression on all other groups.
+    """Return the forecast (..., n, ranks) of each group, from a regression on all other groups.
 
     Parameters
     ----------
     x : (..., n, features)
-        Leading axes are further sets of features of the same samples, which are fitted together.
+        Features. Leading axes contain different features of the same samples, which are fitted in one call.
     rank : (n,) int
-        1 to :data:`~aerpaw_cmp.compare.rank.MAX_RANK`.
+        Rank, 1 to :data:`~aerpaw_cmp.compare.rank.MAX_RANK`.
     groups : (n,) int
         Group of each sample. Each group is held out once.
     penalty : float
@@ -417,7 +421,7 @@ def out_of_group(x: FloatArray, rank: IntArray, groups: IntArray, penalty: float
 def _fit_multinomial(
     x: FloatArray, rank: IntArray, weight: FloatArray, penalty: float, *, steps: int = 30
 ) -> FloatArray:
-    """Return the coefficients (..., ranks, 1 + features) of the largest penalised log likelihood.
+    """Return the coefficients (..., ranks, 1 + features) that maximise the penalised log likelihood.
 
     The search uses damped Newton steps.
 
@@ -428,8 +432,8 @@ def _fit_multinomial(
     weight : (n,)
         Weight of each sample, 0 or 1.
     penalty : float
-        ``penalty / 2`` times the squares of all slopes is added to minus the log likelihood. The constants have a
-        thousandth of this weight, which determines their common shift.
+        ``penalty / 2`` times the sum of squared slopes is subtracted from the log likelihood. The constants have a
+        thousandth of this weight, which is enough to determine their common shift.
 
     Notes
     -----
@@ -462,7 +466,7 @@ def _fit_multinomial(
         gradient = np.swapaxes(p * weight[:, None] - target, -1, -2) @ design + ridge * coefficient
         hessian = _hessian(design, transposed, p, weight, ridge)
         flat = gradient.reshape(*lead, MAX_RANK * width, 1)
-        # pass a matrix of one column, because NumPy 2 takes a stack of vectors for one matrix
+        # pass a matrix with one column, because NumPy 2 would read a stack of vectors as one matrix
         step = np.linalg.solve(hessian, flat)[..., 0].reshape(coefficient.shape)
         damping = np.ones((*lead, 1, 1))
         for _halving in range(12):
@@ -495,7 +499,7 @@ def _hessian(
 
 
 def decision_weights(probability: FloatArray, rank: IntArray, groups: IntArray) -> FloatArray:
-    """Return the weights (ranks,) of the decision with the largest kappa, or ones if held-out groups do not gain.
+    """Return the decision weights (ranks,) that maximise kappa, or ones if kappa of held-out groups does not increase.
 
     Parameters
     ----------
@@ -503,7 +507,7 @@ def decision_weights(probability: FloatArray, rank: IntArray, groups: IntArray) 
         Forecasts of held-out groups.
     rank : (n,) int
     groups : (n,) int
-        Group of each sample. Each group is decided with the weights that suit the other groups.
+        Group of each sample. Each group is decided with weights that were fitted to the other groups.
     """
     weighed, plain = np.zeros_like(rank), decide(probability, np.ones(MAX_RANK))
     for group in np.unique(groups):
@@ -518,13 +522,13 @@ def decision_weights(probability: FloatArray, rank: IntArray, groups: IntArray) 
 
 
 def _kappa_weights(probability: FloatArray, rank: IntArray) -> FloatArray:
-    """Return the weights (ranks,) with the largest kappa, for ranks below and above the most frequent rank.
+    """Return weights (ranks,) that maximise kappa: one for ranks below, and one for ranks above the most frequent rank.
 
-    The most probable rank is too often the most frequent rank, and kappa rewards rare ranks. The two weights are
-    searched on a grid. At equal kappa the weights nearest to 1 are used.
+    Without weights, the most frequent rank would be decided too often, and kappa rewards rare ranks. The two weights
+    are searched on a grid. Of weights with equal kappa, those nearest to 1 are used.
     """
     commonest = int(np.bincount(rank).argmax())
-    # weights near 1 first: a farther weight must be better
+    # weights near 1 first, so that a weight farther away is used only if it is better
     exponents = sorted(np.arange(-3, 13) / 10.0, key=abs)
     best, weights = -np.inf, np.ones(MAX_RANK)
     ranks = np.arange(1, MAX_RANK + 1)
@@ -566,7 +570,7 @@ class ReceiverMixture:
 def fit_mixture(
     features: FloatArray, rank: ArrayLike, groups: IntArray, *, penalties: Sequence[float] = _PENALTIES
 ) -> ReceiverMixture:
-    """Fit one receiver per geometry, with the penalty and the decision that suit the mean of their forecasts.
+    """Fit one receiver per geometry. Penalty and decision weights are those best for the mean of their forecasts.
 
     Parameters
     ----------
@@ -577,17 +581,17 @@ def fit_mixture(
     groups : (n,) int
         Group of each sample, e.g. :func:`sector_groups`. Each group is held out once.
     penalties : sequence of float
-        Penalties to choose from, by the log loss on held-out groups.
+        Candidate penalties. The log loss on held-out groups selects one.
 
     Returns
     -------
     ReceiverMixture
-        One receiver per geometry, in order, and their common decision.
+        One receiver per geometry, in the order of ``features``, and their common decision weights.
 
     Raises
     ------
     InputError
-        If there are fewer than :data:`FEWEST` samples, or one rank only.
+        If there are fewer than :data:`FEWEST` samples, or only one rank.
     """
     x, y, group = _training(features, rank, groups)
     means = [np.mean([out_of_group(item, y, group, penalty) for item in x], axis=0) for penalty in penalties]
@@ -608,11 +612,11 @@ class FeatureChoice:
     Parameters
     ----------
     best : int
-        Index of the candidate with the least log score on held-out groups.
+        Index of the candidate with the smallest log score on held-out groups.
     order : (tried,) int
         Candidates that were cross-validated, best first.
     log_score : (tried,)
-        Log score on held-out groups [nat], in that order.
+        Log score on held-out groups [nat], in the order of ``order``.
     tied : tuple of int
         Candidates that are not significantly worse than the best: the 95 % interval of the difference of log scores on
         the same samples contains 0. The best comes first.
@@ -634,7 +638,7 @@ def choose_features(
     *,
     finalists: int = 60,
 ) -> FeatureChoice:
-    """Choose between candidate geometries by held-out groups of the training flights.
+    """Choose between candidate geometries by their log score on held-out groups of the training flights.
 
     Parameters
     ----------
@@ -644,8 +648,9 @@ def choose_features(
     groups : (n,) int
         Group of each sample. Each group is held out once.
     finalists : int
-        Number of candidates that are cross-validated. They have the best likelihood on the training samples: all
-        candidates have equal numbers of coefficients, and a fit takes a tenth of the time of a cross-validation.
+        Number of candidates that are cross-validated. They are the candidates with the highest likelihood on the
+        training samples. This is fair, because all candidates have the same number of coefficients, and a fit takes
+        only a tenth of the time of a cross-validation.
 
     Returns
     -------
@@ -660,7 +665,7 @@ def choose_features(
     x, y, group = _training(features, rank, groups)
     step = max(1, _HELD // (x.shape[1] * (x.shape[2] + 1) * MAX_RANK))
     rough = np.concatenate([_own_losses(x[i : i + step], y) for i in range(0, len(x), step)])
-    # round to nine digits, so that candidates that differ by rounding alone (mounts half a turn apart) keep their order
+    # round to nine digits, so that equivalent candidates (mounts half a turn apart) keep their order despite rounding
     final = np.argsort(np.round(rough, 9), kind="stable")[:finalists]
     held_out = (out_of_group(x[final[i : i + step]], y, group, _CHOICE_PENALTY) for i in range(0, len(final), step))
     losses = np.array([log_losses(probability, y) for part in held_out for probability in part])
@@ -692,14 +697,14 @@ def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray) -> flo
 
 def _own_losses(x: FloatArray, rank: IntArray) -> FloatArray:
     z = _standardised(x)
-    # a rough likelihood is enough to exclude candidates
+    # a few steps suffice, because a rough likelihood is enough to exclude candidates
     weights = _fit_multinomial(z, rank, np.ones(len(rank)), _CHOICE_PENALTY, steps=6)
     p = _softmax(_design(z) @ np.swapaxes(weights, -1, -2))
     return np.array([log_losses(item, rank).mean() for item in p])
 
 
 def _not_worse(difference: FloatArray) -> bool:
-    # candidates with the same channel differ by rounding alone
+    # equivalent candidates differ only by rounding
     if np.abs(difference).max() < 1e-9:
         return True
     return not influence_interval(float(difference.mean()), difference)[0] > 0.0

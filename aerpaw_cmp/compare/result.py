@@ -1,10 +1,10 @@
-"""The numbers of one comparison, which reports, campaigns and JSON use.
+"""The results of one comparison, which reports, campaigns and JSON use.
 
-This file computes, draws and formats nothing. Times are naive ``datetime64[ns]`` in UTC. A missing number is NaN, and
-a field that does not apply to a flight is None.
+This module only stores numbers; it does not compute, draw or format them. Times are naive ``datetime64[ns]`` in UTC. A
+missing number is NaN, and a field that does not apply to a flight is None.
 
-A new number of a tower and channel needs one field of :class:`RssFurther` (for the rank: :class:`RankFurther`) and one
-function that computes it. Both metrics.json and the tables of the report list the fields by name.
+To add a number per tower and channel, add a field to :class:`RssFurther` (for ranks: :class:`RankFurther`) and a
+function that computes it. Both metrics.json and the tables of the report use the names of the fields.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from .rank import CommonestRank, RankComparison, RankRepeat
 from .receiver import ForecastScore
 from .statistics import Interval, PairedDifference
 
-# Models that a replay is compared with, and their titles. The last two contain no physics.
+# Models with which a replay is compared, and their titles. The last two do not model propagation.
 BASELINE_TITLE = {
     "free_space": "free space",
     "two_ray": "two-ray ground",
@@ -40,7 +40,8 @@ BASELINE_TITLE = {
     "constant": "constant level",
 }
 
-# States of a clock: corrected by the estimate, correction refused, not requested, or corrected by a stated value.
+# States of a clock: corrected by the estimate, not corrected although requested, only estimated, or corrected by a
+# value of the flight file.
 APPLIED, NOT_APPLIED, ESTIMATED, GIVEN = (
     "estimated and applied", "asked for, not applied", "estimated, not applied", "given in flight.yaml"
 )  # fmt: skip
@@ -50,8 +51,9 @@ APPLIED, NOT_APPLIED, ESTIMATED, GIVEN = (
 class ClockResult:
     """The radio clock of a receiver (a tower) compared with the telemetry clock.
 
-    ``radio_minus_telemetry_s`` is positive if the radio clock shows later times; subtracting it corrects them.
-    ``applied`` is one of the states above, and ``checks`` contains the tests behind the verdict, by name.
+    ``radio_minus_telemetry_s`` is positive if the radio clock shows later times. Radio times are corrected by
+    subtracting it. ``applied`` is one of the states above. ``checks`` contains the tests that led to the verdict, by
+    name.
     """
 
     receiver: str
@@ -77,23 +79,24 @@ class ClockResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cause:
-    """A named cause.
+    """A possible cause of the error of a flight.
 
     Parameters
     ----------
     name : str
     sentence : str
-        Channels, numbers, and the RMSE without and with the cause.
+        Sentence with channels, numbers, and the RMSE without and with the cause.
     next_step : str
-        A clause.
+        Next step of the user, as a clause.
     estimate, ci95 : float, (low, high)
-        Number of the cause (lag [s], angle [deg], height [m], loss, floor or step [dB]; else NaN) and its interval.
+        Size of the cause (lag [s], angle [deg], height [m], or loss, floor or step [dB]) and its interval. NaN for
+        causes without a size.
     channels : sequence of str
         Channels that show the cause.
     rmse_db, rmse_with_db : float
         RMSE of 1-s means of these channels without and with the cause [dB].
     gain : float
-        Log odds of the explanations with the cause to all without it.
+        Log odds of all explanations with the cause against all without it.
     """
 
     name: str
@@ -109,7 +112,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """An offset and the RMSE with it [dB]."""
+    """An offset, and the RMSE after this offset [dB]."""
 
     offset_db: float
     rmse_db: float
@@ -127,10 +130,10 @@ class ModelLevel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SnrScore:
-    """The error of a signal-to-noise ratio of the replay over thermal noise, without fitted values, over ``n`` samples.
+    """The error of an SNR predicted from replay and thermal noise without fitted values, over ``n`` samples.
 
-    ``noise_dbm`` is k T B with the noise figure. ``mean_error_db`` is measured minus predicted. The RMSE of the
-    comparison is the error without this mean.
+    ``noise_dbm`` is k T B plus the noise figure. ``mean_error_db`` is measured minus predicted. The RMSE of the
+    comparison is the error after subtracting this mean.
     """
 
     noise_dbm: float
@@ -143,11 +146,12 @@ class SnrScore:
 class RssFurther:
     """Numbers of a tower and channel other than offset, RMSE and correlation, with their names in metrics.json.
 
-    A field without a default is always written, and one whose default is None only if the flight has it. ``n_flagged``
-    is by reason. ``compared_with`` contains, by the name of each baseline and other assumption, whether the replay is
-    better or worse on the same samples. ``averaged`` is by simulation and window. ``n_outliers`` samples are far
-    outside the distribution of the levels of the channel; only ``rmse_without_outliers_db`` excludes them.
-    The other counts are those of :class:`~aerpaw_cmp.compare.level.RssComparison`.
+    A field without a default is always written. A field whose default is None is written only if the flight has it.
+    ``n_flagged`` counts samples by reason. ``compared_with`` contains, for each baseline and each other assumption,
+    whether the replay is better or worse on the same samples. The keys of ``averaged`` are simulation and window.
+    ``n_outliers`` counts samples far outside the distribution of the levels of the channel; only
+    ``rmse_without_outliers_db`` excludes them. The other counts are those of
+    :class:`~aerpaw_cmp.compare.level.RssComparison`.
     """
 
     n_measured_out: int
@@ -162,21 +166,21 @@ class RssFurther:
     compared_with: Mapping[str, PairedDifference]
     averaged: Mapping[str, Mapping[str, Fit]]
     detection: DetectionScore | None = None
-    """Scores of the detection, for a receiver that loses its lock or ends at a floor."""
+    """Scores of the detection, for a receiver that loses its lock or has a floor."""
     snr: SnrScore | None = None
-    """Error of a signal-to-noise ratio, for a receiver whose bandwidth is known."""
+    """Error of the SNR, for a receiver whose bandwidth is known."""
     rmse_bound: str | None = None
-    """Reason why the interval of the RMSE is only a lower bound. None for a complete interval."""
+    """Reason why the interval of the RMSE is only a lower bound. None if it is an ordinary interval."""
     interval_notes: tuple[str, ...] | None = None
-    """Sentences about limits of the intervals: no correlation over place, an error that is not stationary."""
+    """Sentences about limits of the intervals: correlation over position is ignored, or the error is not stationary."""
     simulated_sd_db: float | None = None
-    """Mean stated SD of one sample with learned antennas: gain, nuisance of the flight, noise, fading [dB]."""
+    """Mean stated SD of a sample with learned antennas [dB], from gain, nuisance of the flight, noise and fading."""
     error_bars: Mapping[str, float] | None = None
     """Parts of that standard deviation [dB], and the shares of samples inside the stated 50, 90 and 95 % intervals."""
     elsewhere: Mapping[str, Any] | None = None
-    """Errors of learned antennas on held-out flights of a ``kind`` [dB]: RMSE, that of free space, and of 4 s means."""
+    """Errors of learned antennas on held-out flights of a ``kind`` [dB]: RMSE, of free space too, and of 4-s means."""
     trained_on: tuple[str, ...] | None = None
-    """SHA-256 of the logs of this series from which its antennas or settings were learned. It then has no error."""
+    """SHA-256 of this series' logs from which its antennas or settings were learned. Then the series has no error."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,12 +190,12 @@ class RssResult:
     Parameters
     ----------
     tower, channel, unit : str
-        ``unit`` is that of the measurement before the offset: ``"dBm"`` or ``"dB re full scale"``.
+        ``unit`` is the unit of the measurement before the offset: ``"dBm"`` or ``"dB re full scale"``.
     time : (n,) datetime64[ns]
     measured_db, simulated_dbm : (n,)
-        Levels before the offset; NaN without a signal or a path, or if the pose is unknown or too low.
+        Levels before the offset. NaN without a signal or path, and for poses that are unknown or too low.
     posed : (n,) bool
-        True for samples with a known pose above the lowest height, which are compared.
+        True for compared samples: the pose is known and not below the lowest height.
     position_m : (n, 3)
         Position in the site frame; NaN if the pose is unknown.
     line_of_sight : (n,)
@@ -233,12 +237,12 @@ class RssResult:
 
     @property
     def training(self) -> bool:
-        """True if the antennas were learned from the logs of this series, which then has no error."""
+        """True if the antennas were learned from the logs of this series. Such a series has no error."""
         return bool(self.further.trained_on)
 
     @property
     def clock_verdict(self) -> str:
-        """Verdict about the radio clock. Empty if none was estimated."""
+        """Verdict about the radio clock. Empty if no clock was estimated."""
         return "" if self.further.clock is None else self.further.clock.verdict
 
     @property
@@ -258,7 +262,7 @@ class RssResult:
 
     @property
     def residual_db(self) -> FloatArray:
-        """Measurement plus offset minus simulation (n,). NaN if a side is missing or was learned on this flight."""
+        """Measurement plus offset minus simulation (n,). NaN if either is missing, and for a training flight."""
         if LEARNED_HERE in self.score.fitted_on_scored:
             # a series is not scored on its own training data
             return np.full(len(self.time), np.nan)
@@ -280,8 +284,9 @@ class PairResult:
 class RankFurther:
     """Numbers of the rank of a tower other than those of :class:`~aerpaw_cmp.compare.rank.RankComparison`.
 
-    ``n_flagged`` is by reason, ``foliage`` by run and K. ``commonest`` is the constant forecast. ``repeat`` is the
-    agreement of the modem with itself where the second half of the flight repeats positions of the first half.
+    ``n_flagged`` counts samples by reason. The keys of ``foliage`` are run and K. ``commonest`` is the score of the
+    constant forecast. ``repeat`` is the agreement of the modem with itself at positions that both halves of the flight
+    visit.
     """
 
     n_flagged: Mapping[str, int]
@@ -290,20 +295,20 @@ class RankFurther:
     repeat: Mapping[str, RankRepeat]
     receiver: ForecastScore | None = None
     trained_on: tuple[str, ...] | None = None
-    """SHA-256 of the logs on which the receiver was fitted. It then has no score."""
+    """SHA-256 of the logs of this series to which the receiver was fitted. Such a series has no score."""
     agreement_sd_by_ground: Mapping[str, float] | None = None
-    """Standard deviation of the agreement by K, over grounds within the errors of the known heights."""
+    """Standard deviation of the agreement, by K, if the ground is varied within the errors of the known heights."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankResult:
-    """The rank of one tower: reported by the modem, and simulated for each K, over the compared samples.
+    """The rank at one tower over the compared samples: reported by the modem, and simulated for each K.
 
     Parameters
     ----------
     tower : str
     n_samples : int
-        Samples of the log. Samples that are too low or have no pose are not part of the following arrays.
+        Number of samples in the log. The following arrays omit samples that are too low or have no pose.
     time : (n,) datetime64[ns]
     position_m : (n, 3)
     measured : (n,)
@@ -314,7 +319,7 @@ class RankResult:
     level_dbm : (n,)
         Simulated level; NaN without a path.
     probability : (n, 4), optional
-        Probability of rank 1 to 4 by the fitted receiver of ``rank.receiver``.
+        Probability of ranks 1 to 4 from the receiver in ``rank.receiver``.
     rank : mapping of float to (n,) int
         Simulated rank per K; 0 without a path.
     score : RankComparison
@@ -338,14 +343,14 @@ class RankResult:
 
     @property
     def singular_ratio_db(self) -> FloatArray:
-        """Second to last singular value divided by the first, shape (n, m - 1) [dB], which explains a rank."""
+        """Ratios of all other singular values to the first, shape (n, m - 1) [dB]. They explain a rank."""
         with np.errstate(invalid="ignore"):  # 0 / 0 without a channel
             return db_from_amplitude(self.sigma[:, 1:] / self.sigma[:, :1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditResult:
-    """The check of the engine against another one on a spread of links of all series."""
+    """The check of the engine against another engine, on links spread over all series."""
 
     reference: str
     links: int
@@ -357,16 +362,16 @@ class AuditResult:
     reference_seconds: float = float("nan")
     note: str = ""
     fields: FieldAudit | None = None
-    """Check of fields, paths and attitude against the coefficients of Sionna RT and a second implementation."""
+    """Check of fields, paths and attitude against Sionna RT's coefficients and a second implementation."""
     read_from_cache_of: str = ""
-    """Day on which this machine computed the audit, if it comes from the cache."""
+    """Date on which the audit was computed on this machine, if it comes from the cache. Otherwise empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineResult:
-    """The engine that replayed the flight, its time, its omissions, and its audit.
+    """The engine that replayed the flight, with its computing time, its omissions and its audit.
 
-    ``not_audited`` is the reason why Sionna RT could not audit it, and empty otherwise.
+    ``not_audited`` is the reason why Sionna RT could not audit it. It is empty after an audit.
     """
 
     engine: str
@@ -383,8 +388,8 @@ class EngineResult:
 class FlightVerdict:
     """The comparison of ray tracing with the best baseline ``against``, over all channels of a flight.
 
-    ``difference_db`` is the RMSE of ray tracing minus that of the baseline, each channel after its own offset, so it is
-    negative if ray tracing is better. Levels of a receiver that lost its lock count as its floor.
+    ``difference_db`` is the RMSE of ray tracing minus that of the baseline, with one offset per channel. It is negative
+    if ray tracing is better. Levels of a receiver that lost its lock count as its floor.
     """
 
     against: str
@@ -397,7 +402,7 @@ class FlightVerdict:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightResult:
-    """The results of one flight. Empty for series that the flight does not have.
+    """The results of one flight. Fields are empty for series that the flight does not have.
 
     ``models`` has one row per model over all channels, ``ladder`` one row per model, tower and channel. Both are empty
     if no models were compared.
@@ -415,7 +420,7 @@ class FlightResult:
     likely_cause: Cause | None = None
     """The systematic error that explains most of the RMSE. None if none is identified."""
     next_step: str | None = None
-    """The next step of the user, a clause. None if no known step changes the result."""
+    """The next step of the user, as a clause. None if no known step would change the result."""
 
     @property
     def cause(self) -> str | None:

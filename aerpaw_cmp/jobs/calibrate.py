@@ -1,6 +1,6 @@
-"""The ``calibrate`` job: learn mounted antennas from several flights, and score them on held-out flights.
+"""The ``calibrate`` job, which learns mounted antennas from several flights and scores them on held-out flights.
 
-It also learns when a receiver is in lock, from levels that other flights predict.
+It also learns when a receiver is in lock, from levels that are predicted from other flights.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from ..site.learned import AIRFRAME_BAND, KnownDirections, LearnedHealth, Learne
 
 
 def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[str, Learned]) -> dict[str, LearnedLock]:
-    """Return P(lock) by antenna for levels predicted from other flights, with its scores on held-out flights.
+    """Return a model of P(lock) by antenna, learned from levels predicted from other flights, with held-out scores.
 
     Parameters
     ----------
@@ -55,7 +55,8 @@ def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[st
     Returns
     -------
     dict of str to LearnedLock
-        Empty for receivers that keep their lock, and for fewer than three flights, which cannot be scored.
+        Models by antenna. There is none for receivers that keep their lock, nor with fewer than three flights, which
+        cannot be scored.
     """
     able = [o for o in observed if o.locked is not None and np.isfinite(o.locked).any()]
     if len(flights_of(able)) < 3:
@@ -70,7 +71,7 @@ def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[st
 
 
 def learned_healths(observed: Sequence[Observed], fits: Mapping[str, Learned]) -> dict[str, LearnedHealth]:
-    """Return the health of each antenna (``tower.channel``) that held-out flights have.
+    """Return the usual errors of held-out flights, by antenna (``tower.channel``).
 
     Parameters
     ----------
@@ -108,7 +109,8 @@ def learned_healths(observed: Sequence[Observed], fits: Mapping[str, Learned]) -
 def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[str, str], Learned]:
     """Return gains learned without each pair of flights, by pair.
 
-    The forecast of P(lock) for one flight is fitted to levels of the others, which are predicted without both.
+    P(lock) of one flight is predicted by a fit to the other flights. The levels of each of these are predicted without
+    both flights.
     """
     out: dict[tuple[str, str], Learned] = {}
     for one, other in combinations(groups_of(flights_of(observed)), 2):
@@ -118,7 +120,7 @@ def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[s
 
 
 class _Levels:
-    """Predicted path gain and received level of one series [dB], at samples with a known lock."""
+    """Predicted path gain and received level [dB] of one series, at samples whose lock state is known."""
 
     def __init__(self, o: Observed, learned: Learned) -> None:
         assert o.locked is not None
@@ -133,7 +135,7 @@ class _Levels:
 def _learned(
     series: Sequence[Observed], fits: Mapping[str, Learned], pairs: Mapping[tuple[str, str], Learned]
 ) -> LearnedLock | None:
-    """Learn P(lock) from all flights, and score each flight with the fit of the remaining flights."""
+    """Learn P(lock) from all flights, and score each flight with a fit to all other flights."""
     flights = [_Levels(o, fits[o.samples.flight]) for o in series]
     every = learn_detection([(f.level_db, f.detected) for f in flights])
     scores: list[DetectionScore] = []
@@ -165,15 +167,15 @@ def _learned(
     )
 
 
-# Smallest SD, for a receiver that always writes the same level without lock [dB].
+# Smallest SD [dB], because some receivers always write the same level without lock.
 _LEAST_SD_DB = 0.5
 
-# Width of the central 90 % of a normal distribution, over its standard deviation.
+# Width of the central 90 % of a normal distribution in standard deviations.
 _CENTRAL = 3.29
 
 
 def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
-    """Fit the level over path gain by a line, with and without lock, and return the spread about each line."""
+    """Fit lines to the level over path gain, with and without lock, and return levels, slope and spread."""
     numbers: dict[str, float] = {}
     for name, in_lock in (("locked", True), ("lost", False)):
         parts = [f.detected == in_lock for f in flights]
@@ -181,7 +183,7 @@ def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
         gain, level = (np.concatenate(values) for values in zip(*each, strict=True))
         alike = np.concatenate([np.full(len(g), len(g) ** -0.5) for g, _ in each])  # equal weights of the flights
         slope, middle = np.polyfit(gain, level, 1, w=alike)
-        # in lock, fades are rare and deep, so the central 90 % give a 90 % band that does not cover more
+        # use the central 90 %, because rare deep fades in lock would make a 90 % band too wide
         central = np.mean([np.ptp(np.quantile(m - slope * g, (0.05, 0.95))) for g, m in each]) / _CENTRAL
         sd = central if in_lock else (level - middle - slope * gain).std()
         numbers |= {f"{name}_db": middle, f"{name}_per_db": slope, f"{name}_sd_db": max(sd, _LEAST_SD_DB)}
@@ -189,7 +191,7 @@ def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
 
 
 def lock_words(lock: LearnedLock) -> str:
-    """Return sentences on P(lock) and on the level with a floor, from held-out flights."""
+    """Return sentences about the scores of P(lock) and of levels with a floor on held-out flights."""
     return (
         f"The predicted level gives the probability of lock with a Brier score of {lock.brier:.3f} on held-out flights "
         f"(constant share of each flight: {lock.constant_brier:.3f}), log score {lock.log_score:.3f} "
@@ -199,42 +201,42 @@ def lock_words(lock: LearnedLock) -> str:
     )
 
 
-# Roughness heights that are tried [m]. Infinite means no ground ray.
+# Candidate roughness heights [m]. Infinite means that there is no ground ray.
 _ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
 
 
 class PatternsSettings(StrictModel):
-    """The measured patterns to which the learned gain is added, isotropic by default."""
+    """The measured patterns to which the learned gain is added. They are isotropic by default."""
 
     uav: AntennaSettings | None = None
     tower: AntennaSettings | None = None
     towers: dict[str, AntennaSettings] = Field(default_factory=dict)
-    """Patterns by ``tower.channel``, if they differ."""
+    """Patterns by ``tower.channel``, for towers with a different pattern."""
 
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
 
 
 class CampaignSettings(StrictModel):
-    """Flights of one campaign, with common noise. Campaigns with the same airframe share the gain of the UAV."""
+    """The flights of one campaign, which have the same noise. Campaigns with the same airframe share the UAV's gain."""
 
     flights: Annotated[list[str], Field(min_length=1)]
     source: Source = Source()
 
 
 class CalibrationFile(StrictModel):
-    """The whole calibration.yaml."""
+    """The content of a calibration.yaml."""
 
     calibration: _Name
     flights: Annotated[list[str], Field(min_length=1)]
     """All flights, including those of ``campaigns``."""
     campaigns: dict[_Name, CampaignSettings] = Field(default_factory=dict)
-    """Campaigns by name, if antennas are learned from several together. Each becomes an entry of a site."""
+    """Campaigns by name, if antennas are learned from several campaigns together. Each becomes an entry of the site."""
     patterns: PatternsSettings = PatternsSettings()
     source: Source = Source()
-    """Title, DOI and licence of the flights' data, and their airframe, stored with the learned models of a site."""
+    """Title, DOI and licence of the data, and the airframe. They are stored with the learned models of a site."""
     rank: bool = False
-    """Also learn how the receiver decides its rank."""
+    """True to also learn how the receiver decides its rank."""
 
     @model_validator(mode="before")
     @classmethod
@@ -252,22 +254,22 @@ class CalibrationFile(StrictModel):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroundFit:
-    """Log likelihood of each roughness height of the ground [m], relative to no ground ray (infinite height)."""
+    """The log likelihood of each roughness height of the ground [m], relative to no ground ray (infinite height)."""
 
     roughness_m: tuple[float, ...]
     log_likelihood: tuple[float, ...]
 
     @property
     def likely_m(self) -> tuple[float, float]:
-        """Heights within 2 of the best log likelihood (some 95 %)."""
-        # two standard deviations of a normal likelihood
+        """Range of heights within 2 nat of the best log likelihood (about a 95 % interval)."""
+        # 2 nat are two standard deviations of a normal likelihood
         least = max(self.log_likelihood) - 2.0
         near = [r for r, v in zip(self.roughness_m, self.log_likelihood, strict=True) if v > least]
         return min(near), max(near)
 
     @property
     def used_m(self) -> float | None:
-        """The most probable height, for replays. None if the data fit as well without a ground ray."""
+        """The most probable height, for replays. None if the data fit equally well without a ground ray."""
         return None if math.isinf(self.likely_m[1]) else self.roughness_m[int(np.argmax(self.log_likelihood))]
 
 
@@ -278,7 +280,7 @@ class Calibration:
     settings: CalibrationFile
     flights: tuple[FlightData, ...]
     campaigns: Mapping[str, str]
-    """Campaign of each flight by name."""
+    """Campaign of each flight, by the name of the flight."""
     observed: tuple[Observed, ...]
     learned: Learned
     scores: Mapping[str, tuple[Score, ...]]
@@ -287,9 +289,9 @@ class Calibration:
     locks: Mapping[str, LearnedLock]
     """Lock models by antenna, for receivers that lose their lock."""
     health: Mapping[str, LearnedHealth]
-    """Errors of held-out flights by antenna."""
+    """Usual errors of held-out flights, by antenna."""
     teaching: frozenset[str]
-    """Campaigns whose gain of the UAV predicts most of their held-out flights, so that it may be used elsewhere."""
+    """Campaigns whose UAV gain predicts most of their held-out flights. Only such a gain may be used elsewhere."""
     warnings: tuple[str, ...]
     words: tuple[str, ...]
 
@@ -324,7 +326,7 @@ class Calibration:
 
 
 def load_calibration(path: Path, further: Sequence[Path] = ()) -> CalibrationFile:
-    """Read and check a calibration.yaml, or a flight file and ``further``. UsageError as for any settings file."""
+    """Read and check a calibration.yaml, or create its content from a flight file and the flight files ``further``."""
     if (flight := flight_of(path)) is None:
         settings = load_yaml(path, CalibrationFile)
     else:
@@ -355,17 +357,18 @@ def calibrate(
     flights : sequence of FlightData
         Flights, as returned by :func:`read_flights`.
     folder, logs_root : Path
-        Folder for the paths of patterns, and folder for the logs of ``score`` (default: that of their flight file).
+        Folder for relative paths of patterns, and folder of the logs of ``score`` (by default, that of their flight
+        file).
     campaigns : mapping of str to str, optional
-        Campaign of each flight, as :func:`read_flights` returns it. Default: one campaign.
+        Campaign of each flight, from :func:`read_flights`. By default, all flights are one campaign.
     stages : Stages, optional
     score : sequence of Path
-        Further flight files, which are scored with all learned antennas.
+        Additional flight files, which are only scored with the learned antennas.
 
     Returns
     -------
     Calibration
-        Learned antennas, their scores on held-out flights, and the controls.
+        Learned antennas, their scores on held-out flights, and scores of control experiments.
 
     Raises
     ------
@@ -423,7 +426,7 @@ def calibrate(
 def _score_further(
     further: Sequence[FlightData], flights: Sequence[FlightData], learned: Learned, observed: Sequence[Observed]
 ) -> tuple[tuple[Score, ...], list[str]]:
-    """Score further flights with the learned antennas, and remark on those that were training flights."""
+    """Score additional flights with the learned antennas, and return remarks about those that were training flights."""
     distinct, remarks = counted_once([*flights, *further])
     fresh = [data for data in distinct if not any(data is item for item in flights)]
     if not fresh:
@@ -444,7 +447,7 @@ def _score_further(
 def read_flights(
     settings: CalibrationFile, folder: Path, logs_root: Path | None
 ) -> tuple[list[FlightData], list[str], dict[str, str]]:
-    """Return every flight of the calibration, each log once, remarks on copies, and the campaign of each flight."""
+    """Return all flights of a calibration (each log once), remarks about copies, and the campaign of each flight."""
     places = [folder / name for name in settings.flights]
     out = [load_data(load_with_learned(path), path.parent, logs_root) for path in places]
     names = [data.settings.flight.name for data in out]
@@ -459,9 +462,9 @@ def read_flights(
 def in_campaigns(
     settings: CalibrationFile, observed: Sequence[Observed], flights: Sequence[FlightData], campaigns: Mapping[str, str]
 ) -> list[Observed]:
-    """Return samples with their campaign, and with their airframe and band, of several campaigns.
+    """Return samples with their campaign, airframe and band filled in, if there are several campaigns.
 
-    Airframes of one name share their gain within 7 % of frequency, from the lowest carrier of each band on.
+    Airframes of the same name share their gain within a band, which extends 7 % above its lowest carrier.
 
     Parameters
     ----------
@@ -475,7 +478,7 @@ def in_campaigns(
     Returns
     -------
     list of Observed
-        Unchanged if there is one campaign only.
+        The unchanged samples if there is only one campaign.
     """
     of = settings.by_campaign()
     if len(of) < 2:
@@ -493,7 +496,7 @@ def in_campaigns(
         campaign, carrier = campaigns[s.flight], carriers[s.flight, s.antenna]
         band = max(low for low in bands if low <= carrier)
         source = of[campaign].source.airframe if campaign in of else settings.source.airframe
-        # an airframe without a name belongs to its campaign only
+        # an airframe without a name belongs only to its campaign
         airframe = campaign if source == Source().airframe else source
         samples = dataclasses.replace(s, campaign=campaign, airframe=f"{airframe}, {band / 1e9:g} GHz")
         return dataclasses.replace(o, samples=samples)
@@ -502,7 +505,7 @@ def in_campaigns(
 
 
 def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
-    """Return the samples of every series relative to free space, and remarks."""
+    """Return the samples of every series relative to free space, and remarks about series that are omitted."""
     observed: list[Observed] = []
     warnings: list[str] = []
     carriers: dict[str, dict[str, float]] = {}
@@ -533,7 +536,7 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
 
 
 def _unscored(observed: Sequence[Observed]) -> list[str]:
-    """Return a remark on the tower channels that cannot be scored, because only one flight has them."""
+    """Return a remark about channels of towers that cannot be scored, because only one flight has them."""
     flights = calibration.flights_of(observed)
     if len(flights) < 2:
         return ["only one flight: no flight can be held out, so nothing is scored, and mounts are unstable"]
@@ -544,7 +547,7 @@ def _unscored(observed: Sequence[Observed]) -> list[str]:
 
 
 def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | None, list[str]]:
-    """Return one series of levels at known poses, and remarks. None for ratios, and if no pose is known."""
+    """Return the samples of one series at known poses, and remarks. None for ratios, and if no pose is known."""
     name, remarks = f"{data.settings.flight.name}: {series.tower} {series.channel}", []
     if series.channel.lower() in RATIOS:
         if series.channel.lower() != SNR or any(s.channel.lower() not in RATIOS for s in data.rss):
@@ -567,12 +570,12 @@ def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | Non
 
 
 def learned_antennas(train: Sequence[gains.LinkSamples]) -> Learned:
-    """Learn antennas of both ends from means over time bins, starting from the model's default strengths."""
+    """Learn the antennas of both ends, starting from the default strengths of the model."""
     return calibration.learn(train, Recipe(gains.GainModel(bin_s=BIN_S)))
 
 
 def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
-    """Return the terms and patterns that calibration.yaml specifies."""
+    """Return the terms and patterns that a calibration.yaml specifies."""
     patterns: dict[str, GainOf] = {}
     if settings.patterns.uav is not None:
         patterns["uav"] = gain_of(settings.patterns.uav, folder)
@@ -596,7 +599,7 @@ def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
 
 
 def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], learned: Learned) -> GroundFit:
-    """Return the likelihood of a coherent ground ray per roughness, with the gains integrated out."""
+    """Return the likelihood of a coherent ground ray for each roughness, with the gains integrated out."""
     by_name = {data.settings.flight.name: data for data in flights}
     by_series = {(o.samples.flight, o.samples.antenna): o for o in observed}
 
@@ -636,7 +639,7 @@ def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lea
 def _score_all(
     observed: Sequence[Observed], recipe: Recipe, stages: Stages, fits: dict[str, Learned]
 ) -> dict[str, tuple[Score, ...]]:
-    """Score every split on samples that were not used in the fit. Fits are shared between splits.
+    """Score every split (flight, height, heading, sector) on samples that were not fitted. Splits share fits.
 
     Parameters
     ----------
@@ -676,7 +679,7 @@ def _score_all(
 def _controls_of(
     observed: Sequence[Observed], recipe: Recipe, scores: tuple[Score, ...]
 ) -> dict[str, tuple[Score, ...]]:
-    """Score wrong frames for the gain of the UAV on held-out flights. ``scores`` are those of the body frame."""
+    """Score the UAV's gain in wrong frames on held-out flights, as controls. ``scores`` are those of the body frame."""
     if len(calibration.flights_of(observed)) < 2:
         return {}
     left_out, bare = calibration.flight_left_out, dataclasses.replace(recipe, patterns={})
@@ -692,7 +695,7 @@ def _controls_of(
     }
 
 
-# Directions that represent the gain of an end in its evidence, and the length of its kernel.
+# Share of the variance that the stored directions of a gain may miss, and their largest number.
 _KNOWN_SHARE, _MOST_KNOWN = 0.002, 100
 _LENGTHS: Mapping[gains.Frame, float] = {term.frame: term.length for term in gains.ANTENNA_TERMS}
 
@@ -700,7 +703,7 @@ _LENGTHS: Mapping[gains.Frame, float] = {term.frame: term.length for term in gai
 def known_directions(fit: gains.GainFit, antenna: str, frame: gains.Frame = "body") -> KnownDirections:
     """Return the directions at one end that determine its gain, and the covariance there.
 
-    With 60, 100 or 200 of them the evidence for an airframe differs by at most 3 nat.
+    With 60, 100 or 200 directions, the evidence for an airframe differs by at most 3 nat.
     """
     from scipy.spatial.distance import cdist
 
@@ -710,12 +713,12 @@ def known_directions(fit: gains.GainFit, antenna: str, frame: gains.Frame = "bod
 
 
 def teaching(observed: Sequence[Observed], campaigns: Mapping[str, str], fits: Mapping[str, Learned]) -> frozenset[str]:
-    """Return the campaigns of which more than half of the held-out flights support the gain of the UAV."""
+    """Return the campaigns in which more than half of the held-out flights support the learned gain of the UAV."""
     passed: dict[str, list[bool]] = {}
     for flight, learned in fits.items():
         series = [o.samples for o in observed if o.samples.flight == flight]
         antenna = next((s.antenna for s in series if s.antenna in learned.fit.antennas), None)
-        if antenna is None:  # the antennas of this flight were learned from it alone
+        if antenna is None:  # no antenna of this flight is known from other flights
             continue
         process = _airframe(learned, antenna)
         passed.setdefault(campaigns[flight], []).append(FlightEvidence(series).of_airframe(process).fits)
@@ -725,7 +728,7 @@ def teaching(observed: Sequence[Observed], campaigns: Mapping[str, str], fits: M
 def _contradictions(
     scores: Sequence[Score], controls: Mapping[str, Sequence[Score]], campaigns: Mapping[str, str]
 ) -> list[str]:
-    """Return a sentence for every campaign that the airframe of the others predicts worse than free space or a copy."""
+    """Return a sentence per campaign for which the airframe of the others is worse than free space or a control."""
     out = []
     for name in dict.fromkeys(campaigns[s.flight] for s in scores):
 
@@ -754,7 +757,7 @@ def _airframe(learned: Learned, antenna: str) -> KnownProcess:
 
 
 def _mount_warnings(learned: Learned) -> list[str]:
-    """Return a sentence for every mount that the data do not determine."""
+    """Return one sentence per mount that the data do not determine."""
     return [
         f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is likeliest, with a standard deviation of "
         f"{mount.azimuth_sd_deg:.0f} deg"

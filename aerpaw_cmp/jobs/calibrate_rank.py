@@ -1,7 +1,7 @@
-"""The receiver's part of ``calibrate``: learn how the modem decides its rank, and score it on held-out flights.
+"""The part of ``calibrate`` that learns how a modem decides its rank, and scores this on held-out flights.
 
-The model has only the direct path and one ray off flat ground at height 0. At a rural site the orientation of the ports
-and the strength of the ground ray affect the rank more than any wall.
+The channel model contains only the direct path and one ray reflected by flat ground at height 0. At a rural site, the
+orientation of the antenna ports and the strength of the ground ray affect the rank more than walls do.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ..site.learned import read_table
 # First key of a receiver file.
 FORMAT = "aerpaw-cmp receiver 1"
 
-# Slants of the four ports of a modem: two diagonals, two upright and two lying, all equal.
+# Candidate slants of the four ports of a modem.
 _SLANTS_DEG: tuple[tuple[float, ...], ...] = (
     (45.0, -45.0, 45.0, -45.0), (45.0, -45.0, -45.0, 45.0), (45.0, 45.0, -45.0, -45.0),
     (-45.0, 45.0, -45.0, 45.0), (-45.0, 45.0, 45.0, -45.0), (-45.0, -45.0, 45.0, 45.0),
@@ -44,7 +44,7 @@ _SLANTS_DEG: tuple[tuple[float, ...], ...] = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankGrid:
-    """Geometries and timings that are tried.
+    """The geometries and timings that are tried.
 
     Parameters
     ----------
@@ -53,13 +53,13 @@ class RankGrid:
     uav_slant_deg : tuple of tuple of float
         Slants of the modem's ports.
     ground : tuple of float
-        Amplitude factors on the ground reflection.
+        Amplitude factors of the ground reflection.
     members : int
-        Number of indistinguishable geometries that the forecast averages.
+        Largest number of indistinguishable geometries whose forecasts are averaged.
     thin : int
-        Every n-th sample is used to choose the geometry. All samples are used for the fit.
+        Only every n-th sample is used to choose the geometry. The fit uses all samples.
     shift_s, average_s : tuple of float
-        Delays of a report behind the logged position, and averaging times of the modelled channel, that are tried.
+        Candidate delays of a report behind the logged position, and candidate averaging times of the modelled channel.
     """
 
     yaw_step_deg: float = 30.0
@@ -73,7 +73,7 @@ class RankGrid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankSamples:
-    """Reports of one flight at one tower, at known positions. ``rank`` (n,) is NaN without CSI."""
+    """The reports of one flight at one tower with known positions. ``rank`` (n,) is NaN without CSI."""
 
     flight: str
     tower: str
@@ -88,13 +88,13 @@ class RankSamples:
     """Fingerprint of these reports, independent of their log."""
 
     def part(self, rows: Any) -> RankSamples:
-        """Return some of the samples."""
+        """Return the selected samples."""
         return dataclasses.replace(self, poses=self.poses[rows], rank=self.rank[rows], time_s=self.time_s[rows])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
-    """Time relation of reports to the positions of a log: see :func:`~aerpaw_cmp.compare.receiver.time_means`."""
+    """The delay and averaging time of reports; see :func:`~aerpaw_cmp.compare.receiver.time_means`."""
 
     shift_s: float = 0.0
     average_s: float = 0.0
@@ -110,20 +110,20 @@ class FittedReceiver:
     flights: tuple[str, ...]
     """Names of the training flights."""
     trained_on: tuple[str, ...] = ()
-    """SHA-256 of the training logs, on which it must not be scored."""
+    """SHA-256 of the training logs. The receiver must not be scored on them."""
     marks: tuple[str, ...] = ()
     """Fingerprints of the training reports."""
     mixture: receiver.ReceiverMixture
     timing: Timing = Timing()
 
     def knows(self, samples: RankSamples) -> bool:
-        """Check whether it was fitted on these reports, by their logs or readings."""
+        """Check whether the receiver was fitted to these reports, by the digest of their log or their fingerprint."""
         return not set(self.trained_on).isdisjoint(samples.logs) or among(samples.mark, self.marks)
 
     def forecast(self, samples: RankSamples, turns_deg: Sequence[float] = (0.0,)) -> tuple[FloatArray, IntArray]:
-        """Return the probability of each rank (n, 4) and the decided rank (n,), as a mean over turns of the UAV."""
+        """Return the probability of each rank (n, 4), averaged over headings of the UAV, and the decided rank (n,)."""
         turned = [
-            dataclasses.replace(g, uav_yaw_deg=(g.uav_yaw_deg - turn) % 360.0)  # many rotated mounts are equal
+            dataclasses.replace(g, uav_yaw_deg=(g.uav_yaw_deg - turn) % 360.0)  # many of the rotated mounts are equal
             for turn in turns_deg
             for g in self.geometries
         ]
@@ -190,7 +190,7 @@ def read_receiver(path: Path) -> dict[str, FittedReceiver]:
     Raises
     ------
     InputError
-        If it is not such a file.
+        If the file is not a receiver file.
     """
     with parsing(path, f"a file of format {FORMAT!r}", "a file of another kind", any_shape=True):
         content = json.loads(read_table(path, "a receiver file"))
@@ -257,7 +257,7 @@ def _features(power: FloatArray, samples: RankSamples, timing: Timing) -> FloatA
 
 
 def candidates(grid: RankGrid, samples: RankSamples) -> tuple[Geometry, ...]:
-    """Return the geometries to try: upright and rolled by 90 deg (equal after half a turn), and lying flat."""
+    """Return the geometries to try: arrays upright, rolled by 90 deg (both equal after half a turn), and lying flat."""
     half, full = (np.arange(0.0, end, grid.yaw_step_deg) for end in (180.0, 360.0))
     mounts = [(float(y), 0.0, r) for r in (0.0, 90.0) for y in half] + [(float(y), 90.0, 0.0) for y in full]
     tower = tuple(np.degrees(samples.link.tower_arrays[samples.tower].slant_rad).round(9).tolist())
@@ -265,7 +265,7 @@ def candidates(grid: RankGrid, samples: RankSamples) -> tuple[Geometry, ...]:
 
 
 def samples_by_tower(flights: Sequence[FlightData]) -> dict[str, list[RankSamples]]:
-    """Return the reports of all flights by tower. InputError if there are none."""
+    """Return the reports of all flights by tower. Raise InputError if there are none."""
     towers: dict[str, list[RankSamples]] = {}
     for data in flights:
         for series in data.rank:
@@ -276,7 +276,7 @@ def samples_by_tower(flights: Sequence[FlightData]) -> dict[str, list[RankSample
 
 
 def fit_rank(towers: Mapping[str, Sequence[RankSamples]]) -> RankCalibration:
-    """Fit a receiver per tower on all flights, and score it on held-out flights. InputError for too few reports."""
+    """Fit one receiver per tower, and score it on held-out flights. Raise InputError if there are too few reports."""
     receivers, warnings = {}, []
     scores: dict[str, list[tuple[str, str, ForecastScore]]] = {"flight_left_out": [], "sector_left_out": []}
     for tower, samples in towers.items():
@@ -308,7 +308,7 @@ def fit_rank(towers: Mapping[str, Sequence[RankSamples]]) -> RankCalibration:
 
 
 def _sectors(samples: RankSamples, fitted: FittedReceiver, constant: FloatArray) -> ForecastScore:
-    """Score each sector with a forecast from the other sectors of its flight and the geometries of other flights."""
+    """Score forecasts of held-out sectors, fitted to the other sectors with the geometries of other flights."""
     good = samples.part(samples.rank >= 1)
     groups = receiver.sector_groups(good.poses.position_m, good.tower_m)
     penalty = fitted.mixture.members[0].penalty
@@ -320,7 +320,7 @@ def _sectors(samples: RankSamples, fitted: FittedReceiver, constant: FloatArray)
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """All candidates at thinned samples of each flight. ``power`` has shape (geometries, n, 4) per flight."""
+    """The channels of all candidates at thinned samples of each flight: ``power`` (geometries, n, 4) per flight."""
 
     grid: RankGrid
     samples: Sequence[RankSamples]
@@ -338,8 +338,8 @@ class Tried:
     def fit(self, flights: Sequence[int] | range) -> FittedReceiver:
         """Choose geometries and timing on some flights, and fit the receiver.
 
-        Geometries are chosen without timing first. The best geometries determine the timing, with which all geometries
-        are compared again.
+        First, geometries are chosen without timing. With the best of them, the timing is chosen. With this timing, all
+        geometries are compared a second time.
         """
         first = self.choose(flights, Timing())
         timing = self.choose_timing(flights, first.order[: self.grid.members])
@@ -364,7 +364,7 @@ class Tried:
         )
 
     def choose(self, flights: Sequence[int] | range, timing: Timing) -> receiver.FeatureChoice:
-        """Compare all geometries on held-out sectors within the flights."""
+        """Compare all geometries by their scores on held-out sectors of the flights."""
         thinned = [self.thinned[i] for i in flights]
         return receiver.choose_features(
             self.features(flights, timing), np.concatenate([item.rank for item in thinned]), _groups(thinned)
@@ -385,6 +385,6 @@ class Tried:
 
 
 def _groups(samples: Sequence[RankSamples]) -> IntArray:
-    """Return the sector of each sample. A sector is held out from all flights at once."""
+    """Return the sector of each sample. A sector is held out of all flights together."""
     position_m = np.concatenate([sample.poses.position_m for sample in samples])
     return receiver.sector_groups(position_m, samples[0].tower_m)

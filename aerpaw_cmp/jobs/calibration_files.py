@@ -1,4 +1,4 @@
-"""Antenna files, the settings that name them, and the page of a calibration."""
+"""Output of a calibration: antenna files, the settings that name them, the page, and entries for a site."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ from .calibrate_rank import RankCalibration
 # Start of calibrated.yaml, which identifies an earlier output of this tool.
 _MARK = "# aerpaw-cmp calibrate"
 
-# Share of the variance over both directions that stored directions may miss, and their largest number.
+# Share of the variance of the joint gain that the stored directions may miss, and their largest number.
 _PAIR_SHARE, _MOST_PAIRS = 0.01, 400
 
 
 def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
-    """Return every antenna over the sphere, by ``(tower.channel, "uav" or "tower")``."""
+    """Return the gain over the sphere of every antenna, by ``(tower.channel, "uav" or "tower")``."""
     theta, azimuth, vectors = sphere_grid()
     flat, shape = vectors.reshape(-1, 3), vectors.shape[:2]
     fit, out = calibration.fit, {}
@@ -79,7 +79,7 @@ def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]
 def _antenna_files(
     calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], carrier_hz: float
 ) -> dict[str, str]:
-    """Return the content of each file by name: the full sphere with standard deviation, and cuts for planning tools.
+    """Return the antenna files by name: the full sphere with standard deviation, and cuts for planning tools.
 
     Parameters
     ----------
@@ -110,12 +110,12 @@ def _antenna_files(
 
 
 def _provenance_notes(calibration: Calibration) -> Sequence[str]:
-    """Return the notes on training logs, which are common to all channels."""
+    """Return the notes about training logs, which are the same in all antenna files."""
     return f"{KEY}: {' '.join(calibration.trained_on)}", f"{MARKS}: {' '.join(calibration.marks)}"
 
 
 def _pair_gain(calibration: Calibration, antenna: str) -> PairGain | None:
-    """Return the joint gain of both ends of an antenna. None if it was not learned."""
+    """Return the joint gain of an antenna and the UAV, or None if it was not learned."""
     fit = calibration.fit
     if (term := calibration.pair_term) is None:
         return None
@@ -133,7 +133,7 @@ def _pair_gain(calibration: Calibration, antenna: str) -> PairGain | None:
 def _learned_antenna(
     calibration: Calibration, antenna: str, end: str, files: Mapping[str, str], place: str, command: str
 ) -> dict[str, Any]:
-    """Return the array of one end in calibrated.yaml: its table, with SHA-256 and error model."""
+    """Return the array of one end for calibrated.yaml: its table, with SHA-256 and error model."""
 
     def sha256(file: str) -> str:
         return hashlib.sha256(files[file].encode()).hexdigest()
@@ -149,7 +149,7 @@ def _learned_antenna(
 
 
 def rounded_spread(spread: Spread) -> LearnedSpread:
-    """Return an error model with four digits, as it is written."""
+    """Return an error model rounded to four digits, as it is written to files."""
     return LearnedSpread(**{name: _rounded(value) for name, value in dataclasses.asdict(spread).items()})
 
 
@@ -170,7 +170,7 @@ def learned_settings(
     files : mapping of str to str
         Content of the antenna files by name.
     command : str
-        Command that makes them.
+        Command that creates the files.
 
     Returns
     -------
@@ -187,7 +187,7 @@ def learned_settings(
         power_dbm = link.transmit_power_dbm
         entry = channels.setdefault(channel, {"carrier_hz": link.carrier_hz, "transmit_power_dbm": power_dbm})
         entry["uav"] = at_uav
-        # the antenna of the only tower with a channel is also used at other towers
+        # if only one tower has a channel, its antenna is also used at other towers
         if [name for _, name in towers].count(channel) == 1:
             entry["tower"] = at_tower
         else:
@@ -201,7 +201,7 @@ def learned_settings(
 def _record_of(
     calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], text: str, stages_s: Mapping[str, float]
 ) -> CalibrationData:
-    """Return the record of the page.
+    """Return the record from which the page is written.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def _record_of(
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """Results of a calibration, with remarks on the logs of its flights."""
+    """The results of a calibration, with remarks on the logs of its flights."""
 
     settings: CalibrationFile
     flights: tuple[FlightData, ...]
@@ -265,9 +265,9 @@ def write_files(
     ----------
     calibrated : Calibrated
     folder : Path
-        Existing folder, which the caller swaps for the old one.
+        Existing folder to write to. The caller then moves it to its final place.
     name : str
-        Name of the final folder, for the paths in calibrated.yaml.
+        Name of the final folder, which is used in the paths of calibrated.yaml.
     stages_s : mapping of str to float
         Time of each stage [s].
 
@@ -313,7 +313,7 @@ def write_files(
 
 
 def site_entries(calibrated: Calibrated) -> dict[str, tuple[Entry, dict[str, bytes]]]:
-    """Return the entries of a calibration for a site by campaign, each with its tables by name."""
+    """Return the entries for the learned models of a site, by campaign. Each has its tables by name."""
     settings, out = calibrated.settings, {}
     maps = None if calibrated.calibration is None else _antenna_maps(calibrated.calibration)
     for name, campaign in settings.by_campaign().items():
@@ -345,18 +345,18 @@ def site_entries(calibrated: Calibrated) -> dict[str, tuple[Entry, dict[str, byt
 def _learned_series(
     calibration: Calibration, name: str, maps: Mapping[tuple[str, str], AntennaMap]
 ) -> tuple[list[LearnedSeries], dict[str, bytes]]:
-    """Return the antennas of every tower and channel of a campaign, and their tables by name."""
+    """Return the antennas of all towers and channels of a campaign, and their tables by name."""
     tables: dict[str, bytes] = {}
     series = []
     mine = [o.samples for o in calibration.observed if calibration.campaigns[o.samples.flight] == name]
     for antenna in (a for a in calibration.fit.antennas if any(s.antenna == a for s in mine)):
         samples = [s for s in mine if s.antenna == antenna]
-        # the UAV has one antenna for all towers of a band
+        # the UAV has the same antenna for all towers of a band
         shared = next(s.antenna for s in mine if s.airframe == samples[0].airframe)
         parts = {"tower": antenna, "pair": antenna, "tower_known": antenna, "uav": shared, "known": shared}
         files = {part: f"{safe_name(f'{name}.{owner}.{part}')}.csv.gz" for part, owner in parts.items()}
         notes = {p: (f"aerpaw-cmp calibrate: {name}, {antenna} {p}", *_provenance_notes(calibration)) for p in files}
-        # flight files never name these tables, and fingerprints would be most of their size
+        # omit fingerprints: they would be most of the size of these tables, which flight files never name
         notes |= {part: notes[part][:2] for part in ("known", "tower_known", "pair")}
         for end in ("tower", "uav"):
             gains = maps[parts[end], end]
@@ -394,18 +394,19 @@ def _learned_series(
     return series, tables
 
 
-# Number of samples for the mean standard deviation of a series.
+# Number of samples from which the mean standard deviation of a series is computed.
 _SD_SAMPLES = 200
 
-# Prior SD of the offset between flights [dB], with the weight of two flights. It is a guess: three of dataset 12, LTE,
-# AFAR and NR give 1.0 dB (without AFAR) to 2.8 dB (without dataset 12). Such different values cannot be learned.
+# Prior SD of the offset between flights [dB], with the weight of two flights. It is a guess, because it cannot be
+# learned: estimates from any three of dataset 12, LTE, AFAR and NR range from 1.0 dB (without AFAR) to 2.8 dB (without
+# dataset 12).
 _OFFSET_SD_DB = 1.5
 
 
 def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:
-    """Return the mean level of the flights above the written antennas, with the error on held-out flights."""
+    """Return the mean level of the flights relative to the written antennas, with its error on held-out flights."""
     mine = [o for o in calibration.observed if (o.samples.tower, o.samples.channel) == (series.tower, series.channel)]
-    if mine[0].samples.antenna in calibration.locks:  # the level without lock does not depend on the path
+    if mine[0].samples.antenna in calibration.locks:  # without lock, levels do not depend on the path
         mine = [o.part(o.locked == 1.0) for o in mine if o.locked is not None]
     sent = series.link.transmit_power_dbm
     offsets = [calibration.learned.mean_error(o.samples) + o.sent_dbm - sent for o in mine]
@@ -415,7 +416,7 @@ def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> Le
         if (s.tower, s.channel) == (series.tower, series.channel)
     ]
     n = max(len(squares), 1)
-    # a flight differs from the mean of the n - 1 others by n / (n - 1) of its difference from the mean of all
+    # the difference from the mean of the n - 1 other flights is n / (n - 1) times that from the mean of all n
     variance_db2 = (2.0 * _OFFSET_SD_DB**2 + (1.0 - 1.0 / n) ** 2 * sum(squares)) / (n + 1.0)
     return LearnedLevel(
         offset_db=round(float(np.nanmean(offsets)) + sum(end.level_db for end in ends), 2),
@@ -451,7 +452,7 @@ def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, f
 
 
 def _errors(calibration: Calibration, name: str) -> Errors | None:
-    """Return the errors of held-out flights of a campaign, and of held-out parts. None without held-out flights."""
+    """Return the errors on held-out flights and held-out parts of a campaign, or None without held-out flights."""
 
     def mine(split: str) -> list[Score]:
         return [s for s in calibration.scores[split] if calibration.campaigns[s.flight] == name]
@@ -468,5 +469,5 @@ def _errors(calibration: Calibration, name: str) -> Errors | None:
     return Errors(series=len(scores), heights_m=sorted(heights), **values)
 
 
-# Held-out parts by the prefix of their error. "airframe" has only the airframe of other campaigns.
+# Split by the prefix of its error. For "airframe", only the airframe of other campaigns is used.
 _PARTS = {"sector": "sector", "height": "altitude", "heading": "heading", "airframe": "campaign"}

@@ -1,4 +1,4 @@
-"""Arguments, exit codes and progress of the commands, the only package that prints.
+"""The command line: arguments, exit codes and progress. No other package prints.
 
 There is a module per group of commands. :mod:`aerpaw_cmp.cli.app` describes how to add a command.
 """
@@ -15,13 +15,13 @@ from .app import Interrupted, app
 from .commands import flight, live, logs, machine, planning, reports, site
 from .shown import say
 
-# The modules of the commands, which register their commands when they are imported.
+# Importing these modules registers their commands.
 GROUPS = (logs, flight, reports, planning, live, site, machine)
 
 
 @cache
 def _program() -> Any:
-    """Return the commands as a click program, cached because making it takes 50 ms."""
+    """Return the commands as a click program, cached because building it takes 50 ms."""
     return typer.main.get_command(app)
 
 
@@ -46,9 +46,7 @@ def main(arguments: list[str]) -> int:
     except Interrupted as interrupted:
         raise interrupted.error from None
     except typer.Abort as error:
-        if isinstance(
-            error.__cause__, EOFError
-        ):  # click raises it for an unanswered question, and no command asks questions
+        if isinstance(error.__cause__, EOFError):  # from an unanswered question, which no command asks
             raise error.__cause__ from None
         raise KeyboardInterrupt from error
     except Exception as error:

@@ -1,4 +1,4 @@
-"""The command line, and options that its commands share.
+"""The command-line app, and the options that its commands share.
 
 A command is a function in a module of this package::
 
@@ -6,8 +6,9 @@ A command is a function in a module of this package::
     def diff(first: Annotated[Path, Argument(help="...")], force: Force = False) -> int:
         from ..jobs.diff import run_diff  # here, so that help and completion load no job
 
-and a line of :mod:`aerpaw_cmp.common.text`. It returns the exit code, or None for 0. The decorator adds ``-h``,
-``--json``, ``--quiet`` and the examples below the options. :func:`.answered` prints the JSON object.
+and a line of help in :data:`aerpaw_cmp.common.text.COMMANDS`. The function returns the exit code, or None for 0. The
+decorator adds ``-h``, ``--json``, ``--quiet`` and the examples below the options. :func:`.answered` prints the JSON
+object.
 """
 
 from __future__ import annotations
@@ -40,32 +41,34 @@ app.add_typer(site_app, name="site", help=COMMANDS["site"])
 antenna_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(antenna_app, name="antenna", help=COMMANDS["antenna"])
 
-Json = Annotated[bool, Option("--json", help="Print one JSON object on standard output and nothing else there.")]
-Force = Annotated[bool, Option("--force", help="Replace files that this tool did not write; never an input.")]
-Export = Annotated[
-    list[str] | None, Option(help="Also write the samples as kmz, netcdf or all; names joined by commas, or repeated.")
+Json = Annotated[bool, Option("--json", help="Print only one JSON object on standard output.")]
+Force = Annotated[
+    bool, Option("--force", help="Also replace files that this tool did not write; inputs are never replaced.")
 ]
-LogsRoot = Annotated[Path | None, Option("--logs-root", help="Folder for the paths of the logs.")]
+Export = Annotated[
+    list[str] | None, Option(help="Also write the samples as kmz, netcdf or all; repeatable, or separated by commas.")
+]
+LogsRoot = Annotated[Path | None, Option("--logs-root", help="Folder to which the paths of the logs are relative.")]
 
 
-Workers = Annotated[int, Option(min=1, help="Workers of this machine that share the tasks.")]
+Workers = Annotated[int, Option(min=1, help="Number of local workers that share the tasks.")]
 Scheduler = Annotated[
-    str | None, Option("--scheduler", "--cluster", help="Address of a Dask scheduler, instead of local workers.")
+    str | None, Option("--scheduler", "--cluster", help="Address of a Dask scheduler to use instead of local workers.")
 ]
 Flights = Annotated[
     list[Path] | None,
     Option(
         "--with",
         metavar="FLIGHT",
-        help="Flown flight.yaml to learn from, or calibration.yaml: its flights; repeatable.",
+        help="flight.yaml of a flight to learn from, or a calibration.yaml that lists flights; repeatable.",
     ),
 ]
 DryRun = Annotated[bool, Option("--dry-run", help="Check all inputs, print the stages, and write no files.")]
-Quiet = Annotated[bool, Option("-q", "--quiet", help="Results, warnings and failures only.")]
+Quiet = Annotated[bool, Option("-q", "--quiet", help="Print only results, warnings and failures.")]
 
 
 def output(text: str, metavar: str = "DIR") -> Any:
-    """Return the option of the output folder or file, whose default is in ``text``."""
+    """Return the option for the output folder or file, with ``text`` as its help, which states the default."""
     return Option("-o", "--out", metavar=metavar, help=text)
 
 
@@ -85,7 +88,7 @@ def command(
     examples : sequence of str
         Complete command lines, shown below the options and parsed by a test.
     of : typer.Typer
-        The program, or a group of commands such as ``site_app``.
+        The app to which the command is added: the program, or a group such as ``site_app``.
     text : str, optional
         One line of help; the default is that of :data:`aerpaw_cmp.common.text.COMMANDS`.
     kind : type, optional
@@ -102,7 +105,7 @@ def command(
 
 
 class Interrupted(BaseException):
-    """An interrupted command: ``error`` contains the message about stored results."""
+    """An interruption of a command, whose ``error`` contains the message about stored results."""
 
     def __init__(self, error: KeyboardInterrupt) -> None:
         super().__init__(str(error))
@@ -116,14 +119,14 @@ def _bare(hint: Any) -> Any:
 
 
 def _with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function with ``--json``, ``--quiet`` and interrupts that reach :func:`aerpaw_cmp.cli.main`."""
+    """Add ``--json`` and ``--quiet`` to a command, and let interrupts reach :func:`aerpaw_cmp.cli.main`."""
 
     @functools.wraps(function)
     def run(*, as_json: bool = False, quiet: bool = False, **arguments: Any) -> Any:
         say.as_json, say.quiet = as_json, quiet
         for option, value in arguments.items():
             for number in value if isinstance(value, (list, tuple)) else (value,):
-                # click accepts nan, which passes every comparison with a minimum or maximum
+                # click accepts nan, because nan is never outside a minimum or maximum
                 if isinstance(number, float) and not math.isfinite(number):
                     raise UsageError(f"--{option.replace('_', '-')} {number}", expected="a finite number")
         try:

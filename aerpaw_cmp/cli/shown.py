@@ -25,9 +25,9 @@ def show(text: object, *, to_stderr: bool = False) -> None:
 class ProgressLines:
     """Progress on standard error, so that standard output contains only results.
 
-    On a terminal a share is a bar with the remaining time; elsewhere every quarter is a line. Text after a tab may
-    change between calls. It is shown with the bar, and elsewhere every half minute. With ``quiet`` only :meth:`warn`
-    prints. With ``as_json`` standard output contains one object.
+    On a terminal, progress is a bar with the remaining time. Elsewhere, a line is printed at each quarter. Text after a
+    tab may change between calls. The bar shows this text; elsewhere it is printed every half minute. If ``quiet`` is
+    set, only :meth:`warn` prints. If ``as_json`` is set, standard output contains one JSON object.
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class ProgressLines:
         self.quiet = self.as_json = False
 
     def __call__(self, text: str, fraction: float | None = None, /) -> None:
-        """Show a line, or the share that is done."""
+        """Show a line of text, or the progress if ``fraction`` (0 to 1) is given."""
         if self.quiet:
             return
         if fraction is None:
@@ -53,7 +53,7 @@ class ProgressLines:
                 show(f"{name} {100 * fraction:.0f} %{tail and ': ' + tail}", to_stderr=True)
 
     def warn(self, text: str) -> None:
-        """Show a line, with ``quiet`` as well."""
+        """Show a line, even if ``quiet`` is set."""
         self.end()
         show(text, to_stderr=True)
 
@@ -70,7 +70,7 @@ class ProgressLines:
             self.end()
 
     def end(self) -> None:
-        """Leave the bar in its present state."""
+        """Stop the progress bar and leave it on the terminal as it is."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
@@ -110,7 +110,7 @@ SCHEMA = 1
 
 
 def answered(value: dict[str, Any]) -> bool:
-    """Print the JSON object with the version of its schema if ``--json`` is set, and return whether it is."""
+    """Print a JSON object with its schema version if ``--json`` is set, and return whether it was printed."""
     if say.as_json:
         # JSON has no NaN, and browsers refuse it, so callers replace it by null
         print(json.dumps({"schema": SCHEMA, **value}, indent=1, allow_nan=False), flush=True)
@@ -118,7 +118,7 @@ def answered(value: dict[str, Any]) -> bool:
 
 
 def print_plan(plan: Any) -> None:
-    """Print the plan of a command: a table of stages with their seconds, or one object."""
+    """Print the plan of a command as a table of stages with their seconds, or as one JSON object."""
     if answered(plan.as_dict()):
         return
     rows = [[stage.name, stage.work, number(stage.seconds, "{:.1f}")] for stage in plan.stages]
@@ -127,7 +127,7 @@ def print_plan(plan: Any) -> None:
 
 
 def print_files(paths: Sequence[Path]) -> None:
-    """Print the written files: a line for each, or one object."""
+    """Print the paths of the written files, one per line, or as one JSON object."""
     if not answered({"files": [str(path) for path in paths]}):
         for path in paths:
             show(path)
@@ -164,7 +164,7 @@ def table(columns: list[str], rows: list[list[str]], title: str | None = None, w
 
 
 def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, width: int) -> None:
-    """Return rows as text: the first cell, then names and values."""
+    """Print each row as a paragraph: the first cell, then the names and values of the other cells."""
     import textwrap
 
     if title:
@@ -182,19 +182,20 @@ def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, wi
 
 
 def number(value: float | None, form: str) -> str:
-    """Return a number with a format, or a dash if it is missing."""
+    """Return a number as text in the given format, or a dash if the number is missing."""
     return "-" if value is None else form.format(value)
 
 
 def records(items: Sequence[Any], columns: Mapping[str, str], title: str | None = None) -> None:
-    """Print a table of records or mappings. Print nothing without items.
+    """Print a table of records or mappings, or nothing if there are no items.
 
     Parameters
     ----------
     items : sequence
         One item per row.
     columns : mapping of str to str
-        Content of the cells by heading: ``name``, ``name.of.a.part`` or, with a format, ``name:.2f``.
+        Attribute of each column by heading: ``name``, ``name.part`` for a nested attribute, or ``name:.2f`` with a
+        format.
     title : str, optional
         Line above the table.
     """

@@ -44,8 +44,8 @@ def report(
         list[Path] | None,
         Option(
             metavar="PREDICTION",
-            help="Score a prediction of this flight; repeatable: a folder of 'predict', or CSV, NetCDF, .npz or logs "
-            "of another program.",
+            help="Score a prediction of this flight: a folder of 'predict', or CSV, NetCDF, .npz or logs of another "
+            "program; repeatable.",
         ),
     ] = None,
     against_distance: Annotated[
@@ -54,7 +54,7 @@ def report(
     strict: Annotated[bool, Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
         Literal["none", "svg", "png", "pdf", "all"],
-        Option(help="Figures as separate files: none, or all in one format or in every format."),
+        Option(help="Format of figures as separate files: none, one format, or all formats."),
     ] = "none",
     style: Annotated[
         Literal["screen", "paper"], Option(help="Figure style: screen, or paper (IEEE width, fonts embedded).")
@@ -63,7 +63,7 @@ def report(
     dry_run: DryRun = False,
     force: Force = False,
 ) -> int:
-    """Replay a flight, calibrate, compare, report."""
+    """Replay a flight, calibrate the prediction, compare it with the logs, and write the report."""
     from ...jobs import run
 
     chosen = run.ReportOptions(
@@ -127,7 +127,7 @@ def _verdict(outcome: Any, strict: bool) -> int:
 
 
 def _print_models(models: Sequence[Mapping[str, Any]]) -> None:
-    """Print one line per model over all channels. The page has each channel."""
+    """Print one line per model over all channels. The page lists each channel separately."""
     notes = {"recommended": "recommended", "fastest_sufficient": "fastest sufficient"}
     rows = [{**row, "note": ", ".join(notes[key] for key in notes if row[key])} for row in models]
     columns = {
@@ -232,7 +232,7 @@ def calibrate(
                  for key in ("rmse_db", "rmse_4s_db", *BASELINES)]  # fmt: skip
         rows.append([name.replace("_", " "), *(number(v, "{:.2f}") for v in means), str(len(scores))])
     if rows:
-        heads = ["left out", "RMSE dB", "4 s means dB", *(f"{title} dB" for title in BASELINES.values()), "series"]
+        heads = ["held out", "RMSE dB", "4 s means dB", *(f"{title} dB" for title in BASELINES.values()), "series"]
         table(heads, rows, "Mean scores on held-out data")
     forecasts = [
         {**forecast, "split": split.replace("_", " ")} for split, scores in m["rank"].items() for forecast in scores
@@ -260,7 +260,7 @@ def simulate(
     dry_run: DryRun = False,
     force: Force = False,
 ) -> None:
-    """Forward-simulate a planned flight into logs of the real formats."""
+    """Simulate a planned flight and write its logs in the real formats."""
     from ...jobs import run
 
     options = RunOptions(out=out, force=force, progress=say, dry=dry_run)

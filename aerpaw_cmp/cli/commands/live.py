@@ -19,10 +19,10 @@ WEB = "127.0.0.1:8765"
 
 
 class WebCommand(TyperCommand):
-    """A command whose ``--web`` may stand without an address."""
+    """A command whose option ``--web`` may be given without an address."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Add the default address after a bare ``--web``: an address contains a colon and no slash."""
+        """Add the default address after ``--web`` if no address (with a colon, without a slash) follows."""
         words = []
         for index, word in enumerate(args):
             words.append(word)
@@ -43,20 +43,23 @@ class WebCommand(TyperCommand):
 )
 def tap(
     port: Annotated[
-        list[str] | None, Argument(help="Serial port, or several  [default: the first AT port of a Quectel modem]")
+        list[str] | None, Argument(help="One or more serial ports  [default: the first AT port of a Quectel modem]")
     ] = None,
-    out: Annotated[Path, output("Folder of the log segments. With several ports, each has a folder inside.")] = Path(
+    out: Annotated[Path, output("Folder of the log segments; with several ports, each port has a subfolder.")] = Path(
         "tap"
     ),
-    status: Annotated[bool, Option("--status/--no-status", help="A status line on standard error.")] = True,
+    status: Annotated[bool, Option("--status/--no-status", help="Show a status line on standard error.")] = True,
     enable_csi: Annotated[bool, Option("--enable-csi", help="Switch CSI reporting on; restored on exit.")] = False,
-    ri_hz: Annotated[float, Option(help="Rate of the rank indicator.")] = 2.0,
-    no_csi_alarm: Annotated[float | None, Option(help="Seconds without CSI until the bell rings.")] = None,
+    ri_hz: Annotated[float, Option(help="Rate at which the rank indicator is queried [Hz].")] = 2.0,
+    no_csi_alarm: Annotated[
+        float | None, Option(help="Ring the terminal bell after this many seconds without CSI.")
+    ] = None,
     duration: Annotated[float | None, Option(help="Stop after this many seconds.")] = None,
     web: Annotated[
-        str | None, Option(help=f"Also show the flight as a page, opened with a token, at HOST:PORT [default: {WEB}].")
+        str | None,
+        Option(help=f"Also serve a page of the flight, protected by a token, at HOST:PORT [default: {WEB}]."),
     ] = None,
-    flight: Annotated[Path | None, Option(help="flight.yaml: also predict rank and level by the replay.")] = None,
+    flight: Annotated[Path | None, Option(help="flight.yaml for which rank and level are also predicted.")] = None,
     telemetry: Annotated[Path | None, Option(help="The growing vehicleOut file that --flight follows.")] = None,
 ) -> int:
     """Log the modem's rank indicator until interrupted."""
@@ -64,7 +67,7 @@ def tap(
     from ...common.jsonable import json_safe
 
     if telemetry is not None and flight is None:
-        raise UsageError("--telemetry without --flight", expected="--flight FILE, whose telemetry it is")
+        raise UsageError("--telemetry without --flight", expected="--flight FILE, the flight that has this telemetry")
     from ...jobs.live_tap import Shown, tap_modems
     from ...live.ports import TapSettings
 
@@ -99,7 +102,7 @@ class StatusLine:
 
     @property
     def end(self) -> str:
-        """Text that ends the status line."""
+        """Return the text that ends the status line."""
         return "\n" if self._terminal else ""
 
     def __call__(self, name: str, now: Any) -> None:
@@ -131,7 +134,7 @@ def _needs_posix(command: str) -> None:
             raise UsageError(
                 f"'{command}' needs Python's {name}, which this system does not have",
                 expected="Linux (another POSIX system may do)",
-                cause="Windows; logs of a tap can be read, reported on every system",
+                cause="Windows; logs recorded by a tap can be read on any system",
             ) from None
 
 
@@ -145,7 +148,8 @@ def _needs_posix(command: str) -> None:
 def modem_sim(
     link: Annotated[Path | None, Option(help="Symbolic link to the port, updated when the port changes.")] = None,
     flight: Annotated[
-        Path | None, Option(help="flight.yaml to repeat from now on, with its ranks; requires --telemetry.")
+        Path | None,
+        Option(help="flight.yaml of a flight to repeat in real time, with its ranks; requires --telemetry."),
     ] = None,
     telemetry: Annotated[
         Path | None, Option(help="New telemetry file for --flight; it grows during the flight.")
@@ -158,7 +162,7 @@ def modem_sim(
 
     if (flight is None) != (telemetry is None):
         raise UsageError(
-            "--flight needs --telemetry, and the reverse", expected="both: the flight to fly, and its new log"
+            "--flight and --telemetry are only valid together", expected="the flight and its new telemetry file"
         )
     flown = None
     if flight is not None and telemetry is not None:

@@ -23,9 +23,7 @@ from ..shown import answered, records, say, show, table
 )
 def ingest(
     paths: Annotated[list[Path], Argument(help="Log files and folders.")],
-    out: Annotated[
-        Path | None, output("Flight file (HDF5) with every record  [default: none is written]", "FILE")
-    ] = None,
+    out: Annotated[Path | None, output("Flight file (HDF5) with every record  [default: not written]", "FILE")] = None,
     draft: Annotated[Path | None, Option(help="Also write a first flight.yaml that names these logs.")] = None,
     site: Annotated[
         str | None, Option(help="Site of the draft; its learned antennas are used  [default: lake_wheeler]")
@@ -44,15 +42,15 @@ def ingest(
     every_stream: Annotated[bool, Option("--all", help="Name every stream of a wide table.")] = False,
     force: Force = False,
 ) -> None:
-    """Read logs, account for every line, write the flight file."""
+    """Read logs, account for every line, and write the flight file."""
     from ...jobs import run
     from ...logs.ingest import summary as account
 
     if site is not None and draft is None:
-        raise UsageError("--site without --draft", expected="--draft FILE, for which the site is used")
+        raise UsageError("--site without --draft", expected="--draft FILE, because only a draft uses the site")
     options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
     if columns:
-        # options have precedence over a mapping, for example one that contains the number of rank 1
+        # options take precedence over the mapping, which may contain the same keys (the number of rank 1)
         options = run.mapping(columns) | {key: value for key, value in options.items() if value is not None}
         reader = reader or "generic_csv"
     try:
@@ -87,12 +85,12 @@ def _show(summary: Mapping[str, Any], every_stream: bool) -> None:
 
 @command("formats", examples=["aerpaw-cmp formats", "aerpaw-cmp formats --json"])
 def formats() -> None:
-    """List the readers with a sample line each."""
+    """List the readers, each with a sample line."""
     from ...logs.readers import catalogue
 
     readers = sorted(catalogue(), key=lambda r: r.name)
     listed = [{"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers]
     if answered({"readers": listed}):
         return
-    columns = {"reader": "name", "what": "title", "streams": "kinds", "a line of it": "sample"}
+    columns = {"reader": "name", "what": "title", "streams": "kinds", "sample line": "sample"}
     records([{**item, "kinds": ", ".join(item["kinds"])} for item in listed], columns)

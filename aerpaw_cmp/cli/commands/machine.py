@@ -13,8 +13,10 @@ from ..shown import answered, records, say, show
 
 @command("bench", examples=["aerpaw-cmp bench --quick", "aerpaw-cmp bench --poses 500 --json"])
 def bench(
-    poses: Annotated[int, Option(min=2, help="Poses of the flight that is replayed.")] = 200,
-    quick: Annotated[bool, Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
+    poses: Annotated[int, Option(min=2, help="Number of poses in the replayed flight.")] = 200,
+    quick: Annotated[
+        bool, Option("--quick", help="Use few poses, at most 1e4 samples, and no comparison with other programs.")
+    ] = False,
 ) -> None:
     """Measure speed and error of the replay on this machine."""
     from ...jobs import bench as job

@@ -46,9 +46,9 @@ def predict(
         Option(help="Heading at all points [deg]  [default: that of the route; all headings equally if it has none]"),
     ] = None,
     carrier_ghz: Annotated[
-        float | None, Option(min=0.1, max=100.0, help="Carrier of a prediction before any flight [GHz].")
+        float | None, Option(min=0.1, max=100.0, help="Carrier frequency, if no flight is given [GHz].")
     ] = None,
-    tx_power_dbm: Annotated[float | None, Option(help="Transmit power of such a prediction [dBm].")] = None,
+    tx_power_dbm: Annotated[float | None, Option(help="Transmit power, if no flight is given [dBm].")] = None,
     logs_root: LogsRoot = None,
     dry_run: DryRun = False,
     force: Force = False,
@@ -110,13 +110,13 @@ def plan(
     geofence: Annotated[Path | None, _FENCE] = None,
     avoid: Annotated[list[Path] | None, _AVOID] = None,
     routes: Annotated[list[Path] | None, _ROUTES] = None,
-    minutes: Annotated[float, Option(min=1.0, max=240.0, help="Battery: longest flight [min].")] = 15.0,
+    minutes: Annotated[float, Option(min=1.0, max=240.0, help="Longest flight that the battery allows [min].")] = 15.0,
     speed: Annotated[float, Option(min=0.5, max=40.0, help="Speed [m/s].")] = 8.0,
     height: Annotated[
         list[float] | None,
-        Option(help="Height of the tool's patterns, and of a site as target [m]; repeatable  [default: 40]"),
+        Option(help="Height of the tool's own routes, and of the grid of a target site [m]; repeatable  [default: 40]"),
     ] = None,
-    tower_distance: Annotated[float, Option(min=0.0, help="Least distance to towers [m].")] = 30.0,
+    tower_distance: Annotated[float, Option(min=0.0, help="Smallest distance to towers [m].")] = 30.0,
     out: Annotated[Path | None, output("Output folder  [default: reports/plan-<TARGET>]")] = None,
     logs_root: LogsRoot = None,
     dry_run: DryRun = False,
@@ -181,10 +181,10 @@ def channel(
         list[str] | None, Option("--format", help="netcdf, npz, deepmimo, csv, all; repeatable  [default: netcdf]")
     ] = None,
     bandwidth: Annotated[
-        float | None, Option(min=1.0, help="Also H at the subcarriers of a band of this width [Hz] (NetCDF).")
+        float | None, Option(min=1.0, help="Also write H at the subcarriers of a band of this width [Hz] (NetCDF).")
     ] = None,
     subcarriers: Annotated[
-        int | None, Option(min=1, max=65536, help="Subcarriers of the band  [default: 1024]")
+        int | None, Option(min=1, max=65536, help="Number of subcarriers of the band  [default: 1024]")
     ] = None,
     logs_root: LogsRoot = None,
     force: Force = False,
@@ -209,7 +209,7 @@ def channel(
 
 
 def _print(outcome: Any, sentence: str) -> None:
-    """Print a sentence, warnings and files, or the metrics alone."""
+    """Print a sentence, warnings and files, or only the metrics as JSON."""
     if answered(outcome.metrics):
         return
     show(sentence)
@@ -225,11 +225,11 @@ def locate(
     flight: Annotated[Path, Argument(help="flight.yaml with telemetry and a log of levels; its nodes are not used.")],
     out: Annotated[Path | None, output("Output folder  [default: reports/locate-<flight>]")] = None,
     channel: Annotated[str | None, Option(help="Channel of the logs  [default: the first]")] = None,
-    follow: Annotated[bool, Option("--follow", help="Again every 10 s while the logs grow, until Ctrl-C.")] = False,
+    follow: Annotated[bool, Option("--follow", help="Repeat every 10 s while the logs grow, until Ctrl-C.")] = False,
     logs_root: LogsRoot = None,
     force: Force = False,
 ) -> None:
-    """Place an unknown node on the ground by the levels of a flight."""
+    """Locate an unknown ground node from the levels of a flight."""
     from ...jobs.locate import run_locate
 
     options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)

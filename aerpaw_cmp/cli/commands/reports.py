@@ -32,7 +32,7 @@ def explain(
     engine: Annotated[Literal["image", "sionna"] | None, Option(help="Path search  [default: rt.engine]")] = None,
     logs_root: LogsRoot = None,
 ) -> None:
-    """List every path of a link at an instant, term by term."""
+    """List every path of a link at one time, term by term."""
     from ...jobs.explain import run_explain
 
     explanation = run_explain(
@@ -58,7 +58,7 @@ def _print_explanation(explanation: Any) -> None:
     heads = ["path", "m", "ns", "departure az / el deg", "arrival az / el deg", "dBm", "phase deg"]
     if rows:
         table(heads, rows, f"{counted(len(rows), 'path')} by engine {explanation.engine}")
-        # the path with most interactions lists all terms in order
+        # the path with the most interactions lists all terms in order
         deepest_first = sorted(explanation.paths, key=lambda path: -path.depth)
         names = list(dict.fromkeys(name for path in deepest_first for name in path.terms_db))
         power = f"{explanation.transmit_power_dbm:+.2f}"
@@ -91,7 +91,7 @@ def _print_explanation(explanation: Any) -> None:
 def diff(
     first: Annotated[Path, Argument(help="Folder of a report.")],
     second: Annotated[Path, Argument(help="The other report of the same flight.")],
-    out: Annotated[Path | None, output("Folder for diff.html and diff.json  [default: none is written]")] = None,
+    out: Annotated[Path | None, output("Folder for diff.html and diff.json  [default: not written]")] = None,
     strict: Annotated[bool, Option("--strict", help="Exit code 1 when a number differs by more than 0.01 dB.")] = False,
     force: Force = False,
 ) -> int:
@@ -159,7 +159,7 @@ def campaign(
     workers: Workers = 1,
     scheduler: Scheduler = None,
     keep: Annotated[
-        Path | None, Option(help="Folder for task outcomes; a rerun computes missing outcomes only.")
+        Path | None, Option(help="Folder for task outcomes; a rerun computes only missing outcomes.")
     ] = None,
     fresh: Annotated[bool, Option("--fresh", help="Ignore stored outcomes and store none.")] = False,
     dry_run: DryRun = False,
@@ -188,7 +188,7 @@ def _print_campaign_summary(outcome: Any) -> None:
     names = list(next(iter(m["mean_rmse_db"].values()), {}))
     rows = [[s, *[number(by[f], "{:.2f}") for f in names]] for s, by in m["mean_rmse_db"].items()]
     if names:
-        table(["setting", *names], rows, "Mean RMSE over towers and channels (dB), own offsets")
+        table(["setting", *names], rows, "Mean RMSE over towers and channels (dB), each with its own offset")
     heads = {"setting": "setting", "flight": "flight", "tower": "tower", "K": "k:g"}
     numbers = {"total variation": "total_variation:.3f", "agreement": "agreement:.2f", "kappa": "kappa:.2f"}
     records(m["rank"], heads | numbers, "Rank")

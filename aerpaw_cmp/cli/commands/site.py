@@ -16,7 +16,7 @@ from ..shown import answered, print_files, say, show, table, warn_all
 @command(
     "import",
     of=site_app,
-    text="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) or a Mitsuba scene to a site.yaml.",
+    text="Convert map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) or a Mitsuba scene to a site.yaml.",
     examples=[
         "aerpaw-cmp site import campus.osm --tower roof=40.0090,-105.2670,25 -o site.yaml",
         "aerpaw-cmp site import munich.xml --origin 48.1372,11.5755 --tower BS=8.5,21,27 -o munich.yaml",
@@ -31,13 +31,13 @@ def site_import(
         Option(help="Site whose towers and settings are kept  [default: lake_wheeler for a map without --tower]"),
     ] = None,
     origin: Annotated[
-        str | None, Option(help="Scene: latitude,longitude[,ground height] of its (0, 0, 0), or 'local'.")
+        str | None, Option(help="Scene: latitude,longitude[,ground height] of its origin (0, 0, 0), or 'local'.")
     ] = None,
     tower: Annotated[
         list[str] | None,
         Option(
-            help="Antenna; repeatable. Map: NAME=LATITUDE,LONGITUDE,HEIGHT above ground [deg, m], the first is the "
-            "origin. Scene: NAME=EAST,NORTH,HEIGHT [m]."
+            help="Antenna; repeatable. Map: NAME=LATITUDE,LONGITUDE,HEIGHT above ground [deg, m]; the first antenna is "
+            "the origin. Scene: NAME=EAST,NORTH,HEIGHT [m]."
         ),
     ] = None,
     material: Annotated[
@@ -45,16 +45,18 @@ def site_import(
     ] = None,
     turn: Annotated[float, Option(help="Scene: angle of the x axis, counter-clockwise from east [deg].")] = 0.0,
     dem: Annotated[
-        Path | None, Option(help="Map: elevation model of the ground (.asc, GeoTIFF), heights above the sea.")
+        Path | None, Option(help="Map: elevation model of the ground (.asc, GeoTIFF) with heights above sea level.")
     ] = None,
     dem_crs: Annotated[str | None, Option(help="Map: coordinate system of an .asc, such as EPSG:4326.")] = None,
     untagged: Annotated[
-        Literal["building", "forest", "geofence"] | None, Option(help="Kind of the areas without a tag.")
+        Literal["building", "forest", "geofence"] | None, Option(help="Kind assigned to areas without a tag.")
     ] = None,
-    trees: Annotated[bool, Option("--trees", help="Woods as single trees at random places, not as media.")] = False,
+    trees: Annotated[
+        bool, Option("--trees", help="Model woods as single trees at random positions instead of media.")
+    ] = False,
     force: Force = False,
 ) -> None:
-    """Import footprints, or a scene."""
+    """Import map footprints or a Mitsuba scene as a site."""
     from ...jobs import run, site_scene
 
     scene = len(files) == 1 and site_scene.is_scene(files[0])
@@ -83,7 +85,7 @@ def site_import(
 @command(
     "export",
     of=site_app,
-    text="A site as Mitsuba XML with PLY meshes, which sionna.rt.load_scene opens.",
+    text="Export a site as Mitsuba XML with PLY meshes for sionna.rt.load_scene.",
     examples=["aerpaw-cmp site export lake_wheeler -o scene", "aerpaw-cmp site export site.yaml -o out"],
 )
 def site_export(
@@ -91,7 +93,7 @@ def site_export(
     out: Annotated[Path, output("Output folder.")],
     force: Force = False,
 ) -> None:
-    """Write a site for Sionna."""
+    """Export a site for Sionna RT."""
     from ...jobs.site_scene import run_site_export
 
     files = run_site_export(site, out, force=force).files
@@ -101,7 +103,7 @@ def site_export(
 @command(
     "show",
     of=site_app,
-    text="Plan of a site, and a standalone page that shows it in 3-D.",
+    text="Draw the plan of a site, and write a standalone page that shows it in 3-D.",
     examples=["aerpaw-cmp site show", "aerpaw-cmp site show site.yaml -o reports/site"],
 )
 def site_show(
@@ -109,7 +111,7 @@ def site_show(
     out: Annotated[Path | None, output("Output folder  [default: reports/site-<site>]")] = None,
     force: Force = False,
 ) -> None:
-    """Look at a site."""
+    """Show the plan of a site and its 3-D page."""
     from ...jobs import run
 
     shown = run.run_site_show(site, RunOptions(out=out, force=force))
@@ -125,7 +127,7 @@ def site_show(
 @command(
     "export",
     of=antenna_app,
-    text="A pattern file to Sionna RT's custom pattern (.py), MSI Planet (.msi) or a table over the sphere (.csv).",
+    text="Convert a pattern to Sionna RT's custom pattern (.py), MSI Planet (.msi) or a table over the sphere (.csv).",
     examples=[
         "aerpaw-cmp antenna export SA3300.txt -o sa3300.py",
         "aerpaw-cmp antenna export azimuth.csv --elevation elevation.csv --carrier 3.4e9 -o horn.msi",
@@ -135,16 +137,14 @@ def site_show(
 def antenna_export(
     file: Annotated[Path, Argument(help="Pattern: AERPAW text or .mat, MSI, a sphere .csv, an azimuth cut .csv")],
     out: Annotated[Path, output("File to write: .py, .msi or .csv.", "FILE")],
-    elevation: Annotated[
-        Path | None, Option(metavar="CSV", help="Elevation cut, where FILE is an azimuth cut.")
-    ] = None,
-    variable: Annotated[str | None, Option(help="Grid inside a .mat file.")] = None,
+    elevation: Annotated[Path | None, Option(metavar="CSV", help="Elevation cut, if FILE is an azimuth cut.")] = None,
+    variable: Annotated[str | None, Option(help="Name of the gain grid in a .mat file.")] = None,
     carrier: Annotated[
-        float | None, Option(min=1.0, help="Frequency [Hz]: which of several, and that of .msi.")
+        float | None, Option(min=1.0, help="Frequency [Hz]: selects one of several in FILE, and is written to .msi.")
     ] = None,
     force: Force = False,
 ) -> None:
-    """Write a pattern for another program."""
+    """Convert an antenna pattern for another program."""
     from ...jobs.site_scene import run_antenna_export
 
     outcome = run_antenna_export(file, out, elevation=elevation, variable=variable, carrier_hz=carrier, force=force)
@@ -192,14 +192,16 @@ def map_(
     threshold_snr_db: Annotated[float | None, Option(help="Lowest SNR that counts as coverage [dB].")] = None,
     flights: Flights = None,
     logs_root: LogsRoot = None,
-    study: Annotated[bool, Option("--study/--no-study", help="Also spatial correlation and interpolation.")] = True,
+    study: Annotated[
+        bool, Option("--study/--no-study", help="Also study spatial correlation and interpolation.")
+    ] = True,
     tile_m: Annotated[
         float | None,
         Option(help="Side of tiles written to a Zarr store [m]  [default: 128 positions, from 1e6 receivers on]"),
     ] = None,
     figures: Annotated[
         Literal["none", "png", "svg", "pdf", "all"],
-        Option(help="Figures as separate files: none, or all in one format or in every format."),
+        Option(help="Format of figures as separate files: none, one format, or all formats."),
     ] = "none",
     workers: Workers = 1,
     scheduler: Scheduler = None,
@@ -240,14 +242,14 @@ def map_(
         _print_coverage(outcome.metrics["coverage"], settings)
     rows = [[p["where"], p["what"], p["paper"], p["ours"]] for p in outcome.metrics["paper"]]
     if rows:
-        table(["where", "what", "paper", "here"], rows, "What the paper states, and what this run gives")
+        table(["where", "what", "paper", "here"], rows, "Values of the paper and of this run")
     for path in outcome.files:
         if path.parent == outcome.folder:
             show(path)
 
 
 def _print_coverage(rows: list[dict[str, Any]], settings: Any) -> None:
-    """Print the share of covered positions per tower and height, with the foliage of the paper."""
+    """Print the share of covered positions per tower and height, for the foliage model of the paper."""
     shown = [row for row in rows if row["antennas"] == "MIMO" and row["foliage"] == settings.shown]
     heights = sorted({row["altitude_m"] for row in shown})
     share = {(row["tower"], row["altitude_m"]): f"{100.0 * row['coverage']:.1f} %" for row in shown}

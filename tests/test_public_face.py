@@ -197,7 +197,7 @@ def test_errors_of_python_name_its_arguments(tmp_path: Path, capsys: pytest.Capt
     for call, words in (
         (lambda: ac.read(SAMPLE / "UAV"), "the key 'timezone:' or timezone=, e.g."),
         (lambda: ac.read(tmp_path / "mine.csv"), f"columns={columns}"),
-        (lambda: ac.open_flight(tmp_path / "lost.yaml"), "a wrong path, or logs_root="),
+        (lambda: ac.open_flight(tmp_path / "lost.yaml"), "a wrong path or a wrong logs_root="),
         (lambda: flight.report(tmp_path / "out", audit="x"), "audit='x'"),
         (lambda: flight.report(tmp_path), "expected a new or empty folder, because all content"),
         (lambda: ac.OrdinaryKriging(np.exp).predict([[0.0, 0.0]]), "OrdinaryKriging.predict before fit()"),

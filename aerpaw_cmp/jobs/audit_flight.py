@@ -40,7 +40,7 @@ from .tasks import OutcomeStore, code_digest
 # Number of logged attitudes that are converted to rotations a second time.
 _ATTITUDE_ROWS = 200
 
-# Both are float64, and telemetry times are exact to a nanosecond.
+# Largest difference of both rotations: they are float64, and telemetry times are exact to a nanosecond.
 _ATTITUDE_TOLERANCE_RAD = 1e-6
 
 # Links of all series together, at least three per series. Each takes about 0.1 s.
@@ -48,7 +48,7 @@ _REFERENCE_LINKS_AT_MOST = 64
 
 _TIMES = "The time of the engine is its share for the audited links; that of the reference includes its start-up."
 
-# What an audit of the replay cannot detect.
+# Errors that an audit of the replay cannot detect.
 _NOT_COVERED = (
     "whether the ground and walls of the site reflect like smooth half-spaces",
     "positions of footprints and trees; intervals",
@@ -157,7 +157,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
         rank_disagreement={k: sum(p.rank_disagreement[k] * p.links for p in parts) / links for k in ks},
         seconds=sum(r.replay.seconds for r in replays) * links / max(total, 1),
         reference_seconds=sum(p.reference_seconds for p in parts),
-        note=_TIMES + (f" Rays were raised until two pilots agreed: {rays}." if rays else ""),
+        note=_TIMES + (f" The number of rays was raised until two trial runs agreed: {rays}." if rays else ""),
         fields=dataclasses.replace(fields, not_covered=(*fields.not_covered, *_NOT_COVERED)),
     )
 
@@ -167,7 +167,7 @@ _MOMENTS = 6
 
 
 def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected]]:
-    """Yield replays with fixed towers and their expected inputs. A moving tower is fixed at some times."""
+    """Yield replays with fixed towers and their expected inputs. A moving tower is fixed at several times."""
     site = data.site.under(data.settings.rt.foliage)
     for replayed, expected in zip(replays, expectations(data, replays), strict=True):
         if replayed.tower_m is None:
@@ -196,7 +196,7 @@ def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected
     settings = [*(s.link for s in data.rss), *[data.settings.link.rank] * len(data.rank)]
     rt = data.settings.rt
     loss = reference.ExpectedLoss(**{key: value for each in LOSSES for key, value in each.expected(rt).items()})
-    if len(settings) != len(replays):  # part of the flight: from the links themselves
+    if len(settings) != len(replays):  # only a part of the flight was replayed: use the links of the replays
         return [Expected.of(r.link, loss) for r in replays]
     return [
         Expected(expected_link(link, list(r.link.tower_arrays), data.folder), loss)
@@ -241,10 +241,10 @@ def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudi
     if mode == "ignored" or data.track is None:
         turned_anyway = any(np.abs(r.poses.rotation - np.eye(3)).max(initial=0.0) > 0 for r in replays)
         moved = mode == "ignored" and turned_anyway
-        return FieldAudit(failures=("rt.attitude is 'ignored' and the UAV's array turns",) if moved else ())
+        return FieldAudit(failures=("rt.attitude is 'ignored' but the UAV's array turns",) if moved else ())
     times, angles = _logged_attitudes(data.files)
     if not len(times):
-        return FieldAudit(not_covered=("the attitude: the telemetry has none",))
+        return FieldAudit(not_covered=("the attitude, because the telemetry has none",))
     rows = spread_out(len(times), _ATTITUDE_ROWS)
     at = data.track.pose_at(times[rows])
     used = np.flatnonzero(at.valid & at.attitude_known)

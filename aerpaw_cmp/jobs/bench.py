@@ -25,7 +25,7 @@ from ..propagation.replay import Replay, replay
 from ..propagation.scene import Scene
 from ..site.site import Building, Site, Tower
 
-# Reflections of the reference and of the Sionna rows.
+# Largest number of reflections of the reference and of the Sionna rows.
 _DEPTH = 2
 
 # Poses per PathSolver call.
@@ -41,7 +41,7 @@ def run_bench(
     ratios: bool = True,
     progress: Progress = logged,
 ) -> dict[str, Any]:
-    """Measure speed against error of the replay, and the speed of each part relative to its peer.
+    """Measure speed against error of the replay, and the speed of each part relative to another program.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def run_bench(
 
 
 def _against_peers(progress: Progress) -> dict[str, Any]:
-    """Return the ratio to each peer, at equal error first. None if a peer is not installed."""
+    """Return the speed relative to each other program, first at equal error. None if it is not installed."""
     progress("path search against PathSolver, at equal error and at 1e6 samples")
     searches = path_search_ratios()
     progress("Kriging against PyKrige, reading against pandas")
@@ -111,13 +111,13 @@ def speed_against_error(
     Returns
     -------
     list of dict
-        The image engine is first, because Sionna increases the memory of the process for good. A row has
+        The image engine is first, because Sionna increases the memory of the process permanently. A row has
 
-        - ``engine``, ``samples`` (rays per tower and batch), ``arrays`` (type of H), ``depth``;
-        - ``seconds`` (wall time, warm), ``links_per_s`` (pose-tower pairs), ``peak_mib`` (process; 0: unknown);
-        - ``missing_paths``, ``extra_paths``, ``coverage_differs`` (links with a level in one replay only);
-        - ``rss_max_error_db``, ``rss_rms_error_db`` over links with a level in both replays (None without such links);
-        - ``rank_disagreement`` by K.
+        - ``engine``, ``samples`` (rays per tower and batch), ``arrays`` (type of H), ``depth``; - ``seconds`` (wall
+        time, warm), ``links_per_s`` (pose-tower pairs), ``peak_mib`` (process; 0: unknown); - ``missing_paths``,
+        ``extra_paths``, ``coverage_differs`` (links with a level in one replay only); - ``rss_max_error_db``,
+        ``rss_rms_error_db`` over links with a level in both replays (None if there are no such links); -
+        ``rank_disagreement`` by K.
     """
     reference = replay(site, link, poses, Search(max_depth=_DEPTH))
     rows = []
@@ -134,7 +134,7 @@ def speed_against_error(
 def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: Search) -> Row:
     """Replay all poses with an engine and return its row."""
     sionna = search.engine == "sionna"
-    # without the cache, because a cached search takes only the time of reading it
+    # without the cache, because a cached search would only measure the time of reading
     alone = Run(cache_dir="")
     if sionna:
         replay(site, link, poses[:BATCH], search, run=alone)  # compiles the kernels
@@ -257,7 +257,7 @@ def kriging_vs_pykrige(positions: int = 2556) -> Row | None:
         model = Peer(*points.T, rank, "exponential", {"psill": 0.9, "range": 900.0, "nugget": 0.1})
         return model.execute("points", *targets.T, backend="C", n_closest_points=20)
 
-    return _beside(ours, peer, positions=positions)
+    return _compared(ours, peer, positions=positions)
 
 
 def ingest_vs_pandas(lines: int = 20_523) -> Row:
@@ -274,14 +274,14 @@ def ingest_vs_pandas(lines: int = 20_523) -> Row:
     times = np.datetime64("2025-03-02T15:00:00", "ns") + np.arange(lines) * np.timedelta64(32_760_000, "ns")
     data = format_power_log(times, np.random.default_rng(1).normal(-40, 12, lines), zone)
     reader, options = by_name("sounder_log"), ReadOptions(timezone=zone)
-    return _beside(
+    return _compared(
         lambda: reader.read(data, options),
         lambda: pd.read_csv(io.BytesIO(data), engine="c", header=None, sep=r"\s+"),
         lines=lines,
     )
 
 
-def _beside(ours: Callable[[], Any], peer: Callable[[], Any], **about: int) -> Row:
+def _compared(ours: Callable[[], Any], peer: Callable[[], Any], **about: int) -> Row:
     """Return the seconds of both programs and their ratio."""
     seconds, theirs = median_seconds(ours, 5), median_seconds(peer, 5)
     return {"ratio": theirs / seconds, "seconds_ours": seconds, "seconds_peer": theirs, **about}

@@ -78,7 +78,7 @@ def learned_healths(observed: Sequence[Observed], fits: Mapping[str, Learned]) -
     observed : sequence of Observed
         Series of all flights.
     fits : mapping of str to Learned
-        What was learned without each flight.
+        Antennas learned without each flight.
     """
     held: dict[tuple[str, str], HeldOut] = {}
     for o in observed:
@@ -193,7 +193,7 @@ def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
 def lock_words(lock: LearnedLock) -> str:
     """Return sentences about the scores of P(lock) and of levels with a floor on held-out flights."""
     return (
-        f"The predicted level gives the probability of lock with a Brier score of {lock.brier:.3f} on held-out flights "
+        f"The predicted level forecasts lock with a Brier score of {lock.brier:.3f} on held-out flights "
         f"(constant share of each flight: {lock.constant_brier:.3f}), log score {lock.log_score:.3f} "
         f"({lock.constant_log_score:.3f}). Where levels below {lock.floor_db:g} dB re full scale count as "
         f"{lock.floor_db:g}, the RMSE is {lock.floor_rmse_db:.1f} dB; free space: "
@@ -740,7 +740,7 @@ def _contradictions(
         if alone > min(free, turned):
             out.append(
                 f"{name} contradicts the other campaigns: RMSE {alone:.2f} dB with their airframe, {turned:.2f} dB with"
-                f" it rotated, {free:.2f} dB in free space; give it a separate 'source: {{airframe: ...}}'"
+                f" this airframe rotated, {free:.2f} dB in free space; give it a separate 'source: {{airframe: ...}}'"
             )
     return out
 
@@ -759,7 +759,7 @@ def _airframe(learned: Learned, antenna: str) -> KnownProcess:
 def _mount_warnings(learned: Learned) -> list[str]:
     """Return one sentence per mount that the data do not determine."""
     return [
-        f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is likeliest, with a standard deviation of "
+        f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is most likely, with an SD of "
         f"{mount.azimuth_sd_deg:.0f} deg"
         for name, mount in learned.mounts.items()
         if not mount.identified

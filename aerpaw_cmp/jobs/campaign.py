@@ -186,9 +186,9 @@ def carry_out(task: Task) -> Outcome:
     if not same:
         return failed_task(
             task,
-            f"the worker on {platform.node()} sees other inputs, or runs another version of the program, than the "
-            f"process that planned the campaign (aerpaw-cmp {versions()['aerpaw-cmp']} there); expected the same "
-            "everywhere",
+            f"the worker on {platform.node()} sees other inputs or runs another version of the program than the "
+            f"process that planned the campaign (aerpaw-cmp {versions()['aerpaw-cmp']} there); expected are the same "
+            "inputs and version everywhere",
         )
     start = time.perf_counter()
     outcome = run_task(task)
@@ -502,7 +502,7 @@ def campaign_tasks(
 
 
 def _inputs_of(files: Mapping[str, tuple[Path, FlightFile]], logs_root: Path | None) -> list[Path]:
-    """Return the existing flight files and logs. A missing one becomes a row of the result."""
+    """Return the existing flight files and logs. A missing file becomes a row of the result."""
     paths = [path for path, _ in files.values()]
     paths += [(logs_root or path.parent) / log.path for path, flight in files.values() for log in flight.logs]
     return [path for path in paths if path.exists()]
@@ -511,7 +511,7 @@ def _inputs_of(files: Mapping[str, tuple[Path, FlightFile]], logs_root: Path | N
 def _flight_files(
     campaign: CampaignFile, folder: Path, settings: Mapping[str, Overrides]
 ) -> tuple[dict[str, tuple[Path, FlightFile]], list[Failure]]:
-    """Return the readable flight files by name, with all overrides checked, and the failures of the others."""
+    """Return the readable flight files by name, with all overrides checked, and the failures of other files."""
     files: dict[str, tuple[Path, FlightFile]] = {}
     failures = []
     for entry in campaign.flights:
@@ -610,7 +610,7 @@ def _repeat(pair: PassPair, first: RssRow, second: RssRow, known: int) -> Repeat
 
 
 def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
-    """Choose K on the remaining flights with the same tower and values of K, for every flight."""
+    """Choose K for each flight from the other flights with the same tower and values of K."""
     out = []
     for setting, tower in dict.fromkeys((row.setting, row.tower) for row in rows):
         by: dict[str, dict[float, RankRow]] = {}
@@ -680,7 +680,7 @@ def with_season(
 
 
 def _started_of(rows: Iterable[RssRow]) -> dict[str, int]:
-    """Return the start of each flight [ns after 1970-01-01]. Flights with relative times only have none."""
+    """Return the start of each flight [ns after 1970-01-01]. A flight that has only relative times has no start."""
     starts: dict[str, int] = {}
     for row in rows:
         if row.start_ns and has_wall_clock(np.datetime64(row.start_ns, "ns")):

@@ -35,8 +35,8 @@ from .tasks import inputs_of_flight
 
 _MOST_POSES = 10_000_000
 
-# Bytes of gains and frequency responses per part, and in memory at most. Estimates: paths per link, and bytes per path
-# in addition to its gains.
+# Size of gains and frequency responses per part, and largest size in memory [bytes]. Then two estimates: paths per
+# link, and bytes per path in addition to its gains.
 _PART_BYTES, MOST_BYTES, _PATHS, _PATH_BYTES = 16 << 20, 2 << 30, 4, 512
 
 
@@ -100,7 +100,7 @@ def channel_parts(
     name, link_settings = _chosen_link(settings, chosen)
     towers = _chosen_towers(data, chosen, remarks)
     if chosen.subcarriers is not None and chosen.bandwidth_hz is None:
-        raise UsageError("--subcarriers without a band", expected="--bandwidth HZ, too")
+        raise UsageError("--subcarriers without a band", expected="--bandwidth HZ as well")
     check_band(chosen.bandwidth_hz or 0.0, link_settings.carrier_hz)
     link = link_settings.build(towers, data.folder)
     along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
@@ -174,7 +174,7 @@ def _chosen_link(settings: FlightFile, chosen: ChannelOptions) -> tuple[str, Lin
 
 
 def _chosen_towers(data: FlightData, chosen: ChannelOptions, remarks: list[str]) -> list[str]:
-    """Return the towers by name. A moving tower must be alone and along the track: each pose has another scene."""
+    """Return the towers by name. A moving tower must be the only one, on its track: its scene changes."""
     if unknown := [name for name in chosen.towers if name not in data.site.towers]:
         raise UsageError(f"the site has no tower {unknown[0]!r}", expected="one of " + ", ".join(data.site.towers))
     logs = [str(log.node) for log in data.settings.logs if log.node in data.site.towers]

@@ -69,7 +69,7 @@ if TYPE_CHECKING:
 # Both sides are averaged over these windows to see how much of the error is fading.
 _AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
 
-# Two passes of one position, in the first and second half of a flight, are closer than this [m].
+# Largest distance between a pass of the first half and a pass of the second half of a flight at one position [m].
 _PASSES_WITHIN_M = 3.0
 
 # Number of random grounds for the error bar of rank agreement, and of poses replayed over each.

@@ -67,7 +67,7 @@ from .predict import CorrectedMaps
 from .tasks import code_digest
 from .workers import InProcess, Lost, Workers
 
-# Modes of the trees, from no loss to total loss; the paper's is the last.
+# Modes of the trees, from no loss to total loss. The paper uses the last mode.
 FOLIAGE = ("none", "attenuating", "opaque")
 
 RATIOS = ("spread", "condition")
@@ -106,7 +106,8 @@ class MapSettings:
     max_depth : int
         Largest number of reflections.
     neighbours, radius_m : int, float
-        M and r0 of the interpolators. The radius grows with a spacing above the paper's, so that M positions are near.
+        M and r0 of the interpolators. If the spacing is larger than the paper's, the radius grows so that it contains M
+        positions.
     block_m : float
         Side of the held-out blocks.
     study : bool
@@ -179,7 +180,7 @@ def map_settings(site: str, chosen: Mapping[str, Any], *, quick: bool = False) -
     site : str
         Site whose key ``coverage`` has a carrier and a link budget.
     chosen : mapping
-        Fields of :class:`MapSettings` and of its link budget, which replace those of the site. None: not chosen. A
+        Fields of :class:`MapSettings` and of its link budget, which replace those of the site. None means not chosen. A
         threshold replaces either threshold of the site.
     quick : bool
         Use :data:`QUICK` instead of the paper's defaults.

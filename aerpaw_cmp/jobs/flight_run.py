@@ -51,7 +51,7 @@ from ..site.siteyaml import known_grounds
 from .audit_flight import audit_replays
 from .compare_flight import Levels, compare_flight, fitted_receiver, levels_of
 
-# Loss of the weakened ground reflection: a smooth half-space reflects more than any field.
+# Loss of the weakened ground reflection: a smooth half-space reflects more than any real field.
 _WEAK_GROUND_DB = 10.0
 
 # Smaller gains are not visible on a page [dB].
@@ -133,7 +133,7 @@ class Model:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightLadder:
-    """The scored models, in the order of ``ladder.rungs``. None is the model of the flight file."""
+    """The scored models, in the order of ``ladder.rungs``. A model of None is that of the flight file."""
 
     ladder: Ladder
     models: tuple[Model | None, ...]
@@ -608,7 +608,7 @@ def run_flight(
     climbed: FlightLadder | None = None
     if ladder:
         with stages("ladder"):
-            stages.progress("ladder of models")
+            stages.progress("model comparison")
             climbed = flight_ladder(data, replays)
             if climbed is not None:
                 rows = (series_rows(climbed.ladder, index, name) for index, name in enumerate(climbed.names))

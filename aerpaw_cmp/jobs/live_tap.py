@@ -19,7 +19,7 @@ from ..live.feed import Feed
 from ..live.ports import Stop, TapSettings, TapStatus, TapSummary
 from ..live.tap import Tap
 
-# Environment variable with the token of a page beyond the loopback, so that it is the same after a restart.
+# Environment variable with the token of a page beyond the loopback, so that the token is the same after a restart.
 TOKEN = "AERPAW_CMP_WEB_TOKEN"
 
 
@@ -115,7 +115,7 @@ def _serve(stack: contextlib.ExitStack, feed: Feed, twin: Any, shown: Shown, tit
 
 
 def _together(session: Callable[[int], TapSummary], count: int, stop: Stop) -> list[TapSummary]:
-    """Run sessions in parallel threads. An error in one session ends all."""
+    """Run sessions in parallel threads. An error in one session ends all sessions."""
 
     def run(number: int) -> TapSummary:
         try:

@@ -115,7 +115,7 @@ class LiveTwin:
     def _learn(
         self, ahead: RouteAhead, place: FloatArray, level: float, utc_ns: int, rsrp_dbm: float
     ) -> dict[str, Any] | None:
-        """Return the prediction of the remaining route after a record. None between two time bins."""
+        """Return the prediction of the remaining route after a record, or None between two time bins."""
         free = float(self._free_space(place[None])[0])
         forecast = ahead.add(utc_ns / 1e9, place, rsrp_dbm, {"replay": level, "free space": free})
         if forecast is None:

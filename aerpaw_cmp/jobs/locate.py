@@ -86,7 +86,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
 def _streams(
     settings: FlightFile, flight: Path, logs_root: Path | None, channel: str | None
 ) -> tuple[Stream, IngestedFile, Stream]:
-    """Return the telemetry with most rows, the file of the chosen levels, and these levels."""
+    """Return the telemetry with the most rows, the file of the chosen levels, and these levels."""
     streams = [(f, stream) for f in read_logs(settings, flight.parent, logs_root) for stream in f.result.streams]
     vehicles = [s for _, s in streams if s.kind == "telemetry"]
     levels = {s.channel: (f, s) for f, s in reversed(streams) if s.kind == "rss" and not is_ratio(s)}
@@ -127,7 +127,7 @@ def _cautions(settings: FlightFile, channel: str, uav: MeasuredPattern | None) -
     ]  # fmt: skip
     used = settings.link.of(channel).uav.antenna.file
     if "uav" in settings.antennas and (uav is None or used is None or uav.name not in used):
-        texts.append("antennas.uav is not used: it was learned from this very log.")
+        texts.append("antennas.uav is not used: it was learned from this log.")
     return list(dict.fromkeys(texts))
 
 
@@ -155,9 +155,9 @@ def _numbers(site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -
             f"Path-loss exponent {estimate.slope:.1f} ± {2.0 * estimate.slope_sd:.1f} (fitted, 95 %).",
             ends,
             f"Height of the node: {low:g} m"
-            + ("." if low == high else f" or {high:g} m, which the levels do not decide."),
-            f"Floor of the receiver: {floor}. Strength and length of the shadowing are weighed by the levels. "
-            "No path is ray-traced.",
+            + ("." if low == high else f" or {high:g} m, between which the levels do not decide."),
+            f"Floor of the receiver: {floor}. The levels determine weights for strength and "
+            "length of the shadowing. No path is ray-traced.",
         ),
         "warnings": (edge,) if estimate.at_edge else (),
     }

@@ -54,7 +54,7 @@ from .sources import (
     target_files,
 )
 
-# Name of the target that has all directions between tower and UAV, at all headings.
+# Name of the target that contains all directions between tower and UAV, at all headings.
 _SPHERE = "sphere"
 
 _SPHERE_AWAY_M = 150.0
@@ -283,7 +283,7 @@ def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     out = []
     shapes = [("lawnmower", 0.0, False), ("lawnmower", 90.0, False), ("lawnmower", 0.0, True), ("cross", 0.0, False)]
     for height, (shape, azimuth, turns), nose in product(plan.heights_m, shapes, NOSES):
-        # a pattern with turns on its legs has all headings for any nose
+        # a pattern with turns on its legs has all headings, regardless of the nose setting
         if turns and nose != "along":
             continue
         pattern = Pattern(shape=shape, azimuth_deg=azimuth, height_m=height, nose=nose, turns=turns)  # type: ignore[arg-type]

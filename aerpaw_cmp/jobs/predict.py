@@ -164,7 +164,7 @@ def predict(
             observed, about_logs = observe(known)
             sources = sources_of(known, observed)
             remarks += about_logs
-        _check_shared(where, sources, site, "the flights heard" if known else "the site remembers")
+        _check_shared(where, sources, site, "the flights received" if known else "the site has learned")
         targets = find_targets(where, site, options, logs_root)
     work = f"{counted(len(targets.position_m), 'point')}: {', '.join(sources)}"
     stages.checked(lambda: [PlannedStage("choose, predict", work)])
@@ -253,7 +253,7 @@ def _model_fields(
 def site_of(
     where: Path | None, flights: Sequence[NamedFlight], known: Sequence[FlightData], named: str | None = None
 ) -> tuple[Site, str | Path]:
-    """Return the site of a prediction or plan: the named one, WHERE if it is a site, or that of the flights or WHERE.
+    """Return the site of a prediction or plan: the named site, else WHERE if it is a site, else that of the flights.
 
     Parameters
     ----------
@@ -303,7 +303,8 @@ def site_of(
 def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions) -> Memory | Prior:
     """Return the model of a site without named flights: the levels learned for it, else ray tracing with a prior.
 
-    The prior is used if the user names a carrier or a power, because learned levels have their own.
+    The prior is used if the user names a carrier or a power, because learned levels include their own carrier and
+    power.
     """
     memory = memory_of(place, site) if options.carrier_hz is None and options.tx_power_dbm is None else None
     if memory is not None:
@@ -334,7 +335,7 @@ def _check_shared(where: Path, sources: Mapping[str, Source], site: Site, who: s
         return
     raise UsageError(
         f"{who} {', '.join(sorted(towers))} at {', '.join(f'{b / 1e9:g} GHz' for b in sorted(bands))}; "
-        f"{where.name} asks for {', '.join(sorted(nodes)) or 'any tower'}"
+        f"{where.name} needs {', '.join(sorted(nodes)) or 'any tower'}"
         + (f" at {', '.join(f'{c / 1e9:g} GHz' for c in sorted(carriers))}" if carriers else ""),
         expected="--with a flight that shares a tower and the band",
     )
@@ -478,7 +479,7 @@ def _stated(model: Flown | Memory | Prior, antenna: str, level_db: AnyArray, slo
         ends = {"level_db": level_db, "sd_db": sd, "q05_db": level_db - half, "q95_db": level_db + half}
         return ends | {"slow_sd_db": slow_db}
     low, middle, high = (lock.quantile_db(share) for share in (0.5 - 0.5 * BAND, 0.5, 0.5 + 0.5 * BAND))
-    sd = lock.sd_db(middle)  # the same for means over 4 s, because a loss of lock lasts longer
+    sd = lock.sd_db(middle)  # means over 4 s have the same SD, because a loss of lock lasts longer than 4 s
     ends = {"level_db": level_db + middle, "sd_db": sd, "q05_db": level_db + low, "q95_db": level_db + high}
     parts = {"locked_db": level_db + lock.locked_db, "lost_db": level_db + lock.lost_db}
     spreads = {f"{name}_sd_db": np.full(len(sd), getattr(lock, f"{name}_sd_db")) for name in ("locked", "lost")}
@@ -620,7 +621,8 @@ def run_predict(
     where : Path
         See :func:`.sources.find_targets`.
     flights : sequence of Path
-        Flight files, or calibration.yaml files that list some. If there are none, the learned levels of the site.
+        Flight files, or calibration.yaml files that list flight files. If there are none, the learned levels of the
+        site are used.
     target : TargetOptions
     options : RunOptions
         ``out`` is ``reports/prediction-NAME`` by default.

@@ -418,7 +418,7 @@ def _check_levels(level: FloatArray, quantity: str, path: Path) -> None:
 
 
 def _check_repeats(table: pd.DataFrame, path: Path) -> None:
-    """Refuse two rows of one tower, channel and time with different levels. Without times: position and heading.
+    """Refuse rows of one tower, channel and time (else position and heading) with different levels.
 
     A route can pass a position several times: ``time_s`` after an unknown start distinguishes the passes.
     """

@@ -77,8 +77,8 @@ def run_ingest(
     Returns
     -------
     dict
-        As :func:`aerpaw_cmp.logs.ingest.summary`. With a draft also ``draft`` (what to check) and ``drafts`` (paths),
-        with ``out`` the names of its ``flights``.
+        The result of :func:`aerpaw_cmp.logs.ingest.summary`. A draft adds ``draft`` (remarks to check) and ``drafts``
+        (paths); ``out`` adds the names of its ``flights``.
     """
     from ..logs.flight_file import fill, is_flight_file
     from ..logs.ingest import ingest, summary
@@ -174,22 +174,22 @@ def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportOptions:
-    """Options that the command line gives for one report.
+    """Options of one report on the command line.
 
     Parameters
     ----------
     audit : str, optional
         Number of audited links ("full", "none" or a number), instead of ``rt.audit_links``.
     recommend : Path, optional
-        Where the flight file with the settings of the recommended model is written.
+        Path of the flight file to write with the settings of the recommended model.
     learned : path, optional
-        calibrated.yaml whose antennas, ground and receiver take the place of those of the flight file.
+        calibrated.yaml whose antennas, ground and receiver replace those of the flight file.
     against : sequence of path
         Predictions of this flight that are scored: output folders of ``predict``, or files of other programs.
     against_distance_m : float
         Largest distance between a sample and its predicted position, for other programs.
     figures : {"none", "svg", "png", "pdf", "all"}
-        Figures drawn as files: none, or every one in one format or in all.
+        Format of figures as files: none, one format, or all formats.
     style : {"screen", "paper"}
     export : sequence of str
         Formats of the samples.
@@ -206,7 +206,7 @@ class ReportOptions:
 
 
 def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: RunOptions = DEFAULT) -> JobOutcome:
-    """Replay a flight, calibrate, compare, report.
+    """Replay a flight, calibrate and compare it, and write the report.
 
     Parameters
     ----------
@@ -359,7 +359,7 @@ def run_site_import(
     force: bool = False,
     **options: Any,
 ) -> list[str]:
-    """Write a site.yaml from map files and return what was done to them.
+    """Write a site.yaml from map files, and return a description of each step.
 
     Parameters
     ----------
@@ -433,7 +433,7 @@ def run_map(
     flights : sequence of Path
         Flight files that correct the levels and ranks (:mod:`.predict`).
     figures : {"none", "png", "svg", "pdf", "all"}
-        Figures that are drawn as files, in a format or in all.
+        Format of figures as files: none, one format, or all formats.
 
     Returns
     -------
@@ -506,7 +506,7 @@ def run_campaign(
         campaign.yaml.
     options : RunOptions
     keep : Path, optional
-        Folder for the outcomes of single tasks, instead of the user's cache. A rerun computes only what is missing.
+        Folder for the outcomes of single tasks, instead of the user's cache. A rerun computes only missing outcomes.
     fresh : bool
         Neither read nor store outcomes.
 
@@ -580,11 +580,11 @@ def run_calibrate(
     options : RunOptions
         ``out`` is the file to write. The folder is next to it.
     further : sequence of Path
-        Flight files that are learned from, too.
+        Further flight files to learn from.
     into_site : str, optional
         Site (site.yaml or packaged) that stores the results: an entry of each campaign.
     score : sequence of Path
-        Flight files that are scored with all that was learned; those of training logs are named and not scored.
+        Flight files that are scored with all learned antennas. Flights with training logs are reported but not scored.
 
     Returns
     -------
@@ -600,7 +600,7 @@ def run_calibrate(
 
     settings = load_calibration(path, further)
     if into_site is not None:
-        site_model(into_site)  # report a misspelt site before the fit, and store nothing under its name
+        site_model(into_site)  # report a misspelt site before the fit, so that nothing is stored under its name
         check_index(into_site)
     target = options.out or Path(f"{settings.calibration}.calibrated.yaml")
     if target.suffix.lower() not in (".yaml", ".yml"):

@@ -46,7 +46,7 @@ def is_scene(path: Path) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneOptions:
-    """Facts that a Mitsuba scene does not contain.
+    """Facts about a site that a Mitsuba scene does not contain.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class SceneOptions:
 
 
 def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool = False) -> list[str]:
-    """Write a site.yaml that names a Mitsuba scene, and return what was done.
+    """Write a site.yaml that names a Mitsuba scene, and return a description of each step.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
             content["notes"] = [*content.get("notes", []), _LOCAL_NOTE]
             actions.append(_LOCAL_NOTE)
         model = SiteModel.model_validate(content)
-        site = build_site(model, out.resolve().parent)  # reports inconsistent settings now
+        site = build_site(model, out.resolve().parent)  # report inconsistent settings before the file is written
         actions = [*(note for note in site.notes if " mesh" in note), *actions]
         output.write(sealed(site_yaml(model, header=["made by 'aerpaw-cmp site import' from a scene", *actions])))
     return actions

@@ -357,7 +357,7 @@ class NamedFlight:
     settings: FlightFile
 
     def load(self, logs_root: Path | None) -> FlightData:
-        """Read its logs and track."""
+        """Read the logs and the track of the flight."""
         return load_data(self.settings, self.path.parent, logs_root)
 
 
@@ -596,7 +596,7 @@ PRIOR_SD_DB = {"offset": 10.0, "antennas": 8.0, "shadowing": 6.0, "fading": 5.0}
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """The model before any flight: ray tracing with isotropic antennas, and a wide error that is stated.
+    """The model before any flight: ray tracing with isotropic antennas, and a wide prediction error.
 
     Parameters
     ----------

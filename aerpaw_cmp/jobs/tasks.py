@@ -2,7 +2,7 @@
 
 The inputs are all files that a report was made from: logs, settings, site, antennas, elevation, reference powers. Every
 value of a flight file or a site file that names a file is an input (:mod:`aerpaw_cmp.common.yamlfile`). An outcome is
-stored under a digest of what it depends on, so no finished task is computed twice.
+stored under a digest of its inputs, so no finished task is computed twice.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def other_inputs(
     Parameters
     ----------
     settings : FlightFile
-        As checked.
+        The checked settings.
     flight : Path
         The flight file.
     logs_root : Path, optional
@@ -86,7 +86,7 @@ def inputs_of_flights(flights: Iterable[Path], logs_root: Path | None = None) ->
 
 
 def stamp(path: Path) -> tuple[int, int]:
-    """Return size and time of a file, from which a long-lived worker sees a change. Zeros if there is no file."""
+    """Return size and time of a file, by which a long-lived worker detects changes. Zeros if there is no file."""
     try:
         status = os.stat(path)  # noqa: PTH116
     except OSError:
@@ -127,7 +127,7 @@ READERS = "aerpaw_cmp.readers"
 
 
 class OutcomeStore:
-    """Records by key: ``<key>.npz``, sealed by the digest of its content.
+    """A store of records by key: files ``<key>.npz``, each sealed with the digest of its content.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ class _Arrays:
 
     def put(self, array: AnyArray) -> str:
         """Return the name of an array, which is stored if it is new."""
-        if array.dtype.hasobject:  # these would be pickled
+        if array.dtype.hasobject:  # NumPy would pickle objects
             raise TypeError("an outcome cannot contain arrays of objects")
         name = self._names.setdefault((array.dtype.str, array.shape, array.tobytes()), f"a{len(self._names)}")
         self.by_name[name] = array

@@ -96,7 +96,7 @@ class Workers(ABC):
 
 
 def _outcome(future: Any) -> Any:
-    """Return the result of a finished future, or :class:`Lost`. Raise messages of tasks and errors of lost workers."""
+    """Return the result of a finished future, or :class:`Lost`. Raise the errors of tasks and of lost workers."""
     try:
         return future.result()
     except (AerpawCmpError, BrokenProcessPool, CancelledError):
@@ -153,7 +153,7 @@ class Processes(Workers):
         except BrokenProcessPool:
             return list(active.values())
         finally:
-            if active:  # do not wait for running tasks
+            if active:  # end the processes instead of waiting for running tasks
                 for process in set(multiprocessing.active_children()).difference(others):
                     process.kill()
             pool.shutdown(cancel_futures=True)
@@ -256,7 +256,7 @@ class Cluster(Workers):
 
     def _scheduler_lost(self) -> InputError:
         return InputError(
-            "the scheduler of the workers went away",
+            "the scheduler of the workers cannot be reached",
             cause="it was stopped; finished tasks are stored, run the same command again",
         )
 
@@ -360,7 +360,7 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
     if wrong:
         more = f"; and {len(wrong) - 4} more" if len(wrong) > 4 else ""
         raise UsageError(
-            f"{len(wrong)} of {len(answers)} workers cannot do this campaign: " + "; ".join(wrong[:4]) + more,
+            f"{len(wrong)} of {len(answers)} workers cannot run this campaign: " + "; ".join(wrong[:4]) + more,
             expected="the same aerpaw-cmp on every worker, and the same files under the same paths",
             cause="another environment, or a disk that is not mounted there",
         )

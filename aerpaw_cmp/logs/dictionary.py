@@ -31,7 +31,7 @@ class Quantity:
     Parameters
     ----------
     name : str
-        The field's word, or the column of the record model.
+        The usual term, or the column of the record model.
     role : str
         ``time``, ``position``, ``height``, ``angle``, ``velocity``, ``count``, ``doubt``, ``identity``, ``cell`` or a
         kind of stream: ``rss``, ``rank``, ``kpi``.
@@ -46,7 +46,7 @@ class Quantity:
     datum : str
         Zero of a height: ``take-off``, ``ground``, ``sea level``, ``ellipsoid`` or ``unknown``.
     open_unit : bool
-        Programs write the quantity in several units: numbers without a unit are of an unknown one.
+        Programs write the quantity in several units: the unit of plain numbers is then unknown.
     """
 
     name: str
@@ -175,7 +175,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^((gps|gnss) )?(sats?|satellites?|num sats?)( (used|count|num|in use))?$", r"(^| )satellites (visible|used)$",
     )),
     Quantity("battery_v", "count", (r"^(battery ?)?(volts?|voltage)( v)?$",), "V"),
-    # who
+    # devices and networks
     Quantity("device", "identity", (
         r"^(device|phone|modem|ue|vehicle|drone|uav|logger|serial|client|user|robot|rover|aircraft|tail|host"
         r"|interface|mac|bssid|gps|gps receiver|instance)"
@@ -199,7 +199,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("power", "rss", (r"^link power$", r"^(power )?lw ?[1-5]( (power|level))?( dbm?)?$"), _FULL_SCALE),
     Quantity("quality", "rss", (r"^link quality$",), "dB"),
     Quantity("SNR", "rss", (r"^link snr$",), "dB"),
-    # 'rank' alone may be the position in any list: described() accepts it if the table has levels; 0: nothing reported
+    # 'rank' alone may be the position in any list: described() accepts it if the table has levels. 0 means no report
     Quantity("rank", "rank", (
         r"\b((pdsch|dl|nr|lte|[45]g|mimo|csi) rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri|dl layer num)\b",
     ), none=(0.0,), can_be=(0.0, 16.0)),
@@ -275,7 +275,7 @@ _PORT = re.compile(r"\b(rx|ant(enna)?|port|branch|chain|path) ?\d\b")
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """Content of a column.
+    """The meaning of a column.
 
     Parameters
     ----------
@@ -710,7 +710,7 @@ def names_a_cell(words: str, *, alone: bool = False) -> bool:
 
 
 def like_levels(names: Iterable[str]) -> list[str]:
-    """Return those of some unknown names that may be levels, except electric power next to a voltage."""
+    """Return the unknown names that may be levels, except electric power next to a voltage."""
     words = {name: plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)) for name in names}
     electric = any(re.search(r"volt|batt|\bcurrent", text) for text in words.values())
     return [
@@ -738,7 +738,7 @@ def described(
     known : Program, optional
         The program, if the caller knows it.
     of : collection of str
-        Further names that identify it.
+        Further names that identify the program.
     """
     own = [(name, plain(name)) for name in names]  # a table may have a name twice
     present = [bare for _, bare in own]
@@ -773,7 +773,7 @@ def record_columns(
     Returns
     -------
     dict of str to float array, shape (n,)
-        If several fields have one quantity, the preferred one. Heights above take-off are ``above_home_m``.
+        If several fields have the same quantity, only the preferred field. Heights above take-off are ``above_home_m``.
     """
     columns: dict[str, tuple[tuple[int, int], FloatArray]] = {}
     for name, (what, unit, words) in zip(fields, described(fields, of=of)[1], strict=True):

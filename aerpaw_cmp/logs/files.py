@@ -73,7 +73,7 @@ def unpacked_pieces(file: BinaryIO, path: str | Path) -> Iterator[bytes]:
         module = import_module(_MODULES[name])
     except ImportError as error:
         found = f"a {name} file, and this Python was built without {name}"
-        raise InputError(found, expected="the log unpacked", path=path) from error
+        raise InputError(found, expected="an unpacked log", path=path) from error
     count = 0
     try:
         for piece in iter(partial(module.open(file).read, _PIECE), b""):
@@ -81,24 +81,24 @@ def unpacked_pieces(file: BinaryIO, path: str | Path) -> Iterator[bytes]:
             # check while unpacking, so that a zip bomb is stopped at its first piece
             if count > _MOST_RATIO * file.tell() + _PIECE:
                 found = f"the {name} file unpacks to more than {_MOST_RATIO} times its size"
-                raise InputError(found, cause="no log", path=path)
+                raise InputError(found, cause="not a log", path=path)
             yield piece
     except EOFError as error:
-        raise InputError(f"the {name} file ends too early", cause="a cut download", path=path) from error
+        raise InputError(f"the {name} file ends too early", cause="a truncated download", path=path) from error
     # the header of an xz file may ask for more memory than there is
     except (OSError, ValueError, zlib.error, lzma.LZMAError, MemoryError) as error:
-        raise InputError(f"a damaged {name} file ({error})", cause="a cut download", path=path) from error
+        raise InputError(f"a damaged {name} file ({error})", cause="a truncated download", path=path) from error
 
 
 def unpacked(raw: bytes, path: str | Path, most: int) -> bytes:
-    """Return the content of a packed file of at most ``most`` bytes."""
+    """Return the content of a packed file, and refuse content of more than ``most`` bytes."""
     parts, size = [], 0
     for piece in unpacked_pieces(io.BytesIO(raw), path):
         parts.append(piece)
         size += len(piece)
         if size > most:
             raise InputError(
-                f"the {packed_form(raw)} file unpacks to more than {most} bytes", cause="no log", path=path
+                f"the {packed_form(raw)} file unpacks to more than {most} bytes", cause="not a log", path=path
             )
     return b"".join(parts)
 
@@ -115,12 +115,12 @@ def head_of(place: Path, count: int) -> bytes:
     return head[:count]
 
 
-# A flight of half an hour with a burst every 0.1 s has 18 000.
+# Largest number of files in an archive. A flight of half an hour with a burst every 0.1 s has 18 000.
 MOST_MEMBERS = 20_000
 # Largest size of a member, and of all members together, after decompression.
 MOST_BYTES = 2**31
 _MOST_IN_ALL = 2**35
-# Largest ratio of all members to the archive, beyond ``_FREE_BYTES``: logs shrink to a fifth, some to a 50th.
+# Largest ratio of all members to the archive, in addition to ``_FREE_BYTES``. Logs shrink to a fifth, some to a 50th.
 MOST_RATIO = 100
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 _TAR = b"ustar"
@@ -173,12 +173,13 @@ def archive_members(data: bytes, path: str | Path) -> dict[str, Member]:
     Raises
     ------
     InputError
-        If the archive is damaged, or contains or unpacks to more than a data set can; also from a member's ``read``.
+        If the archive is damaged, or has more files or bytes than a data set can have. ``read`` of a member raises it,
+        too.
     """
     try:
         entries = list(_zip(data, path) if data.startswith(_ZIP) else _tar(data, path))
     except (*_DAMAGE, tarfile.TarError) as error:
-        raise InputError(f"a damaged archive ({error})", cause="a cut download", path=path) from error
+        raise InputError(f"a damaged archive ({error})", cause="a truncated download", path=path) from error
     _check(entries, len(data), path)
     return {member.name: member for member in sorted(entries, key=lambda member: member.name)}
 
@@ -209,9 +210,9 @@ def _unzipped(book: zipfile.ZipFile, entry: zipfile.ZipInfo, path: str | Path, m
             # read one byte more than declared, to detect a false size
             content = stream.read(entry.file_size + 1 if most is None else most)
     except (*_DAMAGE, RuntimeError) as error:
-        raise InputError(f"a damaged or locked member ({error})", cause="a cut download", path=place) from error
+        raise InputError(f"a damaged or locked member ({error})", cause="a truncated download", path=place) from error
     if len(content) > entry.file_size:
-        raise InputError("the member is larger than the archive says", cause="no log", path=place)
+        raise InputError("the member is larger than the archive declares", cause="not a log", path=place)
     return content
 
 
@@ -232,7 +233,7 @@ def _untarred(book: tarfile.TarFile, entry: tarfile.TarInfo, most: int | None) -
 def _member(name: str, size: int, path: str | Path, read: Callable[[int | None], bytes]) -> Member:
     """Return a member under a relative name, so that a flight.yaml reaches files in the archive only."""
     if ".." in name.split("/"):
-        return Member(name, 0, partial(_refused, "the member's name leads out of the archive", "a name below it", path))
+        return Member(name, 0, partial(_refused, "the member's name leads out of the archive", "a relative name", path))
     return Member(name.lstrip("/"), size, read)
 
 
@@ -248,11 +249,11 @@ def most_bytes(size: int) -> int:
 def _check(entries: list[Member], size: int, path: str | Path) -> None:
     total = sum(member.size for member in entries)
     if len(entries) > MOST_MEMBERS:
-        raise InputError(f"the archive holds {len(entries)} files", expected=f"at most {MOST_MEMBERS}", path=path)
+        raise InputError(f"the archive contains {len(entries)} files", expected=f"at most {MOST_MEMBERS}", path=path)
     if total > most_bytes(size):
         raise InputError(
             f"the archive of {size} bytes unpacks to {total} bytes",
-            expected=f"at most {MOST_RATIO} times its size and {_FREE_BYTES >> 20} MiB, and {_MOST_IN_ALL >> 30} GiB",
+            expected=f"at most {MOST_RATIO} times its size plus {_FREE_BYTES >> 20} MiB, and {_MOST_IN_ALL >> 30} GiB",
             cause="not a data set: an archive crafted to fill the disk or memory",
             path=path,
         )

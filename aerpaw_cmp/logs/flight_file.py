@@ -13,8 +13,8 @@ JSON is stored as UTF-8 bytes, because HDF5 strings cannot contain the NUL chara
 int64 nanoseconds of UTC. The file can be read without this package.
 
 After the HDF5 data, which HDF5 ignores, come the word ``AERPAWCS`` and the SHA-256 of all bytes before it. Damage is
-thus found before HDF5 reads the file, because HDF5 takes some damage for data and does not return from other damage.
-A file without the SHA-256 (truncated, or changed by another program) gets the checks of HDF5 only.
+thus found before HDF5 reads the file, because HDF5 reads some damaged bytes as data and never returns from others.
+A file without the SHA-256 (truncated, or changed by another program) is checked only by HDF5.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class IngestedFile:
         SHA-256 of the content after unpacking, which identifies a log under any name and in any archive.
     result : ReadResult
     holder : str
-        The flight file that the log was read from, empty for the log itself.
+        The flight file that the log was read from, empty if the log itself was read.
     """
 
     path: str
@@ -71,7 +71,8 @@ def write_flight(path: str | Path, files: Sequence[IngestedFile]) -> None:
     Raises
     ------
     UsageError
-        If the place is an input, another file, or in no folder; see :class:`~aerpaw_cmp.common.outputs.OutputFile`.
+        If the path is an input, a file of another program, or in a missing folder; see
+        :class:`~aerpaw_cmp.common.outputs.OutputFile`.
     OutputError
         If the output cannot be written to the disk.
     """
@@ -85,7 +86,7 @@ def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
     Raises
     ------
     OSError
-        If the stream takes no more.
+        If the stream cannot be written.
     """
     import h5py
 
@@ -97,7 +98,7 @@ def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
             for i, file in enumerate(files):
                 _write_file(shelf.create_group(f"{i:05d}"), file, sink)
     finally:
-        sink.raise_spared()  # errors of HDF5 after a failure follow from it
+        sink.raise_spared()  # raise the first failure of the stream, which causes the later errors of HDF5
     # HDF5 ignores bytes after its own end
     size = stream.seek(0, os.SEEK_END)
     digest = _digest(stream, size)
@@ -167,7 +168,7 @@ def _type(column: pd.Series[Any]) -> str:
     return {"M": "time", "f": "float", "i": "integer", "u": "integer", "b": "boolean"}.get(kind, "text")
 
 
-# Rows that are converted and written at a time: copies of all rows of a large log would take more than its records.
+# Number of rows that are converted and written at a time: copies of all rows would need more memory than the records.
 _AT_ONCE = 1 << 18
 _CHUNK = 1 << 16
 
@@ -180,7 +181,7 @@ def _write_column(group: Any, name: str, column: pd.Series[Any], kind: str) -> N
     # the shuffle filter and light deflate: a tenth of the size for smooth columns, at little time
     packing = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "chunks": (min(count, _CHUNK),)}
     packing = packing if count > 256 else {}
-    number: dict[str | None, int] = {None: -1}  # no text at all
+    number: dict[str | None, int] = {None: -1}  # the code of a missing text
 
     def converted(part: Any) -> AnyArray:
         if kind == "text":
@@ -202,7 +203,7 @@ def _write_column(group: Any, name: str, column: pd.Series[Any], kind: str) -> N
 def _codes(part: AnyArray, number: dict[str | None, int]) -> AnyArray:
     """Return the numbers of texts, and number new texts.
 
-    The factorize function of pandas up to 2.3 ends a text at a NUL.
+    pandas.factorize is not used, because up to pandas 2.3 it ends a text at a NUL.
     """
     import numpy as np
     import pandas as pd
@@ -230,13 +231,13 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
     Raises
     ------
     InputError
-        If the file is missing, no flight file, of a newer version, or damaged.
+        If the file is missing, damaged, not a flight file, or of a newer version.
     """
     from ..common import native
 
     content = Path(path).read_bytes()
     if not content.startswith(_MAGIC):
-        raise InputError("no HDF5 file", expected="a flight file of 'aerpaw-cmp ingest -o'", path=path)
+        raise InputError("not an HDF5 file", expected="a flight file of 'aerpaw-cmp ingest -o'", path=path)
     _refuse_changed(content, path)
     items, notes = native.read("hdf5", content)
     form, version = notes["attributes"].get("format"), notes["attributes"].get("version")
@@ -244,8 +245,12 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
         raise InputError("an HDF5 file of another kind", expected="a flight file", path=path)
     if version != _VERSION:
         found = f"flight file of version {version}"
-        raise InputError(found, expected=f"version {_VERSION}", cause="a newer tool", path=path)
-    with parsing(path, "a flight file of 'aerpaw-cmp ingest -o'", "a cut copy: ingest the logs again", any_shape=True):
+        raise InputError(
+            found, expected=f"version {_VERSION}", cause="a newer version of this tool wrote it", path=path
+        )
+    with parsing(
+        path, "a flight file of 'aerpaw-cmp ingest -o'", "a truncated copy: ingest the logs again", any_shape=True
+    ):
         return [_read_file(items, name) for name in _numbered(items, "files/")]
 
 

@@ -1,4 +1,4 @@
-"""Logs as data frames, for notebooks: ``read(path)`` gives one frame per stream."""
+"""Logs as data frames, for notebooks: ``read(path)`` returns one frame per stream."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Logs(dict[str, pd.DataFrame]):
     """The frames of logs by the name of their stream, with the account of every file.
 
     ``frame.attrs`` contains the attributes of the stream (node, channel, unit, frequency) and its ``reader``, ``file``
-    and ``kind``. If a log does not name its node, the node is the tower in its path (``LW1/power.txt``). A name in
-    several files becomes ``<file>:<stream>``, with the folder if files have the same name.
+    and ``kind``. If a log does not name its node, the node is the tower in its path (``LW1/power.txt``). If
+    several files have a stream of the same name, the keys are ``<file>:<stream>``, with the folder if necessary.
 
     Parameters
     ----------
@@ -130,27 +130,28 @@ def read(
     Parameters
     ----------
     path : path, pattern, or several of these
-        Files and folders (searched to the bottom); ``~`` and ``"logs/*.txt"`` are understood.
+        Files and folders (searched recursively); ``~`` and ``"logs/*.txt"`` are expanded.
     timezone : str or ZoneInfo, optional
         IANA zone of clocks that show local time, such as ``"America/New_York"``.
     reader : str, optional
-        Name of the reader (``aerpaw-cmp formats`` lists them) instead of finding it by content.
+        Name of the reader (``aerpaw-cmp formats`` lists all readers). Default: detected by content.
     time_origin : str, optional
-        Instant of zero for logs with relative times.
+        Time of zero for logs with relative times.
     options
         Further fields of :class:`aerpaw_cmp.logs.readers.ReadOptions`.
 
     Returns
     -------
     Logs
-        A dict ``{stream: DataFrame}``; columns as in :mod:`aerpaw_cmp.logs.records`, ``time`` in UTC with its zone.
+        A dict ``{stream: DataFrame}`` with the columns of :mod:`aerpaw_cmp.logs.records`, ``time`` in UTC with its
+        zone.
 
     Raises
     ------
     InputError
-        A file is missing, damaged or of no known format; a pattern that no file matches.
+        If a file is missing, damaged or of an unknown format, or no file matches a pattern.
     UsageError
-        An option is missing, such as ``timezone``.
+        If an option is missing, such as ``timezone``.
 
     Examples
     --------

@@ -44,7 +44,7 @@ _OptionsFor = ReadOptions | Callable[[Path], ReadOptions]
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """A file of a folder that was not read, and why."""
+    """A file in a folder that was not read, with the reason."""
 
     path: str
     reason: str
@@ -53,7 +53,7 @@ class Skipped:
 
     @classmethod
     def of(cls, path: Path, names: Collection[str], error: AerpawCmpError) -> Skipped:
-        """Return a file that is skipped, with the files in its folder, and the way to read it if it is a table."""
+        """Return the record of a skipped file: the reason, and for a table the way to read it."""
         way_out = f"; {error.cause}" if "--map" in (error.cause or "") else ""
         return cls(str(path), _samples_of(path.name, names) or error.found + way_out, error)
 
@@ -79,7 +79,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 
 
 def read_head(place: Path) -> bytes:
-    """Return the first bytes of a log on disk, which the sniffers look at."""
+    """Return the first bytes of a log on disk, which the sniffers test."""
     return as_utf8(_raw(place, HEAD_BYTES))
 
 
@@ -116,8 +116,8 @@ def ingest(
     Parameters
     ----------
     paths : sequence of path
-        Files, folders and archives (zip, tar); folders are searched to the bottom, in sorted order. Hidden files are
-        left out. The logs in a flight file of ``ingest -o`` are returned.
+        Files, folders and archives (zip, tar). Folders are searched recursively, in sorted order; hidden files are
+        ignored. For a flight file of ``ingest -o``, its logs are returned.
     options : ReadOptions or callable, optional
         Facts that are not in the files; a callable returns them per path.
     reader : str, optional
@@ -193,11 +193,11 @@ def _below(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> _
     else:
         return [read_file(place, options=options, reader=chosen)], []
     if not inside and not any(isinstance(item.error, UsageError) for item in skipped):
-        known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
+        known = "a reader recognises" if chosen is None else f"reader {chosen.name!r} can read"
         looked = counted(len(skipped), "file")
         first = f"; {one_line(Path(skipped[0].path).name)}: {skipped[0].reason}" if skipped else ""
         raise InputError(
-            f"the {'folder' if is_folder else 'archive'} holds no log that {known} ({looked} looked at){first}",
+            f"the {'folder' if is_folder else 'archive'} contains no log that {known} ({looked} tested){first}",
             expected="one of the formats of 'aerpaw-cmp formats'",
             path=place,
         )
@@ -259,7 +259,7 @@ def named_log(root: Path, name: str) -> Path:
     """Return the path of an existing file, folder or archive member that a flight file names."""
     path = root / name
     if not exists(path):
-        cause = "a wrong path, or --logs-root"
+        cause = "a wrong path or a wrong --logs-root"
         raise InputError("there is no such log", expected=f"a log below '{root}'", cause=cause, path=path)
     return path
 
@@ -272,13 +272,13 @@ def read_log(
     Parameters
     ----------
     root : Path
-        Folder against which the path resolves.
+        Folder to which the path is relative.
     name : str
         Path of the log: a file, a folder of pieces, or a member of an archive.
     options : ReadOptions
         Facts that are not in the file.
     reader : str, optional
-        The reader, if it should not be recognised by content.
+        Name of the reader. Default: detected by content.
     held : dict, optional
         Flight files that the caller has read before; this call adds those that it reads.
 
@@ -330,7 +330,7 @@ def _refuse_other_kind(path: Path, reader: Reader) -> None:
         return
     raise InputError(
         f"the content is that of {' or '.join(claimed_by)}",
-        expected=f"a log of reader {reader.name!r}, as flight.yaml says",
+        expected=f"a log of reader {reader.name!r}, as flight.yaml specifies",
         cause="the wrong file, or the wrong 'reader:'",
         path=path,
     )
@@ -413,7 +413,7 @@ def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: R
     if head.startswith(_HDF5):
         raise InputError(
             "an HDF5 file, such as the flight file that 'ingest -o' writes",
-            expected="the logs themselves, or the flight file named alone: 'ingest' returns the logs in it",
+            expected="the logs themselves, or only the flight file: 'ingest' then returns its logs",
             path=path,
         )
     if reader is None and head:
@@ -458,7 +458,7 @@ def name_inside(path: str) -> str:
 
 
 def _source(flight_file: Path, name: str, held: Held | None = None) -> IngestedFile:
-    """Return one of the logs in a flight file by its path or the end of it."""
+    """Return one of the logs in a flight file by its path or by the end of its path."""
     held = {} if held is None else held
     # read it once for all logs in flight.yaml that refer to it
     files = held[flight_file] = held.get(flight_file) or read_flight(flight_file)
@@ -470,7 +470,7 @@ def _source(flight_file: Path, name: str, held: Held | None = None) -> IngestedF
 
 
 def _in_pieces(place: Path, reader: Reader, options: _OptionsFor | None) -> IngestedFile | None:
-    """Read a log in pieces if its reader can, else return None, as for UTF-16, which is converted at once."""
+    """Read a log in pieces if its reader can, else return None. UTF-16 is never read in pieces."""
     if reader.read_pieces is None or _raw(place, 2) in _UTF_16:
         return None
     chosen, digest = _options(place, options, _neighbour_reader(place)), hashlib.sha256()
@@ -565,7 +565,7 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
         raise InputError(f"the folder cannot be searched ({error})", path=folder) from error
     for place in places:
         if not place.is_file():  # links to folders are not followed, because they may form a circle
-            what = "a link to a folder; also name that folder" if place.is_dir() else "a link to nothing"
+            what = "a link to a folder; also name that folder" if place.is_dir() else "a broken link"
             skipped.append(Skipped(str(place), what))
             continue
         try:
@@ -624,7 +624,8 @@ MOST_NAMED = 6
 def account_rows(account: Mapping[str, Any], every_stream: bool = False) -> tuple[str, list[list[str]]]:
     """Return the folder that all paths share, and a row of :data:`ACCOUNT` per file.
 
-    If a kind has more than :data:`MOST_NAMED` streams, as in a wide table, only their number, unless ``every_stream``.
+    A kind with more than :data:`MOST_NAMED` streams, as in a wide table, is only counted, unless ``every_stream`` is
+    set.
     """
     folder = _common_folder([Path(file["path"]) for file in account["files"]])
     return folder, [_account_row(file, folder, every_stream) for file in account["files"]]
@@ -710,7 +711,7 @@ def _join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
 
 
 def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
-    """Join pieces to one log whose lines are theirs, one after the other."""
+    """Join pieces into one log that contains the lines of all pieces, one after the other."""
     pieces = sorted(file.sha256 for file in group)  # regardless of the names of the pieces
     digest = hashlib.sha256("".join(pieces).encode()).hexdigest()
     before = 0

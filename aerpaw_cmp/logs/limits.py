@@ -45,13 +45,14 @@ _GAIN_MPS2 = 10.0
 # Number of moves on either side of a step from which the speed is estimated.
 _AROUND = 3
 
-# Positions are stale from this duration [s] and this mean logged speed [m/s] on; a receiver reports once a second.
+# Positions are stale if they do not change for this duration [s] (a receiver reports once a second) at this mean logged
+# speed [m/s].
 _STALE_S, _STALE_MPS = 3.0, 1.0
 
 # A step back in time is shorter than this share of the neighbouring steps.
 _STEP_BACK_SHARE = 0.2
 
-# Units of times that were read as another one, and how much slower the track then is.
+# Mistakes in the unit of times, and the factor by which the track is slower in the right unit.
 _OTHER_UNITS = {
     "minutes, read as seconds": 60.0,
     "seconds, read as milliseconds": 1e3,
@@ -81,14 +82,14 @@ def jumps_of(frame: pd.DataFrame, what: str = "") -> tuple[BoolArray, str]:
         units = "; ".join(f"{unit}: {mps:.1f} m/s" for unit, mps in slower.items() if 0.5 < mps <= FASTEST_MPS)
         return none, (
             f"{what}: its positions imply {speed_mps:.0f} m/s throughout: are its times in another unit"
-            f"{units and f' ({units})'}, which the name of their column should contain, such as 'time [min]'?"
+            f"{units and f' ({units})'}? If so, write it into the name of their column, such as 'time [min]'"
         )
     astray, at_rest, fast_mps, at = _astray(time_s, place_m)
     if not astray.any() and speed_mps <= FASTEST_MPS:
         return none, ""
     if speed_mps > FASTEST_MPS or float((astray & ~at_rest).mean()) > _FEW_JUMPS_SHARE:
         return none, (
-            f"{what}: its positions change between places that cannot be reached in time: two vehicles, or two "
+            f"{what}: its positions jump between places that cannot be reached in time: two vehicles, or two "
             "receivers, in one table?"
         )
     out = none.copy()
@@ -130,7 +131,7 @@ _Pairs = Callable[[IntArray, IntArray], BoolArray]
 
 
 def _out_of_reach(time_s: FloatArray, place_m: FloatArray) -> _Pairs:
-    """Return a function of two arrays of rows: the mask of pairs that no aircraft flies in the time between them.
+    """Return a function of two arrays of rows that returns the mask of pairs that no aircraft can reach in time.
 
     The limits are the speed of the fastest aircraft, and the speed of this one around these rows plus its thrust.
 
@@ -170,7 +171,7 @@ def _runs(time_s: FloatArray, place_m: FloatArray) -> tuple[IntArray, IntArray]:
 
 
 def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
-    """Return the rows (n,) whose position stays the same while the logged speed moves on, and a sentence about them.
+    """Return the rows (n,) whose position does not change despite a logged speed, and a sentence about them.
 
     Parameters
     ----------
@@ -199,7 +200,7 @@ def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
     line, speed_mps = int(frame["line"].iloc[rows[begins[longest]]]), moved_m[longest] / lasts_s[longest]
     return none, (
         f"{what}: {counted(int(none.sum()), 'row is', 'rows are')} flagged {STALE}: positions "
-        f"stand still for {lasts_s[longest]:.0f} s from line {line} on, at a logged speed of {speed_mps:.1f} m/s; "
+        f"do not change for {lasts_s[longest]:.0f} s from line {line} on, at a logged speed of {speed_mps:.1f} m/s; "
         "read as missing"
     )
 
@@ -218,11 +219,11 @@ def _comes_back(time_s: FloatArray, place_m: FloatArray) -> bool:
 
 
 def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArray, float, int]:
-    """Return the rows (n,) off the track, those at rest at an end, the speed that the first implies, and its number.
+    """Return masks (n,) of rows off the track and of rows at rest at an end, and speed and row of the first.
 
     Rows between two fast steps form a run. The longest run that moves is the track. A run that the track cannot reach
-    in time is off it if it is short, or if it does not move and the log begins or ends with it. Any other run is a
-    continuation elsewhere, as after a time without fixes.
+    in time is off the track if it is short, or if it does not move and the log begins or ends with it. Any other run is
+    a continuation elsewhere, as after a time without fixes.
     """
     count = len(time_s)
     astray, at_rest = np.zeros((2, count), dtype=np.bool_)
@@ -297,7 +298,7 @@ _FEW_SHARE = 0.01
 # began later.
 _CLOCK_SET_NS = int(np.datetime64("2010-01-01", "ns").astype(np.int64))
 
-# At most this share, or this many, are "a few".
+# "A few" rows are at most this number, or at most a small share of the rows.
 _FEW_ROWS = 3
 
 # Flags of rows that no comparison scores (`flight/scored.py`). The other flags void the doubtful value itself.
@@ -328,7 +329,7 @@ def check(result: ReadResult) -> ReadResult:
 
 # AERPAW's sites, Lake Wheeler and Centennial Campus: latitude, longitude, and the radius of a site, all in degrees.
 SITES_DEG, NEAR_DEG = ((35.727, -78.696), (35.773, -78.677)), 0.3
-# Few take-offs are on a hill with most of the flight this far below [m].
+# Report a flight whose median height is this far below the take-off [m]: few take-offs are on such a hill.
 _BELOW_M = 15.0
 # Highest level that is possible in flight: reports of RSRP end at -31 dBm (3GPP TS 38.133, 10.1.6), those of RSRQ and
 # SINR do not.
@@ -397,7 +398,8 @@ class _Check:
         beyond: dict[str, BoolArray] = {}
         for name in names:
             value, (low, high) = self._values(name), ranges[name]
-            # test the least and greatest first, because masks of all columns of a large log take longer than reading it
+            # test the smallest and largest value first, because masks of all columns of a large log take longer than
+            # reading it
             least = np.fmin.reduce(value) if len(value) else np.nan
             if not np.isnan(least) and not (low <= least and np.fmax.reduce(value) <= high):
                 beyond[name] = (value < low) | (value > high)
@@ -423,14 +425,14 @@ class _Check:
         place = self.frame[[*PLACE[:2]]].median().to_numpy(dtype=np.float64)
         for how, other in (
             ("latitude and longitude swapped", place[::-1]),
-            ("western longitudes without their sign", place * [1, -1]),
+            ("western longitudes written without their sign", place * [1, -1]),
             ("they radians", np.degrees(place)),
             ("they 1e-6 deg, read as 1e-7 deg", place * 10),
         ):
             if (np.abs(np.array(SITES_DEG) - other) < NEAR_DEG).all(axis=1).any():
                 self._said.append(
                     f"{self._what}: the positions lie at latitude {place[0]:.3f}, longitude {place[1]:.3f}; "
-                    f"otherwise they lie at a site of AERPAW: are {how}?"
+                    f"read differently, they lie at a site of AERPAW: are {how}?"
                 )
 
     def _within_ports(self) -> None:
@@ -449,10 +451,10 @@ class _Check:
             return
         known = "another unit, an RSRQ, or an index?" if quantity in _MOST_DBM else "another unit, or an index?"
         first = f"{level[int(np.argmax(bad))]:g} dBm"
-        self._flag(bad, "level_out_of_range", first, f"which is received nowhere ({known})", ["rss_db"])
+        self._flag(bad, "level_out_of_range", first, f"which no receiver measures ({known})", ["rss_db"])
 
     def _mostly_above_zero(self) -> None:
-        """Report heights that are mostly below the take-off, as those that count downwards are."""
+        """Report heights that are mostly below the take-off, such as heights that count downwards."""
         height = self._values("altitude_m")
         if np.isfinite(height).any() and (middle := float(np.nanmedian(height))) < -_BELOW_M:
             self._said.append(

@@ -1,4 +1,4 @@
-"""Numeric and character arrays of MATLAB level-5 files, read so that a damaged file is a message.
+"""Numeric and character arrays of MATLAB level-5 files, read so that a damaged file only causes a message.
 
 SciPy's reader is compiled code that trusts the file: a single wrong byte can end the process with a segmentation
 fault. Here every size is checked before it is used. Full numeric arrays and character matrices are read, plain or
@@ -43,7 +43,7 @@ class _Element(NamedTuple):
 
 
 def _damaged(what: str) -> InputError:
-    return InputError(f"the MATLAB file is damaged ({what})", expected="a whole file", cause="a cut download")
+    return InputError(f"the MATLAB file is damaged ({what})", expected="a complete file", cause="a truncated download")
 
 
 def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArray]:
@@ -68,13 +68,13 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
 
     Notes
     -----
-    Version 7.3 is HDF5: arrays lie transposed, text as 16-bit codes under the attribute ``MATLAB_class``.
+    Version 7.3 is HDF5: arrays are transposed, text as 16-bit codes under the attribute ``MATLAB_class``.
     """
     if data.startswith(MAGIC_73):
         return _read_hdf5(data, wanted)
     if not data.startswith(MAGIC) or len(data) < 128:
         raise InputError(
-            "no MATLAB file",
+            "not a MATLAB file",
             expected="a file that begins with 'MATLAB 5.0 MAT-file' or 'MATLAB 7.3 MAT-file'",
             cause="another kind of file",
         )
@@ -126,7 +126,7 @@ def _letters(codes: AnyArray) -> AnyArray:
 
 
 def _elements(data: bytes, at: int, order: str, *, padded: bool, cut: bool = False) -> Iterator[_Element]:
-    """Yield elements one after the other, padded to eight bytes and perhaps small inside a variable.
+    """Yield elements one after the other, padded to eight bytes. Inside a variable, an element may have the small form.
 
     The last element of data that are ``cut`` may be truncated.
     """
@@ -158,12 +158,12 @@ def _inflated(element: _Element, order: str, most: int) -> _Element:
         raise _damaged(str(error)) from None
     if machine.unconsumed_tail:
         raise InputError(
-            f"the variables of the MATLAB file unpack to more than {most} bytes more",
-            expected=f"at most {MOST_BYTES >> 20} MiB each, in all {MOST_RATIO} times the file",
+            f"the variables of the MATLAB file unpack to more than {most} further bytes",
+            expected=f"at most {MOST_BYTES >> 20} MiB each, in all {MOST_RATIO} times the size of the file",
             cause="a file crafted to fill the memory",
         )
     if not machine.eof:
-        raise _damaged("a compressed variable is cut")
+        raise _damaged("a compressed variable is truncated")
     if len(plain) < 8:
         raise _damaged("an empty variable")
     kind, size = struct.unpack_from(order + "II", plain)

@@ -3,7 +3,7 @@
 A reader is a pure function of bytes: no file, no port. Each format module builds one :class:`Reader` and
 lists it in the catalogue that the entry-point group ``aerpaw_cmp.readers`` names.
 
-Provenance of a stream's clock, height datum and identity: written in the file, stated by its program, or assumed.
+The clock, the height datum and the identity of each stream are written in the file, known from its program, or assumed.
 
 Attributes ``clock_from``, ``height_from`` (streams with altitudes) and ``identity_from`` (levels and ranks) are one of
 ``written``, ``program``, ``assumed``; ``clock_source`` and ``height_source`` describe the program or the assumption.
@@ -39,13 +39,14 @@ class ReadOptions:
     Parameters
     ----------
     timezone : str, optional
-        IANA zone of zone-less clocks. A reader raises ``UsageError`` if it needs the zone.
+        IANA zone of clocks without a zone. A reader raises ``UsageError`` if it needs the zone.
     clock : {"local", "utc", "local_as_utc"}, optional
         Overrides the reader's own rule; ``local_as_utc`` is local wall time stored as if it were UTC.
     time_origin : str, optional
         ISO time (with zone, or local in ``timezone``) of a log whose times are relative.
     gps_rollovers : int
-        How often the week number of the log's GPS receiver has rolled over: each adds 1 024 weeks to its times.
+        How often the week number of the log's GPS receiver has rolled over. Each rollover adds 1 024 weeks to the
+        times.
     ri_base : {"zero", "one"}, optional
         Number that the source prints for rank 1. Readers of formats with a fixed base ignore it.
     columns : mapping, optional
@@ -53,11 +54,11 @@ class ReadOptions:
     kind : str, optional
         Generic CSV only.
     node, channel : str, optional
-        Which tower and which channel the log belongs to.
+        Tower and channel to which the log belongs.
     frequency_hz : float, optional
         Carrier.
     unit : str, optional
-        Unit of RSS where the file does not fix it.
+        Unit of RSS, if the file does not specify it.
     floor_db : float
         RSS at or below this is out of coverage.
     file_name : str
@@ -107,8 +108,8 @@ class Reader:
         ``read_pieces(pieces, options) -> ReadResult``: the same from pieces of whole lines, for logs larger than
         memory; see :mod:`aerpaw_cmp.logs.files`.
     clock_from, height_from : str
-        ``written``, ``program: which``, or ``assumed: what``; see :mod:`aerpaw_cmp.logs.readers`. A stream's own
-        attribute of that name wins.
+        ``written``, ``program: which``, or ``assumed: what``; see :mod:`aerpaw_cmp.logs.readers`. An attribute
+        of this name in a stream has precedence.
     plugin : str
         Entry point of a third-party reader; set by :func:`catalogue`.
     """
@@ -128,7 +129,7 @@ class Reader:
 
 @contextmanager
 def blaming(plugin: str, doing: str, kind: type[AerpawCmpError] = UsageError) -> Iterator[None]:
-    """Name the plug-in in errors that its code raises, unless the name is empty, as for this project."""
+    """Name the plug-in in errors that its code raises, unless the name is empty, as for readers of this project."""
     try:
         yield
     except Exception as error:
@@ -214,7 +215,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
     Raises
     ------
     InputError
-        If none does, if several do (they are named), or if the content is empty or a Git-LFS pointer.
+        If no reader or several readers accept the content, or if it is empty or a Git-LFS pointer.
     """
     if not data.strip():
         raise InputError("the file is empty", expected="log lines", cause="an aborted run", path=path)
@@ -229,7 +230,9 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
         )
     known = claims(data)
     if known and not known[0].kinds:
-        raise InputError(f"no log: {known[0].title}", expected="one of the formats of 'aerpaw-cmp formats'", path=path)
+        raise InputError(
+            f"not a log: {known[0].title}", expected="one of the formats of 'aerpaw-cmp formats'", path=path
+        )
     if len(known) == 1:
         return known[0]
     if known:
@@ -242,7 +245,9 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
         )
     binary = b"\0" in head
     raise InputError(
-        "binary content that no reader recognises" if binary else f"no reader knows this content: {_excerpt(head)}",
+        "binary content that no reader recognises"
+        if binary
+        else f"no reader recognises this content: {_excerpt(head)}",
         expected="one of the formats of 'aerpaw-cmp formats'",
         cause="another kind of file, or a damaged one" if binary else _way_out(head),
         path=path,
@@ -257,7 +262,7 @@ def _way_out(head: bytes) -> str:
     names = [name.strip().strip('"') for name in first.split(sign)]
     if len(names) > 1 and not first.startswith(("{", "[", "<", "$")) and all(not name[:1].isdigit() for name in names):
         if len(head) == HEAD_BYTES and b"\n" not in head:
-            return f"no line ends in the first {HEAD_BYTES >> 10} KiB: an aborted copy, or no table"
+            return f"no line ends in the first {HEAD_BYTES >> 10} KiB: an aborted copy, or not a table"
         return _way_to_map(names)
     words = re.split(r"[,;\s|]+", first)
     if len(words) > 1 and (re.fullmatch(r"[-+.\d]+", words[0] + words[-1]) or "time" in words):
@@ -265,7 +270,7 @@ def _way_out(head: bytes) -> str:
     return "a log of a kind that is not supported: docs/adding_a_reader.md"
 
 
-# Words that a column of a quantity may have in its name, where the dictionary does not know it; the surest first.
+# Words in column names that the dictionary does not know, by quantity; the most reliable word first.
 _LIKE = {
     "time": (r"time", r"date|clock|stamp|epoch|utc|^when"), "latitude_deg": (r"\blat",),
     "longitude_deg": (r"\b(lon|lng)",), "altitude_m": (r"\b(alt|height|elev)",),

@@ -59,7 +59,7 @@ class Stream:
     Parameters
     ----------
     kind : {"telemetry", "rss", "rank", "kpi"}
-        Decides the columns, see the module text.
+        The kind, which decides the columns (see the module text).
     name : str
         Unique within the file, e.g. ``"vehicle"``, ``"power"``, ``"USRP1"``.
     frame : pandas.DataFrame

@@ -1,13 +1,13 @@
 """Routes of an aircraft, from a plan, a map, a table of waypoints, or the log of an earlier flight.
 
 =====================  ============================================================================================
-file                   heights are brought to take-off by
+file                   source of heights above take-off
 =====================  ============================================================================================
-QGroundControl `.plan`  the frame of each item: relative, or sea level less the planned home position's
-`QGC WPL 110` text      the frame of each line: relative, or sea level less that of line 0, the home
-KML                     ``relativeToGround``; ``absolute`` less the first point's, with a remark
-CSV                     nothing: above take-off (a column that says sea level is refused); feet become metres
-a log with positions    the log's reader
+QGroundControl `.plan`  the frame of each item: relative, or sea level minus that of the planned home position
+`QGC WPL 110` text      the frame of each line: relative, or sea level minus that of line 0, the home
+KML                     ``relativeToGround``; ``absolute`` minus that of the first point, with a remark
+CSV                     the column: above take-off (a column of heights above sea level is refused); feet become metres
+a log with positions    the reader of the log
 =====================  ============================================================================================
 """
 
@@ -47,8 +47,8 @@ _TAKEOFFS, _LANDINGS, _TURN, _RETURN = (22, 84), (21, 85), 115, 20
 _ARDUPILOT = 3
 
 
-# Most points of a route or table, and most bytes of its file. A larger file is a log or a mistake, and is refused
-# before all of it is in memory.
+# Largest number of points of a route or table, and largest size of its file. A larger file is a log or a mistake, and
+# is refused before all of it is in memory.
 MOST_POINTS = 2_000_000
 MOST_BYTES = 256 << 20
 
@@ -255,7 +255,7 @@ def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, name
         if item.command == _TURN and route.points:
             _turn(route, item)
         if item.command == _RETURN:
-            route.remark("The return to the take-off at the end is left out.")
+            route.remark("The return to the take-off at the end is ignored.")
         if not (latitude or longitude) or math.isnan(latitude):  # 0, 0 and null mean the current position
             latitude, longitude = place
         if item.command not in (*_WAYPOINTS, *_TAKEOFFS, *_LANDINGS) or math.isnan(latitude):
@@ -269,7 +269,7 @@ def _turn(route: _Route, item: _Item) -> None:
     """Set the yaw of the last point by CONDITION_YAW."""
     degrees, direction, relative = item.numbers[0], item.numbers[2], item.numbers[3]
     if relative == 1:
-        route.remark("Turns relative to the course before them are left out.")
+        route.remark("Turns relative to the course are ignored.")
     # -1, 0 or 1; anything else is another program's parameter
     elif math.isfinite(degrees) and abs(direction) <= 1:
         route.points[-1] = (*route.points[-1][:3], degrees, math.nan)
@@ -288,7 +288,7 @@ def _height(route: _Route, item: _Item, height: float, home: tuple[float, ...]) 
             )
         return height - home[2]
     if item.frame in _TERRAIN_FRAMES:
-        route.remark("Heights above the ground below each point are taken as heights above take-off.")
+        route.remark("Heights above the ground below each point are used as heights above take-off.")
     elif item.frame not in _RELATIVE_FRAMES:
         raise InputError(f"a waypoint in MAVLink frame {item.frame}", expected="frames 0, 3, 5, 6, 10 or 11")
     return height
@@ -313,8 +313,8 @@ def _kml(data: bytes) -> _Route:
     shapes = list(outermost(root, {"LineString", "Point", "Track"}))
     lines = [shape for shape in shapes if plain_tag(shape.tag) != "Point"]
     if not lines and len(shapes) < 2:
-        what = "a geofence, which has areas alone" if any(named(root, "Polygon")) else "a map without a line"
-        raise InputError(f"no route: {what}", expected="a KML with a line (LineString, gx:Track) or points")
+        what = "a geofence, which has only areas" if any(named(root, "Polygon")) else "a map without a line"
+        raise InputError(f"not a route: {what}", expected="a KML with a line (LineString, gx:Track) or points")
     route, sea_level = _Route(), False
     if len(lines) > 1:
         route.remark(f"{len(lines)} lines are flown one after the other.")
@@ -337,7 +337,9 @@ def _kml(data: bytes) -> _Route:
                 cause="a line drawn at one height",
             )
         route.points = [(*point[:2], point[2] - zero, *point[3:]) for point in route.points]
-        route.remark(f"Heights are above sea level: the first point's, {zero:.1f} m, is taken as the take-off's.")
+        route.remark(
+            f"Heights are above sea level: that of the first point, {zero:.1f} m, is used as that of the take-off."
+        )
     return route
 
 

@@ -82,7 +82,7 @@ class Rows:
     data: bytes = field(default=b"", repr=False)
 
     def __len__(self) -> int:
-        """Count the rows."""
+        """Return the number of rows."""
         return len(self.row)
 
     def number(self, name: str, *, none: Iterable[bytes] = (b"n/a", b"-")) -> FloatArray:
@@ -221,7 +221,7 @@ def matched(
     Raises
     ------
     UsageError
-        If a zone-less clock has no zone.
+        If the clock has no zone and none is given.
     """
     lines = _text.split(data)
     rows, groups = _text.match(lines, pattern)
@@ -308,14 +308,14 @@ _FLIGHT_S = 9.0e9
 def instants_of(
     cells: AnyArray, options: ReadOptions, *, clock: str, reader: str
 ) -> tuple[bool, _text.Instants, BoolArray]:
-    """Return the instants of a column of times.
+    """Convert a column of times to UTC.
 
     Parameters
     ----------
     cells : bytes or float array, shape (n,)
     options : ReadOptions
     clock : str
-        ``wall`` (text, local unless it carries an offset), ``epoch_s``, ``epoch_ms``, ``epoch_us`` (UTC),
+        ``wall`` (text, local unless it has an offset), ``epoch_s``, ``epoch_ms``, ``epoch_us`` (UTC),
         ``relative_ns`` .. ``relative_h`` (from ``time_origin``, else from 1970-01-01).
     reader : str
         Its name, for messages.
@@ -514,7 +514,8 @@ def reader(
     name, title, kinds, sample
         The same as in :class:`aerpaw_cmp.logs.readers.Reader`.
     row : re.Pattern or callable
-        See :func:`aerpaw_cmp.logs.rows.matched`. A callable makes it from the file, for instance from its header.
+        See :func:`aerpaw_cmp.logs.rows.matched`. A callable returns the pattern for a file, for instance from its
+        header.
     streams : callable
         ``streams(rows)`` returns the streams of the rows.
     header : re.Pattern, optional
@@ -523,8 +524,8 @@ def reader(
     mark : re.Pattern, optional
         MULTILINE; a line by which a console is recognised.
     torn : re.Pattern, optional
-        The beginning of a row of a console: a line with it that is not a row is rejected, all other lines are comments.
-        Without it, every line that is neither a row nor the header is rejected.
+        The beginning of a row of a console. A line that begins in this way but is not a row is rejected, and all other
+        lines are comments. If it is None, every line that is neither a row nor the header is rejected.
     otherwise : str
         Reason of rejected lines.
     fields : int
@@ -543,9 +544,11 @@ def reader(
         if header is not None and header.fullmatch(line):
             return None
         if torn is not None:
-            return "an incomplete row (torn line?)" if torn.match(line) else None
+            return "an incomplete row (truncated line?)" if torn.match(line) else None
         count = line.count(b",") + 1
-        return f"{counted(count, 'field')}, expected {fields} (torn line?)" if fields not in (0, count) else otherwise
+        return (
+            f"{counted(count, 'field')}, expected {fields} (truncated line?)" if fields not in (0, count) else otherwise
+        )
 
     def read(data: bytes, options: ReadOptions) -> ReadResult:
         pattern = row if isinstance(row, re.Pattern) else row(data)

@@ -27,7 +27,7 @@ from ..common.units import AnyArray, BoolArray, IntArray
 from .readers import ReadOptions
 from .records import COLUMNS, KEPT_REJECTED, Attribute, Kind, RejectedLine, RejectedReason, by_reason
 
-# Characters of a rejected line that are stored.
+# Largest number of characters of a rejected line that are stored.
 TEXT_LIMIT = 500
 
 # Flag of a record in a last line without line end: its last field may be cut short.
@@ -43,14 +43,14 @@ NUMBER = rb"[-+]?\d{1,400}(?:\.\d{0,400})?(?:[eE][-+]?\d{1,400})?"
 
 @dataclass(frozen=True)
 class Lines:
-    """The lines of ``data``: line ``i`` (0-based) is ``data[starts[i]:ends[i]]``, its line end left out."""
+    """The lines of ``data``: line ``i`` (0-based) is ``data[starts[i]:ends[i]]``, without its line end."""
 
     data: bytes
     starts: IntArray
     ends: IntArray
 
     def __len__(self) -> int:
-        """Count the lines."""
+        """Return the number of lines."""
         return len(self.starts)
 
     @cached_property
@@ -60,12 +60,12 @@ class Lines:
 
     @property
     def unterminated(self) -> bool:
-        """True if the last line lacks its line end."""
+        """True if the last line has no line end."""
         return bool(self.data) and not self.data.endswith(b"\n")
 
     @cached_property
     def blank(self) -> BoolArray:
-        """Mask of lines that contain white space only."""
+        """The mask of lines that contain only white space."""
         empty = self.ends <= self.starts
         # only lines that begin with white space can be blank, so that few lines are tested one by one
         first = self.buffer[np.minimum(self.starts, max(len(self.data) - 1, 0))] if len(self) else np.empty(0, np.uint8)
@@ -109,7 +109,7 @@ class Lines:
         return np.asarray(self.buffer[starts[:, None] + np.arange(width)])
 
 
-# Bytes that are searched at a time: they fit in the processor's cache.
+# Number of bytes that are searched at a time. They fit in the processor's cache.
 _SLICE = 1 << 17
 
 
@@ -244,7 +244,7 @@ def columns(groups: list[tuple[bytes, ...]], count: int) -> list[AnyArray]:
 
 
 def cells(texts: Sequence[bytes]) -> AnyArray:
-    """Return texts as an array of bytes, also of an empty list."""
+    """Return texts as an array of bytes, also for an empty list."""
     return np.array(texts or [b""], dtype=np.bytes_)[: len(texts)]
 
 
@@ -264,7 +264,7 @@ def no_flags(count: int) -> AnyArray:
 
 
 def add_flag(column: AnyArray, mask: BoolArray, reason: str) -> None:
-    """Add a reason where the mask holds, in place."""
+    """Add a reason to the flags in place where the mask is true."""
     if mask.any():
         old = column[mask]
         if (old != "").any():
@@ -292,7 +292,7 @@ _AMBIGUOUS = "ambiguous_local_time"
 _NONEXISTENT = "nonexistent_local_time"
 # Wall clock as AERPAW tools write it (bytes pattern, no group).
 TIME = rb"\d{4}[-/]\d\d[-/]\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,9})?"
-# Optional offset behind :data:`TIME`.
+# Optional offset after :data:`TIME`.
 ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
 
 # Ambiguous abbreviations: winter time that is also written in summer, and names that several countries use. Each has
@@ -361,7 +361,7 @@ def zone(name: str | None, *, needed_by: str) -> tzinfo:
     """Return the named zone, or raise ``UsageError`` with the key ``timezone:`` if there is no name."""
     if not name:
         raise UsageError(
-            f"no time zone for the zone-less clock of {needed_by}",
+            f"no time zone for the clock of {needed_by}, which has no zone",
             expected="the key 'timezone:' or --timezone, e.g. America/New_York",
             cause="the log writes local wall time without an offset",
         )
@@ -422,8 +422,8 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     hours, turned = WINTER.get(name or "", ((0.0, ""),))[0]
     if turned and (first != _offsets_s(buckets, zone(turned, needed_by=needed_by), 0)).any():
         raise UsageError(
-            f"{name} is a winter time, and times of {needed_by} lie in summer",
-            expected=f"timezone: {turned} (clocks are turned) or Etc/GMT{-hours:+.0f} (they are not)",
+            f"{name} is a winter time, but times of {needed_by} are in summer",
+            expected=f"timezone: {turned} (with summer time) or Etc/GMT{-hours:+.0f} (without)",
         )
     length = np.diff(np.append(starts, len(wall_ns)))
     if np.array_equal(first, second):
@@ -440,7 +440,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     warnings = []
     if ambiguous.any():
         warnings.append(
-            f"{counted(int(ambiguous.sum()), 'time')} in the hour that {name} had twice: read as daylight time "
+            f"{counted(int(ambiguous.sum()), 'time')} in the hour that occurs twice in {name}: read as daylight time "
             f"until the log's clock steps back; flagged {_AMBIGUOUS}"
         )
     if nonexistent.any():
@@ -624,10 +624,10 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
         return Instants(utc, ambiguous, nonexistent, zoned=bool(valid.any())), valid
     zones = np.unique(offset[zoned & valid])
     alike = (wall[naive] - zones[0] * 1_000_000_000).astype("datetime64[ns]") if len(zones) == 1 else None
-    if alike is not None and _beside(alike, utc[zoned & valid]):
+    if alike is not None and _are_near(alike, utc[zoned & valid]):
         # one program wrote all rows, so times without a zone have the zone of the other times
         where = f"UTC {zones[0] / 3600:+g} h"
-        text = f"{counted(int(naive.sum()), 'time')} without a zone between times at {where}: read as at {where}, too"
+        text = f"{counted(int(naive.sum()), 'time')} without a zone between times at {where}: read with the same zone"
         utc[naive] = alike
         return Instants(utc, ambiguous, nonexistent, (text,), zoned=True), valid
     local = wall_to_utc(wall[naive], options, needed_by=needed_by)
@@ -635,7 +635,7 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
     return Instants(utc, ambiguous, nonexistent, local.warnings), valid
 
 
-def _beside(times: AnyArray, others: AnyArray) -> bool:
+def _are_near(times: AnyArray, others: AnyArray) -> bool:
     """Check whether most times lie within a quarter of an hour of some others."""
     ordered = np.sort(others)
     at = np.searchsorted(ordered, times)

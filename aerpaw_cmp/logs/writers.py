@@ -1,7 +1,7 @@
-"""Records to the bytes of real AERPAW log formats, the inverse of the readers: what ``simulate`` writes.
+"""Conversion of records to the bytes of real AERPAW log formats, for ``simulate``: the inverse of the readers.
 
-Pure functions of arrays; nothing here opens a file. Layouts follow the tools that write the real logs, to the
-column: CR LF line ends where Python's ``csv`` wrote them, octal offsets and ``*`` runs where ``od`` did.
+Pure functions of arrays; nothing here opens a file. Layouts are exactly those of the tools that write the real
+logs: CR LF line ends where Python's ``csv`` wrote them, octal offsets and ``*`` runs where ``od`` did.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]
     times : array of datetime64
         UTC.
     timezone : str
-        IANA zone of the clock that the log pretends to have.
+        IANA zone of the simulated clock.
     digits : int
         Digits of the fraction, 0, 3 or 6; cut, not rounded, as ``strftime`` does.
 
@@ -127,7 +127,8 @@ def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str) -> byte
     -----
     Repeated samples are replaced by one ``*``, as ``od`` does without ``-v``.
 
-    If the log ends inside such a run, the closing offset of od is written, because its length would be lost.
+    If the log ends inside such a run, the closing offset of od is written, because otherwise the length of the run
+    would be lost.
     """
     level = unmasked(rss_db)
     # float32 as in the sounder, so that equal samples have equal digits

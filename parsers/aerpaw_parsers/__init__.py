@@ -1,6 +1,6 @@
 """The log formats, one module each, and their catalogue ``READERS``, which aerpaw-cmp finds by its entry point.
 
-A module has its reader in ``READER``, or several in ``READERS``.
+A module contains its reader in ``READER``, or several readers in ``READERS``.
 """
 
 from __future__ import annotations

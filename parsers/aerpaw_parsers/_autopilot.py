@@ -1,7 +1,7 @@
 """The pose of an aircraft, from the messages of any autopilot.
 
-Positions have their own times, and attitude and velocity are those of the nearest message. Heights count from the home
-at take-off, not from an earlier or later home.
+Positions have their own times; attitude and velocity are those of the message nearest in time. Heights are above the
+home at take-off, not above an earlier or later home.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from aerpaw_cmp.readers import NO_TIME, RELATIVE, ReadOptions, ReadResult, Rejec
 
 from . import _pose, _stamps
 
-# An attitude that is farther in time from a position than this is not used for it [s].
+# Largest time between a position and the attitude that is used for it [s].
 _NEAR_S = 0.5
 
 
@@ -31,7 +31,7 @@ class Series:
     columns: dict[str, FloatArray] = field(default_factory=dict)
 
     def near(self, name: str, time_s: FloatArray) -> FloatArray:
-        """Return a column at other times, from the nearest message, NaN if there is no message nearby."""
+        """Return a column at other times, from the message nearest in time, NaN if there is no message nearby."""
         if not len(self.time_s) or name not in self.columns:
             return np.full(len(time_s), np.nan)
         after = np.clip(np.searchsorted(self.time_s, time_s), 0, len(self.time_s) - 1)
@@ -41,7 +41,7 @@ class Series:
         return np.where(np.abs(self.time_s[best] - time_s) <= _NEAR_S, self.columns[name][best], np.nan)
 
 
-# Autopilots count seconds since 1970 or since power-on; larger times are damaged and do not fit in ns.
+# Latest valid time [s]. Autopilots count from 1970 or from power-on; a later time is damaged and overflows in ns.
 _MOST_S = 4e9
 
 NONE = Series(np.zeros(0), np.zeros(0, dtype=np.int64))
@@ -75,8 +75,8 @@ class Flight:
     utc_minus_clock_s : float or None
         See :func:`offset_s`.
     home : Series
-        ``altitude_m`` of home above sea level, at all times that the log has it. Altitudes of positions are then above
-        sea level, else above home or above the first position.
+        ``altitude_m`` of home above sea level, each time that the log contains it. If home is known, altitudes of
+        positions are above sea level, else above home or above the first position.
     source : str
         Name of the program.
     name : str
@@ -112,10 +112,10 @@ def result(
     flights : list of Flight
         One or more flights, one per vehicle.
     messages : int
-        Number of intact messages, without ``damaged``.
+        Number of intact messages; those in ``damaged`` are not counted.
     damaged : list of RejectedLine
     radio : Series
-        ``RSSI``, ``RemRSSI``, ``Noise`` and ``RemNoise`` of the telemetry radio, in its steps.
+        ``RSSI``, ``RemRSSI``, ``Noise`` and ``RemNoise`` of the telemetry radio, in the radio's steps.
     """
     zero_ns, offset = _text.origin_ns(options, needed_by=reader), flights[0].utc_minus_clock_s
     if offset is not None:
@@ -135,7 +135,7 @@ def result(
     )  # fmt: skip
     if not len(rows):
         return rows.result([])
-    rows.warnings += ["no message carries UTC: " + RELATIVE] if rows.relative else []
+    rows.warnings += ["no message contains UTC: " + RELATIVE] if rows.relative else []
     if len(flights) > 1:
         systems = ", ".join(str(flight.system) for flight in flights)
         rows.warnings.append(f"{len(flights)} vehicles (systems {systems}): each has a separate track")
@@ -144,7 +144,7 @@ def result(
     return rows.result([*tracks, *_radio(rows.part(of == len(flights)), radio, timed[owner == len(flights)])])
 
 
-# Channels of the radio: its own receiver and that of the other end, each with its noise.
+# Channel names: level and noise at this end of the telemetry link, and at the remote end.
 _ENDS = {"RSSI": "radio", "RemRSSI": "radio_remote", "Noise": "radio_noise", "RemNoise": "radio_remote_noise"}
 
 
@@ -188,12 +188,13 @@ def _track(rows: Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     return rows.stream("telemetry", flight.name, values, source=flight.source, system=flight.system)
 
 
-# Positions of the filter and of the receiver usually differ by less than this [m], because a filter follows in seconds.
+# Distance [m] between filter and receiver that is suspicious, because a filter follows the receiver within seconds, the
+# share of such positions that is reported, and the number of a 3-D fix.
 _APART_M, _APART_SHARE, _FIX_3D = 15.0, 0.05, 3
 
 
 def _apart(flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> list[str]:
-    """Return a sentence if positions of the autopilot are far from those of its receiver."""
+    """Return a warning if the positions of the autopilot are far from those of its receiver."""
     fixed = flight.fix.near("fix", time_s) >= _FIX_3D
     there_n, there_e = (np.where(fixed, flight.fix.near(name, time_s), np.nan) for name in _pose.PLACE[:2])
     here_n, here_e = (values[name] for name in _pose.PLACE[:2])
@@ -206,7 +207,7 @@ def _apart(flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> l
         return []
     return [
         f"{int(far.sum())} of {counted(int(both), 'position')} are {np.median(apart_m[far]):.0f} m (median) from those "
-        "of the receiver in the same log: one of the two is wrong; the autopilot's own were read"
+        "of the receiver in the same log. One of the two is wrong; the autopilot's positions are used."
     ]
 
 
@@ -222,7 +223,9 @@ def _height(rows: Rows, flight: Flight, time_s: FloatArray, values: dict[str, An
         astray = _pose.astray(rows, values)[known]
         known = known[~astray] if not astray.all() else known
         rest = _pose.at_rest(rows.time[known], *(values[name][known] for name in _pose.PLACE))
-        rows.warnings.append(f"no home is known: heights count from {'the first position' if rest is None else 'rest'}")
+        rows.warnings.append(
+            f"no home is known: heights are above {'the first position' if rest is None else 'the ground at rest'}"
+        )
         return altitude - float(altitude[known[0]] if rest is None else rest)
     home_m = columns["altitude_m"][home]
     return _pose.above_home(rows, time_s, altitude, flight.home.time_s[home], home_m)

@@ -74,9 +74,10 @@ def streams(
 ) -> list[Stream]:  # fmt: skip
     """Return a stream per cell, which is a radio access, PCI and carrier. Every reading with a level is a record.
 
-    A cell serves from the moment at which the log names it until the log names another one of the same radio access. A
-    PCI with one carrier in the log is one cell, also in readings without a carrier. With several carriers, each is a
-    cell. A second reading of a cell in one row of the log is flagged ``cell_twice``.
+    A cell serves from the moment at which the log names it until the log names another cell of the same radio access.
+    If a PCI occurs with one carrier, readings without a carrier belong to the same cell. If it occurs with several
+    carriers, each carrier is a separate cell. A second reading of a cell in one row of the log is flagged
+    ``cell_twice``.
 
     Parameters
     ----------
@@ -87,7 +88,7 @@ def streams(
     quantity : str
         Quantity of the levels.
     more : mapping, optional
-        Further attributes of the cells, by ``more`` of the readings.
+        Further attributes of the cells; the keys are values of ``more`` in the readings.
     """
     rows_or_table = readings if isinstance(readings, pd.DataFrame) else [*readings]
     table = pd.DataFrame(rows_or_table, columns=list(Reading._fields))
@@ -143,7 +144,7 @@ def _stream(rows: Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attr
             f"{_RANGE_DBM[1]:g} dBm (the first: {level[outside][0]:g}; another unit, or an index?): "
             "read as out of coverage"
         )
-    # phones write the end of the scale (3GPP TS 36.133, 9.1.4) without a signal; a weak cell fades down to it
+    # phones write the lowest value (3GPP TS 36.133, 9.1.4) if there is no signal; a weak cell approaches it gradually
     ends = (level == _END_DBM) & (about["quantity"] == "RSRP")
     if ends.any() and not ((level > _END_DBM) & (level < _END_DBM + 10.0)).any():
         outside |= ends
@@ -172,7 +173,7 @@ def named(
     rows: Rows, name: str, values: FloatArray, *, unit: str = "", where: BoolArray | None = None,
     about: Mapping[str, Attribute | None] | None = None, alone: bool = False,
 ) -> Stream | None:  # fmt: skip
-    """Return the level or KPI stream of a column by its name, or a KPI if the name is unknown.
+    """Return the stream of a column, a level or a KPI according to its name. An unknown name is a KPI.
 
     Levels of neighbours without an identity, levels at the base station, statistics and predictions are KPIs.
 

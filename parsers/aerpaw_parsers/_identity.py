@@ -1,8 +1,8 @@
 """The identity of a reading: the combination of all columns that name a device, a network, a cell or a beam.
 
-A column joins the key of a series if it distinguishes rows that the other columns of the key do not distinguish. The
-number of a cell does so next to a PCI only if one PCI has two numbers. A column with an unknown name joins the key if
-its values distinguish rows of one time, or if they and the level take turns from row to row.
+A column joins the key of a series if it distinguishes rows that the other columns of the key do not distinguish. If
+there is a PCI, the number of a cell joins only if one PCI occurs with two numbers. A column with an unknown name joins
+if its values distinguish rows with the same time, or if its values and the level change together in a fixed order.
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ def parts(
     rows : Rows
     sheet : Sheet
     keys : str
-        Quantities of the dictionary, such as ``device`` or ``network``; the combination of all their columns counts.
+        Quantities of the dictionary, such as ``device`` or ``network``. The identity is the combination of all columns
+        of these quantities.
     found : bool
-        Look for columns of unknown names that distinguish rows, too.
+        Whether to look also for columns with unknown names that distinguish rows.
     level : int, optional
         The column of levels, if its name does not show it.
 
@@ -66,7 +67,8 @@ def parts(
     for i in several:
         empty = [texts[i][row] for row in picked].count("")
         if empty > _MOSTLY * len(picked):
-            text = f"is empty in {counted(empty, 'row')}, a series of their own: are its cells merged? Then fill them"
+            text = f"is empty in {counted(empty, 'row')}, which become a separate series"
+            text = f"{text}: are its cells merged? If so, fill them"
             rows.warnings.append(f"column {sheet.names[i]!r} {text}")
     if unknown := [sheet.names[i] for i in several if i in marks and sheet.meanings[i] is None]:
         shown = ", ".join(map(repr, unknown))
@@ -97,7 +99,7 @@ def _values(texts: _Texts) -> dict[int, set[str]]:
 
 
 def _levels(sheet: _sheet.Sheet) -> AnyArray:
-    """Return which levels, ratios and ranks each row has, as bytes that are empty if it has none."""
+    """Return for each row, as bytes, which levels, ratios and ranks it has. The bytes are empty if it has none."""
     columns = [
         np.isfinite(sheet.numbers(i))
         for i, meaning in enumerate(sheet.meanings)
@@ -108,7 +110,7 @@ def _levels(sheet: _sheet.Sheet) -> AnyArray:
 
 
 def _with_level(sheet: _sheet.Sheet) -> BoolArray:
-    """Return the mask of the rows with a level, a ratio or a rank, of all rows if the table has none."""
+    """Return the mask of the rows with a level, a ratio or a rank, or of all rows if no row has any."""
     filled: BoolArray = _levels(sheet) != b""
     return filled if filled.any() else np.ones(len(sheet), dtype=bool)
 
@@ -123,7 +125,7 @@ def dividing_columns(texts: _Texts, counts: BoolArray, base: Sequence[str] = ())
     counts : bool array, shape (n,)
         Rows that are considered.
     base : sequence of str, length n, optional
-        Identity that is known before.
+        Part of the identity of each row that is already known.
     """
     picked = np.flatnonzero(counts).tolist()
     key = [base[row] for row in picked] if len(base) else [""] * len(picked)
@@ -141,13 +143,13 @@ def dividing_columns(texts: _Texts, counts: BoolArray, base: Sequence[str] = ())
 
 
 def _is_divided(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
-    """Check whether a key has two values of a column, without the few rows in which a program lags."""
+    """Check whether a key has two values of a column, ignoring the few rows in which a program lags."""
     totals, values = Counter[str](), Counter[str]()
     for (before, _), count in counts.items():
         totals[before] += count
     several = len(totals) > 1
     for (before, _), count in counts.items():
-        # next to another column, a value in few rows is its delay; in a column alone, each value counts
+        # if the key has other columns, a value in few rows is a delay; if it has none, each value counts
         lag = count <= _LAG_ROWS and count <= _LAG_SHARE * totals[before]
         values[before] += not (lag and (several or alone))
     return max(values.values(), default=0) > 1
@@ -170,8 +172,9 @@ def cell_columns(sheet: _sheet.Sheet) -> list[int]:
 def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int], level: int | None) -> list[int]:
     """Return the columns without a known quantity whose values are separate networks or devices.
 
-    Such columns are the names of cells if there is no PCI, and columns that take turns with the level. A node, a beam
-    or a direction is found because most times have several rows without it. Devices also differ in their positions.
+    Such columns contain names of cells if there is no PCI, or change together with the level in a fixed order. A column
+    of nodes, beams or directions is found because many rows have the same time and key without it. Devices also differ
+    in their positions.
     """
     key = keys[0]
     marks = cell_columns(sheet) if key == "network" and ("PCI" in keys or sheet.find("PCI") is None) else []
@@ -188,7 +191,7 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
         i for i, m in enumerate(sheet.meanings) if m is None and i not in marks and not _OTHERS.search(sheet.plain[i])
     ]
     while (repeated := table.duplicated().mean()) >= _REPEATED:
-        # add the column after which fewest rows share their time and key, then look for another one
+        # add the column that leaves the fewest rows with the same time and key, then look for another column
         left = {i: table.assign(mark=sheet.texts(i)).duplicated().mean() for i in unknown if _few(sheet.texts(i))}
         best = min(left, key=lambda i: left[i], default=-1)
         if best < 0 or left[best] > repeated - _REPEATED / 2:
@@ -209,14 +212,14 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
             marks += [i] if in_turns else []
             if alternates and not in_turns:
                 rows.warnings.append(
-                    f"column {sheet.names[i]!r}: the level steps with its values from row to row, but they do not take "
-                    "turns: does it name the device or cell of a row? Then call it 'device'"
+                    f"column {sheet.names[i]!r}: the level changes with its values from row to row, but not in a "
+                    "fixed order: does it name the device or cell of a row? If so, call it 'device'"
                 )
     return marks
 
 
 def _of_one_key(table: pd.DataFrame) -> BoolArray:
-    """Return the mask of the rows with the most frequent key, of all rows if there is no key."""
+    """Return the mask of the rows with the most frequent key, or of all rows if there is no key."""
     if not table.shape[1]:
         return np.ones(len(table), dtype=bool)
     key = table.groupby(list(table.columns), sort=False).ngroup().to_numpy()
@@ -231,14 +234,15 @@ def _few(texts: Iterable[str]) -> bool:
     return 1 < len({*texts}) <= _MOST_MARKS
 
 
-# Values alternate if this share of the rows differs from the row before. In addition, the median step of the level
-# within a value is below this share of the median step between values. They take turns if this share of the rows
-# repeats the order of the rows before.
+# A column and the level alternate if at least _CHANGED of the rows have another value than the row before, and the
+# median level step within a value is below _SMALLER of the median step between values. They alternate in a fixed order
+# if at least _IN_TURN of the rows repeat the order of the rows before. _FEWEST is the smallest number of rows for this
+# test.
 _CHANGED, _SMALLER, _IN_TURN, _FEWEST = 0.3, 0.5, 0.8, 8
 
 
 def _alternates(time: AnyArray, sheet: _sheet.Sheet, column: int, level: int) -> tuple[bool, bool]:
-    """Return whether a column and the level alternate together between neighbouring rows, and whether in turns."""
+    """Return whether a column and the level alternate together, and whether they do so in a fixed order."""
     texts = np.array(sheet.texts(column), dtype=object)
     if column == level or not _few(texts.tolist()) or len(texts) < _FEWEST:
         return False, False
@@ -259,7 +263,7 @@ def _typical(steps: FloatArray) -> float:
 
 
 def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
-    """Return the texts of a column, empty where they name nothing, such as a network 0; a device 0 is a name."""
+    """Return the texts of a column, empty where a text is not a name: a network 0 is not, but a device 0 is."""
     meaning = sheet.meanings[column]
     zero = (
         meaning is None or meaning.quantity.name != "network" or sheet.plain[column].startswith(("sim", "slot", "sub"))

@@ -1,4 +1,4 @@
-"""JSON lines: one object per line, with the account of all other lines."""
+"""JSON lines: one object per line, with an account of all other lines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from aerpaw_cmp.readers import FloatArray, IntArray, Lines, ReadResult, RejectedLine, Rows, dictionary, mean_rank
 
 _MOST_LINES = 5000
-# Most bytes of incomplete objects over several lines, as a limit on time.
+# Largest total size [bytes] of incomplete objects that are tried over several lines, as a limit on time.
 _MOST_TRIED = 64 << 20
 
 
@@ -31,7 +31,7 @@ class Objects:
     rejected : list of RejectedLine
         Lines that are not objects.
     more : int array
-        0-based further lines of objects over several lines.
+        0-based lines of objects over several lines, except the first line of each.
     closed : bool
         True if all objects are in an array that ends on its line.
     """
@@ -44,7 +44,7 @@ class Objects:
 
 
 def objects(lines: Lines) -> Objects:
-    """Return the objects of a file, one per line or each over several lines.
+    """Return the objects of a file, each on one line or over several lines.
 
     A file may also be one JSON array of objects, on one line or with its brackets on separate lines. Commas at the end
     of lines are ignored.
@@ -65,12 +65,14 @@ def objects(lines: Lines) -> Objects:
             value, last = _several(lines, i)
             more += range(i + 1, last + 1)
             tried += 0 if value is not None else int(lines.ends[min(i + _MOST_LINES, len(lines) - 1)] - lines.starts[i])
-        listed = value if isinstance(value, list) else [value]  # an array of all of them on a line
+        listed = value if isinstance(value, list) else [value]  # one line may contain an array of all objects
         if listed and all(isinstance(item, dict) for item in listed):
             rows += [i] * len(listed)
             values += listed
         else:
-            rejected.append(lines.reject(i, "no JSON object (torn line?)" if value is None else "no JSON object"))
+            rejected.append(
+                lines.reject(i, "not a JSON object (truncated line?)" if value is None else "not a JSON object")
+            )
     closed = len(set(rows)) < len(rows)
     return Objects(np.array(rows, dtype=np.int64), values, rejected, np.array(more, dtype=np.int64), closed)
 
@@ -119,7 +121,7 @@ def first(head: bytes) -> dict[str, Any] | None:
     return None
 
 
-# Objects that only group values: their names say nothing about the values.
+# Names of objects that only group values and do not describe them.
 _GROUPS = re.compile(
     r"(?:(?:gps|gnss|pos(?:ition)?|loc(?:ation)?|coord(?:inate)?s?|geo|data|meta(?:data)?|info|sample|record|measurement"
     r"|payload|fix|state|telemetry)\.)+"
@@ -164,7 +166,7 @@ def number(value: Any) -> float:
 
 
 def column(entries: list[dict[str, Any]], *names: str) -> FloatArray:
-    """Return a key of every object as numbers, by the first of several names that an object has."""
+    """Return a value of every object as numbers, under the first of ``names`` that the object has."""
     return np.array([number(next((entry[name] for name in names if name in entry), None)) for entry in entries])
 
 
@@ -181,7 +183,7 @@ def listed(entry: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def ue_ranks(rows: Rows, ues: list[tuple[int, dict[str, Any]]]) -> ReadResult:
-    """Return the rank streams of UEs, each given with its row, with the keys that are in the dictionary."""
+    """Return the rank streams of UEs, pairs of row and object, with those keys that are in the dictionary."""
     entries = [ue for _, ue in ues]
     none = np.full(len(entries), np.nan)
     columns = {"rank": none, "cqi": none, "mcs": none, "rnti": column(entries, "rnti")}
@@ -199,4 +201,4 @@ _OF_UE = ("rank", "cqi", "mcs", "pci")
 
 def bracket(line: bytes) -> str | None:
     """Return the reason for lines that are not objects, or None for the brackets of an array."""
-    return None if line.strip() in (b"[", b"]") else "no JSON object"
+    return None if line.strip() in (b"[", b"]") else "not a JSON object"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-# ``written``, or ``program`` or ``assumed`` with its meaning, and the names of the readers. Other readers have their
-# own text, which is assumed. A text with an offset, or an epoch, is written.
+# Each key is the source of the clock (``written``, ``program`` or ``assumed``) and its meaning; the value lists
+# readers. For readers that are not listed, the source is assumed. Times with an offset and epochs always count as
+# written.
 _CLOCKS = {
     "program: ts on the node, local wall time":
         "vehicle_log sounder_log controller_log srsenb_log srsue_log srsran_gnb oai_log",

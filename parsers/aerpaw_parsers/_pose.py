@@ -46,7 +46,9 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
     surest = min(dictionary.rank_of(quantity, sheet.plain[i]) for i, quantity in known)
     alike = [sheet.names[i] for i, quantity in known if dictionary.rank_of(quantity, sheet.plain[i]) == surest]
     if len(alike) > 1:
-        rows.warnings.append(f"several columns of positions ({', '.join(alike)}): {alike[0]!r} was read, a guess")
+        rows.warnings.append(
+            f"several columns of positions ({', '.join(alike)}): {alike[0]!r} was used, which is a guess"
+        )
     sheet.used |= {i for i in (latitude, longitude, sheet.find("altitude_m")) if i is not None}
     values: dict[str, AnyArray] = {key: sheet.numbers(i) for key, i in zip(PLACE, (latitude, longitude), strict=False)}
     written, unfixed = np.isfinite(values[PLACE[0]]) & np.isfinite(values[PLACE[1]]), without_fix(sheet)
@@ -62,7 +64,7 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
     if np.isfinite(height).any():
         values["altitude_m"], about = above_takeoff(rows, values, datum, lost)
     elif sheet.find("altitude_m") is not None:
-        rows.warnings.append("the column of heights holds no number: heights are unknown")
+        rows.warnings.append("the column of heights contains no number: heights are unknown")
     values |= _attitude(rows, sheet)
     for key in (*VELOCITIES, "battery_v"):
         if (column := sheet.find(key)) is not None:
@@ -76,7 +78,7 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
 
 
 def without_fix(sheet: _sheet.Sheet) -> BoolArray:
-    """Return the rows (n,) that the table marks as rows without a fix, by any of its columns about the fix."""
+    """Return the mask (n,) of the rows that any column about the fix marks as rows without a fix."""
     unfixed = np.zeros(len(sheet), dtype=bool)
     for i, meaning in enumerate(sheet.meanings):
         name = "" if meaning is None else meaning.quantity.name
@@ -87,13 +89,13 @@ def without_fix(sheet: _sheet.Sheet) -> BoolArray:
             continue
         values = sheet.numbers(i)
         if name == "accuracy":
-            # without a fix receivers write a DOP of 0, 99 or 99.99, or the largest number that they have
+            # without a fix, receivers write a DOP of 0, 99 or 99.99, or the largest number that they have
             of_dop = "dop" in words and bool((values < _MOST_DOP).any())
             none = (values >= _NO_DOP) | (values == 0) if of_dop else values >= _NO_ACCURACY
         elif name == "satellites":
             none = values == 0
         else:
-            # MAVLink counts 1 without a fix and 3 with one; the quality of NMEA, which has no 3, is 1 with a fix
+            # MAVLink writes 1 without a fix and 3 with a fix; the quality of NMEA is 1 with a fix and never 3
             of_mavlink = re.search("type|status|mode", words) is not None and (values >= 3).any()
             none = values <= float(of_mavlink or ((values == 3).any() and "qual" not in words))
         # a column with this value throughout is not filled by the program
@@ -120,7 +122,7 @@ def of_readings(
 
 
 def whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> str:
-    """Return a clause that names the only one of two angles in whole degrees, or an empty text."""
+    """Return a clause that names the angle in whole degrees if exactly one of two is, else an empty text."""
     known = [angle[np.isfinite(angle)] for angle in (values[key] for key in PLACE[:2])]
     # a receiver writes decimals even at rest; an index or a count does not
     coarse = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]
@@ -145,7 +147,9 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
     """Return datum and values of the most useful column of heights, in the order of the dictionary."""
     column = sheet.find("altitude_m")
     if column is None:
-        rows.warnings.append("no column is known as a height: give the track another log, or heights are unknown")
+        rows.warnings.append(
+            "no column is known as a height, so heights are unknown: use another log for the track if it has heights"
+        )
         return "unknown", np.full(len(rows), np.nan)
     meaning = sheet.meanings[column]
     assert meaning is not None
@@ -171,9 +175,9 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
 _IMPERIAL = ("mph", "ft", "feet", "foot", "ft/s")
 # Columns that name the datum of the heights.
 _OF_DATUM = re.compile(r"(vertical )?(alt|altitude|height)? ?(ref|reference|type|datum|mode|frame)( frame)?")
-# Home has moved if its altitude changes by more than this [m]. An aircraft that is this much higher has taken off [m].
+# Home has moved if its altitude changes by more than ``MOVED_M``; an aircraft has taken off if it climbs by ``_OFF_M``.
 MOVED_M, _OFF_M = 0.5, 2.0
-# A home this near sea level [m] is not set: the two heights of a record are then equal, except for rounding.
+# A home this close to sea level [m] is not set: the two heights of a record are then equal, except for rounding.
 UNSET_M = 0.01
 
 
@@ -188,8 +192,12 @@ def above_home(
         step_m = altitude[begin - 1] - altitude[begin] if 0 < begin < len(altitude) else 0.0
         leaps = abs(step_m) > _REST_M + _CLIMB_MPS * (time_s[begin] - time_s[begin - 1]) if step_m else False
         altitude = np.where(np.arange(len(altitude)) < begin, np.nan, altitude) if leaps else altitude
-        how = "have no height, since the altitude leaps as home is set" if leaps else "count from the home set later"
-        rows.warnings.append(f"home was not set in {counted(int((~known_home).sum()), 'record')}: those before {how}")
+        how = (
+            "have no height, because the altitude jumps when home is set"
+            if leaps
+            else "use the home that was set later"
+        )
+        rows.warnings.append(f"home was not set in {counted(int((~known_home).sum()), 'record')}: these {how}")
     known = np.flatnonzero(np.isfinite(altitude))
     climbs = altitude[known] - np.minimum.accumulate(altitude[known]) > _OFF_M
     takeoff_s = time_s[known[int(np.argmax(climbs))]] if climbs.any() else home_s[-1]
@@ -209,9 +217,9 @@ def home_was_set(altitude: FloatArray, height: FloatArray) -> bool:
 
 
 def _with_moved_home(rows: Rows, sheet: _sheet.Sheet, height: FloatArray) -> tuple[FloatArray, bool]:
-    """Return heights above the home at take-off, by a column above sea level if there is one, and whether home is set.
+    """Return heights above the home at take-off, and whether home was set.
 
-    Such a column shows that home moved in one step, or that the autopilot never knew it.
+    If there is a column of altitudes above sea level, it shows whether home moved in one step or was never known.
     """
     for i, meaning in enumerate(sheet.meanings):
         datum = "" if meaning is None else meaning.quantity.datum
@@ -268,7 +276,7 @@ def above_takeoff(rows: Rows, values: dict[str, AnyArray], datum: str, lost: Boo
     rest = _ground(*(column[known] for column in (rows.time, *(values[name] for name in PLACE))))
     first = float(altitude[known[0]]) if rest is None else rest
     climbs = rest is not None
-    # a hover may begin anywhere: its lowest height shows whether 0 was the ground
+    # a log may begin in a hover at any height, so use the lowest height to decide whether 0 is the ground
     if datum == "unknown" and abs(first if climbs else np.abs(altitude[known]).min()) < _NEAR_ZERO_M:
         return altitude, about | {"height_datum": "take-off"}
     if datum == "unknown" and not climbs:
@@ -290,7 +298,7 @@ def astray(rows: Rows, values: Mapping[str, AnyArray]) -> BoolArray:
     return jumps_of(pd.DataFrame({"time": rows.time, "line": rows.row + 1, **place}))[0]
 
 
-# No small aircraft climbs so fast [m/s].
+# No small aircraft climbs faster than this [m/s].
 _FASTEST_MPS = 60.0
 # Heights that begin within this distance of zero are relative to take-off.
 _NEAR_ZERO_M = 10.0
@@ -301,7 +309,7 @@ _DEGREE_M = 111_000.0
 
 
 def _without_first_zeros(altitude: FloatArray, time: AnyArray | None) -> FloatArray:
-    """Return altitudes with NaN in first rows of 0 if all others are far from 0: the receiver had no fix yet.
+    """Return altitudes with NaN for leading zeros if all other altitudes are far from 0: there was no fix yet.
 
     If times are given, as for an unknown datum, the step must also be faster than any climb.
     """
@@ -346,17 +354,19 @@ def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitud
 
 
 def _attitude(rows: Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
-    """Return angles in degrees by the unit in the name, by the program, or else by the values of all three."""
+    """Return angles in degrees. The unit is that in the name, else that of the program, else decided by the values."""
     columns = {key: column for key in ANGLES if (column := sheet.find(key)) is not None}
     values = {key: sheet.numbers(column) for key, column in columns.items()}
     named = any(sheet.unit(column) for column in columns.values())
     if not named and are_radians(values):
-        rows.warnings.append("the unit of the angles is unknown: read as radians by their values, a guess")
+        rows.warnings.append(
+            "the unit of the angles is unknown: read as radians because of their values, which is a guess"
+        )
         values = {key: np.degrees(value) for key, value in values.items()}
     elif not named and not set(ANGLES) <= set(values) and are_small(values):
         rows.warnings.append(small_angles(values))
     yaw = values.get("yaw_deg")
-    # no aircraft points due north to the last digit
+    # no aircraft points exactly due north in every row
     if yaw is not None and len(yaw) > 2 and np.isfinite(yaw).any() and not np.nan_to_num(yaw).any():
         rows.warnings.append("the yaw is 0 throughout: read as unknown")
         values["yaw_deg"] = np.full(len(yaw), np.nan)
@@ -366,7 +376,9 @@ def _attitude(rows: Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
 def small_angles(values: Iterable[str]) -> str:
     """Return the sentence about angles whose unit is neither in their names nor visible in their values."""
     words = " and ".join(name.removesuffix("_deg") for name in values)
-    return f"the unit of {words} is unknown, and no value is beyond 2 pi: read as degrees; or is it 'yaw [rad]'?"
+    return (
+        f"the unit of {words} is unknown, and no value is beyond 2 pi: read as degrees (radians? call it 'yaw [rad]')"
+    )
 
 
 def are_small(values: dict[str, FloatArray]) -> bool:

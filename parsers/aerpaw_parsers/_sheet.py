@@ -1,8 +1,8 @@
 """Tables with a header and columns in any order, whose meaning is in the dictionary.
 
 The header may follow title lines, and its separator is that of the table. Decimal commas are read if the separator is
-another character. A header in the middle of the file begins a new table. Last cells that a program omits are read as
-empty. A table whose values are outside the ranges of the dictionary for its header is refused.
+another character. A header in the middle of the file begins a new table. Trailing cells that a program omits are read
+as empty. A table whose values are outside the ranges of the dictionary for its header is refused.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from aerpaw_cmp.readers import ReadOptions, ReadResult, RejectedLine, Rows, buil
 from . import _json, _stamps
 
 SEPARATORS = (",", ";", "\t", "|")
-# Lines in front of a header, at most.
+# Largest number of lines before a header.
 TITLES = 60
 _NUMBER = re.compile(r"([-+]?\d{0,20}(?:[.,]\d{0,40})?(?:[eE][-+]?\d{1,3})?) ?([^\d\s,.][^\d\s]{0,9})?")
 
@@ -48,7 +48,7 @@ def split_row(line: bytes, separator: str) -> list[str]:
 
 
 def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, list[str]] | None:
-    """Return the place, separator and names of the first line that is a header."""
+    """Return the index, separator and names of the first line that is a header."""
     for i, line in enumerate(lines[:TITLES]):
         # a longer line is not a header
         if len(line) > 65_536 or b"\0" in line:
@@ -90,7 +90,7 @@ _OF_PROGRAMS = re.compile(rb'"(schema|log_type|connected_bssid|abs_time|ue_list)
 
 def _number(text: str) -> tuple[float, str]:
     """Return the number and the unit of a cell, NaN for other text."""
-    match = _NUMBER.fullmatch(text.replace("\u2212", "-"))  # the minus sign of typesetting, of word processors
+    match = _NUMBER.fullmatch(text.replace("\u2212", "-"))  # word processors write the typographic minus sign
     if match is None or not match[1] or (match[2] and not (dictionary.is_unit(match[2]) or match[2] in _HARMLESS)):
         return np.nan, ""
     try:
@@ -166,7 +166,7 @@ class Sheet:
     said : dict
         Quantities that the user maps to columns with other names, by column.
     used : set of int
-        Columns that a stream was made of, shared by all parts of the table.
+        Columns that are used in a stream; all parts of the table share this set.
     """
 
     lines: _text.Lines
@@ -183,7 +183,7 @@ class Sheet:
     _cell_units: dict[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Count the rows."""
+        """Return the number of rows."""
         return len(self.row)
 
     @property
@@ -229,7 +229,7 @@ class Sheet:
         return min(known)[2] if known else None
 
     def named(self, *names: str) -> int | None:
-        """Return the first column with one of some plain names."""
+        """Return the first column whose plain name is one of ``names``, or None."""
         return next((self._own.index(name) for name in names if name in self._own), None)
 
     def unit(self, column: int) -> str:
@@ -280,7 +280,7 @@ class Sheet:
             self.__dict__.pop(cached, None)
 
     def part(self, where: BoolArray) -> Sheet:
-        """Return the rows of a mask, which share the notes."""
+        """Return a table of the rows of a mask, which shares the notes of this table."""
         return replace(
             self, row=self.row[where], _numbers={}, _cell_units={},
             cells=[*compress(self.cells, where.tolist())],
@@ -319,7 +319,7 @@ class Sheet:
         reads = _angle if meaning is not None and meaning.quantity.role == "position" else _number
         if meaning is not None and meaning.quantity.name == "fix":
             texts = [_fix(text) for text in texts]
-        counts = Counter(texts)  # tables repeat themselves
+        counts = Counter(texts)  # parse each distinct text once, because tables repeat texts
         parsed = {text: reads(text) for text in counts}
         values = np.array([parsed[text][0] for text in texts], dtype=np.float64)
         told = {text: count for text, count in counts.items() if text.lower() not in NO_VALUE}
@@ -327,7 +327,7 @@ class Sheet:
         if meaning is not None and 2 * sum(words.values()) > sum(told.values()):
             self.notes[column] = (
                 f"column {self.names[column]!r}: {counted(sum(words.values()), 'cell')} without a number (the first: "
-                f"{next(iter(words))[:30]!r}) and read as missing"
+                f"{next(iter(words))[:30]!r}) are read as missing"
             )
         unit = meaning.unit if meaning is not None and "[" in self.names[column] else ""
         if unit and meaning is not None and meaning.quantity.unit and not dictionary.is_unit(unit):
@@ -335,7 +335,7 @@ class Sheet:
             self.notes.setdefault(column, text)
         if self.unit(column) in dictionary.ACROSS_50_OHM:
             self.notes[column] = (
-                f"column {self.names[column]!r}: dBuV read as dBm in a receiver of 50 ohm, a guess (-107 dB)"
+                f"column {self.names[column]!r}: dBuV are converted to dBm for a receiver of 50 ohm (-107 dB), a guess"
             )
         units = {unit for _, unit in parsed.values() if dictionary.is_unit(unit)}
         if not units:
@@ -373,7 +373,7 @@ class Sheet:
     @cached_property
     def _has_points(self) -> bool:
         """Check whether the first row has a decimal point, and commas only between thousands."""
-        # the first row only, because a table has one form
+        # test only the first row, because all rows have the same form
         first = [cell.strip() for cell in self.cells[0]] if self.cells else []
         commas = [cell for cell in first if _DECIMAL_COMMA.fullmatch(cell)]
         return any(_DECIMAL_POINT.fullmatch(cell) for cell in first) and all(map(_THOUSANDS.fullmatch, commas))
@@ -393,7 +393,7 @@ class Sheet:
             said.append(f"not read, though they look like levels, identities, positions or times: {shown}{more}")
         gains = [i for i in left if _GAIN.search(self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
         if gains:
-            text = "changes, and levels are read as written: do they contain it?"
+            text = "changes, and levels are not corrected for it: do they already include it?"
             said.append(f"column {self.names[gains[0]]!r} {text}")
         equal = len(self) - len({*map(tuple, self.cells)})
         if equal > _MOST_EQUAL * len(self):
@@ -430,7 +430,7 @@ _ASU = re.compile(r"\basu\b")
 _GAIN = re.compile(r"^(?!.*\b(tx|transmit\w*|ant|antenna)\b).*\b(gain|agc|atten(uation|uator)?)\b")
 # Largest share of rows that are equal to another row: rows within one second may be equal.
 _MOST_EQUAL = 0.3
-# Names of columns in one sentence.
+# Largest number of column names in one sentence.
 _MOST_NAMED = 20
 _DECIMAL_POINT = re.compile(r"[-+]?\d{1,20}\.\d{1,40}")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d{1,20},\d{1,40}")
@@ -536,14 +536,15 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     return table.sheet(lines, numbers[-1] if numbers else at)
 
 
-# Most lines of a cell with line breaks.
+# Largest number of lines of a cell with line breaks.
 _MOST_LINES = 40
 
 
 def _logical(lines: Sequence[tuple[int, bytes]], separator: str, width: int) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of lines with the number of the first line of each: a quoted cell may have line breaks.
 
-    A lone quote, such as the sign of inches, does not join lines: they are joined only to a row as wide as the header.
+    A lone quote, such as an inch mark, does not join lines: lines are joined only if they form a row as wide as the
+    header.
     """
     last = -1
     for place, (i, line) in enumerate(lines):
@@ -559,7 +560,7 @@ def _logical(lines: Sequence[tuple[int, bytes]], separator: str, width: int) -> 
 
 
 def _unique_names(names: Sequence[str], group: Sequence[str] = ()) -> list[str]:
-    """Return unique names of a header: repeated ones get the text of merged cells above them, or a number."""
+    """Return the names of a header as unique names, by adding the text of merged cells above them, or a number."""
     counts, before = Counter(names), Counter[str]()
     unlike, above = [], ""
     for i, name in enumerate(names):
@@ -611,7 +612,7 @@ class _Table:
         return True
 
     def _is_header(self, texts: list[str]) -> bool:
-        """Check whether a line is a header, with the same columns or others, for the lines below it."""
+        """Check whether a line is a header, perhaps with other columns, and apply it to the lines below."""
         texts = _unique_names(texts)
         bare = [dictionary.without_unit(text) for text in texts]
         both = zip(bare, texts, strict=True)
@@ -665,7 +666,7 @@ class _Table:
             cells=[[*cells, *[""] * (len(self.names) - len(cells))] for cells in self._cells],
             blank_rows=np.array([*self.comments, *foot], dtype=np.int64),
             rejected=[
-                lines.reject(i, f"{counted(count, 'field')} where the header has {width} (torn line?)")
+                lines.reject(i, f"{counted(count, 'field')} where the header has {width} (truncated line?)")
                 for i, count, width in odd
             ],
         )  # fmt: skip
@@ -721,7 +722,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     if column is None and weeks is None:
         return None
     if weeks is not None:
-        clock, cells, warnings = "epoch_s", weeks, ["the times are GPS weeks and seconds: leap seconds were taken off"]
+        clock, cells, warnings = "epoch_s", weeks, ["the times are GPS weeks and seconds: leap seconds were subtracted"]
     else:
         assert column is not None
         clock, cells, warnings = _times(sheet, column, options, mapped=mapped)
@@ -770,7 +771,7 @@ def _to_utc(timed: Rows, sheet: Sheet, column: int | None) -> None:
 
 
 def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None:
-    """Return the best column of times: UTC rather than local, and not the time of the last fix, which stands still."""
+    """Return the best column of times: UTC rather than local, and not the time of the last fix, which may stop."""
     column = sheet.find("time")
     times = [i for i, meaning in enumerate(sheet.meanings) if meaning and meaning.quantity.name == "time"]
     if column is None or len(times) < 2:
@@ -789,7 +790,7 @@ def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None
     rest = [i for i in ranked if i != column]
     moving = next((i for i in rest if _moves_on(sheet, i, texts, options)), column)
     if moving != column:
-        text = f"column {sheet.names[column]!r} stands still while {sheet.names[moving]!r} runs on: the latter was read"
+        text = f"column {sheet.names[column]!r} stops while {sheet.names[moving]!r} advances: the latter is used"
         sheet.notes[moving] = f"{text} (the former may be the time of the last fix)"
     return moving
 
@@ -800,7 +801,7 @@ def _is_dated(sheet: Sheet, column: int) -> bool:
     return _stamps.is_dated(first) or (":" in first and sheet.find("date") is not None)
 
 
-# A clock stands still if another one advances by more than this while it shows one time [s].
+# A clock has stopped if another clock advances by more than this while it shows one time [s].
 _STANDS_S = 2.0
 
 
@@ -846,7 +847,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     if day is not None and not zone:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
     if day is not None and "local" in sheet.names[day].lower() and zone == "UTC":
-        text = "local dates with UTC times: near midnight of the two zones the date is off by a day"
+        text = "dates are local but times are UTC: between midnight in the two zones, the date is wrong by a day"
         sheet.notes[day] = f"columns {sheet.names[day]!r} and {sheet.names[column]!r}: {text}"
     if (beside := sheet.find("zone")) is not None:
         zone, texts = _zone_column(sheet, beside, zone, texts, options)
@@ -874,7 +875,9 @@ def _zone_column(sheet: Sheet, column: int, zone: str, texts: list[str], options
     if unknown := next((text for text, own in known.items() if not own and text.lower() not in _NO_ZONE), ""):
         sheet.notes[column] = f"column {sheet.names[column]!r}: {unknown[:30]!r} is not a known zone: not used"
     elif zone and word and word != zone:
-        sheet.notes[column] = f"column {sheet.names[column]!r} has {word}, the name of the times {zone}: {zone} is used"
+        sheet.notes[column] = (
+            f"column {sheet.names[column]!r} contains {word}, but the name of the time column {zone}: {zone} is used"
+        )
     elif word and options.timezone not in (None, word) and not all(map(_DATED.fullmatch, texts[:3])):
         text = f"column {sheet.names[column]!r} has the zone of the times, {word}: --timezone is not used"
         sheet.notes[column] = text
@@ -918,7 +921,7 @@ def way_to_level(sheet: Sheet) -> list[str]:
     relative = sheet.meanings[filled[0]] or "dbfs" in sheet.names[filled[0]].lower()
     unit = "dBm" if (sheet.unit_read(filled[0]) or "dBm") == "dBm" and not relative else "dB"
     others = f" (so may {', '.join(repr(sheet.names[i]) for i in filled[1:5])})" if filled[1:] else ""
-    return [f"{sheet.names[filled[0]]!r} may be a level, and is not read as one{others}: {options} --unit {unit}"]
+    return [f"{sheet.names[filled[0]]!r} may be a level, but is not read as one{others}: {options} --unit {unit}"]
 
 
 def _has_levels(sheet: Sheet, column: int) -> bool:
@@ -1014,10 +1017,10 @@ def _is_angle(values: FloatArray) -> bool:
 
 def shifted(found: str, expected: str) -> InputError:
     """Return the error for a table whose values are in columns with other names."""
-    return InputError(f"the rows do not fit the header: {found}", expected=expected, cause=BESIDE)
+    return InputError(f"the rows do not fit the header: {found}", expected=expected, cause=MISALIGNED)
 
 
-BESIDE = "a column is missing in the header or in the rows, so that values are under the wrong names"
+MISALIGNED = "a column is missing in the header or in the rows, so that values are under the wrong names"
 
 
 # Whole seconds and a counter that belong together differ by less than 1 s, plus 0.5 s for rounding.

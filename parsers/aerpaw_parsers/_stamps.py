@@ -1,8 +1,8 @@
 """Conversion of dates and times in any form to ``YYYY-mm-dd HH:MM:SS.f``, with the zone if there is one.
 
 All readers and ``--map`` use this parser. The zone is that in the cell, else that in the name of the column, else the
-user's. The complete column decides whether ``03/04/2025`` is in March or April; if it cannot, the order is assumed
-and a warning reports it.
+user's. The complete column decides whether ``03/04/2025`` is in March or April. If this is undecided, an order
+is assumed and a warning reports it.
 """
 
 from __future__ import annotations
@@ -136,9 +136,11 @@ class _Order:
         fits = [first for first in (True, False) if date and self._dated(dates[0], first) == date]
         self.day_first = fits[0] if len(fits) == 1 else european
         reason = "as in countries with decimal commas" if european else "a guess"
-        reason = "as the date in the file name" if len(fits) == 1 else reason
+        reason = "as in the date of the file name" if len(fits) == 1 else reason
         word = "day" if self.day_first else "month"
-        self.warnings.append(f"the dates can be read with the day or the month first: the {word} was taken, {reason}")
+        self.warnings.append(
+            f"the dates can be read with the day or the month first: the {word} is assumed to come first, {reason}"
+        )
 
     def _year(self, dates: list[re.Match[str]]) -> None:
         if len(dates[0]["c"]) == 4:
@@ -149,10 +151,12 @@ class _Order:
             and all(_FIRST_YEAR <= number <= _LAST_YEAR for number in first)
         )
         word = "first" if self.year_first else "last"
-        self.warnings.append(f"the years of the dates have two digits: the {word} number was taken, a guess")
+        self.warnings.append(
+            f"the years of the dates have two digits: the {word} number is assumed to be the year, which is a guess"
+        )
 
     def _span_d(self, dates: Iterable[re.Match[str]], day_first: bool) -> float:
-        """Return the days between the first and the last date in one order of day and month, within a day or two."""
+        """Return roughly how many days lie between the first and the last date for one order of day and month."""
         parts = (self.parts(match, day_first=day_first) for match in dates)
         days = [365.25 * int(year) + 30.44 * month + day for year, month, day in parts]
         return max(days) - min(days)
@@ -246,7 +250,7 @@ class _Zones:
         try:
             moment = datetime.fromisoformat(date)
         except ValueError:
-            return ""  # not a date of the calendar, which the caller reports
+            return ""  # the date does not exist, which the caller reports
         if self._own and (here := _at(self._own, moment)) is not None and here[1] == word:
             return _shown(here[0])
         if word in _WITH_SUMMER or "/" in word:
@@ -273,7 +277,7 @@ class _Zones:
         expected = f"{' or '.join(ways)}: put the offset in place of {word} in the file"
         if len(candidates) > 1:
             expected += ", or state the zone of the log with --timezone"
-        raise UsageError(f"the times say {word}, {doubt}", expected=expected)
+        raise UsageError(f"the zone of the times is {word}, {doubt}", expected=expected)
 
 
 def _shown(hours: float) -> str:
@@ -385,7 +389,7 @@ def read(
     shown = _padded(shown)
     filled = [text for text in shown if text]
     compact = [match for text in filled if (match := _COMPACT.fullmatch(text))]
-    # counts of seconds pass 60 to 99 in these places, times of the day never do
+    # in counts of seconds these digits reach 60 to 99, in times of the day they never do
     clocks = len(compact) == len(filled) and all(len({match[part] for match in compact}) > 1 for part in (6, 7))
     if 2 * sum(clocks or bool(match[1] or zone) for match in compact) > len(filled):
         shown = [_COMPACT.sub(_with_marks, text) for text in shown]
@@ -403,7 +407,9 @@ def read(
     warnings = order.warnings
     bare = [match for text in plain if (match := _match(text)) and match.groupdict().get("second") is None]
     if len(set(filled)) < len(filled) and 2 * len(bare) > len(filled):
-        warnings.append("the times have no seconds (a table saved by a spreadsheet?): rows of a minute share one time")
+        warnings.append(
+            "the times have no seconds (a table saved by a spreadsheet?): all rows of a minute share one time"
+        )
     zones = _Zones(options, zone)
     cells = [
         text.encode() if _COMMON.fullmatch(text) and (not zone or text[-6] in "+-" or text[-1] == "Z")
@@ -457,12 +463,12 @@ def refuse_spreadsheets(texts: Sequence[str]) -> None:
         raise InputError(
             f"the times are minutes and seconds without the hour and the date, such as {minutes[0]}",
             expected="whole times",
-            cause="the table was saved by a spreadsheet, which shows times so: save the column as text",
+            cause="the table was saved by a spreadsheet, which shows times in this form: save the column as text",
         )
 
 
-# The longest flight [s], the longest step between its rows [s], and the least step of numbers without a unit in each
-# unit that they may have. Steps of 10 may be 10 ms, steps of 5 are 5 s.
+# The longest flight [s], the longest step between its rows [s], and, for each unit, the smallest step that numbers
+# without a unit may have. Steps of 10 may be 10 ms, steps of 5 are 5 s.
 _FLIGHT_S, _LONGEST_STEP_S = 10_800.0, 60.0
 _LEAST_STEPS = {"s": 0.0, "ms": 10.0, "us": 2e3, "ns": 2e6}
 _NAMES = {
@@ -475,14 +481,14 @@ _NAMES = {
 }
 # A log that is shorter than this if its numbers are seconds may be in minutes or hours [s].
 _SHORT_S = 60.0
-# Steps of loggers that do not move [s]. No program writes rows in such steps of milliseconds.
+# Time steps of stationary loggers [s]. No program writes rows that are this many milliseconds apart.
 _QUARTERS = (900.0, 1800.0, 3600.0)
-# No program of a radio or an autopilot writes rows in such steps [ns].
+# No program of a radio or an autopilot writes rows that are closer in time than this [ns].
 _LEAST_NS = 1e6
 
 
 def _step(value: FloatArray) -> float:
-    """Return the median step between rows of different times, or NaN if all are the same."""
+    """Return the median step between rows of different times, or NaN if all times are equal."""
     steps = np.abs(np.diff(value[np.isfinite(value)]))
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
 
@@ -507,7 +513,7 @@ def _longer_units(value: FloatArray) -> list[str]:
 
 
 def are_seconds(value: FloatArray, unit: str) -> bool:
-    """Check whether the steps of numbers are too short in the unit of a program, and likely in seconds."""
+    """Check whether the steps of numbers are too short in the unit of a program but plausible in seconds."""
     return _step(value) * _text.COUNTS[unit].ns <= _LEAST_NS and "s" in _likely_units(value)
 
 
@@ -534,7 +540,7 @@ def _numbers(
     if unit is not None:
         return f"relative_{unit}", value, []
     whole, of_day = not (value % 1 > 0).any(), 86_400 < middle < 86_400_000
-    late = whole and middle > 86_400  # beyond a day of seconds
+    late = whole and middle > 86_400  # more seconds than a day has
     unit = next((unit for unit in likely if unit != "s" or not late), "ms" if late and of_day and not likely else "s")
     unit = "s" if step in _QUARTERS and not (value % step).any() else unit
     known = likely if whole else _longer_units(value)
@@ -542,7 +548,7 @@ def _numbers(
     if unit == "s" and not others:
         return "relative_s", value, []
     lasting = "; ".join(f"as {_NAMES[other]} {_lasting(value, other)}" for other in others)
-    text = f"the times are numbers without a unit: read as {_NAMES[unit]}, a guess"
+    text = f"the times are numbers without a unit: read as {_NAMES[unit]}, which is a guess"
     text = f"{text} (the log lasts {_lasting(value, unit)}; {lasting})"
     advice = f"if it is wrong, write the unit in the column's name, such as 'time [{others[0]}]'"
     # A log that begins within the first hour counts from its start. A later one counts from midnight, unless the user
@@ -562,7 +568,7 @@ def _doubts_of_epoch(epoch_s: float, gps: bool) -> list[str]:
         return []
     years = [np.datetime64(round(epoch_s) + zero, "s").item().year for zero in (0, GPS_S)]
     text = f"the times are read as epochs of {years[0]}; if they count from 1980 (GPS time), they are of {years[1]}"
-    return [f"{text}: then call their column 'GPS time'"]
+    return [f"{text}. In that case, call their column 'GPS time'."]
 
 
 def _lasting(value: FloatArray, unit: str) -> str:
@@ -576,13 +582,13 @@ GPS_S, LEAP_S = 315_964_800, 18
 SCALES_S = {"gpst": LEAP_S, "gpstime": LEAP_S, "tai": 37}
 # GPS time of January 2018 and of February 2030. As epochs they are of 2008 and 2020.
 _GPS_S_OF = (1.2e9, 1.58e9)
-_GPS_COUNT = "the times count from 1980 (GPS time): 18 leap seconds were taken off"
-# Date of number zero, and the numbers of the years 2000 to 2099.
+_GPS_COUNT = "the times count from 1980 (GPS time): 18 leap seconds were subtracted"
+# Date of day number zero, and the range of day numbers for the years 2000 to 2099.
 _DAY_NUMBERS = (("1899-12-30", 36_526.0, 73_051.0, "a spreadsheet"), ("-001-12-31", 730_486.0, 767_011.0, "MATLAB"))
 
 
 def _are_days(value: FloatArray, low: float, high: float) -> bool:
-    """Check whether numbers are days with the time as fraction: within two days, from row to row less than 90 s."""
+    """Check whether numbers are day numbers with the time as fraction: within two days, in steps below 90 s."""
     finite = value[np.isfinite(value)]
     if len(finite) < 3 or finite.min() < low or finite.max() >= high or np.ptp(finite) > 2.0:
         return False
@@ -595,8 +601,8 @@ def _of_day(
     """Return times of day with the date of ``time_origin`` or of the file name, if there is one."""
     matches = [_OF_DAY.fullmatch(text) for text in texts]
     seconds = np.array([_seconds(item.groupdict()) if item else np.nan for item in matches], dtype=np.float64)
-    # a step back by more than half a day is midnight, a smaller one is a clock that was set; a step forward to the
-    # first row of another device leads to the day before
+    # A step back by more than half a day is midnight; a smaller step back means that the clock was set. A step forward
+    # by more than half a day to the first row of another device returns to the day before.
     step = np.nan_to_num(np.diff(seconds, prepend=np.nan))
     other = np.zeros(len(step), dtype=bool) if device is None else np.diff(device, prepend=device[:1]) != 0
     seconds += 86_400.0 * (np.cumsum(step < -43_200) - np.cumsum((step > 43_200) & other))
@@ -614,7 +620,9 @@ def _of_day(
         return _on_a_date(seconds, options, [text], written)
     warnings = ["the times are marked as UTC but read as local, like the program's file names"]
     if hours:
-        warnings.append(f"the times are {hours:+d} h from the start in the summary next to the log: corrected, local")
+        warnings.append(
+            f"the times are {hours:+d} h from the start in the summary next to the log: corrected, and read as local"
+        )
     return _on_a_date(seconds - 3600.0 * hours, options, warnings)
 
 
@@ -633,17 +641,17 @@ def _session_start_s(options: ReadOptions) -> float | None:
 def _on_a_date(
     seconds: FloatArray, options: ReadOptions, warnings: list[str], zone: str = ""
 ) -> tuple[str, AnyArray, list[str]]:
-    """Return seconds of the first day with their date, or as relative times if the day is unknown."""
+    """Return seconds after the first midnight as dated times, or as relative times if the day is unknown."""
     date = options.time_origin[:10] if options.time_origin else _date_in_name(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
         return "relative_s", seconds, [*warnings, "the times have no date and the file name has none either"]
     cells = _wall_cells(np.datetime64(date, "us"), seconds, zone, options)
     source = "time_origin" if options.time_origin else "the file name"
-    return "wall", cells, [f"the times have no date: it is that of {source}, {date}", *warnings]
+    return "wall", cells, [f"the times have no date: the date of {source} is used, {date}", *warnings]
 
 
 def _wall_cells(day: np.datetime64, seconds: FloatArray, zone: str, options: ReadOptions) -> AnyArray:
-    """Return seconds after the beginning of a day as texts, with the offset that the zone has at the first."""
+    """Return seconds after the beginning of a day as texts, with the UTC offset of the zone on that day."""
     stamps = day + np.round(np.nan_to_num(seconds) * 1e6).astype("timedelta64[us]")
     cells = np.datetime_as_string(stamps, unit="us").astype(np.bytes_)
     date = str(stamps[np.argmax(np.isfinite(seconds))])[:10]

@@ -20,7 +20,8 @@ from . import _autopilot
 
 _MARK = b"\xa3\x95"
 _FMT = 128
-# Letters of a layout: code of struct, and the factor that makes SI or degrees of it (c, C, e, E 0.01; L 1e-7 deg).
+# Letters of a layout: code of struct, and the factor that converts a value to SI units or degrees (c, C, e, E 0.01; L
+# 1e-7 deg).
 _TYPES = {
     "b": ("b", 1.0), "B": ("B", 1.0), "h": ("h", 1.0), "H": ("H", 1.0), "i": ("i", 1.0), "I": ("I", 1.0),
     "f": ("f", 1.0), "d": ("d", 1.0), "c": ("h", 0.01), "C": ("H", 0.01), "e": ("i", 0.01), "E": ("I", 0.01),
@@ -35,7 +36,7 @@ _TEXT = re.compile(rb"FMT, ?128, ?89, ?FMT,")
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether a log begins with the message that describes the messages ``FMT``."""
+    """Check whether a log begins with the message that describes ``FMT`` messages."""
     return head[:3] == _MARK + bytes([_FMT]) or _TEXT.match(head) is not None
 
 
@@ -120,9 +121,10 @@ def _number(cell: str) -> float:
 
 
 def _series(by_name: _Rows, name: str) -> _autopilot.Series:
-    """Return the messages of one name with its most frequent description and of its first instance (filter).
+    """Return the messages of one name that have its most frequent layout and its first instance (filter).
 
-    For several GPS receivers, return the one with most fixes, because the first may never have had a fix.
+    For several GPS receivers, return the messages of the receiver with the most fixes, because the first may never have
+    had a fix.
     """
     timed = {names: rows for names, rows in by_name[name].items() if "TimeUS" in names}
     if not timed:

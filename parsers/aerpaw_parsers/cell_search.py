@@ -1,7 +1,7 @@
 """AERPAW's cell search: ``Found CELL MHz, 3500.0, EARFCN, 7399, PHYID, 1, ... PSS power dBm, -30.1, PSR, 2.3, <time>``.
 
-Console and table of srsRAN's program as changed by AERPAW: a line per cell and sweep. Its time is at the end (with
-milliseconds after a colon, or in the form of ``asctime``) or at the beginning, from ``ts``.
+The console and the table of srsRAN's program, as modified by AERPAW, have a line per cell and sweep. The time of a line
+is at its end (with milliseconds after a colon, or in the form of ``asctime``) or at its beginning, from ``ts``.
 
 The level is the power of the synchronisation signal, not an RSRP. There is a series per PCI and EARFCN.
 """
@@ -38,7 +38,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     clock, time, warnings = _stamps.read(texts, options)
     rows = built(
         lines, row, {"time": time}, options, reader="cell_search", clock=clock,
-        reason=lambda line: "an incomplete cell (torn line?)" if b"Found CELL" in line else None,
+        reason=lambda line: "an incomplete cell (truncated line?)" if b"Found CELL" in line else None,
     )  # fmt: skip
     rows.warnings += warnings
     cells = [groups[i] for i in rows.at.tolist()]

@@ -20,7 +20,7 @@ _BLOCK = re.compile(_STAMP + rb"[^\n]{0,40}?\[Controller-->UAV\] (?P<what>SNR|Do
 
 
 def _no_level(data: bytes, row: IntArray) -> BoolArray:
-    """Return the value lines whose block, by the last head before them, does not contain levels."""
+    """Return the mask of value lines in blocks without levels, according to the last heading before each line."""
     heads, kinds = match(split(data), _BLOCK)
     of_levels = np.array([False] + [kind[1] == b"SNR" for kind in kinds], dtype=bool)
     return np.asarray(~of_levels[np.searchsorted(heads, row)])

@@ -36,7 +36,7 @@ def _reading(text: bytes) -> dict[str, str]:
         cells[_NAMES.get(name.decode(), name.decode())] = value.decode()
     if (place := _GPS.search(text)) is not None:
         longitude, latitude = place[1].decode(), place[2].decode()
-        # some firmware writes the latitude first: a latitude beyond 90 degrees cannot be
+        # some firmware writes the latitude first, which shows as a latitude beyond 90 degrees
         swapped = abs(float(latitude)) > 90
         cells |= {"latitude": longitude if swapped else latitude, "longitude": latitude if swapped else longitude}
     if (date := _DATE.search(text)) is not None:
@@ -57,9 +57,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     texts = [data[first:last] for first, last in zip(begin, [*begin[1:], len(data)], strict=False)]
     readings = [(i, _reading(text)) for i, text in zip(number, texts, strict=True)]
     placed = [(i, cells) for i, cells in readings if cells["latitude"] and cells["longitude"]]
-    if lines.unterminated and placed and re.search(rb"[\d.]$", data):  # a cut number may lack digits
+    if lines.unterminated and placed and re.search(rb"[\d.]$", data):  # a truncated number may have lost digits
         del placed[-1]
-    torn = [lines.reject(i, "a subtitle without a position (cut?)") for i in sorted({*number} - {i for i, _ in placed})]
+    torn = [
+        lines.reject(i, "a subtitle without a position (truncated?)")
+        for i in sorted({*number} - {i for i, _ in placed})
+    ]
     return _pose.of_readings(lines, placed, torn, options, reader=READER.name)
 
 

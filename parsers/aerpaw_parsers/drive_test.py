@@ -42,7 +42,7 @@ _IsHeader = Callable[[list[str]], bool]
 # A tower of Lake Wheeler in the name of a column.
 _TOWER = re.compile(r"\blw ?([1-5])\b")
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
-# A cell without the word "serving" may serve or not, if there are several cells.
+# Values with which the columns "serving", "neighbouring" and "technology" mark a cell that does not serve.
 _NO, _YES = ("false", "0", "no", "", "n/a", "none", "null", "nan", "-"), ("true", "1", "yes")
 _NEIGHBOURS = ("neighbor", "neighbour", "neighboring", "neighbouring", "detected", "monitored")
 
@@ -76,12 +76,12 @@ def _has_time(names: list[str]) -> bool:
     return not known.isdisjoint(("time", "date")) or {"gps_week", "gps_seconds"} <= known
 
 
-# Readers of tables that also have a time and a level or position. They know units that are not in the names.
+# Readers of specific tables that pass the same test. They know units that are not in the names.
 _NARROWER = (nemo_csv, quectel_ri, ardupilot_bin, rtklib_pos, vehicle_out)
 
 
 def _is_table(head: bytes, header: _IsHeader) -> bool:
-    """Check whether a file begins with such a header and is not of a narrower format."""
+    """Check whether a file begins with a header of this kind and is not of a more specific format."""
     narrower = _is_snr_of_towers(head) or any(module.READER.sniff(head) for module in _NARROWER)
     return not narrower and _sheet.starts(head, header)
 
@@ -93,7 +93,7 @@ def _is_snr_of_towers(head: bytes) -> bool:
 
 @dataclass
 class _Cell:
-    """Columns of one place in the table: the serving cell, or the n-th of the others, of one device or SIM."""
+    """The columns of one cell: the serving cell or the n-th other cell of one device or SIM."""
 
     rat: str
     place: str
@@ -113,7 +113,7 @@ class _Cell:
 
 
 _IDENTITY = ("pci", "arfcn")
-# Places that are devices or SIMs, with separate series for their cells.
+# Prefixes of devices and SIMs, whose cells are separate series.
 _OWNERS = ("sim", "slot", "dev", "modem", "phone", "ue")
 
 
@@ -155,7 +155,7 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
             cell.columns = {**of_row, **cell.columns}
     placed = _completed(cells, others)
     if len(placed) == 1:
-        placed[0].place = "serving"  # 'rsrp1' alone
+        placed[0].place = "serving"  # a single column such as 'rsrp1' is the serving cell
     return placed, others, ranks
 
 
@@ -168,7 +168,7 @@ def _part(sheet: _sheet.Sheet, column: int) -> str:
 
 
 def _preference(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, bool, int]:
-    """Return a sort key: first filled columns, then no means, then no single ports, then most distinct values."""
+    """Return a sort key that prefers filled columns, then neither means nor single ports, then many values."""
     known = sheet.numbers(column)
     count = len(np.unique(known[np.isfinite(known)]))
     return not count, _part(sheet, column) == "mean", _part(sheet, column) == "port", -count
@@ -317,7 +317,7 @@ def _read(data: bytes, options: ReadOptions, *, header: _IsHeader, reader: str, 
 
 
 def of_sheet(rows: Rows, sheet: _sheet.Sheet, *, track: str = "phone", source: str = "table of a phone") -> ReadResult:
-    """Return the streams of a table with names of the dictionary, for each device and network.
+    """Return the streams of a table whose columns the dictionary knows, for each device and network.
 
     Parameters
     ----------
@@ -408,7 +408,7 @@ def _of_a_scheduler(rows: Rows, sheet: _sheet.Sheet) -> bool:
     if not words & {"rnti", "ue", "nprb", "prb", "prbs"}:
         return False
     rows.warnings.append(
-        "the table is from a scheduler of the uplink: its ratios to the noise are not levels of the downlink"
+        "the table is from a scheduler of the uplink: its signal-to-noise ratios are not levels of the downlink"
     )
     return True
 
@@ -428,7 +428,7 @@ def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: li
             for i in others
             if (m := sheet.meanings[i]) and m.part == "mean" and (m.rat, m.place) == (cell.rat, cell.place)
         ]
-        for listed, what in ((cell.ports, "series of their own"), (means, "KPIs")):
+        for listed, what in ((cell.ports, "separate series"), (means, "KPIs")):
             if listed:
                 shown = ", ".join(repr(sheet.names[i]) for i in listed)
                 rows.warnings.append(f"the level of the cell is {sheet.names[level]!r}; read as {what}: {shown}")
@@ -494,14 +494,14 @@ def _rank(rows: Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     few = _MOST_IDLE * len(ri) if cqi is None else none.sum() / 2
     if doubtful.sum() > max(few, 1) and np.nanmax(ri, initial=0) < _MOST_PORTS:
         text = f"0 in {counted(int(doubtful.sum()), 'row')}, read as no report: do its ranks count from 0?"
-        rows.warnings.append(f"column {sheet.names[column]!r}: {text} Then use --map and --ri-base zero")
+        rows.warnings.append(f"column {sheet.names[column]!r}: {text} If so, use --map and --ri-base zero")
     source = "scheduled PDSCH rank" if "pdsch" in name else "CSI report"
     return rows.stream(
         "rank", name, values, where=np.isfinite(ri), flag=flag, ri_base=("one", "zero")[zero], source=source
     )
 
 
-# Largest share of rows without a report, and the receive ports of a phone or modem.
+# Largest share of rows without a report, and the largest number of receive ports of a phone or modem.
 _MOST_IDLE, _MOST_PORTS = 0.1, 4
 _FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero)\b")
 

@@ -36,12 +36,12 @@ _LEVELS = ("mpower1", "mpower2", "mpower", "mquality", "RSRP", "RSRP2", "RSSI", 
 _TEXTS = ("timestamp_power_for_csv", "timestamp_for_csv")
 _EPOCHS = ("timestamp_power", "timestamp_meas")
 _UTC, _DECODED = "timestamp_meas", "succes"
-# Levels of files without a clock, and the seconds between rows of the flights that they were made of.
+# Level variables of files without a clock, and the time between rows of the raw flights [s].
 _PROCESSED = {"RSRP_s": 0.1, "power_all": 0.03276}
 _NAMES = {*_TELEMETRY, *_LEVELS, *_TEXTS, *_EPOCHS, "mSpeed"}
 # Names that only a flight has.
 _SURE = {*_LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
-# Raw positions of the LTE flights, which come before their levels; the interpolated ones are read.
+# Raw positions, with which files of LTE flights begin; they identify the format, but only interpolated ones are read.
 _GPS = re.compile(r"GPS[xyz]")
 _TEXT = re.compile(_text.TIME)
 
@@ -49,7 +49,7 @@ _TEXT = re.compile(_text.TIME)
 def sniff(head: bytes) -> bool:
     """Check whether it is a MATLAB file whose first variables are those of a merged flight.
 
-    Names of a 7.3 file are anywhere in it: those in the sniffed bytes decide.
+    A 7.3 file may have its names anywhere: only names in the sniffed bytes are tested.
     """
     if head.startswith(MAGIC_73):
         return any(re.search(rb"\b%s\b" % name.encode(), head) for name in _SURE)
@@ -94,7 +94,7 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
     raise InputError("the MATLAB file has no clock", expected=f"a variable {clocks}", cause="not a flight")
 
 
-# Name of the clock of files without a clock, whose rows are counted.
+# Name of the clock if a file has no clock and its rows are counted.
 _COUNTED = "row number"
 
 
@@ -132,7 +132,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """
     table = _load(data)
     if not any(name in table for name in (*_LEVELS, *_TELEMETRY)):
-        raise InputError("the MATLAB file holds no flight", expected=f"variables: {', '.join(sorted(_NAMES)[:5])}")
+        raise InputError("the MATLAB file contains no flight", expected=f"variables: {', '.join(sorted(_NAMES)[:5])}")
     count = _common_length(table)
     wall, valid, clock = _wall(table)
     keep = np.flatnonzero(valid)
@@ -203,7 +203,7 @@ def _measured(rows: Rows, table: dict[str, AnyArray]) -> Iterator[Stream | None]
 
 READER = Reader(
     name="flight_mat",
-    title="merged MATLAB flight (Dataset 12, AFAR, LTE at 3.51 GHz, and what their authors made of them)",
+    title="merged MATLAB flight (Dataset 12, AFAR, LTE at 3.51 GHz, and their processed files)",
     kinds=("telemetry", "rss", "kpi"),
     sample="mX mY mZ mRoll mPitch mYaw mpower1 mpower2 timestamp_power timestamp_power_for_csv", sniff=sniff, read=read,
 )  # fmt: skip

@@ -66,7 +66,9 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
     if absent := sorted({name for name in options.columns.values() if name not in header}):
         raise unknown_name(f"the file has no column {absent[0]!r}", absent[0], header[:40])
     if options.kind == "rank" and options.ri_base is None:
-        raise UsageError("a table does not say whether rank 1 is written as 0 or 1", expected="'ri_base:' zero or one")
+        raise UsageError(
+            "the table does not show whether rank 1 is written as 0 or 1", expected="'ri_base:' zero or one"
+        )
     return options.kind, {column: header.index(name) for column, name in options.columns.items()}
 
 
@@ -76,13 +78,13 @@ def _values(sheet: _sheet.Sheet, column: int, name: str, options: ReadOptions) -
     Raises
     ------
     UsageError
-        If the unit in the file belongs to another quantity than the mapping.
+        If the unit in the file belongs to another quantity than that of the mapping.
     """
     values, unit = sheet.numbers(column), sheet.unit_read(column)
     meaning, written = sheet.meanings[column], sheet.names[column]
     if meaning is not None and not _is_of(meaning.quantity, name, options.unit):
         raise UsageError(
-            f"the name of column {written!r} means {meaning.quantity.name}, the mapping {name}",
+            f"the name of column {written!r} means {meaning.quantity.name}, but it is mapped to {name}",
             expected="one quantity and unit: correct the mapping, --unit or the header",
         )
     wanted = next(unit for end, unit in (*_UNITS.items(), ("", "")) if name.endswith(end))
@@ -92,9 +94,9 @@ def _values(sheet: _sheet.Sheet, column: int, name: str, options: ReadOptions) -
         raise UsageError(f"column {written!r} is in {unit} and mapped to {name}", expected=f"a column in {wanted}")
     same = {"dBm": (None, "dBm"), "dB re full scale": (None, "dB", "dB re full scale")}.get(unit, (options.unit,))
     if name == "rss_db" and options.unit not in same:
-        raise UsageError(f"column {written!r} is in {unit} and --unit says {options.unit}", expected="one unit")
+        raise UsageError(f"column {written!r} is in {unit}, but --unit is {options.unit}", expected="one unit")
     if name == "rss_db" and unit == "dB" and options.unit == "dBm":
-        sheet.notes[column] = f"column {written!r} says dB and --unit dBm: read as dBm"
+        sheet.notes[column] = f"column {written!r} is marked dB, but --unit is dBm: read as dBm"
     return values
 
 
@@ -146,10 +148,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     for column in (where[name] for name in _VALUE[kind]):
         if len(sheet) and not any(sheet.texts(column)):
             found = f"column {sheet.names[column]!r} is empty in every row"
-            raise InputError(found, expected="values", cause=_sheet.BESIDE)
+            raise InputError(found, expected="values", cause=_sheet.MISALIGNED)
     unit = sheet.unit_read(where["rss_db"]) if kind == "rss" else ""
     if kind == "rss" and options.unit is None and not unit:
-        rows.warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
+        rows.warnings.append("no 'unit:' is given: the levels are read as dB re full scale")
     angles = {name: sheet.numbers(where[name]) for name in _pose.ANGLES if name in where}
     if not any(sheet.unit(where[name]) for name in angles) and _pose.are_small(angles):
         rows.warnings.append(_pose.small_angles(angles))
@@ -167,7 +169,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _tables(lines: Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
-    """Yield place, separator and names of lines that may be the header, from the first on."""
+    """Yield index, separator and names of each line that may be the header, starting at ``first``."""
     for i in range(first, min(first + _sheet.TITLES, len(lines))):
         line = lines.raw(i).removeprefix(b"\xef\xbb\xbf")
         separator = max(_sheet.SEPARATORS, key=lambda sign: line.count(sign.encode()))
@@ -206,7 +208,7 @@ def _stream(rows: Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], 
         about = {"ri_base": options.ri_base, **about}
     else:
         latitude, longitude, altitude = (values[key] for key in _pose.PLACE)
-        # -999 is what loggers write without a fix, here within rounding
+        # loggers write -999 if there is no fix, here with a margin for rounding
         lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (altitude > -998.5))
         add_flag(flag, lost, "no_fix")
         values |= {key: np.where(lost, np.nan, values[key]) for key in _pose.PLACE}
@@ -216,7 +218,7 @@ def _stream(rows: Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], 
 
 
 def _above_takeoff(rows: Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], where: dict[str, int]) -> _pose.Height:
-    """Convert altitudes above sea level or the ellipsoid, by the header, to heights above take-off."""
+    """Convert altitudes to heights above take-off if the header names sea level or the ellipsoid as their datum."""
     height = sheet.meanings[where["altitude_m"]] if "altitude_m" in where else None
     if height is None or height.quantity.datum not in ("sea level", "ellipsoid") or "latitude_deg" not in values:
         return {}

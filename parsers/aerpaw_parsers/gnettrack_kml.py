@@ -35,7 +35,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     cut = [i for i, text in enumerate(texts) if b"</Placemark>" not in text]
     readings = [_reading(text) for text in texts]
     timed = [i for i, reading in enumerate(readings) if reading.get("TIME") and i not in cut]
-    torn = lines.reject_all(np.setdiff1d(row[cut], row[timed]), "a placemark without its end (a cut file?)")
+    torn = lines.reject_all(np.setdiff1d(row[cut], row[timed]), "a placemark without its end (truncated file?)")
     sheet = _sheet.of_readings(lines, [(int(row[i]), readings[i]) for i in timed], torn)
     rows = _sheet.rows(sheet, options, reader="gnettrack_kml") if timed else None
     if rows is None:

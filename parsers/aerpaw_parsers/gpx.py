@@ -22,7 +22,7 @@ from . import _pose, _sheet, drive_test
 _TAG = rb"(?:\w{1,20}:)?(?:trkpt|wpt|rtept)"  # XML libraries write the prefix of a namespace
 _POINT = re.compile(rb"<" + _TAG + rb"\b([^<>]{0,200})>(.{0,2000}?)(?:</" + _TAG + rb">)", re.DOTALL)
 _INSIDE = re.compile(rb"<(?:[\w-]{1,20}:)?([\w-]{1,40})(?:\s[^<>]{0,80})?>\s{0,40}([^<>]{1,80}?)\s{0,40}</")
-# In the tag of a point or of an extension, or in the text of a remark: 'RSRP=-80, PCI: 11'.
+# A name and a value, in the tag of a point or an extension, or in the text of a remark: 'RSRP=-80, PCI: 11'.
 _PAIR = re.compile(rb"\b([A-Za-z][\w-]{0,40})\s?=\s?[\"']\s?([^\"'<>]{0,80}?)\s?[\"']")
 _REMARK = re.compile(rb"\b([A-Za-z][A-Za-z_]{1,40})\s?[=:]\s?(-?\d[\d.]{0,40})(?![\d:])")
 _REMARKS = ("cmt", "desc", "name")
@@ -39,7 +39,7 @@ def _points(data: bytes) -> list[tuple[int, dict[str, str]]]:
     """Return the place in the file and the cells of each complete point."""
     points, tracked = [], b"<trkpt" in data
     for point in _POINT.finditer(data):
-        # cut off, if the next point begins inside; next to a track, single points are marked places
+        # a point that contains the start of another is truncated; if there is a track, single points are only markers
         if _START.search(point[2]) or (tracked and b"trkpt" not in point[0]):
             continue
         found = [*_PAIR.findall(point[1]), *_INSIDE.findall(point[2])]
@@ -70,7 +70,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     sheet = _sheet.of_readings(lines, readings, _torn(lines, data, row))
     rows = _sheet.rows(sheet, options, reader="gpx") if readings else None
     if rows is None:
-        return _sheet.all_rejected(data, "gpx", "a point without position or time (torn?)")
+        return _sheet.all_rejected(data, "gpx", "a point without position or time (truncated?)")
     begun = [track.start() for track in re.finditer(rb"<(?:\w{1,20}:)?trk\b", data)]
     track = np.searchsorted(begun, np.array([at for at, _ in points], dtype=np.int64))[rows.at]
     parts = {"": (rows, sheet)}
@@ -101,7 +101,7 @@ def _torn(lines: Lines, data: bytes, row: object) -> list[RejectedLine]:
     tracked = b"<trkpt" in data
     starts = (start.start() for start in _START.finditer(data) if b"trkpt" in start[0] or not tracked)
     begun = np.unique(lines.number_at(starts))
-    return lines.reject_all(np.setdiff1d(begun, np.asarray(row)), "a point without position or time (torn?)")
+    return lines.reject_all(np.setdiff1d(begun, np.asarray(row)), "a point without position or time (truncated?)")
 
 
 READER = Reader(

@@ -1,7 +1,7 @@
 """MAVLink telemetry log of a ground station (``.tlog``): eight bytes of UTC in us, then one packet, and so on.
 
 The messages GLOBAL_POSITION_INT (33: position, height above home, velocity, heading), ATTITUDE (30), GPS_RAW_INT
-(24: fix) and SYS_STATUS (1: battery) are read. They are those of the component that sends the positions of a vehicle,
+(24: fix) and SYS_STATUS (1: battery) are read. Only the component that sends the positions of a vehicle is read,
 because the attitude of a gimbal is not that of the aircraft. Checksums are checked. Source: MAVLink guide, "Packet
 Serialization".
 """
@@ -44,7 +44,7 @@ def _crc(data: bytes) -> int:
 
 
 def _packet(data: bytes, at: int) -> tuple[int, int, tuple[int, int], bytes] | None:
-    """Return the length with its time, message number, source and payload of a packet, or None."""
+    """Return the length (with its time), message number, source and payload of a packet, or None if there is none."""
     if at + 16 > len(data):
         return None
     stamp = int.from_bytes(data[at : at + 8], "big")

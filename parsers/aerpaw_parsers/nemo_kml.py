@@ -38,7 +38,7 @@ def sniff(head: bytes) -> bool:
 
 def _reason(line: bytes) -> str | None:
     if _HINT.search(line):
-        return "a Nemo description without time, quantity, position or altitude (torn line?)"
+        return "a Nemo description without time, quantity, position or altitude (truncated line?)"
     return None  # markup
 
 
@@ -85,7 +85,7 @@ def _in_seconds(time_ms: FloatArray, latitude: FloatArray, longitude: FloatArray
     return FASTEST_MPS < speed_mps <= 1e3 * FASTEST_MPS
 
 
-# Nemo's KML writes this behind the quantities of the serving cell, its CSV writes ``nr`` before them (``nr_rsrp``).
+# Nemo's KML writes this after the quantities of the serving cell; its CSV writes ``nr`` before them (``nr_rsrp``).
 _SERVING = " (NR SpCell)"
 
 

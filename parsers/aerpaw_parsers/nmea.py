@@ -41,7 +41,7 @@ def _sentences(lines: Lines, rejected: list[RejectedLine]) -> list[tuple[int, st
     for i in np.flatnonzero(~lines.blank).tolist():
         found = _SENTENCE.fullmatch(lines.raw(i))
         if found is None or not (found[5] or unchecked):
-            rejected.append(lines.reject(i, "not a complete NMEA sentence (cut?)"))
+            rejected.append(lines.reject(i, "not a complete NMEA sentence (truncated?)"))
         elif found[5] and reduce(xor, found[1]) != int(found[5], 16):
             rejected.append(lines.reject(i, "the checksum of the NMEA sentence is wrong"))
         else:
@@ -56,7 +56,7 @@ def _day_s(clock: str) -> float:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Return the telemetry ``vehicle`` of the talker that writes most positions."""
+    """Return the telemetry ``vehicle`` of the talker that writes the most positions."""
     rejected: list[RejectedLine] = []
     lines = split(data)
     sentences = _sentences(lines, rejected)

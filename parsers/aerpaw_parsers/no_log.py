@@ -45,7 +45,7 @@ def _antenna_mat(head: bytes) -> bool:
 
 def _refuse(what: str) -> Callable[[bytes, ReadOptions], ReadResult]:
     def read(_data: bytes, _options: ReadOptions) -> ReadResult:
-        raise InputError(f"no log: {what}", expected="one of the formats of 'aerpaw-cmp formats'")
+        raise InputError(f"not a log: {what}", expected="one of the formats of 'aerpaw-cmp formats'")
 
     return read
 

@@ -86,7 +86,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     columns |= {"sinr_db": value["sinr"][reported], "rsrp_dbm": value["rsrp"][reported]}
     about = {"ri_base": "one", "source": "CSI report, last one"}
     ranks = of_ues(rows, "rank", options.channel or "oai", columns, pick=reported, flag=flag, about=about)
-    # a gNB prints 0 of 0 measurements
+    # a gNB prints a level of 0 if it made 0 measurements
     measured = np.flatnonzero(~np.isnan(value["rsrp"]) & (np.isnan(value["meas"]) | (value["meas"] > 0)))
     level, flag = rows.level(value["rsrp"])
     levels = {"rss_db": level[measured], "serving": np.ones(len(measured)), "rnti": rnti[measured]}

@@ -52,7 +52,7 @@ def _readings(entries: list[dict[str, Any]]) -> Iterator[_cells.Reading]:
 
 
 def _text_cells(line: bytes) -> list[dict[str, Any]] | None:
-    """Return the cells of a line of the text of 2023 by the names of the JSON, or None for other fields."""
+    """Return the cells of a line in the text of 2023 under the names of the JSON, or None if its fields differ."""
     decoded = []
     for block in _BLOCK.findall(line):
         cells = block.split(b",")
@@ -75,7 +75,7 @@ def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
     sound = np.array([item is not None for item in cells], dtype=bool)
     rows = built(
         lines, row[sound], {"time": np.array([float(group[0]) for group in groups], dtype=np.float64)[sound]}, options,
-        reader="pawprints", reason=lambda _line: "not a whole 'CELL_LOG_START ... CELL_LOG_STOP' (torn line?)",
+        reader="pawprints", reason=lambda _line: "not a complete 'CELL_LOG_START ... CELL_LOG_STOP' (truncated line?)",
         clock="epoch_ms", extra=odd,
     )  # fmt: skip
     blocks = [item for item in cells if item is not None]
@@ -96,7 +96,7 @@ def _read_location(data: bytes, options: ReadOptions) -> ReadResult:
     dated = len(_GPS_EPOCH.findall(data)) == len(_GPS_SECONDS.findall(data))
     rows = matched(
         data, _GPS_EPOCH if dated else _GPS_SECONDS, options, reader="pawprints",
-        reason=lambda _line: "not a whole 'GPS_LOG_START ... GPS_LOG_STOP' (torn line?)",
+        reason=lambda _line: "not a complete 'GPS_LOG_START ... GPS_LOG_STOP' (truncated line?)",
         clock="epoch_ms" if dated else "relative_s",
     )  # fmt: skip
     return rows.result([_placed(rows, *(rows.number(name) for name in ("latitude", "longitude", "altitude")))])

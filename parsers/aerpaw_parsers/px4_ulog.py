@@ -3,9 +3,9 @@
 The format describes itself: ``F`` messages contain the fields of each topic, ``A`` its number, ``D`` its data. The
 topics ``vehicle_global_position``, ``vehicle_attitude`` (quaternion) and ``vehicle_local_position`` (velocity) are
 read, and ``vehicle_gps_position`` or ``sensor_gps`` for UTC and fix, or for the position if there is no other. Instance
-0 of each is read, and the receiver with most fixes. Heights are above ``home_position`` at take-off, else above the
-ground at rest or the first position.
-Source: PX4 guide, "ULog File Format".
+0 of each topic is read. If there are several receivers, the receiver with the most fixes is read. Heights are above
+``home_position`` at take-off, else above the ground at rest or the first position. Source: PX4 guide, "ULog File
+Format".
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _KINDS = frozenset(b"BFIMPQADLCSORT")
 
 
 def _layout(text: str) -> np.dtype[np.void] | None:  # type: ignore[type-var]
-    """Return the layout of a topic, or None if it contains another topic, which no wanted topic does."""
+    """Return the layout of a topic, or None if it contains another topic (no topic that is read does)."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     for part in text.split(";"):
         if not part:
@@ -62,7 +62,7 @@ def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int
     while at + 3 <= len(data):
         size, kind = struct.unpack_from("<HB", data, at)
         if kind not in _KINDS or at + 3 + size > len(data):
-            reason = f"{counted(len(data) - at, 'byte')} without a message at {at}: read no further"
+            reason = f"{counted(len(data) - at, 'byte')} without a message at {at}: the rest is not read"
             damaged.append(RejectedLine(count + 1, reason, ""))
             break
         body = data[at + 3 : at + 3 + size]
@@ -85,7 +85,7 @@ def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int
 
 
 def _best(topics: list[tuple[str, int]], tables: Mapping[tuple[str, int], AnyArray]) -> tuple[str, int] | None:
-    """Return the first instance of a topic with most fixes, or None if there is no instance."""
+    """Return the first instance of a topic with the most fixes, or None if there is no instance."""
 
     def fixes(topic: tuple[str, int]) -> int:
         fix = _column(tables[topic], "fix_type")

@@ -54,7 +54,9 @@ def _tables(lines: _text.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, f
         if heads is None:
             continue  # neighbours and operators are not read
         if not time or len(cells) != len(heads):
-            rejected.append(lines.reject(i, "a table row without a time, or of another width than its head (torn?)"))
+            rejected.append(
+                lines.reject(i, "a table row without a time, or with other columns than its heading (truncated?)")
+            )
             continue
         kind = next((word for word in (b"LTE", b"NR5G") if word in row[3] and title == b"servingcell"), title)
         entries.append((i, time, kind.decode("ascii"), dict(zip(heads, map(_number, cells), strict=True))))

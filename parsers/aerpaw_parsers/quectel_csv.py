@@ -41,7 +41,7 @@ _T = rb"^\[?(?P<time>" + TIME + ZONE + rb")(?:,|\]?[ \t]{1,4})"
 
 
 def _answer(command: bytes, word: bytes, rat: bytes, names: str) -> bytes:
-    """Return the pattern of an answer: its command and word, and its fields, with a dot for one that is not read."""
+    """Return the pattern of an answer with its command, word and fields. A dot is a field that is not read."""
     return rb'"{0,3}(?:\+' + command + rb': ?)?"{0,3}' + word + rb'"{1,3}' + _fields(rat, names)
 
 
@@ -64,7 +64,7 @@ _FORMS = tuple(
     re.compile(_T + form + rb"[ \t]*\r?$", re.MULTILINE) for form in (
         rb"(?:" + _INFO + rb")?" + _CSI[b"lte"] + b"," + _CSI[b"nr5g"] + _FIFTH + rb"(?:(?:," + _C + rb"){4})?",
         _LTE + rb"(?:," + _NSA + rb"(?:" + _ARFCN + rb"(?:," + _C + rb"){3})?)?",
-        _SA + rb"(?:," + _C + rb"){0,3}",  # firmwares differ behind the SINR
+        _SA + rb"(?:," + _C + rb"){0,3}",  # firmware versions differ after the SINR
         _NSA + rb"(?:" + _ARFCN + rb"(?:," + _C + rb"){1,4})?",
         _CSI[b"lte"] + _FIFTH, _CSI[b"nr5g"] + _FIFTH,
     )
@@ -85,19 +85,19 @@ def sniff(head: bytes) -> bool:
 
 def _reason(line: bytes) -> str | None:
     if line.strip() == b"OK":
-        return None  # written by the start script, not by the modem
+        return None  # the start script wrote this line, not the modem
     if b"\0" in line:
         return "NUL bytes in the line (the file system was not synced when the power failed)"
     if line.startswith(b"[") and _TALK.match(line):
         return None  # commands and other answers of a console
     if not re.match(rb"\[?" + TIME, line):
-        return "no time stamp in front (torn or stray modem line)"
+        return "no time stamp at the beginning (truncated or stray modem line)"
     if b"neighbourcell" in line:
         return "neighbour-cell row: not read"
     if b"SEARCH" in line:
         return "the modem was searching: no serving cell"
     if b"csi" in line:
-        return "incomplete CSI answer (torn row, or a stray modem line inside it)"
+        return "incomplete CSI answer (truncated row, or a stray modem line inside it)"
     return "not a row of the logger's CSVs, or one with another number of columns"
 
 

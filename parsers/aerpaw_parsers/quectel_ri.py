@@ -1,7 +1,7 @@
 """The published rank-indicator table (Dryad wh70rxx06): ``ID,Time and date,Longitude,Latitude,Altitude,NR RI``.
 
-RI counts data layers from 1, as the modem wrote it; 0 means no CSI. Times are local wall time. Rank stream
-``nr5g_csi`` with the table's own positions.
+RI counts data layers from 1, as the modem wrote it; 0 means no CSI. Times are local wall time. The result is
+the rank stream ``nr5g_csi`` with the positions of the table.
 """
 
 from __future__ import annotations

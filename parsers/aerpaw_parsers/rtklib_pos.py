@@ -29,7 +29,7 @@ def sniff(head: bytes) -> bool:
 
 
 def _time(day: str, clock: str, scale_s: int) -> str:
-    """Return UTC of a date and a clock, or of a GPS week and its second, an empty text for neither."""
+    """Return the UTC of a date and a clock, or of a GPS week and its second. Empty for other input."""
     try:
         if "/" in day:
             time = np.datetime64(f"{day.replace('/', '-')}T{clock}", "us")
@@ -63,7 +63,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
             cells = (time, *found.group(3, 4, 5), _FIX.get(found[6], ""), found[7])
             readings.append((i, dict(zip(names, cells, strict=True))))
         elif not lines.raw(i).startswith(b"%"):
-            rejected.append(lines.reject(i, "not 'date time latitude longitude height Q ns' (cut?)"))
+            rejected.append(lines.reject(i, "not 'date time latitude longitude height Q ns' (truncated?)"))
     return _pose.of_readings(lines, readings, rejected, options, reader=READER.name)
 
 

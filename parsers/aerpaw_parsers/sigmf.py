@@ -75,7 +75,7 @@ def _column(captures: list[dict[str, Any]], field: str, *names: str) -> FloatArr
 
 
 def _times(captures: list[dict[str, Any]], own: str) -> list[str]:
-    """Return the times of all captures, from the given field or those of the core."""
+    """Return the times of all captures, from the given field or from the core fields."""
     stamps = (next((capture[field] for field in (own, *_TIMES) if field in capture), None) for capture in captures)
     return [str(item) for stamp in stamps for item in _list(stamp)]
 
@@ -122,7 +122,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         captures = _merged(meta)
     except (ValueError, RecursionError, AttributeError) as error:
         found = f"the SigMF meta file is not JSON ({error})"
-        raise InputError(found, expected="a whole file", cause="a cut download") from None
+        raise InputError(found, expected="a complete file", cause="a truncated download") from None
     tables = [*_track(captures, options), *_levels(captures, options)]
     warnings: list[str] = []
     if not any(stream.kind == "rss" for _, stream in tables):
@@ -151,7 +151,7 @@ def _levels(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tu
         if not len(values):
             continue
         if len(values) != len(texts):
-            raise InputError(f"{len(values)} values of {name} and {len(texts)} times", expected="as many of each")
+            raise InputError(f"{len(values)} values of {name} and {len(texts)} times", expected="one time per value")
         rows = _rows_of(texts, options)
         counts = [len(_list(_json.inside(capture, "measurement:values").get(name))) for capture in captures]
         tuned = [_json.number(capture.get("core:frequency")) for capture in captures]
@@ -187,7 +187,7 @@ def _data_name(options: ReadOptions) -> str:
 def _powers(
     meta: dict[str, Any], captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str]
 ) -> Iterator[tuple[Rows, Stream]]:
-    """Yield the power of each burst of the samples, for captures with their global fields."""
+    """Yield the power of each burst of samples. ``captures`` include the global fields."""
     common = _json.inside(meta, "global")
     samples, full_scale = _samples(common, _json.listed(meta, "captures"), options)
     rate = _json.number(common.get("core:sample_rate"))
@@ -197,7 +197,7 @@ def _powers(
     size, zero = max(1, round(_BURST_S * rate)), _integer(common.get("core:offset"))
     # 0 lies between the two middle codes: 127.5 of 0 .. 255
     middle = full_scale - 0.5 if samples.dtype.kind == "u" else 0.0
-    bursts: list[tuple[str, float, float]] = []  # stamp of the capture, seconds behind it, frequency
+    bursts: list[tuple[str, float, float]] = []  # stamp of the capture, seconds after it, frequency
     powers: list[FloatArray] = []
     means, clipped, most = [], [], 0.0
     starts = [min(max(_integer(item.get("core:sample_start")) - zero, 0), len(samples)) for item in captures]

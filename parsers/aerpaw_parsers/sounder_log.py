@@ -150,7 +150,7 @@ def _piece(lines: _text.Lines, rejects: _text.Rejects) -> _Piece:
         line = lines.raw(i)
         sample, star, foot = (form.match(line) for form in (_ODD, _STAR, _FOOT))
         if sample is not None and i == torn and len(line) < _STAMP + 1 + len(sample[2]) + _VALUE:
-            rejects.add(lines, [i], "torn last line: the value is cut short")
+            rejects.add(lines, [i], "truncated last line: the value is cut short")
         elif sample is not None:
             samples.append((i, sample[1], sample[2], float(sample[3])))
         if mark := star or foot:
@@ -182,7 +182,7 @@ def _reason(line: bytes) -> str:
     if not line.startswith(b"["):
         return "the line does not begin with '[time]': it was not written through 'ts'"
     if not re.match(_HEAD, line):
-        return "the time stamp is incomplete or of another form (torn line?)"
+        return "the time stamp is incomplete or of another form (truncated line?)"
     return "neither 'offset value', nor '*': not an od line"
 
 
@@ -201,7 +201,7 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     feet = marks.take(marks.offset >= 0)
     if not len(stars.line):
         return _Samples.none(), stars.line, []
-    # a foot line ends the last run, like a sample without a value
+    # a last line that contains only an offset ends the last run, like a sample without a value
     near = np.unique(np.searchsorted(samples.line, stars.line).clip(max=len(samples.line) - 1))
     ends = (samples.take(near) if len(samples.line) else samples).join(feet)
     after = np.searchsorted(ends.line, stars.line)
@@ -209,14 +209,14 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     bad: list[tuple[int, str]] = []
     ok = (before >= 0) & (after < len(ends.line))
     same = np.concatenate(([False], np.diff(before) == 0)) & (before >= 0)
-    bad += [(int(i), "'*' without a sample before it or an offset after it: the run has no length")
+    bad += [(int(i), "'*' without a sample before it or an offset after it: so the length of the run is unknown")
             for i in stars.line[~ok]]  # fmt: skip
     bad += [(int(i), "a second '*' in one run") for i in stars.line[ok & same]]
     chosen = np.flatnonzero(ok & ~same)
     start, end = before[chosen], after[chosen]
     count = (ends.offset[end] - samples.offset[start]) // 4 - 1
     fits = (count >= 0) & (np.cumsum(np.maximum(count, 0)) <= _MOST_REPEATS)
-    bad += [(int(i), "'*' between offsets that do not bound a run of believable length")
+    bad += [(int(i), "'*' between offsets that do not bound a run of plausible length")
             for i in stars.line[chosen[~fits]]]  # fmt: skip
     chosen, start, end, count = chosen[fits], start[fits], end[fits], count[fits]
     step = np.concatenate([np.arange(1, n + 1) for n in count.tolist()]) if len(count) else np.zeros(0, dtype=np.int64)
@@ -236,7 +236,7 @@ _NAMED = re.compile(r"(?<![a-z])(power|quality|snr)(?![a-z])|(?:power|quality|sn
 
 
 def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
-    """Return one stream of levels, named by ``options.channel`` or the file, because all logs have one layout.
+    """Return one stream of levels. ``options.channel`` or the file name decides its kind: all logs have one layout.
 
     The samples of all pieces are stored; runs, times and flags are computed for all of them.
 
@@ -249,7 +249,7 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     log = _joined(pieces, rejects)
     repeats, used, bad = _expand(log.samples, log.marks)
     feet = log.marks.line[log.marks.offset >= 0].tolist()
-    foot = "no value behind the offset (torn last line, or the end of od's input)"
+    foot = "no value after the offset (truncated last line, or the end of od's input)"
     for i, reason in (*bad, *((i, foot) for i in feet)):
         rejects.add_line(i + 1, reason, log.texts.get(i, ""))
     tally.update(repeated=len(repeats.line), accepted=len(log.samples.line) + len(used))
@@ -284,7 +284,7 @@ def _joined(pieces: Iterable[bytes], rejects: _text.Rejects) -> _Piece:
 def _stream(
     log: _Piece, repeats: _Samples, options: ReadOptions, tally: Counter[str], notes: list[str]
 ) -> Stream | None:
-    """Return the stream with its flags, or None without samples, and add warnings about its times to ``notes``."""
+    """Return the stream with its flags, or None if it is empty, and add warnings about its times to ``notes``."""
     samples = log.samples
     if not len(samples.line):
         return None

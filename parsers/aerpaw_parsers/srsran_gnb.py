@@ -57,7 +57,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         options = replace(options, clock="utc")  # the program's log and metrics are in UTC
     rows = matched(
         data, pattern, options, reader="srsran_gnb",
-        reason=lambda line: "an incomplete line of the table (torn line?)" if _TORN.match(line) else None,
+        reason=lambda line: "an incomplete line of the table (truncated line?)" if _TORN.match(line) else None,
     )  # fmt: skip
     rnti = np.array([int(text, 16) if text else np.nan for text in rows.text("rnti")], dtype=np.float64)
     columns = {"cqi": rows.number("cqi"), "mcs": rows.number("mcs"), "rnti": rnti, "pci": rows.number("pci")}
@@ -90,7 +90,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     if options.clock is None:
         options = replace(options, clock="utc")
     clock, time, warnings = _stamps.read(texts, options)
-    # an object without UEs is valid and not a truncated line
+    # an object without UEs is valid, not a truncated line
     mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host
     rows = built(
         lines, row[with_ue], {"time": time}, options, reader="srsran_json", reason=_json.bracket, clock=clock,

@@ -69,7 +69,7 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     Raises
     ------
     InputError
-        If the schema is another one than :data:`SCHEMA`.
+        If the schema is not :data:`SCHEMA`.
     """
     log = _Log()
     for data in pieces:
@@ -136,7 +136,7 @@ class _Log:
             self._note(record)
 
     def _note(self, record: dict[str, Any]) -> None:
-        """Note events of the complete log in a record: gaps, clock steps, lost records, the end."""
+        """Note the events in a record that concern the complete log: gaps, clock steps, lost records, the end."""
         kind = record["kind"]
         if isinstance(record.get("n"), int):
             self.numbers.add(int(record["n"]))
@@ -169,7 +169,7 @@ class _Log:
         if self.rejected and self.rejected[-1].reason.startswith("torn tail"):
             texts.append("the last line is truncated (power loss or kill while writing)")
         if not self.ended:
-            texts.append("no end record: the session was cut")
+            texts.append("no end record: the session was cut off")
         return tuple(texts)
 
 

@@ -71,10 +71,10 @@ def _reason(line: bytes) -> str | None:
         return "NUL bytes in the line (the file system was not synced when the power failed)"
     fields = len(re.sub(rb"\([^()]*\)", b"", line).split(b","))
     if fields not in (8, 9, 10, 11):
-        return f"{fields} fields where 8, 9, 10 or 11 were expected (torn line?)"
+        return f"{fields} fields where 8, 9, 10 or 11 were expected (truncated line?)"
     if not re.search(TIME, line):
-        return "no time stamp (torn line?)"
-    return "a field is not of the form that vehicleOut has there"
+        return "no time stamp (truncated line?)"
+    return "a field does not have the form that vehicleOut specifies for it"
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -83,12 +83,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     Raises
     ------
     UsageError
-        If the times carry no offset and no time zone is given.
+        If the times have no offset and no time zone is given.
     """
     pattern = _EITHER if mostly(data, _LONGER) and not mostly(data, _ROW) else _ROW
     rows = matched(data, pattern, options, reader="vehicle_out", reason=_reason)
     number = {name: _numbers(rows, name) for name in _NUMBERS}
-    for name in ("pitch_11", "yaw_11", "roll_11", "volt_11", "volt_9"):  # fields with other places in other layouts
+    for name in ("pitch_11", "yaw_11", "roll_11", "volt_11", "volt_9"):  # fields whose column depends on the layout
         own = name.partition("_")[0]
         number[own] = np.fmax(number[own], _numbers(rows, name))
     jumps = int((np.diff(number["index"]) != 1).sum())
@@ -126,7 +126,7 @@ def _values(rows: Rows, number: dict[str, FloatArray]) -> dict[str, AnyArray]:
         warnings.append(f"{counted(int(no_fix.sum()), 'row')} without a position fix: position NaN, flagged no_fix")
     rows.warnings = [*warnings, *rows.warnings]
     if len(rows) > 10 and (number["fix"] == 6).all() and (number["satellites"] == 10).all():
-        rows.warnings.append("fix 6 with 10 satellites throughout: a digital-twin run looks like this, not a flight")
+        rows.warnings.append("fix 6 with 10 satellites throughout: probably a run of the digital twin, not a flight")
     counts = {name: number[name].astype(np.int64) for name in ("fix", "satellites")} | {"battery_v": number["volt"]}
     return {name: np.where(no_fix | outside, np.nan, part) for name, part in place.items()} | motion | counts
 

@@ -26,7 +26,7 @@ def rows_of(ingested: Ingested) -> dict[str, list[str]]:
         total = sum(len(stream.frame) for stream in result.streams)
         rows[os.path.relpath(file.path, REAL)] = [result.reader, *map(str, (*counts, total))]
     for left in ingested.skipped:
-        rows[os.path.relpath(left.path, REAL)] = ["no log", left.reason.removeprefix("no log: ")]
+        rows[os.path.relpath(left.path, REAL)] = ["no log", left.reason.removeprefix("not a log: ")]
     return rows
 
 
@@ -37,7 +37,7 @@ def rows(field_logs: Ingested) -> dict[str, list[str]]:
 
 def test_no_file_is_left_without_a_word(rows: dict[str, list[str]]) -> None:
     assert set(rows) == {row[0] for row in TABLE}
-    assert not any("no reader knows" in row[-1] for row in rows.values())
+    assert not any("no reader recognises" in row[-1] for row in rows.values())
 
 
 @pytest.mark.parametrize("row", TABLE, ids=[row[0] for row in TABLE])

@@ -98,7 +98,7 @@ def test_a_growing_log_is_followed_until_it_is_interrupted(flight, capsys, tmp_p
 
     whole = flight.with_name("power.txt").read_text().splitlines(keepends=True)
     growing = flight.with_name("growing.txt")
-    growing.write_text("".join(whole[: len(whole) // 2]) + whole[-1][:9])  # a torn last line
+    growing.write_text("".join(whole[: len(whole) // 2]) + whole[-1][:9])  # a truncated last line
     (flight.parent / "growing.yaml").write_text(flight.read_text().replace("path: power.txt", "path: growing.txt"))
     waits = []
 

@@ -102,7 +102,9 @@ def test_many_receivers_are_tiles_by_themselves_and_few_are_not():
 
 
 @pytest.mark.parametrize(
-    "ending", [InputError("the scheduler of the workers went away"), KeyboardInterrupt()], ids=["cluster", "interrupt"]
+    "ending",
+    [InputError("the scheduler of the workers cannot be reached"), KeyboardInterrupt()],
+    ids=["cluster", "interrupt"],
 )
 def test_finished_tiles_are_not_computed_again(ending, tmp_path, in_one_piece):
     crew = Watched(ending, after=3)

@@ -148,7 +148,7 @@ def test_no_flight_that_shares_a_tower_is_one_message(small):
     other = small / "other.yaml"
     text = (small / "a.yaml").read_text().replace("node: LW1", "node: LW4").replace("node: LW2", "node: LW5")
     other.write_text(text)
-    with pytest.raises(UsageError, match="asks for LW4, LW5"):
+    with pytest.raises(UsageError, match="needs LW4, LW5"):
         predict.predict(other, named_flights([small / "a.yaml"]))
     with pytest.raises(UsageError, match="the site is not named"):
         predict.predict(small / "points.csv", [])

@@ -98,7 +98,7 @@ def test_workers_run_no_module_that_lies_in_the_working_folder(tmp_path: Path) -
 def test_workers_that_see_no_file_or_run_other_code_are_named(seen: dict[str, Any]) -> None:
     cluster = seen["cluster"]
     assert cluster["good"] == "no error"
-    assert cluster["unseen"].startswith("UsageError: 2 of 2 workers cannot do this campaign: ")
+    assert cluster["unseen"].startswith("UsageError: 2 of 2 workers cannot run this campaign: ")
     assert "does not see" in cluster["unseen"]
     assert "nowhere" in cluster["unseen"]
     assert "runs different code" in cluster["other"]
@@ -208,5 +208,5 @@ def test_a_scheduler_that_goes_away_as_it_is_asked_is_one_message() -> None:
         def nthreads(self) -> dict[str, int]:
             raise OSError("Stream is closed")
 
-    with pytest.raises(InputError, match="went away"):
+    with pytest.raises(InputError, match="cannot be reached"):
         _ = workers.Cluster(Gone()).count

@@ -47,7 +47,7 @@ def test_round_trip_and_rotation(tmp_path):
     results = [READER.read(path.read_bytes(), ReadOptions()) for path in log.paths]
     assert all(READER.sniff(path.read_bytes()) for path in log.paths)
     # each segment but the last says that it goes on
-    assert [r.warnings for r in results] == [()] * (len(results) - 1) + [("no end record: the session was cut",)]
+    assert [r.warnings for r in results] == [()] * (len(results) - 1) + [("no end record: the session was cut off",)]
 
 
 def test_a_second_session_never_writes_into_the_first(tmp_path):

@@ -88,7 +88,7 @@ def test_bombs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert [Path(f.path).name for f in ingested] == ["b_vehicleOut.txt"]
     assert "unpacks to" in ingested.skipped[0].reason
     monkeypatch.setattr(archives, "MOST_MEMBERS", 1)
-    with pytest.raises(InputError, match="holds 2 files"):
+    with pytest.raises(InputError, match="contains 2 files"):
         ingest(place)
 
 

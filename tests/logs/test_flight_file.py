@@ -210,7 +210,7 @@ def test_files_that_are_no_flight_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_flight(path)
     path.write_bytes(b"")
-    with pytest.raises(InputError, match="no HDF5 file"):
+    with pytest.raises(InputError, match="not an HDF5 file"):
         read_flight(path)
     with h5py.File(path, "w") as book:
         book["a"] = 1

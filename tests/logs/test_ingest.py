@@ -180,7 +180,7 @@ def test_gzip_members_are_joined(tmp_path: Path) -> None:
         (b"\0\1\2\3" * 500, "binary content"),
         (bytes(range(256)) * 20, "binary content"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "Git-LFS pointer"),
-        (b"hello, world\n", "no reader knows this content: 'hello, world'"),
+        (b"hello, world\n", "no reader recognises this content: 'hello, world'"),
         (gzip.compress(b"hello", mtime=0)[:-6], "gzip file ends too early"),
         (b"\x1f\x8b\x08\x00rubbish", "gzip"),
         (gzip.compress(b"", mtime=0), "empty"),
@@ -219,7 +219,7 @@ def test_missing_file(tmp_path: Path) -> None:
 
 def test_a_folder_without_logs(tmp_path: Path) -> None:
     (tmp_path / "notes.md").write_text("we flew\n")
-    with pytest.raises(InputError, match="no log that a reader knows"):
+    with pytest.raises(InputError, match="no log that a reader recognises"):
         ingest(tmp_path, options=OPTIONS)
 
 
@@ -320,7 +320,7 @@ def test_symlink_loops_end(tmp_path: Path) -> None:
 def test_a_flight_file_is_not_a_log_and_a_folder_says_why_nothing_was_read(tmp_path: Path) -> None:
     write_flight(tmp_path / "flight.h5", [])
     assert ingest(tmp_path / "flight.h5") == []
-    with pytest.raises(InputError, match=r"no log that a reader knows \(1 file looked at\); flight.h5: an HDF5 file"):
+    with pytest.raises(InputError, match=r"no log that a reader recognises \(1 file tested\); flight.h5: an HDF5 file"):
         ingest(tmp_path)
     with pytest.raises(InputError, match="no log that reader 'vehicle_out' can read"):
         ingest(tmp_path, reader="vehicle_out")

@@ -128,4 +128,4 @@ def test_positions_that_stand_still_at_speed_are_stale(speed_mps: float, flagged
     shown = after.streams[0].frame
     assert (shown["flag"] == "position_stale").sum() == flagged
     assert shown["latitude_deg"].isna().sum() == flagged
-    assert not flagged or "still for 99 s from line 51 on, at a logged speed of 5.0 m/s" in after.warnings[0]
+    assert not flagged or "change for 99 s from line 51 on, at a logged speed of 5.0 m/s" in after.warnings[0]

@@ -199,12 +199,12 @@ def test_a_header_and_a_mapping_that_disagree_are_refused(tmp_path: Path) -> Non
     place = ("time=time", "p [dBm]=rss_db", "lat=latitude_deg", "lon=longitude_deg")
     with pytest.raises(UsageError, match="is in deg and mapped to altitude_m"):
         read(tmp_path / "x.csv", (*place, "h [deg]=altitude_m"), {})
-    with pytest.raises(UsageError, match="'lon' means longitude_deg, the mapping latitude_deg"):
+    with pytest.raises(UsageError, match="'lon' means longitude_deg, but it is mapped to latitude_deg"):
         read(tmp_path / "x.csv", (*place[:2], "lon=latitude_deg", "lat=longitude_deg"), {})
     (tmp_path / "y.csv").write_text(table("time,cqi", f"{EPOCH},2"))
-    with pytest.raises(UsageError, match="'cqi' means CQI, the mapping ri_raw"):
+    with pytest.raises(UsageError, match="'cqi' means CQI, but it is mapped to ri_raw"):
         read(tmp_path / "y.csv", ("time=time", "cqi=ri_raw"), {"ri_base": "one"})
-    with pytest.raises(UsageError, match="is in dBm and --unit says"):
+    with pytest.raises(UsageError, match="is in dBm, but --unit is"):
         read(tmp_path / "x.csv", place, {"unit": "dB re full scale"})
 
 

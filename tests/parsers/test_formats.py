@@ -120,7 +120,7 @@ def test_torn_and_impossible_telemetry_says_why() -> None:
 def test_digital_twin_is_named() -> None:
     line = b"%d,-78.7000001,35.7300002,0.5,48.1,99,2025-03-02 10:00:%02d.250000,6,10\r\n"
     twin = b"".join(line % (i + 1, i) for i in range(20))
-    assert any("digital-twin" in text for text in read("vehicle_out", twin).warnings)
+    assert any("digital twin" in text for text in read("vehicle_out", twin).warnings)
 
 
 def test_sounder_offsets_are_octal_and_runs_come_back() -> None:

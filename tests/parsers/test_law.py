@@ -72,9 +72,9 @@ def test_every_reader_has_a_sample() -> None:
 @pytest.mark.parametrize("kind", NO_LOGS)
 def test_what_is_no_log_is_named_and_taken_by_no_reader(kind: str) -> None:
     assert [reader.name for reader in claims(NO_LOGS[kind])] == [kind]
-    with pytest.raises(InputError, match="no log: "):
+    with pytest.raises(InputError, match="not a log: "):
         identify(NO_LOGS[kind])
-    with pytest.raises(InputError, match="no log: "):
+    with pytest.raises(InputError, match="not a log: "):
         by_name(kind).read(NO_LOGS[kind], OPTIONS)
 
 

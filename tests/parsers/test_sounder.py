@@ -142,7 +142,7 @@ def test_a_foot_bounds_the_last_run_by_its_offset_and_its_time(first: int) -> No
 def test_a_foot_at_the_beginning_of_a_file_is_one(offset: int) -> None:
     result = read(line(0, f"{offset:07o}"), sample(1, offset), sample(2, offset + 4))
     assert (result.accepted, [reject.number for reject in result.rejected]) == (2, [1])
-    assert "no value behind the offset" in result.rejected[0].reason
+    assert "no value after the offset" in result.rejected[0].reason
 
 
 @pytest.mark.parametrize(
@@ -152,8 +152,8 @@ def test_a_foot_at_the_beginning_of_a_file_is_one(offset: int) -> None:
         ([sample(0, 0), sample(1, 4), star(2)], 3, "or an offset after it"),
         ([sample(0, 0), star(1), star(2), sample(4, 16)], 3, "a second '*' in one run"),
         ([sample(0, 0), sample(1, 4), star(2), star(2), sample(4, 16)], 4, "a second '*' in one run"),
-        ([sample(0, 8), star(1), sample(4, 0)], 2, "do not bound a run of believable length"),
-        ([sample(0, 0), star(1), sample(4, 4 * 5_000_002)], 2, "do not bound a run of believable length"),
+        ([sample(0, 8), star(1), sample(4, 0)], 2, "do not bound a run of plausible length"),
+        ([sample(0, 0), star(1), sample(4, 4 * 5_000_002)], 2, "do not bound a run of plausible length"),
     ],
 )
 def test_stars_that_say_no_length(lines: list[str], number: int, words: str) -> None:

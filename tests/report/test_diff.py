@@ -294,7 +294,7 @@ def without(*keys):
 
 
 BAD = {
-    "a torn last line": (cut_last_line, r"rss\.csv, line \d+: the last line does not end.*truncated", InputError),
+    "a truncated last line": (cut_last_line, r"rss\.csv, line \d+: the last line does not end.*truncated", InputError),
     "a torn line": (tear_a_line, r"rss\.csv, line 6: .*truncated", InputError),
     "a word": (word_for_number, r"rss\.csv, line 4: column 'measured_db': 'loud'; expected a number", InputError),
     "an older table": (lambda f: change_table(f, "rss", lambda t: t.drop(columns="up_m")), r"no column 'up_m'.*older", InputError),

@@ -210,7 +210,7 @@ def test_bad_gain_grids_are_explained(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no gain grid 'tiltd'; expected one of tilted"):
         read_gain_grid(path, "tiltd")
     path.write_bytes(b"MATLAB 5.0 nonsense" * 20)
-    with pytest.raises(AerpawCmpError, match="no MATLAB"):
+    with pytest.raises(AerpawCmpError, match="not a MATLAB"):
         read_gain_grid(path, "tilted")
 
 

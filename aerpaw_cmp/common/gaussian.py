@@ -28,9 +28,8 @@ def gaussian_kernel(first: FloatArray, second: FloatArray, length: float) -> Flo
     from scipy.spatial.distance import cdist
 
     kernel = np.asarray(cdist(first, second, "sqeuclidean"))
-    kernel /= (
-        -2.0 * length**2
-    )  # compute in place: two more matrices of this size would take as long as the exponentials
+    # compute in place: two more matrices of this size would take as long as the exponentials
+    kernel /= -2.0 * length**2
     np.exp(kernel, out=kernel)
     return kernel
 

@@ -133,7 +133,8 @@ def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
     return [part for place in places for part in ([place] if len(place) <= 3 else _in_threes(place))]
 
 
-# Longitudes and latitudes of one area differ by less [deg]; a longitude and a latitude differ by more.
+# The longitudes of an area differ by less than this [deg], and so do its latitudes. A longitude and a latitude differ
+# by more.
 _AREA_DEG = 5.0
 
 

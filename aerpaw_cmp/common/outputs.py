@@ -1,6 +1,6 @@
 """Output files and folders: they overwrite only outputs of this tool, and are written atomically.
 
-Two kinds of result, one rule:
+The two kinds of result follow the same rule:
 
 =====================  =======================================================  ==================================
 kind                   proof that this tool wrote it                            how the new output gets the name

@@ -55,7 +55,7 @@ def counted(number: int, noun: str, plural: str = "") -> str:
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 
 
-# Begin of a cell, which may also follow a semicolon. An apostrophe of the log is guarded, too, because unguarded()
+# Start of a cell, which may also follow a semicolon. An apostrophe of the log is guarded, too, because unguarded()
 # would otherwise remove it
 _BEGINNING = re.compile(r"(^|;)(?=[=+\-@\t\r'])")
 _GUARDED = re.compile(r"(^|;)'")

@@ -71,7 +71,7 @@ class Rows:
 
     def after(self, first: int, most: int = CHUNK) -> tuple[int, str]:
         """Return the number of the first row, and the rows from there on as little-endian floats in base64."""
-        # rows before the oldest are lost; a cursor beyond the end was not made by this page, and gets no rows
+        # rows before the oldest are lost; a cursor beyond the end is invalid and gets no rows
         oldest = self.count - len(self._rows)
         first = min(max(first, oldest), self.count)
         part = itertools.islice(self._rows, first - oldest, first - oldest + most)

@@ -7,7 +7,7 @@ the CRC-32 of the preceding text, which distinguishes records from truncated or 
 A thread writes the records (:class:`TapLog`). The polling waits at most ``patience_s`` for each record, so a record is
 normally in the kernel before the next command is sent.
 
-A disk that stalls for seconds, as memory cards do, or is full or read-only does not stop the polling. Records wait in
+The polling continues if the disk stalls for seconds, as memory cards do, or is full or read-only. Records wait in
 bounded memory, in order, and are written when the disk accepts them again. Records that had to be dropped are counted
 in a ``disk`` record.
 """

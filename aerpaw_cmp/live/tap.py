@@ -25,7 +25,7 @@ from . import modem, ports
 from .log import Clock, TapLog, boot_id, clock_synchronised
 from .predict import Asked, Predict, PredictionWorker
 
-# A jump of the wall clock against the monotonic one beyond this is recorded.
+# A jump of the wall clock against the monotonic clock is recorded if it exceeds this.
 _CLOCK_STEP_NS = 50_000_000
 # Readings of the two clocks farther apart than this are not compared, because the process was paused between them.
 _PAUSE_NS = 5_000_000
@@ -500,7 +500,7 @@ class Tap:
             if status == "ok":
                 self._ri_times.append(record["last_mono_ns"])
                 if self._worker is not None:
-                    # the pose at the middle of the exchange, because the time of the rank within it is unknown
+                    # use the pose at the middle of the exchange, because the time of the rank within it is unknown
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
                     self._worker.ask(Asked(middle, record["sent_utc_ns"], decoded.get("rank"), self._last["rsrp_dbm"]))
             elif status in ("error", "cme"):

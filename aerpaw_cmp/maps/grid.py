@@ -538,7 +538,7 @@ class LinkBudget:
     noise_figure_db : float
         Noise figure F of the receiver.
     threshold_dbm, threshold_snr_db : float, optional
-        Lowest level, or lowest SNR, at which a position is covered; one of the two.
+        Lowest level, or lowest SNR, at which a position is covered. Only one of them can be given.
 
     Raises
     ------

@@ -603,7 +603,8 @@ def _apply(rule: Weights, values: FloatArray) -> FloatArray:
     start = np.concatenate([[0], np.cumsum(used.sum(axis=1))])
     # sparse, because each target uses about 20 of thousands of samples
     matrix = csr_array((rule.weight[used], rule.index[used], start), shape=(len(used), len(values)))
-    # relative to one value of the field, so that a constant field is exact although weights sum to 1 within 1e-16
+    # add differences from one value of the field, so that a constant field is exact although weights sum to 1 within
+    # 1e-16
     reference = _reference(values)
     estimate = reference + matrix @ (values - reference)
     target, column = np.nonzero(rule.weight == 1.0)

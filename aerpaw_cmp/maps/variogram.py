@@ -237,7 +237,7 @@ class _Projection:
         reasons = {
             "one exponential fits as well": gain <= 0,
             "one of the two exponentials has no amplitude": min(c1, c3) <= 1e-3 * max(c1, c3),
-            # rates within 5 % are one exponential in two parts
+            # two rates within 5 % represent a single exponential
             "both exponentials decay at the same rate": log_rates[0] - log_rates[1] < 0.05,
             "the faster decay ends before the first distance, so its rate cannot be determined":
                 log_rates[0] > self.log_rates[1] - 1e-3,

@@ -107,7 +107,7 @@ def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:
     """Return the paths of all parts as one set, sorted by pose, with the pose numbers of the flight."""
     numbered = [replace(part, pose=at[part.pose]) for at, part in zip(rows, parts, strict=True)]  # type: ignore[type-var]
     paths = numbered[0].one_after_another(numbered)
-    # stable sort, so that within a pose the order by tower, depth and faces remains
+    # use a stable sort, which keeps the order by tower, depth and faces within a pose
     return paths.select(np.argsort(paths.pose, kind="stable")) if (np.diff(paths.pose) < 0).any() else paths
 
 

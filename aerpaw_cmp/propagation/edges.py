@@ -179,7 +179,7 @@ _SHARPEST = 1e-6
 _LEAST_WAVELENGTHS = 0.5
 
 # Distance from an edge point at which the air on both of its faces is checked.
-# Far above the rounding of coordinates at 1 km, far below the gap between two walls of a map.
+# It is far above the rounding of coordinates at 1 km, and far below the gap between two walls of a map.
 _PROBE_M = 1e-3
 
 # Number of pairs of edge and pose that are examined together. It limits the memory and does not change a result.

@@ -46,7 +46,7 @@ def path_cache(search: Search, run: Run) -> PathCache | None:
     """Return the path cache of a replay, or None if it does not use one."""
     folder = run.cache_dir
     if folder is None:
-        # the image engine is faster than reading its paths back
+        # do not use a cache for the image engine, which is faster than reading its paths from a file
         if search.engine != "sionna":
             return None
         folder = cache_folder()
@@ -186,7 +186,7 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
 
 
 def by_beams(scene: Scene, search: Search) -> bool:
-    """Check whether the image engine searches by compiled beams: in a scene of triangles, or among many faces."""
+    """Check whether the image engine searches by compiled beams, as in a scene of triangles or among many faces."""
     if search.engine != "image":
         return False
     if scene.surfaces is not None:

@@ -166,7 +166,7 @@ class Surfaces:
     corners_m : (triangles, 3, 3)
         Corners of every triangle, as in the file.
     face : (triangles,) int
-        Face of each triangle; triangles of a face follow each other.
+        Face of each triangle. The triangles of a face are consecutive.
     first : (faces + 1,) int
         Where the triangles of each face begin.
     flat_m : (triangles, 3, 2)
@@ -487,7 +487,7 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
     # use take, because indexing with brackets is several times slower for rows of two numbers
     low, high = (faces.lower - tolerance_m).take(index, 0), (faces.upper + tolerance_m).take(index, 0)
     good = (a >= low[:, 0]) & (a <= high[:, 0]) & (b >= low[:, 1]) & (b <= high[:, 1])
-    # polygons last, and only for points within the bounds
+    # test polygons last, and only for points within the bounds
     for face in np.flatnonzero(np.bincount(index[good])):
         polygon = faces.polygon[face]
         if polygon is None:
@@ -660,7 +660,8 @@ def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, rol
     Parameters
     ----------
     yaw_rad, pitch_rad, roll_rad : array_like, broadcastable to (...)
-        Counter-clockwise yaw from east; positive pitch turns the boresight **down**; roll about the boresight.
+        Yaw is counter-clockwise from east, positive pitch turns the boresight **down**, and roll is about the
+        boresight.
 
     Returns
     -------
@@ -790,7 +791,7 @@ def uav_comparison_array(
         The array of four ports.
     """
     half = wavelength_m / 4
-    # left column first, and the upper port before the lower port
+    # the left column is first, and the upper port precedes the lower port
     positions = np.array([[0, half, half], [0, half, -half], [0, -half, half], [0, -half, -half]])
     return _mounted(positions, slant_deg, pattern, yaw_deg, roll_deg)
 

@@ -37,7 +37,8 @@ LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 # Variable with the folders that are searched instead of the system's, separated as in PATH.
 FOLDERS_VARIABLE = "AERPAW_CMP_LLVM_FOLDERS"
 
-# A trial takes about two seconds. The limit is far above, so that a slow disk does not look like a library that hangs.
+# A trial takes about two seconds. This limit is far longer, so that a slow disk does not look like a library that
+# hangs.
 _TRIAL_TIMEOUT_S = 300.0
 
 # Dr.Jit's wheel links libatomic.so.1, which a minimal Debian does not have.

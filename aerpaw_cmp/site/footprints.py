@@ -55,7 +55,7 @@ _LEVEL_M = 3.0
 # Two storeys, the height of a barn or a house.
 _DEFAULT_HEIGHT_M = 6.0
 TALLEST_M = 300.0
-# Outlines farther from the origin do not belong to the site.
+# Outlines farther than this from the origin do not belong to the site.
 FAR_M = 20_000.0
 
 # Area of a site without a base: the map up to the first distance from the first tower in each direction, and the second
@@ -69,7 +69,7 @@ _FEWEST_ELEVATIONS, _MOST_ELEVATIONS, _ELEVATION_SD_M = 3, 300, 1.0
 # Coordinates are rounded to this grid [m].
 _GRID_M = 0.001
 
-# Narrower areas are drawing errors, and vertices closer to a straight line are removed.
+# Areas narrower than this are drawing errors, and vertices closer than this to a straight line are removed.
 _SLIVER_M = 0.3
 
 _MINIMUM_AREA_M2 = 2.0
@@ -364,9 +364,8 @@ def _check_place(content: MapFile, frame: SiteFrame) -> None:
 def _distance_m(latitude: Any, longitude: Any, frame: SiteFrame) -> Any:
     """Return the approximate distance from the origin [m], or inf for an impossible position."""
     good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
-    north = (
-        np.where(good, latitude, 0.0) - frame.latitude_deg
-    )  # replace invalid values, because a truncated number may be 1e306
+    # replace invalid values, because a truncated number may be 1e306
+    north = np.where(good, latitude, 0.0) - frame.latitude_deg
     # use the shorter way around the Earth
     turn = (np.where(good, longitude, 0.0) - frame.longitude_deg + 180) % 360 - 180
     east = turn * math.cos(math.radians(frame.latitude_deg))

@@ -99,7 +99,7 @@ class Errors(StrictModel):
         return self.model_copy(update={"rmse_db": rmse_db}), kind
 
 
-# Flights are at one height if their cruise heights differ by less.
+# Flights count as flown at the same height if their cruise heights differ by less than this.
 _SAME_HEIGHT_M = 5.0
 
 
@@ -133,7 +133,7 @@ class LearnedLock(StrictModel):
 
 
 class LearnedLevel(StrictModel):
-    """The level of a log minus that of free space with the transmit power and gains as written [dB], with its SD."""
+    """The level of a log minus the free-space level for the stated power and gains [dB], with its SD."""
 
     offset_db: float
     sd_db: Annotated[float, Field(gt=0)]
@@ -209,7 +209,7 @@ class LearnedSeries(StrictModel):
     channel: str
     """Label of the antenna in the training flights. Other flights may use another label."""
     receiver: str = ""
-    """Receiver to which ``level`` and ``lock`` apply, as ``receiver`` of a flight file. Empty if not named."""
+    """Receiver to which ``level`` and ``lock`` apply, as named by ``receiver`` in a flight file. Empty if not named."""
     carrier_hz: float
     tower_file: str
     uav_file: str
@@ -561,7 +561,8 @@ def find_named(name: str, folder: Path, end: str = "") -> Named:
         If the learned models cannot be read.
     """
     site, _, entry_part = name.rpartition("/")
-    # a site next to the flight file comes before a packaged one; absolute, so that it is valid in any working folder
+    # prefer a site next to the flight file to a packaged site; use an absolute path, which is valid in any working
+    # folder
     place: str | Path = folder.absolute() / f"{site}.yaml"
     packaged = folder_of(site)
     if not folder_of(place).is_dir() and packaged.is_absolute() and packaged.is_dir():

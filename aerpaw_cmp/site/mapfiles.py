@@ -103,7 +103,7 @@ class MapFile:
             self.notes.append(f"{name}: left out, not areas: {listed}")
 
 
-# A ring with more self-intersections is not repaired, because the time to try has no limit.
+# A ring with more self-intersections than this is not repaired, because the repair could take unlimited time.
 MAX_CROSSINGS = 1000
 
 

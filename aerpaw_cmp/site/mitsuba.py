@@ -38,7 +38,7 @@ _LARGEST_HEADER = 65_536
 # Largest size of a mesh file in bytes.
 _LARGEST_FILE = 2**30
 
-# A polygon is not flat if a corner is farther from the plane of its first three corners [m].
+# A polygon is not flat if a corner is farther than this from the plane of its first three corners [m].
 _FLAT_M = 1e-3
 
 _TYPES = {

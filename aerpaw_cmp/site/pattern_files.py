@@ -244,7 +244,8 @@ def _great_circle(text: str, name: str, carrier_hz: float | None) -> MeasuredPat
     return _pattern(level, name, frequency, _MOST_OF_LEARNED_CUTS_DB)
 
 
-# Columns of a cut by the first letters of the angle: degrees clockwise from the front, or below the horizon.
+# Sign that converts an angle, by the first letters of its name, to degrees clockwise from the front or below the
+# horizon.
 _CUT_ANGLES = {"az": -1.0, "phi": -1.0, "el": -1.0, "th": 1.0, "zen": 1.0}
 
 
@@ -344,7 +345,7 @@ def _sionna_module(pattern: MeasuredPattern, name: str, target: Path, notes: tup
     import base64
 
     theta, phi, _ = sphere_grid(STEP_DEG)
-    # closed at 360 deg, because the written module interpolates within its table and not across its end
+    # repeat the values at 360 deg, because the written module interpolates only within its table
     at = np.meshgrid(np.radians(theta), np.radians(np.append(phi, 360.0)), indexing="ij")
     table = np.stack([part for field in pattern.field(*at) for part in (field.real, field.imag)], axis=-1)
     template = Path(__file__).with_name("sionna_pattern.txt").read_text(encoding="utf-8")

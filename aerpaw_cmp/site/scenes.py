@@ -102,7 +102,7 @@ def site_meshes(site: Site) -> dict[str, Mesh]:
 # Size of an added ground plane beyond the scene, in sizes of the scene.
 _PLANE_MARGIN = 10.0
 
-# A scene whose horizontal surfaces cover a smaller share of its plan has no ground.
+# A scene has no ground if its horizontal surfaces cover a smaller share of its plan than this.
 GROUND_SHARE = 0.5
 
 # Vertical part of the normal above which a surface can be ground.
@@ -318,7 +318,7 @@ _DRAWN_TALLER_M = 1.0
 # Largest number of prisms that represent a scene in pictures.
 _DRAWN_MOST = 3000
 
-# A part of a shape that covers a larger share of the plan is ground, including hills.
+# A part of a shape is ground, including hills, if it covers a larger share of the plan than this.
 _GROUND_PART = 0.25
 
 

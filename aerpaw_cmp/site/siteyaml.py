@@ -310,7 +310,7 @@ def load_site(
     name_or_path : str or Path
         ``"lake_wheeler"`` or the path of a file.
     coordinates : str, optional
-        Published positions to use if a tower has several; overrides the file.
+        Published positions to use if a tower has several. This argument overrides the file.
     tower_ground : {"flat", "offsets", "surface", "dem"}, optional
         ``flat`` sets the ground to up = 0 everywhere (the paper). ``offsets`` uses the stated height of each tower.
         ``surface`` puts towers, buildings and trees on a smooth surface through ``ground_points``, and ``dem`` on the
@@ -804,8 +804,8 @@ def place_trees(
 
     Notes
     -----
-    Random positions are drawn in batches. Of two positions that are too close the earlier one is used, as in random
-    sequential addition, but complete batches are decided at once.
+    Random positions are drawn in batches. If two positions are too close, the earlier one is used, as in random
+    sequential addition. Complete batches are decided at once.
     """
     area = forest.area if keep_clear is None else shapely.difference(forest.area, keep_clear)
     # the seed uses the name, not the order, so that an added forest does not move the trees of others
@@ -856,7 +856,7 @@ def _first_come(points: FloatArray, spacing_m: float) -> BoolArray:
     """Return a mask of points (n, 2) that have no earlier selected point closer than ``spacing_m``."""
     keep = np.zeros(len(points), dtype=bool)
     open_ = np.ones(len(points), dtype=bool)
-    # strictly closer, because two trees at exactly the spacing are allowed
+    # find pairs that are strictly closer, because two trees at exactly the spacing are allowed
     pairs = cKDTree(points).query_pairs(np.nextafter(spacing_m, 0), output_type="ndarray") if len(points) else None
     if pairs is None or not len(pairs):
         return open_

@@ -244,7 +244,7 @@ class _OneLink:
         gap = math.dist(self.target, self.reference.source)
         # a pose is out of reach only if it is too far from every tower, not only from this tower
         nearest = min(math.dist(self.target, tower.position_m) for tower in self.reference.site.towers.values())
-        # buried, in the near field, or beyond reach: the replay must have no path there
+        # a target that is buried, in the near field or out of reach must have no path in the replay
         nowhere = self.target[2] < min(ground, 0.0) or gap < 0.01 or nearest > 1e5
         for path in self.mine:
             sequence = self.sequence(path)
@@ -783,7 +783,7 @@ def extra_rows(replay: Replay, reference: Replay, chosen: IntArray) -> IntArray:
 
 
 def _of_chosen(paths: PathSet, chosen: IntArray) -> tuple[IntArray, PathSet]:
-    """Return the rows of the paths of some poses, and these paths with the index in ``chosen`` as their pose."""
+    """Return the rows of the paths at the poses ``chosen``, and these paths with poses numbered as in ``chosen``."""
     place = np.full(int(max(chosen.max(initial=-1), paths.pose.max(initial=-1))) + 1, -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
     rows = np.flatnonzero(place[paths.pose] >= 0)

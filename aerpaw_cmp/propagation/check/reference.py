@@ -141,7 +141,7 @@ def layout_positions(
     if layout == "tower_comparison":  # arXiv 2502.10324 VII-D: 60 mm, 1.68 m, 60 mm, the first port leftmost
         return ((0.0, 0.9, 0.0), (0.0, 0.84, 0.0), (0.0, -0.84, 0.0), (0.0, -0.9, 0.0))
     q = wavelength / 4
-    if layout == "uav_comparison":  # 2 x 2, column by column from the left, the upper one first
+    if layout == "uav_comparison":  # 2 x 2, column by column from the left, with the upper element first
         return ((0.0, q, q), (0.0, q, -q), (0.0, -q, q), (0.0, -q, -q))
     # the first port leftmost, which is +y looking along x
     n = 1 if layout == "single" else elements

@@ -60,7 +60,7 @@ def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector
 
 
 def slant_rotation(e_theta: Number, e_phi: Number, cosine: Number, sine: Number) -> tuple[Number, Number]:
-    """Return the field of an element slanted from vertical: only its polarisation in the (theta, phi) basis rotates.
+    """Return the field of an element slanted from vertical: its polarisation is rotated in the (theta, phi) basis.
 
     Source: 3GPP TR 38.901 section 7.3.2.
 

@@ -501,7 +501,8 @@ TRUNKS = 0.3
 # At 0.55 of the first Fresnel radius nu is -0.78, where the knife edge's loss begins.
 _CLEAR = 0.55
 
-# Seen from above, a vertical segment is a point and does not cross an area. Shifted by this distance it crosses one.
+# Seen from above, a vertical segment is a point and does not cross an area. One end is therefore shifted by this
+# distance.
 _UPRIGHT_M = 1e-6
 # Pairs of a segment and a side of a forest stand; about 100 MB of temporary arrays.
 _SIDES_AT_ONCE = 1_000_000
@@ -622,7 +623,7 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
     stands = [forest for forest in site.forests if forest.height_m is not None]
     if not stands:
         return
-    # bounding boxes only: the exact test follows below
+    # the tree compares only bounding boxes, and the exact test follows
     tree = shapely.STRtree([stand.area for stand in stands])
     moved = np.flatnonzero(
         np.isfinite(start_m).all(axis=1) & np.isfinite(end_m).all(axis=1) & (start_m != end_m).any(axis=1)
@@ -749,7 +750,7 @@ def knife_edge_db(nu: FloatArray) -> FloatArray:
 
     Source: ITU-R P.526-15 eq. 31.
     """
-    # far below -0.78 the root of x squared loses all digits when x is added
+    # limit nu, because far below -0.78 the sum of x and the root of its square loses all digits
     x = np.maximum(nu, -0.78) - 0.1
     return np.where(nu > -0.78, np.maximum(6.9 + 20.0 * np.log10(np.sqrt(x * x + 1.0) + x), 0.0), 0.0)
 

@@ -524,7 +524,7 @@ def _doubled(pose, faces, points):  # type: ignore[no-untyped-def]
 
 @kernel
 def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[no-untyped-def]
-    """Return all paths whose first face is one of ``firsts``, by a walk along beams, depth first.
+    """Return all paths whose first face is one of ``firsts``, by a depth-first search along beams.
 
     It is one long function, because passing a record to another function makes numba count references to its arrays.
     """

@@ -141,7 +141,7 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
     bool
     """
     a, inverse = segment
-    # limit to shares from 0 to 1, so that boxes behind the start or beyond the end are not hit
+    # limit the interval to 0 and 1, so that boxes behind the start or beyond the end are not hit
     enter, leave = 0.0, 1.0
     for axis in range(3):
         at_lower = (lower[node, axis] - a[axis]) * inverse[axis]
@@ -232,7 +232,7 @@ WELD_M = 1e-4
 # Largest number of corners of the convex outline of a face in the search. Larger outlines are replaced by a rectangle.
 WINDOW = 8
 
-# Triangles with less area are removed, because their plane is undefined.
+# Triangles with a smaller area than this are removed, because their plane is undefined.
 _SMALLEST_M2 = 1e-10
 
 

@@ -302,7 +302,7 @@ RELATIVE_TOLERANCE = 1e-12
 # A link shorter than this has no path: its ends are not in the far field, and a zero length has no direction.
 MINIMUM_LENGTH_M = 0.01
 
-# Face sequences per tower beyond which the ``image`` engine gives up.
+# Largest number of face sequences per tower of the ``image`` engine.
 _SEQUENCE_BUDGET = 200_000
 
 # Largest number of cells of a dense step, which limits its memory (8 MB per array).
@@ -372,7 +372,7 @@ def find_paths(
 
 
 def searched_links(links: Links) -> BoolArray:
-    """Return links (towers, poses) that may have paths: with a pose, long enough and not excluded."""
+    """Return links (towers, poses) that may have paths: they have a pose, are long enough and are not excluded."""
     alive = np.empty((len(links.sources_m), len(links.targets_m)), dtype=np.bool_)
     with np.errstate(invalid="ignore"):
         # loop over towers, because the coordinates of all pairs would be the largest array of the search
@@ -668,7 +668,7 @@ def _meets_last_face(
 # Share of the targets above which the first faces of a sequence are tested for all targets at once.
 _OFTEN = 0.1
 
-# If the heights of both ends over a plane differ by less [m], the reflection point is uncertain.
+# If the heights of both ends over a plane differ by less than this [m], the reflection point is uncertain.
 _SURE_M = 1e-4
 
 

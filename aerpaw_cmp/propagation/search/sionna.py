@@ -337,7 +337,7 @@ class _Finder:
         generator._shoot_and_bounce = watched
 
     def _share_kernels(self) -> None:
-        """Pass ray directions to kernels as data. As a literal, their number would compile two kernels again."""
+        """Pass ray directions to kernels as data. A new number of rays would otherwise require new kernels."""
         import drjit as dr
         import sionna.rt.path_solvers.sb_candidate_generator as generator
         from sionna.rt.utils import fibonacci_lattice
@@ -652,7 +652,7 @@ def _check_gain(raw: dict[str, Any], sources_m: FloatArray, targets_m: FloatArra
 def _sequences(
     raw: dict[str, Any], face_of: dict[int, IntArray], max_depth: int
 ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Return (receiver, tower, path) in Sionna's arrays, and the faces, of valid paths with reflections only."""
+    """Return the indices (receiver, tower, path) in Sionna's arrays, and the faces, of valid pure reflection paths."""
     receiver, tower, path = np.nonzero(raw["valid"])
     sequence = np.full((len(receiver), max_depth), -1, dtype=np.int64)
     good = np.ones(len(receiver), dtype=np.bool_)

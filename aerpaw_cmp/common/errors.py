@@ -273,13 +273,13 @@ def from_python(public: _T) -> _T:
 
 
 class CheckError(AerpawCmpError):
-    """The job ran, but a check that the user requested failed."""
+    """The error for a failed check that the user requested. The job itself ran."""
 
     exit_code = 1
 
 
 class UsageError(AerpawCmpError):
-    """The command line or a configuration file is wrong."""
+    """The error for a wrong command line or configuration file."""
 
     exit_code = 2
     others: Any = ()
@@ -287,13 +287,13 @@ class UsageError(AerpawCmpError):
 
 
 class InputError(AerpawCmpError):
-    """An input file or device could not be read."""
+    """The error for an input file or device that could not be read."""
 
     exit_code = 3
 
 
 class OutputError(AerpawCmpError):
-    """An output cannot be written: the disk is full, fails, or is not writable."""
+    """The error for an output that cannot be written: the disk is full, fails, or is not writable."""
 
     exit_code = 3
 

@@ -458,7 +458,7 @@ class StatusNotifier:
         self._thread.start()
 
     def notify(self, status: TapStatus) -> None:
-        """Queue a status. A plain line is dropped while others wait, a message only if the queue is full."""
+        """Queue a status. If others wait, one without a message is dropped."""
         # the next line overwrites a line, but a message is shown once
         if status.message or self._queue.qsize() < 10:
             try:

@@ -259,7 +259,7 @@ class Tap:
         raise first_error
 
     def _ports_to_try(self) -> list[ports.PortInfo]:
-        """Return the ports to try: at the start the named port or all AT ports, later first the same interface."""
+        """Return the ports to try: first the named port or all AT ports, later ports of the same interface first."""
         roots, last = self._settings.roots, self._info
         if last is None:
             if self._settings.port is not None:

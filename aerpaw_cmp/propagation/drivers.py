@@ -267,7 +267,7 @@ def replay_moving(
         moved_site, several, some, links = _scene_of(site, link, name, poses, block)
         return _of_one_tower(replay(moved_site, several, some, replace(search, links=links), field, run), name, block)
 
-    # lazily: a block is traced when it is joined, so that only one scene is in memory
+    # ``map`` is lazy: a block is traced when it is joined, so that only one scene is in memory
     result = in_turn([block.rows for block in blocks], map(of, blocks), progress)
     return replace(result, ends=Ends(link, poses, sources_m[:, None], field))
 

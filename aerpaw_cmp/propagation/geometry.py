@@ -674,7 +674,7 @@ def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, rol
     [0.0, 1.0, 0.0]
     """
     yaw, pitch, roll = np.broadcast_arrays(*map(unmasked, (yaw_rad, pitch_rad, roll_rad)))
-    # written out, because this needs one pass over a flight; a product of three rotations needs three
+    # write out the product, which needs one pass over a flight instead of three
     ca, sa = np.cos(yaw), np.sin(yaw)
     cb, sb = np.cos(pitch), np.sin(pitch)
     cg, sg = np.cos(roll), np.sin(roll)

@@ -388,7 +388,7 @@ def _read_geotiff(data: bytes, frame: SiteFrame) -> Dem:
     )  # fmt: skip
 
 
-# Cells of the surface as an elevation model, and their largest number.
+# Cell size of a surface as an elevation model [m], and the largest number of cells.
 _CELL_M, _MOST_CELLS = 25.0, 40_000
 
 # Candidate lengths and standard deviations [m].
@@ -477,7 +477,7 @@ class Surface:
         return Factor.of(self._between(self.place_m) + np.diag(self.error_m**2))
 
     def _waves(self, random: np.random.Generator) -> _Waves:
-        """Return a random draw of the process, without the points: waves whose vectors follow its spectrum."""
+        """Return a random draw of the process that ignores the points: waves whose vectors follow its spectrum."""
         # the spectrum of order 3/2 is Student's t with 3 degrees of freedom: a normal divided by sqrt(chi-squared / 3)
         vector = random.standard_normal((2, _WAVES)) / (self.length_m * np.sqrt(random.chisquare(3, _WAVES) / 3.0))
         height = self.deviation_m * np.sqrt(2.0 / _WAVES)

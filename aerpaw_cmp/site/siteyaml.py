@@ -793,7 +793,7 @@ def place_trees(
     sizes : TreeSizes, optional
         Sizes of the trees; those of the paper by default.
     seed : int
-        The same seed and forest have the same trees. Forests do not affect each other.
+        The same seed and forest result in the same trees. Forests do not affect each other.
     keep_clear : shapely geometry, optional
         Area without trunks (buildings, masts).
 

@@ -368,7 +368,7 @@ class CrownIndex:
         live = np.flatnonzero(last >= first)  # NaN compares false
         pieces = np.ceil((last - first)[live] * along[live] / _PIECE_M).clip(1).astype(np.int64)
         ends = np.cumsum(pieces)
-        # limit batches by the fullest cell, because of their memory
+        # the fullest cell limits the size of a batch, to bound its memory
         at_once = max(_PAIRS_AT_ONCE // max(int(np.diff(self._row).max()), 1), 1)
         begin = 0
         while begin < len(live):
@@ -398,7 +398,7 @@ class CrownIndex:
         square = step_east * step_east + step_north * step_north
         nearest = np.divide(east * step_east + north * step_north, square, out=low.copy(), where=square > 0)
         np.clip(nearest, low, last[owner], out=nearest)
-        # the piece that contains that point: other pieces meet the crown, too, and would count it twice
+        # find the piece that contains that point, because other pieces meet the crown, too, and would count it twice
         turn = np.divide(nearest - low, wide, out=np.zeros_like(low), where=wide > 0).astype(np.int64)
         east -= nearest * step_east
         north -= nearest * step_north
@@ -609,7 +609,7 @@ class _Crossing:
         return self.stand.height_m
 
     def depth_m(self, lowered_m: FloatArray) -> FloatArray:
-        """Return the length (k,) in the canopy of segments lowered by (k,) [m]. Trunk space counts in part."""
+        """Return the length (k,) of lowered segments in the canopy [m], plus ``TRUNKS`` times the length between trunks."""
         way = self.end - self.start
         up, rise = (self.start[:, 2] - lowered_m)[self.piece] - self.ground_m, way[self.piece, 2]
         base = self.height_m * self.stand.crown_base_fraction

@@ -399,7 +399,7 @@ def amplitudes(
     pairs = elements.tower_m.shape[2]
     out = np.empty((len(g.depth), pairs), dtype=np.complex128)
     step = max(1, PAIRS_PER_CHUNK // pairs)
-    # all paths of one depth together, so that no step is evaluated for shorter paths
+    # evaluate all paths of one depth together, so that no step is evaluated for shorter paths
     for depth in np.unique(g.depth):
         rows = np.flatnonzero(g.depth == depth)
         for start in range(0, len(rows), step):

@@ -1,1 +1,1 @@
-"""Paths between towers and poses: mirror images, beams, Sionna, obstacles, and reflections off crowns."""
+"""Paths between towers and poses: mirror images, beams, Sionna, obstacles and terrain."""

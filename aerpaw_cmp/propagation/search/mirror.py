@@ -482,7 +482,7 @@ class _Growth:
         faces, box, depth = self.faces, self.bounds, level.faces.shape[1]
         grown: list[IntArray] = []
         images: list[FloatArray] = []
-        # eight arrays of this size live at once
+        # eight arrays of this size exist at the same time
         step = max(1, CELLS_PER_CHUNK // (8 * len(faces)))
         for start in range(0, len(level.faces), step):
             now, past = level.faces[start : start + step], level.images_m[start : start + step]

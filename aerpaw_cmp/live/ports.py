@@ -458,8 +458,8 @@ class StatusNotifier:
         self._thread.start()
 
     def notify(self, status: TapStatus) -> None:
-        """Queue a status. If others wait, one without a message is dropped."""
-        # the next line overwrites a line, but a message is shown once
+        """Queue a status. It is dropped if the queue is full, or if it has no message and ten others wait."""
+        # the terminal overwrites a line without a message by the next line, but shows a message only once
         if status.message or self._queue.qsize() < 10:
             try:
                 self._queue.put_nowait(status)

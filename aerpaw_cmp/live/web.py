@@ -221,7 +221,10 @@ class WebServer(ThreadingHTTPServer):
             request.close()
 
     def _accept(self, ready: selectors.BaseSelector) -> None:
-        """Let a connection wait for its request. If too many wait, close the oldest one of the address with most."""
+        """Let a connection wait for its request.
+
+        If too many connections wait, close the oldest connection of the address that has the most.
+        """
         try:
             request, address = self.socket.accept()
         except OSError:  # the listening socket is closed, or too many files are open

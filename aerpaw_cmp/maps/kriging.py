@@ -563,7 +563,7 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
 
 
 def _trace_of_inverse(factor: FloatArray, inverse_pivot: FloatArray) -> FloatArray:
-    """Return the trace (t,) of ``C^-1``, the sum of squares in ``L^-1``. ``L`` is stored by columns (m, m+, t)."""
+    """Return the trace (t,) of ``C^-1``, the sum of squares in ``L^-1``. ``L`` is in columns (m, m or more, t)."""
     inverse = np.zeros((len(factor), *inverse_pivot.shape))
     for j, pivot in enumerate(inverse_pivot):
         np.multiply(np.einsum("kt,kit->it", factor[:j, j], inverse[:j, :j]), -pivot, out=inverse[j, :j])

@@ -647,7 +647,7 @@ class PairGain:
         Notes
         -----
         The variance is a weighted mean of the variance of the record and of the sum of the variances of antennas and
-        prior. The weight of the record is the share of the process that known directions determine.
+        prior. The weight of the record is the share of the process variance that the known directions determine.
         """
         gain, sd = np.empty(len(directions)), np.empty(len(directions))
         white = self._factor.whiten(self.gain_db)

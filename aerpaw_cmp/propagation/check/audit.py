@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from ..search.sionna import Coefficients
 
 
-# Relative to the strongest of a path's four entries: float32 has errors of about 5e-4 in rotations, patterns and
-# Fresnel coefficients.
+# Tolerance of an entry, relative to the strongest of a path's four entries. The float32 errors in rotations, patterns
+# and Fresnel coefficients are about 5e-4.
 _ENTRY_TOLERANCE = 3e-3
 
 # Sionna's reflection points are barycentric on large triangles, and float32 has 24 bits for a coordinate.

@@ -609,7 +609,10 @@ class _Crossing:
         return self.stand.height_m
 
     def depth_m(self, lowered_m: FloatArray) -> FloatArray:
-        """Return the length (k,) of lowered segments in the canopy [m], plus ``TRUNKS`` times the length between trunks."""
+        """Return the length (k,) [m] in the canopy of segments that are lowered by ``lowered_m`` (k,).
+
+        The length between trunks is included, multiplied by ``TRUNKS``.
+        """
         way = self.end - self.start
         up, rise = (self.start[:, 2] - lowered_m)[self.piece] - self.ground_m, way[self.piece, 2]
         base = self.height_m * self.stand.crown_base_fraction

@@ -38,8 +38,8 @@ PARTS: dict[str, dict[str, object]] = {
     "buildings": {"site.without_buildings": False},
     "woods as trees": {"rt.foliage": "opaque"},
     "woods as media": {"rt.foliage": "attenuating"},
-    "relief (offsets)": {"site.tower_ground": "offsets"},
-    "relief (surface)": {"site.tower_ground": "surface"},
+    "ground heights (offsets)": {"site.tower_ground": "offsets"},
+    "ground heights (surface)": {"site.tower_ground": "surface"},
 }
 EIGHTHS = 8
 GAMMAS_DB_PER_M, HEIGHTS_M = (0.1, 0.2, 0.3, 0.47, 0.7, 1.0), (10.0, 15.0, 20.0, 25.0, 30.0)

@@ -106,7 +106,7 @@ class Model:
         if self.trees != "none":
             woods = "woods as media" if self.media else "trees"
             parts.append("opaque trees" if self.trees == "opaque" else f"{woods} ({self.trees})")
-        parts += [] if self.relief == "flat" else [f"relief ({self.relief})"]
+        parts += [] if self.relief == "flat" else [f"ground heights ({self.relief})"]
         return _FREE_SPACE if not parts else " + ".join(parts)
 
     def settings(self, max_depth: int) -> dict[str, dict[str, Any]]:
@@ -583,7 +583,7 @@ def run_flight(
     ----------
     data : FlightData
     stages : Stages, optional
-        Times "clocks", "replay", "compare", "audit" and "ladder".
+        Times "clocks", "replay", "compare", "audit" and "models".
     replays : FlightReplay, optional
         Existing replays of this flight (:func:`~aerpaw_cmp.flight.replay.replay_flight`).
     audit : bool
@@ -640,7 +640,7 @@ def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
         "replay": f"{samples}, engine {rt.engine}",
         "compare": samples,
         "audit": f"{counted(audited, 'link')} by the other engine" if audited else "",
-        "ladder": "simpler and richer models" if n_rss and rt.engine == "image" else "",
+        "models": "simpler and richer models" if n_rss and rt.engine == "image" else "",
         "report": f"page, figures of {counted(drawn, 'channel')}",
     }
     return [PlannedStage(name, work) for name, work in stages.items() if work]

@@ -483,7 +483,7 @@ def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def wall_to_utc(wall_ns: IntArray, options: ReadOptions, *, needed_by: str) -> Instants:
-    """Convert a zone-less clock to UTC by the options: local unless ``clock: utc`` is set."""
+    """Convert times without a zone to UTC by the options: local unless ``clock: utc`` is set."""
     if options.clock == "utc":
         none = np.zeros(len(wall_ns), dtype=bool)
         return Instants(wall_ns.astype("datetime64[ns]"), none, none)

@@ -273,7 +273,7 @@ def test_a_cut_flight_keeps_a_tower_whose_antennas_flights_taught(
     assert placement is not None
     assert (placement.node == "LW1") == keeps
     if keeps:
-        assert "with the antennas that flights taught" in placement.question
+        assert "with its antennas learned from flights" in placement.question
         assert placement.tower is None
 
 
@@ -287,7 +287,7 @@ def test_of_towers_that_fit_alike_the_receivers_own_is_proposed(
     placement = placer.propose(_flown(placer, gains, "LW1", slice(0, 500)), {name: [] for name in usual})
     assert placement is not None
     assert placement.node == said
-    assert f"the levels fit LW2 or LW1 as well as any place: is it {said}?" in placement.question
+    assert f"the levels fit LW2 or LW1 as well as any other position: is it {said}?" in placement.question
 
 
 @pytest.mark.parametrize(
@@ -303,7 +303,7 @@ def test_a_tower_stands_beside_antennas_of_which_nothing_is_known(
     placement = placer.propose(_flown(placer, gains, at, part))
     assert placement is not None
     assert placement.node == said
-    assert ("as well as any place" in placement.question) == (said != "NODE")
+    assert ("as well as any other position" in placement.question) == (said != "NODE")
 
 
 @pytest.mark.parametrize("head", ["cell_id,rsrp", "rsrp cell 1,rsrp cell 2"])

@@ -39,7 +39,7 @@ def test_a_planned_report_names_its_links_and_poses_and_writes_nothing(
     assert sorted(tmp_path.rglob("*")) == there
     work = {stage["name"]: stage["work"] for stage in plan["stages"]}
     assert work["replay"] == "1\N{NARROW NO-BREAK SPACE}310 RSS samples, 655 rank samples, engine image"
-    assert list(work) == ["read", "clocks", "replay", "compare", "ladder", "report"]
+    assert list(work) == ["read", "clocks", "replay", "compare", "models", "report"]
     assert plan["output"] == "reports/sample1"
     assert [stage["name"] for stage in plan["stages"] if stage["seconds"] is None] == list(work)[1:]
     audited = planned(capsys, "report", file, "--logs-root", SAMPLE, "--audit", "50", "--figures", "none")

@@ -51,7 +51,7 @@ def report(
     against_distance: Annotated[
         float, Option(min=0.01, help="Largest distance from a sample to a predicted position [m].")
     ] = AGAINST_DISTANCE_M,
-    strict: Annotated[bool, Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    strict: Annotated[bool, Option("--strict", help="End with exit code 1 if a check failed.")] = False,
     figures: Annotated[
         Literal["none", "svg", "png", "pdf", "all"],
         Option(help="Format of figures as separate files: none, one format, or all formats."),

@@ -78,7 +78,7 @@ def _show(summary: Mapping[str, Any], every_stream: bool) -> None:
     from ...logs.ingest import ACCOUNT, account_notes, account_rows
 
     folder, rows = account_rows(summary, every_stream)
-    table(list(ACCOUNT), rows, f"files below {folder}" if folder else None)
+    table(list(ACCOUNT), rows, f"Files in {folder}" if folder else None)
     for note in account_notes(summary):
         say(note)
 

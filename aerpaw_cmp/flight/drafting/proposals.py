@@ -244,7 +244,7 @@ class Placer:
             return _node(self._local(place), at_list, about, nodes)
         best = int(odds_tower.argmax())
         if odds_tower[best] >= _TOWER_ODDS:
-            how = "with the antennas that flights taught" if odds_tower[best] > odds[best] else "as well as any place"
+            how = "with its antennas learned from flights" if odds_tower[best] > odds[best] else "as well as any other position"
             near = [i for i in np.argsort(-odds_tower) if odds_tower[i] > odds_tower[best] - _UNDECIDED]
             alike = [towers[i].name for i in near]
             # part of a flight can fit several towers: one with learned antennas is the most likely
@@ -262,7 +262,7 @@ class Placer:
         )
         about = (
             f"{decided}. They fit this place best, 90 % within {estimate.radius90_m:.0f} m, "
-            f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where did the node stand?"
+            f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where was the node?"
         )
         place = estimate.place_m
         at_estimate = round(float(latitude[0]), 7), round(float(longitude[0]), 7), float(place[2])
@@ -744,7 +744,7 @@ def _airframe_for(
         return Proposal()
     best, odds = max(tried.values(), key=lambda pair: min(pair[1].over_own, pair[1].over_turned))
     if not odds.fits:
-        text = f"none of the learned airframes fits these levels; the best one, {best.name}: {_odds(odds)}"
+        text = f"none of the learned airframes fits these levels. The best is {best.name}, with {_odds(odds)}"
         return Proposal(antennas_about=text)
     about = best.entry.about(*_expected(best.entry, None))
     return Proposal(
@@ -787,10 +787,10 @@ def _odds(odds: Evidence) -> str:
     Examples
     --------
     >>> _odds(Evidence(over_own=4.0, over_turned=20.0))
-    'odds 55:1 against a separate gain, more than 1000:1 against rotated copies'
+    'odds 55:1 against an unknown gain, more than 1000:1 against rotated copies'
     """
     turned = "" if math.isinf(odds.over_turned) else f", {_ratio(odds.over_turned)} against rotated copies"
-    return f"odds {_ratio(odds.over_own)} against a separate gain{turned}"
+    return f"odds {_ratio(odds.over_own)} against an unknown gain{turned}"
 
 
 def _ratio(nat: float) -> str:

@@ -112,7 +112,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
 
 
 def pytest_unconfigure() -> None:
-    """Field logs and paths are some ten megabytes; the folder of the run, with all others in it, goes last."""
+    """Remove the folder of the test run at its end: field logs and paths need some ten megabytes."""
     shutil.rmtree(_OWN, ignore_errors=True)
 
 
@@ -136,7 +136,7 @@ def pytest_xdist_auto_num_workers() -> int | None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Files in an order drawn with the seed, and in each its tests, the same in every process; else the dearest first.
+    """Shuffle files and tests with the seed, equally in every process, or else run the longest files first.
 
     A worker that begins its last file late would leave the others without work.
     """
@@ -176,7 +176,10 @@ def pytest_collect_file() -> Generator[None, list[pytest.Collector], list[pytest
 
 @pytest.fixture(scope="module")
 def sionna() -> Any:
-    """The module that drives Sionna RT, its variant loaded; skips where Sionna or a device for Dr.Jit is missing."""
+    """Return the module that drives Sionna RT, with its variant loaded.
+
+    Skip the test if Sionna RT or a device for Dr.Jit is missing.
+    """
     from aerpaw_cmp.propagation.llvm import let_sionna_load
 
     let_sionna_load()

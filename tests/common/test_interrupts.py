@@ -1,4 +1,7 @@
-"""Interrupts that Python swallows or wraps are raised again; held ones come at the end, once."""
+"""Check that swallowed or wrapped interrupts are raised again.
+
+Interrupts that are held back are raised once, at the end.
+"""
 
 import os
 import signal

@@ -79,7 +79,7 @@ def test_masks_come_in_many_shapes() -> None:
 
 
 def test_no_function_of_arrays_looks_under_a_mask() -> None:
-    """``np.asarray`` of what a caller gave drops its mask; only times, whose gaps are NaT, are taken so."""
+    """``np.asarray`` would drop the mask of an argument. Times may be converted with it, because their gaps are NaT."""
     seen, wrong = 0, []
     for path in ROOM.rglob("*.py"):
         content = path.read_text(encoding="utf-8")

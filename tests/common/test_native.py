@@ -29,7 +29,7 @@ ROWS = len(SECRET) // 8
 
 
 def hdf5(fill: Callable[[h5py.File], object], user_block: bytes = b"") -> bytes:
-    """An HDF5 file; behind 512 bytes a MATLAB 7.3 one."""
+    """Return the bytes of an HDF5 file. With a user block of 512 bytes it is a MATLAB 7.3 file."""
     file = io.BytesIO()
     with h5py.File(file, "w", userblock_size=len(user_block)) as book:
         fill(book)

@@ -1,4 +1,4 @@
-"""Constants against the relations that define them; conversions against their inverses."""
+"""Check constants against the relations that define them, and conversions against their inverses."""
 
 import numpy as np
 import pytest

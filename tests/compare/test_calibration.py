@@ -225,7 +225,10 @@ def test_baselines_of_a_part_take_their_offset_from_outside_it_too(split: str) -
 
 
 def test_a_line_over_distance_is_the_one_that_least_squares_finds_outside() -> None:
-    """Slope and level of samples outside alone; whatever free space is relative to; 0 to STEEPEST."""
+    """Slope and level come from the outside samples only.
+
+    The reference of free space does not matter, and the slope is limited to 0 to ``STEEPEST``.
+    """
     rng = np.random.default_rng(12)
     base = observed("a", seed=4)
     outside = np.arange(len(base.samples)) < 120
@@ -287,7 +290,10 @@ def test_a_score_is_that_by_hand_and_wants_fifty_samples() -> None:
 
 
 def test_parts_of_a_circle_and_of_the_heights_are_those_by_hand() -> None:
-    """Six sectors of 60 degrees and eight headings of 45, a guard of ten; heights five metres from the usual one."""
+    """Check six sectors of 60 degrees and eight headings of 45 degrees with a guard of 10 degrees.
+
+    Heights within five metres of the most frequent height belong together.
+    """
     scored, second = circled("a", 1), circled("b", 2)
     for parts, count, angle in (
         (

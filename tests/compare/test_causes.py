@@ -79,7 +79,10 @@ def test_the_clock_has_the_lag_of_its_judgement_and_no_other() -> None:
 
 
 def test_a_prediction_that_ripples_has_no_lag_that_rivals_a_trouble() -> None:
-    """Shifted between its samples a ripple is smoother, and fits better from second to second; no level is nearer."""
+    """Interpolation between samples smooths a ripple.
+
+    The shifted ripple therefore fits better from second to second, but the level does not come nearer.
+    """
     sound = _sound()
     assert not list(causes._clock(replace(sound, predicted_db=sound.predicted_db + 6.0 * np.sin(sound.time_s**2))))
 
@@ -197,7 +200,10 @@ def test_what_is_left_above_a_floor_is_no_ceiling_and_no_other_trouble() -> None
 
 
 def test_an_attitude_that_is_not_used_is_no_turned_antenna() -> None:
-    """Flown with a steady yaw, both explain the level; only one of them is in the settings."""
+    """If the yaw does not change, attitude and heading explain the level equally well.
+
+    Only one of the two is in the settings.
+    """
     sound, turn = _sound(), _sound().turned_db[90.0]
     logged = {"logged": turn + np.random.default_rng(0).normal(0.0, 0.05, 300)}
     assert _named(replace(sound, measured_db=sound.measured_db + turn, attitude_db=logged)) == "attitude"
@@ -257,7 +263,7 @@ def test_slow_fading_alone_is_no_step_and_no_loss() -> None:
 
 
 def test_situations_of_the_benchmark_are_named() -> None:
-    """One of each kind on average; the benchmark itself prints the table of 300."""
+    """Draw about one flight of each kind. The benchmark itself prints the table of 300 flights."""
     wrong = []
     for number in range(12):
         planted = () if number % 4 == 0 else (TROUBLES[number % len(TROUBLES)],)
@@ -352,7 +358,10 @@ def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memories(
 
 
 def test_a_free_form_pays_for_its_numbers_and_a_wide_search_for_its_width() -> None:
-    """Twenty columns of noise explain less than none; a value known to a tenth of its range costs a factor of ten."""
+    """Twenty columns of noise lower the evidence.
+
+    A value that is known to a tenth of its range costs a factor of ten.
+    """
     generator = np.random.default_rng(5)
     residual, design = (
         generator.normal(size=300),

@@ -25,7 +25,10 @@ def drawn(length: float, sd_db: float, seed: int):
 
 
 def planted(name: str, seed: int, gains, *, n: int = 500, height: float = 50.0, channels=("A", "B"), world=False):
-    """A flight over waypoints at random, with its heading; residual = planted gains + offset + shadowing + noise."""
+    """Simulate a flight over random waypoints with its headings.
+
+    The residual is the sum of planted gains, offset, shadowing and noise.
+    """
     rng = np.random.default_rng(seed)
     corner = rng.uniform(-300, 300, (9, 2))
     at = np.linspace(0, 8, n)

@@ -37,7 +37,10 @@ def test_the_covariance_of_a_smooth_memory_is_that_of_matern_three_halves(rate: 
 
 @pytest.mark.parametrize(("share", "rate"), [(0, 0), (0, 9), (1, 4), (2, 17)])
 def test_a_memory_whitens_its_terms_and_foretells_the_mean(share: int, rate: int) -> None:
-    """Rates run fastest; half the rate times the covariance has the power 1 of an endless sequence at its low end."""
+    """The index of the rate changes fastest.
+
+    Half the rate times the covariance has power 1 at the low end of an infinite sequence.
+    """
     white, known, at = WHITE_SHARES[share], memories(6), share * len(RATES) + rate
     covariance = (1.0 - white) * 0.5 * RATES[rate] * statistics._exponential(RATES[rate], 6) + white * np.eye(7)
     inner, cross = covariance[1:, 1:], covariance[0, 1:]

@@ -15,7 +15,7 @@ MODEL = GainModel(TERMS, own_sd_db=1.0, own_length_m=20.0, noise_sd_db=1.0, bin_
 
 
 def flight(name, seed, yaw_deg, *, n=80, reach=300.0):
-    """A random walk over waypoints at one heading, seen by one tower; no levels yet."""
+    """Return a random walk over waypoints at one heading, seen by one tower, without levels."""
     rng = np.random.default_rng(seed)
     corner, at = rng.uniform(-reach, reach, (6, 2)), np.linspace(0, 5, n)
     position = np.stack([np.interp(at, np.arange(6), corner[:, k]) for k in (0, 1)] + [np.full(n, 50.0)], axis=1)
@@ -87,7 +87,7 @@ def test_nobody_has_flown_and_an_antenna_that_no_route_sees():
 
 
 def test_ranking_follows_the_true_error_on_fields_of_known_covariance():
-    """Candidates differ in heading and reach; each is flown in drawn worlds and the target is predicted."""
+    """Candidates differ in heading and extent. Each is flown in simulated worlds, and then the target is predicted."""
     known = flight("a", 1, 0.0)
     routes = [flight("b", 10 + k, 45.0 * k, reach=60.0 + 40.0 * k) for k in range(7)]
     routes += [flight("b", 20, 0.0, n=20), flight("b", 1, 0.0), flight("b", 22, 180.0, n=30)]

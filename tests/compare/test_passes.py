@@ -10,7 +10,10 @@ FLIGHTS, LINKS, SAMPLES = 7, 3, 160
 
 
 def season(seed: int = 0) -> list[Pass]:
-    """Lawnmower routes at two heights, each flight a metre or two off; links sampled together but for NaN of their own."""
+    """Simulate lawnmower flights at two heights, each shifted by a metre or two.
+
+    All links have the same sample times, but each link has its own NaN.
+    """
     rng = np.random.default_rng(seed)
     share = np.linspace(0.0, 1.0, SAMPLES)
     leg, along = np.floor(share * 4), (share * 4) % 1

@@ -23,7 +23,7 @@ from aerpaw_cmp.compare.receiver import (
 
 
 def planted(n=1200, seed=2):
-    """Features and ranks drawn from a known regression; groups of equal size."""
+    """Return features and ranks drawn from a known regression, in groups of equal size."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(n, 4)) * [6.0, 5.0, 4.0, 8.0] - [10.0, 20.0, 30.0, 80.0]
     z = (x - x.mean(axis=0)) / x.std(axis=0)
@@ -55,7 +55,10 @@ def test_probabilities_come_near_the_planted_ones():
 
 @pytest.mark.parametrize(("penalty", "steep"), [(0.3, 1.0), (5.0, 1.0), (1e-3, 1.0), (0.1, 40.0)])
 def test_no_step_lessens_the_penalised_loss(penalty, steep):
-    """The slope at the solution is zero, the constant penalised by a thousandth; features that tell all need short steps."""
+    """The gradient at the solution is zero, with a thousandth of the penalty for the constant.
+
+    Features that separate the ranks completely need short steps.
+    """
     x, rank, _, groups = planted(600)
     x[:, 1] = np.where(rank > 2, steep, -steep) * np.abs(x[:, 1])
     x[:, 3] = 7.0  # says nothing, has no spread

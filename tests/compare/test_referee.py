@@ -100,7 +100,10 @@ def test_nearest_points_by_trying_all() -> None:
 
 
 def test_a_point_of_another_heading_is_not_near() -> None:
-    """Four headings are predicted at one position; a sample takes the one within 45 degrees of its nose."""
+    """Four headings are predicted at one position.
+
+    A sample is compared with the heading that is within 45 degrees of its own.
+    """
     points, yaw = np.zeros((4, 3)), np.array([0.0, 90.0, 180.0, 270.0])
     samples, heading = np.full((4, 3), 1.0), np.array([100.0, 350.0, 44.0, np.nan])
     index, near = nearest_points(samples, heading, points, yaw, 15.0)
@@ -113,7 +116,10 @@ def test_a_point_of_another_heading_is_not_near() -> None:
 
 
 def test_crps_of_single_samples_in_closed_form() -> None:
-    """CRPS of N(0, s) at its mean is s (sqrt 2 - 1) / sqrt pi; far away it is the distance minus s / sqrt pi."""
+    """The CRPS of N(0, s) at its mean is s (sqrt 2 - 1) / sqrt pi.
+
+    Far from the mean it is the distance minus s / sqrt pi.
+    """
     time, level = np.zeros(1), np.zeros(1)
     for measured, crps in ((0.0, 3.0 * (np.sqrt(2.0) - 1.0) / np.sqrt(np.pi)), (90.0, 90.0 - 3.0 / np.sqrt(np.pi))):
         card = level_card(time, np.array([measured]), PredictedLevel(level_db=level, sd_db=np.full(1, 3.0)), ())

@@ -16,7 +16,7 @@ def route():
 
 
 def flown(trend, seed, until_s=120.0):
-    """Levels of a route whose truth is a trend, a smooth field and noise; the prediction at the time given."""
+    """Simulate levels along a route as a trend, a smooth field and noise. Return the prediction at the given time."""
     rng = np.random.default_rng(seed)
     t, place = route()
     free = -20.0 * np.log10(np.linalg.norm(place - [400.0, 300.0, 10.0], axis=1))
@@ -87,7 +87,10 @@ def by_hand(length, place, time, value, here, later):
 
 @pytest.mark.parametrize("ripple_db", [4.0, 0.05])
 def test_each_prediction_is_that_of_the_bins_by_hand(ripple_db):
-    """Bins of two seconds and four samples; the trend with the least discounted score on levels 20 s ahead of what was known."""
+    """Bins have two seconds and four samples.
+
+    The trend is the one with the lowest discounted score for levels 20 s ahead of the known ones.
+    """
     rng = np.random.default_rng(3)
     line = np.column_stack([np.arange(200) * 4.0, np.full(200, 3.0), 30.0 + 0.01 * np.arange(200)])
     trends = {"up": 0.05 * line[:, 0], "down": -0.03 * line[:, 0]}

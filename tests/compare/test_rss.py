@@ -185,7 +185,7 @@ def test_link_geometry_in_the_antenna_frames():
 
 
 def test_spans_are_runs_of_smoothed_errors_of_one_sign():
-    """Smoothed by a loop; cut where the sign changes or a gap is longer than the window."""
+    """Smooth with a plain loop, and cut where the sign changes or a gap is longer than the window."""
     rng = np.random.default_rng(15)
     time = np.round(np.cumsum(rng.choice([0.25, 0.5], 400)), 2)
     time[200:] += 2.25

@@ -47,7 +47,10 @@ def test_few_flights_and_missing_ones():
 
 @pytest.mark.parametrize(("correlation", "least"), [(0.0, 0.93), (0.6, 0.87)])
 def test_intervals_of_24_flights_contain_the_mean(correlation: float, least: float) -> None:
-    """Independent flights get no wider intervals than Student's t, but for one in ten; correlated flights get wider."""
+    """For independent flights, at most one interval in ten is wider than Student's t.
+
+    For correlated flights, intervals are wider.
+    """
     rng, inside, wider = np.random.default_rng(8), [], []
     for _ in range(400):
         values = rng.normal(size=64)

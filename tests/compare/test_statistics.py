@@ -147,7 +147,10 @@ def test_an_interval_wider_than_twice_its_value_is_a_bound(monkeypatch):
 
 
 def test_a_difference_whose_interval_nobody_can_use_has_none(monkeypatch):
-    """One that holds 0 and reaches beyond an error itself, here 2 dB; exchanged models have none either."""
+    """An interval that contains 0 and extends beyond one of the errors (2 dB) is not reported.
+
+    The same holds if the models are exchanged.
+    """
     errors = np.tile([2.0, -2.0], 50), np.tile([2.0, 2.0, -2.0, -2.0], 25)
     for half_db2, given in ((7.9, True), (8.1, False)):
         draws = np.linspace(-half_db2 / 0.95, half_db2 / 0.95, 4097)

@@ -55,7 +55,7 @@ def calibration(trouble: str, draw: Generator) -> Verdict:
 
 
 def frames(trouble: str, draw: Generator) -> Verdict:
-    """The body frame against two wrong ones; a field over places fits the world frame as well or better."""
+    """Compare the body frame with two wrong frames. For a field over places, the world frame fits as well or better."""
     n = int(draw.integers(4, 9))
     gain = {"antenna": -1.5, "place": 1.5}.get(trouble, 0.0)
     body = [(f"F{i}", value) for i, value in enumerate(draw.normal(3.0, 0.8, n))]
@@ -73,7 +73,7 @@ def prediction(trouble: str, draw: Generator) -> Verdict:
 
 
 def coverage(trouble: str, draw: Generator) -> Verdict:
-    """A square of 900 positions about a tower; trees and a hill take levels."""
+    """Draw 900 positions in a square around a tower, where trees and a hill reduce the coverage."""
     east, north = np.meshgrid(np.linspace(-600, 600, 30), np.linspace(-600, 600, 30))
     trees, hill = np.zeros(east.size, bool), np.zeros(east.size, bool)
     edge = draw.uniform(-300.0, 200.0)

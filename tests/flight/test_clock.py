@@ -146,7 +146,7 @@ def test_no_single_place_of_a_flight_shifts_its_clock(spoilt, seeds):
 def test_a_shift_that_less_than_a_fifth_of_the_flight_supports_is_not_shown(
     begin: float, end: float, shown: bool
 ) -> None:
-    """Each second of one part of the flight is evidence of 1 nat for the shift; the other seconds know nothing."""
+    """Each second of one part of the flight supports the shift with 1 nat. The other seconds contain no evidence."""
     mean_s = np.arange(1000.0)
     evidence = (mean_s >= 1000.0 * begin) & (mean_s < 1000.0 * end)
 
@@ -219,7 +219,10 @@ def test_too_few_samples_and_gaps_of_the_telemetry():
 
 
 def test_a_track_of_one_pose_and_a_level_that_never_changes_are_no_fault():
-    """A table of one instant has no place at either side of any; a constant leaves nothing to explain."""
+    """A table with one time has no position before or after a given time.
+
+    A constant level leaves nothing to explain.
+    """
     instant = dataclasses.replace(
         ALONG, distance_m=ALONG.distance_m[:1], directions=ALONG.directions[:1],
         predicted_db={name: level[:1] for name, level in ALONG.predicted_db.items()},
@@ -249,7 +252,10 @@ def test_the_model_that_explains_the_level_is_chosen():
 
 
 def test_the_likelihood_is_that_of_a_multivariate_normal():
-    """Second way: the dense covariance, the scale profiled by hand; differences over gains and lags agree."""
+    """Compute the likelihood a second time with the dense covariance, with the scale maximised by hand.
+
+    Differences over gains and lags agree.
+    """
     rng = np.random.default_rng(8)
     t = np.sort(rng.uniform(0, 90, 80))
     features = np.column_stack([np.ones(80), np.log10(50 + t), rng.normal(0, 1, (80, 9))])

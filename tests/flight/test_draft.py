@@ -82,7 +82,7 @@ def test_another_day_a_ratio_and_relative_times_are_left_out(logs: Path) -> None
 
 
 def test_a_radio_clock_in_utc_is_asked_about_and_compared(logs: Path) -> None:
-    """The telemetry is local; the log of LW1 was written in UTC, that of LW2 an hour late."""
+    """The telemetry is in local time. The log of LW1 was written in UTC, and that of LW2 is an hour late."""
     for name, hour in (("LW1/USRP1_power_log.txt", "2025-06-01 14:"), ("LW2/USRP1_power_log.txt", "2025-06-01 11:")):
         (logs / name).write_text((logs / name).read_text().replace("2025-06-01 10:", hour))
     text = (logs / "LW3/USRP1_power_log.txt").read_text()  # from another flight, four hours later
@@ -330,7 +330,7 @@ def test_attitude_height_and_floor_are_proposed(tmp_path: Path, attitude: bool) 
 def test_a_draft_of_a_flight_file_names_logs_in_it_that_came_from_above(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Logs were named relative to a folder above; the flight file is read once for all of them."""
+    """The logs were named relative to a parent folder. The flight file is read once for all of them."""
     (tmp_path / "work").mkdir()
     (tmp_path / "logs").symlink_to(SAMPLE)
     monkeypatch.chdir(tmp_path / "work")

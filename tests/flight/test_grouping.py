@@ -181,7 +181,10 @@ def test_radios_meet_a_flight_up_to_the_slack_before_and_after() -> None:
 
 
 def test_no_origin_for_a_lap_of_a_route_that_is_flown_again() -> None:
-    """A log of one lap lies on the track at two times; where the second lap is flown aside, at one."""
+    """The log of one lap matches the track at two times.
+
+    If the second lap is flown elsewhere, it matches at one time.
+    """
     t = np.arange(440)
     flown = track("2025-03-02T15:00:00", seconds=len(t))
     lap = 2 * np.pi * t / 200.0

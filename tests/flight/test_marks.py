@@ -132,7 +132,10 @@ def test_strange_marks_of_a_file_are_of_no_log(foreign: str) -> None:
 
 @pytest.mark.parametrize("often", [0.05, 0.1, 0.3])
 def test_a_quarter_of_a_rank_log_is_known(often: float) -> None:
-    """Rows without CSI and another base of the indicator change nothing; another flight of the modem is another."""
+    """Rows without CSI and another base of the rank indicator do not matter.
+
+    Another flight of the same modem is a different log.
+    """
 
     def held(seed: int) -> Readings:
         generator = np.random.default_rng(seed)

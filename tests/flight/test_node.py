@@ -89,7 +89,7 @@ def test_levels_of_no_tower_are_placed_and_asked_about(tmp_path: Path) -> None:
     east, north = SITE.frame.to_local(np.array([node.latitude_deg or 0.0]), np.array([node.longitude_deg or 0.0]))
     assert np.hypot(east[0] - ROVER[0], north[0] - ROVER[1]) < 25.0
     assert "no tower fits the levels" in remarks  # LW1 is outside the region
-    assert "where did the node stand?" in remarks
+    assert "where was the node?" in remarks
 
 
 def test_a_position_list_is_tried_first(tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def _place(at: tuple[float, float], line: int) -> node.ListedPlace:
 def test_a_tower_stands_unless_a_place_wins_and_a_listed_one_wants_as_much_as_any_tower(
     towers: tuple[float, ...], listed: tuple[float, ...], said: str | int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Towers by their order; a list is of lines 7, 8 and one 6 km away, of which no odds are asked."""
+    """Odds of towers are in their order. A list has lines 7 and 8, and a line 6 km away whose odds are not computed."""
     names = list(SITE.towers)
     placer = _placer(
         [_place((-100.0, 50.0), 7), _place((250.0, -90.0), 8), _place((6000.0, 0.0), 9)][: 3 * bool(listed)]
@@ -221,7 +221,10 @@ def test_another_tower_is_named_where_its_evidence_is_far_above(
 
 
 def test_levels_are_taken_in_flight_and_their_offset_is_that_to_free_space() -> None:
-    """40 dBm at 3.3 GHz; below five metres nothing counts, and below the floor of the receiver its floor."""
+    """The transmitter has 40 dBm at 3.3 GHz.
+
+    Samples below five metres are ignored, and levels below the receiver's floor count as the floor.
+    """
     placer = _placer()
     time = np.datetime64("2025-06-01T14:00:00", "ns") + np.arange(400) * np.timedelta64(1, "s")
     away = np.linalg.norm(_track()[:400] - SITE.towers["LW1"].position_m, axis=1)

@@ -58,7 +58,10 @@ def test_a_mistake_is_named_with_what_was_meant(settings: FlightFile, key: str, 
 
 
 def test_links_are_those_of_the_paper_unless_the_file_says_otherwise() -> None:
-    """arXiv 2502.10324: RSS flights at 3.3 GHz sent by the UAV; rank at 3.4 GHz, 10 W, arrays at 45 and 315 degrees."""
+    """In arXiv 2502.10324, the UAV transmits at 3.3 GHz for RSS.
+
+    Rank is at 3.4 GHz and 10 W, with arrays at 45 and 315 degrees.
+    """
     links = LinksSettings()
     assert (links.rss.carrier_hz, links.rss.uav_transmits, links.rss.tower.layout) == (3.3e9, True, "single")
     rank = links.rank

@@ -193,7 +193,7 @@ def test_a_track_with_its_times_in_another_unit_is_asked_about(tmp_path: Path) -
 def test_heights_above_the_sea_and_a_level_that_is_always_empty(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A UAV is not 1.7 km up; a phone writes -1 for a network that it does not receive."""
+    """A UAV does not fly 1.7 km above ground. A phone writes -1 for a network that it does not receive."""
     (tmp_path / "site.yaml").write_text(
         "name: s\norigin: {latitude_deg: 35.7275, longitude_deg: -78.696}\n"
         "towers: {T1: {latitude_deg: 35.7275, longitude_deg: -78.697, antenna_height_m: 10.0}}\n"

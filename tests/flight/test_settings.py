@@ -73,7 +73,10 @@ def test_a_key_takes_its_limits_and_nothing_beyond(key: str) -> None:
 
 
 def test_what_a_flight_file_does_not_say() -> None:
-    """A plan of usual speeds and intervals without any trouble; the paper's arrays for ranks, one element for levels."""
+    """By default, a plan has usual speeds and intervals and no errors.
+
+    Ranks have the paper's arrays, and levels single elements.
+    """
     said = FlightFile.model_validate({"flight": {"name": "f", "plan": PLAN}, "logs": [{"path": "a"}]})
     plan = said.flight.plan
     assert plan is not None

@@ -86,7 +86,7 @@ ELSEWHERE = {
 
 
 def leaves(model: type[BaseModel], above: str = "") -> Iterator[str]:
-    """Yield the dotted keys of a model; those of the first model where several can stand."""
+    """Yield the dotted keys of a model. If several models are possible, the first is used."""
     for name, info in model.model_fields.items():
         inner = _models_in(info.annotation)[:1]
         yield from leaves(inner[0], f"{above}{name}.") if inner else [f"{above}{name}"]

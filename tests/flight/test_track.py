@@ -64,7 +64,7 @@ _LOGGED = [
 
 @pytest.mark.parametrize(("misread", "logged"), list(zip(tracks.MISREAD, _LOGGED, strict=True)))
 def test_a_misread_attitude_is_brought_back(misread, logged):
-    """Roll 2, pitch -5, yaw 100 degrees in ten wrong ways; the third has the course alone."""
+    """Roll 2, pitch -5 and yaw 100 degrees are logged in ten wrong ways. In the third way, the course alone is used."""
     t, turn = np.arange(5.0), body_rotation(0, 0, 100) if logged == (7, 9, 11) else body_rotation(2, -5, 100)
     way, (roll, pitch, yaw) = 9 * body_rotation(0, 0, 100)[:, 0], logged
     track = Track(telemetry(t, way[0] * t, way[1] * t, 10, roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw), FRAME)

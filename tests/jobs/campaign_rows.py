@@ -1,4 +1,4 @@
-"""Rows of a campaign with levels and places; numbers that the functions under test do not read are NaN."""
+"""Make rows of a campaign with levels and places. Numbers that the functions under test do not read are NaN."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from aerpaw_cmp.report.campaign import RssRow
 
 
 def rss_row(flight: str, channel: str, measured: Any, simulated: Any, **keys: Any) -> RssRow:
-    """A row of LW1; ``keys`` in place of what is made up."""
+    """Return an invented row of LW1. ``keys`` replace its values."""
     measured, simulated = np.asarray(measured, float), np.asarray(simulated, float)
     n = len(measured)
     nan = float("nan")

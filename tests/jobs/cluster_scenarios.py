@@ -1,4 +1,4 @@
-"""What test_workers.py checks on real Dask clusters, in a process of its own: prints one JSON object.
+"""Run the scenarios of test_workers.py on real Dask clusters in a separate process, and print one JSON object.
 
 A process of its own, since killed workers leave open sockets to the collector, which would warn in somebody else's test.
 """

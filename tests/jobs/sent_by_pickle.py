@@ -7,7 +7,10 @@ from aerpaw_cmp.jobs.workers import InProcess
 
 
 class SentByPickle(InProcess):
-    """Orders and results go through pickle, as to a process and back; ``sizes`` are those of the orders [bytes]."""
+    """A pool that pickles tasks and results, as on the way to a process and back.
+
+    ``sizes`` are the sizes of the tasks [bytes].
+    """
 
     count = 2
 

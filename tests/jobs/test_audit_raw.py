@@ -1,4 +1,7 @@
-"""The audit from raw bytes is silent on a right flight; tests/long/outside_faults.py plants faults under it."""
+"""Check that the audit from raw bytes reports nothing on a correct flight.
+
+tests/long/outside_faults.py injects faults below it.
+"""
 
 import csv
 import math
@@ -52,7 +55,10 @@ rank: {{tower: T1}}
 
 
 def write_flight(folder: Path) -> Path:
-    """A flight of two minutes that turns all the time, with antennas that have lobes; returns its flight.yaml."""
+    """Write a flight of two minutes that rotates all the time, with antennas that have lobes.
+
+    Return its flight.yaml.
+    """
     t = np.arange(0.0, 120.0)
     north, east = 35.7275 + 1.5e-5 * t, -78.6975 + 1.2e-5 * t
     up = 40 + 5 * np.sin(t / 9)

@@ -183,7 +183,7 @@ def test_one_flight_is_learned_and_not_scored(folder: Path) -> None:
 
 @pytest.mark.field
 def test_dataset12_each_way(tmp_path: Path) -> None:
-    """Everything but the offset learned on the other flight: 3.53 dB here; free space 6.37."""
+    """Learn everything except the offset from the other flight: RMSE 3.53 dB, free space 6.37 dB."""
     from aerpaw_cmp.compare import calibration
     from aerpaw_cmp.jobs.calibrate import load_calibration, observe, read_flights
 
@@ -201,7 +201,10 @@ def test_dataset12_each_way(tmp_path: Path) -> None:
 
 
 def test_towers_with_one_channel_keep_their_own_antennas(tmp_path: Path) -> None:
-    """As the SNR of four towers in one log: each tower has an entry, and the only tower of a channel serves for all."""
+    """Use the SNR of four towers in one log.
+
+    Each tower has an entry, and a channel with a single tower has one antenna for all.
+    """
     antennas = ("LW1.snr", "LW2.snr", "LW1.A")
     series = SimpleNamespace(link=LinkSettings(carrier_hz=3.3e9))
     calibration = SimpleNamespace(

@@ -32,7 +32,7 @@ SETTINGS = RankGrid(
 
 
 def flight(seed: int) -> RankSamples:
-    """Zigzag around the tower at 30 m; ranks are still to be planted."""
+    """Fly a zigzag around the tower at 30 m, with ranks that tests add later."""
     rng = np.random.default_rng(seed)
     azimuth, far = rng.uniform(0, 2 * np.pi, 400), rng.uniform(60, 350, 400)
     at = np.column_stack([far * np.cos(azimuth), far * np.sin(azimuth), rng.uniform(25, 35, 400)])

@@ -48,7 +48,7 @@ def flight_settings(name: str, seed: int, yaw_deg: float) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two simulated flights over one route; their flight files then say a wrong azimuth of the tower."""
+    """Simulate two flights over one route. Their flight files then name a wrong azimuth of the tower."""
     place = tmp_path_factory.mktemp("campaign")
     for seed, name in enumerate(OFFSETS_DB, start=1):
         simulate(write_yaml(place / f"{name}.yaml", flight_settings(name, seed, YAW_DEG)))
@@ -386,7 +386,7 @@ def test_a_failed_task_leaves_its_traceback_in_a_file(folder: Path) -> None:
 
 
 def test_many_settings_are_held_in_the_memory_of_one() -> None:
-    """Series of samples stay for the first setting; shared offsets of the others come from their moments."""
+    """Only the first setting keeps its sample series. Shared offsets of the other settings come from moments."""
     rng, n = np.random.default_rng(3), 5000
     every, held = [], []
     for number in range(40):

@@ -73,7 +73,7 @@ def only_unnamed_time(faults):
 
 
 def check_labels(book, start):
-    """Select by tower, by time and by port; ``book`` has complex ``h`` and ``gain``."""
+    """Select by tower, time and port. ``book`` has complex ``h`` and ``gain``."""
     assert {"tower", "time", "rx", "tx", "path"} <= set(book.indexes)
     one = book.sel(tower="LW2")
     np.testing.assert_array_equal(one.h, book.h[:, list(book.tower).index("LW2")])

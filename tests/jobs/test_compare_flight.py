@@ -34,7 +34,10 @@ pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 
 def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sentence, warning and table have one clock; nothing is asked where it was corrected, or where it changes nothing."""
+    """Sentence, warning and table name the same clock.
+
+    There is no question if the clock was corrected or if it changes nothing.
+    """
     monkeypatch.setattr(likely_cause, "gains_by_direction", lambda *_: None)
     monkeypatch.setattr(likely_cause, "_with_other", lambda e, *_: e)
     for shifted, other, fall_db, first in (
@@ -93,7 +96,10 @@ def flight(
     rank: tuple[Any, Any] | None = None, rt: dict[str, Any] | None = None, rss_keys: dict[str, Any] | None = None,
     **keys: Any,
 ) -> Path:  # fmt: skip
-    """A flight eastwards past LW1 at 40 m; ``rss`` maps channels to (seconds, levels), ``rank`` is (seconds, RI)."""
+    """Return a flight eastwards past LW1 at 40 m.
+
+    ``rss`` maps channels to (seconds, levels), and ``rank`` is (seconds, RI).
+    """
     t = np.arange(0.0, seconds + 1.0)
     logs = [eastwards(folder, t, 5.0 * (t - 10.0), yaw_deg=120.0)]
     logs += [rss_log(folder, channel, *series) for channel, series in (rss or {}).items()]
@@ -503,7 +509,10 @@ def test_an_expectation_that_the_flight_refutes_is_withdrawn(
 
 
 def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With lock, levels are about the prediction and the mean error; without lock, about the level of other flights."""
+    """Locked levels are distributed about the prediction and the mean error.
+
+    Without lock, they are distributed about the level of other flights.
+    """
     lock = SimpleNamespace(
         gain_db=-100.0,
         per_db=0.1,

@@ -27,7 +27,10 @@ pytestmark = pytest.mark.usefixtures("few_pictures")
 
 
 def flight(folder: Path, exponent: float = 2.0) -> Path:
-    """Eastwards past LW1 at 40 m; the levels are log-distance plus noise, the flight file asks for coherent ground."""
+    """Write a flight eastwards past LW1 at 40 m.
+
+    The levels are log-distance plus noise, and the flight file has a coherent ground reflection.
+    """
     t, at = np.arange(0.0, 121.0), np.arange(0.0, 120.0, 0.2)
     range_m = np.sqrt((-500.0 + 8.0 * at) ** 2 + 55.0**2 + 30.0**2)
     level = -30.0 - 10.0 * exponent * np.log10(range_m) + np.random.default_rng(1).normal(size=len(at))
@@ -150,7 +153,10 @@ def test_learned_antennas_are_scored_on_other_flights_alone(tmp_path: Path) -> N
 
 
 def remembering(folder: Path, learned_db: float, trained_on: str = "a" * 64, tower: str = "LW1") -> Path:
-    """The planted flight at a site whose memory has antennas for its tower and channel; its own file names none."""
+    """Write the planted flight at a site with learned antennas for its tower and channel.
+
+    The flight file itself names no antennas.
+    """
     site = folder / "mine.yaml"
     site.write_bytes(Path(str(folder_of("lake_wheeler"))).with_suffix(".yaml").read_bytes())
     rows, columns = np.mgrid[0:19, 0:24]
@@ -181,7 +187,10 @@ def test_a_node_of_the_flight_is_offered_what_rovers_of_others_taught(
 def test_an_isotropic_flight_is_offered_what_its_site_remembers(
     learned_db: float, chosen: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Both beat this flight as set; on other flights the learned antennas beat free space, or they do not."""
+    """Both models are better than the settings of this flight.
+
+    Whether learned antennas are recommended depends on their error on other flights.
+    """
     metrics = report(remembering(tmp_path, learned_db), capsys, "--recommend", str(tmp_path / "best.yaml"))
     rungs = {row["model"]: row for row in metrics["ladder"]}
     assert {"learned sphere", "learned sphere + heading"} <= set(rungs)

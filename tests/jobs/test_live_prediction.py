@@ -56,7 +56,10 @@ def test_prediction_follows_a_growing_log(tmp_path: Path) -> None:
 
 
 def test_the_rest_of_the_route_is_predicted_from_what_was_measured(tmp_path: Path) -> None:
-    """Planted: the replay, 31 dB below its level; the rest must come out there, with the replay as its trend."""
+    """The measured level is the replay minus 31 dB.
+
+    The rest of the route must be predicted 31 dB lower too, with the replay as trend.
+    """
     settings = load_flight(FLIGHT)
     trajectory = plan_trajectory(settings.flight.plan)
     site = choose_site(settings.site, FLIGHT.parent)

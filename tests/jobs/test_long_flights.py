@@ -51,7 +51,10 @@ def test_a_part_of_the_flight_turns_as_the_whole_does(one_tower: FlightData) -> 
 
 
 def test_a_replay_in_blocks_is_the_replay(one_tower: FlightData, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Levels, channel matrices, paths and their order; flights beyond a block are replayed a block at a time."""
+    """Compare levels, channel matrices, and paths with their order.
+
+    Flights longer than a block are replayed block by block.
+    """
     settings = one_tower.settings
     off = settings.model_copy(update={"rss": settings.rss.model_copy(update={"lag": "off"})})
     data = dataclasses.replace(one_tower, settings=off)

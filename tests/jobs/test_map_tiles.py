@@ -19,7 +19,10 @@ FRAME = SiteFrame(35.7, -78.7)
 
 
 def town(buildings=80, side_m=800.0, seed=1, trees=0):
-    """Buildings turned at random, some that touch, one that holds a tower; towers on ground of two heights."""
+    """Return buildings at random angles, some of which touch, and one with a tower inside.
+
+    The towers are on ground of two heights.
+    """
     rng = np.random.default_rng(seed)
     middle = rng.uniform(-side_m / 2, side_m / 2, (buildings, 2))
     blocks = []

@@ -1,4 +1,7 @@
-"""Stored task results: reused under any name, ignored if damaged or out of date; tasks are tried twice."""
+"""Check stored task results: they are reused under any name, and ignored if damaged or out of date.
+
+A task is tried twice.
+"""
 
 import dataclasses
 import io
@@ -231,7 +234,10 @@ def test_a_worker_that_sees_other_files_fails_the_task(flight: Path) -> None:
 
 
 def test_a_log_that_changes_is_read_again_by_a_worker_that_lives_on(flight: Path, tmp_path: Path) -> None:
-    """A worker of a cluster serves campaign after campaign; its cache of logs is of content, not of names."""
+    """A worker of a cluster serves several campaigns.
+
+    Its cache of logs depends on their content, not on their names.
+    """
     for name in flight.parent.iterdir():
         shutil.copy(name, tmp_path) if name.is_file() else shutil.copytree(name, tmp_path / name.name)
     task = Task(tmp_path / flight.name, "f", "a", {}, None)

@@ -114,7 +114,7 @@ def test_simulate_writes_nothing_outside_its_folder(logs: Path, capsys: pytest.C
 
 @pytest.fixture
 def commands(logs: Path) -> dict[str, list[str]]:
-    """Every command that writes a folder; the folder follows."""
+    """Return the arguments of every command that writes a folder, without the folder."""
     (logs / "campaign.yaml").write_text("campaign: c\nflights: [flight.yaml]\n")
     site = logs.parent / "site.yaml"
     place = logs.parent / "g.json"
@@ -180,7 +180,7 @@ def tiny_flight(folder: Path) -> Path:
 
 
 def test_a_tower_inside_a_building_is_named_by_each_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A tower of the site and a node of the flight's own, both inside one hall; no path reaches either."""
+    """A tower of the site and a node of the flight are inside one building. No path reaches either."""
     flight, site = tiny_flight(tmp_path), tmp_path / "site.yaml"
     content = yaml.safe_load(flight.read_text())
     hall = {"name": "hall", "polygon_m": [[-20, -20], [20, -20], [20, 20], [-20, 20]], "height_m": 30}

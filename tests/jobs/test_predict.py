@@ -316,7 +316,7 @@ def test_a_prediction_that_learned_from_the_flight_is_refused(said):
 
 
 def test_a_prediction_that_learned_from_the_flight_refuses_half_of_it(said, prediction):
-    """The half has another digest; its readings are those that the prediction keeps marks of."""
+    """Half of the log has another digest. Its readings match the fingerprints in the prediction."""
     data, folder, _ = said
     halves = [
         dataclasses.replace(s, time=s.time[: len(s.time) // 2], measured_db=s.measured_db[: len(s.time) // 2])

@@ -35,7 +35,10 @@ LEVEL = LearnedLevel(offset_db=-7.0, sd_db=1.5, transmit_power_dbm=30.0, unit="d
 
 
 def table(gain_db: float, sd_db: tuple[float, float], note: str = "") -> bytes:
-    """Gain of ``gain_db`` times the cosine of the azimuth; the first deviation before the antenna, the second behind."""
+    """Return a gain of ``gain_db`` times the cosine of the azimuth.
+
+    ``sd_db`` contains the standard deviations in front of the antenna and behind it.
+    """
     azimuth = np.radians(np.arange(0.0, 360.0, 5.0))
     ahead = np.cos(azimuth) >= 0
     sd = np.broadcast_to(np.where(ahead, *sd_db), (37, 72))
@@ -89,7 +92,10 @@ def test_levels_are_free_space_and_the_remembered_gains(site: Path) -> None:
 
 
 def test_a_receiver_that_loses_its_lock_is_forecast_in_two_parts(site: Path, tmp_path: Path) -> None:
-    """Drawn sample by sample: in lock or not, then about the line of either part; the offset of the flight is open."""
+    """Draw each sample as locked or not, and its level about the line of that part.
+
+    The offset of the flight is unknown.
+    """
     lock = LearnedLock(
         gain_db=-92.0, per_db=0.4, share=0.7, locked_db=-70.0, locked_per_db=0.8, locked_sd_db=2.0, lost_db=-85.0,
         lost_per_db=0.3, lost_sd_db=4.0, flights=3, brier=0.1, constant_brier=0.2, log_score=0.4,

@@ -21,7 +21,7 @@ SETTINGS = planned(
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Reports with one reflection and with none; the first also exports everything."""
+    """Write one report with a reflection and one without. The first also exports everything."""
     folder = tmp_path_factory.mktemp("pair")
     path = write_yaml(folder / "flight.yaml", SETTINGS)
     simulate(path)

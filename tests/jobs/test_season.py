@@ -89,7 +89,7 @@ def test_a_campaign_without_levels(data):
 
 
 def test_soundings_between_towers_show_a_radio_that_lost_a_decibel_last_night(tmp_path: Path):
-    """Names and lines as AERPAW's nightly script writes them; ``null`` is the noise without a transmitter."""
+    """Names and lines are those of AERPAW's nightly script. ``null`` is the noise without a transmitter."""
     rng, towers = np.random.default_rng(3), ("LW1", "LW2", "LW3", "LW4", "LW5")
     for night in range(1, 16):
         weather = rng.normal()

@@ -41,7 +41,7 @@ def write_flight(folder: Path, **changes: object) -> Path:
 
 
 def report(path: Path, name: str, *options: str) -> tuple[pd.DataFrame, dict]:
-    """Report a flight; return rss.csv and metrics.json."""
+    """Report a flight, and return rss.csv and metrics.json."""
     out = path.parent / name
     assert main(["report", str(path), "-o", str(out), "-q", *options]) == 0
     return pd.read_csv(out / "rss.csv"), json.loads((out / "metrics.json").read_text())

@@ -223,7 +223,7 @@ def test_a_part_of_a_training_log_in_another_layout_is_known_by_its_readings(fol
 
 
 def test_two_logs_of_one_flight_in_two_flight_files(folder: Path) -> None:
-    """Only the series of the log that comes twice is left out; what else the later flight holds counts."""
+    """Only the series of the repeated log is excluded. The other series of the later flight count."""
     both = settings("aside", {"model": "iso"})
     both["logs"].append({"path": LOG, "reader": "sounder_log", "node": "LW2", "channel": "USRP9"})
     flights = [load_data(load_flight(folder / "first.yaml"), folder)]

@@ -460,7 +460,7 @@ def _replay_lines(lines: Sequence[_Line], context: _Context, known: Proposal) ->
     if any(stream.kind == "rank" for line in lines for stream in line.compared):
         return [
             *why,
-            "# To use rt.attitude: logged, first write the mounting of link.rank.uav relative to the aircraft's nose.\n",
+            "# To use rt.attitude: logged, write the mounting of link.rank.uav relative to the aircraft's nose.\n",
             f"rt: {{audit_links: {_QUICK_AUDIT}{shaded}}}{_QUICK}\n",
         ]
     frame, keys = context.flown[0].frame, f"{alone}, audit_links: {_QUICK_AUDIT}"

@@ -244,7 +244,11 @@ class Placer:
             return _node(self._local(place), at_list, about, nodes)
         best = int(odds_tower.argmax())
         if odds_tower[best] >= _TOWER_ODDS:
-            how = "with its antennas learned from flights" if odds_tower[best] > odds[best] else "as well as any other position"
+            how = (
+                "with its antennas learned from flights"
+                if odds_tower[best] > odds[best]
+                else "as well as any other position"
+            )
             near = [i for i in np.argsort(-odds_tower) if odds_tower[i] > odds_tower[best] - _UNDECIDED]
             alike = [towers[i].name for i in near]
             # part of a flight can fit several towers: one with learned antennas is the most likely

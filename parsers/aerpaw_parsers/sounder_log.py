@@ -335,7 +335,8 @@ def _name(options: ReadOptions) -> tuple[str, bool]:
 def _warnings(tally: Counter[str], of_times: list[str], options: ReadOptions) -> Iterator[str]:
     """Yield sentences about the counts."""
     if tally["repeated"]:
-        yield f"{counted(tally['repeated'], 'sample')} restored from '*' (od's sign for equal lines); flagged 'repeated'"
+        samples = counted(tally["repeated"], "sample was", "samples were")
+        yield f"{samples} restored: the log has '*' (of the program od) for values that repeat. Flagged 'repeated'"
     if tally["lost"]:
         yield f"offsets jump at {counted(tally['lost'], 'place')}: {counted(tally['missing'], 'sample')} missing"
     if tally["back"]:

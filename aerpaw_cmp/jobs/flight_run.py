@@ -607,7 +607,7 @@ def run_flight(
             result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress, anew=anew))
     climbed: FlightLadder | None = None
     if ladder:
-        with stages("ladder"):
+        with stages("models"):
             stages.progress("model comparison")
             climbed = flight_ladder(data, replays)
             if climbed is not None:

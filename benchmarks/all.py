@@ -139,7 +139,7 @@ def _run(command: list[str], limit_s: float = LIMIT_S) -> tuple[str, str | None]
 
 
 def run_one(name: str, command: list[str]) -> dict[str, Any]:
-    """The JSON of one benchmark, its seconds and the load before it; its last words where it fails."""
+    """Return the JSON of one benchmark, its seconds and the load before it. If it fails, return its last words."""
     load, start = os.getloadavg()[0], time.perf_counter()
     print(f"{name} ...", file=sys.stderr, flush=True)
     text, why = _run(command, LONG_S if name == "country" else LIMIT_S)
@@ -165,7 +165,7 @@ def run_axes(command: list[str], axes: Sequence[str] = AXES) -> dict[str, Any]:
 
 
 def check(names: Sequence[str]) -> int:
-    """Run each at its smallest size; 1 where one does not come to its end."""
+    """Run each benchmark at its smallest size, and return 1 if one of them does not finish."""
     without = () if os.environ.get("AERPAW_CMP_FIELD_DATA") else ON_FIELD_DATA
     failed = 0
     for name in names or list(SMALLEST):

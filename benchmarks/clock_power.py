@@ -30,7 +30,7 @@ UNSHIFTED_WITHIN_S = 1.0
 
 
 def drafted(path: Path, timezone: str) -> FlightData | None:
-    """The flight of one file as its draft has it; None where it has no levels along a track."""
+    """Return the drafted flight of one file, or None if it has no levels along a track."""
     try:
         files = ingest([path], options=ReadOptions(timezone=timezone))
         with tempfile.TemporaryDirectory() as folder:

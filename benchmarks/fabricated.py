@@ -95,7 +95,7 @@ def _row(
 def rss_result(
     tower: str, channel: str, time: Any, position_m: FloatArray, levels: Mapping[str, FloatArray], **more: Any
 ) -> RssResult:
-    """Comparison of the levels ``measured`` and ``simulated`` (n,); the others are baselines.
+    """Compare the levels ``measured`` and ``simulated`` (n,), with the other levels as baselines.
 
     Parameters
     ----------

@@ -168,7 +168,7 @@ def record(flights: list[Path], logs: Path | None, quick: bool) -> dict[str, Any
 
 
 def differences(before: Any, after: Any) -> dict[str, float]:
-    """The worst differences of two records; infinite where shapes, paths or cases differ."""
+    """Return the largest differences of two records. They are infinite if shapes, paths or cases differ."""
     worst = {
         "paths": 0.0,
         "vertices_m": 0.0,

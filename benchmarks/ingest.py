@@ -44,7 +44,7 @@ def _wall(first: int, count: int, step_ns: int) -> np.ndarray:  # type: ignore[t
 
 
 def write_sounder(place: Path, lines: int) -> None:
-    """A power log; its octal offsets run through."""
+    """Write a power log with consecutive octal offsets."""
     values = [b"%16.6f" % value for value in np.random.default_rng(5).normal(-40, 9, STEP)]
     with place.open("wb") as file:
         for first, count in _blocks(lines):
@@ -54,7 +54,7 @@ def write_sounder(place: Path, lines: int) -> None:
 
 
 def write_vehicle(place: Path, lines: int) -> None:
-    """Telemetry of ten fields; its index runs through."""
+    """Write telemetry of ten fields with a consecutive index."""
     rng = np.random.default_rng(6)
     names = ("altitude_m", "roll_deg", "pitch_deg", "yaw_deg", "velocity_north_mps", "velocity_east_mps")
     track = pd.DataFrame({name: rng.uniform(-9, 9, STEP) for name in names}).assign(time=START)

@@ -70,7 +70,7 @@ def shifted_by(seconds_of: Callable[[Array, np.random.Generator], Array]) -> Fau
 
 
 def levels_by(change: Callable[[Array, Table, np.random.Generator], Array], *, every: bool = False) -> Fault:
-    """Levels of all or one channel after a change; all of one fault have the same draws."""
+    """Change the levels of one channel, or of all channels. All channels of one fault use the same random numbers."""
 
     def fault(t: Table, draw: np.random.Generator) -> None:
         names = levels(t) if every else channels(t, draw)
@@ -82,7 +82,7 @@ def levels_by(change: Callable[[Array, Table, np.random.Generator], Array], *, e
 
 
 def swapped(*pairs: tuple[str, str]) -> Fault:
-    """Columns that are exchanged; nothing without them."""
+    """Exchange pairs of columns, if both exist."""
 
     def fault(t: Table, _: np.random.Generator) -> None:
         for a, b in pairs:

@@ -72,7 +72,10 @@ def samples(quick):
 
 
 def peer_leave_one_out(points, values, index, pairs):
-    """PyKrige on the given (target, field) pairs, each from the same neighbours; estimates and seconds."""
+    """Run PyKrige on the given (target, field) pairs, each with the same neighbours as ours.
+
+    Return estimates and seconds.
+    """
     estimate = np.empty(len(pairs))
     start = time.perf_counter()
     for row, (target, field) in enumerate(pairs):
@@ -102,7 +105,10 @@ def leave_one_out(quick, full, pairs):
 
 
 def on_the_grid(quick):
-    """Ours on the regular grid, where targets share weights; complete fields and fields with gaps per altitude."""
+    """Run our Kriging on the regular grid, where targets share weights.
+
+    Fields are complete, or have gaps that differ by altitude.
+    """
     grid, _, values = samples(quick)
     gaps = values.copy()
     rng = np.random.default_rng(2)

@@ -114,7 +114,10 @@ def learned(
 
 
 def errors(correction: Correction, asked: LinkSamples, known: Sequence[LinkSamples]) -> Part:
-    """Errors over means of :data:`MEANS_S`; about their own mean where the flight is not known."""
+    """Compute errors of means over :data:`MEANS_S`.
+
+    If the flight is unknown, the errors are relative to their own mean.
+    """
     own = asked.flight not in {s.flight for s in known}
     binned = asked.binned(MEANS_S)
     level, sd = correction.predict(binned, None if own else asked.flight, own_mean=own)
@@ -125,7 +128,7 @@ def errors(correction: Correction, asked: LinkSamples, known: Sequence[LinkSampl
 def both(
     train: Sequence[LinkSamples], asked: Sequence[LinkSamples], antennas: Sequence[LinkSamples] = ()
 ) -> tuple[str, list[Part], list[Part]]:
-    """Title of the chosen field; errors of each series without a field and with the chosen one."""
+    """Return the title of the chosen field, and the errors of each series without a field and with the chosen one."""
     chosen, alone = (learned(train, titles, antennas) for titles in ((), (OFF,)))
     asked = [s for s in asked if len(s) and s.antenna in chosen.channels]
     return chosen.title, *([errors(c, s, train) for s in asked] for c in (alone, chosen))  # type: ignore[return-value]
@@ -182,7 +185,10 @@ def blocks(bench: Bench, *, quick: bool) -> None:
 def block_errors(
     bench: Bench, test: str, known: Sequence[str], antennas: Sequence[str], *, every: int = 1
 ) -> list[float]:
-    """Numbers of :data:`BLOCK_LINE` for one flight, of every n-th block; ``antennas``: flights that teach no more."""
+    """Compute the numbers of :data:`BLOCK_LINE` for every n-th block of a flight.
+
+    ``antennas`` are flights from which only antennas are learned.
+    """
     extra = [o.samples for o in samples_of(bench, antennas)]
     answers = [both(*fold, extra) for fold in list(questions(bench, "blocks", known, test))[::every]]
     row = []

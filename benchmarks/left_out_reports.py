@@ -75,7 +75,7 @@ def recipe_of_campaign(name: str) -> Path:
 
 
 def without(recipe: Path, flights: Collection[str], folder: Path, campaigns: Collection[str] = ()) -> Path:
-    """Write a calibration without some flights and campaigns; return its path."""
+    """Write a calibration without some flights and campaigns, and return its path."""
     content = yaml.safe_load(recipe.read_text(encoding="utf-8"))
 
     def kept(names: Sequence[str]) -> list[str]:
@@ -150,7 +150,7 @@ def reported(log: Path, site: Path, folder: Path) -> tuple[str, dict[str, Any]]:
 
 
 def thirds(log: Path, folder: Path) -> Iterator[Path]:
-    """The three parts of a merged table; each column is cut by its own length."""
+    """Return the three parts of a merged table, with each column cut by its own length."""
     columns = {name: value.ravel() for name, value in loadmat(log).items() if not name.startswith("__")}
     for part in range(3):
         cut = {name: v[part * v.size // 3 : (part + 1) * v.size // 3] for name, v in columns.items()}

@@ -121,7 +121,7 @@ def opened(page: Path, repeats: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Make the pages, open them, print the table; exit code 1 where a limit is missed."""
+    """Make the pages, open them, and print the table. The exit code is 1 if a limit is exceeded."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="report,long,map,campaign")
     parser.add_argument("--map", type=Path, help="a map.html that was made before")

@@ -192,7 +192,10 @@ def peers(history: list[dict[str, Any]]) -> list[str]:
 
 
 def last_result(history: list[dict[str, Any]], name: str) -> tuple[str, dict[str, Any]]:
-    """The last result of a benchmark, and when and at what load it was measured; empty if there is no result."""
+    """Return the last result of a benchmark, with the time and load of its measurement.
+
+    It is empty if there is no result.
+    """
     for run in reversed(history):
         entry = run["benchmarks"].get(name, {})
         if result := entry.get("result"):

@@ -20,7 +20,7 @@ SHARES = {0.5: 0.6745, 0.9: 1.6449, 0.95: 1.96}
 
 
 def flown(rng: np.random.Generator, count: int, each: int) -> Rows:
-    """Lawnmowers with legs of 480 m, 45 m apart, 4 s a row; every other flight 20 m higher."""
+    """Simulate lawnmowers with legs of 480 m, 45 m apart, and 4 s per row. Every second flight is 20 m higher."""
     parts = []
     for flight in range(count):
         t = 4.0 * np.arange(each)

@@ -88,7 +88,10 @@ def two_channels(folder: Path) -> tuple[Path, list[str], str]:
 
 
 def cold_and_warm(flight: Path, options: list[str], folder: Path, repeats: int) -> dict[str, dict[str, float]]:
-    """First (cold) and next (warm) report, medians; the processor time of imports before and after each."""
+    """Measure the first (cold) and the next (warm) reports, as medians.
+
+    Measure the imports before and after each of them.
+    """
     by_state: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
     for number in range(repeats):
         caches = folder / f"kept{number}"

@@ -144,7 +144,10 @@ def _seconds(points: list[dict[str, Any]], plan: dict[str, Any]) -> float:
 
 
 def report(hours: float) -> dict[str, float]:
-    """A report as a process, imports included, from simulated logs; 1 000 000 samples of a channel in ten hours."""
+    """Measure a report as a process with its imports, from simulated logs.
+
+    Ten hours are 1 000 000 samples of a channel.
+    """
     sys.path.insert(0, str(ROOT / "benchmarks"))
     from report import run as run_process
 
@@ -159,7 +162,7 @@ def report(hours: float) -> dict[str, float]:
 
 
 def flights(count: int, workers: int = 1) -> dict[str, float]:
-    """A campaign; its flights are simulated before."""
+    """Measure a campaign whose flights were simulated before."""
     from aerpaw_cmp.jobs.options import RunOptions
     from aerpaw_cmp.jobs.run import run_campaign, run_simulate
 
@@ -201,7 +204,7 @@ MEASURES: dict[str, Callable[[float], dict[str, float]]] = {
 
 
 def measure(axis: str, size: float, seconds: float) -> dict[str, Any]:
-    """One size in a process of its own; its reason where it cannot be measured."""
+    """Measure one size in a separate process. If this is not possible, return the reason."""
     command = [sys.executable, __file__, "--one", axis, str(size)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "parsers")])}
     try:

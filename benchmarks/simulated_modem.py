@@ -17,7 +17,7 @@ from aerpaw_cmp.logs.files import Record, decode_record
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Faults to make; every number counts answers, 0 is never; times in seconds.
+    """The faults to inject, where numbers count answers, 0 means never, and times are in seconds.
 
     ``binary_echo`` echoes a command with its high bits set, ``glue`` leaves out the line end between two information
     lines, ``silent_after`` says nothing more after so many answers.
@@ -42,7 +42,10 @@ class Faults:
 
 @dataclass(slots=True)
 class Served:
-    """An answer; ``read`` is True once the other side sent its next command: then it has read this one to the end."""
+    """An answer, whose ``read`` becomes True once the other side sent its next command.
+
+    Then the answer was read completely.
+    """
 
     command: str
     lines: tuple[str, ...]
@@ -50,7 +53,7 @@ class Served:
 
 
 class FaultyModem(ModemSimulator):
-    """The simulated modem with faults; other devices by ``kind``."""
+    """The simulated modem with faults, or another device according to ``kind``."""
 
     def __init__(
         self,
@@ -93,7 +96,7 @@ class FaultyModem(ModemSimulator):
             os.close(old)
 
     def replug(self) -> None:
-        """Put the cable back: a new node under another number, the link follows; the modem says RDY."""
+        """Plug the cable in again: the device gets a new number, and the link follows. The modem then reports RDY."""
         spare = pty.openpty()  # takes the number that became free, so that the modem gets another one
         with self._lock:
             self._node = self._plug()
@@ -189,7 +192,7 @@ class BadLine:
 
 
 def read_log(folder: Path, bad: list[BadLine] | None = None) -> Iterator[Record]:
-    """Records of the tap's log in a folder, in order; bad lines go to ``bad``."""
+    """Return the records of the tap's log in a folder, in order. Damaged lines are appended to ``bad``."""
     bad = [] if bad is None else bad
     for path in sorted(folder.glob("tap_*.jsonl")):
         lines = path.read_bytes().split(b"\n")

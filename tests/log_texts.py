@@ -9,7 +9,7 @@ from aerpaw_cmp.logs.writers import local_text
 
 
 def quectel_csv(times: Any, rank: Any, timezone: str) -> bytes:
-    """Rank (1 to 8; NaN: no CSI) as AERPAW's ``Basic_and_Other_Params.csv``, its first line ``OK`` included."""
+    """Return ranks (1 to 8, or NaN without CSI) as AERPAW's ``Basic_and_Other_Params.csv``, with its first line ``OK``."""
     lines = ["OK\n"]
     for time, value in zip(local_text(times, timezone, digits=3), np.nan_to_num(rank).astype(int), strict=True):
         report = f"27,{value},15,3" if value else "0,0,0,0"

@@ -35,7 +35,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 
 def utc_us(text: str, zone: str) -> int:
-    """Microseconds since 1970 of a written instant; one without an offset is local to ``zone``.
+    """Return the microseconds since 1970 of a written time. A time without an offset is local to ``zone``.
 
     Examples
     --------
@@ -54,7 +54,7 @@ def utc_us(text: str, zone: str) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row of telemetry: UTC [us], degrees, metres above take-off; roll, pitch, yaw [deg] where they are written."""
+    """A row of telemetry: UTC [us], degrees, metres above take-off. Roll, pitch and yaw [deg] if they are written."""
 
     time_us: int
     latitude_deg: float
@@ -80,7 +80,9 @@ class Log:
 
 
 def read_log(data: bytes, zone: str) -> Log | None:
-    """Telemetry and readings of a vehicleOut, a power log, a table with a title line or a merged .mat; else None.
+    """Read telemetry and levels of a vehicleOut, a power log, a table with a title line or a merged .mat.
+
+    Return None for other logs.
 
     Parameters
     ----------
@@ -106,7 +108,10 @@ def read_log(data: bytes, zone: str) -> Log | None:
 
 
 def _od_lines(text: str, zone: str) -> dict[int, Reading]:
-    """``[stamp] octal value`` of od through ts; no value on a line ``*``, which stands for repeated samples."""
+    """Read the lines ``[stamp] octal value`` of od through ts.
+
+    A line ``*`` has no value and means repeated samples.
+    """
     out = {}
     for number, line in enumerate(text.split("\n"), start=1):
         match = re.match(r"\[([^\]]+)\] (?:\*|[0-7]+ +(\S+))\s*$", line)
@@ -136,7 +141,7 @@ def _vehicle_rows(text: str, zone: str) -> Iterable[Row]:
 
 
 def _table(text: str, zone: str) -> Log:
-    """A table with a title line that names its columns; angles in radians."""
+    """Read a table with a title line that names its columns, and angles in radians."""
     rows, readings = [], {}
     lines = list(csv.reader(io.StringIO(text)))
     names = [cell.strip().lower() for cell in lines[0]]
@@ -272,7 +277,7 @@ def level(turn: Matrix) -> Matrix:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Place [m] and turn at an instant; no turn without attitude in the rows."""
+    """A position [m] and a rotation at one time. There is no rotation if the rows have no attitude."""
 
     place_m: Vector
     turn: Matrix | None

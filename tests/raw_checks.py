@@ -48,7 +48,7 @@ class Account:
     broken: list[str] = field(default_factory=list)
 
     def add(self, kind: str, difference: float, where: str, spare: float = 0.0) -> None:
-        """One comparison; NaN is a failure, ``spare`` more than the tolerance is allowed."""
+        """Add one comparison, where NaN is a failure. ``spare`` is added to the tolerance."""
         off = difference if math.isfinite(difference) else math.inf
         self.count[kind] = self.count.get(kind, 0) + 1
         self.failed[kind] = self.failed.get(kind, 0) + (off > _TOLERANCES[kind][0] + spare)
@@ -108,7 +108,7 @@ def raw_checked(data: FlightData, replays: Sequence[Replayed], expected: Sequenc
 
 
 def _log(data: FlightData, settings: LogSettings, file: IngestedFile) -> Log | None:
-    """A log of the flight, read a second time; None where the flight file states its times or columns."""
+    """Read a log of the flight a second time. Return None if the flight file specifies its times or columns."""
     zone = "UTC" if settings.clock == "utc" else settings.timezone or data.settings.timezone
     content = (data.folder / settings.path).read_bytes()
     assert hashlib.sha256(content).hexdigest() == file.sha256, "the report names its inputs by their hash"
@@ -339,7 +339,7 @@ def _value(reading: Reading, series: RssSeries, log: LogSettings) -> float | Non
 
 
 def _as_asked(pose: Pose, mode: str) -> Matrix | None:
-    """The turn as ``rt.attitude`` has it; None where the log says none."""
+    """Return the rotation according to ``rt.attitude``, or None if the log has none."""
     if mode == "ignored":
         return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     return level(pose.turn) if mode == "level" and pose.turn is not None else pose.turn

@@ -1,4 +1,4 @@
-"""The real logs that AERPAW_CMP_FIELD_DATA names; tests marked ``field`` are skipped, saying so, where it names none."""
+"""Find the real logs in AERPAW_CMP_FIELD_DATA. If it is not set, tests marked ``field`` are skipped with a message."""
 
 import os
 from pathlib import Path
@@ -8,7 +8,7 @@ REAL = Path(os.environ.get("AERPAW_CMP_FIELD_DATA") or "/nowhere")
 
 
 def dataset12(name: str) -> dict[str, Any]:
-    """Columns of a flight of data set 12; its authors' x and y are not the same axis in all their files."""
+    """Return the columns of a flight of dataset 12. Its authors' x and y are not the same axes in all files."""
     import numpy as np
     from scipy.io import loadmat
 

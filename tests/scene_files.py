@@ -7,7 +7,7 @@ QUADS = ("0 2 3 1", "4 5 7 6", "0 1 5 4", "2 6 7 3", "0 4 6 2", "1 3 7 5")  # ou
 
 
 def box(folder: Path, name: str, material: str, low: tuple[float, ...], high: tuple[float, ...]) -> str:
-    """Write the PLY mesh of a box, of a rectangle where it has no height; give its element of the scene."""
+    """Write the PLY mesh of a box, or of a rectangle if it has no height. Return its element of the scene."""
     corners = [c[::-1] for c in itertools.product(*zip(low[::-1], high[::-1], strict=True))]
     quads = QUADS if low[2] < high[2] else ("0 1 3 2",)
     lines = [

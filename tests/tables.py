@@ -12,7 +12,7 @@ ATTITUDE = {"roll_deg": "roll", "pitch_deg": "pitch", "yaw_deg": "yaw"}
 
 
 def write_csv(path: Path, names: str, *columns: Any) -> None:
-    """A table of numbers; an empty cell where one is not finite."""
+    """Write a table of numbers, with an empty cell for a number that is not finite."""
     rows = "\n".join(",".join(f"{v:.11g}" if np.isfinite(v) else "" for v in row) for row in zip(*columns, strict=True))
     path.write_text(f"{names}\n{rows}\n", encoding="utf-8")
 
@@ -35,7 +35,10 @@ def rank_log(folder: Path, at: Any, ri: Any, node: str = "LW1") -> dict[str, Any
 
 
 def eastwards(folder: Path, t: Any, east_m: Any, yaw_deg: float | None = None) -> dict[str, Any]:
-    """The entry of a track 55 m north of LW1 at 40 m; with the attitude of a level flight where a heading is given."""
+    """Write a track 55 m north of LW1 at 40 m, and return its entry.
+
+    If a heading is given, the attitude is that of a level flight.
+    """
     t, still = np.asarray(t, float), np.zeros(len(t))
     places = (still + LW1[0] + 5e-4, LW1[1] + np.asarray(east_m) / 90_314.0, still + 40.0)
     turns = () if yaw_deg is None else (still, still, still + yaw_deg)

@@ -1,4 +1,7 @@
-"""Every bad input is one clear message and exit code 2 or 3, through the command line; never a traceback."""
+"""Check that every bad input ends the command line with one clear message and exit code 2 or 3.
+
+There is never a traceback.
+"""
 
 import re
 import shlex

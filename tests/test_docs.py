@@ -59,7 +59,7 @@ def check(line: str, in_block: bool) -> None:
 
 
 def parse(words: list[str], complete: bool) -> None:
-    """Let the program read a line; within a sentence it may leave out what the command needs."""
+    """Let the program parse a line. A line within a sentence may omit required arguments."""
     if words[0].startswith("-"):
         assert words[0] in {option for parameter in PROGRAM.params for option in parameter.opts} | {
             "--version",
@@ -111,7 +111,7 @@ def blocks(page: str) -> list[tuple[str, str]]:
 def test_the_tutorial_shows_what_its_commands_print(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its quick commands are run here; the report is that of ``make report`` but for the audit."""
+    """Run the quick commands of the tutorial. Its report is that of ``make report`` except for the audit."""
     monkeypatch.chdir(tmp_path)
     shown, ran = "", []
     for kind, text in blocks((ROOT / "docs" / "tutorial.md").read_text()):

@@ -1,4 +1,4 @@
-"""Whole reports on real logs; skipped, saying so, where AERPAW_CMP_FIELD_DATA names none."""
+"""Run complete reports on real logs, and skip them with a message if AERPAW_CMP_FIELD_DATA is not set."""
 
 import json
 from collections.abc import Callable
@@ -86,7 +86,7 @@ def test_snr_of_four_towers_is_scored_per_tower(report: Report) -> None:
 
 @pytest.mark.parametrize(("name", "limit"), [("nr_rank_flight1", 0.07), ("nr_rank_flight3", 0.10)])
 def test_slanted_ports_reproduce_the_histogram_of_measured_rank(report: Report, name: str, limit: float) -> None:
-    """The order of the slants was chosen on flight 1; flight 3 had no say."""
+    """The order of the slants was chosen on flight 1. Flight 3 was not used for this choice."""
     assert report(name)["rank"]["LW1"]["simulated"]["10"]["total_variation"] <= limit
 
 

@@ -174,7 +174,10 @@ def test_no_setting_is_without_effect() -> None:
 
 
 def test_the_architecture_page_shows_the_rooms_that_are_there() -> None:
-    """One line per room in the table and in the picture, in the order that import-linter holds; nothing loose."""
+    """Table and picture have one line per subpackage, in the order of import-linter.
+
+    No module is outside a subpackage.
+    """
     package = ROOT / "aerpaw_cmp"
     rooms = {path.parent.name for path in package.glob("*/__init__.py")}
     loose = {path.stem for path in package.glob("*.py")} - {"__init__"}
@@ -239,7 +242,10 @@ def lacking(function: ast.FunctionDef) -> list[str]:
 
 
 def test_functions_of_four_parameters_describe_each_and_what_they_return() -> None:
-    """Every public function of a public module; those of the command line describe themselves in ``--help``."""
+    """Check every public function of a public module.
+
+    Functions of the command line describe themselves in ``--help``.
+    """
     undescribed, seen = {}, 0
     for path in modules():
         inside = path.relative_to(ROOT)
@@ -279,7 +285,10 @@ def private_imports(tree: ast.AST) -> list[str]:
 
 
 def test_no_module_takes_a_private_name_of_another() -> None:
-    """A private module of a package may be imported (the parsers share some); a private name of a module may not."""
+    """A private module of a package may be imported, because parsers share some.
+
+    A private name of a module may not be imported.
+    """
     imports = {path.name: names for path in modules() if (names := private_imports(parsed(path)))}
     own = {path.stem for path in (ROOT / "parsers" / "aerpaw_parsers").glob("_*.py")}
     assert {name: left for name, names in imports.items() if (left := set(names) - own)} == {}

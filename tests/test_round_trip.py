@@ -35,7 +35,7 @@ def flight(folder: Path, **plan: object) -> Path:
 
 
 def round_trip(folder: Path, **plan: object) -> dict[str, dict[str, RssResult]]:
-    """Simulate through the command line, read the files back, compare; results by tower and channel."""
+    """Simulate by the command line, read the files back, and compare. Return the results by tower and channel."""
     path = flight(folder, **plan)
     simulate(path)
     data = load_data(load_flight(path), folder)
@@ -118,7 +118,7 @@ def test_bad_lines_are_rejected_and_counted(tmp_path: Path) -> None:
 
 
 def with_logs(path: Path, *logs: dict[str, str]) -> None:
-    """The flight file with other logs after its track; ranks are of LW3."""
+    """Write the flight file with other logs after its track. Ranks are those of LW3."""
     content = yaml.safe_load(path.read_text())
     content |= {"logs": [content["logs"][0], *logs], "rank": {"tower": "LW3"}}
     content["flight"]["plan"].pop("offsets_db", None)

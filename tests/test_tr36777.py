@@ -7,7 +7,7 @@ from benchmarks import tr36777
 
 
 def test_probability_of_sight_by_hand() -> None:
-    """Annex B-1 at 30 m: p1 = 6135 m, d1 = 393 m (RMa-AV); p1 = 2552 m, d1 = 18 m (UMa-AV)."""
+    """Annex B-1 at 30 m has p1 = 6135 m and d1 = 393 m (RMa-AV). For UMa-AV, p1 = 2552 m and d1 = 18 m."""
     far = np.array([1000.0])
     assert tr36777.sight_probability("RMa-AV", far, 30.0) == pytest.approx(
         0.393 + np.exp(-1000 / 6135) * 0.607, abs=1e-3

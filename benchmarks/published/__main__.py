@@ -26,7 +26,10 @@ BASELINES = ("free_space", "log_distance")
 
 
 def predicted(bench: Bench, task: str, entrant: str) -> pd.DataFrame | None:
-    """Answers of one of ours to a task, as a predictions.csv has them; None where it answers another kind."""
+    """Return one of our entrants' answers to a task, as in a predictions.csv.
+
+    Return None if it answers another kind of task.
+    """
     rank = bench.manifest.tasks[task].kind == "rank"
     model: Any = (entrants.RANK if rank else entrants.LEVEL).get(entrant)
     if model is None:
@@ -42,7 +45,7 @@ def predicted(bench: Bench, task: str, entrant: str) -> pd.DataFrame | None:
 
 
 def entry_of(bench: Bench, name: str, tasks: list[str]) -> Entry | None:
-    """Answers of one of ours to the tasks whose files are at hand; None where it answers none of them."""
+    """Return one of our entrants' answers to the tasks whose files exist. Return None if it answers none of them."""
     runnable = [task for task in tasks if not bench.skipped(task, training=True)]
     frames = [frame for task in runnable if (frame := predicted(bench, task, name)) is not None]
     return Entry(pd.concat(frames, ignore_index=True), {"entrant": name}) if frames else None
@@ -86,7 +89,7 @@ def template(bench: Bench, out: Path, tasks: list[str], *, force: bool = False) 
 
 
 def enter(bench: Bench, tasks: list[str], names: list[str], out: Path | None = None) -> dict[str, Any]:
-    """Scores of our own entrants by task and entrant; ``out`` is a folder that gets their predictions.
+    """Return the scores of our entrants by task and entrant. ``out`` is a folder for their predictions.
 
     Raises
     ------
@@ -113,7 +116,7 @@ def enter(bench: Bench, tasks: list[str], names: list[str], out: Path | None = N
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one verb; its result is JSON on standard output."""
+    """Run one subcommand, and print its result as JSON."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--data", type=Path, default=Path(), help="folder of the published logs")
     common.add_argument("--manifest", type=Path, default=MANIFEST)

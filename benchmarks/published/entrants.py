@@ -39,7 +39,10 @@ def _offsets(values: Any, known: pd.DataFrame, asked: pd.DataFrame) -> Any:
 
 
 def anchored(gain: Gain, known: pd.DataFrame, asked: pd.DataFrame) -> Answer:
-    """A gain with the offsets of what is known; the standard deviation is that of the known rows about theirs."""
+    """Add the offsets of the known rows to a gain.
+
+    The standard deviation is that of the known rows about their offsets.
+    """
     error = known["measured"].to_numpy() - gain(known)
     spread = np.std(error - _offsets(error, known, known))
     return gain(asked) + _offsets(error, known, asked), np.full(len(asked), max(float(spread), 0.1))
@@ -50,7 +53,7 @@ def _free_space(rows: pd.DataFrame) -> Any:
 
 
 def _log_distance(known: pd.DataFrame, asked: pd.DataFrame, _: Flights) -> Answer:
-    """A slope of each channel with the distance; offsets of each series are free."""
+    """Fit a slope over the logarithm of the distance for each channel, with a free offset per series."""
     x, y = np.log10(_distance_m(known)), known["measured"].to_numpy()
     slopes = {}
     for channel in {*known["channel"], *asked["channel"]}:
@@ -96,7 +99,7 @@ def _replayed(flight: ac.Flight, engine: str, depth: int, level: str) -> dict[tu
 
 
 def _replay(engine: str, depth: int, level: str, known: pd.DataFrame, asked: pd.DataFrame, flights: Flights) -> Answer:
-    """Ray tracing; where no path arrives, the mean of the others."""
+    """Predict by ray tracing. If there is no path, use the mean of the other predictions."""
 
     def gain(rows: pd.DataFrame) -> Any:
         out = np.full(len(rows), np.nan)

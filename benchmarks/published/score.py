@@ -123,7 +123,7 @@ class Entry:
 
 
 def read_entry(path: Path, bench: Bench, tasks: Sequence[str]) -> Entry:
-    """Read predictions.csv, or the CSV of ``report --against``; both may have lines ``# key: value`` above the header.
+    """Read predictions.csv, or the CSV of ``report --against``. Both may have lines ``# key: value`` above the header.
 
     Raises
     ------

@@ -173,7 +173,7 @@ class Bench:
         return self._opened[name]
 
     def skipped(self, task: str, *, training: bool) -> list[str]:
-        """Files that a task lacks, each with its source; empty where it can be run."""
+        """List the missing files of a task with their sources. The list is empty if the task can be run."""
         spec = self.manifest.tasks[task]
         absent = [name for flight in (*spec.test, *(spec.train if training else ())) for name in self.missing(flight)]
         return [
@@ -186,7 +186,7 @@ class Bench:
         return [flight for flight in self.manifest.tasks[task].test if not self.missing(flight)]
 
     def chosen(self, names: list[str]) -> list[str]:
-        """The named tasks, or all; UsageError for an unknown one."""
+        """Return the named tasks, or all. An unknown name raises UsageError."""
         for name in names:
             if name not in self.manifest.tasks:
                 raise UsageError(f"unknown task {name!r}", expected=", ".join(self.manifest.tasks))
@@ -267,7 +267,7 @@ def _texts(frame: pd.DataFrame) -> list[str]:
 
 
 def _headings(track: pd.DataFrame, frame: pd.DataFrame) -> Any:
-    """Heading (n,) of the nose at the samples, clockwise from north [deg]; NaN without telemetry."""
+    """Return the heading (n,) of the nose at the samples, clockwise from north [deg]. It is NaN without telemetry."""
     if track.empty:
         return np.nan
     turned = np.unwrap(track["heading_deg"], period=360.0)

@@ -57,7 +57,7 @@ def table(gain: np.ndarray) -> bytes:
 
 
 def known_site(folder: Path, turn_deg: int = 0) -> Path:
-    """Return the packaged site with these antennas, and the airframe rotated by complete steps of its table."""
+    """Write the packaged site with these antennas, and the airframe rotated by complete steps of its table."""
     place = folder / "mine.yaml"
     place.write_bytes(folder_of("lake_wheeler").with_suffix(".yaml").read_bytes())
     _, _, v = sphere_grid(20.0)

@@ -322,7 +322,7 @@ def test_what_was_learned_from_ranks_alone_names_its_logs_too(tmp_path: Path) ->
 
 @pytest.mark.field
 def test_a_quarter_of_an_nr_flight_is_not_scored_by_the_receiver_that_learned_from_it(tmp_path: Path) -> None:
-    """The packaged receiver was fitted on NR flights 1 and 3; a quarter of flight 3 has another digest."""
+    """The packaged receiver was fitted on NR flights 1 and 3. A quarter of flight 3 has another digest."""
     rows = (REAL / "nr_rank" / "july2_2024_flight3_nemo_nr.csv").read_text().splitlines()
     content = yaml.safe_load((Path(__file__).parents[1] / "field" / "nr_rank_flight3.yaml").read_text())
     flights: list[FlightData] = []

@@ -20,7 +20,7 @@ PAGE = Page(b"<!doctype html><title>t</title>", "default-src 'none'")
 
 
 class Browser:
-    """Reads the events of a page, or takes nothing; comes back when it is dropped."""
+    """A browser that reads the events of a page or accepts nothing. It reconnects when it is dropped."""
 
     @classmethod
     def of(cls, web, *, reads=True):
@@ -65,7 +65,7 @@ def web(request):
 
 @contextlib.contextmanager
 def page_open(wanted):
-    """A feed with its server and two browsers; None where no page is wanted."""
+    """Yield a feed with its server and two browsers, or None if no page is wanted."""
     if not wanted:
         yield None
         return
@@ -116,7 +116,7 @@ class Session:
         return self.summary
 
     def wait(self, condition, timeout=15.0):
-        """Poll until the condition holds; fails the test if it never does."""
+        """Wait until the condition is true, and fail the test if it never is."""
         until = time.monotonic() + timeout
         while not condition():
             assert self.error is None, self.error
@@ -161,7 +161,7 @@ def tools():
 
 @pytest.fixture
 def modem(tmp_path):
-    """Makes simulators; all end with the test."""
+    """Return a function that makes simulated modems. All of them end with the test."""
     with contextlib.ExitStack() as stack:
 
         def make(**settings):
@@ -173,7 +173,7 @@ def modem(tmp_path):
 
 @pytest.fixture
 def tap(tmp_path, request):
-    """Makes taps with fast settings on a port; what still runs is ended with the test."""
+    """Return a function that makes taps with fast settings on a port. Those that still run are ended with the test."""
     running = []
     pages = contextlib.ExitStack()
     feed = pages.enter_context(page_open("web" in request.fixturenames and request.getfixturevalue("web")))

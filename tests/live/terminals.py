@@ -13,7 +13,7 @@ def held(port: Path) -> RawIOBase:
 
 
 def until(condition: Callable[[], object], limit_s: float = 15.0) -> None:
-    """Wait for a condition; fails the test where it never comes."""
+    """Wait for a condition, and fail the test if it never becomes true."""
     end = time.monotonic() + limit_s
     while not condition():
         assert time.monotonic() < end

@@ -127,7 +127,7 @@ def test_only_the_end_of_long_telemetry_is_read(tmp_path):
 
 
 def test_the_delay_of_telemetry_counts_new_lines_only(tmp_path):
-    """A log that stopped is old; its lines were not late."""
+    """A log that stopped is old. Its lines were not delayed."""
     path = tmp_path / "t.log"
     path.write_text("2026-01-01T00:00:00,1\n")
     follower = TelemetryFollower(path, LINES, ReadOptions())

@@ -373,7 +373,7 @@ def test_nothing_is_asked_of_another_place(driver, fly):
 
 
 def test_the_demo_of_the_readme(driver, tmp_path, capsys):
-    """The commands a reader types: modem-sim, tap --web, Ctrl-C; then the log played to the page."""
+    """Run the commands that a reader types: modem-sim, tap --web, Ctrl-C. Then replay the log to the page."""
     environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'parsers'}"}
 
     def run(*arguments):

@@ -1,4 +1,7 @@
-"""The one law of large logs: pieces of any size give what one piece gives; rejected lines are bounded."""
+"""Check that large logs read in pieces of any size give the same records as in one piece.
+
+The stored rejected lines are limited.
+"""
 
 import hashlib
 from itertools import pairwise

@@ -49,7 +49,10 @@ def test_text_and_what_is_left_out(compressed: bool) -> None:
 
 
 def test_matlab_stores_small_integers_for_doubles_and_small_elements() -> None:
-    """MATLAB writes whole doubles as bytes, and short data inside the tag; both by hand after the specification."""
+    """MATLAB writes whole-numbered doubles as bytes, and short data inside the tag.
+
+    Both are written by hand from the specification.
+    """
     import struct
 
     flags = struct.pack("<IIII", 6, 8, 6, 0)

@@ -129,7 +129,7 @@ def drawn(draw: random.Random, root: Path) -> Call:
 
 
 def child(call: Call, root: Path, said: Path) -> None:
-    """Become the call; never returns."""
+    """Replace the child process by the call. This function never returns."""
     main = next(iter(entry_points(group="console_scripts", name="aerpaw-cmp"))).load()
 
     if call.folder.endswith("gone"):

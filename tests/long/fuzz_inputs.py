@@ -89,7 +89,7 @@ class ViolationError(Exception):
 
 @dataclass(frozen=True)
 class Target:
-    """Something that reads: ``run`` gives whether it took the input; the package's errors are its other answer."""
+    """A function that reads input. ``run`` returns whether it accepted the input, or raises an error of the package."""
 
     name: str
     seeds: tuple[bytes, ...]
@@ -232,7 +232,10 @@ def _near(value: bytes, chance: np.random.Generator) -> bytes:
 
 
 def one_value(data: bytes, chance: np.random.Generator) -> bytes:
-    """Return a file with one value replaced, half the time by a value that resembles it; in a binary file one bit."""
+    """Return a file with one value replaced, half of the time by a similar value.
+
+    In a binary file, one bit is flipped.
+    """
     values = [] if b"\0" in data[:2000] else [match.span() for match in _VALUE.finditer(data)]
     if not values:
         at = int(chance.integers(len(data)))
@@ -691,7 +694,7 @@ def _native_reader(kind: str) -> native.Read:
 
 
 class TimeIsUpError(BaseException):
-    """The alarm; no ``except Exception`` of the package may swallow it."""
+    """The alarm, which no ``except Exception`` of the package may catch."""
 
 
 def _alarm(_signal: int, _frame: Any) -> None:
@@ -768,7 +771,10 @@ def _processor_s(pid: int | None) -> float:
 
 
 def run_block(target: Target, seed: int, start: int, stop: int) -> dict[str, Any]:
-    """Inputs ``start`` to ``stop`` in a process of their own; if it ends or hangs, the input is at fault."""
+    """Run inputs ``start`` to ``stop`` in a separate process.
+
+    If the process ends or hangs, the current input is the cause.
+    """
     parts: list[dict[str, Any]] = []
     context = multiprocessing.get_context("fork")
     while start < stop:

@@ -62,7 +62,7 @@ CASES = {
 
 
 def fence(corners: int, spread: float) -> str:
-    """A geofence at LW1; with a spread it crosses itself at almost every corner."""
+    """Return a geofence at LW1. With a spread, it crosses itself at almost every corner."""
     chance = random.Random(1)
     at = ((35.7275 + spread * chance.random(), -78.696 + spread * chance.random()) for _ in range(corners))
     places = " ".join(f"{east:.7f},{north:.7f},0" for north, east in at)

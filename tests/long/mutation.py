@@ -246,7 +246,10 @@ def own_folders() -> None:
 
 
 def in_child(work: Callable[[], str], limit_s: float) -> str:
-    """``killed by`` the test that the work, in a forked child, names; by time or crash where it says nothing."""
+    """Run the work in a forked child, and return ``killed by`` the test that it names.
+
+    Without a name, the reason is the time limit or a crash.
+    """
     import resource
 
     here, there = os.pipe()
@@ -454,7 +457,10 @@ def near_tests(reach: Reach, path: str, lines: tuple[int, int] | None) -> list[s
 
 
 def within(budget_s: float, reach: Reach, path: str, lines: tuple[int, int] | None) -> list[str]:
-    """Tests that reach lines of a module, in the order of :func:`near_tests`, that fit in a time; one at least."""
+    """Return tests that reach lines of a module and fit into a time, in the order of :func:`near_tests`.
+
+    At least one is returned.
+    """
     near, out, left = near_tests(reach, path, lines), [], budget_s
     for name in near:
         if reach[name]["seconds"] <= left:
@@ -589,7 +595,7 @@ def drawn(count: int, seed: int, only: list[str], part: str) -> list[Mutant]:
 
 
 def draw(chosen: list[Mutant], reach: Reach, account: Path | None, budget_s: float) -> None:
-    """Try mutants; one line for each, and the shares."""
+    """Try mutants, and print one line for each and the shares."""
     known = equivalents()
     counts: dict[str, dict[str, int]] = {}
 

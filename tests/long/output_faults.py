@@ -52,7 +52,7 @@ ERRORS = {"full": (errno.ENOSPC, 1), "broken": (errno.EIO, 0), "read-only": (err
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A command of two variants; the target is added by ``-o``."""
+    """A command in two variants, to which the target is added by ``-o``."""
 
     name: str
     kind: str
@@ -334,7 +334,7 @@ def _tree(folder: Path) -> dict[str, str]:
 def try_job(
     job: Job, inputs: Path, work: Path, shim: ctypes.CDLL, kills: int, chance: random.Random, *, errors: bool = True
 ) -> Tally:
-    """All faults of one job; without ``errors`` kills only."""
+    """Inject all faults into one job. Without ``errors``, only kill it."""
     runs, tally = Runs(job, work / "root", shim), Tally()
     original = _tree(inputs)
     runs.learn()
@@ -393,7 +393,10 @@ def try_job(
 
 
 def _next_run_clears(runs: Runs, tally: Tally, *, absent: bool) -> None:
-    """A clean run after faults succeeds and leaves the target and nothing else; then perhaps nothing is there."""
+    """Check that a run without faults succeeds after a fault and leaves only the target.
+
+    With ``absent``, remove the target afterwards.
+    """
     runs.clean("a")
     if rest := runs.litter():
         tally.violations.append(f"{runs.job.name}: after a clean run there is {rest}")

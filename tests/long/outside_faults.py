@@ -26,7 +26,10 @@ NO_LEVEL = "it moves no pose and no level"
 
 @dataclass(frozen=True)
 class Fault:
-    """``old`` becomes ``new`` in a file; ``tests`` fail with it; ``unseen``: why the audit need not see it."""
+    """A fault that replaces ``old`` by ``new`` in a file, so that ``tests`` fail.
+
+    ``unseen`` is the reason why the audit need not detect it.
+    """
 
     name: str
     file: str

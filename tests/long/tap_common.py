@@ -71,7 +71,7 @@ def run_tap(settings: Any, **options: Any) -> Any:
 
 
 def start_tap(port: Path, folder: Path, **settings: Any) -> subprocess.Popen[str]:
-    """A tap in its own process; its summary comes as JSON on standard output."""
+    """Start a tap in a separate process, which prints its summary as JSON."""
     values = {"port": str(port), "folder": str(folder), **settings}
     environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'parsers'}"}
     command = [sys.executable, "-c", CHILD, json.dumps(values)]
@@ -112,7 +112,7 @@ print(json.dumps({"rows": rows, "holes": holes, "connections": connections,
 
 
 def start_browser(port: int) -> subprocess.Popen[str]:
-    """A reader of the page's events in its own process; SIGTERM makes it print what it got."""
+    """Start a reader of the page's events in a separate process. On SIGTERM it prints what it received."""
     return subprocess.Popen([sys.executable, "-c", BROWSER, str(port)], stdout=subprocess.PIPE, text=True)
 
 
@@ -160,7 +160,7 @@ def read_lines(journal: Iterable[Any]) -> list[tuple[str, tuple[str, ...]]]:
 
 
 def resident_kib(pid: int) -> int:
-    """Resident memory of a process [KiB]; 0 if it ended."""
+    """Return the resident memory of a process [KiB], or 0 if it ended."""
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1])

@@ -21,7 +21,7 @@ from tests.long.tap_common import conditions, free_port, read_lines, show, start
 
 
 def one_kill(number: int, seed: int, folder: Path, *, web: bool = False, patience_s: float = 0.25) -> dict[str, int]:
-    """One tap, killed; what it had acknowledged against what is on disk."""
+    """Kill one tap, and compare the records that it acknowledged with those on disk."""
     chance = random.Random(f"{seed}/{number}")
     link, log = folder / f"modem{number}", folder / f"log{number}"
     with FaultyModem(link=link, faults=Faults(latency_s=0.001, jitter_s=0.01, seed=number)) as modem:

@@ -32,7 +32,10 @@ def rss_flight():
 
 
 def fitted(points, values):
-    """Curve through bins of 30 m; samples closer than half a bin share one fade and would hide the nugget."""
+    """Fit a curve through bins of 30 m.
+
+    Samples closer than half a bin share the same fading and would hide the nugget.
+    """
     bins = field_correlation(points, values, maximum_m=300.0)
     return fit_biexponential(bins.mean_distance_m[1:], bins.correlation[1:])
 

@@ -21,7 +21,7 @@ TOWERS = {"A": np.array([-200.0, 0.0, 10.0]), "B": np.array([200.0, 50.0, 10.0])
 
 
 class Engine:
-    """Free space; the second singular value falls with distance; no path beyond a range."""
+    """An engine with free space, a second singular value that falls with distance, and no path beyond a range."""
 
     def __init__(self, range_m=350.0, extra_loss_db=0.0):
         self.range_m, self.extra_loss_db = range_m, extra_loss_db

@@ -76,7 +76,10 @@ def test_shared_weights_on_a_grid_equal_the_textbook():
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 25), st.floats(-1e3, 1e3), st.floats(0.1, 50.0))
 def test_properties(seed, m, shift, factor):
-    """Weights sum to 1; affine in the values; moving the site changes nothing; nor does the order of samples."""
+    """Weights sum to 1, and estimates are affine in the values.
+
+    Neither moving the site nor the order of samples changes the estimates.
+    """
     rng = np.random.default_rng(seed)
     points, targets, values = rng.uniform(0, 400, (40, 2)), rng.uniform(0, 400, (6, 2)), rng.normal(size=40)
     model = OrdinaryKriging(PAPER, m, 500.0).fit(points, values)

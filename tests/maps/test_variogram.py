@@ -1,4 +1,4 @@
-"""Correlation against a plain double loop and scikit-gstat; the curve against the paper's numbers."""
+"""Check the correlation against a plain double loop and scikit-gstat, and the curve against the paper's numbers."""
 
 import numpy as np
 import pytest

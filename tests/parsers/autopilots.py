@@ -12,7 +12,7 @@ VOLTS = (12.587, 12.193, 12.242)  # voltages of ArduPilot's simulated battery on
 
 
 def dataflash(count: int = COUNT, fix: int = 4, satellites: int = 14, *, radio: bool = False) -> bytes:
-    """ArduPilot .bin: POS, ATT, GPS, XKF1, BAT and RAD at 1 Hz; the clock counts from switching on."""
+    """Return an ArduPilot .bin with POS, ATT, GPS, XKF1, BAT and RAD at 1 Hz. Its clock counts from power-on."""
     forms = {
         129: ("POS", "QLLfff", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt"),
         130: ("ATT", "QccccCC", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw"),
@@ -89,7 +89,10 @@ def tlog(version: int = 2, system: int = 1, count: int = COUNT, fix: int = 4, sa
 
 
 def ulog(place: str = "estimator") -> bytes:
-    """PX4 .ulg: position, attitude, velocity, GPS and home; or the receiver's position alone, before or since 1.14."""
+    """Return a PX4 .ulg with position, attitude, velocity, GPS and home.
+
+    It can also have only the receiver's position, in the form before or since 1.14.
+    """
     gps = b"uint64_t timestamp;uint64_t time_utc_usec;uint8_t fix_type;uint8_t satellites_used;"
     integers, doubles = b"int32_t lat;int32_t lon;int32_t alt;", b"double latitude_deg;double longitude_deg;"
     more = {"estimator": b"", "integers": integers, "doubles": doubles + b"double altitude_msl_m;"}[place]

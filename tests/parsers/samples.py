@@ -48,7 +48,7 @@ def saved(table: dict[str, object], *, compressed: bool = True) -> bytes:
 
 
 def mat_flight(**changes: object) -> bytes:
-    """A merged flight of five rows, two channels; the epoch holds the local wall clock."""
+    """Return a merged flight of five rows and two channels, whose epoch is the local wall clock."""
     count = 5
     wall = np.datetime64("2025-03-02T10:00:00.250") + np.arange(count) * np.timedelta64(260, "ms")
     table: dict[str, object] = {

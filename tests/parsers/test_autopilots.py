@@ -71,7 +71,10 @@ def test_pyulog_reads_the_same_px4_log(tmp_path: object) -> None:
 
 @pytest.mark.parametrize("columns", ["TimeUS,Lat", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt,More"])
 def test_a_message_described_anew_keeps_what_was_read_before(columns: str) -> None:
-    """The rows before were written by the other description; the names of the last one once met their values."""
+    """The earlier rows were written with the first description.
+
+    The names of the second description must not be applied to their values.
+    """
     form = "QL" if columns.count(",") == 1 else "QLLffff"
     size = 3 + struct.calcsize("<" + {"QL": "Qi", "QLLffff": "Qiiffff"}[form])
     anew = struct.pack("<BB4s16s64s", 129, size, b"POS", form.encode(), columns.encode())

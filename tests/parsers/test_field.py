@@ -1,4 +1,4 @@
-"""The readers on real logs; skipped, saying so, where AERPAW_CMP_FIELD_DATA names none."""
+"""Run the readers on real logs, and skip the tests with a message if AERPAW_CMP_FIELD_DATA is not set."""
 
 import csv
 import json

@@ -258,7 +258,7 @@ def test_kml_with_styles_in_front_is_still_known() -> None:
 
 
 def test_srsenb_layout_with_a_pci_column_reads_the_same_numbers() -> None:
-    """Newer versions print the cell's pci before the rnti; an rnti of decimal digits must not be taken for it."""
+    """Newer versions print the cell's PCI before the RNTI. An RNTI of decimal digits must not be read as the PCI."""
     before = read("srsenb_log", samples.FILES["srsenb_log/console"]).streams[0].frame
     newer = (
         samples.FILES["srsenb_log/console"]

@@ -198,7 +198,7 @@ def test_samples_of_both_ways_come_in_the_order_of_the_file() -> None:
     ("value", "counts"), [("          2e-05", True), ("         2e-05", False), ("          2e-0", False)]
 )
 def test_a_last_line_without_its_end_counts_where_it_has_its_whole_width(value: str, counts: bool) -> None:
-    """An exponent is not read at once; one character less may be a number cut short."""
+    """A value with an exponent is not accepted. A value that is one character shorter may be a truncated number."""
     result = read(sample(1, 0), line(2, f"0000004 {value}").rstrip("\n"))
     assert result.accepted == 1 + counts
     assert [reject.number for reject in result.rejected] == ([] if counts else [2])

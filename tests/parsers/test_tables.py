@@ -122,7 +122,10 @@ def levels(*rows: bytes) -> dict[str, list[float]]:
 
 
 def test_every_reading_of_a_cell_is_a_record() -> None:
-    """Two carriers of one PCI are two cells; a cell that a row names twice is kept twice, the second one flagged."""
+    """Two carriers of one PCI are two cells.
+
+    If a row names a cell twice, both readings are kept, and the second is flagged.
+    """
     assert levels(phone(0, "7"), phone(1, "7", arfcn="2000", level="-80"), phone(2, "8")) == {
         "lte_pci7_arfcn1300": [-90.0], "lte_pci7_arfcn2000": [-80.0], "lte_pci8": [-90.0]
     }  # fmt: skip
@@ -198,7 +201,10 @@ def test_speeds_in_centimetres_per_second() -> None:
 
 @pytest.mark.parametrize("first", [0, 1_200_000_000])
 def test_microseconds_count_from_the_origin(first: int) -> None:
-    """The sign for micro is no letter; a column of microseconds reaches 1e9, an epoch in s, after a quarter hour."""
+    """The micro sign is not a letter.
+
+    After a quarter of an hour, a column of microseconds reaches 1e9, which could be an epoch in seconds.
+    """
     head = SIX_COLUMNS.replace("Time", "Time [\u00b5s]")
     data = (head + "".join(f"{first + 1_000_000 * i},35.72,-78.69,30,-80\n" for i in range(6))).encode()
     time = next(s.frame["time"] for s in drive_test(data, time_origin="2025-03-02T15:00:00Z").streams)
@@ -334,7 +340,10 @@ def test_two_phone_lines_glued_by_a_torn_one_are_rejected() -> None:
 
 
 def test_rows_that_a_bare_decimal_comma_shifts_are_rejected() -> None:
-    """They have a field more; where the last column is empty the row would fit with every value in the next column."""
+    """Such rows have one more field.
+
+    If the last column is empty, the row would fit with every value in the next column.
+    """
     head = "Time,Latitude,Longitude,Altitude (m),RSRP (dBm),Note\n"
     rows = [f"2025-03-02 10:00:0{i},25,35.72,-78.69,30,-8{i},{'' if i % 2 else 'x'}" for i in range(6)]
     result = drive_test((head + "\n".join(rows) + "\n").encode())

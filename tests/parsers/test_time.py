@@ -77,7 +77,7 @@ def test_no_or_wrong_zone(name: str | None) -> None:
 
 
 def test_a_winter_time_in_summer_is_refused_with_what_may_be_meant() -> None:
-    """EST is -5 h all year in the zone database; who flies in July and writes it means New York, or does not."""
+    """EST is -5 h all year in the time zone database. A user who writes EST in July may mean New York's summer time."""
     with pytest.raises(UsageError, match=r"New_York \(with summer time\) or Etc/GMT\+5"):
         _text.local_to_utc(wall("2024-07-02T11:00:00"), "EST", needed_by="a test")
     winter = _text.local_to_utc(wall("2024-01-02T11:00:00"), "EST", needed_by="a test")

@@ -60,7 +60,7 @@ def test_a_midnight_of_nmea_has_the_date_of_its_own_day(first: str) -> None:
 
 
 def test_positions_of_gns_sentences_through_a_stamp_are_read() -> None:
-    """A cut sentence is rejected; the logger's own time is not read."""
+    """A truncated sentence is rejected. The logger's own time is not read."""
     stamp = "[2025-03-02 11:00:00] "
     log = stamp + sentence("GNRMC,150000.00,A,3543.8,N,07842.0,W,0.1,0.0,020325,,,A")
     for i, mode in enumerate(("AA", "RR")):
@@ -205,7 +205,7 @@ def test_positions_on_a_local_grid_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_fix_type_of_one_has_no_position(tmp_path: Path) -> None:
-    """MAVLink's fix type is 1 without a fix; a quality of NMEA is 1 with one."""
+    """MAVLink's fix type 1 means no fix. The NMEA quality 1 means a fix."""
     rows = [f"2025-06-11T14:30:{i:02d}Z,{1 if i < 3 else 3},35.7{i:04d},-78.6960,{30 + i}" for i in range(10)]
     for name, positions in (("fix_type", 7), ("GPS quality", 10)):
         (tmp_path / "log.csv").write_text("\n".join([f"utc,{name},lat,lon,alt_agl_m", *rows]) + "\n")

@@ -90,7 +90,7 @@ EXCHANGE = '{{"kind":"exchange","query":"{query}","status":"{status}","flags":[]
 
 
 def exchange(n: int, place: str, query: str, decoded: str, status: str = "ok") -> bytes:
-    """A line of the tap; ``place`` are hundredths of a second."""
+    """Return a line of the tap's log. ``place`` contains hundredths of a second."""
     times = samples.TAP_TIMES.format(place)
     return samples.tap_line(EXCHANGE.format(query=query, status=status, n=n, times=times, decoded=decoded))
 

@@ -100,7 +100,10 @@ def test_what_fuzzing_found() -> None:
 
 @pytest.mark.parametrize("name", ["ten_fields", "eleven_fields", "nine_fields", "eight_fields"])
 def test_further_fields_behind_a_row_are_left_out(name: str) -> None:
-    """A logger that writes more; glued rows, which look so too, stay rejected in a log of the known layout."""
+    """A logger may write more fields in every row.
+
+    In a log of the known layout, two rows joined in one line look similar and are rejected.
+    """
     data = SAMPLES["vehicle_out"][name][0]
     usual = by_name("vehicle_out").read(data, OPTIONS)
     more = re.sub(rb"(\r?\n)", rb",7.5,AUTO\1", data)

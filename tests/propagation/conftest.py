@@ -84,7 +84,7 @@ def _on_face(faces, index, point):
 
 
 def brute_force(site, faces, source, target, max_depth):
-    """Every face sequence of one link, tried one by one; sequences as tuples."""
+    """Try every face sequence of one link, and return the valid sequences as tuples."""
     sequences = set()
     for depth in range(max_depth + 1):
         for sequence in itertools.product(range(len(faces)), repeat=depth):

@@ -14,7 +14,7 @@ GROUND = (2, 1, 0)
 
 
 def faces_of(boxes):
-    """[(plane, bounds)] with bounds {other axis: (low, high)}; the ground has none."""
+    """Return [(plane, bounds)] with bounds {other axis: (low, high)}, which are empty for the ground."""
     faces = [(GROUND, {})]
     for west, east, south, north, top in boxes:
         upright = {2: (None, top)}
@@ -122,7 +122,10 @@ def strictly_inside(b, point):
 
 
 def random_scene(rng, boxes=3, half=6, poses=12):
-    """Integer boxes, a source and targets on the same grid; walls touch and ends lie on faces often."""
+    """Draw boxes with integer corners, and a source and targets on the same grid.
+
+    Walls often touch, and ends often lie on faces.
+    """
     solids = []
     for _ in range(boxes):
         west, south = (2 * rng.integers(-half // 2, half // 2, 2)).tolist()

@@ -18,7 +18,7 @@ CLEARANCE_M = 2e-3
 
 
 def shipped(name: str) -> Path:
-    """A scene that the installed Sionna RT ships; nothing is imported."""
+    """Return the path of a scene that the installed Sionna RT contains, without importing Sionna RT."""
     folder = find_spec("sionna").submodule_search_locations[0]
     path = Path(folder) / "rt" / "scenes" / name / f"{name}.xml"
     if not path.exists():

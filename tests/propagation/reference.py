@@ -59,7 +59,10 @@ def fresnel(cos_theta, eta, thickness_m, wavelength):
 
 
 def element_field(turn, direction, slant, field):
-    """Field vector in site axes of an element that sends along ``direction``; ``field(theta, phi)``."""
+    """Return the field vector in site axes of an element that sends along ``direction``.
+
+    ``field`` is a function of theta and phi.
+    """
     x, y, z = matvec(transpose(turn), direction)
     theta, phi = mp.acos(z), mp.atan2(y, x)
     e_theta, e_phi = field(theta, phi)
@@ -122,7 +125,7 @@ def path_amplitude(tx, rx, tx_turn, rx_turn, tx_slant, rx_slant, planes, wavelen
 
 
 def channel(tx_points, rx_points, tx_turn, rx_turn, tx_slants, rx_slants, paths, wavelength, field):
-    """H as an mpmath matrix (rx, tx); ``paths`` is a list of lists of planes."""
+    """Return H as an mpmath matrix (rx, tx). ``paths`` is a list of lists of planes."""
     h = mp.matrix(len(rx_points), len(tx_points))
     for i, (r, rs) in enumerate(zip(rx_points, rx_slants, strict=True)):
         for j, (t, ts) in enumerate(zip(tx_points, tx_slants, strict=True)):

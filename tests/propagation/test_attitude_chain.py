@@ -18,7 +18,7 @@ from aerpaw_cmp.propagation.replay import replay
 
 
 class Witness:
-    """Isotropic; keeps the directions it was asked for as unit vectors of the device (front, left, up)."""
+    """An isotropic antenna that stores the requested directions as unit vectors of the device (front, left, up)."""
 
     name = "witness"
 
@@ -117,7 +117,10 @@ def test_each_port_has_its_own_pattern(scenes):
 
 
 def test_each_tower_has_its_own_array(scenes, tmp_path):
-    """flight.yaml's ``towers``: LW2 looks the other way and has a slant of 60 degrees; LW1 keeps the common array."""
+    """With ``towers`` in flight.yaml, LW2 faces the opposite way and has a slant of 60 degrees.
+
+    LW1 keeps the common array.
+    """
     site = scenes.site(towers=((0.0, 0.0, 10.0), (0.0, 0.0, 10.0)))
     settings = LinkSettings.model_validate({
         "carrier_hz": 3.4e9,

@@ -90,7 +90,10 @@ def test_paths_that_the_other_engine_lacks_are_invented_only_where_none_can_be()
      ("one polarisation", 0.02, "dB"), ("ground", 1e-3, "rad"), ("own points", 1e-4, ""), ("own points", 0.01, "dB")],
 )  # fmt: skip
 def test_coefficients_of_paths_are_compared_as_shares_of_the_strongest(planted: str, size: float, seen: str) -> None:
-    """Phases on short paths alone; what Sionna's own rounded reflection points turn is allowed, and no more."""
+    """Phases are compared on short paths only.
+
+    The rotation by Sionna's rounded reflection points is allowed, and no more.
+    """
     generator = np.random.default_rng(3)
     turns = np.array([rotation_from_yaw_pitch_roll(*generator.uniform(-0.4, 0.4, 3)) for _ in range(4)])
     east, north, _ = SITE.towers["LW1"].position_m
@@ -199,7 +202,10 @@ def test_paths_of_the_asked_poses_are_matched_and_those_that_are_lacking_counted
 
 
 def test_a_link_s_error_is_that_of_its_sum_where_all_paths_are_near_and_none_fades() -> None:
-    """Five links of two poses and three towers; the second has a far path, the third fades, the last has no path."""
+    """Compare five links of two poses and three towers.
+
+    The second has a distant path, the third fades, and the last has no path.
+    """
     traced = replay(SITE, LINK, POSES, Search("image", max_depth=1)).paths
     link = np.array([0, 0, 1, 1, 2, 2, 3, 4])
     paths = dataclasses.replace(traced.select(np.zeros(8, dtype=np.int64)), pose=link // 3, tower=link % 3)

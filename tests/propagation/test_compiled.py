@@ -1,4 +1,7 @@
-"""The compiled search against mirror images in NumPy: the same paths; and replays without compiled code."""
+"""Check that the compiled search finds the same paths as mirror images in NumPy.
+
+Also check replays without compiled code.
+"""
 
 import ast
 import dataclasses
@@ -37,7 +40,7 @@ needs_numba = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def case():
-    """Poses, paths and scene of three towers; most paths have reflections at slabs and at the ground."""
+    """Return poses, paths and scene of three towers. Most paths have reflections off slabs and the ground."""
     site, link, poses = random_scene(60, towers=3)
     paths = replay(site, link, poses).paths
     assert set(paths.depth) == {0, 1, 2}

@@ -1,4 +1,4 @@
-"""Chords by sampling and bisection of the solids themselves, tangents and grid edges; models against their tables."""
+"""Check chords by sampling and bisection of the solids, tangents and grid edges. Check models against their tables."""
 
 import itertools
 import math

@@ -186,7 +186,7 @@ def test_a_site_of_prisms_as_a_scene_has_the_paths_of_the_prism_engine(scenes, t
 
 
 def test_prisms_by_beams_have_the_paths_of_the_image_engine(scenes):
-    """Random prisms with holes; tests/propagation/test_compiled.py has walls that touch and ends on faces."""
+    """Draw random prisms with holes. tests/propagation/test_compiled.py has walls that touch and ends on faces."""
     rng = np.random.default_rng(11)
     spots = rng.uniform([-120, -120, 0], [120, 120, 40], (60, 3))
     site = scenes.site(scenes.buildings(rng, 8, spread_m=90.0, holes=True), ((0.0, -20.0, 10.0), (3.0, -5.0, 25.0)))
@@ -206,7 +206,10 @@ def test_a_thousand_buildings_are_searched_not_refused(scenes):
 
 
 def first_met(surfaces, source, spot):
-    """Label of the first surface on a straight way, by the planes of all triangles; None where there is none."""
+    """Return the label of the first surface on a straight line, by the planes of all triangles.
+
+    Return None if there is none.
+    """
     corner = surfaces.corners_m
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

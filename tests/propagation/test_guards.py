@@ -57,7 +57,7 @@ def test_a_line_of_sight_unlike_friis_or_a_gain_stops_the_run(settings, near_m, 
 
 @pytest.mark.parametrize("many", [9, 10])
 def test_a_batch_with_nearly_as_many_paths_as_fit_is_refused(many):
-    """Gains are the root of the power over both slants of both ends; padding is cut off."""
+    """Gains are the square root of the power over both slants of both ends. Padding is removed."""
     valid = np.zeros((3, 2, 30), dtype=bool)  # receivers, towers, paths
     valid[:, 1, : many // 3] = True
     valid[0, 1, : many - 2 * (many // 3)] = True

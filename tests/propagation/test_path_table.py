@@ -21,7 +21,7 @@ BARN = Building("barn", box(40, -20, 60, 25), 9.0)
 
 
 def lossy(paths, sources_m, targets_m):
-    """Loss by depth and place; the third tower's line of sight is stopped."""
+    """Return a loss by depth and position. The line of sight of the third tower is blocked."""
     loss = 3.0 * paths.depth + 0.01 * np.linalg.norm(targets_m[paths.pose] - sources_m[paths.tower], axis=1)
     return np.where((sources_m[paths.tower, 0] < -40.0) & (paths.depth == 0), np.inf, loss)
 

@@ -137,14 +137,20 @@ def test_layouts_a_second_time():
 
 
 def test_arrays_of_the_comparison_look_north_east_and_from_the_uav_south_east_upright():
-    """arXiv 2502.10324: yaw 45 and 315 degrees counter-clockwise from east; the UAV's 2 x 2 is rolled by 90 degrees."""
+    """In arXiv 2502.10324 the yaws are 45 and 315 degrees counter-clockwise from east.
+
+    The UAV's 2 x 2 array is rolled by 90 degrees.
+    """
     for array, yaw, roll in ((tower_comparison_array(), 45.0, 0.0), (uav_comparison_array(0.09), 315.0, 90.0)):
         assert array.mount == pytest.approx(np.array(reference.turned(yaw, 0.0, roll)), abs=1e-12)
         assert sorted(np.degrees(array.slant_rad)) == pytest.approx([-45.0, -45.0, 45.0, 45.0])
 
 
 def test_ports_of_the_comparison_are_where_the_paper_has_them():
-    """arXiv 2502.10324 VII-D: along a line, and 2 x 2 at half a wavelength; slants of neighbours a right angle apart."""
+    """In arXiv 2502.10324 VII-D, ports are along a line, and 2 x 2 at half a wavelength.
+
+    The slants of neighbours differ by a right angle.
+    """
     tower, uav = tower_comparison_array(), uav_comparison_array(0.09)
     np.testing.assert_allclose(np.diff(tower.positions_m, axis=0), np.outer([0.06, 1.68, 0.06], [0, -1, 0]), atol=1e-15)
     assert np.degrees(tower.slant_rad) == pytest.approx([45.0, -45.0, 45.0, -45.0])
@@ -177,7 +183,10 @@ def test_elements_are_where_their_array_has_them_in_the_second_implementation(sc
 @pytest.mark.parametrize("slope", [0.2, 5.0])
 @pytest.mark.parametrize(("clear_m", "expected"), [(1e-3, True), (None, None), (-1e-3, False)])
 def test_of_wall_and_ground_a_path_meets_first_what_it_reaches_first(scenes, wall_first, slope, clear_m, expected):
-    """Unfolded, the path is a straight line past the foot of the wall; within a hair of it there is no verdict."""
+    """After unfolding, the path is a straight line past the foot of the wall.
+
+    Within a micrometre of the foot there is no verdict.
+    """
     clear_m = max(slope, 1.0) * 5e-7 if clear_m is None else clear_m
     above_m = clear_m if wall_first else -clear_m
     site = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), ((-10.0, 0.0, 10 * slope + above_m),))
@@ -203,7 +212,10 @@ def test_of_wall_and_ground_a_path_meets_first_what_it_reaches_first(scenes, wal
     ],
 )  # fmt: skip
 def test_a_path_exists_up_to_the_surfaces(scenes, source, target, walls, expected):
-    """Mirrors by number, -1 the ground; an end may lie on its mirror, and what a hair decides is not judged."""
+    """Mirrors have numbers, and -1 is the ground.
+
+    An end may lie on its mirror, and cases that a micrometre decides have no verdict.
+    """
     site = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), (source,))
     second_way = reference.Reference(site, "LW1", field_audit.Expected.of(scenes.link(site)).link)
     mirror = {-1: second_way.mirrors[0], 0: next(m for m in second_way.mirrors if m.normal[0] == -1.0)}

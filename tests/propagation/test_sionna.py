@@ -86,7 +86,10 @@ def test_too_few_samples_lose_paths_and_the_audit_says_so(sionna, scenes, lone):
 
 
 def test_audit_of_the_field_by_sionnas_own_coefficients(sionna, scenes, lone, monkeypatch):
-    """Power, phase and both slants of each path; a fault of 0.1 dB or 0.011 rad in the reflections is seen."""
+    """Compare power, phase and both slants of each path.
+
+    A fault of 0.1 dB or 0.011 rad in the reflections is detected.
+    """
     site, poses = lone
     link = scenes.link(site, tower_comparison_array(), uav_comparison_array(wavelength_m(scenes.carrier_hz)))
     few = scenes.poses(poses.position_m[:BATCH], poses.rotation[:BATCH])
@@ -140,7 +143,10 @@ def test_second_replay_traces_nothing(sionna, scenes, lone, tmp_path, monkeypatc
 
 
 def explicit_channels(sionna, scene, link, poses):
-    """H (poses, 1, n_rx, n_tx) of one tower as Sionna itself gives it, each element pair traced; float32 phases."""
+    """Return H (poses, 1, n_rx, n_tx) of one tower as Sionna computes it, with each element pair traced.
+
+    Phases are in float32.
+    """
     import mitsuba as mi
     import sionna.rt as rt
 

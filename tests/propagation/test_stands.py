@@ -110,7 +110,10 @@ def test_what_gets_through_adds_to_what_gets_over() -> None:
 @pytest.mark.parametrize("tilt_m", [0.0, 0.5, 3.0, 10.0])
 @pytest.mark.parametrize("width_m", [0.001, 100.0])
 def test_the_level_has_no_step_where_a_ray_leaves_the_canopy(tilt_m: float, width_m: float) -> None:
-    """Fine sweeps over the top: no jump, no gain, nothing lost above 0.55 Fresnel radii; level and tilted rays."""
+    """In fine sweeps over the top there is no step, no gain, and no loss above 0.55 Fresnel radii.
+
+    Rays are level and tilted.
+    """
     site = wood(box(100.0, -900.0, 100.0 + width_m, 900.0))
     heights = np.arange(12.0, 28.0, 0.01)
     for model in (foliage_model("p833", 3.4e9), WALL):

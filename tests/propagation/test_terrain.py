@@ -48,7 +48,7 @@ def test_a_pose_behind_the_ridge_has_no_path_and_one_above_it_has(site: Site) ->
 
 
 def test_paths_that_terrain_stops_are_counted_of_all_paths_whatever_the_parts(site: Site) -> None:
-    """Lines of sight; the first part loses none, the second all."""
+    """Replay lines of sight. The first part loses none of them, and the second part loses all."""
     link = Link(3.3e9, {"T": single_element()}, single_element())
     east = np.array([300.0, 320.0, 340.0, 900.0, 910.0, 920.0])
     poses = Poses(np.column_stack([east, 0 * east, 0 * east + 60.0]), np.tile(np.eye(3), (6, 1, 1)))
@@ -189,7 +189,7 @@ def test_mirrors_along_a_profile_are_the_shortest_ways_of_each_zone(wavelength: 
 
 
 def test_a_zone_reaches_to_where_the_way_is_longer_by_half_a_wavelength() -> None:
-    """Sample by sample away from the mirror, straight between samples; unknown ground ends it."""
+    """Go away from the mirror sample by sample, with straight lines between samples. Unknown ground ends the zone."""
     rng = np.random.default_rng(7)
     along = np.sort(rng.uniform(0.0, 100.0, (9, 60)), axis=0)
     spot = np.where(np.arange(60) % 3 == 0, along[4], rng.uniform(along[0], along[-1]))

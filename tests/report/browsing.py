@@ -172,7 +172,7 @@ def set_scheme(driver, *schemes: str) -> None:
 
 
 class PageLaws:
-    """Laws of every page; the module gives the page's ``driver``.
+    """Checks of every page, for which the module provides the page's ``driver``.
 
     ``ready`` is true once its script is done, ``views`` are what may not overflow, ``static`` stands without scripts.
     """

@@ -141,7 +141,10 @@ def test_the_pointer_reads_value_and_position(driver, data):
 
 @pytest.mark.parametrize(("scheme", "begun"), [("dark", 0.25), ("light", 0.0)])
 def test_the_picture_lies_where_the_values_do(driver, data, scheme, begun):
-    """The colour under a cell's middle is that of its value, north up and east right; none is lost in the night."""
+    """The colour at the centre of a cell is that of its value, with north up and east right.
+
+    In the dark scheme the scale begins brighter, so that no cell disappears.
+    """
     set_scheme(driver, scheme)
     pick(driver, tower="LW4", antennas="SISO", foliage="none", height="30 m")
     colours = driver.execute_script(

@@ -146,7 +146,7 @@ def test_the_page_opens_with_a_verdict_against_the_baselines_and_explains_its_me
 
 
 def test_a_flight_with_another_gain_is_named_with_its_interval_and_what_to_do(data):
-    """9 dB more on all links of one flight of the first setting; the others keep their scatter."""
+    """Add 9 dB to all links of one flight of the first setting. The other flights keep their scatter."""
     odd = data.reference_rows[len(data.reference_rows) // 2].flight
     rows = tuple(
         dataclasses.replace(row, difference=dataclasses.replace(row.moments, mean_db=row.moments.mean_db + 9.0))

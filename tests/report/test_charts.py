@@ -16,7 +16,7 @@ from benchmarks.fabricated import with_numbers
 
 @pytest.fixture
 def serving():
-    """Three cells of which the third never serves; the prediction takes it for the second at times."""
+    """Return three cells, of which the third never serves. The prediction sometimes confuses it with the second."""
     level = [[-70, -80, -99], [-70, -80, -99], [-90, -75, -99], [-90, -85, -80], [np.nan] * 3]
     return compare_serving([0, 1, 1, 1, 0], level, ["LW1 PCI 1", "LW2 PCI 2", "LW3 PCI 3"])
 

@@ -52,7 +52,7 @@ def test_a_new_column_is_one_row(report_data: ReportData, monkeypatch: pytest.Mo
 
 
 def test_a_column_of_some_series_is_empty_in_the_others(report_data: ReportData) -> None:
-    """A family has the members of all series in one order; without any series its name is in no header."""
+    """A family contains the members of all series in one order. Without any series, no header contains its name."""
     first, second = report_data.rss[:2]
     fewer = dataclasses.replace(second, baselines={"two_ray": second.baselines["two_ray"]})
     columns, rows = tables(RSS, [first, fewer])

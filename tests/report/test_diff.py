@@ -1,4 +1,7 @@
-"""Two reports compared: a planted change is found, where it is and how large; equal reports give no difference."""
+"""Check that the comparison of two reports finds a planted change, its place and its size.
+
+Equal reports have no difference.
+"""
 
 import json
 import shutil
@@ -38,7 +41,7 @@ def written(report_data, tmp_path_factory):
 
 @pytest.fixture
 def pair(written, tmp_path):
-    """The report twice; the second is for tests to change."""
+    """Return two copies of a report, of which tests may change the second."""
     first, second = tmp_path / "first", tmp_path / "second"
     shutil.copytree(written, first)
     shutil.copytree(written, second)

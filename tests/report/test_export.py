@@ -177,7 +177,7 @@ def test_no_engine_no_audit(report_data):
 
 
 def test_rank_csv_holds_what_a_receiver_decides_by(report_data):
-    """Level and ratios of singular values; empty where there is no path, never infinite."""
+    """Check the level and the ratios of singular values. They are empty if there is no path, and never infinite."""
     panel = report_data.rank[0]
     level, sigma = np.full(len(panel.time), -80.0), np.tile([1.0, 10**-0.625], (len(panel.time), 1))
     level[1], sigma[2, 1] = np.nan, 0.0

@@ -211,7 +211,7 @@ def test_grey_steps_of_the_ranks_are_apart():
 
 
 def test_drawing_without_the_unseen_pass_gives_the_same_picture(small_report):
-    """``Figure.savefig`` draws once more before each file; leaving that out must not move anything."""
+    """``Figure.savefig`` draws an additional time before each file. Skipping this pass must not move anything."""
     spec = next(p for p in figures.figure_specs(small_report) if p.name == "trajectory")
     with canvas.style():
         ours = canvas.save_as(spec.draw(), ("svg", "png"))["png"]
@@ -277,7 +277,7 @@ def test_names_are_drawn_as_they_are(small_report):
 
 
 def test_a_cloud_of_a_long_flight_is_thinned_and_its_extremes_stay(monkeypatch):
-    """One sample in many is drawn, spread over the whole flight; a spike or a gap between them is not lost."""
+    """Only some samples are drawn, spread over the complete flight. A spike or a gap between them is still drawn."""
     rng = np.random.default_rng(5)
     values = rng.normal(0, 1, 100_000)
     values[[12_345, 77_777]] = 40.0, -30.0
@@ -302,7 +302,10 @@ def test_very_many_outages_are_joined_where_no_eye_parts_them():
 
 
 def test_both_channels_of_a_tower_stand_in_one_panel_of_report_and_map(report_data, maps_data):
-    """The second is moved by its offset less that of the first; spans in which they part are shaded."""
+    """The second channel is moved by its offset minus that of the first.
+
+    Spans in which the channels differ are shaded.
+    """
     (spec,) = [spec for spec in figures.figure_specs(report_data) if spec.name.startswith("rss_channels")]
     assert spec.name == "rss_channels_LW1_USRP1_USRP2"
     (ax,) = spec.draw().axes

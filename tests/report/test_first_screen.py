@@ -439,7 +439,10 @@ def test_channels_of_the_same_levels_are_corrected_for_once(report_data, shift_d
 
 
 def test_a_receiver_that_lost_its_lock_has_one_error_that_with_the_floor(report_data):
-    """Levels: ray tracing 3 dB, the line 5 dB off where detected; both sides at the floor elsewhere."""
+    """Detected levels differ from ray tracing by 3 dB and from the line by 5 dB.
+
+    Elsewhere, both sides are at the floor.
+    """
     panel, rng = report_data.rss[0], np.random.default_rng(7)
     level = np.where(np.isfinite(panel.simulated_dbm), panel.simulated_dbm, -80.0)
     measured = level + rng.normal(0.0, 3.0, len(level))

@@ -79,7 +79,10 @@ def test_towers_together_come_first_and_heights_rise(maps_data):
 
 
 def test_a_page_keeps_its_size_whatever_the_grid(maps_data):
-    """A grid of nine times the cells under a small limit: single towers go first, then cells; the page says so."""
+    """Use a grid of nine times the cells with a small limit.
+
+    First layers of single towers are omitted, then cells, and the page states it.
+    """
     fine = dataclasses.replace(
         maps_data,
         rss=tuple(dataclasses.replace(m, values=np.kron(m.values, np.ones((3, 3)))) for m in maps_data.rss),
@@ -129,7 +132,7 @@ def test_one_cell_and_absurd_values(maps_data):
 
 
 def test_level_colours_rise_evenly_in_lightness():
-    """CIE L* of the level scale grows by nearly equal steps; the difference scale is lightest at zero."""
+    """The lightness CIE L* of the level scale grows by nearly equal steps. The difference scale is lightest at zero."""
     lightness = {}
     script = (Path(report.__file__).parent / "templates/common.js").read_text(encoding="utf-8")
     for name in ("viridis", "RdBu_r"):

@@ -83,7 +83,7 @@ def _children(node: ast.AST) -> Iterator[tuple[ast.AST, str]]:
 
 
 def of_template(path: Path) -> Iterator[tuple[str, str]]:
-    """Condition and text of each block of a template; what the template prints is a gap."""
+    """Yield the condition and the text of each block of a template. Values that the template prints become gaps."""
     source = re.sub(r"<style>.*?</style>|{#.*?#}", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
     above: list[str] = []
     held, at_start = "", ""

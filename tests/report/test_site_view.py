@@ -86,7 +86,7 @@ def test_ten_thousand_trees_keep_the_files_small(report_data):
 
 
 def test_holes_stay_empty_and_fences_are_drawn(report_data):
-    """Filling the line of an area with holes covers exactly the area; the page and the pictures show geofences."""
+    """Filling the outline of an area with holes covers exactly the area. The page and the pictures show geofences."""
     ring = Polygon([(0, 0), (30, 0), (30, 30), (0, 30)], [[(10, 10), (10, 20), (20, 20), (20, 10)]])
     line = shapes.outline(ring)
     east, north = line.T

@@ -15,7 +15,7 @@ FRAME = SiteFrame(35.7275, -78.696)
 
 
 def asc(path: Path, height: np.ndarray, west: float, south: float, cell: float, corner: bool = True) -> Path:
-    """Rows of ``height`` from the south; the file lists them from the north."""
+    """Write an elevation file. The rows of ``height`` begin in the south, and those of the file in the north."""
     word, shift = ("corner", 0.0) if corner else ("center", cell / 2)
     head = f"ncols {height.shape[1]}\nnrows {height.shape[0]}\nxll{word} {west + shift:.12g}\nyll{word} {south + shift:.12g}\n"
     body = "\n".join(" ".join(f"{v:.9g}" for v in row) for row in np.where(np.isnan(height), -9999, height)[::-1])

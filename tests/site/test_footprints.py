@@ -1,4 +1,4 @@
-"""One village written in four formats gives one site; every kind of broken outline is repaired and reported."""
+"""Check that one village in four formats gives the same site. Every kind of broken outline is repaired and reported."""
 
 import json
 from pathlib import Path

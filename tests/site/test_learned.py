@@ -186,7 +186,10 @@ NOT_AS_WRITTEN = "is not the one that was learned"
 )
 @pytest.mark.parametrize("end", ["uav", "LW1.A"])
 def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: bytes | None, said: str) -> None:
-    """The report goes on with the isotropic antenna, in one note; the other end stays learned."""
+    """The report uses the isotropic antenna instead and states it in one note.
+
+    The other end keeps its learned antenna.
+    """
     table = folder_of(folder / "mine.yaml") / ("A.u.csv.gz" if end == "uav" else "A.t.csv.gz")
     if content is None:
         table.unlink()

@@ -1,4 +1,4 @@
-"""Closed bodies by the divergence theorem; scenes that Sionna opens."""
+"""Check closed bodies by the divergence theorem, and scenes by opening them in Sionna."""
 
 import subprocess
 import sys

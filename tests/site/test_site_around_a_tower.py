@@ -89,7 +89,7 @@ def with_elevations(path: Path, elevations: dict[tuple[float, float], str]) -> P
 
 
 def test_elevations_of_the_map_shape_the_ground(tmp_path: Path) -> None:
-    """A slope of 50 m per 0.01 degrees to the east; one point lies 50 km away and does not count."""
+    """The ground rises by 50 m per 0.01 degrees to the east. One point 50 km away is ignored."""
     grid = [(LATITUDE + a, LONGITUDE + b) for a in (-5e-3, 0.0, 5e-3) for b in (-6e-3, -2e-3, 2e-3, 6e-3)]
     elevations = {place: f"{80 + 5000 * (place[1] - LONGITUDE):.1f} m" for place in grid} | {(-34.3, 151.2): "900"}
     model, actions = import_site([with_elevations(tmp_path / "c.geojson", elevations)], towers=TOWERS)
@@ -128,7 +128,7 @@ def test_elevations_that_contradict_are_one_message(tmp_path: Path) -> None:
 
 
 def test_an_elevation_file_is_the_ground(tmp_path: Path) -> None:
-    """Cells of 0.001 degrees; the ground rises by 1 m per column to the east."""
+    """Cells have 0.001 degrees. The ground rises by 1 m per column to the east."""
     rows = "\n".join(" ".join(str(100 + column) for column in range(60)) for _ in range(60))
     head = f"ncols 60\nnrows 60\nxllcorner {LONGITUDE - 0.03}\nyllcorner {LATITUDE - 0.03}\ncellsize 0.001\n"
     (tmp_path / "ground.asc").write_text(head + rows)

@@ -42,7 +42,10 @@ def test_level_is_that_of_an_isotropic_antenna():
 
 
 def test_cuts_of_a_pattern_that_is_known():
-    """Vertical cut: index 0 in front, 90 straight down, 180 behind, 270 straight up; horizontal runs clockwise."""
+    """In the vertical cut, index 0 is in front, 90 straight down, 180 behind and 270 straight up.
+
+    The horizontal cut is clockwise.
+    """
     gain, sd = smooth()
     text = planning_cuts(SpherePattern("a", gain, sd), "a", 3.3e9).splitlines()
     start = text.index("VERTICAL 360")
@@ -77,7 +80,10 @@ def test_broken_files_are_told(tmp_path, spoil, message):
 
 
 def test_spreadsheets_may_quote_and_space_the_cells(tmp_path):
-    """Read line by line, where the whole table at once is not; both give the same numbers."""
+    """Quoted cells are read line by line, because the fast reader of complete tables fails.
+
+    Both readers return the same numbers.
+    """
     plain, quoted = tmp_path / "a.csv", tmp_path / "b.csv"
     text = sphere_csv(*smooth())
     plain.write_text(text)
@@ -99,7 +105,7 @@ def lobed():
 
 @pytest.mark.parametrize("form", ["msi", "msi in dBd"])
 def test_cuts_of_planning_tools_read_back(tmp_path, form):
-    """Both principal cuts come back; between them nothing is known."""
+    """Both principal cuts are reproduced. The gain between them is unknown."""
     pattern, file = lobed(), tmp_path / "a.msi"
     text = planning_cuts(pattern, "a", 3.3e9)
     if form == "msi in dBd":
@@ -174,7 +180,10 @@ def test_a_pattern_that_no_antenna_can_have_is_refused(tmp_path, gain_dbi, cut, 
 
 
 def test_a_gain_without_unit_that_cannot_be_dbd_is_refused_with_the_line_that_fixes_it(tmp_path):
-    """MSI Planet's default is dBd; with beams of 65 and 15 deg, 17.15 dBi is more power out than in."""
+    """MSI Planet's default unit is dBd.
+
+    With beams of 65 and 15 degrees, 17.15 dBi would radiate more power than it receives.
+    """
     file, text = tmp_path / "a.msi", msi(15.0, sector(65, 25.0), sector(15, 25.0))
     file.write_text(text.replace("15.00 dBi", "15.0"))
     with pytest.raises(InputError, match=r"mean gain over the sphere is 1\.9 dB.*'GAIN 15\.0 dBi'"):
@@ -210,7 +219,7 @@ def test_a_table_of_impossible_gains_is_refused(tmp_path, values):
 
 
 def test_a_great_circle_at_several_frequencies(tmp_path):
-    """The carrier chooses; both halves of the circle come back, blended around."""
+    """The carrier selects the frequency. Both halves of the circle are reproduced and blended around."""
     theta = np.linspace(-np.pi, np.pi, 121)
     rows = [
         f"{f}\t{t:.10f}\t{g}\t0\t0\t0\t0" for f, shift in ((902000000, 0), (3300000000, 2))

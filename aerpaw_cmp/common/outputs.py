@@ -488,7 +488,7 @@ class _Place:
         self._further: list[int] = []
         self._left = False
         with explained_os_errors(named):
-            with held():  # interrupts wait, so that a created file is always registered in AT_END
+            with held():  # delay interrupts, so that a created file is always registered in AT_END
                 self.descriptor = self._claim(folder)
                 AT_END.append(self.leave)
             try:
@@ -567,7 +567,7 @@ class _Place:
         if self.leave in AT_END:
             AT_END.remove(self.leave)
         descriptors = (self.descriptor, *self._further)
-        # otherwise the folder belongs to another run or does not exist
+        # clear it only if it is ours: otherwise it belongs to another run or does not exist
         if any(self._is_there(descriptor) for descriptor in descriptors):
             with contextlib.suppress(OSError):
                 _clear(self.part) if self.part.is_dir() else self.part.unlink()

@@ -77,7 +77,7 @@ def guarded(table: Any) -> Any:
             if words:
                 texts = table[name].astype(object)
                 guarded_columns[name] = texts.replace({word: guarded_text(word) for word in words})
-    # copy, because the caller reads numbers from its table afterwards
+    # return a copy, because the caller reads numbers from its table afterwards
     return table.assign(**guarded_columns) if guarded_columns else table
 
 

@@ -44,7 +44,8 @@ _MAX_NODES = 4_000_000
 _MAX_DEPTH = 64
 
 _TAG = "tag:yaml.org,2002:"
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # events only: nothing is constructed by PyYAML
+# The loader is used for events only, so that PyYAML does not construct objects.
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _INT = re.compile(r"[-+]?[0-9]+\Z")
 _HEX = re.compile(r"0x[0-9a-fA-F]+\Z")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
@@ -155,7 +156,7 @@ def _dumper() -> Any:
         """A dumper that quotes words which this reader would read as another type."""
 
         def ignore_aliases(self, _: Any) -> bool:
-            return True  # equal lists are written out: '&id001' does not help a reader
+            return True  # write equal lists in full, because an anchor such as '&id001' does not help a reader
 
     def word(dumper: Any, text: str) -> Any:
         quoted = not isinstance(_plain_value(text), str)
@@ -232,7 +233,7 @@ def _parse(text: str, path: str | Path | None) -> _Document:
         mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         cause = "tabs cannot indent in YAML; use blanks" if _tab_indents(text, mark) else None
-        # PyYAML's term for control characters
+        # PyYAML calls control characters unacceptable
         if "unacceptable" in problem:
             cause = "a log or another binary file instead of the settings"
         raise UsageError(
@@ -333,7 +334,8 @@ class _Builder:
     def _scalar(self, event: Any) -> Any:
         if event.tag not in (None, "!", _TAG + "str"):
             self._fail(event, f"the tag '{event.tag.replace(_TAG, '!!')}' is not allowed")
-        is_text = event.tag is not None or not event.implicit[0]  # !!str, quoted, or block text
+        # a scalar with the tag !!str, in quotes or in a block is text
+        is_text = event.tag is not None or not event.implicit[0]
         return event.value if is_text else _plain_value(event.value)
 
 
@@ -466,7 +468,7 @@ def _models_at(model: type[pydantic.BaseModel], location: Location) -> list[type
 
 
 def _models_in(annotation: Any) -> list[type[pydantic.BaseModel]]:
-    if isinstance(annotation, type) and typing.get_origin(annotation) is None:  # on 3.10 list[int] is a type
+    if isinstance(annotation, type) and typing.get_origin(annotation) is None:  # in Python 3.10 list[int] is a type
         return [annotation] if issubclass(annotation, pydantic.BaseModel) else []
     return [model for part in typing.get_args(annotation) for model in _models_in(part)]
 

@@ -349,7 +349,7 @@ QUERIES: Mapping[str, Query] = {
 }
 
 RI_QUERY = "nr5g_csi"
-# Polled at the slower rate, in this order.
+# Queries that are polled at the slower rate, in this order.
 OTHER_QUERIES = ("servingcell", "qrsrp", "qsinr", "lte_csi", "qrsrq", "qnwinfo", "qcainfo")
 
 _BY_TEXT = {query.text: query for query in QUERIES.values()}

@@ -251,7 +251,7 @@ class SerialPort:
         try:
             if not os.isatty(fd):
                 raise OSError(errno.ENOTTY, os.strerror(errno.ENOTTY))
-            users = holders(path)  # before changing anything on a port that another process uses
+            users = holders(path)  # check this first, because another process may use the port
             if users:
                 raise _busy(path, users)
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)

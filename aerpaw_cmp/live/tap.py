@@ -104,7 +104,7 @@ class Tap:
         self._port: ports.SerialPort | None = None
         self._info: ports.PortInfo | None = None
         self._first_bytes: bytearray | None = None
-        # records from before the log is open, then None
+        # records that precede the opening of the log; None once it is open
         self._early: list[Record] | None = []
         self._received = 0
         self._in_step = True

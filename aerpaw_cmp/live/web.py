@@ -139,7 +139,7 @@ class WebServer(ThreadingHTTPServer):
 
     daemon_threads = True
     block_on_close = False
-    # the default of 5 would turn browsers away during a flood
+    # the default of 5 would refuse browsers during a flood
     request_queue_size = 128
 
     def __init__(

@@ -312,7 +312,7 @@ class ServingTowerMean:
         towers = len(np.asarray(self.towers_m))
         self.total_ = np.zeros((towers, self.values_.shape[1]))
         self.count_ = np.zeros_like(self.total_)
-        # not +=, which adds only one of several values with the same index
+        # do not use +=, which adds only one of several values with the same index
         np.add.at(self.total_, self.tower_, np.where(finite, self.values_, 0.0))
         np.add.at(self.count_, self.tower_, finite)
         return self

@@ -166,7 +166,7 @@ def serving_tower(points_m: ArrayLike, towers_m: ArrayLike) -> IntArray:
     if len(towers) == 0:
         raise UsageError("the site has no tower", expected="at least one tower to serve the map")
     squared = ((points[:, None, :] - towers[None, :, :]) ** 2).sum(axis=-1)
-    # rounded, so that the rule for ties decides and not a rounding error
+    # round, so that the rule for ties decides and not a rounding error
     return np.asarray(np.argmin(np.round(squared, 6), axis=1), dtype=np.int64)
 
 

@@ -601,7 +601,7 @@ def _apply(rule: Weights, values: FloatArray) -> FloatArray:
 
     used = rule.index >= 0
     start = np.concatenate([[0], np.cumsum(used.sum(axis=1))])
-    # sparse, because each target uses about 20 of thousands of samples
+    # use a sparse matrix, because each target uses about 20 of thousands of samples
     matrix = csr_array((rule.weight[used], rule.index[used], start), shape=(len(used), len(values)))
     # add differences from one value of the field, so that a constant field is exact although weights sum to 1 within
     # 1e-16

@@ -175,7 +175,7 @@ class Reach:
         faces = self._faces = site_faces(site)
         bounds = shapely.bounds(footprints) + NEAR_M * np.array([-1.0, -1.0, 1.0, 1.0])
         self._near = shapely.STRtree(shapely.box(*bounds.T))
-        self._ends = corners(faces, 1e9)[:, :2, :2]  # ends of the lower edge of a wall
+        self._ends = corners(faces, 1e9)[:, :2, :2]  # ends of the lower edge of each wall, seen from above
         self._is_wall = (faces.solid >= 0) & (faces.normal[:, 2] == 0.0)
         self._mirrors = Mirrors(faces, self.extent_m)
 

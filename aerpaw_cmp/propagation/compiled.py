@@ -148,7 +148,7 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     import numba
     from numba.core import config
 
-    options = options or {"_nrt": True}  # set explicitly, or the option of the first caller would be used
+    options = options or {"_nrt": True}  # set the option explicitly: otherwise that of the first caller would be used
     compiled = numba.njit(nogil=True, **_MATHS, **options)(function)
     if (folder := code_folder()) is not None:
         before = config.CACHE_DIR

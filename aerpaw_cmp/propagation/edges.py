@@ -630,7 +630,7 @@ def _patterns(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return E_theta and E_phi (paths, elements) of one end's elements ``toward`` directions (paths, 3)."""
     count = len(arrays[0])
-    # shape (1, 1), which broadcasts against every path and element
+    # use the shape (1, 1), which broadcasts against every path and element
     if all(plain(array.patterns) for array in arrays):
         return np.ones((1, 1), complex), np.zeros((1, 1), complex)
     fields = np.empty((len(paths), 2, count), dtype=np.complex128)

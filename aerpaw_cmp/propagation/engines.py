@@ -201,7 +201,7 @@ def by_beams(scene: Scene, search: Search) -> bool:
 
 # ------------------------------------------------------------------------------------------------------- the cache
 
-# Raised whenever the entries or the search change.
+# Version of the entries. Increase it if the entries or the search change.
 LAYOUT = 4
 
 # Columns of an entry. The terrain changes paths after the search.

@@ -315,7 +315,7 @@ def legs(source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray) -> 
 
     An unused vertex (NaN) is replaced by the point after it, so that the leg from there has zero length.
     """
-    # backwards: an unused corner gets the position of the next corner
+    # go backwards, so that an unused corner gets the position of the next corner
     points = [target_m]
     for step in reversed(range(vertices_m.shape[1])):
         vertex = vertices_m[:, step]
@@ -388,7 +388,7 @@ def _parts(footprint: Polygon) -> list[Polygon]:
     # a self-crossing ring becomes several polygons, and perhaps lines, which are not walls
     valid = footprint if footprint.is_valid else shapely.make_valid(footprint)
     polygons = [part for part in shapely.get_parts(valid) if part.geom_type == "Polygon" and part.area > 0.0]
-    # counter-clockwise, so that every edge has the building on its left
+    # orient rings counter-clockwise, so that every edge has the building on its left
     return [
         orient(Polygon(_corners(part.exterior), [_corners(hole) for hole in part.interiors]), 1.0) for part in polygons
     ]
@@ -407,7 +407,8 @@ def _corners(ring: shapely.LinearRing) -> FloatArray:
         flat = np.abs(turn) <= _COLLINEAR * length
         if not flat.any():
             break
-        points = np.delete(points, np.flatnonzero(flat)[0], axis=0)  # one at a time, because the neighbours change
+        # remove one vertex at a time, because its neighbours change
+        points = np.delete(points, np.flatnonzero(flat)[0], axis=0)
     return points
 
 
@@ -735,9 +736,9 @@ _TOWER_PORTS_M = (0.0, 0.060, 1.740, 1.800)
 
 
 def _centred_line(along_m: FloatArray) -> FloatArray:
-    # across the boresight, which is x
+    # the line is across the boresight, which is x
     positions = np.zeros((len(along_m), 3))
-    positions[:, 1] = along_m.mean() - along_m  # first port leftmost (+y)
+    positions[:, 1] = along_m.mean() - along_m  # the first port is leftmost (+y)
     return positions
 
 

@@ -530,7 +530,7 @@ def replay(
     choice = chosen_samples(scene, link, poses, search, cache)
     search = search if choice is None else replace(search, samples=choice.samples)
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
-    # report a damaged entry: the numbers are right, but the time is not
+    # report damaged cache entries, which explain a long search: the results are correct
     notes += map(Omission, cache.warnings) if cache else []
     # use the scene without terrain planes, because these paths reflect off level ground
     further = further_paths(site, scene, link, poses, search, field)
@@ -662,7 +662,7 @@ def _channels(
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     # a blocked path adds zero to H; only the flag distinguishes it from a path that fades
-    open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle
+    open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss means an obstacle
     has_path[paths.pose[open_], paths.tower[open_]] = True
     for item in further:
         # path_power contains only the reflections, because other kinds have separate powers

@@ -220,7 +220,7 @@ def _single_valued_poles(e_theta: ComplexArray, e_phi: ComplexArray) -> tuple[Co
     for row, next_row, slope in ((0, 1, 1.0), (-1, -2, -1.0)):
         x, y, _ = _pole_vectors(e_theta, e_phi, row, slope)
         near_x, near_y, _ = _pole_vectors(e_theta, e_phi, next_row, slope)
-        if (x * np.conj(near_x) + y * np.conj(near_y)).real < 0:  # files write the row of a pole from either side
+        if (x * np.conj(near_x) + y * np.conj(near_y)).real < 0:  # the row of a pole may be written from either side
             x, y = -x, -y
         e_theta[row] = slope * (x * np.cos(phi) + y * np.sin(phi))
         e_phi[row] = y * np.cos(phi) - x * np.sin(phi)
@@ -468,7 +468,7 @@ def _unfold(folded: ComplexArray) -> ComplexArray:
     There, some files contain spherical components, and other files the components of the cut, which differ in sign. The
     field is smooth where phi wraps around, and along each meridian next to the poles, which distinguishes both cases.
     """
-    # theta is zero here
+    # column with theta = 0
     middle = folded.shape[2] // 2
     near, far = folded[:, :, middle:].copy(), folded[:, :, middle::-1].copy()
     inner = slice(1, -1)
@@ -487,7 +487,7 @@ def _apart(first: ComplexArray, second: ComplexArray) -> float:
 
 def _mirrored(half: ComplexArray) -> ComplexArray:
     """Return (phis, thetas) with phi replaced by -phi."""
-    # phi 0 remains first
+    # keep phi = 0 in the first row
     return np.roll(half[::-1], 1, axis=0)
 
 

@@ -278,7 +278,7 @@ class Entry(StrictModel):
     def about(self, errors: Errors | None = None, kind: str = "on another flight") -> str:
         """Return a sentence about the training flights and the expected error (default: held-out flights)."""
         errors = errors or self.errors
-        days = f" of {', '.join(self.flown)}" if self.flown else ""  # empty for logs with relative times
+        days = f" of {', '.join(self.flown)}" if self.flown else ""  # there are no days for logs with relative times
         text = f"learned on {counted(len(self.flights), 'flight')}{days}"
         text += f", the UAV also on {', '.join(self.joined)}" if self.joined else ""
         if errors is not None:
@@ -651,7 +651,7 @@ class PairGain:
         """
         gain, sd = np.empty(len(directions)), np.empty(len(directions))
         white = self._factor.whiten(self.gain_db)
-        # limit the memory of the kernel against all known directions
+        # use batches, because the kernel with all known directions needs much memory
         for start in range(0, len(directions), 4096):
             part = slice(start, start + 4096)
             across = gaussian_kernel(directions[part], self.directions, self.length)
@@ -798,7 +798,7 @@ def unit_mean_gain(gain_db: FloatArray) -> FloatArray:
     The level of a learned gain is not determined, because the offset contains it.
     """
     theta = np.linspace(0.0, np.pi, gain_db.shape[0])
-    # area of a ring, which is zero at a pole
+    # weight by the area of a ring, which is zero at a pole
     weight = np.sin(theta)[:, None] * np.ones_like(gain_db)
     return np.asarray(gain_db - db_from_power((power_from_db(gain_db) * weight).sum() / weight.sum()))
 
@@ -955,7 +955,7 @@ def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float, notes:
         Text that ends with a line end.
     """
     degrees = np.radians(np.arange(360.0))
-    # minus, because HORIZONTAL runs clockwise
+    # the sign is negative, because HORIZONTAL runs clockwise
     level = pattern.gain_dbi(np.full(360, np.pi / 2), -degrees)
     below = np.pi / 2 + degrees  # zenith angle on the great circle through the boresight
     over = pattern.gain_dbi(below, np.zeros(360))

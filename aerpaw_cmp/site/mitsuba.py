@@ -336,7 +336,7 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
             continue
         name = shape.get("id") or f"shape {len(parts) + 1}"
         mesh, content = read_mesh(_file_of(shape, name, path))
-        # digests of digests, so that bytes cannot move from one file to the next
+        # combine digests, so that moving bytes from one file to the next changes the result
         digest.update(hashlib.sha256(content).digest())
         parts.append(_Part(name, _of_shape(shape, name, radio, unknown), mesh))
         if sum(len(part.mesh.triangles) for part in parts) > _MOST_TRIANGLES:

@@ -99,7 +99,7 @@ def site_meshes(site: Site) -> dict[str, Mesh]:
     return {name: joined(parts) for name, parts in pieces.items()}
 
 
-# Size of an added ground plane beyond the scene, in sizes of the scene.
+# Distance by which an added ground plane extends beyond the scene, in sizes of the scene.
 _PLANE_MARGIN = 10.0
 
 # A scene has no ground if its horizontal surfaces cover a smaller share of its plan than this.
@@ -278,7 +278,8 @@ def _encloses(corners_m: FloatArray, place_m: FloatArray) -> bool:
     if np.linalg.norm(across.sum(axis=0)) > 1e-3 * np.linalg.norm(across, axis=1).sum():
         return False  # an open mesh, such as terrain
     votes = 0
-    for shift in ((1e-4, 2e-4), (-3e-4, 1e-4), (2e-4, -3e-4)):  # if one line meets an edge, the others do not
+    # use three lines: if one of them meets an edge, the others do not
+    for shift in ((1e-4, 2e-4), (-3e-4, 1e-4), (2e-4, -3e-4)):
         a, b, c = (corners_m[:, k] - place_m - np.array([*shift, 0.0]) for k in range(3))
         turns = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))])
         over = (turns > 0).all(axis=0) | (turns < 0).all(axis=0)

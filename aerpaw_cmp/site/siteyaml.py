@@ -866,7 +866,7 @@ def _first_come(points: FloatArray, spacing_m: float) -> BoolArray:
         live = open_[early] & open_[late]
         early, late = early[live], late[live]
         waiting[late] = True
-        chosen = open_ & ~waiting  # no earlier point nearby is undecided
+        chosen = open_ & ~waiting  # select points near which no earlier point is undecided
         keep |= chosen
         open_ &= ~chosen
         open_[late[chosen[early]]] = False

@@ -257,7 +257,7 @@ class _OneLink:
         if complete and not nowhere:
             # None: there are too many sequences to try; the paths of the replay are still judged
             for sequence in self.reference.sequences(self.target, max_depth) or ():
-                # only a path that certainly exists can be missing
+                # count a path as missing only if it certainly exists
                 if self.reference.verdict(sequence, self.target) and (key := _key(sequence)) not in keys:
                     missing += 1
                     keys.add(key)
@@ -273,7 +273,7 @@ class _OneLink:
         for path in self.mine:
             sequence = self.sequence(path)
             if sequence is None:
-                return FieldAudit(doubtful=1)  # already counted as a failure
+                return FieldAudit(doubtful=1)  # this was already counted as a failure
             loss = self.reference.loss_db(sequence, self.target)
             if loss is None:
                 return FieldAudit(doubtful=1)
@@ -333,7 +333,7 @@ def _level_error(level_dbm: float, power: float, transmit_dbm: float, size: floa
 
     The error is infinite if only one of the two levels is in coverage.
     """
-    if power <= (1e-9 * size) ** 2:  # no power, or a fade deeper than 180 dB
+    if power <= (1e-9 * size) ** 2:  # there is no power, or the fade is deeper than 180 dB
         return 0.0 if not math.isfinite(level_dbm) or power > 0 else math.inf
     if not math.isfinite(level_dbm):
         return math.inf

@@ -277,7 +277,8 @@ def why_not(
 
 def _why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray) -> str:
     """Return the same as :func:`why_not` for a scene of triangles, by the rules of its search."""
-    from ..search.beams import EDGE_M, obstacle, reflection_points  # compiled, so loaded only for a scene of triangles
+    # this is compiled code, which is loaded only for a scene of triangles
+    from ..search.beams import EDGE_M, obstacle, reflection_points
 
     sequence = sequence[sequence >= 0]
     points = np.zeros((0, 3))
@@ -296,7 +297,7 @@ def _why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArra
 
 
 def _metres(length: float) -> str:
-    # a miss below a centimetre must not read as 0.00 m
+    # a miss below a centimetre must not be shown as 0.00 m
     return f"{length:.2f} m" if length >= 0.01 else f"{length:.1e} m"
 
 

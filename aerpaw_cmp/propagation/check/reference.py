@@ -607,7 +607,7 @@ class Reference:
         h = np.zeros((uav, tower), dtype=np.complex128)
         power = 0.0
         for sequence, loss in paths:
-            # a factor on the amplitude, so its exponent is half that of a power
+            # the factor applies to the amplitude, so its exponent is half that of a power
             factor = 0.0 if math.isinf(loss) else 10 ** (-loss / 20)
             amplitudes = np.array(
                 [[factor * self.pair(sequence, t, u, target, turn) for t in range(tower)] for u in range(uav)]
@@ -686,7 +686,7 @@ def _bounces(sequence: Sequence[Mirror], source: Vector, target: Vector) -> list
         images.append(mirror.mirrored(images[-1]))
     points = [target]
     for mirror, image in zip(reversed(sequence), reversed(images[1:]), strict=True):
-        # the image lies behind the mirror, the next point before it
+        # the image lies behind the mirror, and the next point in front of it
         ahead, behind = mirror.height(points[0]), -mirror.height(image)
         if ahead + behind <= 0:
             return None

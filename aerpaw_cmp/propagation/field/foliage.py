@@ -84,7 +84,7 @@ P833_TABLE: tuple[tuple[float, float, float], ...] = (
     (1852.2, 0.30, 29.0),
     (2117.5, 0.34, 34.1),
 )
-_GAMMA_EXPONENT = 0.70  # log-log fit of the table
+_GAMMA_EXPONENT = 0.70  # slope of a log-log fit of the table
 _MAXIMUM_EXPONENT = 0.43  # A_m = A1 f^0.43, P.833's own fit for Mulhouse
 
 
@@ -337,7 +337,7 @@ class CrownIndex:
         around = np.arange(-steps, steps + 1)
         offset = np.stack(np.meshgrid(around, around, indexing="ij"), axis=-1).reshape(-1, 2)
         body, cell = [], []
-        # cell by cell around each crown, all crowns at once
+        # loop over the cells around a crown, for all crowns at once
         for shift in offset:
             at = home + shift
             corner = low + at * self._cell_m
@@ -632,7 +632,7 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
         np.isfinite(start_m).all(axis=1) & np.isfinite(end_m).all(axis=1) & (start_m != end_m).any(axis=1)
     )
     flat = end_m[moved, :2].copy()
-    flat[np.hypot(*(flat - start_m[moved, :2]).T) < _UPRIGHT_M, 0] += _UPRIGHT_M  # a line has a length
+    flat[np.hypot(*(flat - start_m[moved, :2]).T) < _UPRIGHT_M, 0] += _UPRIGHT_M  # a line must have a length
     near, stand = tree.query(shapely.linestrings(np.stack([start_m[moved, :2], flat], axis=1)))
     for number in np.unique(stand):
         mine, (corner, last) = near[stand == number], _corners(stands[number])

@@ -120,7 +120,7 @@ def geometry(
         image = image - 2.0 * ((image * normal).sum(axis=1) - offset)[:, None] * normal
         # mirror earlier faces, too, because the last image sees their mirror images
         for vectors in (frame, normals[:, :step]):
-            # in place, because frame and normals are copies
+            # change the arrays in place, because they are copies
             vectors -= 2.0 * np.einsum("nij,nj->ni", vectors, normal)[..., None] * normal[:, None, :]
     # rotate only arrays of poses between the first and last of these paths
     first, last = paths.pose.min(initial=len(poses)), paths.pose.max(initial=0)

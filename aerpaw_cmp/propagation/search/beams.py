@@ -367,7 +367,7 @@ def _direct(solids, source, targets, rules):  # type: ignore[no-untyped-def]
     free = np.zeros(len(targets), np.bool_)
     antenna = np.zeros(3), 0.0
     for r in range(len(targets)):
-        # serial, because a line of sight takes too little time for threads
+        # do not use threads, because a line of sight takes too little time
         free[r] = segment_cut(solids.corners, solids.tree, source, targets[r], antenna, antenna, rules) < 0
     return free
 

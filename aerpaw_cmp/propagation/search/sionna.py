@@ -95,7 +95,7 @@ def _variant(kinds: Sequence[str]) -> str:
     without_llvm: SionnaMissingError | None = None
     if "llvm" in kinds:
         try:
-            prepare_llvm()  # before Dr.Jit searches for a library
+            prepare_llvm()  # call this before Dr.Jit searches for a library
         except SionnaMissingError as error:
             without_llvm = error  # a GPU does not need LLVM
     import mitsuba as mi
@@ -143,7 +143,7 @@ class _Scene:
     """A Sionna scene, and the face of each of its triangles."""
 
     scene: Any
-    face_of: dict[int, IntArray]  # object id -> face of each triangle
+    face_of: dict[int, IntArray]  # face of each triangle, by the id of the object
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

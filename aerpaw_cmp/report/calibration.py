@@ -1,4 +1,4 @@
-"""calibration.html with metrics.json: learned antennas over the sphere, directions of the flights, held-out scores."""
+"""The page calibration.html with its metrics.json: learned antennas, flown directions, and held-out scores."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from .texts import minute, number, percent
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AntennaMap:
-    """One antenna over the sphere.
+    """The gain of one antenna over the sphere.
 
     Parameters
     ----------
     name : str
-        A name such as ``LW1.USRP1 tower``.
+        Name, such as ``LW1.USRP1 tower``.
     theta_deg, azimuth_deg : (t,), (p,)
     gain_dbi, sd_db : (t, p)
     level_db : float
-        Level that was subtracted from the learned gain for a mean of 0 dBi.
+        Level that was subtracted from the learned gain, so that its mean is 0 dBi.
     flown : (m, 3)
         Unit vectors of the directions that flights measured.
     """
@@ -69,7 +69,7 @@ class CalibrationData(Made):
 
 ONE_FLIGHT = "Nothing is scored: one flight alone. Next: add a second flight."
 
-# Learned antennas against the best baseline, by :func:`~aerpaw_cmp.compare.verdict.by_flight`.
+# Sentence and next step, by the verdict of :func:`~aerpaw_cmp.compare.verdict.by_flight` on learned antennas.
 HELPS: dict[str, tuple[str, str]] = {
     "better": (
         "The learned antennas are significantly better ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
@@ -86,7 +86,7 @@ HELPS: dict[str, tuple[str, str]] = {
     "no interval": ("The difference is {effect:+.1f} dB; two flights give no interval.", "add a third flight"),
 }
 
-# Body frame against frames that do not rotate with the UAV, by :func:`~aerpaw_cmp.compare.verdict.antenna_or_place`.
+# Sentence and next step, by the verdict of :func:`~aerpaw_cmp.compare.verdict.antenna_or_place` on the UAV's frame.
 FRAMES: dict[str, tuple[str, str]] = {
     "antenna": (
         "The learned gain rotates with the UAV, as an antenna does: {where} the error is {size:.1f} dB larger "
@@ -119,7 +119,7 @@ def helps(scores: Sequence[Score]) -> Verdict:
 
 
 def frame(controls: Mapping[str, Sequence[Score]]) -> Verdict:
-    """Test whether an antenna or an effect of the place explains the levels, without measured patterns."""
+    """Test whether an antenna or the position explains the learned gain, without measured patterns."""
     body = _errors(controls.get("body frame, no patterns", ()))
     return antenna_or_place(
         [by_flight(body, _errors(controls.get(name, ())), where) for name, where in WRONG_FRAMES.items()]
@@ -133,12 +133,12 @@ def _errors(scores: Sequence[Score], name: str = "rmse_db") -> list[tuple[str, f
 def sentences(
     scores: Mapping[str, Sequence[Score]], controls: Mapping[str, Sequence[Score]], ground_m: tuple[float, float] | None
 ) -> tuple[str, ...]:
-    """Return the summary of page and terminal, then further sentences.
+    """Return the summary for page and terminal, followed by details.
 
     Parameters
     ----------
     scores, controls : mapping of str to sequence of Score
-        Scores by kind of held-out data, and by wrong or simpler models.
+        Scores by kind of held-out data, and scores of wrong or simpler models as controls.
     ground_m : (float, float), optional
         Range of the roughness height that the data allow [m]; None if no ground was fitted.
 
@@ -264,7 +264,7 @@ def scores_card(data: CalibrationData) -> Card:
 
 
 def _rows(splits: Mapping[str, Sequence[Mapping[str, Any]]] | None, keys: Sequence[str]) -> list[tuple[Any, ...]]:
-    """Return a row per score: what was held out, then its numbers by key."""
+    """Return one row per score: what was held out, then the numbers of ``keys``."""
     known = (splits or {}).items()
     return [(SPLIT_TITLE.get(split, split), *(row[key] for key in keys)) for split, of in known for row in of]
 
@@ -306,7 +306,7 @@ def ground_card(data: CalibrationData) -> Card:
 
 
 def rank_card(data: CalibrationData) -> Card:
-    """Return the card of the receiver's held-out forecasts of the rank."""
+    """Return the card of the rank receiver's forecasts on held-out flights."""
     table = Table(
         caption="A receiver fitted on the other flights; log score in nats per report, lower is better. The constant "
         "forecast has the shares of the training flights. Total variation is that of the expected histogram.",

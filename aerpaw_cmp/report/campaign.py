@@ -1,4 +1,4 @@
-"""The records of many flights and settings, and campaign.html, campaign.json and campaign.csv made from them."""
+"""Records of many flights and settings, and the files campaign.html, campaign.json and campaign.csv."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from .texts import interval, k_key, minute, more, number
 class RssRow:
     """The RSS of one flight, setting, tower and channel.
 
-    ``offset_db`` and ``rmse_db`` are fitted on the samples of this row. ``pooled_offset_db`` is the offset of its group
-    of ``calibration:``, and ``pooled_rmse_db`` is the RMSE with it. ``held_out_offset_db`` is fitted on the other
-    flights of the same setting, tower and channel, and ``held_out_rmse_db`` is the RMSE with it. Both are NaN if there
-    is no other flight.
+    ``offset_db`` and ``rmse_db`` are fitted to the samples of this row. ``pooled_offset_db`` is the common offset of
+    the row's group in ``calibration:``, and ``pooled_rmse_db`` the RMSE with this offset. ``held_out_offset_db`` is
+    fitted to the other flights with the same setting, tower and channel, and ``held_out_rmse_db`` is the RMSE with that
+    offset. Both are NaN if there is no other flight.
 
-    ``baselines`` are RMSE by name [dB], each with its own offset. ``span_db`` is the search range of the offset. Arrays
-    (n,) have a value per sample, NaN if one side is missing. Only rows of the first setting have them; other rows have
-    ``difference`` instead.
+    ``baselines`` contains the RMSE of each baseline with its own offset, by name [dB]. ``span_db`` is the search range
+    of the offset. Arrays (n,) have one value per sample, NaN if measurement or simulation is missing. Only rows of the
+    first setting have these arrays; other rows have ``difference`` instead.
     """
 
     flight: str
@@ -67,7 +67,7 @@ class RssRow:
     position_m: FloatArray = field(repr=False)
     heading_deg: FloatArray | None = field(repr=False, default=None)
     start_ns: int = 0
-    """First time, nanoseconds after 1970-01-01."""
+    """First time [ns since 1970-01-01]."""
     difference: Moments | None = None
     pooled_offset_db: float = float("nan")
     pooled_rmse_db: float = float("nan")
@@ -119,7 +119,7 @@ class RankRow:
     best_k: float
     best_k_ci95: Interval | None
     commonest_agreement: float = float("nan")
-    """Agreement if the most frequent rank is always predicted, the baseline of a model."""
+    """Agreement if the most frequent rank is always predicted, as a baseline."""
     logs: tuple[str, ...] = ()
     """SHA-256 of the logs that contain the reports."""
     mark: str = field(repr=False, default="")
@@ -137,10 +137,10 @@ class Failure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PooledOffset:
-    """An offset that several rows share.
+    """A common offset of several rows.
 
-    ``spread_db`` is the standard deviation of the offsets of the members (NaN for one member), and ``range_db`` their
-    range. ``own_rmse_db`` and ``pooled_rmse_db`` are means over the members.
+    ``spread_db`` and ``range_db`` are standard deviation (NaN for one row) and range of the rows' own offsets.
+    ``own_rmse_db`` and ``pooled_rmse_db`` are means over the rows.
     """
 
     setting: str
@@ -164,15 +164,16 @@ class Repeat:
     rmse_db : float
         RMS difference of the two measurements after the best constant ``offset_db`` (second minus first) [dB].
     share : float
-        Number of pairs divided by the number of samples of the first flight.
+        Number of pairs of samples divided by the number of samples of the first flight.
     single_db : float
         ``rmse_db / sqrt(2)``, the error of one flight if both have equal and independent errors.
     residual_rmse_db : float
         RMS difference of the residuals of the two flights [dB].
     place_rmse_db : float
-        RMS difference of the mean residuals per cell of the plan, at all heights.
+        RMS difference of the mean residuals per horizontal cell, over all heights.
     place_correlation : float
-        Correlation of the mean residuals per cell of the plan. Near 1, the model has the same errors on both flights.
+        Correlation of the mean residuals per horizontal cell. If it is near 1, the model has the same errors on both
+        flights.
     cells : int
         Number of cells that both flights visit.
     height_difference_m : float
@@ -198,10 +199,10 @@ class Repeat:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankTransfer:
-    """The total variation of one flight at the K that the other flights select.
+    """The total variation of one flight with the K that other flights select.
 
-    ``k`` has the smallest mean total variation on ``chosen_on`` among the K of the flight files, and ``own_k`` on the
-    flight itself.
+    Of the K in the flight files, ``k`` has the smallest mean total variation on the flights ``chosen_on``, and
+    ``own_k`` the smallest on this flight.
     """
 
     setting: str
@@ -217,7 +218,7 @@ class RankTransfer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettingRank:
-    """One setting, compared with the setting of smallest mean error over flights.
+    """One setting, compared with the setting that has the smallest mean error over flights.
 
     Parameters
     ----------
@@ -227,12 +228,13 @@ class SettingRank:
     n_flights : int
         Number of flights with an error under this setting.
     mean_db : float
-        Mean over flights of the mean error over towers and channels [dB], held out if there is another flight.
+        Mean over flights of the mean error over towers and channels [dB]. Errors are held out if there are several
+        flights.
     quantiles_db : tuple of float
         Quantiles of 0, 10, 25, 50, 75, 90 and 100 % over flights.
     difference_db, difference_ci95_db : float, Interval or None
-        Mean over flights of the error minus that of the first setting on the same links, and its interval, which is
-        None for the first setting.
+        Mean over flights of the error minus that of the first setting on the same links, and its interval. The interval
+        is None for the first setting.
     n_paired : int
         Number of flights in that difference.
     verdict : str
@@ -261,14 +263,14 @@ class Season:
     started : mapping of str to str
         First time of each flight (UTC, ISO 8601); missing for logs with relative times.
     ranking : tuple of SettingRank
-        Rankings over all links and, if there are several, of each link. The best setting is first.
+        Rankings over all links and, if there are several links, for each link. The best setting is first.
     nodes : tuple of NodeOffset
-        Offsets of nodes under the first setting, or of soundings between towers.
+        Offsets of nodes under the first setting, or from soundings between towers.
     places_db : mapping of (int, int) to float
-        Mean residual of the first setting over flights, towers and channels, by column and row of a cell of the plan,
+        Mean residual of the first setting over flights, towers and channels, by column and row of a horizontal cell,
         counted from the origin of the site.
     reports : mapping of str to str
-        Address of the report of a flight, relative to the folder of the campaign.
+        Path of the report of each flight, relative to the folder of the campaign.
     """
 
     held_out: bool = False
@@ -285,7 +287,7 @@ class Season:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignData(Made):
-    """The content of the page. ``settings`` are the changes of each setting by its label.
+    """The content of the page. ``settings`` contains the changes of each setting by its label.
 
     Two samples have the same position if they are within ``radius_m`` and their headings agree within
     ``heading_within_deg``. Residuals are averaged in cells of ``cell_m``.
@@ -313,7 +315,7 @@ class CampaignData(Made):
 
     @property
     def reference(self) -> str:
-        """The first setting, to which repeatability, steps and places belong."""
+        """The first setting, which is used for repeatability, steps and the map of residuals."""
         return next(iter(self.settings), "")
 
     @property
@@ -330,7 +332,7 @@ class CampaignData(Made):
 # Largest number of warnings of flights that are listed one by one.
 FEW = 8
 
-# Sentence and next step by the cause of :func:`~aerpaw_cmp.compare.verdict.campaign_verdict`.
+# Sentence and next step, by the cause of :func:`~aerpaw_cmp.compare.verdict.campaign_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
     "outlying error": (
         "Flight {where} stands out: its RMSE is {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) that of the others.",
@@ -353,12 +355,12 @@ CAUSES: dict[str, tuple[str, str]] = {
 # Largest number of settings in a sentence.
 _FEW_SETTINGS = 4
 
-# Below this share of samples with a pair, the repeatability is valid for a few positions only.
+# Below this share of samples with a pair, the repeatability is valid only for a few positions.
 _FEW_PAIRS = 0.25
 
 
 def rss_flights(data: CampaignData) -> list[str]:
-    """Return the flights with RSS, and those that failed. Flights with rank only have no RMSE."""
+    """Return the flights with RSS, and those that failed. Flights with only rank have no RMSE."""
     ranked = {row.flight for row in data.rank} - {row.flight for row in data.rss}
     return [name for name in data.flights if name not in ranked]
 
@@ -398,7 +400,7 @@ def headline(data: CampaignData) -> list[str]:
 
 
 def step_words(data: CampaignData) -> list[str]:
-    """Return a sentence per step of an offset, the latest first, and the smallest step that the last date can show."""
+    """Return a sentence per step of an offset, the latest first, and one about the smallest detectable step."""
     judged = [node for node in data.season.nodes if np.isfinite(node.smallest_db)]
     if not judged:
         return []
@@ -460,7 +462,7 @@ def warnings(data: CampaignData) -> list[str]:
 
 
 def edge_warnings(data: CampaignData) -> list[str]:
-    """Return a warning for each row whose best offset is at the end of its search range, which is a failed check."""
+    """Return one warning per row whose best offset is at the end of its search range. This counts as a failed check."""
     return [
         f"{row.flight}, {row.setting}, {row.link}: the best offset is at the end of its search range."
         for row in data.rss
@@ -471,7 +473,7 @@ def edge_warnings(data: CampaignData) -> list[str]:
 def by_error(rows: Iterable[RssRow], name: str) -> list[tuple[str, float, str]]:
     """Return flights by error, largest first: name, mean error over links [dB], worst link.
 
-    ``name`` is the field of the error. Rows without it count with their own RMSE.
+    ``name`` is the field of the error. For rows without this error, the RMSE with their own offset is used.
     """
     by: dict[str, list[tuple[float, str]]] = {}
     for row in rows:
@@ -513,7 +515,7 @@ def cause(data: CampaignData) -> Verdict:
 
 
 def against_baselines(row: RssRow) -> str:
-    """Return the text of a cell: the baselines that ray tracing is significantly worse and better than."""
+    """Return the text of a cell that lists baselines from which ray tracing differs significantly."""
     parts = [
         f"{word} than " + ", ".join(pretty(name) for name, decision in row.verdicts.items() if decision == word)
         for word in ("worse", "better")
@@ -522,7 +524,7 @@ def against_baselines(row: RssRow) -> str:
     return "; ".join(parts) or ("not significant" if row.verdicts else "\u2013")
 
 
-# Number of nodes in the chart. Nodes with steps are first, then those that vary most.
+# Largest number of nodes in the chart. Nodes with steps are shown first, then those that vary most.
 _NODES_SHOWN = 12
 
 
@@ -553,7 +555,7 @@ def charts_of(data: CampaignData) -> list[Chart]:
 
 
 def _places(data: CampaignData) -> list[Places]:
-    """Return the mean residual of each cell of the plan over flights, towers and channels."""
+    """Return the map of mean residuals per horizontal cell, over flights, towers and channels."""
     residuals, name = data.season.places_db, f"all flights, {data.reference}"
     if not residuals:
         return []
@@ -565,7 +567,7 @@ def _places(data: CampaignData) -> list[Places]:
 # Largest number of warnings on the page.
 MANY = 200
 
-# Largest number of flights in a table with a column or a heading for each.
+# Largest number of flights in a table that has one column or heading per flight.
 _FEW_FLIGHTS = 20
 
 # Rows of a table on the page. The files in the same folder contain all rows.
@@ -617,7 +619,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
 
 
 def _campaign_frame(data: CampaignData) -> pd.DataFrame:
-    """Return one row per flight, setting, tower and channel (``kind`` rss) or K (``kind`` rank), and per failure."""
+    """Return a table with one row per flight, setting, tower and channel or K, and per failure."""
     rows = [
         {"kind": "rss", **cells(row), **{f"{name}_rmse_db": error for name, error in row.baselines.items()},
          "fitted": " ".join(row.fitted)}
@@ -860,8 +862,8 @@ def campaign_page(data: CampaignData, files: Sequence[str]) -> str:
 def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     """Write ``campaign.html``, ``campaign.json`` and the tables. Return the files, the page first.
 
-    ``pairs.csv`` contains all pairs of flights at the same positions, and campaign.json those with the most pairs of
-    samples.
+    ``pairs.csv`` contains all pairs of flights at the same positions. campaign.json contains only the pairs with the
+    most common samples.
     """
     folder = Path(folder)
     indent = 2 if len(data.rss) + len(data.rank) < _COMPACT_ROWS else None

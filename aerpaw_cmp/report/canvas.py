@@ -1,9 +1,9 @@
 """Matplotlib figures of a report, drawn from finished arrays.
 
 Every figure is a separate :class:`matplotlib.figure.Figure`, drawn inside :func:`style` without pyplot and global
-state. Colours also differ in lightness, line style, marker or hatch, so that they can be distinguished in grey. Clouds
-of points are rasterised, and long lines are thinned with their extremes retained. An SVG of a long flight is
-therefore small.
+state. Data sets differ not only in colour, but also in lightness, line style, marker or hatch, so that they can be
+distinguished in grey. Clouds of points are rasterised. Long lines are thinned, but retain their extremes. The SVG of a
+long flight is therefore small.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Palette of Okabe and Ito (jfly.uni-koeln.de/color), selected for distinct lightness.
+# Colours of Okabe and Ito (jfly.uni-koeln.de/color) that differ in lightness.
 MEASURED = "#56B4E9"
 SECOND = "#7A3FA0"
 SIMULATED = "#111111"
@@ -60,7 +60,7 @@ class FigureSpec:
 STYLES = ("screen", "paper")
 FORMATS = ("png", "svg", "pdf")
 
-# Width of two columns of an IEEE page.
+# Width of a figure over two columns of an IEEE page.
 _IEEE_WIDTH_IN = 7.16
 
 
@@ -115,7 +115,7 @@ def style(kind: str = "screen") -> Iterator[None]:
 
 
 def subplots(size: tuple[float, float], *shape: int, **options: Any) -> tuple[Figure, Any]:
-    """Return a figure whose parts do not overlap, and its axes. ``size`` is width and height in inches."""
+    """Return a figure with automatic layout, and its axes. ``size`` is width and height in inches."""
     from matplotlib.figure import Figure
 
     fig = Figure(figsize=size, layout="constrained")
@@ -159,7 +159,7 @@ def placed(
 
 
 def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
-    """Return the figure in some of :data:`FORMATS`, in the style ``paper`` as wide as two columns of an IEEE page."""
+    """Return the figure by format. In the style ``paper``, it is as wide as two columns of an IEEE page."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.ticker import AutoLocator
 
@@ -172,7 +172,7 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
         if isinstance(locator, AutoLocator):
             locator.set_params(min_n_ticks=3)
     images = {name: io.BytesIO() for name in formats}
-    # use the canvases, because Figure.savefig draws an additional, hidden figure before each file
+    # use the canvases directly, because Figure.savefig draws everything twice
     agg = FigureCanvasAgg(fig)
     agg.draw()  # this computes the layout
     if "png" in images:
@@ -180,13 +180,13 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
 
         picture = Image.fromarray(np.asarray(agg.buffer_rgba())).convert("RGB")
         picture.save(images["png"], "PNG", compress_level=2, dpi=(fig.dpi, fig.dpi))
-    fig.set_layout_engine("none")  # a second layout would cost as much as a drawing
+    fig.set_layout_engine("none")  # a second layout would take as long as drawing
     if "svg" in images:
         from matplotlib.backends.backend_svg import FigureCanvasSVG
 
         FigureCanvasSVG(fig).print_svg(images["svg"], metadata={"Date": None})
     if "pdf" in images:
-        from matplotlib.backends.backend_pdf import FigureCanvasPdf  # loads fontTools, which takes as long as a figure
+        from matplotlib.backends.backend_pdf import FigureCanvasPdf  # import only here, because it loads fontTools
 
         FigureCanvasPdf(fig).print_pdf(images["pdf"], metadata={"CreationDate": None})
     return {name: file.getvalue() for name, file in images.items()}
@@ -212,7 +212,7 @@ _MOST_TICKS = 9
 
 
 def time_axis(ax: Axes, start: np.datetime64) -> None:
-    """Set label and ticks of an axis in seconds after ``start``. Ticks are round times of day if the logs have UTC."""
+    """Set label and ticks of an axis in seconds after ``start``. If the logs have UTC, ticks are round times of day."""
     if not has_wall_clock(start):
         ax.set_xlabel("Time after the first sample [s]")
         return
@@ -253,7 +253,7 @@ def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
     # each segment yields two samples per array, its smallest and its largest
     per = -(-n // max(1, limit // (2 * len(values))))
     starts = np.arange(0, n, per)
-    # the thinned line ends where the flight ends
+    # retain the first and last sample, so that the thinned line covers the whole flight
     rows = [np.array([0, n - 1])]
     for array in values:
         table = np.pad(np.asarray(array, dtype=np.float64), (0, -n % per), constant_values=np.nan).reshape(-1, per)
@@ -264,7 +264,7 @@ def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
 
 
 def thinned(at: FloatArray, values: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
-    """Return a line with about ``limit`` points that looks like the line (n,).
+    """Return a thinned line with about ``limit`` points that looks like the original (n,).
 
     The extremes of each segment and its gaps (NaN) are retained.
 
@@ -279,7 +279,7 @@ def thinned(at: FloatArray, values: FloatArray, limit: int = POINTS_PER_LINE) ->
 
 
 def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
-    """Return the indices of the points of a cloud that are drawn.
+    """Return the indices of the points of a cloud that should be drawn.
 
     Clouds with more than ``limit`` points are thinned evenly, and their extremes are retained.
 
@@ -300,7 +300,7 @@ def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
     """
     if len(values) <= limit:
         return np.arange(len(values))
-    return np.union1d(spread_out(len(values), limit), keep_extremes([values], 1200))  # extremes for every two pixels
+    return np.union1d(spread_out(len(values), limit), keep_extremes([values], 1200))  # extremes per two pixels
 
 
 def dots(ax: Axes, at: FloatArray, values: FloatArray, size: float = 2.0, **options: Any) -> None:
@@ -328,12 +328,12 @@ def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
     >>> [ends.tolist() for ends in runs(np.array([True, False, True, True]))]
     [[0, 2], [0, 3]]
     """
-    # add zeros at both ends, so that a segment that begins or ends with the flight has two edges
+    # add zeros at both ends, so that every segment has two edges
     edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
     return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
 
 
-# Number of segments that a time axis can show, which is larger than its number of pixels.
+# Number of segments that a time axis can show. It exceeds the number of pixels.
 _SPANS = 2000
 
 
@@ -352,13 +352,13 @@ def draw_out_of_coverage(
     label : str
         Text of the legend.
     height : float
-        Share of the height of the axes that the spans fill, from below.
+        Share of the height of the axes that the spans fill, from the bottom.
     hatch : str
         Hatch pattern of matplotlib.
     """
     if not mask.any():
         return
-    # a sample covers half a step on each side, so that a single sample has a width
+    # extend each segment by half a step on each side, so that a single sample is visible
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
     first, last = runs(mask)
     # join segments closer than a pixel
@@ -386,7 +386,7 @@ def draw_waypoints(
     start : datetime64
         Zero of the x axis.
     names : bool
-        True if the labels are written, too.
+        True to write the labels, too.
     """
     for number, (label, time) in enumerate(waypoints):
         at = float((time - start) / np.timedelta64(1, "s"))
@@ -399,7 +399,7 @@ def draw_waypoints(
 
 
 def legend_below(ax: Axes, columns: int = 4) -> None:
-    """Draw a legend below the axes, where it does not hide data."""
+    """Draw a legend below the axes, so that it does not hide data."""
     handles, labels = ax.get_legend_handles_labels()
     if handles:
         ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns, borderaxespad=0.0)
@@ -418,7 +418,7 @@ def draw_credit(ax: Axes, site: Site) -> None:
         )  # fmt: skip
 
 
-# Looks of the areas of a site on a plan.
+# Appearance of the areas of a site on a plan.
 _PLAN: Mapping[str, Mapping[str, Any]] = {
     "forest": {"facecolor": _FOREST, "edgecolor": "#7FA873", "hatch": "..", "linewidth": 0.6, "alpha": 0.7,
                "zorder": 0.3},
@@ -429,7 +429,7 @@ _PLAN: Mapping[str, Mapping[str, Any]] = {
 
 
 def draw_areas(ax: Axes, site: Site, looks: Mapping[str, Mapping[str, Any]]) -> None:
-    """Draw the areas of each kind with a look, and the source of the map."""
+    """Draw all areas whose kind is in ``looks``, and the source of the map."""
     from matplotlib.collections import PolyCollection
     from matplotlib.path import Path as Outline
 
@@ -440,7 +440,7 @@ def draw_areas(ax: Axes, site: Site, looks: Mapping[str, Mapping[str, Any]]) -> 
         "geofence": [fence.area for fence in site.geofences],
     }
     for label, look in looks.items():
-        # one path with all rings of an area, so that holes are not filled
+        # use one path for all rings of an area, so that holes are not filled
         outlines: list[Any] = [
             Outline.make_compound_path(*(Outline(np.asarray(ring.coords)[:, :2], closed=True) for ring in rings))
             for rings in ((area.exterior, *area.interiors) for area in areas[label])
@@ -526,13 +526,13 @@ def frame_around(
     east, north = east[good], north[good]
     width = max(float(np.ptp(east)) * (1 + 2 * margin), least_m)
     height = max(float(np.ptp(north)) * (1 + 2 * margin), least_m)
-    # equal scales require the shape of the plan
+    # extend the limits to the shape of the plan, because both scales are equal
     width, height = max(width, height * shape), max(height, width / shape)
     middle_east, middle_north = (east.min() + east.max()) / 2, (north.min() + north.max()) / 2
     ax.set_xlim(middle_east - width / 2, middle_east + width / 2)
     ax.set_ylim(middle_north - height / 2, middle_north + height / 2)
     for name in (text for text in ax.texts if isinstance(text, Annotation)):
-        # names are to the right of their towers and above them, and would cross the right and upper edge
+        # names are right of and above their towers; move those that would cross the right or upper edge
         if name.xy[0] > middle_east + width / 4:
             name.set(x=-6, ha="right")
         if name.xy[1] > middle_north + 0.4 * height:
@@ -552,7 +552,7 @@ def plan_shape(east: FloatArray, north: FloatArray) -> float:
 
 
 def beyond(values: FloatArray, low: float, high: float) -> str:
-    """Return the ends of a colour scale that values exceed, as the option ``extend`` of a colour bar.
+    """Return which ends of a colour scale the values exceed, for the option ``extend`` of a colour bar.
 
     Examples
     --------
@@ -564,7 +564,7 @@ def beyond(values: FloatArray, low: float, high: float) -> str:
 
 
 def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither", cax: Any = None) -> Any:
-    """Return a colour bar with arrows at ends that values exceed. An SVG contains its colours as one picture.
+    """Draw a colour bar and return it. It has arrows at ends that values exceed, and an SVG contains it as a picture.
 
     Parameters
     ----------
@@ -598,7 +598,7 @@ def legend_of(ax: Axes, shown: Callable[[str], bool]) -> tuple[list[Any], list[s
 
 
 def robust_limits(ax: Axes, levels: Sequence[FloatArray], around: float | None = None) -> None:
-    """Set the ordinate to the 0.2 to 99.8 % range with a margin, so that a few nulls of two-ray do not extend it."""
+    """Limit the ordinate to the 0.2 to 99.8 % range with a margin, so that a few deep nulls do not extend it."""
     values = np.concatenate([level[np.isfinite(level)] for level in levels])
     if not len(values):
         ax.set_ylim(-1.0, 1.0)

@@ -1,7 +1,7 @@
-"""A page as a list of cards, each of which is returned by one function.
+"""Pages as lists of cards. One function returns each card.
 
 A :class:`Card` has a heading, paragraphs, tables, charts and positions, and ``page.html.jinja`` shows the cards of all
-pages in the same way. A card or table without content is not shown, so the functions need no conditions.
+pages in the same way. A card or table without content is not shown, so the functions do not have to check for content.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from ..compare.statistics import Interval
 from .page import json_text, rendered, write_file
 from .texts import flat, interval, number, percent, short
 
-# Forms of a column: text, the head of a row, right-aligned text, a percentage. A column of numbers has the number of
-# its decimals instead.
+# Forms of a column: text, head of a row, right-aligned text, percentage. The form of a column of numbers is its number
+# of decimals.
 TEXT, HEAD, RIGHT, SHARE = "text", "head", "right", "share"
 
-# Scripts of a page, by the view of its positions.
+# Scripts of a page, by the view that shows its positions.
 _SCRIPTS = {
     "explorer": ("uplot.min.js", "common.js", "explorer.js"),
     "map_explorer": ("common.js", "map_explorer.js"),
@@ -30,7 +30,7 @@ _SCRIPTS = {
 
 
 def cell(value: Any, form: str | int) -> Any:
-    """Return the text of a cell: an interval in brackets, a number with the decimals of its column, or the given text.
+    """Return the text of a cell from an interval, a number or a text, in the form of its column.
 
     Examples
     --------
@@ -50,7 +50,7 @@ def _numeric(form: str | int) -> bool:
 
 
 def estimate(value: float | None, ends: Interval | None, decimals: int = 2, mark: str = "{}") -> Markup:
-    """Return a number with its interval in small type.
+    """Return a number as HTML, with its interval in small type.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class Table:
     columns : mapping of str to str or int
         Heads, each with the form of its cells: :data:`TEXT`, :data:`HEAD`, :data:`RIGHT`, :data:`SHARE` or decimals.
     rows : sequence of sequences
-        Cells, as :func:`cell` takes them.
+        Values of the cells, in the form that :func:`cell` accepts.
     look : str
         ``dense`` for many columns, ``tall`` for many rows.
     notes : sequence of str
@@ -104,7 +104,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Positions:
-    """The data of a map or sphere. ``view`` is the name of its script: explorer, map_explorer or places."""
+    """The data of a map or sphere. ``view`` names the script that shows it: explorer, map_explorer or places."""
 
     view: str
     data: Mapping[str, Any]
@@ -112,23 +112,23 @@ class Positions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Card:
-    """A part of a page: heading, paragraphs, tables, charts and positions, in this order, then further cards.
+    """A part of a page: heading, paragraphs, tables, charts and positions in this order, followed by inner cards.
 
     Parameters
     ----------
     title : str
     text : sequence
-        Paragraphs (strings, with commands between backquotes), lists, and Markup, which is not changed.
+        Paragraphs: strings (with commands between backquotes), lists, or Markup, which is not escaped.
     tables : sequence of Table
     chart : str
-        Section of the charts of this card (:class:`~aerpaw_cmp.report.charts.Chart`).
+        Section whose charts (:class:`~aerpaw_cmp.report.charts.Chart`) this card shows.
     positions : Positions, optional
     id, link : str
         Anchor of a section, and its name in the navigation.
     fold : bool
         True if the card is closed until a reader opens it.
     group : str
-        Name of a group of cards of which one is open at a time.
+        Name of a group of cards of which only one is open at a time.
     grid : bool
         True if charts are side by side.
     parts : sequence of Card
@@ -164,7 +164,7 @@ class Page:
     verdict : str
         The result in a paragraph.
     cautions : sequence of str
-        Limits of the numbers. Three are shown, and the others can be unfolded.
+        Limits of the numbers. Three are shown; all others can be unfolded.
     about : sequence of str
         Lines in small type.
     numbers : sequence
@@ -199,7 +199,7 @@ class Page:
 
 
 def settings_card(made: Any, *settings: Mapping[str, Any], fold: bool = False) -> Card:
-    """Return the card of settings, versions and seconds. ``made`` has the fields of :class:`~.page.Made`."""
+    """Return the card of settings, versions and times. ``made`` has the fields of :class:`~.page.Made`."""
     rows = [row for part in settings for row in flat(part)]
     checked = Table(caption="The checked settings.", columns={"Key": HEAD, "Value": TEXT}, rows=rows)
     software = Table(caption="Software.", columns={"Name": HEAD, "Version": TEXT}, rows=list(made.versions.items()))

@@ -1,4 +1,4 @@
-"""The channel along a route as files: NetCDF, arrays for Sionna, a DeepMIMO scenario, and a table for an emulator."""
+"""Files of the channel along a route: NetCDF, arrays for Sionna, a DeepMIMO scenario, and a table for an emulator."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from ..propagation.replay import PathTable, Replay, frequency_responses, impulse
 _LINK, _PORTS = ("time", "tower"), ("rx", "tx")
 _PATH = ("path", *_LINK)
 _SITE, _ARRAY = "site frame, azimuth from east, counter-clockwise", "array frame, from the boresight, counter-clockwise"
-# Dimensions along which the file grows: with each part, and with a link that has more paths.
+# Dimensions that grow while a file is written: with each part, and with the number of paths of a link.
 _GROWS = ("time", "path")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Along:
-    """The poses of the UAV at equal steps of a flight or a route.
+    """The poses of the UAV at equal steps along a flight or route.
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ class Along:
     number : (poses,), optional
         Number of each pose, if the route has no times.
     towers_m : (poses, 3), optional
-        Positions of a tower that moves [m].
+        Positions of the tower, if it moves [m].
     velocity_mps, tower_mps : (poses, 3), optional
-        Velocities of the UAV and of a tower that moves [m/s]; None if the times do not determine them.
+        Velocities of the UAV, and of the tower if it moves [m/s]. None if they cannot be computed from the times.
     remarks : tuple of str
     """
 
@@ -62,7 +62,7 @@ class Along:
     remarks: tuple[str, ...] = ()
 
     def part(self, rows: slice) -> Along:
-        """Return some of the poses."""
+        """Return the selected poses."""
         arrays = {"time_s": self.time_s, "number": self.number, "towers_m": self.towers_m,
                   "velocity_mps": self.velocity_mps, "tower_mps": self.tower_mps}  # fmt: skip
         some: Any = {name: None if values is None else values[rows] for name, values in arrays.items()}
@@ -81,7 +81,7 @@ class Channel:
     replay : Replay
     table : PathTable
     summed : {"coherent", "power"}
-        Sum over the paths of a link that yields its level.
+        How the paths of a link are summed to its level.
     level_db, level_sd_db : (poses, towers), optional
         Calibrated level and its standard deviation, in the unit of the log.
     level_unit : str
@@ -109,7 +109,7 @@ class Channel:
 
     @property
     def doppler_hz(self) -> FloatArray | None:
-        """The Doppler shift (paths,) [Hz], None if the velocity is not known."""
+        """The Doppler shift (paths,) [Hz]. None if the velocity is unknown."""
         own, other = self.along.velocity_mps, self.along.tower_mps
         return None if own is None else self.table.doppler_hz(self.carrier_hz, own, 0.0 if other is None else other)
 
@@ -119,12 +119,12 @@ class Channel:
         return [*self.along.remarks, *self.replay.left_out]
 
     def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
-        """Return values per path (paths, ...) as (most paths of a link, poses, towers, ...), and None as None."""
+        """Return values per path (paths, ...) as an array (paths per link, poses, towers, ...). None stays None."""
         return None if values is None else self.table.by_link(values, self.replay.ends, fill)
 
 
 def channel_dataset(channel: Channel) -> Dataset:
-    """Return the channel as labelled variables: paths by (path, time, tower), H and levels by (time, tower)."""
+    """Return the channel as labelled variables: paths over (path, time, tower), H and levels over (time, tower)."""
     variables = {
         name: _variable(name, values, dimensions, *about)
         for name, values, dimensions, *about in _quantities(channel)
@@ -150,14 +150,14 @@ def channel_dataset(channel: Channel) -> Dataset:
         described["time"] |= {"long_name": "number of the pose: the route has no times", "units": "1"}
     if channel.level_db is not None:
         described["level_db"]["comment"] = f"unit: {channel.level_unit}; the paths and H do not use what was learned"
-        # only the levels are learned from logs
+        # only the levels depend on logs
         for name in ("level_db", "level_sd_db"):
             described[name][KEY] = " ".join(channel.trained_on)
     return data
 
 
 def _face_flags(channel: Channel) -> dict[str, Any]:
-    """Return the meanings of ``faces``: the faces that a path touches, from tower to UAV."""
+    """Return the meanings of the codes of ``faces``."""
     return flags(("no_path", *(name or "line_of_sight" for name in channel.table.names)), np.int32, -1)
 
 
@@ -201,7 +201,7 @@ _GAIN = "gain of a path at the carrier, its phase included; 0 without a path"
 
 
 def _times(along: Along) -> FloatArray:
-    """Return the coordinate (poses,): seconds since a whole second or since the start [s], or numbers of poses."""
+    """Return the time coordinate (poses,): seconds since a full second or since the start, or numbers of poses."""
     if along.start is None:
         return along.time_s if along.number is None else along.number
     fraction = (along.start - along.start.astype("datetime64[s]")) / np.timedelta64(1, "s")
@@ -212,7 +212,7 @@ def _variable(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: st
     """Return dimensions, values, attributes and encoding of a variable."""
     about = {"long_name": meaning, **({"units": unit} if unit else {})}
     if np.iscomplexobj(values):
-        # the digits of a phase cannot be compressed, and level 1 is enough for the zeros
+        # compression level 1 is enough for the zeros, and phases cannot be compressed
         return dimensions, values, about, {"complevel": 1, **({"_FillValue": 0.0} if name == "gain" else {})}
     missing: Any = {"i": values.dtype.type(-1), "f": np.nan}.get(values.dtype.kind)
     of_links = dimensions[: len(_PATH)] == _PATH or dimensions == _LINK
@@ -230,12 +230,12 @@ def write_channel(
     Parameters
     ----------
     parts : iterable of Channel
-        Parts of the channel; one part if a format is not in :data:`STREAMED`.
+        Parts of the channel. There must be only one part if a format is not in :data:`STREAMED`.
     folder : Path
     formats : sequence of str
         Names of :data:`FORMATS`.
     stages : Stages
-        Times the stage "write".
+        Receives the time of the stage "write".
 
     Returns
     -------
@@ -273,7 +273,7 @@ def _netcdf(folder: Path) -> Any:
         def write(channel: Channel, folder: Path) -> Path:
             data = channel_dataset(channel)
             book.append(data)
-            # later parts add remarks and faces
+            # update the attributes, because later parts add remarks and faces
             book.describe(comment=data.attrs["comment"])
             book.describe("faces", **_face_flags(channel))
             return folder / "channel.nc"
@@ -304,7 +304,7 @@ def _write_npz(channel: Channel, folder: Path) -> Path:
 
 
 def _write_csv(channel: Channel, folder: Path) -> Path:
-    """Write a row per time and tower: the level of the link, delay and Doppler shift of its strongest path."""
+    """Write one row per time and tower: level of the link, and delay and Doppler shift of its strongest path."""
     path, table, (poses, towers) = folder / "channel.csv", channel.table, channel.replay.has_path.shape
     strongest = channel.by_link((np.abs(table.gain) ** 2).mean(axis=(1, 2)), -1.0).argmax(axis=0)
     time: AnyArray = channel.along.time_s
@@ -317,13 +317,13 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
     for name, values in (("delay_s", table.delay_s), ("doppler_hz", channel.doppler_hz)):
         each = channel.by_link(values)
         shown[name] = np.nan if each is None else np.take_along_axis(each, strongest[None], axis=0).ravel()
-    # parts are appended to the file that the first part begins
+    # the first part creates the file, and later parts are appended
     guarded(pd.DataFrame(shown)).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")
     return path
 
 
 def _write_deepmimo(channel: Channel, folder: Path) -> Path:
-    """Write a scenario of DeepMIMO 4: towers transmit to the poses, port 1 to port 1, elevations from the zenith."""
+    """Write a DeepMIMO 4 scenario from towers to poses, from port 1 to port 1, with elevations from the zenith."""
     table, ends, link = channel.table, channel.replay.ends, channel.replay.ends.link
     scenario = folder / "deepmimo" / (re.sub(r"[^a-z0-9]+", "_", channel.along.name.lower()).strip("_") or "flight")
     scenario.mkdir(parents=True)
@@ -367,5 +367,5 @@ def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]
 _WRITERS = {"npz": _write_npz, "deepmimo": _write_deepmimo, "csv": _write_csv}
 FORMATS = ("netcdf", *_WRITERS)
 
-# Formats that are written part by part. Others need the complete channel in memory.
+# Formats that are written part by part. All other formats need the complete channel in memory.
 STREAMED = {"netcdf", "csv"}

@@ -1,7 +1,7 @@
-"""Charts that the script of a page draws, and the table of serving cells.
+"""Charts that the script of a page draws, and the confusion matrix of serving cells.
 
-A chart has marks over two axes: a ``band`` (x, low, high), a ``line`` (x, y) or ``dots`` (x, y, and whiskers low to
-high). ``rows`` are names instead of an ordinate.
+A chart has marks over two axes. A mark is a ``band`` (x, low, high), a ``line`` (x, y) or ``dots`` (x, y, and whiskers
+from low to high). ``rows`` are names that replace the numbers of the ordinate.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Chart:
 
 
 def drawn(panels: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Return charts of one kind by their titles as a figure, at most three in a row."""
+    """Draw charts of one kind, by their titles, in one figure with at most three per row."""
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
     fig, axes = placed((9.2, 0.6 + 3.2 * rows), rows, columns, gap_in=(0.7, 0.8))
@@ -72,7 +72,7 @@ def drawn(panels: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 def charts_of(data: ReportData) -> list[Chart]:
-    """Return every chart that the data allow, in reading order."""
+    """Return all charts that the data allow, in the order of the page."""
     charts = []
     for panel in data.rss:
         score = panel.further.detection
@@ -112,7 +112,7 @@ def charts_of(data: ReportData) -> list[Chart]:
 
 
 def _errors(models: Sequence[ModelRow]) -> dict[str, Any]:
-    """Return a row per model, with its RMSE on held-out areas."""
+    """Return a chart with one row per model: its RMSE on held-out areas."""
     of = [(i, row) for i, row in enumerate(models) if np.isfinite(row.rmse_heldout_db)]
     rmse, apart = (np.array([getattr(row, key) for _, row in of])
                    for key in ("rmse_heldout_db", "difference_to_best_db"))  # fmt: skip
@@ -125,7 +125,7 @@ def _errors(models: Sequence[ModelRow]) -> dict[str, Any]:
 
 
 def _costs(models: Sequence[ModelRow]) -> dict[str, Any]:
-    """Return a numbered dot for each model, and a different mark for the fastest sufficient model."""
+    """Return a chart of RMSE against computing time, with one numbered dot per model."""
     marks = []
     for name, fastest in (("other models", False), ("fastest sufficient", True)):
         of = [(number, row) for number, row in enumerate(models, 1)
@@ -139,7 +139,7 @@ def _costs(models: Sequence[ModelRow]) -> dict[str, Any]:
 
 
 def flown(data: ReportData) -> list[Chart]:
-    """Return measured and simulated levels of every channel of a flight over time, for the page of a map."""
+    """Return charts of measured and simulated levels over time, one per channel of a flight, for the page of a map."""
     start, caption = start_of(data), "Ray tracing is drawn less the offset of the channel."
     clock = {"label": "", "start": str(start.astype("datetime64[ms]"))}
     axis = clock if has_wall_clock(start) else {"label": "Time after the first sample [s]", "start": ""}
@@ -157,7 +157,7 @@ def flown(data: ReportData) -> list[Chart]:
 
 
 def _detection(score: DetectionScore) -> dict[str, Any]:
-    """Return the share of detected samples against the predicted probability."""
+    """Return a chart of the share of detected samples against the predicted probability."""
     said, seen, _ = 100.0 * np.array(score.reliability, dtype=np.float64).T
     ends = np.array([0.0, 100.0])
     return {
@@ -171,7 +171,7 @@ def _detection(score: DetectionScore) -> dict[str, Any]:
 
 
 def _forecast(data: ReportData, panel: RankResult) -> dict[str, Any]:
-    """Return the probability of each rank along the flight as stacked bands."""
+    """Return a chart of the probability of each rank along the flight, as stacked bands."""
     assert panel.probability is not None
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
@@ -192,16 +192,16 @@ def _forecast(data: ReportData, panel: RankResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# The cells with the most samples have a row each. The other cells share one row.
+# Largest number of cells with their own row. All other cells share one row.
 MOST_CELLS = 16
 OTHER = "others"
 
 
 def shown_confusion(serving: ServingComparison, most: int = MOST_CELLS) -> tuple[list[str], AnyArray]:
-    """Return names and counts of a readable matrix, shape (cells, cells + 1). Its last column is "no path".
+    """Return the names of cells and a readable confusion matrix (cells, cells + 1), whose last column is "no path".
 
-    Cells that neither served nor were predicted are not shown. If there are more than ``most``, the cells with the
-    fewest samples are added up as "others".
+    Cells that neither served nor were predicted are omitted. If there are more than ``most``, the cells with the fewest
+    samples are added up as "others".
     """
     counts = np.asarray(serving.confusion)
     weight = counts.sum(axis=1) + counts[:, :-1].sum(axis=0)

@@ -1,4 +1,4 @@
-"""Every column of rss.csv and rank.csv in one table: name, unit, meaning, and how its values are computed.
+"""The columns of rss.csv and rank.csv: name, unit, meaning, and the function that computes the values.
 
 :data:`RSS` and :data:`RANK` produce the CSV files, the NetCDF variables of the exports, the list of columns on a
 report's page and the table in docs/outputs.md. A new column is one row here.
@@ -18,7 +18,7 @@ from ..compare.result import RankResult, RssResult
 from ..logs.records import has_wall_clock
 from .texts import iso_time, k_key
 
-# Positions to 0.1 mm and levels to 1e-4 dB, which is finer than any log.
+# Positions are written to 0.1 mm and levels to 1e-4 dB, which is finer than any log.
 DECIMALS = 4
 
 _RANKS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
@@ -112,7 +112,7 @@ RSS: tuple[Column, ...] = (
 
 
 def _integers(values: Any) -> Any:
-    """Return values as integers, which are written without decimals, and as empty cells if NaN."""
+    """Return values as integers, so that they are written without decimals. NaN becomes an empty cell."""
     import pandas as pd
 
     return pd.Series(values, dtype="float64").astype("Int64").array
@@ -145,7 +145,7 @@ def header(columns: Sequence[Column]) -> list[str]:
 
 
 def described(columns: Sequence[Column]) -> list[tuple[str, str, str]]:
-    """Return name, unit and meaning of each column. A family has an ellipsis for its model, K or rank."""
+    """Return name, unit and meaning of each column. In a family, an ellipsis replaces the model, K or rank."""
     return [(column.name.format("…"), column.unit, column.meaning.format("…")) for column in columns]
 
 
@@ -215,7 +215,7 @@ def _times(time: Any, part: slice) -> dict[str, Any]:
     known = instants[~np.isnat(instants)]
     if not len(known):
         return {"time_utc": "", "time_s": np.full(len(instants[part]), np.nan)}
-    # the first time of the complete table, because all parts count from the same time
+    # use the first time of the complete table, so that all parts have the same zero
     first = known.min()
     seconds = (instants[part] - first) / np.timedelta64(1, "s")
     return {"time_utc": iso_time(instants[part]) if has_wall_clock(first) else "", "time_s": seconds}

@@ -1,4 +1,4 @@
-"""diff.html and diff.json: changes between two reports of one flight, and sentences about them."""
+"""The files diff.html and diff.json, which describe the changes between two reports of one flight."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from .flight_words import count
 from .page import json_text, write_file
 from .texts import cut, interval, minute, number, short
 
-# Differences up to this are ignored, because the tables have four decimals, and one for offsets.
+# Differences up to this are ignored, because tables are rounded to four decimals, and offsets to one.
 TOLERANCE_DB = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """A named value of two reports. None if a report has no such entry."""
+    """A named value in two reports, None if a report does not have it."""
 
     key: str
     first: Any
@@ -38,7 +38,7 @@ class Entry:
 class InputEntry:
     """An input file that differs between the reports.
 
-    ``what`` is added, removed or changed.
+    ``what`` is "added", "removed" or "changed".
     """
 
     role: str
@@ -58,7 +58,7 @@ class ReportSide:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportDiff:
-    """Two reports, ``first`` and ``second``. Every difference is second minus first.
+    """Two reports and their differences. Every difference is second minus first.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class ReportDiff:
     pooled : PairedDifference, optional
         Difference in RMSE over all links.
     links_first_only, links_second_only : tuple of str
-        Links that only one report has.
+        Links that only the first, or only the second, report has.
     remarks : tuple of str
         Limits of the comparison, and numbers that look wrong.
     """
@@ -224,12 +224,12 @@ def changes_card(diff: ReportDiff) -> Card:
     )  # fmt: skip
 
 
-# A hash or a fingerprint of a log.
+# A SHA-256 digest or a fingerprint of a log.
 _DIGEST = re.compile(r"\b([0-9a-f]{12})[0-9a-f.]{20,}")
 
 
 def in_short(value: Any) -> str:
-    """Return the text of a value, with the first 12 digits of each hash and fingerprint.
+    """Return the text of a value. Digests and fingerprints are shortened to 12 digits.
 
     The file diff.json has all digits.
 
@@ -253,7 +253,7 @@ def write_diff(diff: ReportDiff, folder: Path) -> list[Path]:
     return [write_file(folder / "diff.html", diff_page(diff)), write_file(folder / "diff.json", numbers)]
 
 
-# Sentences about two reports, by the verdict of the paired interval. Only they contain "better" and "worse".
+# Sentences about two reports, by the verdict of the paired interval. Only these contain "better" and "worse".
 DIFFERENCE = {
     "better": "The second is significantly better: {difference:+.2f} dB {interval} (95 %).",
     "worse": "The second is significantly worse: {difference:+.2f} dB {interval} (95 %).",
@@ -261,7 +261,7 @@ DIFFERENCE = {
     "no interval": "The difference is {difference:+.2f} dB; too few independent samples for an interval.",
 }
 
-# Number of differences in the first sentence if the RMSE are equal.
+# Number of differences that the first sentence names if the RMSE are equal.
 _NAMED = 2
 
 
@@ -278,7 +278,7 @@ def verdict(diff: ReportDiff) -> str:
 
 
 def _site_alone(diff: ReportDiff) -> bool:
-    """Check whether only the site changed: its key of the flight file, the flight file, and the file of the site."""
+    """Check whether only the site changed: its key in the flight file, the flight file itself, and the site file."""
     settings = [entry.key.split(".")[0] == "site" for entry in diff.settings]
     inputs = [entry.role.startswith("site file") for entry in diff.inputs]
     others = [entry for entry in diff.inputs if not entry.role.startswith(("site file", "flight file"))]

@@ -1,7 +1,7 @@
-"""The data of the linked views of a report, as one block of packed arrays for the script of the page.
+"""Data of the linked views of a report, as one block of packed arrays for the script of the page.
 
-The script computes only numbers of a selected segment (offset, RMSE, correlation and histograms), by the formulas of
-:mod:`aerpaw_cmp.compare`.
+The script itself computes only the numbers of a selected segment (offset, RMSE, correlation and histograms), with the
+formulas of :mod:`aerpaw_cmp.compare`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .flight_words import instants, nearest_k, pretty
 from .packed import PackedArrays, packed, scene
 from .texts import k_key
 
-# Largest number of samples of all series on a page. Longer series are thinned, and extremes are retained.
+# Largest number of samples of all series on a page. Longer series are thinned, but retain their extremes.
 POINTS = 50_000
 
 TRACK_POINTS = 4000
@@ -44,7 +44,7 @@ def payload(data: ReportData, charts: Sequence[Chart] = (), limit: int = POINTS)
     total = sum(len(p.time) for p in data.rss) + sum(len(p.time) for p in data.rank)
 
     def share(n: int) -> int:
-        # at least 200, so that a short series next to a very long one retains its shape
+        # at least 200 samples, so that a short series keeps its shape next to a very long one
         return n if total <= limit else max(200, limit * n // total)
 
     rss_settings = data.settings.get("rss") or {}
@@ -66,7 +66,7 @@ def payload(data: ReportData, charts: Sequence[Chart] = (), limit: int = POINTS)
 
 
 def _place(panel: RssResult | RankResult, pick: IntArray, arrays: PackedArrays) -> dict[str, int]:
-    """Return positions of the UAV, and of a tower that moves."""
+    """Return the positions of the UAV, and of the tower if it moves."""
     ends = [("", panel.position_m), *([] if panel.tower_m is None else [("tower_", panel.tower_m)])]
     return {
         f"{whose}{axis}": arrays.add(places[pick])
@@ -81,7 +81,7 @@ AXES = ("east", "north", "up")
 def _rss(
     panel: RssResult, source: Source | None, start: np.datetime64, arrays: PackedArrays, limit: int
 ) -> dict[str, Any]:
-    # retain the extremes of the residual, too, because a reader looks for the largest errors
+    # also retain the extremes of the residual, because readers look for the largest errors
     pick = keep_extremes([panel.measured_db, panel.residual_db], limit)
     models = [{"name": "ray tracing", **_fit(panel.score), "level": arrays.add(panel.simulated_dbm[pick]),
                "learned_here": panel.training}]  # fmt: skip

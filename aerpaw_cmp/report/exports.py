@@ -1,12 +1,12 @@
-"""Samples along a flight as files for other programs: ``write_exports(export, folder, formats)``.
+"""Export of the samples along a flight as files for other programs.
 
-An :class:`Export` contains one table of points per kind (``rss``, ``rank``), with a row per sample: its link, time,
-position and values. The values are those of ``rss.csv`` and ``rank.csv`` with the same rounding, and latitude and
-longitude. A missing number is NaN, and a rank of 0 means that there is no path.
+An :class:`Export` contains one table of points per kind (``rss``, ``rank``), with one row per sample: link, time,
+position and values. The values are those of ``rss.csv`` and ``rank.csv`` with the same rounding. Latitude and longitude
+are added. A missing number is NaN, and a rank of 0 means that there is no path.
 
-Each format is one function ``write_X(export, folder)``. NetCDF follows CF-1.11. The KMZ has tracks for Google Earth
-coloured by level, residual and rank, in one folder per link and quantity, of which the first is visible. Samples out
-of coverage are grey. Maps over a grid are written by :mod:`aerpaw_cmp.maps.export`.
+Each format is one function ``write_X(export, folder)``. NetCDF follows CF-1.11. The KMZ contains tracks for Google
+Earth, coloured by level, residual and rank. There is one folder per link and quantity, and only the first is visible at
+first. Samples out of coverage are grey. Maps over a grid are written by :mod:`aerpaw_cmp.maps.export`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from .texts import iso_time
 # 8 decimals of a degree are 1 mm.
 _DEGREE_DECIMALS = 8
 
-# Units for UDUNITS; levels of logs that are not in dBm are ratios.
+# Units in the notation of UDUNITS. Levels that are not in dBm count as ratios.
 _UDUNITS = {"": "1", "m": "m", "s": "s", "dBm": DBM}
 
 # Columns that identify a link.
@@ -63,7 +63,8 @@ class Points:
     kind : str
         Name of files and layers: ``"rss"``, ``"rank"``.
     table : pandas.DataFrame
-        ``time`` (UTC), :data:`LINK`, unit, :data:`PLACES` and ``columns``. Each link is contiguous and in time order.
+        Table with ``time`` (UTC), :data:`LINK`, unit, :data:`PLACES` and ``columns``. The rows of each link are
+        contiguous and in time order.
     columns : tuple of Column
     """
 
@@ -81,7 +82,7 @@ class Points:
 class Export:
     """The exported content of a flight.
 
-    ``clock`` is True if times are UTC. Otherwise they count from 1970-01-01, because the logs have relative times.
+    ``clock`` is True if times are UTC. If the logs have relative times, it is False, and times count from 1970-01-01.
     """
 
     data: ReportData
@@ -276,14 +277,14 @@ def _shown(points: Points) -> Iterator[_Shown]:
     scales = _scales_of(points)
     columns = {c.name: c for c in points.columns if c.name in scales}
     for (_, tower, channel, rows), (name, column) in itertools.product(points.links(), columns.items()):
-        if name.startswith("simulated_rank") and rows[name].isna().all():  # only other links have this K
+        if name.startswith("simulated_rank") and rows[name].isna().all():  # this K occurs only on other links
             continue
         shown = f"{tower} {channel}".strip() + f", {_LEVELS.get(name, column.meaning)}"
         yield _Shown(name=shown, column=column, scale=scales[name], rows=rows)
 
 
 def _style(scale: Scale) -> str:
-    """Return one line style per colour. KML writes alpha, blue, green, red."""
+    """Return one KML line style per colour. The order in KML is alpha, blue, green, red."""
     return "".join(
         f'<Style id="{scale.key}{i}"><LineStyle><color>ff{c[5:7]}{c[3:5]}{c[1:3]}</color><width>4</width></LineStyle>'
         "</Style>"
@@ -301,7 +302,7 @@ def _towers(export: Export) -> str:
 
 
 def _flown(export: Export) -> str:
-    """Return the track, with times if they are known. Empty if there are fewer than two positions."""
+    """Return the track as KML, with times if they are known. Empty if there are fewer than two positions."""
     if (line := export.data.track) is None:
         return ""
     known = np.flatnonzero(np.isfinite(line.east_m) & np.isfinite(line.north_m) & ~np.isnat(line.time))
@@ -321,7 +322,7 @@ def _flown(export: Export) -> str:
 
 
 def _lines(shown: _Shown, budget: int, *, clock: bool, visible: bool) -> Iterator[str]:
-    """Yield the lines of a link, one per segment of one colour."""
+    """Yield the lines of a link. Each line has one colour."""
     rows = shown.rows[shown.rows["latitude_deg"].notna() & shown.rows["time"].notna()]
     if len(rows) < 2:
         return
@@ -331,7 +332,7 @@ def _lines(shown: _Shown, budget: int, *, clock: bool, visible: bool) -> Iterato
     times, bins = iso_time(rows["time"].to_numpy()), shown.scale.bin_of(values)
     starts = np.flatnonzero(np.concatenate([[True], bins[1:] != bins[:-1]]))
     for first, after in zip(starts, [*starts[1:], len(rows) - 1], strict=True):
-        last = int(after)  # a line ends at the beginning of the next one, so that there is no gap
+        last = int(after)  # end a line where the next begins, so that there is no gap
         if last <= first:
             continue
         number = int(bins[first])
@@ -365,7 +366,7 @@ OUT = CLASS_COLOURS[0]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scale:
-    """The colours of one quantity: ``edges`` (m + 1,) between them, or None if its values are classes."""
+    """The colours of one quantity, with the ``edges`` (m + 1,) of their ranges, or None if the values are classes."""
 
     key: str
     title: str
@@ -375,11 +376,11 @@ class Scale:
 
     @property
     def legend(self) -> str:
-        """The name of the picture of the scale in the archive."""
+        """The name of the picture of this scale in the archive."""
         return f"legends/{self.key}.png"
 
     def bin_of(self, values: FloatArray) -> IntArray:
-        """Return the number of the colour of each value (n,). The last is out of coverage."""
+        """Return the index of the colour of each value (n,). The last colour means out of coverage."""
         last, known = len(self.colours) - 1, np.nan_to_num(values)
         inner = np.arange(1.5, last) if self.edges is None else self.edges[1:-1]
         missing = ~np.isfinite(values) | ((known < 1) & (self.edges is None))
@@ -393,7 +394,7 @@ RANKS = Scale(
 
 
 def _scales_of(points: Points) -> dict[str, Scale]:
-    """Return the scale of each coloured column: levels share one, residuals have another, ranks have classes."""
+    """Return the scale of each coloured column. Levels share one scale, residuals another, and ranks have classes."""
     if points.kind == "rank":
         return {c.name: RANKS for c in points.columns if c.name.startswith(("measured_rank", "simulated_rank"))}
     names = ["calibrated_db", "simulated_dbm"]
@@ -409,11 +410,11 @@ def _scales_of(points: Points) -> dict[str, Scale]:
 
 
 def _round_step(step: float) -> float:
-    """Round a step up to 1, 2 or 5 times a power of ten."""
+    """Return a step rounded up to 1, 2 or 5 times a power of ten."""
     if not step > 0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(step))
-    # a step of 2 with a rounding error must not become 5
+    # with a margin, because a rounding error must not turn a step of 2 into 5
     return float(next(m for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9)) * power)
 
 
@@ -441,7 +442,7 @@ FOLDER = "exports"
 
 
 def chosen_formats(names: Iterable[str], known: Iterable[str] = FORMATS) -> tuple[str, ...]:
-    """Return the formats that a user names. Names may be joined by commas, and ``all`` names every format.
+    """Return the formats that a user chose. Names may be joined by commas, and ``all`` means every format.
 
     Raises
     ------
@@ -466,7 +467,7 @@ def chosen_formats(names: Iterable[str], known: Iterable[str] = FORMATS) -> tupl
 
 
 def _missing_module(name: str) -> str:
-    """Return the missing module of a format, or an empty text."""
+    """Return the name of a module that a format needs and that is not installed, or an empty text."""
     return next((module for module in _NEEDS.get(name, ()) if importlib.util.find_spec(module) is None), "")
 
 
@@ -481,7 +482,7 @@ def write_exports(export: Export, folder: Path, formats: Iterable[str], progress
     formats : iterable of str
         Names of :data:`FORMATS`.
     progress : Progress
-        Called for a format of ``all`` whose library is missing.
+        Receives a message for each format of ``all`` whose library is missing.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""report.html of a flight, its metrics.json, and the folder of its results."""
+"""The page report.html of a flight, its metrics.json, and the folder of its results."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from .flight_data import RANKS, InputFile, ReportData, start_of
 from .page import about, json_text, merge, rendered, write_figures, write_file
 from .texts import clock, cut, duration, interval, k_key, minute, number, percent
 
-# Rejected lines shown per file; the flight file contains all.
+# Largest number of rejected lines that are shown per file.
 _REJECTED_SHOWN = 20
 
 # Formats in which figures are written as files.
@@ -44,7 +44,7 @@ FIGURES = ("none", "svg", "png", "pdf", "all")
 
 
 def metrics(data: ReportData) -> dict[str, Any]:
-    """Return the content of metrics.json as plain values. ``extra_metrics`` of the data is merged last, key by key."""
+    """Return the content of metrics.json as plain values. ``data.extra_metrics`` is merged last, key by key."""
     rss: dict[str, dict[str, Any]] = {}
     for item in data.rss:
         rss.setdefault(item.tower, {})[item.channel] = _rss_metrics(item)
@@ -103,7 +103,7 @@ def _rss_metrics(series: RssResult) -> dict[str, Any]:
 
 
 def clock_metrics(clock: ClockResult) -> dict[str, Any]:
-    """Return ``clock.<receiver>`` of metrics.json: numbers, verdict, whether it was applied, and its checks."""
+    """Return the entry ``clock.<receiver>`` of metrics.json: numbers, verdict, whether it was applied, and checks."""
     return {
         **clock.checks,
         "radio_minus_telemetry_s": clock.radio_minus_telemetry_s, "ci95_s": clock.ci95_s, "verdict": clock.verdict,
@@ -317,7 +317,7 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
 
 
 def models_card(data: ReportData) -> Card:
-    """Return the card that compares models by their error on held-out areas, over all channels and for each."""
+    """Return the card that compares models by their error on held-out areas, over all channels and per channel."""
     if not data.models:
         return Card()
     kept, same = distinct(data.ladder, words.AS_SET)
@@ -362,7 +362,7 @@ def models_card(data: ReportData) -> Card:
 
 
 def serving_card(data: ReportData) -> Card:
-    """Return the card that compares serving cells with the cells predicted strongest."""
+    """Return the card that compares serving cells with the cells that are predicted to be the strongest."""
     serving = data.serving
     if serving is None or not serving.n:
         return Card()
@@ -507,7 +507,7 @@ def _rejected(f: InputFile) -> Table:
 
 def method_card(data: ReportData, files: Sequence[str]) -> Card:
     """Return the card of the method, the notes of site and flight, and the columns of the files."""
-    notes = list(dict.fromkeys([*data.site.notes, *data.notes]))  # notes of the flight may repeat notes of the site
+    notes = list(dict.fromkeys([*data.site.notes, *data.notes]))  # notes of flight and site may be equal
     heads = {"Column": HEAD, "Unit": TEXT, "Meaning": TEXT}
     tables = [
         Table(caption=f"Columns of {name}.", columns=heads, rows=described(columns))
@@ -559,7 +559,7 @@ def page(data: ReportData, files: Sequence[str]) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WrittenReport:
-    """The files of a report, ``report.html`` first, and its record with the seconds of all stages."""
+    """The files of a report, ``report.html`` first, and its data with the seconds of all stages."""
 
     files: tuple[Path, ...]
     data: ReportData
@@ -587,7 +587,7 @@ def write_report(
     exports : sequence of str
         Formats of :data:`aerpaw_cmp.report.exports.FORMATS` for the samples, in addition to CSV.
     stages : Stages, optional
-        Clock of the stages. The seconds of the stage "report" are stored in the record.
+        Receives the time of the stage "report", which is also stored in the data.
 
     Returns
     -------
@@ -605,7 +605,7 @@ def write_report(
         specs = [] if drawn == "none" else figures.figure_specs(data)
         formats = FORMATS if drawn == "all" else (drawn,)
         for name, text in (("rss.csv", csv_text(RSS, data.rss)), ("rank.csv", csv_text(RANK, data.rank))):
-            # write a table without rows, too, so that every report has the same files
+            # also write a table without rows, so that every report has the same files
             written.append(write_file(folder / name, text))
         pictures = write_figures(specs, folder / "figures", formats, style, stages.progress)
     written += pictures
@@ -617,7 +617,7 @@ def write_report(
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
     offered = (folder, folder / FOLDER)
     files = ["metrics.json", *(path.relative_to(folder).as_posix() for path in written if path.parent in offered)]
-    # the page names the folder of figures only if it was written
+    # the page lists the folder of figures only if there are any
     files += ["figures/"] * bool(pictures)
     with stages("report"):
         html = write_file(folder / "report.html", page(data, files))

@@ -1,6 +1,6 @@
 """The content of a report: the numbers of :mod:`aerpaw_cmp.compare.result` and their context.
 
-A flight with rank only has ``rss=()``. A missing number is NaN, and ``null`` in ``metrics.json``. Times are naive
+A flight with only rank has ``rss=()``. A missing number is NaN here, and ``null`` in ``metrics.json``. Times are naive
 ``datetime64[ns]`` in UTC.
 """
 
@@ -21,7 +21,7 @@ from ..flight.gains import antennas_used
 from ..logs.records import RejectedLine
 from ..site.site import Site
 
-if TYPE_CHECKING:  # the modules of logs and replay load pandas
+if TYPE_CHECKING:  # import only for type checks, because these modules load pandas
     from ..flight.data import FlightData
     from ..flight.replay import FlightReplay, Replayed
     from ..flight.settings import LogSettings
@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # the modules of logs and replay load pandas
 # Ranks of a 4 x 4 channel, the bars of every histogram.
 RANKS = (1, 2, 3, 4)
 
-# Quantities against which residuals are drawn, and their axis labels.
+# Quantities against which residuals are plotted, with their axis labels.
 GEOMETRY = {
     "distance_m": "Distance tower to UAV [m]",
     "elevation_deg": "Elevation of the UAV seen from the tower [deg]",
@@ -48,7 +48,7 @@ GEOMETRY = {
 class InputFile:
     """An input file. For a log, ``lines == accepted + rejected + blank``.
 
-    ``rejected`` is the number of rejected lines; ``rejected_lines`` may contain only some of them.
+    ``rejected`` is the number of all rejected lines. ``rejected_lines`` may contain only some of them.
     """
 
     path: str
@@ -62,12 +62,12 @@ class InputFile:
     warnings: tuple[str, ...] = ()
     rejected_lines: tuple[RejectedLine, ...] = ()
     learned_on: tuple[str, ...] = ()
-    """SHA-256 of the logs that this file was learned from. Empty for other files."""
+    """SHA-256 of the logs from which this file was learned. Empty for files that were not learned."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """The track of the UAV, with ``time`` (n,) and positions (n,) in the site frame [m]."""
+    """The track of the UAV: ``time`` (n,), and positions (n,) in the site frame [m]."""
 
     time: AnyArray
     east_m: FloatArray
@@ -87,14 +87,14 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """The origin of samples in the logs: names of the files, and the numbers of file and line of each sample (n,)."""
+    """The origin of samples in the logs: names of the files, and file and line number of each sample (n,)."""
 
     files: tuple[str, ...]
     file: IntArray
     line: IntArray
 
 
-# Kind of a path other than reflections, such as a diffracted path.
+# Kind of a path that does not consist of reflections only, such as a diffracted path.
 FURTHER = -1
 
 
@@ -108,7 +108,8 @@ class PosePaths:
     time : (poses,) datetime64[ns]
         Times of the poses, from the first channel of the tower.
     lines : tuple of tuples
-        Paths of each pose: points (corners, 3) from tower to UAV [m], and the number of reflections or the kind.
+        Paths of each pose. A path has points (corners, 3) from tower to UAV [m], and its number of reflections or
+        :data:`FURTHER`.
     """
 
     tower: str
@@ -134,13 +135,13 @@ class ReportData(FlightResult):
     sources : mapping of str to Source
         Origin of the samples in the logs, by tower and channel.
     synthetic : bool
-        True if the logs were made by ``aerpaw-cmp simulate``, which the first screen states.
+        True if ``aerpaw-cmp simulate`` made the logs. The first screen then says so.
     warnings : tuple of str
         Sentences about limits of the numbers.
     doubts : tuple of str
         Clauses about clocks and heights for the summary.
     cautions : tuple of str
-        Sentences about settings that do not fit, which are shown before all warnings.
+        Sentences about settings that do not fit the flight. They are shown before all warnings.
     antennas : tuple of str
         Sentences that name the antennas of the replay.
     notes : tuple of str
@@ -150,7 +151,7 @@ class ReportData(FlightResult):
     stages_s : mapping of str to float
         Seconds of each stage.
     extra_metrics : mapping
-        Further content of ``metrics.json``, merged last, key by key.
+        Additional content of ``metrics.json``, merged last, key by key.
     """
 
     title: str
@@ -194,10 +195,10 @@ def used_towers(data: ReportData) -> list[str]:
     return [name for name in used if name in data.site.towers] or list(data.site.towers)
 
 
-# Poses per tower whose paths are drawn.
+# Number of poses per tower whose paths are drawn.
 POSES = 300
 
-# Largest number of paths of other kinds than reflections that are drawn for a pose.
+# Largest number of paths of kind :data:`FURTHER` that are drawn per pose. The shortest are drawn.
 SHORTEST = 8
 
 
@@ -268,8 +269,8 @@ def report_data(
 def clock_warnings(clocks: Mapping[str, ClockResult], cause: Cause | None = None) -> tuple[str, ...]:
     """Return sentences about clocks that were or should be corrected, or could not be checked.
 
-    Requested corrections that were not made come first. Receivers of one computer share a clock and a sentence. A clock
-    that is the likely cause is omitted, because the summary contains it.
+    Requested corrections that were not made come first. There is one sentence per clock, because receivers of one
+    computer share a clock. A clock that is the likely cause is omitted, because the summary names it.
     """
     named = cause.channels if cause is not None and "clock" in cause.name.split(" or ") else ()
     late = {channel.partition(" ")[0] for channel in named}
@@ -294,7 +295,7 @@ def _clock_warning(clock: ClockResult) -> str:
 
 
 def rss_warnings(result: RssResult) -> tuple[str, ...]:
-    """Return warnings about a channel that could not be compared, or whose offset is at the end of its search range."""
+    """Return warnings about a channel that could not be compared, or whose offset is at the end of the search range."""
     if result.score.n == 0:
         return (f"{result.name}: no sample could be compared; its numbers are missing, not zero.",)
     if result.score.at_edge:
@@ -357,7 +358,7 @@ def track_of(data: FlightData) -> Track | None:
 
 
 def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
-    """Return the waypoints of the plan or of the report settings, each at the time at which the track is nearest."""
+    """Return the waypoints of the plan or of the report settings, each at the time when the track is nearest to it."""
     plan = data.settings.flight.plan
     points = data.settings.report.waypoints or (plan.waypoints if plan else [])
     track = track_of(data)
@@ -368,7 +369,7 @@ def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
         if not point.label:
             continue
         distance = np.linalg.norm(line_m[start:] - (point.east_m, point.north_m, point.height_m), axis=1)
-        # take the first time within 2 m of the nearest approach, because later visits belong to later waypoints
+        # use the first time that is within 2 m of the nearest approach, because later visits belong to later waypoints
         near = np.flatnonzero(distance <= np.nanmin(distance) + 2.0)
         index = start + int(near[0])
         out.append(Waypoint(label=point.label, time=track.time[index], east_m=point.east_m, north_m=point.north_m))

@@ -1,4 +1,4 @@
-"""Figures of a flight as files. ``map --with`` writes the figures of two channels, too."""
+"""Figures of a flight as files. ``map --with`` also writes the figures that compare two channels."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 def figure_specs(data: ReportData) -> list[FigureSpec]:
-    """Return every figure that the data allow. A number is added to equal file names."""
+    """Return all figures that the data allow. Equal file names get a number."""
     used: dict[str, int] = {}
     result = []
     for spec in (*_track_and_level(data), *channel_specs(data), *_ranks(data)):
@@ -90,9 +90,9 @@ def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
 
 
 def trajectory(data: ReportData, track: Track) -> Figure:
-    """Draw the flight on the plan of the site, and enlarged with the height as colour."""
+    """Draw the flight on the plan of the site, and enlarged with its height as colour."""
     fig, (site_plan, close) = subplots((9.2, 5.4), 1, 2, width_ratios=(1.0, 1.35))
-    # tracks of towers that move, whose symbols are at the middle of the track
+    # draw tracks of towers that move, because a symbol shows only the middle of the track
     ways = {item.tower: item.tower_m[:, :2] for item in data.series if item.tower_m is not None}
     for ax in (site_plan, close):
         draw_site(ax, data.site)
@@ -110,7 +110,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     frame_around(site_plan, *np.concatenate([flown, *places.values()]).T, least_m=200.0, shape=0.75)
     extent, centre = np.nanmax([*np.ptp(flown, axis=0), 100.0]), np.nanmean(flown, axis=0)
     used = (places[name] for name in used_towers(data))
-    # next to a distant tower the flight would be a dot
+    # omit distant towers, because the flight would be a dot next to them
     near = [place for place in used if np.linalg.norm(place - centre) < extent]
     frame_around(close, *np.concatenate([flown, *near, *ways.values()]).T)
     for waypoint in data.waypoints:
@@ -146,7 +146,7 @@ def altitude(data: ReportData, track: Track) -> Figure:
 
 
 def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
-    """Draw the measured level as logged, simulation and baselines minus their offsets, and the residual over time."""
+    """Draw over time: the level as logged, simulation and baselines minus their offsets, and the residual."""
     start, score = start_of(data), panel.score
     seconds = seconds_since(panel.time, start)
     fig, (ax, below) = subplots((9.2, 5.6), 2, 1, sharex=True, height_ratios=(2.6, 1.0))
@@ -162,7 +162,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
         colour, dashes = BASELINE[name]
         ax.plot(
             *thinned(seconds, _moved(baseline.level_dbm, baseline.offset_db)), color=colour, linestyle=dashes,
-            linewidth=1.2, zorder=2.5 if name == "two_ray" else 3.7,  # its dense fringes would hide the other lines
+            linewidth=1.2, zorder=2.5 if name == "two_ray" else 3.7,  # its dense fringes would hide other lines
             label=f"{pretty(name)} (own offset)",
         )  # fmt: skip
     label = f"ray tracing, {_offset(score.offset_db)}"
@@ -204,7 +204,7 @@ def _moved(level_dbm: FloatArray, offset_db: float) -> FloatArray:
 
 
 def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssResult]) -> Figure:
-    """Draw both channels of a tower and the ray tracing. Segments in which they differ are shaded (Fig. 15)."""
+    """Draw both channels of a tower and the ray tracing. Segments in which the channels differ are shaded (Fig. 15)."""
     start, (first, second) = start_of(data), panels
     fig, ax = subplots((9.2, 3.6))
     for span in pair.score.spans:
@@ -249,7 +249,7 @@ def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: F
         ax.scatter(
             east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **style,
             label=f"{f'rank {value}' if value else 'no path'} ({count(int(at.sum()))})",
-            zorder=3.0 + 1.0 / at.sum(),  # rare ranks are on top, so that few points are visible among many
+            zorder=3.0 + 1.0 / at.sum(),  # rare ranks on top, so that they are visible
         )  # fmt: skip
     ax.set_title(title)
     ax.legend(
@@ -266,7 +266,7 @@ def rank_maps(data: ReportData, panel: RankResult) -> Figure:
     rows = -(-len(maps) // columns)
     east, north, _ = panel.position_m.T
     shape = plan_shape(east, north)
-    # title, axis label and a legend of two lines need 1.6 inches
+    # 1.6 inches are for title, axis label and a legend of two lines
     fig, axes = subplots((9.2, rows * (3.9 / shape + 1.6)), rows, columns, squeeze=False)
     for ax, (title, rank) in zip(axes.ravel(), maps, strict=False):
         _rank_map(ax, data.site, east, north, rank, title)
@@ -309,7 +309,7 @@ def rank_histograms(panel: RankResult) -> Figure:
 
 
 def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
-    """Draw the measured rank and the rank of every K over time in rows, above SINR and singular values."""
+    """Draw the measured rank and the rank for every K over time, above SINR and singular values."""
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
     rows = 1 + len(panel.rank)
@@ -338,7 +338,7 @@ def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
 
 
 def _draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankResult) -> None:
-    """Draw reported ranks as ticks. Ranks held over from an earlier report are smaller and grey."""
+    """Draw reported ranks as ticks. Ranks that repeat an earlier report are smaller and grey."""
     held_over = ~panel.score.staleness.fresh
     for mask, label, colour, size in (
         (~held_over, "measured", "#0072B2", 7),
@@ -366,6 +366,6 @@ def _draw_singular_values(ax: Axes, seconds: FloatArray, panel: RankResult) -> N
     lowest = [-20 * np.log10(k) for k in panel.rank] + values[np.isfinite(values)].tolist()
     ax.set_ylim(max(min(lowest, default=-20.0) - 6.0, -110.0), 2.0)  # values below -110 dB are rounding errors
     ax.set_ylabel("Singular value\nover largest [dB]")
-    # one entry for all thresholds
+    # one legend entry for all thresholds
     entries = dict(zip(*ax.get_legend_handles_labels()[::-1], strict=True))
     ax.legend(entries.values(), entries.keys(), loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)

@@ -1,4 +1,4 @@
-"""The page of ``tap --web``: one file that contains its map and requests data only from the tap."""
+"""The page of ``tap --web``, one file that contains its map and requests data only from the tap."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def live_map(
     heights_m : sequence of float
     grid : Grid
     values : (heights, north, east) int, (heights, north, east) float
-        Rank, 0 without a path, and level [dBm], NaN without a path.
+        Rank (0 without a path), and level [dBm] (NaN without a path).
 
     Returns
     -------
@@ -65,7 +65,7 @@ def live_page(background: dict[str, Any] | None, title: str) -> tuple[bytes, str
     Parameters
     ----------
     background : dict, optional
-        Result of :func:`live_map`. None: the page shows the measurement alone, without a map.
+        Result of :func:`live_map`. With None, the page shows only the measurement, without a map.
     title : str
         Text next to the heading.
     """

@@ -1,4 +1,4 @@
-"""locate.html with metrics.json: the regions that contain a ground node, on the map of the site."""
+"""The page locate.html with its metrics.json: a map of the regions that contain a ground node."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def write_locate(
     Parameters
     ----------
     numbers : mapping
-        Content of metrics.json; ``modes`` are positions, the likeliest first.
+        Content of metrics.json. ``modes`` are the possible positions, the likeliest first.
     regions : Regions
     track_m : (n, 2 or more)
         East, north of the flight [m].

@@ -1,7 +1,7 @@
-"""map.html and metrics.json of the command ``map``: maps, tables, sentences, figures, and the data of the script.
+"""The page map.html of the command ``map`` and its metrics.json: maps, tables, sentences, figures and script data.
 
-All maps of a page have one grid, with row 0 in the south and column 0 in the west. The script computes the numbers of
-a layer (share in coverage, median, shares of ranks) from rounded values, and :func:`layer_numbers` returns the same
+All maps of a page have the same grid, with row 0 in the south and column 0 in the west. The script computes the numbers
+of a layer (share in coverage, median, shares of ranks) from rounded values, and :func:`layer_numbers` returns the same
 numbers for metrics.json.
 """
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Name of the nearest tower, which serves each position of a joint map.
+# Name of the joint map, in which the nearest tower serves each position.
 JOINT = "joint"
 
 
@@ -53,18 +53,19 @@ _RANK_CLASSES = ("Z", *map(str, RANKS))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapLayer:
-    """A map of one quantity.
+    """A map layer of one quantity.
 
     Parameters
     ----------
     quantity, unit : str
-        Layers of one quantity share a colour scale and can be subtracted.
+        Quantity and unit. Layers of the same quantity share a colour scale and can be subtracted.
     values : (rows, columns)
-        Values from the south-west; NaN out of coverage.
+        Values, starting in the south-west; NaN out of coverage.
     classes : tuple of str
-        Names of the values 0, 1, ... of a layer of classes.
+        Names of the values 0, 1, ..., for a layer of classes.
     version, link, tower, antennas, foliage : str
-        Properties that distinguish layers of a quantity; empty if they do not apply. The tower "joint" is the nearest.
+        Properties that distinguish layers of a quantity, empty if they do not apply. The tower "joint" means the
+        nearest tower.
     k : float, optional
         Singular-value ratio of a rank.
     height_m : float
@@ -85,7 +86,7 @@ class MapLayer:
 
     @property
     def axes(self) -> dict[str, str]:
-        """The properties of this layer as texts, by the label of their choice on the page."""
+        """The properties of this layer as texts, by the label of the menu on the page."""
         k = "" if self.k is None else k_key(self.k)
         height = "" if math.isnan(self.height_m) else f"{self.height_m:g} m"
         axes = {"Version": self.version, "Link": self.link, "Tower": self.tower, "Antennas": self.antennas, "K": k,
@@ -93,7 +94,7 @@ class MapLayer:
         return {name: value for name, value in axes.items() if value}
 
     def place(self, axis: str) -> float:
-        """Return a number that orders the choices of an axis: the joint map first, then rising K and heights."""
+        """Return a number for sorting the choices of an axis: the joint map first, then rising K and heights."""
         return {"Tower": float(self.tower != JOINT), "K": self.k, "Height": self.height_m}.get(axis) or 0.0
 
 
@@ -108,7 +109,7 @@ class RssMap(MapLayer):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankMap(MapLayer):
-    """The rank for one K. ``share`` (5,) contains the shares of positions out of coverage and of ranks 1 to 4.
+    """The rank for one K. ``share`` (5,) contains the shares of positions out of coverage and with rank 1 to 4.
 
     If K is None, the rank is the most probable rank of a learned receiver, and ``share`` contains mean probabilities.
     """
@@ -139,7 +140,7 @@ class MapError:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperRow:
-    """A number of the paper, the same number of this run, and the figure that shows it."""
+    """A number of the paper, the same number from this run, and the figure that shows it."""
 
     where: str
     what: str
@@ -162,27 +163,27 @@ class MapsData(Made):
     borders_m : tuple of (2, 2) arrays
         Lines between the areas of two towers (Voronoi), east and north [m].
     rank : tuple of RankMap
-        Ranks of the nearest tower. ``rank_by_tower`` contains the ranks of each tower, for the map of the page.
+        Ranks with the nearest tower. ``rank_by_tower`` contains the ranks with each tower, for the map of the page.
     corrected : tuple of RssMap
-        Levels of each link for figures, raw and corrected by flights (in the field ``antennas``).
+        Levels of each link for figures, raw and corrected by flights. The field ``antennas`` distinguishes them.
     corrected_rank : tuple of RankMap
-        Ranks of each tower with a learned receiver: traced ranks for every K, and the ranks of the receiver.
+        For each tower with a learned receiver: traced ranks for every K, and the ranks of the receiver.
     flown_m : tuple of (n, 2)
         Tracks of the correcting flights, east and north [m].
     outside_flown : float
         Share of positions outside the range of the correction.
     corrected_words : str
-        Summary of the prediction that corrected the levels.
+        Summary of the prediction with which levels were corrected.
     budget : str
         Sentence with power, noise floor and threshold, if they differ from the paper.
     flights : tuple of ReportData
-        Flights of ``--with``, replayed and compared.
+        Flights of ``--with``, after replay and comparison.
     layers : tuple of MapLayer
         Layers other than RSS and rank.
     correlation : mapping of str to (BinnedCorrelation, BiExponential)
-        Correlation against distance and its fitted curve, if any, by title.
+        Correlation against distance, and its fitted curve or None, by title.
     metrics : mapping
-        Further content of ``metrics.json``.
+        Additional content of ``metrics.json``.
     """
 
     title: str
@@ -213,7 +214,7 @@ class MapsData(Made):
 
 LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
 
-# Sentence and next step by the cause of :func:`~aerpaw_cmp.compare.verdict.coverage_verdict`.
+# Sentence and next step, by the cause of :func:`~aerpaw_cmp.compare.verdict.coverage_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
     "none": (LEAST + ".", "`aerpaw-cmp plan` for a flight that measures it"),
     "trees": (LEAST + "; trees take most of the rest.", "fly higher, or {thinner}"),
@@ -243,7 +244,7 @@ def first_words(data: MapsData) -> str:
 
 
 def coverage(data: MapsData) -> list[Coverage]:
-    """Return the coverage of the nearest tower at each height, for the first foliage mode and without foliage."""
+    """Return the coverage by the nearest tower at each height, for the first foliage mode and without foliage."""
     shown = [item for item in data.rss if item.tower == JOINT] or list(data.rss)
     if not shown:
         return []
@@ -307,7 +308,7 @@ def grouped(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
 
 
 def half_width(at_m: FloatArray) -> float:
-    """Return half of the spacing of cell centres [m], and 15 for a single cell."""
+    """Return half the spacing of cell centres [m], or 15 for a single cell."""
     return float(at_m[1] - at_m[0]) / 2 if len(at_m) > 1 else 15.0
 
 
@@ -319,7 +320,7 @@ def extent_m(data: MapsData) -> tuple[float, float, float, float]:
 
 
 def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | None = None, **options: Any) -> Any:
-    """Draw a map with cells as an image, hatched at NaN, with buildings, forests, towers and borders.
+    """Draw the cells of a map as an image (hatched at NaN), with buildings, forests, towers and borders.
 
     Parameters
     ----------
@@ -340,7 +341,7 @@ def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | N
     """
     from matplotlib.patheffects import withStroke
 
-    ax.patch.set(**MISSING)  # cells without a value are transparent and show the hatched background
+    ax.patch.set(**MISSING)  # the hatched background is visible through cells without a value
     image = ax.imshow(values, origin="lower", extent=extent_m(data), interpolation="none", zorder=1, **options)
     halo = [withStroke(linewidth=2.2, foreground="white")]
     looks = {
@@ -374,12 +375,12 @@ def overlay_legend(axes: Sequence[Axes]) -> list[Any]:
 
 
 def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure, list[Axes]]:
-    """Return a figure with ``count`` maps with labels on its outer axes, and a margin on the right [inch]."""
+    """Return a figure with axes for ``count`` maps, labels on its outer axes, and a margin on the right [inch]."""
     west, east, south, north = extent_m(data)
     columns = min(count, COLUMNS)
     rows = -(-count // columns)
     columns = -(-count // rows)
-    width = min((7.4 - 0.15 * columns) / columns, 3.2)  # the rest is for the colour bar and the labels
+    width = min((7.4 - 0.15 * columns) / columns, 3.2)  # the remaining width is for the colour bar and the labels
     height = float(np.clip(width * (north - south) / (east - west), 0.8, 6.5))
     size = 9.2, rows * (height + 0.35) + 1.0
     fig, grid = placed(size, rows, columns, gap_in=(0.3, 0.4), right_in=right_in, sharex=True, sharey=True)
@@ -430,7 +431,7 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
 
 
 def distribution(members: Sequence[RssMap]) -> dict[str, Any]:
-    """Return the distribution of RSS of each tower and of the joint map at one height.
+    """Return a chart of the distribution of RSS of each tower and of the joint map at one height.
 
     Positions out of coverage count as positions below all levels.
     """
@@ -444,7 +445,7 @@ def distribution(members: Sequence[RssMap]) -> dict[str, Any]:
 
 
 def rank_shares(members: Sequence[RankMap]) -> dict[str, Any]:
-    """Return stacked shares of ranks and of positions out of coverage at each height."""
+    """Return a chart of stacked shares of ranks, and of positions out of coverage, at each height."""
     members = sorted(members, key=lambda member: member.height_m)
     at = np.array([member.height_m for member in members])
     half = np.diff(at) / 2.0 if len(at) > 1 else np.array([5.0])
@@ -460,7 +461,7 @@ def rank_shares(members: Sequence[RankMap]) -> dict[str, Any]:
 
 
 def correlation(binned: BinnedCorrelation, fit: BiExponential | None) -> dict[str, Any]:
-    """Return the correlation against distance, and its fitted curve."""
+    """Return a chart of the correlation against distance, with its fitted curve."""
     marks: list[Any] = [{"kind": "dots", "name": "data", "x": binned.distance_m, "y": binned.correlation}]
     if fit is not None:
         at = np.linspace(0.0, binned.distance_m[-1], 251)
@@ -469,7 +470,7 @@ def correlation(binned: BinnedCorrelation, fit: BiExponential | None) -> dict[st
 
 
 def error_curves(members: Sequence[MapError], worst: float) -> dict[str, Any]:
-    """Return MAE against height for every method. ``worst`` is the largest error of all panels, for an equal scale."""
+    """Return a chart of MAE against height per method. Its scale ends at ``worst``, the largest error of all panels."""
     marks = []
     for method, rows in grouped(sorted(members, key=lambda e: e.altitude_m), lambda e: e.method).items():
         at, mae = np.array([[row.altitude_m, row.mae] for row in rows]).T
@@ -480,7 +481,7 @@ def error_curves(members: Sequence[MapError], worst: float) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plate:
-    """The panels of one kind, by title. They are one figure as a file, and one chart each on the page."""
+    """The panels of one kind, by title. They form one figure file, and each is one chart of the page."""
 
     name: str
     section: str
@@ -504,7 +505,7 @@ class Plate:
 
 
 def plates(data: MapsData) -> Iterator[Plate]:
-    """Yield the distributions, shares, correlations and errors."""
+    """Yield the panels of distributions, shares, correlations and errors."""
     for words, maps in grouped((*data.rss, *data.corrected), lambda m: f"{m.antennas}{_under(m.foliage)}").items():
         yield Plate(
             name=f"rss_cdf_{safe_name(words)}", section="rss", title=f"Distribution of RSS, {words}",
@@ -547,9 +548,9 @@ def plates(data: MapsData) -> Iterator[Plate]:
 
 
 def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
-    """Return one colour scale for all maps: the 1 to 99.5 % range, rounded to 5 dB [dBm]."""
+    """Return the ends of one colour scale for all maps: the 1 to 99.5 % range, rounded to 5 dB [dBm]."""
     levels = np.concatenate([np.zeros(0), *(entry.values.ravel() for entry in maps)])
-    # a few cells next to a tower are far above all others and would use most colours
+    # exclude the few cells next to a tower that are far above all others and would take most colours
     low, high = ends_of_scale(levels[np.isfinite(levels)], 99.5)
     return 5.0 * math.floor(low / 5), 5.0 * max(math.ceil(high / 5), math.floor(low / 5) + 1)
 
@@ -584,7 +585,7 @@ def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
         yield FigureSpec(f"rank_map_learned_{safe_name(tower)}", partial(rank_grid, data, learned))
 
 
-# Limit of the layers as base64 [bytes]. Above it, layers of single towers are omitted, then cells are thinned.
+# Largest size of the layers as base64 [bytes]. Above it, first layers of single towers are omitted, then cells.
 MOST_BYTES = 4_000_000
 
 _LATTICE = 9
@@ -598,7 +599,7 @@ LEVEL, _CLASSES = "level", "classes"
 
 
 def page_layers(data: MapsData) -> list[MapLayer]:
-    """Return every layer of the page, sorted by quantity."""
+    """Return all layers of the page, sorted by quantity."""
     versions = [
         replace(m, quantity="Rank, raw and corrected", version=f"{'corrected' if m.k is None else 'raw'}, {m.source}",
                 k=None)
@@ -608,7 +609,7 @@ def page_layers(data: MapsData) -> list[MapLayer]:
 
 
 def layer_numbers(layer: MapLayer) -> dict[str, Any]:
-    """Return numbers of a layer: share in coverage, percentiles, shares of classes. None if missing."""
+    """Return the numbers of a layer: share in coverage, percentiles, shares of classes. Missing numbers are None."""
     finite = layer.values[np.isfinite(layer.values)]
     result: dict[str, Any] = {
         "quantity": layer.quantity,
@@ -637,8 +638,9 @@ def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST
     data : MapsData
     charts : sequence of Chart
     most_bytes : int
-        If all layers need more, layers of single towers other than RSS are omitted, then all layers of single towers.
-        Then only every second (third, ...) cell of each row and column is included. ``left_out`` names what is missing.
+        If all layers together are larger, first the layers of single towers except RSS are omitted, then all layers of
+        single towers. After that, only every second (third, ...) cell of each row and column is included. ``left_out``
+        names what is omitted.
     """
     layers = page_layers(data)
     joint = [item for item in layers if item.tower in ("", JOINT)]
@@ -649,7 +651,7 @@ def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST
     return next(
         content | {"left_out": left_out, "stride": stride}
         for left_out, chosen, stride in itertools.chain(tries, thinned)
-        # measure after packing, because the compressed size depends on the maps
+        # measure after packing, because the compressed size depends on the values
         if len((content := _packed(data, charts, chosen, stride))["packed"]["data"]) <= most_bytes
     )
 
@@ -675,7 +677,7 @@ def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer],
 
 
 def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, stride: int) -> dict[str, Any]:
-    """Return one quantity: its axes, and the number of the array for each combination of their values."""
+    """Return the content for one quantity: its axes, and the array number for each combination of their values."""
     places: dict[str, dict[str, float]] = {}
     for layer in layers:
         for axis, value in layer.axes.items():
@@ -699,7 +701,7 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
 
 
 def _class_colours(classes: Sequence[str]) -> list[str]:
-    """Return a colour per class: the colours of ranks, or colours that differ in hue and lightness."""
+    """Return one colour per class: the colours of ranks, or else colours that differ in hue and lightness."""
     if tuple(classes) == _RANK_CLASSES:
         return ["", *(CLASS_COLOURS[rank] for rank in RANKS)]
     if not classes:
@@ -714,9 +716,9 @@ def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dic
     Returns
     -------
     dict
-        ``middle`` and ``reach`` (2,) [m]; ``powers`` (m, 2); ``lat``, ``lon`` (m,) [deg]: the sum over m of
-        coefficient times u^p v^q with u, v = (position - middle) / reach. ``worst_m``: the largest error on the
-        lattice of the fit.
+        ``middle`` and ``reach`` (2,) [m], ``powers`` (m, 2), and coefficients ``lat`` and ``lon`` (m,) [deg]. An angle
+        is the sum over m of coefficient times u^p v^q, with u, v = (position - middle) / reach. ``worst_m`` is the
+        largest error on the lattice of the fit.
 
     Notes
     -----
@@ -725,7 +727,7 @@ def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dic
     """
     ends = np.array([[east_m[0], east_m[-1]], [north_m[0], north_m[-1]]], dtype=np.float64)
     middle = ends.mean(axis=1)
-    # at least 100 m, because the script divides by the reach, which is 0 for one row of cells
+    # at least 100 m, because the script divides by the reach, which would be 0 for one row of cells
     reach = np.maximum(np.ptp(ends, axis=1) / 2, 100.0)
     u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, _LATTICE), np.linspace(-1, 1, _LATTICE)))
     east, north = middle[0] + u * reach[0], middle[1] + v * reach[1]
@@ -777,7 +779,7 @@ def result_card(data: MapsData) -> Card:
 
 
 def coverage_table(data: MapsData) -> Table:
-    """Return the share of positions in coverage by height. Rows with 100.0 % everywhere share one row."""
+    """Return the table of shares in coverage by height. Heights with 100.0 % everywhere share one row."""
     heights = sorted({m.height_m for m in data.rss})
     rows: list[Sequence[str | None]] = []
     full = 0
@@ -830,7 +832,7 @@ def interpolation_card(data: MapsData) -> Card:
 
 
 def error_tables(errors: Sequence[MapError]) -> list[Table]:
-    """Return a table for each kind of evaluation: a row per method and K, a column per height."""
+    """Return one table per kind of evaluation, with one row per method and K, and one column per height."""
     tables = []
     for evaluation, members in grouped(errors, lambda e: e.evaluation).items():
         heights = sorted({e.altitude_m for e in members})
@@ -878,7 +880,7 @@ def maps_page(data: MapsData, files: Sequence[str]) -> str:
 
 
 def write_maps(data: MapsData, folder: str | Path, drawn: str = "none") -> list[Path]:
-    """Write ``map.html``, ``metrics.json`` and figures in one format, all or none. Return the files, the page first."""
+    """Write ``map.html``, ``metrics.json`` and figures in the formats ``drawn``, and return the files, page first."""
     folder = Path(folder)
     written = [write_file(folder / "metrics.json", json_text(maps_metrics(data)))]
     specs = [] if drawn == "none" else figure_specs(data)

@@ -1,4 +1,4 @@
-"""Data for the scripts of pages: packed arrays, and outlines and walls of a site as points."""
+"""Data for the scripts of pages: packed arrays, and the objects of a site as points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..site.site import Building, Site
 # Value that represents NaN in an array of each integer kind.
 NONE = {"u1": 255, "u2": 65_535, "i2": -32_768}
 
-# Largest magnitude in 16 bits. The most negative number represents NaN, so the range is symmetric.
+# Largest magnitude in 16 bits. The range is symmetric, because the most negative number represents NaN.
 LARGEST = 32_767
 
 
@@ -27,7 +27,7 @@ _TREES = 1500
 
 
 class PackedArrays:
-    """The arrays of a page, each stored once, one after the other at multiples of eight bytes.
+    """The arrays of a page in one block. Equal arrays are stored once, and each starts at a multiple of eight bytes.
 
     Examples
     --------
@@ -45,7 +45,7 @@ class PackedArrays:
         self._size = 0
 
     def add(self, values: AnyArray, kind: str = "f4") -> int:
-        """Store values in little endian and return their number. Equal arrays share a number."""
+        """Store an array in little-endian form and return its number. Equal arrays share a number."""
         raw = np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()
         key = (kind, raw)
         if key not in self._known:
@@ -58,7 +58,7 @@ class PackedArrays:
         return self._known[key]
 
     def add_steps(self, values: FloatArray, step: float) -> int:
-        """Store values as 16-bit multiples of ``step`` and return their number. NaN and infinities are missing."""
+        """Store an array as 16-bit multiples of ``step`` and return its number. NaN and infinities count as missing."""
         return self.add(_steps_of(values, step), "i2")
 
     def content(self) -> dict[str, Any]:
@@ -68,7 +68,7 @@ class PackedArrays:
 
 
 def _steps_of(values: FloatArray, step: float) -> AnyArray:
-    """Return values as multiples of ``step``, clipped to 16 bits. NaN and infinities are missing.
+    """Return values as multiples of ``step``, clipped to 16 bits. NaN and infinities count as missing.
 
     Examples
     --------
@@ -92,7 +92,7 @@ def step_for(values: FloatArray, finest: float = 0.01) -> float:
     """
     array = np.asarray(values, dtype=np.float64)
     reach = float(np.abs(array[np.isfinite(array)]).max(initial=0.0))
-    # subtract a rounding error of the logarithm, because a value at the limit must not have a larger step
+    # allow for rounding of the logarithm, because a value at the limit must not get a larger step
     tens = int(np.ceil(np.log10(max(reach / (LARGEST * finest), 1.0)) - 1e-12))
     return float(finest * 10.0**tens)
 
@@ -123,23 +123,23 @@ def listed(points: Any) -> Any:
 
 
 def at_height(line_m: FloatArray, up_m: float) -> FloatArray:
-    """Return a line (n, 2) at a height, shape (n, 3)."""
+    """Return a line (n, 2) as a line (n, 3) at a height."""
     return np.column_stack([line_m, np.full(len(line_m), up_m)])
 
 
 def ends_of_scale(values: FloatArray, most: float) -> list[float]:
     """Return the ends of a colour scale: the 1 % and ``most`` % quantiles of finite values.
 
-    For equal values the ends are half a unit below and above. Without values they are 0 and 1.
+    If all values are equal, the ends are half a unit below and above. Without values, they are 0 and 1.
     """
     low, high = (float(v) for v in np.percentile(values, [1.0, most])) if len(values) else (0.0, 1.0)
     return [low, high] if high > low else [low - 0.5, low + 0.5]
 
 
 def packed(value: Any, arrays: PackedArrays) -> Any:
-    """Return a chart whose arrays are replaced by their numbers in the block of the page."""
+    """Return a chart with its arrays stored in ``arrays`` and replaced by their numbers."""
     if isinstance(value, np.ndarray):
-        # 32-bit floats have seven digits, so a time beyond 1e5 s would lose hundredths of a second
+        # 32-bit floats have seven digits, so times beyond 1e5 s would lose hundredths of a second
         return arrays.add(value, "f8" if value.max(initial=0.0) > 1e5 else "f4")
     if isinstance(value, dict):
         return {key: packed(each, arrays) for key, each in value.items()}
@@ -164,6 +164,6 @@ def scene(site: Site, most_trees: int = _TREES) -> dict[str, Any]:
 
 
 def plan_of(site: Site) -> dict[str, Any]:
-    """Return :func:`scene` for a plan, with the roofs of buildings and without trees, whose loss the levels contain."""
+    """Return :func:`scene` for a plan, with roofs of buildings, but without trees."""
     solid = scene(site)
     return {**solid, "trees": [], "buildings": [faces[-1:] for faces in solid["buildings"]]}

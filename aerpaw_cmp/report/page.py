@@ -1,4 +1,4 @@
-"""The base of every page: template engine, files of a folder of results, and figures.
+"""Basis of all pages: template engine, files of a folder of results, and figures.
 
 A page is one file that needs no other file and no network. The template engine escapes every text from a log or a
 configuration.
@@ -31,7 +31,7 @@ def links_of(by_tower: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str],
 
 
 def merge(into: dict[str, Any], numbers: Mapping[str, Any]) -> None:
-    """Merge ``numbers`` into ``into``, key by key. Keys that only ``into`` has are unchanged."""
+    """Merge ``numbers`` into ``into``, key by key. Other keys of ``into`` are not changed."""
     for key, value in numbers.items():
         if isinstance(value, Mapping) and isinstance(into.get(key), dict):
             merge(into[key], value)
@@ -40,14 +40,14 @@ def merge(into: dict[str, Any], numbers: Mapping[str, Any]) -> None:
 
 
 def json_text(numbers: Mapping[str, Any], indent: int | None = 2) -> str:
-    """Return numbers as JSON text of a file."""
+    """Return numbers as the JSON text of a file."""
     return json.dumps(numbers, indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def write_file(path: Path, content: str | bytes | Iterator[str]) -> Path:
     """Write one file of a folder of results and return its path.
 
-    Text may come in pieces. The folder of the file is created if its parent exists.
+    Text may be passed in pieces. The folder of the file is created if its parent exists.
     :class:`~aerpaw_cmp.common.outputs.OutputFolder` writes the folder atomically and turns errors into messages.
     """
     path.parent.mkdir(exist_ok=True)
@@ -60,7 +60,7 @@ def write_file(path: Path, content: str | bytes | Iterator[str]) -> Path:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Made:
-    """The time (UTC, ISO 8601), versions and seconds of the stages that every page and its metrics.json contain."""
+    """The time (UTC, ISO 8601), versions and times per stage, which every page and its metrics.json contain."""
 
     generated: str = field(default_factory=utc_now)
     versions: Mapping[str, str] = field(default_factory=versions)
@@ -83,13 +83,13 @@ _CONTENT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline';
 
 
 def digest(text: str) -> str:
-    """Return the digest by which a content policy names a script or style."""
+    """Return the digest of a script or style for a content security policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
 
 
 @cache
 def environment() -> Any:
-    """Return the template engine, which escapes all text and fails on undefined names."""
+    """Return the template engine. It escapes all text and fails on undefined names."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -104,7 +104,7 @@ def environment() -> Any:
 
 
 def script(*names: str) -> str:
-    """Return the text of scripts, one after the other."""
+    """Return the text of the named scripts, joined."""
     folder = resources.files("aerpaw_cmp.report") / "templates"
     return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
 
@@ -122,12 +122,12 @@ def rendered(template: str, scripts: Sequence[str] = (), **content: Any) -> str:
 
 
 def as_json(content: Mapping[str, Any]) -> str:
-    """Return JSON text for a script element. No text inside can end the element."""
+    """Return JSON text for a script element. It is escaped so that no text inside can end the element."""
     return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def embedded(content: Mapping[str, Any] | None) -> Markup:
-    """Return the data of the script of a page, empty if there are no data."""
+    """Return the element with the data of a page's script, or nothing if there are no data."""
     return Markup(as_json(content)) if content else Markup("")
 
 
@@ -138,7 +138,7 @@ def write_figures(
     kind: str = "screen",
     progress: Progress = logged,
 ) -> list[Path]:
-    """Draw figures, write each in its formats, and return the files.
+    """Draw figures, write each in all formats, and return the files.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def write_figures(
     kind : str
         Style, as in :func:`render`.
     progress : Progress
-        Called with the share of the figures that are drawn.
+        Called with the share of figures that have been drawn.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The data of maps and spheres of predict, plan, locate, calibrate and campaign: values at positions or directions."""
+"""Data of the maps and spheres of predict, plan, locate, calibrate and campaign: values at positions or directions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ BODY = ("forward", "left", "aft", "right")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Places:
-    """A group of values at positions, one of the choices of a reader.
+    """A group of values at positions or directions. The reader of a page can choose a group.
 
     Parameters
     ----------
@@ -41,15 +41,15 @@ class Places:
     at : (n, 3)
         East, north, up [m]; unit vectors if ``around`` is given.
     values : mapping of str to (n,)
-        Values by name with unit. :data:`BAND` are the ends of the interval of the first, drawn over time.
+        Values by name with unit. :data:`BAND` names the ends of the interval of the first values, drawn over time.
     around : tuple of str
-        Names of the azimuths 0, 90, 180, 270 degrees of a sphere; empty for positions.
+        Names of the azimuths 0, 90, 180 and 270 degrees, for values on a sphere; empty for positions.
     cell_m : float
         Side of the cells of a grid [m].
     time_s : (n,), optional
         Times of points along a route [s].
     dots : (m, 3)
-        Unit vectors that are marked on the sphere.
+        Unit vectors to mark on the sphere.
     """
 
     name: str
@@ -108,7 +108,7 @@ def payload(
 
 
 def _scale(group: str, layer: str) -> tuple[str, str]:
-    """Return the key of a colour scale, which a quantity shares at all heights, and before and after a flight."""
+    """Return the key of a colour scale. A quantity has one scale for all heights, and before and after a flight."""
     return group.partition(", ")[0], layer.partition(" ")[0]
 
 
@@ -128,7 +128,7 @@ def _group(
     layers = []
     for name, column in group.values.items():
         values = np.asarray(column, dtype=np.float64)[pick]
-        # steps of 0.01 would be visible in probabilities, which are between 0 and 1
+        # use finer steps for probabilities, in which steps of 0.01 would be visible
         step = step_for(values, 1e-4 if "probability" in name else 0.01)
         scale = {"range": ranges[_scale(group.name, name)], "step": step}
         layers.append({"name": name, **scale, "values": arrays.add_steps(values, step)})

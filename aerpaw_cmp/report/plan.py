@@ -1,4 +1,4 @@
-"""plan.html with metrics.json, the recommended route as files, and the map of expected standard deviations."""
+"""The page plan.html with its metrics.json, the files of the recommended route, and the map of expected SDs."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from .texts import minute, number
 class PlanPage(Made):
     """The content of the page of ``plan``.
 
-    ``candidates`` and ``curve`` are rows of metrics.json. ``outline_m`` (k, 2) and ``holes_m`` are the limits of the
-    area in which a route may run [m]. ``track_m`` (n, 3) is the recommended route. ``place_m`` (m, 3) are the points
-    of the target with their standard deviations ``before_db`` and ``after_db`` (m,). If the target is all directions,
-    they are directions from ``seen_from_m`` (3,).
+    ``candidates`` and ``curve`` are rows of metrics.json. ``outline_m`` (k, 2) and ``holes_m`` limit the area in which
+    a route may run [m]. ``track_m`` (n, 3) is the recommended route. ``place_m`` (m, 3) are the points of the target,
+    and ``before_db`` and ``after_db`` (m,) their standard deviations. If the target is all directions, the points are
+    directions from ``seen_from_m`` (3,).
     """
 
     target: str
@@ -111,7 +111,7 @@ def write_plan(data: PlanPage, folder: Path) -> list[Path]:
 
 
 def _groups(data: PlanPage) -> Iterator[Places]:
-    """Yield the proposed route, which the page shows first, and the target: positions, or directions from a tower.
+    """Yield the proposed route, which is shown first, and the target: positions, or directions from a tower.
 
     The values of each point of the target are averaged over all headings.
     """

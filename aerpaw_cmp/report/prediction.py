@@ -1,4 +1,4 @@
-"""prediction.html with metrics.json, prediction.csv and prediction.nc, and their sentences."""
+"""The page prediction.html with metrics.json, prediction.csv and prediction.nc, and their sentences."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ TITLES = {
     "prior": "ray tracing with isotropic antennas, before any flight",
 }
 
-# Flags of points: outside the flown area the standard deviation is that of the model alone.
+# Flags of points. Outside the flown area, the standard deviation is that of the model without flights nearby.
 FLAGS = ("outside_flown", "out_of_coverage", "no_position")
 
 # Share of points outside the flown area above which the summary names it.
 MANY = 0.2
 
-# Sentences about the selected model on held-out data, by the paired interval.
+# Sentences about the selected model on held-out data, by the verdict of the paired interval.
 AGAINST_FREE_SPACE = {
     "better": ("On held-out {over} it is {size:.1f} dB better than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
     "worse": ("On held-out {over} it is {size:.1f} dB worse than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
@@ -90,7 +90,7 @@ PLAN = "Next: `aerpaw-cmp plan` finds the flight that reduces the standard devia
 
 
 def heading_words(yaw_deg: FloatArray) -> str:
-    """Return the heading to which a prediction applies.
+    """Return the heading for which a prediction is valid, as text.
 
     Examples
     --------
@@ -111,7 +111,7 @@ def first_words(
     lock: float | None = None,
     origin: str = REMEMBERED,
 ) -> str:
-    """Return the summary of terminal, page and metrics.json: error with band, best baseline, next step.
+    """Return the summary for terminal, page and metrics.json: error with band, best baseline, and next step.
 
     Parameters
     ----------
@@ -120,10 +120,10 @@ def first_words(
     outside : float
         Share of points outside the flown area, or in directions with few training samples.
     expected_db : float
-        Stated standard deviation of a mean over 4 s on a new flight, root mean square over the points [dB]. For a
-        receiver that loses its lock it is that of a sample.
+        Stated standard deviation of a 4-s mean on a new flight, as root mean square over the points [dB]. For a
+        receiver that loses its lock, it is the standard deviation of a sample.
     band_db : float
-        Half of the 90 % interval of a sample, mean over the points [dB].
+        Half the width of the 90 % interval of a sample, averaged over the points [dB].
     heading : str
         Text of :func:`heading_words`.
     lock : float, optional
@@ -160,7 +160,7 @@ def cautions(correction: Correction, outside: float) -> list[str]:
 
 
 def memory_cautions(known: Sequence[tuple[Entry, LearnedSeries]], outside: float) -> list[str]:
-    """Return warnings for a prediction without flights, with the learned models of the site by entry."""
+    """Return warnings for a prediction from learned models of the site, without flights."""
     each: dict[str, list[str]] = {}
     for entry, series in known:
         each.setdefault(entry.about(), []).append(f"{series.tower} {series.channel}")
@@ -177,7 +177,7 @@ def prior_words(carrier_hz: float, power_dbm: float) -> str:
 
 
 def prior_caution(sd_db: Mapping[str, float]) -> str:
-    """Return the sentence on the parts of the standard deviation before any flight [dB]."""
+    """Return the sentence about the parts of the standard deviation before any flight [dB]."""
     parts = ", ".join(f"{name} {value:g} dB" for name, value in sd_db.items())
     return f"The standard deviation is a prior: {parts}. One flight determines the offset and most of the rest."
 
@@ -196,12 +196,12 @@ def _inside_share(error: FloatArray, sd: FloatArray) -> float:
 
 
 def _against_free_space(correction: Correction) -> Verdict:
-    """Compare the chosen model with free space on held-out data: by flight, or by the blocks of one flight."""
+    """Compare the chosen model with free space on held-out data, per flight or per block of a single flight."""
     error, free_space = (
         correction.held_out[key][0] for key in ((correction.base, correction.title), ("free space", OFF))
     )
     if len(correction.flights) > 1:
-        # compare by flight, like calibrate, because samples of one flight share its offset and its weather
+        # as in calibrate, compare per flight, because samples of one flight share offset and weather
         parts = correction.held_out_parts
         verdict = by_flight(_by_part(error, parts), _by_part(free_space, parts))
         return replace(verdict, cause="two flights") if verdict.cause == "no interval" else verdict
@@ -218,7 +218,7 @@ def _by_part(error: FloatArray, parts: Sequence[tuple[str, int]]) -> Iterator[tu
 
 
 def field(correction: Correction) -> Verdict:
-    """Return the difference in CRPS between the best residual field and no residual field."""
+    """Return the verdict on the difference in CRPS between the best residual field and no residual field."""
     base = correction.base
     title = min((t for b, t in correction.crps_db if b == base and t != OFF), key=lambda t: correction.crps_db[base, t])
     difference, ends = crps_difference(correction.held_out, (base, title), correction.held_out_place_m)
@@ -346,7 +346,7 @@ def _model_card(data: PredictionPage) -> Card:
     return Card(title="Model", id="model", text=[text], tables=[errors], parts=parts)
 
 
-# Rows of prediction.csv that are written at a time, which limits the memory.
+# Number of rows of prediction.csv that are written together, which limits the memory.
 _ROWS_AT_ONCE = 100_000
 
 
@@ -385,7 +385,7 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
 
 
 def _dataset(data: PredictionPage) -> Dataset:
-    """Return the levels by (tower, channel, time), or by (tower, channel, point) if the positions have no times."""
+    """Return the levels over (tower, channel, time), or over (tower, channel, point) if positions have no times."""
     series = [part for _, part in data.series]
     first, time = series[0], series[0]["time_s"].to_numpy(np.float64)
     timed = data.kind == "route" and bool((np.diff(time) > 0.0).all())

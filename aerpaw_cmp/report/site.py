@@ -1,4 +1,4 @@
-"""A site as a plan, and as a page that shows it in 3-D.
+"""Drawings of a site: a plan, and a page that shows it in 3-D.
 
 The page is one file that contains its script and loads no other file.
 """
@@ -26,7 +26,7 @@ TREES_IN_PAGE = 5000
 
 
 def view_limits(site: Site) -> FloatArray:
-    """Return the lowest and highest east, north and up of all objects with a margin, shape (3, 2) [m]."""
+    """Return the limits (3, 2) of all objects in east, north and up, with a margin [m]."""
     points = [tower.position_m for tower in site.towers.values()]
     areas = [(b.footprint, b.base_m + b.height_m) for b in drawn_buildings(site)]
     areas += [(forest.area, 0.0) for forest in site.forests] + [(fence.area, 0.0) for fence in site.geofences]
@@ -40,7 +40,7 @@ def view_limits(site: Site) -> FloatArray:
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     margin = 0.05 * max(high[0] - low[0], high[1] - low[1], 100.0)
-    # objects of a site may be below its origin
+    # include objects below the origin
     ground = min(0.0, float(low[2]))
     return np.array(
         [[low[0] - margin, high[0] + margin], [low[1] - margin, high[1] + margin], [ground, max(high[2] * 1.1, 30.0)]]
@@ -48,7 +48,7 @@ def view_limits(site: Site) -> FloatArray:
 
 
 def plan(site: Site) -> Figure:
-    """Return the plan of all objects with equal scales."""
+    """Return the plan of all objects, with equal scales."""
     limits = view_limits(site)
     width, height = np.ptp(limits[:2], axis=1)
     shape = float(np.clip(width / height, 0.45, 2.2))

@@ -1,4 +1,4 @@
-"""Texts of pages for numbers, intervals and times, and names of keys and files."""
+"""Text of numbers, intervals and times on pages, and names of keys and files."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
     """
     if value is None or not math.isfinite(value):
         return "–"
-    rounded = round(value, decimals) + 0.0  # a number that rounds to zero has no sign
+    rounded = round(value, decimals) + 0.0  # adding 0.0 removes the sign of a number that rounds to zero
     text = f"{rounded:,.{decimals}f}".replace(",", "\u202f").replace("-", "\u2212")
     return f"{text}\u202f{unit}" if unit else text
 
 
 def interval(value: tuple[float | None, float | None] | None, decimals: int = 1) -> str:
-    """Return an interval as ``[low, high]`` and a bound as ``≥ low``.
+    """Return an interval as the text ``[low, high]``, or a lower bound as ``≥ low``.
 
     The text is empty for None and "cannot tell" if both ends are missing.
     """
@@ -84,7 +84,7 @@ def minute(instant: str) -> str:
 
 
 def duration(seconds: float | None) -> str:
-    """Return seconds with three significant digits, in ms below one second.
+    """Return seconds as text with three significant digits, in ms below one second.
 
     Examples
     --------
@@ -98,9 +98,10 @@ def duration(seconds: float | None) -> str:
 
 
 def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Yield nested settings as dotted names and plain text, without settings that are not set.
+    """Yield nested settings as dotted names and plain text. Settings without a value are omitted.
 
-    An interval without an upper end is ``≥ low``. The records of a list, such as the logs of a flight, have numbers.
+    An interval without an upper end becomes ``≥ low``. The records of a list, such as the logs of a flight, are
+    numbered.
 
     Examples
     --------
@@ -121,7 +122,7 @@ def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, st
 
 
 def _plain(name: str, value: Any) -> str | None:
-    """Return the text of one setting or number, None if it is not set or empty."""
+    """Return the text of one setting or number, or None if it is not set or empty."""
     if "ci95" in name and isinstance(value, (list, tuple)) and None in value:
         return None if value[0] is None else f"≥ {short(value[0])}"
     if isinstance(value, (list, tuple)):
@@ -130,7 +131,7 @@ def _plain(name: str, value: Any) -> str | None:
 
 
 def clock(instant: Any, start: Any) -> str:
-    """Return the time of day (UTC), or seconds after ``start`` if the log has relative times only.
+    """Return the time of day (UTC), or seconds after ``start`` if the log has only relative times.
 
     Examples
     --------
@@ -168,7 +169,7 @@ def cut(text: str, most: int = 120) -> str:
 
 
 def coded(text: str) -> Markup:
-    """Return an escaped text whose parts between backquotes are set as code.
+    """Return an escaped text in which the parts between backquotes are formatted as code.
 
     Examples
     --------

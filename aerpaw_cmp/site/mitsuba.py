@@ -186,7 +186,7 @@ class _Body:
         # a header that promises more than the file contains fails here, before memory is requested
         self.take(("V", least), element.count, element)
         self.place = begun
-        # most meshes have triangles only, so lists as long as the first are read as one table
+        # most meshes have only triangles: if all lists are as long as the first list, read them as one table
         first, fields = self._row(element), list[Any]()
         for i, ((_, kind, length), values) in enumerate(zip(element.properties, first, strict=True)):
             fields += [(f"length {i}", length)] if length else []

@@ -136,7 +136,7 @@ def reflected(wave: Vector, toward: Vector, normal: Vector, te: Number, tm: Numb
 
 
 def spreading(cycles: Number) -> Number:
-    """Return ``lambda / (4 pi L)`` for a length in wavelengths, at most 1, as no gain is possible."""
+    """Return ``lambda / (4 pi L)`` for a length in wavelengths, at most 1, because spreading is not a gain."""
     # where two elements coincide the length is zero: infinity becomes 1
     return np.minimum(1.0, 1.0 / (4.0 * np.pi * cycles))
 

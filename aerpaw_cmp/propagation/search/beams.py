@@ -651,7 +651,7 @@ def find_paths(
     max_depth: int = 2,
     extent_m: FloatArray | None = None,
 ) -> PathSet:
-    """Find the paths of :func:`aerpaw_cmp.propagation.search.mirror.find_paths` in scenes with too many sequences.
+    """Find the same paths as :func:`.mirror.find_paths`, in scenes that have too many sequences for it.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""A second, independent way from the bytes of logs to poses: for :mod:`tests.raw_checks`.
+"""A second, independent way from the bytes of logs to poses, for :mod:`tests.raw_checks`.
 
-It shares no code with the readers, the track and the geodesy of the package, and imports none of them: lines by the csv
-module and regular expressions, local time by zoneinfo row by row, positions by way of earth-centred coordinates,
-attitude by quaternions. What it cannot read it leaves to its caller to name.
+It imports none of the package's readers, track and geodesy. Lines are read by the csv module and regular expressions, and
+local times by zoneinfo row by row. Positions are converted through earth-centred coordinates, and attitude through
+quaternions. A log that it cannot read is left to the caller.
 """
 
 from __future__ import annotations

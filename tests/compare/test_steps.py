@@ -1,6 +1,6 @@
-"""Offsets of nodes over the nights of a season: planted gains and steps are given back, chance is not.
+"""Offsets of nodes over many nights: planted gains and steps are found, and chance is not.
 
-python -m tests.compare.test_steps SEASONS        prints the shares over so many simulated seasons of soundings
+python -m tests.compare.test_steps CAMPAIGNS      prints the shares for this number of simulated campaigns of soundings
 """
 
 import sys

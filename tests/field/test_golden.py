@@ -1,8 +1,8 @@
 """Every file of the field data, with its reader and counts, or with its kind if it is not a log.
 
-``golden.csv`` holds a line per file: path, reader, lines, accepted, rejected, number of streams and of their rows;
-for a file that is none, ``no log`` and what it is. The counts of the text logs were taken by other means too (grep,
-SciPy).
+``golden.csv`` has one line per file: path, reader, lines, accepted and rejected lines, number of streams and of their
+rows. For a file that is not a log, it contains ``no log`` and the kind of the file. The counts of the text logs were also
+determined by other means (grep, SciPy).
 """
 
 import csv

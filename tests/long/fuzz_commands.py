@@ -1,14 +1,19 @@
-"""Random whole command lines: none may end in exit code 70, in a traceback, in silence or never.
+"""Run random command lines: none may end with exit code 70 or a traceback, without a message, or never.
 
     python -m tests.long.fuzz_commands [--calls 10000] [--seed 1]
 
-Each call is a fork of this process, so that imports are paid for once. Drawn are the command, the spelling of every
-path (relative, absolute, ``..``, links, members of archives, odd and impossible names), the working folder (also one
-that was removed), the standard descriptors (closed, full, a pipe without a reader) and a signal at a random moment.
-Printed are the exit codes and each violation with what draws it again (``--seed N --only CALL``).
+Each call is a fork of this process, so that imports are paid for once. These parts of a call are random:
 
-A call is in order when it ends within its time with a code of the table in ``aerpaw_cmp/__main__.py`` other than 70,
-says why where the code is not 0 and standard error is open, and leaves no hidden place beside an output.
+- the command, and the spelling of every path (relative, absolute, ``..``, links, members of archives, odd and impossible
+  names);
+- the working folder, which may have been removed;
+- the standard descriptors (closed, full, a pipe without a reader);
+- a signal at a random moment.
+
+The script prints the exit codes, and each violation with the options that repeat it (``--seed N --only CALL``).
+
+A call must end within its time, with a code of the table in ``aerpaw_cmp/__main__.py`` other than 70. If the code is not
+0 and standard error is open, the call must print the reason. It must leave no hidden file next to an output.
 """
 
 import argparse

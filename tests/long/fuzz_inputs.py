@@ -1,15 +1,18 @@
 """Damaged inputs: each file gives a result that accounts for its lines, or one message of the package.
 
-Every reader of the catalogue, flight.yaml, site.yaml, campaign.yaml, map files, MATLAB files, flight files, antenna
-files, the path cache and elevation models are given mutated seeds. Seeds are the samples of the tests, pieces of a few
-lines of ``sample_logs`` and of ``$AERPAW_CMP_FIELD_DATA``; each is accepted as it is. In two of three inputs one value
-of a seed is replaced, so that what lies behind the first check is tested, too; in the others bytes, lines, numbers
-(infinities, 1e30, -0, integers of forty digits), encodings and clocks change. Checked for each input: the accounting
-law; no exception but the package's own; at most 2 s of the processor and 300 MiB; the process lives. Input ``i`` of a
-target depends on the seed, the target and ``i`` alone, so a violation is made again with ``--reproduce TARGET I``.
+Mutated seeds are passed to every reader of the catalogue, and to the readers of flight.yaml, site.yaml, campaign.yaml,
+map files, MATLAB files, flight files, antenna files, the path cache and elevation models. Seeds are the samples of the
+tests, and pieces of a few lines of ``sample_logs`` and of ``$AERPAW_CMP_FIELD_DATA``. Each seed itself is accepted.
 
-``--inputs 20000 --workers 2`` is the recorded run of docs/security.md: some 1 300 s of the processor for all readers.
-Each row is printed as soon as it is done, so that what an interrupted run has done counts.
+In two of three inputs one value of a seed is replaced, so that code behind the first check is tested, too. In the
+others, bytes, lines, numbers (infinities, 1e30, -0, integers of forty digits), encodings and clocks change.
+
+For each input, all lines must be accounted for, and only exceptions of the package may be raised. It may take at most
+2 s of processor time and 300 MiB, and the process must survive. Input ``i`` of a target depends only on the seed, the
+target and ``i``, so ``--reproduce TARGET I`` repeats a violation.
+
+``--inputs 20000 --workers 2`` is the recorded run of docs/security.md, with about 1 300 s of processor time for all
+readers. Each row is printed as soon as it is done, so the rows of an interrupted run are valid.
 """
 
 import argparse

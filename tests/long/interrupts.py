@@ -1,12 +1,14 @@
-"""Ctrl-C in every command: seconds of the processor until it has ended, how it ended, and what it left.
+"""Press Ctrl-C in every command: measure the time until it ends, how it ends, and what it leaves.
 
     python -m tests.long.interrupts [--only TEXT] [--moments 7] [--json]
 
-Each command runs once to its end on a large input, which gives the processor time that it takes; then once for each
-moment, a share of that time, at which its process group gets SIGINT as from a terminal (the tap and its modem: by the
-clock). In order is an exit with 130, a message without a traceback, at most a second of the processor after the signal,
-and nothing behind: no hidden place, no half-written output, no process. The clock is shown, too; on a busy machine it
-says more of the others.
+Each command first runs to its end on a large input, to measure its processor time. Then it runs once for each moment,
+which is a share of that time. At this moment its process group gets SIGINT, as from a terminal. (The tap and its modem
+are interrupted by the clock.)
+
+A command must end with exit code 130, a message without a traceback, and at most one second of processor time after the
+signal. It must leave no hidden file, no incomplete output and no process. The clock time is shown, too, but on a busy
+machine it depends mostly on other processes.
 """
 
 import argparse

@@ -1,16 +1,17 @@
 """Mutation testing of the subpackages for physics, statistics and scoring.
 
 Each mutant changes one place of one module: an operator, a comparison, a sign, a constant, a condition. The tests that
-reach the changed statement run on it in a forked child, where nothing else is changed, and end at the first failure.
-A mutant that every test passes has survived; `mutation_equivalent.txt` beside this file lists, with the reason, those
-that change nothing that can be seen. Mutants are drawn at random over all modules of the rooms, with a seed, since all
+reach the changed statement run in a forked child, where nothing else is changed, and end at the first failure. A mutant
+that passes every test has survived. `mutation_equivalent.txt` in the same folder lists the mutants that change nothing
+visible, each with its reason. Mutants are drawn at random over all modules of the subpackages, with a seed, because all
 of them would take weeks.
 
     python -m tests.long.mutation record MAP [--tests tests/compare]   # which test reaches which line (some minutes)
     python -m tests.long.mutation draw MAP --count 60 --seed 7 [--part 1/2] [--account FILE] [--only compare/ maps/]
 
-A line that hundreds of tests reach is tried on the shortest case of each, then on further cases, up to `--budget`
-seconds of the processor: what only a longer test would notice counts as survived, so that the score is a lower bound.
+If hundreds of tests reach a line, the shortest case of each test runs first, then further cases, up to `--budget`
+seconds of processor time. A mutant that only a longer test would detect counts as survived, so the score is a lower
+bound.
 """
 
 from __future__ import annotations

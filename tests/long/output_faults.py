@@ -1,24 +1,28 @@
 """Kill each writing command, and fill or break its disk: is the output under its final name complete?
 
-Six commands (ingest, site import, simulate, report, campaign, map), on jobs made small: eight seconds of flight, a map
-of a few cells, two figures per page. Each run is a fork of this process, so that imports are paid for once; the
-numbers and pictures of report, campaign and map are those of the first run, everything that is written is made anew. A
-library in C (output_faults.c, built here, by LD_PRELOAD) counts the calls that change the disk below the output folder
-(open to write, write, rename, link, unlink, mkdir, rmdir, chmod, fsync, ftruncate) and acts at the n-th:
+The script runs six commands (ingest, site import, simulate, report, campaign, map) on small jobs: eight seconds of
+flight, a map of a few cells, two figures per page. Each run is a fork of this process, so that imports are paid for
+once. The numbers and pictures of report, campaign and map are reused from the first run, and all files are written
+again. A library in C (output_faults.c, built here, loaded by LD_PRELOAD) counts the calls that change the disk below the
+output folder (open to write, write, rename, link, unlink, mkdir, rmdir, chmod, fsync, ftruncate). It acts at the n-th:
 
-- ``kill``: SIGKILL before the call, or after it, or with half of a write done; four kills of five are such, spread
-  evenly over all calls of the run. The fifth is SIGKILL at a random moment of the whole command.
+- ``kill``: SIGKILL before the call, after it, or in the middle of a write. Four of five kills are of this kind, spread
+  evenly over all calls of the run. The fifth is a SIGKILL at a random moment of the command.
 - ``full``: ENOSPC at the n-th call and at every later one that takes space, for every n.
-- ``broken``: EIO at the n-th call alone, for every n. ``read-only``: EROFS from the first.
+- ``broken``: EIO at the n-th call alone, for every n. ``read-only``: EROFS from the first call on.
 - ``removed``: the folder above the output is removed at the n-th call, for ten n.
-- ``limit``: a real limit on the size of files (RLIMIT_FSIZE), and a real full tmpfs where one can be mounted.
+- ``limit``: a real limit on the size of files (RLIMIT_FSIZE), and a real full tmpfs if one can be mounted.
 
-Two variants of each job follow each other into one target. After each: inputs have their bytes; the target is whole
-(its own SHA-256 list), of one variant (files that two clean runs write alike are compared), and there if it was there
-before; an error is exit code 3 with one message that names the output, and leaves no other file. What a kill left is
-cleared by the next run.
+Two variants of each job are written one after the other into one target. After each of them, these checks are made:
 
-In the end the first job is tried with a planted fault, writing in place as the tool once did: the checks must fail.
+- Inputs are unchanged.
+- The target is complete according to its SHA-256 list, and belongs to one variant. (Files that two clean runs write
+  identically are compared.) It exists if it existed before.
+- An error has exit code 3 and one message that names the output, and leaves no other file.
+- The next run removes what a kill left.
+
+At the end, the first job is run with a planted fault that writes in place, as an earlier version did. The checks must
+detect it.
 """
 
 import argparse

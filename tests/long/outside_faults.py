@@ -1,9 +1,9 @@
 """Inject faults into a copy of the sources: which do the checks from raw bytes detect, and which the tests?
 
-Each fault changes one line between the bytes of a log and a number of the report. The audit is that of the flight of
-tests/jobs/test_audit_raw.py (attitude that turns all the time, antennas with lobes, a take-off point above the origin,
-a radio clock ahead); the tests are named beside the fault and need no field data. A fault that the audit need not see
-has the reason.
+Each fault changes one line between the bytes of a log and a number of the report. The audit uses the flight of
+tests/jobs/test_audit_raw.py (an attitude that rotates all the time, antennas with lobes, a take-off point above the
+origin, a radio clock that is ahead). The tests are listed with each fault and need no field data. If the audit need not
+detect a fault, the reason is given.
 
     python -m tests.long.outside_faults [--only TEXT] [--stale] [--no-tests] [--json]
 """

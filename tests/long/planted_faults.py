@@ -1,10 +1,9 @@
 """Inject faults one at a time into the replay: does the audit of a report detect them?
 
-The flight is the sample flight with the aircraft's attitude and attenuating trees, thinned: nothing of the replay lies
-idle. Each fault is a change of one line of the package, made in memory and taken back; compiled code is
-switched off. Beside the verdict of the audit
-stands what the fault changes: RSS, the phase of H, ranks at K = 10. A fault below 0.1 dB, 0.01 rad and any rank need
-not be seen.
+The flight is a thinned sample flight with the aircraft's attitude and attenuating trees, so that all parts of the replay
+are used. Each fault changes one line of the package in memory, and is undone afterwards. Compiled code is switched off.
+Next to the verdict of the audit, the table lists the effect of the fault on RSS, on the phase of H, and on ranks at
+K = 10. A fault below 0.1 dB and 0.01 rad that changes no rank need not be detected.
 
 Run: python -m tests.long.planted_faults [--only TEXT] [--no-sionna] [--markdown] [--json]
 """

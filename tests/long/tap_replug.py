@@ -1,10 +1,11 @@
-"""Unplug and replug at random moments: is every byte that the kernel gave in a record, and every gap recorded?
+"""Unplug and replug at random moments: is every byte from the kernel in a record, and is every gap recorded?
 
-Two accounts. By bytes: a copy of all that the tap's port gave (one file per opening) is cut into lines here, without
-the package, and held against the lines, unfinished lines and final results of the records. By answers: each answer
-that the modem saw read to its end (the tap had sent its next command) stands in the log, as often as it was given. The
-modem sends byte by byte, so that cables are pulled in the middle of lines. What it sent into a cable that was pulled
-before anybody read it is neither: it is counted as ``bytes_never_read``.
+There are two checks. The first compares bytes: a copy of the bytes that the tap's port received (one file per opening) is
+split into lines here, without code of the package. These are compared with the lines, unfinished lines and final results
+of the records. The second compares answers: each answer that the tap read completely (it had sent its next command) must
+be in the log, as often as the modem sent it. The modem sends byte by byte, so that cables are unplugged in the middle of
+lines. Bytes that it sent into a cable and that were not read before the cable was unplugged are not compared. They are
+counted as ``bytes_never_read``.
 """
 
 import argparse

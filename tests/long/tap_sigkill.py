@@ -1,9 +1,8 @@
-"""SIGKILL at random moments: is every answer that the modem saw read in the log, and no record corrupt?
+"""Send SIGKILL at random moments: does the log contain every answer that the tap read, and no corrupt record?
 
-An answer counts as read once the tap sent its next command, so no waiting second is granted: the check is harder
-than "acknowledged more than one second before". On a machine so busy that a write takes more than a
-quarter of a second, what waits in memory at the kill is lost, as docs/tap.md says; ``--patience-s 10`` tells that from
-any other loss.
+An answer counts as read once the tap sent its next command. This is stricter than to allow one second for writing. On a
+very busy machine, where a write takes more than a quarter of a second, records that wait in memory at the kill are lost
+(docs/tap.md). ``--patience-s 10`` distinguishes this from any other loss.
 """
 
 import argparse

@@ -1,9 +1,9 @@
-"""The tap with its page: does the log lose anything, is a record soon on the screen, what does the server cost?
+"""Run the tap with its page: is the log complete, is the page up to date, and what does the server cost?
 
-Three parts. *Soak*: all rates of a session multiplied, three readers of the page, one of them stopped (SIGSTOP) for
-a twelfth of the time; before it a sixth of the time without the page. *Pace*: the rank at 10 Hz, with and without the
-page and its readers. *Fuzz*: damaged requests while the tap runs. The modem runs in this process; the tap and the
-readers in their own.
+The script has three parts. *Soak* multiplies all rates of a session, with three readers of the page. One of them is
+stopped (SIGSTOP) for a twelfth of the time. Before that, the tap runs without the page for a sixth of the time. *Pace*
+polls the rank at 10 Hz, with and without the page and its readers. *Fuzz* sends damaged requests while the tap runs. The
+modem runs in this process, and the tap and the readers in separate processes.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """Synthetic samples of every format in several encodings. None is taken from a real log.
 
-``sample_files/`` holds those in text, to the byte: a folder for each reader, and one of files that are no logs. What
-is to come of them, lines that are accepted and rejected, stands in ``accounts.csv``.
+``sample_files/`` contains the text formats byte by byte: one folder per reader, and one folder of files that are not logs.
+``accounts.csv`` contains the expected numbers of accepted and rejected lines.
 """
 
 import csv

@@ -1,6 +1,6 @@
 """Logs that were once read wrongly, reduced and invented, with variants in other words and orders.
 
-``cases/`` holds the files; right values follow from what the files say, not from what a reader gives.
+``cases/`` contains the files. The expected values come from the content of the files, not from the output of a reader.
 """
 
 import json

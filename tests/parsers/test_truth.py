@@ -1,7 +1,7 @@
 """Synthetic files with known content: the variations of real programs, for each format.
 
-``truth.yaml`` holds those in text. A case is a file's name, its bytes and, for each stream that it must give, columns as
-they must come out; ``time`` in seconds after 2025-03-02 15:00:00 UTC, which is 10:00:00 in New York.
+``truth.yaml`` contains the text formats. A case has a file name, its bytes, and the expected columns of each stream.
+``time`` is in seconds after 2025-03-02 15:00:00 UTC, which is 10:00:00 in New York.
 """
 
 from dataclasses import dataclass, field, replace

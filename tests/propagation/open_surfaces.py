@@ -1,7 +1,7 @@
 """Specular paths among open triangles by plain enumeration, independent of the engine, for small scenes.
 
-Each triangle is a mirror of its own, in its own plane; every sequence of them is tried, and every triangle is asked
-whether it cuts a segment. Paths are told apart by where they reflect.
+Each triangle is a separate mirror in its own plane. Every sequence of triangles is tried, and every triangle is tested
+for whether it cuts a segment. Paths are distinguished by their reflection points.
 """
 
 import itertools

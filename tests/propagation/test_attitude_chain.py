@@ -1,7 +1,7 @@
-"""From logged attitude to the arrival angle at an antenna: aircraft frame, mount and array, computed by hand.
+"""Attitude from the log to the arrival angle at an antenna: aircraft frame, mount and array, computed by hand.
 
-The pattern writes down from where it is asked; the tower stands level with the UAV, so each case can be turned with a
-hand held flat: thumb up, fingers to the nose.
+The pattern records the directions in which its gain is requested. The tower is level with the UAV, so you can reproduce
+each case with a flat hand: the thumb points up, and the fingers point along the nose.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""One table of columns: CSV, NetCDF, the page and docs/outputs.md have what it says.
+"""One table declares the columns of CSV, NetCDF, the page and docs/outputs.md.
 
 python -m tests.report.test_columns        writes the tables of docs/outputs.md
 """

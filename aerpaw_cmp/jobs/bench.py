@@ -102,11 +102,11 @@ def speed_against_error(
     site, link, poses
         Inputs of the replay.
     samples : sequence of int
-        Rays of the Sionna rows. Empty: no Sionna rows.
+        Rays of the Sionna rows. If empty, there are no Sionna rows.
     depths : sequence of int
         Depths of the rows of the image engine.
     progress : callable
-        Receives the row that is running.
+        Receives the name of the row that is being measured.
 
     Returns
     -------
@@ -221,7 +221,7 @@ def path_search_ratios(
     -------
     dict
         ``at`` maps samples to the numbers of :func:`path_search`. ``equal_error`` is the entry with the fewest samples
-        that find as many paths as the most samples. A ratio to more samples would flatter the image engine.
+        that find as many paths as the most samples. A comparison with more samples would favour the image engine.
     """
     most = path_search(poses, samples[-1])
     at = {samples[-1]: most}
@@ -234,7 +234,7 @@ def path_search_ratios(
 
 
 def median_seconds(action: Callable[[], Any], repeats: int) -> float:
-    """Return the median processor time after a warm-up, which other programs do not change."""
+    """Return the median processor time after a warm-up. Other running programs do not change it."""
     return statistics.median(timeit.repeat(action, timer=time.process_time, number=1, repeat=repeats + 1)[1:])
 
 
@@ -261,7 +261,7 @@ def kriging_vs_pykrige(positions: int = 2556) -> Row | None:
 
 
 def ingest_vs_pandas(lines: int = 20_523) -> Row:
-    """Compare reading a power log of the length of a real flight with ``pandas.read_csv(engine="c")``.
+    """Compare the reader of power logs with ``pandas.read_csv(engine="c")``, on a log as long as a real flight.
 
     The reader returns UTC times, levels, flags and the account of every line; pandas returns text and numbers.
     """

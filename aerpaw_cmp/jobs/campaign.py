@@ -4,7 +4,7 @@ A campaign.yaml names flight files and, optionally, settings: labels with overri
 (``rt.max_depth: 1``). Every setting runs on every flight. A flight that cannot be read is a row with its message.
 
 A task is one flight under one setting. Workers run tasks and return rows of numbers, which are stored. The rows of
-several flights give pooled offsets, held-out errors, a ranking of settings, steps of offsets, and mean residuals by
+several flights determine pooled offsets, held-out errors, a ranking of settings, steps of offsets, and mean residuals by
 position.
 """
 
@@ -73,7 +73,7 @@ class Task:
     reference: bool = True
     """True for the setting whose flights are compared with each other: its positions are stored."""
     key: str | None = None
-    """Digest of the inputs as the planning process sees them. None if an input cannot be read, or without a store."""
+    """Digest of the inputs as the planning process sees them. None if an input cannot be read or there is no store."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +116,7 @@ def _flight_file(path: Path, _size: int, _mtime_ns: int) -> FlightFile:
 
 
 def _settings(task: Task) -> FlightFile:
-    """Return the settings of a task. UsageError if their learned antennas do not fit its overrides."""
+    """Return the settings of a task. Raise UsageError if the learned antennas do not fit the overrides."""
     written = overridden(_flight_file(task.path, *stamp(task.path)), task.overrides)
     return with_learned(written, task.path.parent)
 
@@ -129,7 +129,7 @@ def _logs(key: _Logs) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class _Logs:
-    """A cache key of logs. It compares only what the reading of logs depends on."""
+    """A cache key of logs. It compares only the settings on which the reading of logs depends."""
 
     folder: Path
     logs_root: Path | None
@@ -295,7 +295,7 @@ def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: i
     """Return the tasks of each setting for a dry run. ``kept`` has the stored outcomes by task number.
 
     The time of a task is the mean time of the stored tasks of its setting, divided by ``workers``.
-    If its setting has no stored task, the mean is taken over all stored tasks. Without a stored task it is unknown.
+    If its setting has no stored task, the mean is taken over all stored tasks. If there is no stored task, the time is unknown.
     """
     spent: dict[str, list[float]] = {}
     for number, outcome in kept.items():
@@ -622,7 +622,7 @@ def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
             common = [k for k in fits if other_flights and all(k in at for at in other_flights)]
             if not common:
                 continue
-            # only values of K that all other flights have, because means over different flights cannot be compared
+            # use only values of K that all other flights have, because means over different flights cannot be compared
             chosen = min(common, key=lambda k: finite_mean([at[k].total_variation for at in other_flights]))
             best = min(fits, key=lambda k: fits[k].total_variation)
             out.append(
@@ -696,7 +696,7 @@ def _iso(ns: int) -> str:
 
 
 def _held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
-    """Return rows with the offset of the other flights of their setting, tower and channel, and the RMSE after it."""
+    """Return rows with the RMSE after the offset of the other flights of the same setting, tower and channel."""
     groups: dict[tuple[str, str, str, str], list[int]] = {}
     for i, row in enumerate(rows):
         groups.setdefault((row.setting, row.tower, row.channel, row.unit), []).append(i)
@@ -736,7 +736,7 @@ def rank_settings(
     flights : sequence of str
         Flights that are compared.
     link : str
-        Link of the rows, for the record.
+        Link of the rows, which is stored in the result.
 
     Returns
     -------
@@ -782,7 +782,7 @@ def _paired(errors: Mapping[str, Any], base: Mapping[str, Any], flights: Sequenc
 
 
 def _flown(rows: Sequence[RssRow], order: Sequence[str], started: Mapping[str, int]) -> tuple[NodeOffset, ...]:
-    """Return the offset of each tower and channel over the flights, minus the common part, and its steps."""
+    """Return the offsets of each tower and channel over the flights, minus their common part, and their steps."""
     known = {(row.flight, row.link): row.moments.mean_db for row in rows}
     links = list(dict.fromkeys(row.link for row in rows))
     offsets = np.array([[known.get((flight, link), np.nan) for link in links] for flight in order])
@@ -804,7 +804,7 @@ def soundings(paths: Sequence[Path], timezone: str | None) -> tuple[NodeOffset, 
     Raises
     ------
     InputError
-        If no log names a link.
+        If no log names both ends of a link.
     """
     levels = []
     for file in ingest(paths, options=ReadOptions(timezone=timezone)):
@@ -828,7 +828,7 @@ def soundings(paths: Sequence[Path], timezone: str | None) -> tuple[NodeOffset, 
 
 
 def _radio(link: Mapping[str, Any], end: str) -> str:
-    """Return tower, serial number and channel of one end of a link, as far as the log has them."""
+    """Return tower, serial number and channel of one end of a link, if the log has them."""
     serial, channel = link.get(f"{end}_serial_number"), link.get(f"{end}_channel")
     return str(link[end]) + (f" {serial}" if serial else "") + (f":{channel}" if channel else "")
 

@@ -57,7 +57,7 @@ class ChannelOptions:
     formats : sequence of str
         Names in :data:`aerpaw_cmp.report.channel.FORMATS`.
     bandwidth_hz : float, optional
-        Bandwidth for H at subcarriers.
+        Bandwidth of the subcarriers at which H is computed.
     subcarriers : int, optional
         Number of subcarriers. Default: 1024.
     """
@@ -84,7 +84,7 @@ def channel_parts(
     stages : Stages, optional
         Times "replay" and "paths".
     room : int, optional
-        Largest size of all parts together [bytes]. None: one part, in memory.
+        Largest size of all parts together [bytes]. None means a single part in memory.
 
     Yields
     ------
@@ -105,7 +105,7 @@ def channel_parts(
     link = link_settings.build(towers, data.folder)
     along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
     # a speed over less than one second is mostly noise of the positions
-    spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # long steps are not gaps
+    spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # a long step is not a gap
     velocity = velocities_mps(along.time_s, along.poses.position_m, *spans)
     if np.isfinite(velocity).any():
         other = None if along.towers_m is None else velocities_mps(along.time_s, along.towers_m, *spans)
@@ -118,7 +118,7 @@ def channel_parts(
     count, links = len(along.poses), len(along.poses) * len(towers)
     pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
     size = _size(pairs, _PATHS, offsets)
-    # a power of two, as the chunks of the file: a part that ends within a chunk would compress the chunk twice
+    # use a power of two, like the chunks of the file: a part that ends within a chunk would compress the chunk twice
     at_once = 1 << max(0, (_PART_BYTES * count // size).bit_length() - 1)
     further = " of disk space"
     if (drawn := settings.rt.engine != "image") or room is None:  # Sionna draws its rays for all poses at once
@@ -126,7 +126,7 @@ def channel_parts(
         further = ", or only netcdf and csv" + (" with rt.engine: image" if drawn else "")
     _refuse(size, f"{counted(count, 'pose')}, {counted(len(towers), 'tower')}", room, further)
     extent_m = None if at_once >= count else extent_of(along.poses.position_m)
-    progress = stages.progress if extent_m is None else lambda *_: None  # no progress for single parts
+    progress = stages.progress if extent_m is None else lambda *_: None  # do not report progress of single parts
     names = {"": 0}  # the line of sight
     for start in range(0, count, at_once):
         part = along.part(slice(start, start + at_once))
@@ -246,13 +246,13 @@ def _planned(data: FlightData, route: Path, step_s: float) -> Along:
 
 
 def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> Callable[[Poses], dict[str, Any]]:
-    """Return a function for the calibrated levels of poses by the site's learned antennas, if there are any."""
+    """Return a function for the calibrated levels of poses, with the learned antennas of the site if there are any."""
     towers, sources = tuple(link.tower_arrays), dict[str, Source]()
     memory = memory_of(data.site_place, data.site)
     if memory is None:
         remarks.append("No calibrated level: no antennas were learned for this site (aerpaw-cmp calibrate).")
         return lambda _: {}
-    # antennas of the link's channel come first (False before True), else those of another channel near the carrier
+    # try the antennas of the link's channel first (False sorts before True), then those of another channel
     for source in sorted(memory.sources().values(), key=lambda s: s.channel != name):
         near = abs(source.link.carrier_hz / link.carrier_hz - 1.0) <= BAND
         if source.tower in towers and near and source.tower not in data.nodes:
@@ -298,7 +298,7 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
     settings, stages = load_with_learned(flight), Stages(options.progress)
     root, route = options.logs_root or flight.parent, chosen.route
     if route is None and settings.flight.plan and not all((root / log.path).exists() for log in settings.logs):
-        route = flight  # not flown yet: use its plan
+        route = flight  # the flight has no logs yet, so use its plan
     inputs = [*inputs_of_flight(settings, flight, root), *([] if route is None else target_files(route, None, root))]
     folder = options.out or Path("reports") / f"channel-{settings.flight.name}"
     with OutputFolder(folder, job="channel", inputs=inputs, force=options.force) as output:

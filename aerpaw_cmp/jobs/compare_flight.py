@@ -103,7 +103,7 @@ _SERVING_WITHIN_S = 1.5
 
 
 def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> ServingComparison | None:
-    """Compare the logged serving cells with the strongest predicted cells. None if no log has the serving cell.
+    """Compare the logged serving cells with the strongest predicted cells. Return None if no log contains the serving cell.
 
     The comparison has the cells that the flight file assigns to towers, at the times when one of them served. Levels
     are as simulated: cells of one network have equal power, and an offset per cell would hide which one is stronger.
@@ -214,10 +214,10 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
 
 
 def stated_spread(replayed: Replayed) -> StatedSpread | None:
-    """Return the error bars that learned antennas state for the level of the direct path. None without such antennas.
+    """Return the error bars that learned antennas state for the level of the direct path. None if there are no such antennas.
 
-    If only one end is learned, or no file has the gain of both ends together, the gains of both ends are taken as
-    independent. They are learned from the same levels, so the true standard deviation is rather smaller.
+    If only one end is learned, or no file has the joint gain of both ends, the gains of both ends are assumed to be
+    independent. They are learned from the same levels, so the true standard deviation is probably smaller.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
     geometry = link_geometry(data.site, series.tower, replayed, data.settings.rt)
     position = replayed.spread(replayed.poses.position_m)
     simple = _baseline_levels(data.site, series.tower, replayed)
-    # the empirical baselines are about the mean of free space
+    # fit the empirical baselines to levels relative to the mean of free space
     known = np.isfinite(levels.measured_db) & np.isfinite(simple["free_space"])
     mean = float(simple["free_space"][known].mean()) if known.any() else np.nan
     line = log_distance_level_db(levels.measured_db, geometry["distance_m"], position)
@@ -291,7 +291,7 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
 
 
 def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> RssFurther:
-    """Return counts and conditions, and for a scored series further views of the error.
+    """Return counts and conditions, and for a scored series further statistics of the error.
 
     Parameters
     ----------
@@ -388,7 +388,7 @@ def _baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, Fl
     """Return free space and two-ray levels (isotropic) at the samples (n,) [dBm]."""
     place, link = site.towers[tower], replayed.link
     source, target = replayed.source_m(site), replayed.poses.position_m
-    if replayed.tower_m is not None:  # one position per pose: (poses, towers, 3)
+    if replayed.tower_m is not None:  # the tower has one position per pose: (poses, towers, 3)
         source = source[:, None, :]
     ends = (source, target, link.carrier_hz, link.transmit_power_dbm)
     two_ray = two_ray_dbm(*ends, ground_material=site.ground_material, ground_m=place.ground_m)
@@ -453,7 +453,7 @@ def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:
 
 
 def _detection(case: _Case) -> DetectionScore | None:
-    """Score P(lock) or P(above the floor), and all samples with the floor. None without lock and floor."""
+    """Score P(lock) or P(above the floor), and all samples with the floor. None if there is neither lock nor floor."""
     series, levels, lock = case.series, case.levels, _lock(case)
     if series.locked is not None:
         known, detected, floor_db = np.isfinite(series.locked), series.locked == 1.0, LOCK_FLOOR_DB
@@ -543,7 +543,7 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
     dict of str to (n,)
         ``altitude_m``, ``distance_m``, ``elevation_deg``, ``azimuth_deg``, ``tower_elevation_deg``,
         ``uav_azimuth_deg``, ``uav_elevation_deg``; ``heading_deg`` with a track, ``foliage_depth_m`` with trees.
-        NaN without a known pose.
+        NaN if no pose is known.
     """
     link = replayed.link
     directions = rss.link_geometry(
@@ -638,7 +638,7 @@ def fitted_receiver(data: FlightData, tower: str) -> FittedReceiver | None:
     named = data.settings.rank.receiver
     if named is None:
         return None
-    from .calibrate_rank import read_receiver  # few flights name one
+    from .calibrate_rank import read_receiver  # import here, because few flights name a receiver
 
     receivers = read_receiver(data.folder / named)
     if tower not in receivers:
@@ -653,15 +653,15 @@ def fitted_receiver(data: FlightData, tower: str) -> FittedReceiver | None:
 def _receiver_forecast(
     data: FlightData, series: RankSeries
 ) -> tuple[FloatArray | None, ForecastScore | None, tuple[str, ...]]:
-    """Return the receiver's probability of each rank (n, 4), its score, and this flight's logs if fitted on them."""
+    """Return the receiver's probability of each rank (n, 4), its score, and the logs of this flight if it was fitted on them."""
     receiver = fitted_receiver(data, series.tower)
     if receiver is None:
         return None, None, ()
-    from .calibrate_rank import rank_samples  # few flights name a receiver
+    from .calibrate_rank import rank_samples  # import here, because few flights name a receiver
 
     samples = rank_samples(data, series)
     probability, decided = receiver.forecast(samples)
-    if receiver.knows(samples):  # no score on its own training data
+    if receiver.knows(samples):  # do not score a receiver on its own training data
         return probability, None, samples.logs
     constant = receiver.mixture.members[0].constant
     return probability, score_forecast(samples.rank, probability, decided, constant), ()
@@ -701,7 +701,7 @@ def _agreement_by_ground(
     Returns
     -------
     dict of str to float
-        Empty for sites without ``ground_points``, scenes of triangles and moving towers.
+        The dict is empty if the site has no ``ground_points`` or is a scene of triangles, or the tower moves.
     """
     model = site_model(data.site_place)
     known = np.flatnonzero(np.isfinite(measured))

@@ -1,6 +1,6 @@
 """The ``map`` job: coverage and rank maps in several foliage modes, their study, and the record of the page.
 
-Paths depend neither on arrays nor on foliage, so each chunk of positions is searched once. Single elements, arrays and
+Paths do not depend on arrays or foliage, so each chunk of positions is searched once. Single elements, arrays and
 all foliage modes are evaluated on these paths, and a foliage mode only evaluates the links with foliage.
 """
 
@@ -151,7 +151,7 @@ class MapSettings:
             raise UsageError(f"tiles of {self.tile_m:g} m", expected=f"at least the spacing, {self.spacing_m:g} m")
 
     def tile_cells(self, grid: Grid) -> int | None:
-        """Return the number of positions along a side of a tile. None for a map in one piece."""
+        """Return the number of positions along a side of a tile, or None for a map in one piece."""
         if self.tile_m is not None:
             return max(1, round(self.tile_m / self.spacing_m))
         receivers = len(grid) * len({*self.rss_altitudes_m, *self.rank_altitudes_m})
@@ -275,7 +275,7 @@ class SiteChannels:
         }  # fmt: skip
 
     def empty(self, grid: Grid) -> dict[str, job.MapResult]:
-        """Return maps by foliage mode without coverage."""
+        """Return maps without coverage, by foliage mode."""
         self._take_site(replace(self.reach.site, towers={}))
         return self._maps(grid)
 
@@ -401,7 +401,7 @@ DRAWS = 10
 class MapOutcome:
     """All results of one run.
 
-    ``maps`` has the maps by foliage mode, for a map in tiles at the positions in ``tiles``. ``studies`` has one study
+    ``maps`` has the maps by foliage mode. For a map in tiles, they are at the positions in ``tiles``. ``studies`` has one study
     per treatment of positions out of coverage. They are missing ("missing"), have rank 0 ("zero"), or have rank 0 with
     M random samples instead of the M nearest ("random"). ``draws`` has the scores of "random" for :data:`DRAWS`
     draws. ``blocks`` has the errors of each interpolator on held-out square blocks.
@@ -451,7 +451,7 @@ def make_maps(
     name : str
         Name of the site for workers.
     out : Path, optional
-        Output folder. Finished tiles are files in ``NAME.tiles`` next to it. None: a map in one piece.
+        Output folder. Finished tiles are files in ``NAME.tiles`` next to it. None means a map in one piece.
 
     Returns
     -------
@@ -468,7 +468,7 @@ def make_maps(
     crew = workers or InProcess()
     share = partial(stages.progress, "maps")
     tile_cells = None if out is None else settings.tile_cells(grid)
-    # four tiles per worker: with one tile each, all would wait for the slowest worker
+    # make four tiles per worker, because with one tile each, all workers would wait for the slowest worker
     shared = math.ceil(math.sqrt(len(grid) / (4 * crew.count)))
     tiling = Tiling(grid, tile_cells or (shared if crew.count > 1 else max(grid.shape)))
     with stages("maps"):
@@ -522,13 +522,13 @@ def _write_tiles(
         )
     step = math.ceil(math.sqrt(len(tiling.grid) / SHOWN_POSITIONS))
     outcome.maps, outcome.paths = tiling.joined(map(store.read, range(len(tiling))), step)
-    # the study needs neighbours at distances that every n-th position does not have
+    # the study needs close neighbours, which every n-th position does not have
     outcome.settings = replace(outcome.settings, study=False)
     outcome.tiles = {"tiles": len(tiling), "positions": len(tiling.grid), "shown_every": step}
 
 
 def _job_of(site: str, settings: MapSettings) -> dict[str, Any]:
-    """Return all inputs of the values of a map: settings, content of the site's files, program."""
+    """Return everything on which the values of a map depend: settings, content of the site's files, program."""
     without = ("study", "neighbours", "radius_m", "block_m", "seed")
     chosen = {key: str(value) for key, value in asdict(settings).items() if key not in without}
     files = [file_digest(file)[:12] for file in inputs_of_site(site)]
@@ -746,7 +746,7 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
 
 
 def _correlations(outcome: MapOutcome) -> dict[str, tuple[BinnedCorrelation, BiExponential | None]]:
-    """Return each correlation against distance, with its fitted curve if it has one, by title."""
+    """Return each correlation against distance, with its fitted curve if there is one, by title."""
     titles = {"horizontal": "Rank, one height", "vertical": "Rank, across heights", "RSS": "RSS, one height"}
     studies = {key: outcome.studies[key] for key in TREATMENTS if key in outcome.studies}
     fitted = {f"Rank vectors, {TREATMENTS[key]}": (study.correlation, study.fit) for key, study in studies.items()}

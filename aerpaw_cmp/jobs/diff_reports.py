@@ -135,7 +135,7 @@ def read_metrics(file: Path) -> dict[str, Any]:
 
 
 def _table(path: Path, kind: str, columns: Sequence[str]) -> Any:
-    """Read a table of samples. Errors name the line."""
+    """Read a table of samples. An error names the line of the table."""
     import pandas as pd
 
     texts = {name: "str" for name in ("time_utc", "tower", "channel", "unit") if name in columns}
@@ -257,7 +257,7 @@ def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterat
 
 
 def _matched(mine: Any, theirs: Any) -> tuple[verdict.Overlap, Any, Any]:
-    """Return the rows of two tables of one link at common times. Several rows at one time keep their order."""
+    """Return the rows of two tables of one link at common times. Rows with the same time keep their order."""
 
     def keyed(table: Any) -> Any:
         # logs without times of day have seconds after the first sample
@@ -265,7 +265,7 @@ def _matched(mine: Any, theirs: Any) -> tuple[verdict.Overlap, Any, Any]:
         return table.assign(_key=instant, _turn=instant.groupby(instant).cumcount()).set_index(["_key", "_turn"])
 
     first, second = keyed(mine), keyed(theirs)
-    # the usual case of two reports of the same logs, where a join would take most of the time
+    # in the usual case of two reports of the same logs, avoid the join, which would take most of the time
     if first.index.equals(second.index):
         return verdict.Overlap(first=len(first), second=len(second), common=len(first)), first, second
     common = first.index.intersection(second.index, sort=False)
@@ -278,7 +278,7 @@ def _values(table: Any, name: str) -> FloatArray:
 
 
 def _instants(table: Any) -> FloatArray:
-    """Return seconds since 1970. For logs without times of day, seconds after the first sample of the link."""
+    """Return seconds since 1970, or since the first sample of the link if the log has no times of day."""
     import pandas as pd
 
     known = pd.to_datetime(table["time_utc"].where(table["time_utc"] != ""), utc=True, errors="coerce")
@@ -292,10 +292,9 @@ def _places_m(table: Any) -> FloatArray:
 
 
 def _levels(mine: ReadReport, theirs: ReadReport) -> Iterator[tuple[verdict.LevelDifference, Any, FloatArray]]:
-    """Yield the difference of each common link.
+    """Yield the difference of each common link, with the data of its common samples.
 
-    With it are the times [s] and the residuals of the second and of the first report, and the positions (n, 3) of the
-    common samples.
+    The data are the times [s], the residuals of the second and of the first report, and the positions (n, 3).
     """
     names = ("measured_db", "simulated_dbm", "residual_db")
     for (tower, channel), numbers in links_of(mine.metrics["rss"]).items():

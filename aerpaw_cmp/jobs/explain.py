@@ -87,7 +87,7 @@ def run_explain(
     ----------
     flight : Path
     time : str
-        Seconds after the first sample of the tower, or ISO 8601 (without an offset: in the flight's time zone).
+        Seconds after the first sample of the tower, or ISO 8601 (in the time zone of the flight if it has no offset).
     tower : str
     channel : str, optional
         Channel of the RSS logs, or "rank" for the rank log. Default: the first series of the tower.
@@ -104,7 +104,7 @@ def run_explain(
     Raises
     ------
     UsageError
-        If tower or channel is unknown, the time is malformed or outside the logs, or no pose is known at it.
+        If tower or channel is unknown, the time is malformed or outside the logs, or no pose is known at that time.
     """
     settings = load_with_learned(flight)
     data = load_data(settings, flight.parent, logs_root)
@@ -206,7 +206,7 @@ def _instant(text: str, first: Any, zone: str | None) -> Any:
 def _pose(
     data: FlightData, series: RssSeries | RankSeries, at: int, progress: Progress
 ) -> tuple[Link, Poses, list[str], Times]:
-    """Return link and pose of a sample as in the report, notes, and its time (1,) on the telemetry's clock."""
+    """Return link and pose of a sample as in the report, notes, and the time (1,) on the clock of the telemetry."""
     rt, notes = data.settings.rt, []
     if isinstance(series, RssSeries):
         time = series.time

@@ -318,7 +318,7 @@ class _Climber:
     def _trees(self, best: Model) -> list[Model]:
         if not self._data.site.wooded:
             return []
-        # without Weissberger: within 0.11 dB of P.833 on every real flight
+        # Weissberger is not tried, because it is within 0.11 dB of P.833 on every real flight
         kinds: tuple[Trees, ...] = ("p833", "opaque")
         media = any(forest.height_m is not None for forest in self._data.site.forests)
         return [dataclasses.replace(best, trees=kind, media=media and kind != "opaque") for kind in kinds]
@@ -450,7 +450,7 @@ def _arrays(link: Link) -> list[Any]:
 
 
 def _isotropic_link(link: Link) -> Link:
-    """Return the link with isotropic elements."""
+    """Return the link with isotropic antenna elements."""
 
     def other(array: Any) -> Any:
         return dataclasses.replace(array, patterns=tuple(Isotropic() for _ in array.patterns))
@@ -462,7 +462,7 @@ def _isotropic_link(link: Link) -> Link:
 def recommended_changes(
     settings: FlightFile, stated: Mapping[str, Any], model: Model, offered: Mapping[str, str] | None = None
 ) -> dict[KeyPath, Any]:
-    """Return the keys of a flight file that a model changes, by path. None for a key to remove.
+    """Return the keys of a flight file that a model changes, by path. A value of None means that the key is removed.
 
     Parameters
     ----------
@@ -537,7 +537,7 @@ def recommended_text(settings: FlightFile, ladder: FlightLadder | None, flight: 
     """
     if ladder is None or ladder.ladder.recommended is None:
         raise _NOT_RECOMMENDED
-    # bytes: line ends stay as they are
+    # read bytes, so that line ends stay as they are
     text = unsealed(flight.read_bytes().decode("utf-8"))
     if ladder.recommended is None:
         return text, f"No model is significantly better than {flight.name}: the recommended file is a copy of it."
@@ -623,7 +623,7 @@ def run_flight(
 
 
 def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
-    """Return the stages of a report for its dry run. ``figures`` is as for the report.
+    """Return the stages of a report for its dry run. ``figures`` is the option of the report.
 
     One pose of every series is replayed and the receiver is read, so that errors of the run appear in the dry run.
     """
@@ -647,7 +647,7 @@ def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
 
 
 def cause_beyond_models(cause: Cause | None, climbed: FlightLadder | None) -> Cause | None:
-    """Return the likely cause. None for a function of direction if the recommended model explains as much."""
+    """Return the likely cause, or None if it depends on direction and the recommended model explains as much."""
     if cause is None or cause.name not in OF_DIRECTION or climbed is None or climbed.recommended is None:
         return cause
     at, rmse_db = climbed.ladder.recommended, climbed.ladder.rmse_db

@@ -30,7 +30,7 @@ class Shown:
     Parameters
     ----------
     web : str, optional
-        HOST:PORT of the page; None: no page.
+        HOST:PORT of the page. None means no page.
     flight, telemetry : Path, optional
         flight.yaml of the prediction, and the growing telemetry log.
     say : callable
@@ -53,7 +53,7 @@ def tap_modems(
     settings : TapSettings
         Settings of each modem. ``port``, and for several modems a folder in ``folder``, are set here.
     ports : sequence of str or None
-        None: the first AT port of a Quectel modem.
+        None means the first AT port of a Quectel modem.
     shown : Shown
     on_status : callable
         Receives the name of the modem (empty if there is only one) and its status.

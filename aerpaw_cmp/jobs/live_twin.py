@@ -80,7 +80,7 @@ class LiveTwin:
         return predict_along(follower, partial(self.at, ahead=self.route_ahead()))
 
     def route_ahead(self) -> RouteAhead | None:
-        """Return the prediction of the planned route, which learns during the flight. None without a plan."""
+        """Return the prediction of the planned route, which learns during the flight, or None if there is no plan."""
         plan = self.settings.flight.plan
         if plan is None:
             return None

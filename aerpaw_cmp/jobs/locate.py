@@ -50,7 +50,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
     Raises
     ------
     UsageError, InputError
-        There is no telemetry or no such channel, there are too few levels, or they do not determine a place.
+        If there is no telemetry or no such channel, or the levels are too few or do not determine a position.
     """
     settings, stages = load_with_learned(flight), Stages(options.progress)
     inputs = inputs_of_flight(settings, flight, options.logs_root)
@@ -132,7 +132,7 @@ def _cautions(settings: FlightFile, channel: str, uav: MeasuredPattern | None) -
 
 
 def _numbers(site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -> dict[str, Any]:
-    """Return numbers and sentences about the node for metrics.json and the page. ``ends`` is about the antennas."""
+    """Return numbers and sentences about the node for metrics.json and the page. ``ends`` describes the antennas."""
     parts, names = estimate.regions.modes(), ("latitude_deg", "longitude_deg", "east_m", "north_m")
     angles = site.frame.to_geographic(*np.array([mode.place_m for mode in parts]).T)
     modes = [
@@ -143,7 +143,7 @@ def _numbers(site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -
     position = dict(zip(names[:2], (float(v[0]) for v in site.frame.to_geographic(place[:1], place[1:])), strict=True))
     region50_m, region90_m = (estimate.regions.radius_m(place, part) for part in (0.5, 0.9))
     low, high = estimate.height_m
-    floor = "not known" if not np.isfinite(track.floor_db) else f"{track.floor_db:.1f} dB; levels below are not known"
+    floor = "not known" if not np.isfinite(track.floor_db) else f"{track.floor_db:.1f} dB; lower levels are not known"
     edge = "The region reaches the edge of the search, 400 m beyond the flight: the node may be farther away."
     return {
         "sentence": _sentence(position, modes, region90_m),
@@ -155,7 +155,7 @@ def _numbers(site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -
             f"Path-loss exponent {estimate.slope:.1f} ± {2.0 * estimate.slope_sd:.1f} (fitted, 95 %).",
             ends,
             f"Height of the node: {low:g} m"
-            + ("." if low == high else f" or {high:g} m, between which the levels do not decide."),
+            + ("." if low == high else f" or {high:g} m. The levels do not decide between them."),
             f"Floor of the receiver: {floor}. The levels determine weights for strength and "
             "length of the shadowing. No path is ray-traced.",
         ),

@@ -112,7 +112,7 @@ class PlanOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidate:
-    """A candidate flight: route, pattern (None for a file), reason of a refusal, and the SD after it [dB]."""
+    """A candidate flight: its route, its pattern (None for a file), why it is refused, and the SD after it [dB]."""
 
     route: Route
     pattern: Pattern | None = None
@@ -121,7 +121,7 @@ class Candidate:
 
     @property
     def row(self) -> dict[str, Any]:
-        """Entry of this candidate in metrics.json."""
+        """The entry of this candidate in metrics.json."""
         length = {"length_m": self.route.length_m, "minutes": self.route.duration_s / 60.0}
         return {"name": self.route.name, "sd_db": self.sd_db, **length, "refused": self.refused}
 
@@ -136,7 +136,7 @@ def _plan_flight(
     target : str
         ``sphere``, or a target of :func:`.sources.find_targets`.
     flights : sequence of NamedFlight
-        Earlier flights. Without them the antennas are unknown.
+        Earlier flights. If there are none, the antennas are unknown.
     plan : PlanOptions
     logs_root : Path or None
     stages : Stages
@@ -265,7 +265,7 @@ def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
         latitude, longitude = np.array(corners).T
         east, north = site.frame.to_local(latitude, longitude)
         ring = shapely.Polygon(np.column_stack([east, north]))
-        if len(corners) > _MOST_CORNERS or is_tangled(ring):  # a repair has no time limit
+        if len(corners) > _MOST_CORNERS or is_tangled(ring):  # the repair of such an outline has no time limit
             raise InputError(
                 f"an area of {len(corners)} corners that cannot be used",
                 expected=f"at most {_MOST_CORNERS} corners and {MAX_CROSSINGS} crossings of the outline with itself",
@@ -297,7 +297,7 @@ def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
 
 
 def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
-    """Return routes of files at the speed of the plan, each with the reason if it is refused."""
+    """Return routes of files at the speed of the plan, each with the reason for a refusal."""
     out = []
     for path in plan.routes:
         targets = find_targets(path, site, TargetOptions(heights_m=plan.heights_m))
@@ -305,7 +305,7 @@ def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
             raise InputError("not a route", expected="a .plan, KML, CSV or log with two points or more", path=path)
         place, yaw = targets.position_m[targets.known], targets.yaw_deg[targets.known]
         steps = np.diff(place, axis=0)
-        yaw = np.where(np.isfinite(yaw), yaw, bearing_deg(np.vstack([steps, steps[-1:]])))  # else along the course
+        yaw = np.where(np.isfinite(yaw), yaw, bearing_deg(np.vstack([steps, steps[-1:]])))  # if the file has no yaw, the nose points along the course
         ground = site.takeoff_ground_m
         points = [
             Waypoint(east_m=float(p[0]), north_m=float(p[1]), height_m=float(p[2]) - ground, yaw_deg=float(y))
@@ -343,7 +343,7 @@ def _leaves_area(route: Route, area: Any) -> bool:
 
 
 def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, str]]) -> dict[str, LinkSamples]:
-    """Return target points (None: all directions) per antenna, at all headings if a point has no heading."""
+    """Return target points per antenna (all directions if ``points`` is None), at all headings if none is given."""
     out = {}
     for antenna, end in ends.items():
         tower = np.asarray(site.towers[end[0]].position_m)
@@ -402,7 +402,7 @@ def _flown_knowledge(series: Sequence[LinkSamples]) -> Known:
 
 
 def _thinned(samples: LinkSamples, most: int) -> LinkSamples:
-    """Return at most ``most`` samples of a target. The step has no common factor with the number of headings."""
+    """Return at most ``most`` samples of a target. The step and the number of headings have no common factor, so that all headings occur."""
     step = max(1, math.ceil(len(samples) / most))
     step += int(step > 1 and step % 2 == 0)
     return samples.part(np.arange(0, len(samples), step))
@@ -438,7 +438,7 @@ def _curve(
 
 
 def _of_length(candidate: Candidate, share: float, area: Any, plan: PlanOptions) -> Route | None:
-    """Return a candidate for this share of the battery. None for more than the length of a file."""
+    """Return a candidate for a share of the battery, or None if the route of a file is shorter than that."""
     if candidate.pattern is not None:
         return route_of(candidate.pattern, area, plan.speed_mps, 60.0 * share * plan.minutes)
     full = flown(candidate.route.name, candidate.route.waypoints, plan.speed_mps)

@@ -97,7 +97,7 @@ def _drafted(file: Path, flight: str | None) -> FlightFile:
 @from_python
 @dataclass(repr=False, eq=False)
 class Flight:
-    """A checked flight.yaml with its logs. It is replayed only on request.
+    """A checked flight.yaml with its logs. The flight is replayed only on request.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class Flight:
 
     @cached_property
     def rss(self) -> pd.DataFrame:
-        """Measured levels: ``time tower channel unit measured_db east_m north_m up_m``. NaN without a signal."""
+        """Measured levels: ``time tower channel unit measured_db east_m north_m up_m``. NaN if there is no signal."""
         frames = []
         for series in self.data.rss:
             position = np.full((len(series.time), 3), np.nan)
@@ -190,7 +190,7 @@ class Flight:
         keys = {key if "." in key else f"rt.{key}": value for key, value in overrides.items()}
         if engine is not None:
             keys["rt.engine"] = engine
-        # overrides first, because learned antennas must fit their carrier
+        # apply overrides first, because learned antennas must fit the carrier in them
         settings = with_learned(overridden(self.written or self.data.settings, keys), self.path.parent)
         data = gather(settings, self.path.parent, self.data.files, self.logs_root) if keys else self.data
         return ReplayedFlight(data, replay_flight(data))
@@ -299,7 +299,7 @@ class ReplayedFlight:
 
     @property
     def rss_dbm(self) -> dict[Series, FloatArray]:
-        """Simulated level (n,) [dBm] at every sample of a series. NaN without a pose or a path."""
+        """Simulated level (n,) [dBm] at every sample of a series. NaN if there is no pose or no path."""
         return {key: replayed.spread(replayed.replay.rss_dbm[:, 0]) for key, replayed in self.series.items()}
 
     @property
@@ -398,7 +398,7 @@ class Comparison:
             A node ``<tower>/<channel>`` per RSS series and ``<tower>/rank`` per rank series. Times are UTC.
 
             - RSS: ``measured_db``, ``calibrated_db`` (measured plus the fitted offset), ``simulated_dbm``, and
-              ``residual_db`` (calibrated minus simulated, NaN without a comparison).
+              ``residual_db`` (calibrated minus simulated, NaN if not compared).
             - Rank: ``measured``, and ``simulated`` by ``k``.
 
         Raises

@@ -25,7 +25,7 @@ class RunOptions:
     out : Path, optional
         Folder or file of the results. Each job has a default.
     logs_root : Path, optional
-        Folder against which the paths of logs resolve.
+        Folder to which the paths of logs are relative.
     force : bool
         Also replace files that this tool did not write or that were changed since. Inputs are never replaced.
     workers : int
@@ -33,7 +33,7 @@ class RunOptions:
     scheduler : str, optional
         Address of a Dask scheduler, used instead of local processes.
     progress : Progress
-        Receives stages and the share done.
+        Receives the name of each stage and the share that is done.
     dry : bool
         Only check the inputs: the job raises :class:`~aerpaw_cmp.common.stages.NotRun` before the computation.
     """
@@ -63,7 +63,7 @@ class JobOutcome:
     ----------
     folder : Path
     metrics : dict
-        Content of metrics.json. Empty for a job without metrics.
+        Content of metrics.json. The dict is empty for a job without metrics.
     files : tuple of Path
         Files that were written, the page first.
     failed_checks : tuple of str

@@ -421,7 +421,7 @@ def _table(
 ) -> pd.DataFrame:
     """Return the rows of every tower and channel, then of every receiver.
 
-    Numbers are float32, because a million points would take gigabytes otherwise.
+    Numbers are float32, because float64 would take gigabytes for a million points.
 
     Parameters
     ----------
@@ -489,9 +489,9 @@ def _stated(model: Flown | Memory | Prior, antenna: str, level_db: AnyArray, slo
 def _levels(
     targets: Targets, sources: Mapping[str, Source], model: Flown | Memory | Prior, progress: Progress
 ) -> tuple[AnyArray, AnyArray, BoolArray]:
-    """Return level, standard deviation of 4 s means (series, n) [dB], and True where the model is a guess.
+    """Return level, standard deviation of 4 s means (series, n) [dB], and True where the model extrapolates.
 
-    Headings have equal weights if the heading is not known.
+    All headings have equal weights if the heading is unknown.
     """
     level, slow = np.full((2, len(sources), len(targets)), np.nan, dtype=np.float32)
     guess: BoolArray = np.zeros(level.shape, dtype=np.bool_)
@@ -507,7 +507,7 @@ def _levels(
 
 
 def _in_parts(targets: Targets) -> Iterator[tuple[IntArray, float]]:
-    """Yield blocks of neighbouring targets with a position, and the share that is done after each."""
+    """Yield blocks of neighbouring targets with a position, and the share of targets that is done after each block."""
     known = np.flatnonzero(targets.known)
     tile = np.floor(targets.position_m[known, :2] / _TILE_M)
     known = known[np.lexsort(tile.T)]
@@ -525,7 +525,7 @@ def _turns(yaw_deg: FloatArray) -> FloatArray:
 def _serving(level: AnyArray, slow: AnyArray, channels: Sequence[str]) -> AnyArray:
     """Return the probability (series, n) that each tower is the strongest of its channel.
 
-    Gauss-Hermite quadrature over the level of the tower. Levels of towers are assumed to be independent.
+    The method is Gauss-Hermite quadrature over the level of the tower, with independent levels of the towers.
     """
     from scipy.special import ndtr
 
@@ -583,7 +583,7 @@ def _ranks(
             continue
         position, yaw, each = targets.position_m[some], targets.yaw_deg[some], []
         turns = _turns(yaw).tolist()
-        few = len(some) * len(turns) <= MOST_RANKED  # limits memory
+        few = len(some) * len(turns) <= MOST_RANKED  # all headings at once only for few targets, which limits memory
         asked = [turns] if few and not np.isfinite(yaw).any() else [[turn] for turn in turns]
         for together in asked:
             heading = np.where(np.isfinite(yaw), yaw, together[0])
@@ -664,7 +664,7 @@ class CorrectedLevel:
 class CorrectedMaps:
     """All corrected maps of a run, and the page of the prediction.
 
-    ``ranks``: probabilities (n, 4) by tower and height, NaN where unknown.
+    ``ranks`` contains probabilities (n, 4) by tower and height, NaN where unknown.
     """
 
     levels: tuple[CorrectedLevel, ...]
@@ -737,7 +737,7 @@ def corrected_maps(
     Parameters
     ----------
     site : str
-        The site as in the command ``map``.
+        The site, as for the command ``map``.
     spacing_m : float
     heights_m : (sequence of float, sequence of float)
         Heights of levels, and of ranks.

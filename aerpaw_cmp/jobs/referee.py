@@ -96,11 +96,11 @@ class ForeignPrediction:
         - ``level`` [dB or dBm].
         - Those of ``sd_db q05_db q95_db rank yaw_deg time_s p_rank1..4`` that the file has.
     sha256 : str
-        Digest of the file. Empty for a folder of logs.
+        Digest of the file. It is empty for a folder of logs.
     remarks : tuple of str
         Sentences on how the file was read.
     unit : str
-        Unit of ``level_db``. Empty for the unit of the log.
+        Unit of ``level_db``. It is empty if the levels have the unit of the log.
     """
 
     path: Path
@@ -165,7 +165,7 @@ def read_foreign(path: Path, data: FlightData) -> ForeignPrediction:
 
 
 def _predicted_unit(path: Path, data: FlightData) -> str:
-    """Return the unit of the levels of ``predict`` from its metrics.json. Empty if the channels have several.
+    """Return the unit of the levels of ``predict`` from its metrics.json. The text is empty if the channels have several units.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def _predicted_unit(path: Path, data: FlightData) -> str:
 
 
 # --- formats -------------------------------------------------------------------------------------------------------
-# Each returns a table under the names of the file, and its attributes ``program``, ``remarks`` and ``unit``.
+# Each function returns a table with the column names of the file, and the attributes ``program``, ``remarks`` and ``unit``.
 
 
 def _csv(content: bytes, path: Path) -> pd.DataFrame:
@@ -218,7 +218,7 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
     with parsing(path, "a NetCDF file"):
         values, notes = read_native("netcdf", content)
     remarks: tuple[str, ...] = ()
-    # dimensions and values by name
+    # dimensions and values of each variable by its name
     known = {name.lower(): (notes["dims"][name][: array.ndim], array) for name, array in values.items()}
     if "up_m" in known:
         known.setdefault("height_m", known["up_m"])
@@ -307,7 +307,7 @@ def _emulated(folder: Path, data: FlightData) -> pd.DataFrame:
     units, ours = (sorted({s.unit for s in of.rss}) for of in (twin, data))
     remarks = [f"{folder.name} is an emulated flight: {counted(len(frame), 'level')} with a position."]
     if units != ours:
-        remarks.append(f"Its levels are in {', '.join(units)}, those of the flight in {', '.join(ours)}: no bias.")
+        remarks.append(f"Its levels are in {', '.join(units)}, those of the flight in {', '.join(ours)}, so no bias is stated.")
     unit = units[0] if len(units) == 1 else "several units"
     frame.attrs = {"program": "emulated flight", "remarks": tuple(remarks), "unit": unit}
     return frame
@@ -327,7 +327,7 @@ def _drafted(folder: Path, data: FlightData) -> FlightFile:
 
 
 def _checked(frame: pd.DataFrame, path: Path, site: Site) -> tuple[str, pd.DataFrame]:
-    """Return the quantity and the table under the names of :class:`ForeignPrediction`."""
+    """Return the quantity, and the table with the column names of :class:`ForeignPrediction`."""
     columns = f"(columns: {', '.join(map(str, frame))})"
     quantities = [name for name in QUANTITIES if name in frame]
     if len(quantities) > 1:
@@ -362,7 +362,7 @@ def _numbers(column: Any) -> Any:
 
 
 def _times(frame: pd.DataFrame, path: Path) -> Any:
-    """Return times (n,) as naive UTC datetime64[ns]. NaT without a column of times."""
+    """Return times (n,) as naive UTC datetime64[ns]. NaT if there is no column of times."""
     name = next((name for name in ("time_utc", "time") if name in frame), None)
     if name is None:
         return pd.Series(pd.NaT, index=frame.index, dtype="datetime64[ns]")
@@ -379,7 +379,7 @@ def _times(frame: pd.DataFrame, path: Path) -> Any:
 
 
 def _places(frame: pd.DataFrame, path: Path, site: Site) -> AnyArray:
-    """Return east, north, up (n, 3) in the site frame [m]. NaN without columns of positions."""
+    """Return east, north, up (n, 3) in the site frame [m]. NaN if there are no columns of positions."""
     if set(_PLACE) <= set(frame):
         place = np.column_stack([_numbers(frame[name]) for name in _PLACE])
         cause = "map coordinates (UTM) instead of metres from the origin"
@@ -455,7 +455,7 @@ def _check_names(table: pd.DataFrame, data: FlightData, path: Path) -> None:
 # --- scores --------------------------------------------------------------------------------------------------------
 
 
-# Numbers of a card in the tables, with their heads.
+# Numbers of a card that the tables show, with their headings.
 _HEADS = {
     "bias_db": "bias dB", "rmse_db": "RMSE dB", "rmse_offset_db": "RMSE after offset dB", "rmse_1s_db": "RMSE 1 s dB",
     "correlation": "correlation", "crps_db": "CRPS dB", "coverage_90": "inside 90 %",
@@ -521,7 +521,7 @@ def judge(
 
 
 def _means(series: Sequence[_Series]) -> list[dict[str, Any]]:
-    """Return the means over channels of each model. None for a number that is missing for a channel."""
+    """Return the means over channels of each model. A number that is missing for a channel is None."""
     rows = []
     for model in dict.fromkeys(name for entry in series for name in entry["cards"]):
         cards = [entry["cards"][model] for entry in series if model in entry["cards"]]
@@ -586,7 +586,7 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
     scored = near & heard & np.isfinite(level)
     if scored.sum() < FEWEST:
         return None
-    # without a reference in common with the log, a missing level is not a predicted outage
+    # if prediction and log have no common reference, a missing level is not a predicted outage
     rows = near if absolute else scored
     same = rows & (np.isfinite(level) | ~heard)
     name, band = given.path.name, [predicted.get(column) for column in ("sd_db", "q05_db", "q95_db")]
@@ -614,7 +614,7 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
 
 
 def split_by_series(table: pd.DataFrame, tower: str, channel: str) -> pd.DataFrame:
-    """Return the rows of a tower that count for one of its channels."""
+    """Return the rows of a tower that apply to one of its channels."""
     part: pd.DataFrame = table[(table["tower"] == tower) & table["channel"].isin(["", channel])]
     own: pd.DataFrame = part[part["channel"] == channel]
     return part if own.empty else own
@@ -629,7 +629,7 @@ def predicted_at(
     ----------
     given : ForeignPrediction
     part : DataFrame
-        Its rows for the tower and channel of the samples.
+        Rows of the prediction for the tower and channel of the samples.
     time : (n,) datetime64[ns]
     position_m : (n, 3)
     heading_deg : (n,), optional
@@ -665,7 +665,7 @@ def predicted_at(
 def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData, near_m: float) -> dict[str, Any] | None:
     """Return kappa, total variation and agreement of predicted ranks and of ray tracing, on the same samples.
 
-    ``log_score`` and ``constant_log_score`` are those of probabilities, if the prediction has them.
+    If the prediction has probabilities, ``log_score`` and ``constant_log_score`` are also returned.
     """
     ranked = [name for name in ("rank", *RANKS) if name in given.table]
     part = given.table[(given.table["tower"] == item.tower) & given.table[ranked].notna().any(axis=1)]

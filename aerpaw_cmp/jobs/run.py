@@ -114,7 +114,7 @@ def _write_drafts(
     files: list[Any], draft: Path, first: OutputFile, output: Callable[[Path], OutputFile], site: str | None,
     options: dict[str, Any],
 ) -> dict[str, Any]:  # fmt: skip
-    """Write a flight file for each flight of some logs, and return its remarks and the paths."""
+    """Write a flight file for each flight in the logs, and return remarks and paths."""
     from ..flight.drafting.draft import SITE, DraftOptions, drafts
 
     home = first.target.parent
@@ -145,7 +145,7 @@ def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
     flight : Path
         flight.yaml with ``flight.plan``.
     options : RunOptions
-        ``out`` is ``simulated/NAME`` by default, after the flight.
+        ``out`` is ``simulated/NAME`` by default, with the name of the flight.
 
     Returns
     -------
@@ -164,7 +164,7 @@ def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
     settings = load_with_learned(flight)
     site = choose_site(settings.site, flight.parent)
     simulator = FlightSimulator(settings, site, flight.parent)
-    inputs = inputs_of_flight(settings.model_copy(update={"logs": []}), flight)  # the logs are its outputs
+    inputs = inputs_of_flight(settings.model_copy(update={"logs": []}), flight)  # the logs of the flight file are outputs here, not inputs
     folder = options.out or Path("simulated") / settings.flight.name
     stages = options.stages("simulate", inputs, folder)
     files = simulator.run(folder, inputs=inputs, force=options.force, stages=stages)
@@ -185,7 +185,7 @@ class ReportOptions:
     learned : path, optional
         calibrated.yaml whose antennas, ground and receiver replace those of the flight file.
     against : sequence of path
-        Predictions of this flight that are scored: output folders of ``predict``, or files of other programs.
+        Predictions of this flight to score: output folders of ``predict``, or files of other programs.
     against_distance_m : float
         Largest distance between a sample and its predicted position, for other programs.
     figures : {"none", "svg", "png", "pdf", "all"}
@@ -282,7 +282,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
 
 
 def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[str, ...]:
-    """Return the formats of the exports. UsageError for options that exclude each other."""
+    """Return the formats of the exports. Raise UsageError for options that exclude each other."""
     from ..report.canvas import STYLES
     from ..report.exports import chosen_formats
     from ..report.flight import FIGURES
@@ -320,7 +320,7 @@ def _with_audit(settings: Any, audit: str | None) -> Any:
     """Return the settings with the number of audited links of the command line."""
     if audit is None:
         return settings
-    # more links than any flight has
+    # "full" is a number that is larger than the number of links of any flight
     numbers = {"full": 10**9, "none": 0}
     if audit not in numbers and not audit.isdecimal():
         raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full' or 'none'")
@@ -389,7 +389,7 @@ def run_site_import(
         model, actions = import_site(files, base=base, towers=towers, **options)
         text = site_yaml(model, header=["made by 'aerpaw-cmp site import' from map data", *actions])
         output.write(sealed(text))
-    # antennas learned for a site belong to its towers, which named towers replace
+    # do not copy learned antennas if towers are named, because the antennas belong to the towers of the base site
     return [*actions, *([] if towers else carry_memory(base or "lake_wheeler", out))]
 
 
@@ -533,7 +533,7 @@ def run_campaign(
     nodes = soundings(sounded, campaign.timezone) if sounded else ()
     folder = options.out or Path("reports") / campaign.campaign
     stages = options.stages("campaign", inputs, folder)
-    if keep is not None and ":/" in str(keep):  # an address such as s3://; a path has a single slash there
+    if keep is not None and ":/" in str(keep):  # an address such as s3:// is not a folder; a path has a single slash after the colon
         raise UsageError(f"--keep {keep}", expected="a folder")
     store = None if fresh else keep or cache_folder("outcomes")
     note = f"finished tasks are stored in {store}; the same command computes the rest" if store else "nothing is stored"
@@ -582,7 +582,7 @@ def run_calibrate(
     further : sequence of Path
         Further flight files to learn from.
     into_site : str, optional
-        Site (site.yaml or packaged) that stores the results: an entry of each campaign.
+        Site (site.yaml or packaged) in which the results are stored, with one entry per campaign.
     score : sequence of Path
         Flight files that are scored with all learned antennas. Flights with training logs are reported but not scored.
 

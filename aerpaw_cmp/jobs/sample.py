@@ -29,7 +29,7 @@ def sample_folder() -> Path:
     raise UsageError(
         "the sample flight is missing",
         expected=f"{PACKAGED} or {CHECKOUT}",
-        cause="a package that was built without its samples",
+        cause="the package was built without its samples",
     )
 
 

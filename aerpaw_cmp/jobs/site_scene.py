@@ -35,7 +35,7 @@ _LOCAL_NOTE = (
 
 
 def is_scene(path: Path) -> bool:
-    """Check whether a file is the XML of a Mitsuba scene, with 'scene' as first element."""
+    """Check whether a file is the XML of a Mitsuba scene, whose first element is 'scene'."""
     try:
         with path.open("rb") as file:
             head = file.read(65536)
@@ -270,7 +270,7 @@ def _parts_of_scene(scene: TriangleScene) -> Iterator[tuple[str, str, Mesh]]:
 
 
 def _plain(name: str) -> str:
-    """Return a name as file name and identifier."""
+    """Return a name that is valid as a file name and as an identifier."""
     return re.sub(r"[^A-Za-z0-9_-]+", "-", name)
 
 
@@ -343,7 +343,7 @@ def run_antenna_export(
     elevation : Path, optional
         Second cut, if ``file`` is an azimuth cut.
     variable : str, optional
-        Grid inside a .mat file.
+        Name of the gain grid in a .mat file.
     carrier_hz : float, optional
     force : bool
         Replace a file that this tool did not write.

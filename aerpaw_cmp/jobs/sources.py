@@ -64,13 +64,13 @@ class Targets:
     position_m : (n, 3)
         East, north, up [m]. NaN if a position is unknown.
     yaw_deg : (n,)
-        Heading, clockwise from north. NaN if unknown: all headings then have equal weights.
+        Heading, clockwise from north. If it is NaN, all headings have equal weights.
     time_s : (n,)
         Time since the first point.
     up : (3,) or (n, 3), optional
         Upward axis of the aircraft. Default: level flight.
     grid : Grid, optional
-        The grid, if the points are its positions, height after height.
+        The grid, if the points are its positions, in order of height.
     heights_m : tuple of float
     remarks : tuple of str
     """
@@ -101,9 +101,9 @@ class TargetOptions:
     Parameters
     ----------
     heights_m : tuple of float
-        Heights of a grid. The first is also that of route points without a height.
+        Heights of a grid. The first height is also used for route points without a height.
     spacing_m : float, optional
-        Distance between the positions of a grid. Default: ``grid_spacing_m``. Refused along a route.
+        Distance between the positions of a grid. Default: ``grid_spacing_m``. Not allowed for a route.
     heading_deg : float, optional
         Heading at all points. Default: that of the route, else all headings with equal weights.
     site : str, optional
@@ -169,7 +169,7 @@ def is_settings(path: Path) -> bool:
 
 
 def target_files(where: Path, site: str | None, logs_root: Path | None) -> list[Path]:
-    """Return the files that WHERE and the site of ``--site`` are read from."""
+    """Return the files from which WHERE and the site of ``--site`` are read."""
     files = [] if site is None else inputs_of_site(site)
     if (flight := flight_of(where)) is not None:
         return [*files, *inputs_of_flight(flight, where, logs_root)]
@@ -246,7 +246,7 @@ def _planned(flight: FlightFile, site: Site) -> Targets:
 def _leaning(position_m: FloatArray, time_s: FloatArray) -> FloatArray:
     """Return the upward axes (n, 3) of a multicopter, which leans into its motion."""
     time = np.maximum.accumulate(time_s)
-    # over two seconds, because logged positions are rounded and an aircraft does not lean faster
+    # use positions two seconds apart, because they are rounded and an aircraft does not lean faster
     begin, end = np.clip(time - 1.0, time[0], None), np.clip(time + 1.0, None, time[-1])
     moved = interpolated(end, time, position_m) - interpolated(begin, time, position_m)
     up = np.radians(LEAN_DEG_PER_MPS) * moved / np.maximum(end - begin, 1e-9)[:, None]
@@ -279,7 +279,7 @@ _COLUMNS = ("east_m", "north_m", "height_m", "yaw_deg", "time_s")
 
 
 def _local_points(path: Path) -> Targets | None:
-    """Read points of a CSV with east_m, north_m and height_m (and yaw_deg, time_s). None for other files."""
+    """Read points of a CSV with east_m, north_m and height_m (and yaw_deg, time_s), or return None for other files."""
     if path.suffix.lower() != ".csv":
         return None
     with parsing(path, "columns east_m, north_m, height_m"):
@@ -379,7 +379,7 @@ def named_flights(paths: Sequence[Path]) -> list[NamedFlight]:
 
 
 def files_of(flights: Sequence[NamedFlight], logs_root: Path | None) -> list[Path]:
-    """Return every file that the flights are read from."""
+    """Return every file from which the flights are read."""
     return [file for flight in flights for file in inputs_of_flight(flight.settings, flight.path, logs_root)]
 
 
@@ -431,7 +431,7 @@ class Source:
         return level_samples((self.tower, self.channel), self.tower_m, position_m, yaw_deg, time_s, up)
 
     def replayed_db(self, samples: LinkSamples) -> FloatArray:
-        """Return the replayed level of a level aircraft above free space (n,) [dB]. NaN without a path."""
+        """Return the replayed level minus free space (n,) [dB] of an aircraft in level flight. NaN if there is no path."""
         link = self.link.build([self.tower], self.folder)
         turn = azimuth_rad(-samples.at_tower) - azimuth_rad(samples.at_uav)
         flat = np.zeros(len(turn))
@@ -486,7 +486,7 @@ class Flown:
     correction: Correction
     sources: Mapping[str, Source]
     targets: int
-    """Number of targets that are predicted in all."""
+    """Total number of predicted targets."""
     trained_on: Sequence[Sequence[str]] = ()
     """SHA-256 of the training data of its base, in addition to the named flights."""
     marks: Sequence[Sequence[str]] = ()
@@ -497,8 +497,8 @@ class Flown:
         antenna = each[0].antenna
         level, slow = self.correction.over_headings(each, all_targets=self.targets)
         guess = outside(each[0].position_m, self.sources[antenna].samples)
-        # The field's offset of a new flight is normal. Its spread is estimated from the differences between flights on
-        # all channels: few differences determine it poorly.
+        # The offset of the residual field of a new flight is normally distributed. Its SD is estimated from the
+        # differences between flights on all channels, because few differences determine it poorly.
         count = {name: len({s.flight for s in source.samples}) for name, source in self.sources.items()}
         flights, differences, fitted = count[antenna], sum(count.values()) - len(count), self.correction
         wider = math.sqrt((1.0 + 1.0 / flights) * (student_factor(1 + differences) ** 2 - 1.0))

@@ -71,12 +71,12 @@ def other_inputs(
 
 
 def inputs_of_flight(settings: FlightFile, flight: Path, logs_root: Path | None = None) -> list[Path]:
-    """Return every file that a flight and its site are read from. No output may replace one of them."""
+    """Return every file from which a flight and its site are read. No output may replace such a file."""
     return [*input_files(settings, flight, logs_root), *inputs_of_site(settings.site.file, flight.parent)]
 
 
 def inputs_of_flights(flights: Iterable[Path], logs_root: Path | None = None) -> list[Path]:
-    """Return the inputs of several flight files. For a wrong flight file, return its own path only."""
+    """Return the inputs of several flight files. If a flight file is wrong, return only its own path."""
     files: list[Path] = []
     for flight in flights:
         files.append(flight)
@@ -86,7 +86,7 @@ def inputs_of_flights(flights: Iterable[Path], logs_root: Path | None = None) ->
 
 
 def stamp(path: Path) -> tuple[int, int]:
-    """Return size and time of a file, by which a long-lived worker detects changes. Zeros if there is no file."""
+    """Return size and time of a file, by which a long-lived worker detects changes. Both are 0 if there is no file."""
     try:
         status = os.stat(path)  # noqa: PTH116
     except OSError:
@@ -116,7 +116,7 @@ def _entry(name: str, place: Path, role: str) -> InputFile:
     return InputFile(path=name, sha256=digest_of(place), role=role, learned_on=_learned_on(place, *stamp(place)))
 
 
-# Version of the entries. Increase it if their format changes.
+# Version of the format of entries. Increase it if the format changes.
 LAYOUT = 8
 
 _SEAL = b"aerpaw-cmp outcome"
@@ -132,9 +132,9 @@ class OutcomeStore:
     Parameters
     ----------
     folder : Path
-        Made when the first entry is written.
+        It is created when the first entry is written.
     kind : type
-        Dataclass of an outcome. An entry is checked against its fields; no other class is built from a file.
+        Dataclass of an outcome. Entries are checked against its fields, and only this class is built from a file.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class OutcomeStore:
 
     def __init__(self, folder: Path, kind: type) -> None:
         self.folder = folder
-        # a list, because pydantic accepts no configuration for a dataclass
+        # use a list, because pydantic accepts no configuration for a dataclass
         self._kind = TypeAdapter(list[kind], config=ConfigDict(arbitrary_types_allowed=True, extra="forbid"))  # type: ignore[valid-type]
         self.warnings: list[str] = []
 
@@ -215,7 +215,7 @@ def _with_arrays(value: Any, arrays: Mapping[str, AnyArray]) -> Any:
 
 
 class _Arrays:
-    """Arrays by name, each stored once: channels of a tower share times and positions, half of the volume."""
+    """Arrays by name, each stored once, because channels of a tower share times and positions (half of the volume)."""
 
     def __init__(self) -> None:
         self.by_name: dict[str, AnyArray] = {}
@@ -247,7 +247,7 @@ def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> l
     entries = [
         {"role": other_input.role, "path": other_input.path, "sha256": other_input.sha256}
         for other_input in other_inputs(settings, flight, logs_root)
-        if other_input.role != "flight file"  # its content is in the settings, with overrides
+        if other_input.role != "flight file"  # the content of the flight file is in the settings, with overrides
     ]
     for log in settings.logs:
         path = (logs_root or flight.parent) / log.path
@@ -256,9 +256,9 @@ def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> l
 
 
 def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: object) -> str:
-    """Return the digest of what an outcome depends on: relevant settings, content of inputs, code, and ``more``.
+    """Return the digest of everything on which an outcome depends: relevant settings, content of inputs, code, and ``more``.
 
-    Labels are not part of it, so a flight or setting with a new name keeps its stored outcomes.
+    Labels are not part of the digest, so a flight or setting with a new name keeps its stored outcomes.
     """
     digest = hashlib.sha256()
     digest.update("\n".join([str(LAYOUT), code_digest(), *map(str, more)]).encode())

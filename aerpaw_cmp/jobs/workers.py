@@ -1,11 +1,11 @@
 """Workers for independent tasks: in this process, in processes of this machine, or on a Dask cluster.
 
-All kinds have one interface, :class:`Workers`, and pass one test suite. A task is a function of a small record that can
+All kinds of workers have the interface :class:`Workers` and pass the same tests. A task is a function of a small record that can
 be pickled. If a worker process ends, the tasks that it was running are repeated one at a time. A task whose worker ends
 again becomes :class:`Lost`.
 
 Processes of this machine communicate through pipes that no other process can open. A Dask scheduler and its workers
-unpickle what they receive, and so execute code of every user who can connect: connections must use TLS.
+unpickle what they receive. Every user who can connect can thus execute code, so connections must use TLS.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Task = Callable[[Any], Any]
 # A function that receives the number of an item and the result of its task, or :class:`Lost`.
 _OnResult = Callable[[int, Any], None]
 
-# Seconds to wait for a scheduler, until a scheduler without workers is reported, and between counts of workers.
+# Waiting times [s]: for a scheduler, before a scheduler without workers is reported, and between counts of workers.
 CONNECT_S, NO_WORKER_S, COUNT_EVERY_S = 10.0, 30.0, 2.0
 
 
@@ -83,7 +83,7 @@ class Workers(ABC):
         Raises
         ------
         AerpawCmpError
-            The message with which a task ended.
+            The error of a task.
         InputError
             If the scheduler of the workers is lost.
         """
@@ -122,7 +122,7 @@ class InProcess(Workers):
 
 
 class Processes(Workers):
-    """Processes of this machine. If one ends, all are replaced."""
+    """Processes of this machine. If one process ends, all processes are replaced."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -136,7 +136,7 @@ class Processes(Workers):
         self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult
     ) -> list[int]:
         active: dict[Future[Any], int] = {}
-        others = multiprocessing.active_children()  # processes of the calling program
+        others = multiprocessing.active_children()  # processes that the calling program started itself
         with _in_trusted_folder() as folder:
             # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
             pool = ProcessPoolExecutor(min(self.count, len(waiting)), get_context("spawn"), _start_worker, (folder,))
@@ -184,7 +184,7 @@ def _start_worker(folder: Path) -> None:
 
 
 def _follow_parent() -> None:
-    """End with the parent process, also during a task."""
+    """End this process when its parent ends, even during a task."""
     if (parent := multiprocessing.parent_process()) is not None:
         wait([parent.sentinel])
         os._exit(1)
@@ -367,7 +367,7 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
 
 
 def _difference(paths: Sequence[str], code: str, version: str) -> str:
-    """Return how the process that runs this function differs from the planning process. Empty if it does not.
+    """Return how the process that runs this function differs from the planning process. The text is empty if it does not differ.
 
     Parameters
     ----------

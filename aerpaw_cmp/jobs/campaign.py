@@ -4,8 +4,8 @@ A campaign.yaml names flight files and, optionally, settings: labels with overri
 (``rt.max_depth: 1``). Every setting runs on every flight. A flight that cannot be read is a row with its message.
 
 A task is one flight under one setting. Workers run tasks and return rows of numbers, which are stored. The rows of
-several flights determine pooled offsets, held-out errors, a ranking of settings, steps of offsets, and mean residuals by
-position.
+several flights determine pooled offsets, held-out errors, a ranking of settings, steps of offsets, and mean residuals
+by position.
 """
 
 from __future__ import annotations
@@ -294,8 +294,8 @@ def _rank_rows(task: Task, data: FlightData, result: RankResult, series: RankSer
 def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: int) -> list[PlannedStage]:
     """Return the tasks of each setting for a dry run. ``kept`` has the stored outcomes by task number.
 
-    The time of a task is the mean time of the stored tasks of its setting, divided by ``workers``.
-    If its setting has no stored task, the mean is taken over all stored tasks. If there is no stored task, the time is unknown.
+    The time of a task is the mean time of the stored tasks of its setting, divided by ``workers``. If its setting has
+    no stored task, the mean is taken over all stored tasks. If there is no stored task, the time is unknown.
     """
     spent: dict[str, list[float]] = {}
     for number, outcome in kept.items():

@@ -103,7 +103,7 @@ _SERVING_WITHIN_S = 1.5
 
 
 def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> ServingComparison | None:
-    """Compare the logged serving cells with the strongest predicted cells. Return None if no log contains the serving cell.
+    """Compare logged serving cells with the strongest predicted cells, or return None if no log has a serving cell.
 
     The comparison has the cells that the flight file assigns to towers, at the times when one of them served. Levels
     are as simulated: cells of one network have equal power, and an offset per cell would hide which one is stronger.
@@ -214,7 +214,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
 
 
 def stated_spread(replayed: Replayed) -> StatedSpread | None:
-    """Return the error bars that learned antennas state for the level of the direct path. None if there are no such antennas.
+    """Return the error bars that learned antennas state for the direct path, or None if there are no such antennas.
 
     If only one end is learned, or no file has the joint gain of both ends, the gains of both ends are assumed to be
     independent. They are learned from the same levels, so the true standard deviation is probably smaller.
@@ -653,7 +653,7 @@ def fitted_receiver(data: FlightData, tower: str) -> FittedReceiver | None:
 def _receiver_forecast(
     data: FlightData, series: RankSeries
 ) -> tuple[FloatArray | None, ForecastScore | None, tuple[str, ...]]:
-    """Return the receiver's probability of each rank (n, 4), its score, and the logs of this flight if it was fitted on them."""
+    """Return the receiver's probability of each rank (n, 4), its score, and this flight's logs if it was fitted on them."""
     receiver = fitted_receiver(data, series.tower)
     if receiver is None:
         return None, None, ()

@@ -401,10 +401,10 @@ DRAWS = 10
 class MapOutcome:
     """All results of one run.
 
-    ``maps`` has the maps by foliage mode. For a map in tiles, they are at the positions in ``tiles``. ``studies`` has one study
-    per treatment of positions out of coverage. They are missing ("missing"), have rank 0 ("zero"), or have rank 0 with
-    M random samples instead of the M nearest ("random"). ``draws`` has the scores of "random" for :data:`DRAWS`
-    draws. ``blocks`` has the errors of each interpolator on held-out square blocks.
+    ``maps`` has the maps by foliage mode. For a map in tiles, they are at the positions in ``tiles``. ``studies`` has
+    one study per treatment of positions out of coverage. They are missing ("missing"), have rank 0 ("zero"), or have
+    rank 0 with M random samples instead of the M nearest ("random"). ``draws`` has the scores of "random" for
+    :data:`DRAWS` draws. ``blocks`` has the errors of each interpolator on held-out square blocks.
     """
 
     site: Site

@@ -305,7 +305,8 @@ def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
             raise InputError("not a route", expected="a .plan, KML, CSV or log with two points or more", path=path)
         place, yaw = targets.position_m[targets.known], targets.yaw_deg[targets.known]
         steps = np.diff(place, axis=0)
-        yaw = np.where(np.isfinite(yaw), yaw, bearing_deg(np.vstack([steps, steps[-1:]])))  # if the file has no yaw, the nose points along the course
+        # if the file has no yaw, the nose points along the course
+        yaw = np.where(np.isfinite(yaw), yaw, bearing_deg(np.vstack([steps, steps[-1:]])))
         ground = site.takeoff_ground_m
         points = [
             Waypoint(east_m=float(p[0]), north_m=float(p[1]), height_m=float(p[2]) - ground, yaw_deg=float(y))
@@ -402,7 +403,7 @@ def _flown_knowledge(series: Sequence[LinkSamples]) -> Known:
 
 
 def _thinned(samples: LinkSamples, most: int) -> LinkSamples:
-    """Return at most ``most`` samples of a target. The step and the number of headings have no common factor, so that all headings occur."""
+    """Return at most ``most`` samples of a target. The step and the number of headings have no common factor."""
     step = max(1, math.ceil(len(samples) / most))
     step += int(step > 1 and step % 2 == 0)
     return samples.part(np.arange(0, len(samples), step))

@@ -165,7 +165,7 @@ def read_foreign(path: Path, data: FlightData) -> ForeignPrediction:
 
 
 def _predicted_unit(path: Path, data: FlightData) -> str:
-    """Return the unit of the levels of ``predict`` from its metrics.json. The text is empty if the channels have several units.
+    """Return the unit of the levels of ``predict`` from its metrics.json, or an empty text for several units.
 
     Raises
     ------
@@ -188,7 +188,8 @@ def _predicted_unit(path: Path, data: FlightData) -> str:
 
 
 # --- formats -------------------------------------------------------------------------------------------------------
-# Each function returns a table with the column names of the file, and the attributes ``program``, ``remarks`` and ``unit``.
+# Each function returns a table with the column names of the file, and the attributes ``program``, ``remarks`` and
+# ``unit``.
 
 
 def _csv(content: bytes, path: Path) -> pd.DataFrame:
@@ -307,7 +308,9 @@ def _emulated(folder: Path, data: FlightData) -> pd.DataFrame:
     units, ours = (sorted({s.unit for s in of.rss}) for of in (twin, data))
     remarks = [f"{folder.name} is an emulated flight: {counted(len(frame), 'level')} with a position."]
     if units != ours:
-        remarks.append(f"Its levels are in {', '.join(units)}, those of the flight in {', '.join(ours)}, so no bias is stated.")
+        remarks.append(
+            f"Its levels are in {', '.join(units)}, those of the flight in {', '.join(ours)}, so no bias is stated."
+        )
     unit = units[0] if len(units) == 1 else "several units"
     frame.attrs = {"program": "emulated flight", "remarks": tuple(remarks), "unit": unit}
     return frame

@@ -164,7 +164,8 @@ def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
     settings = load_with_learned(flight)
     site = choose_site(settings.site, flight.parent)
     simulator = FlightSimulator(settings, site, flight.parent)
-    inputs = inputs_of_flight(settings.model_copy(update={"logs": []}), flight)  # the logs of the flight file are outputs here, not inputs
+    # the logs of the flight file are outputs here, not inputs
+    inputs = inputs_of_flight(settings.model_copy(update={"logs": []}), flight)
     folder = options.out or Path("simulated") / settings.flight.name
     stages = options.stages("simulate", inputs, folder)
     files = simulator.run(folder, inputs=inputs, force=options.force, stages=stages)
@@ -533,7 +534,8 @@ def run_campaign(
     nodes = soundings(sounded, campaign.timezone) if sounded else ()
     folder = options.out or Path("reports") / campaign.campaign
     stages = options.stages("campaign", inputs, folder)
-    if keep is not None and ":/" in str(keep):  # an address such as s3:// is not a folder; a path has a single slash after the colon
+    # an address such as s3:// is not a folder; a path has a single slash after the colon
+    if keep is not None and ":/" in str(keep):
         raise UsageError(f"--keep {keep}", expected="a folder")
     store = None if fresh else keep or cache_folder("outcomes")
     note = f"finished tasks are stored in {store}; the same command computes the rest" if store else "nothing is stored"

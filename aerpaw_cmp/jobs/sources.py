@@ -431,7 +431,7 @@ class Source:
         return level_samples((self.tower, self.channel), self.tower_m, position_m, yaw_deg, time_s, up)
 
     def replayed_db(self, samples: LinkSamples) -> FloatArray:
-        """Return the replayed level minus free space (n,) [dB] of an aircraft in level flight. NaN if there is no path."""
+        """Return the replayed level minus free space (n,) [dB] for level flight, NaN if there is no path."""
         link = self.link.build([self.tower], self.folder)
         turn = azimuth_rad(-samples.at_tower) - azimuth_rad(samples.at_uav)
         flat = np.zeros(len(turn))

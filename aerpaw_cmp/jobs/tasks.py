@@ -256,7 +256,7 @@ def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> l
 
 
 def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: object) -> str:
-    """Return the digest of everything on which an outcome depends: relevant settings, content of inputs, code, and ``more``.
+    """Return the digest of all that an outcome depends on: relevant settings, content of inputs, code, and ``more``.
 
     Labels are not part of the digest, so a flight or setting with a new name keeps its stored outcomes.
     """

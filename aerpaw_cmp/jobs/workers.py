@@ -1,8 +1,8 @@
 """Workers for independent tasks: in this process, in processes of this machine, or on a Dask cluster.
 
-All kinds of workers have the interface :class:`Workers` and pass the same tests. A task is a function of a small record that can
-be pickled. If a worker process ends, the tasks that it was running are repeated one at a time. A task whose worker ends
-again becomes :class:`Lost`.
+All kinds of workers have the interface :class:`Workers` and pass the same tests. A task is a function of a small record
+that can be pickled. If a worker process ends, the tasks that it was running are repeated one at a time. A task whose
+worker ends again becomes :class:`Lost`.
 
 Processes of this machine communicate through pipes that no other process can open. A Dask scheduler and its workers
 unpickle what they receive. Every user who can connect can thus execute code, so connections must use TLS.
@@ -367,7 +367,7 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
 
 
 def _difference(paths: Sequence[str], code: str, version: str) -> str:
-    """Return how the process that runs this function differs from the planning process. The text is empty if it does not differ.
+    """Return how this worker process differs from the planning process, or an empty text if it does not differ.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ class Quantity:
     none : tuple of float
         Numbers that mean a missing value, in addition to those of :data:`UNAVAILABLE`.
     can_be : (low, high)
-        Possible values in its unit: a value beyond them belongs to another column.
+        Possible values in the unit of the quantity. A value outside this range belongs to another column.
     datum : str
         Zero of a height: ``take-off``, ``ground``, ``sea level``, ``ellipsoid`` or ``unknown``.
     open_unit : bool
@@ -231,7 +231,7 @@ QUANTITIES: tuple[Quantity, ...] = (
 
 @cache
 def _forms() -> tuple[tuple[re.Pattern[str], Quantity], ...]:
-    """Return one expression per row, because one search excludes all patterns of a row for most names."""
+    """Return one expression per row, so that a single search excludes all patterns of a row for most names."""
     return tuple((re.compile("|".join(f"(?:{pattern})" for pattern in row.names)), row) for row in QUANTITIES)
 
 
@@ -488,8 +488,8 @@ def impossible(quantity: Quantity, values: FloatArray) -> BoolArray:
 
 
 def angle_form(values: FloatArray, quantity: Quantity) -> str:
-    """Return the unit of positions that are too large for degrees: ``1e-7 deg`` or ``ddmm.mmmm``, else empty."""
-    # zeros are rows before the first fix
+    """Return the unit of positions that are too large for degrees: ``1e-7 deg``, ``ddmm.mmmm`` or an empty text."""
+    # rows before the first fix contain zeros
     known = np.abs(values[np.isfinite(values) & ~is_none(quantity, values) & (values != 0)])
     most = quantity.can_be[1]
     # use the median, because a few damaged rows do not show another unit
@@ -512,7 +512,7 @@ def _times(factor: float) -> Callable[[FloatArray], FloatArray]:
 
 def _milliwatts(per_unit: float) -> Callable[[FloatArray], FloatArray]:
     def convert(values: FloatArray) -> FloatArray:
-        # zero power has no level in dB, and a negative value is not a power
+        # a power of zero has no level in dB, and a negative value is not a power
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(values >= 0, 10 * np.log10(np.where(values > 0, values, np.nan) * per_unit), np.nan)
 
@@ -570,7 +570,7 @@ def is_unit(text: str) -> bool:
 
 
 def _scale(written: str) -> tuple[float, str]:
-    """Return the factor before a unit, 1 if there is none, and the unit."""
+    """Return the factor before a unit (1 if there is none) and the unit."""
     scaled = _SCALED.fullmatch(written)
     return (
         (1.0, written) if scaled is None else (float(scaled[1] if scaled[1][0] != "e" else f"1{scaled[1]}"), scaled[2])
@@ -578,7 +578,7 @@ def _scale(written: str) -> tuple[float, str]:
 
 
 def unit_of(written: str) -> str:
-    """Return the unit into which a written unit is converted, an unknown unit as written, empty for other words."""
+    """Return the unit to which a written unit is converted, an unknown unit as written, else an empty text."""
     written = _scale(written)[1]
     known = UNITS.get(written)
     return known[0] if known else "deg" if written in _DDMM else written if _A_UNIT.fullmatch(written) else ""
@@ -604,7 +604,7 @@ class Program:
     ----------
     name : str
     signs : collection of str
-        Sets of plain names. A table with all names of one set is by this program.
+        Sets of plain names. A table that has all names of one set was written by this program.
     words : mapping of str to str
         Patterns of the program's names, matched against complete plain names, and the dictionary's words for them.
     units : mapping of str to str
@@ -740,7 +740,7 @@ def described(
     of : collection of str
         Further names that identify the program.
     """
-    own = [(name, plain(name)) for name in names]  # a table may have a name twice
+    own = [(name, plain(name)) for name in names]  # use a list, because a table may have a name twice
     present = [bare for _, bare in own]
     known = known or program([*present, *map(plain, of)])
     words, columns = dict(known.words) if known else {}, []

@@ -69,7 +69,7 @@ def unpacked_pieces(file: BinaryIO, path: str | Path) -> Iterator[bytes]:
     name = packed_form(file.read(10)) or "bzip2"
     file.seek(0)
     try:
-        # a Python build may not have the module
+        # some Python builds do not have the module
         module = import_module(_MODULES[name])
     except ImportError as error:
         found = f"a {name} file, and this Python was built without {name}"
@@ -104,7 +104,7 @@ def unpacked(raw: bytes, path: str | Path, most: int) -> bytes:
 
 
 def head_of(place: Path, count: int) -> bytes:
-    """Return the first bytes of the content of a packed file, as far as it is not damaged."""
+    """Return the first bytes of the content of a packed file, up to the first damage."""
     head = b""
     # reading the file later reports the damage
     with suppress(InputError), place.open("rb") as file:
@@ -142,7 +142,7 @@ class Member:
     Parameters
     ----------
     name : str
-        Relative path, also if the archive has an absolute one.
+        Relative path, even if the path in the archive is absolute.
     size : int
         Size after decompression according to the archive [bytes].
     read : callable
@@ -162,7 +162,7 @@ def is_archive(head: bytes) -> bool:
 
 def path_in_archive(path: Path) -> tuple[Path, str] | None:
     """Return the archive and the member that a path names, or None if no part of the path is a file."""
-    # Path's own test raises for a name that is too long
+    # Path.is_file raises for a name that is too long
     file = next((parent for parent in path.parents if isfile(parent)), None)  # noqa: PTH113
     return None if file is None else (file, path.relative_to(file).as_posix())
 
@@ -193,7 +193,7 @@ def _zip(data: bytes, path: str | Path) -> Iterator[Member]:
     for entry in book.infolist():
         if not entry.is_dir() and not _hidden(entry.filename):
             size = entry.file_size
-            # deflate cannot reach this ratio: the directory is false
+            # deflate cannot reach this ratio, so the size in the directory is false
             lies = size > MOST_BYTES or size > _RATIO * entry.compress_size + _MARGIN
             read = (
                 partial(_refused, f"the member unpacks to {size} bytes", f"at most {MOST_BYTES}", path)
@@ -220,7 +220,7 @@ def _tar(data: bytes, path: str | Path) -> Iterator[Member]:
     # "r:": no compression, which would be unpacked without a limit
     book = tarfile.open(fileobj=io.BytesIO(data), mode="r:")  # noqa: SIM115 - members are read later
     for entry in book.getmembers():
-        # no links, devices or pipes
+        # skip links, devices and pipes
         if entry.isreg() and not _hidden(entry.name):
             yield _member(entry.name, entry.size, path, partial(_untarred, book, entry))
 
@@ -231,7 +231,7 @@ def _untarred(book: tarfile.TarFile, entry: tarfile.TarInfo, most: int | None) -
 
 
 def _member(name: str, size: int, path: str | Path, read: Callable[[int | None], bytes]) -> Member:
-    """Return a member under a relative name, so that a flight.yaml reaches files in the archive only."""
+    """Return a member under a relative name, so that a flight.yaml can only name files inside the archive."""
     if ".." in name.split("/"):
         return Member(name, 0, partial(_refused, "the member's name leads out of the archive", "a relative name", path))
     return Member(name.lstrip("/"), size, read)
@@ -351,7 +351,7 @@ class Column:
         """Append values."""
         end = self._count + len(piece)
         if end > len(self._values):
-            # a sixteenth more, as a compromise between moves and unused memory
+            # reserve a sixteenth more, as a compromise between moves and unused memory
             self._values.resize(end + end // 16, refcheck=False)  # the system moves pages, not bytes
         self._values[self._count : end] = piece
         self._count = end

@@ -56,7 +56,7 @@ class IngestedFile:
         SHA-256 of the content after unpacking, which identifies a log under any name and in any archive.
     result : ReadResult
     holder : str
-        The flight file that the log was read from, empty if the log itself was read.
+        The flight file from which the log was read. Empty if the log itself was read.
     """
 
     path: str
@@ -81,7 +81,7 @@ def write_flight(path: str | Path, files: Sequence[IngestedFile]) -> None:
 
 
 def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
-    """Write the content of a flight file, block by block, to an empty stream that can be read, too.
+    """Write the content of a flight file, block by block, to an empty stream that can also be read.
 
     Raises
     ------
@@ -178,7 +178,7 @@ def _write_column(group: Any, name: str, column: pd.Series[Any], kind: str) -> N
 
     numbers = {"text": np.int32, "time": np.int64, "float": np.float64, "integer": np.int64, "boolean": np.bool_}
     count = len(column)
-    # the shuffle filter and light deflate: a tenth of the size for smooth columns, at little time
+    # the shuffle filter and light deflate reduce smooth columns to a tenth in little time
     packing = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "chunks": (min(count, _CHUNK),)}
     packing = packing if count > 256 else {}
     number: dict[str | None, int] = {None: -1}  # the code of a missing text
@@ -210,7 +210,7 @@ def _codes(part: AnyArray, number: dict[str | None, int]) -> AnyArray:
 
     cells = part.tolist()
     code = {}
-    for cell in dict.fromkeys(cells):  # a column has few different values
+    for cell in dict.fromkeys(cells):  # a text column has few different values
         text = None if pd.isna(cell) else str(cell)
         code[cell] = number.setdefault(text, len(number) - 1)
     return np.fromiter(map(code.__getitem__, cells), np.int32, len(cells))

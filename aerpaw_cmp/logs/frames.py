@@ -161,7 +161,7 @@ def read(
     zone = None if timezone is None else str(timezone)
     chosen = ReadOptions(timezone=zone, time_origin=time_origin, **options)
     if chosen.columns:
-        reader = reader or "generic_csv"  # as with --map
+        reader = reader or "generic_csv"  # the same default as for --map
     files = Ingested()
     # a str is also a sequence, so test it first
     for source in [path] if isinstance(path, (str, os.PathLike)) else path:

@@ -90,7 +90,7 @@ def _unpacked(raw: bytes, path: str | Path) -> bytes:
 
 
 def _raw(place: Path, limit: int | None = None) -> bytes:
-    """Return the bytes on disk, all or the first ``limit``."""
+    """Return all bytes on disk, or the first ``limit`` bytes."""
     try:
         if place.is_dir():
             raise InputError("a folder where a log is expected", path=place)
@@ -121,7 +121,7 @@ def ingest(
     options : ReadOptions or callable, optional
         Facts that are not in the files; a callable returns them per path.
     reader : str, optional
-        Name of the reader, instead of sniffing.
+        Name of the reader. Default: detected by content.
 
     Returns
     -------
@@ -322,7 +322,7 @@ def read_log(
 
 
 def _refuse_other_kind(path: Path, reader: Reader) -> None:
-    """Refuse a log that another reader recognises and the named one does not: it is the wrong file."""
+    """Refuse a log that the named reader does not recognise but another reader does: it is the wrong file."""
     if reader.name == "generic_csv":
         return  # the user named the columns of this file
     claimed_by = sniffers_of(path)
@@ -372,7 +372,7 @@ def _member(
     chosen: Reader | None,
 ) -> IngestedFile:  # fmt: skip
     """Read one file of an archive, and unpack it only if its first bytes are those of a log."""
-    # only the beginning, because data sets contain recordings of GiB next to their logs
+    # read only the beginning, because data sets contain recordings of GiB next to their logs
     head = member.read(DEEP_BYTES)
     if chosen is None and member.size > DEEP_BYTES and packed.packed_form(head) is None and not packed.is_archive(head):
         chosen = identify(as_utf8(head), path=str(path))
@@ -417,7 +417,9 @@ def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: R
             path=path,
         )
     if reader is None and head:
-        reader = identify(head, path=str(path))  # before reading the rest: folders contain large files of other kinds
+        reader = identify(
+            head, path=str(path)
+        )  # identify the file before reading the rest, because folders contain large files of other kinds
     pointer = head.startswith(b"version https://git-lfs")
     if reader is not None and head.strip() and not pointer and (file := _in_pieces(place, reader, options)) is not None:
         return file
@@ -441,7 +443,7 @@ def _of_kind(file: IngestedFile, chosen: Reader | None, flight_file: Path) -> In
 
 
 def _in_flight_file(path: Path) -> tuple[Path, str] | None:
-    """Return the flight file that a path leads into, and the name of the log in it."""
+    """Return the flight file that contains the log of a path, and the name of the log in it."""
     part = _part_of(path)
     return part if part is not None and _head(part[0]).startswith(_HDF5) else None
 
@@ -504,7 +506,7 @@ def _read(
 
 def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[], ReadResult]) -> ReadResult:
     """Return the result of a reader with impossible values flagged, and name the file in errors."""
-    from . import limits, readers  # load pandas, as any reader does
+    from . import limits, readers  # import here, because these modules load pandas
 
     expected, cause = f"lines such as {reader.sample!r}", "a log of another kind, or a damaged one"
     with parsing(path, expected, cause), blaming(reader.plugin, f"reader {reader.name!r} read it", InputError):
@@ -522,9 +524,9 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
 
 # GPS receivers count weeks modulo 1 024 (IS-GPS-200): after a rollover their dates are earlier by this number of days.
 ROLLOVER_DAYS = 7 * 1024
-# The first LTE networks. Earlier dates of logs are wrong.
+# Start of the first LTE networks. Earlier dates of logs are wrong.
 _PLAUSIBLE_FROM = datetime(2009, 12, 1)
-# Later dates are wrong: counts of LabVIEW (from 1904) and NTP (from 1900), read as Unix time, are after 2080.
+# Dates after this are wrong: counts of LabVIEW (from 1904) and NTP (from 1900), read as Unix time, are after 2080.
 _FUTURE = datetime(2050, 1, 1)
 
 
@@ -559,13 +561,13 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
     try:
-        # in order of names: joined pieces and equal clocks then have one order on every disk
+        # sort by name, so that joined pieces and logs with equal clocks have the same order on every disk
         places = sorted(p for p in folder.rglob("*") if not p.name.startswith(".") and (p.is_file() or p.is_symlink()))
     except OSError as error:
         raise InputError(f"the folder cannot be searched ({error})", path=folder) from error
     for place in places:
         if not place.is_file():  # links to folders are not followed, because they may form a circle
-            what = "a link to a folder; also name that folder" if place.is_dir() else "a broken link"
+            what = "a link to a folder: name that folder as well" if place.is_dir() else "a broken link"
             skipped.append(Skipped(str(place), what))
             continue
         try:
@@ -605,7 +607,7 @@ def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
 
 
 def _span(stream: Stream) -> dict[str, Any]:
-    """Return the first and last time (ISO, UTC) and the mean rate, None if undefined."""
+    """Return the first and last time (ISO, UTC) and the mean rate, or None for undefined values."""
     if not stream.rows:
         return {"start": None, "end": None, "rate_hz": None}
     time = stream.frame["time"]
@@ -632,7 +634,7 @@ def account_rows(account: Mapping[str, Any], every_stream: bool = False) -> tupl
 
 
 def _common_folder(paths: Sequence[Path]) -> str:
-    """Return the folder that all paths share, empty if there is no such folder."""
+    """Return the folder that all paths share, or an empty text if there is no such folder."""
     if len(paths) < 2 or len({path.is_absolute() for path in paths}) > 1:
         return ""
     return os.path.commonpath([path.parent for path in paths])
@@ -643,7 +645,7 @@ def _account_row(file: Mapping[str, Any], folder: str, every_stream: bool) -> li
     kinds: dict[str, list[str]] = {}
     for stream in streams:
         kinds.setdefault(stream["kind"], []).append(f"{stream['name']} {stream['rows']}")
-    # as a set: streams of one log mostly share their rate
+    # use a set, because streams of one log mostly have the same rate
     rates = {"-" if s["rate_hz"] is None else _rate_words(s["rate_hz"]) for s in streams}
     start, seconds = _start_and_length([s for s in streams if s["start"]])
     return [
@@ -712,7 +714,9 @@ def _join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
 
 def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
     """Join pieces into one log that contains the lines of all pieces, one after the other."""
-    pieces = sorted(file.sha256 for file in group)  # regardless of the names of the pieces
+    pieces = sorted(
+        file.sha256 for file in group
+    )  # sorted, so that the digest does not depend on the names of the pieces
     digest = hashlib.sha256("".join(pieces).encode()).hexdigest()
     before = 0
     parts: dict[tuple[str, str], list[tuple[Stream, pd.DataFrame]]] = {}

@@ -1,18 +1,18 @@
-"""Possible range of each quantity of the record model, for all readers: rows beyond it are flagged.
+"""The possible range of each quantity of the record model. Rows outside it are flagged, for all readers.
 
 A value beyond its range becomes NaN; a position, an attitude or a velocity loses all three components. Its row gets a
-flag, and a warning gives the number of such rows and the first of them. Rows with a flag of :data:`UNSCORED` stay in
+flag, and a warning states the number of such rows and the first row. Rows with a flag of :data:`UNSCORED` stay in
 the records and are not compared.
 
-The ranges are those of physics and of small aircraft. They are wide, to find impossible values (a corrupted digit, an
-overflow, a sentinel) and not unusual ones.
+The ranges are those of physics and of small aircraft. They are wide, because they should find impossible
+values (a corrupted digit, an overflow, a sentinel) and not unusual values.
 
 Speeds reveal wrong clocks and positions: no small aircraft flies faster than 100 m/s, or gains 10 m/s in a second.
 
 A few positions that cannot be reached in time from the rows around them are jumps of the receiver. They are flagged and
 read as missing, as is a distant place where a log begins or ends at rest, such as the origin of an autopilot's filter.
-Positions that stay the same while the logged speed moves the aircraft on are stale, flagged and read as missing, too.
-The times of a track that is too fast throughout are in another unit. A track in two places at once belongs to two
+Positions that do not change although a speed is logged are stale. They are also flagged and read as missing.
+If a track is too fast throughout, its times are in another unit. A track in two places at once belongs to two
 vehicles. Both are reported, and their values stay as they are.
 """
 
@@ -102,7 +102,7 @@ def jumps_of(frame: pd.DataFrame, what: str = "") -> tuple[BoolArray, str]:
 
 
 def path_of(frame: pd.DataFrame) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the rows with a time and a position, their times [s], and east, north, up [m] about the first."""
+    """Return the rows with a time and a position, their times [s], and east, north, up [m] from the first position."""
     time = frame["time"].to_numpy("datetime64[ns]")
     latitude, longitude = (frame[name].to_numpy(np.float64) for name in PLACE[:2])
     known = np.isfinite(latitude) & np.isfinite(longitude) & ~np.isnat(time) & ((latitude != 0) | (longitude != 0))
@@ -133,7 +133,8 @@ _Pairs = Callable[[IntArray, IntArray], BoolArray]
 def _out_of_reach(time_s: FloatArray, place_m: FloatArray) -> _Pairs:
     """Return a function of two arrays of rows that returns the mask of pairs that no aircraft can reach in time.
 
-    The limits are the speed of the fastest aircraft, and the speed of this one around these rows plus its thrust.
+    The limits are the speed of the fastest aircraft, and the speed of this aircraft around these rows plus the gain
+    that its thrust allows.
 
     Parameters
     ----------
@@ -263,7 +264,7 @@ class Limit:
     columns : tuple of str
         Components that become NaN together.
     ranges : tuple of (low, high)
-        One per column, both ends possible, in the unit of the column's name.
+        Smallest and largest possible value of each column, in the unit of its name.
     flag : str
         Flag of rows beyond it.
     """
@@ -495,7 +496,7 @@ class _Check:
         step, *back = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in lags)
         # the level returns within the next records; after fading it would not return so exactly
         turns = step > _APART_DB and min(back) < _BACK_SHARE * step
-        # most series repeat few times, and grouping them is slow
+        # in most series few times repeat, and grouping them is slow
         if not turns and 3 * len(np.unique(time)) > 2 * len(time):
             return
         at_once = pd.Series(level).groupby(time).agg(["min", "max", "size"])
@@ -513,14 +514,14 @@ class _Check:
         )
 
     def _near_in_time(self) -> None:
-        """Flag a few stamps that lie days from all the others."""
+        """Flag a few time stamps that are days from all other time stamps."""
         # subtract as floats, because int64 would overflow for NaT and for stamps 300 years apart
         time = self.frame["time"].to_numpy("datetime64[ns]")
         stamp: IntArray = time.view(np.int64)
         timed = ~np.isnat(time)
         if timed.sum() < 2 or float(stamp[timed].max()) - float(stamp[timed].min()) <= _APART_S * 1e9:
             return
-        # NaT last: it is the smallest of all integers
+        # sort NaT last, although it is the smallest integer
         order = np.argsort(np.where(timed, stamp, np.iinfo(np.int64).max), kind="stable")[: int(timed.sum())]
         group = np.concatenate(([0], np.cumsum(np.diff(stamp[order].astype(np.float64)) > _APART_S * 1e9)))
         size = np.bincount(group)
@@ -530,7 +531,7 @@ class _Check:
         # if no group is dominant, the file contains two flights, not a few bad time stamps
         few &= 2 * size.max() > len(order)
         last = stamp[order][np.append(np.flatnonzero(np.diff(group)), len(order) - 1)]
-        unset = last < _CLOCK_SET_NS  # any number of rows before the clock was set
+        unset = last < _CLOCK_SET_NS  # flag any number of rows that were written before the clock was set
         few |= unset & ~unset.all()
         bad = np.zeros(len(stamp), dtype=np.bool_)
         bad[order[few[group]]] = True

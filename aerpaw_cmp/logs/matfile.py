@@ -54,7 +54,7 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
     data : bytes
         The file.
     wanted : collection of str or None
-        Names, None for all. Variables that the file does not have, or of other classes, are missing in the result.
+        Names of the variables, or None for all. The result omits variables that are missing or of another class.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
 
     Notes
     -----
-    Version 7.3 is HDF5: arrays are transposed, text as 16-bit codes under the attribute ``MATLAB_class``.
+    Version 7.3 is HDF5: arrays are transposed, and text is stored as 16-bit codes with the attribute ``MATLAB_class``.
     """
     if data.startswith(MAGIC_73):
         return _read_hdf5(data, wanted)
@@ -173,7 +173,7 @@ def _inflated(element: _Element, order: str, most: int) -> _Element:
 
 
 def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[str, AnyArray | None]:
-    """Return the name and the array of a variable, None if it is not wanted or has another class."""
+    """Return the name and the array of a variable. The array is None if it is not wanted or of another class."""
     parts = _elements(body, 0, order, padded=True)
     flags, dimensions, title = _head_of(parts)
     # signed, because a negative size means damage and would wrap to a huge size

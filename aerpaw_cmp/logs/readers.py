@@ -1,6 +1,6 @@
 """The reader contract, and the way from a file's bytes to its reader.
 
-A reader is a pure function of bytes: no file, no port. Each format module builds one :class:`Reader` and
+A reader is a pure function of bytes. It opens no file or port. Each format module builds one :class:`Reader` and
 lists it in the catalogue that the entry-point group ``aerpaw_cmp.readers`` names.
 
 The clock, the height datum and the identity of each stream are written in the file, known from its program, or assumed.
@@ -23,9 +23,9 @@ from ..common.errors import AerpawCmpError, InputError, UsageError, one_line
 from .records import Attribute, Kind, ReadResult, Stream
 
 ENTRY_POINT_GROUP = "aerpaw_cmp.readers"
-# Bytes of a file that sniffers see first.
+# Number of bytes of a file that sniffers see first.
 HEAD_BYTES = 65_536
-# Bytes that they see if no log reader recognises the first ones.
+# Number of bytes that sniffers see if no log reader recognises the first ``HEAD_BYTES``.
 DEEP_BYTES = 4 << 20
 
 # A function that reads a log from pieces of complete lines, with a result that does not depend on their size.
@@ -50,7 +50,7 @@ class ReadOptions:
     ri_base : {"zero", "one"}, optional
         Number that the source prints for rank 1. Readers of formats with a fixed base ignore it.
     columns : mapping, optional
-        Generic CSV only: record column to file column.
+        Name of the file column for each record column, only for generic CSV.
     kind : str, optional
         Generic CSV only.
     node, channel : str, optional
@@ -95,7 +95,7 @@ class Reader:
     title : str
         One line for ``aerpaw-cmp formats``.
     kinds : tuple of str
-        Kinds of stream that it can return; none for known files that are not logs, with a description in ``title``.
+        Kinds of stream that the reader can return. Empty for known files that are not logs; ``title`` describes them.
     sample : str
         One typical line.
     sniff : callable
@@ -105,8 +105,8 @@ class Reader:
     pieces : bool
         True if a file of a few records is a piece of the log in its folder.
     read_pieces : callable, optional
-        ``read_pieces(pieces, options) -> ReadResult``: the same from pieces of whole lines, for logs larger than
-        memory; see :mod:`aerpaw_cmp.logs.files`.
+        ``read_pieces(pieces, options) -> ReadResult``: the same as ``read``, from pieces of complete lines, for logs
+        larger than memory; see :mod:`aerpaw_cmp.logs.files`.
     clock_from, height_from : str
         ``written``, ``program: which``, or ``assumed: what``; see :mod:`aerpaw_cmp.logs.readers`. An attribute
         of this name in a stream has precedence.
@@ -203,7 +203,7 @@ def claims(data: bytes) -> list[Reader]:
     """
     data = _BLANK_LINES.sub(b"", data[:DEEP_BYTES])
     heads = (data[:HEAD_BYTES], data) if len(data) > HEAD_BYTES else (data,)
-    # log readers first, with few bytes and then with more, because a text page may quote a log
+    # try log readers first, with few bytes and then with more, because a page of text may quote a log
     tried = [(head, True) for head in heads] + [(head, False) for head in reversed(heads)]
     accepting = ([r for r in catalogue() if bool(r.kinds) is of_logs and _accepts(r, head)] for head, of_logs in tried)
     return next((readers for readers in accepting if readers), [])
@@ -220,7 +220,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
     if not data.strip():
         raise InputError("the file is empty", expected="log lines", cause="an aborted run", path=path)
     head = data[:HEAD_BYTES]
-    # before any sniffer, because it is a text that no reader would recognise
+    # test this before any sniffer, because no reader would recognise the text of a pointer
     if head.startswith(b"version https://git-lfs"):
         raise InputError(
             "a Git-LFS pointer instead of the data",
@@ -257,7 +257,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
 def _way_out(head: bytes) -> str:
     titled = re.sub(rb"\A(?:\s*#[^\n]*\n)+", b"", head.lstrip(b"\xef\xbb\xbf \r\n"))
     first = titled.split(b"\n", 1)[0].decode("utf-8", "replace").strip()
-    # the most frequent one: a decimal comma is rarer than the separator
+    # the most frequent sign is the separator, because decimal commas are rarer
     sign = max(",;\t|", key=first.count)
     names = [name.strip().strip('"') for name in first.split(sign)]
     if len(names) > 1 and not first.startswith(("{", "[", "<", "$")) and all(not name[:1].isdigit() for name in names):
@@ -335,7 +335,7 @@ def _split(what: str, text: str) -> dict[str, Attribute]:
 
 
 def named_tower(path: str, towers: Sequence[str]) -> str | None:
-    """Return the tower of the site whose name is in a path (``lw-1`` is LW1), the last one of several."""
+    """Return the tower of the site whose name is in a path (``lw-1`` is LW1), the last tower if there are several."""
     places = {}
     for tower in towers:
         letters = "[-_ ]?".join(map(re.escape, re.findall(r"\d+|[^\W\d_]+", tower)))
@@ -343,5 +343,5 @@ def named_tower(path: str, towers: Sequence[str]) -> str | None:
         ends = r"(?!\d)" if tower[-1:].isdigit() else r"(?![^\W_])"
         for match in re.finditer(rf"(?<![^\W_]){letters}{ends}" if letters else r"(?!)", path, re.IGNORECASE):
             places[match.start()] = tower
-    # the last one, because file names come after folders
+    # use the last tower, because file names come after folders
     return places[max(places)] if places else None

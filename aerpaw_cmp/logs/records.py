@@ -24,7 +24,7 @@ kpi
 
 An rss stream of one cell has the attribute ``pci`` and, if known, ``arfcn``, ``band`` and ``rat``.
 
-Its column ``serving`` is 1 while the cell serves the phone, 0 while another cell does, and NaN if unknown.
+The column ``serving`` is 1 while the cell serves the phone, 0 while another cell serves it, and NaN if unknown.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Stream:
     kind : {"telemetry", "rss", "rank", "kpi"}
         The kind, which decides the columns (see the module text).
     name : str
-        Unique within the file, e.g. ``"vehicle"``, ``"power"``, ``"USRP1"``.
+        Name that is unique within the file, e.g. ``"vehicle"``, ``"power"``, ``"USRP1"``.
     frame : pandas.DataFrame
         The records in file order, default integer index.
     attributes : mapping
@@ -106,7 +106,7 @@ class RejectedLine:
 
 @dataclass(frozen=True, slots=True)
 class RejectedReason:
-    """A reason why lines were rejected, their number, and the first and last of them (1-based)."""
+    """A reason why lines were rejected, with their number and the first and last line (1-based)."""
 
     reason: str
     count: int
@@ -163,7 +163,7 @@ class ReadResult:
     reasons: tuple[RejectedReason, ...] = ()
 
     def __post_init__(self) -> None:
-        # readers of small files return the lines only
+        # readers of small files return only the lines
         if not self.reasons:
             reasons = by_reason(RejectedReason(line.reason, 1, line.number, line.number) for line in self.rejected)
             object.__setattr__(self, "reasons", reasons)

@@ -72,7 +72,7 @@ def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFra
         A QGroundControl plan, ``QGC WPL`` waypoints, a KML with a line or points, a CSV with named columns, or any
         log with positions.
     height_m : float, optional
-        Height above take-off of points without a height.
+        Height above take-off for points that have no height.
 
     Returns
     -------
@@ -117,7 +117,7 @@ class _Route:
 
 def _route(data: bytes, path: str | Path) -> _Route:
     head = data[:HEAD_BYTES]
-    # before the log readers, because one of them might accept the JSON of a plan
+    # try this before the log readers, because one of them might accept the JSON of a plan
     if re.match(rb"\s*\{", head) and b'"fileType"' in data[: 1 << 20]:
         return _plan(data, path)
     if re.match(rb"\s*QGC WPL \d+", head):
@@ -151,7 +151,7 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
             place = f"{int(silent.sum())} of {counted(len(table), 'point')} without a height"
             raise InputError(place, expected="heights above take-off in the file, or one height for all points")
         table["altitude_m"] = table["altitude_m"].fillna(height_m)
-    # programs count headings from -180 or from 0
+    # some programs count headings from -180, others from 0
     table["yaw_deg"] = table["yaw_deg"] % 360.0
     table.attrs["remarks"] = list(route.remarks)
     return table
@@ -159,7 +159,7 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
 
 def _log(path: str | Path) -> _Route:
     """Return the track of a log."""
-    # any zone and origin, because a route has no date
+    # use any zone and origin, because a route has no date
     file = read_file(path, options=ReadOptions(timezone="UTC", time_origin="2000-01-01T00:00:00"))
     tracks = [stream for stream in file.result.streams if "latitude_deg" in stream.frame.columns]
     if not tracks:
@@ -210,7 +210,7 @@ def _items(listed: Sequence[Any]) -> Iterator[_Item]:
 
 
 def _numbers(values: Sequence[Any], count: int = 0) -> tuple[float, ...]:
-    """Return numbers, NaN for null."""
+    """Return numbers, with NaN for null."""
     numbers = tuple(math.nan if value is None else float(value) for value in values)
     return numbers + (math.nan,) * (count - len(numbers))
 
@@ -308,7 +308,7 @@ def _root(data: bytes) -> ElementTree.Element:
 
 
 def _kml(data: bytes) -> _Route:
-    """Return the lines and tracks of a map, or its points in their order if it has no line."""
+    """Return the lines and tracks of a map, or its points in the order of the file if it has no line."""
     root = _root(data)
     shapes = list(outermost(root, {"LineString", "Point", "Track"}))
     lines = [shape for shape in shapes if plain_tag(shape.tag) != "Point"]
@@ -321,7 +321,7 @@ def _kml(data: bytes) -> _Route:
     for shape in lines or shapes:
         modes = kml.modes_of(shape)
         sea_level |= "absolute" in modes
-        # the default of KML: a 0 in drawn lines is then not a height
+        # clamping to the ground is the default of KML: a 0 in drawn lines is then not a height
         clamped = not modes or any(mode.startswith("clamp") for mode in modes)
         headings = [float(m[1]) for angles in named(shape, "angles") if (m := _HEADING.match(str(angles.text or "")))]
         for index, place in enumerate(kml.places_of(shape)):
@@ -369,7 +369,7 @@ def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
 
 def _sheet(data: bytes) -> _Route:
     """Return the waypoints of a table, which without a header are latitude, longitude, height and yaw."""
-    # one line at a time, so that a table beyond the limit is refused before all of it is in memory
+    # read one line at a time, so that a table beyond the limit is refused before all of it is in memory
     text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", errors="replace")
     lines = (line for line in text if line.strip() and not line.lstrip().startswith("#"))
     head = next(lines, None)

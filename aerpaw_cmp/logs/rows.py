@@ -1,8 +1,8 @@
 """Conversion of lines to records, for all text formats.
 
 :func:`matched` returns the :class:`Rows` of a pattern with named groups, one of them ``time``. :func:`built` does the
-same for readers that find their rows in another way. ``Rows.number`` and ``Rows.text`` are the columns,
-``Rows.stream`` makes a stream of them, and ``Rows.result`` completes the account.
+same for readers that find their rows in another way. ``Rows.number`` and ``Rows.text`` return columns,
+``Rows.stream`` returns a stream of columns, and ``Rows.result`` completes the account.
 
 :func:`reader` makes a reader from the regular expression of its rows, its mark, and the streams of its columns. It adds
 sniffing, the account of all lines, times, and truncated last lines.
@@ -97,7 +97,7 @@ class Rows:
     def si(self, name: str) -> FloatArray:
         """Return a column of numbers with SI suffixes: ``-4.3k`` is -4300."""
         cells = [cell.strip() for cell in self.columns[name].tolist()]
-        scaled = [cell[-1:] in _SI and cell[-2:-1].isdigit() for cell in cells]  # 'nan' is not a nano
+        scaled = [cell[-1:] in _SI and cell[-2:-1].isdigit() for cell in cells]  # the n of 'nan' does not mean nano
         scale = np.array([_SI[cell[-1:]] if mark else 1.0 for cell, mark in zip(cells, scaled, strict=True)])
         plain = _text.cells([cell[:-1] if mark else cell for cell, mark in zip(cells, scaled, strict=True)])
         return np.asarray(replace(self, columns={name: plain}).number(name) * scale, dtype=np.float64)
@@ -291,7 +291,7 @@ def built(
 def _untimed(lines: _text.Lines, rows: IntArray, cells: AnyArray, valid: BoolArray, clock: str) -> list[RejectedLine]:
     """Return the lines rejected for their time: an unknown form, not a date of the calendar, or beyond any flight."""
     bad = np.flatnonzero(~valid & ~np.isin(rows, rows[valid]))
-    # a line of several records is rejected once
+    # reject a line of several records only once
     bad = bad[np.unique(rows[bad], return_index=True)[1]] if len(bad) else bad
     if clock != "wall":
         return lines.reject_all(rows[bad], NO_TIME)

@@ -1,9 +1,9 @@
 """Lines of a text log, their clocks, and the frames of their records.
 
 Lines are byte ranges of a file, without a Python object per line. A line ends with LF, and a CR before it belongs to
-the line end. A last text without LF is a line, too; a file that ends with LF does not have an additional empty line.
+the line end. Text after the last LF is also a line. A file that ends with LF has no additional empty line.
 
-Wall clocks of all readers become UTC here. AERPAW nodes write naive America/New_York time almost everywhere, and some
+Wall clocks of all readers become UTC here. Almost all AERPAW nodes write naive America/New_York time, and some
 authors stored that wall clock as if it were UTC.
 """
 
@@ -122,7 +122,7 @@ def _places(buffer: AnyArray, byte: int) -> IntArray:
 
 
 def split(data: bytes) -> Lines:
-    r"""Cut a file into lines.
+    r"""Split a file into lines.
 
     Examples
     --------
@@ -183,7 +183,7 @@ class Rejects:
         # numbers count from the first piece of the file
         low, high = int(min(numbers)) + self.before + 1, int(max(numbers)) + self.before + 1
         self._reasons.append(RejectedReason(reason, len(numbers), low, high))
-        # more than are kept, because the reasons of one piece are not added in the order of the file
+        # store more lines than are kept, because the reasons of one piece are not added in the order of the file
         if len(self._first_lines) < 4 * KEPT_REJECTED:
             for i in sorted(numbers)[:KEPT_REJECTED]:
                 self._first_lines.append(RejectedLine(int(i) + self.before + 1, reason, lines.text(int(i))))
@@ -249,7 +249,7 @@ def cells(texts: Sequence[bytes]) -> AnyArray:
 
 
 def numbers(column: AnyArray) -> AnyArray:
-    """Return text of numbers as float64, NaN for empty text."""
+    """Convert numbers from text to float64, with NaN for empty text."""
     if column.dtype.itemsize == 0 or len(column) == 0:
         return np.full(len(column), np.nan)
     # Python programs print None for an unknown value
@@ -259,7 +259,7 @@ def numbers(column: AnyArray) -> AnyArray:
 def no_flags(count: int) -> AnyArray:
     """Return an empty flag column."""
     column = np.empty(count, dtype=object)
-    column.fill("")  # one object for all rows: np.full would create one per row
+    column.fill("")  # use one object for all rows, because np.full would create one object per row
     return column
 
 
@@ -274,7 +274,7 @@ def add_flag(column: AnyArray, mask: BoolArray, reason: str) -> None:
 
 
 def first_lines(head: bytes, count: int = 40) -> list[bytes]:
-    """Return complete, non-blank lines at the start of a file, which sniffers look at."""
+    """Return complete, non-blank lines at the start of a file, which sniffers test."""
     # enough for forty lines of any log
     pieces = head[:16_384].split(b"\n")
     if len(head) > 16_384 or (len(pieces) > 1 and not head.endswith(b"\n")):
@@ -338,7 +338,7 @@ class Instants:
     time : datetime64[ns] array, shape (n,)
         UTC, naive.
     ambiguous, nonexistent : bool array, shape (n,)
-        Wall clock that occurs twice, or never, because of a change between winter and summer time.
+        True for a wall clock that occurs twice, or never, because of a change between winter and summer time.
     warnings : tuple of str
         Sentences for the user.
     zoned : bool
@@ -358,7 +358,7 @@ class Instants:
 
 
 def zone(name: str | None, *, needed_by: str) -> tzinfo:
-    """Return the named zone, or raise ``UsageError`` with the key ``timezone:`` if there is no name."""
+    """Return the named zone. If there is no name, the UsageError names the key ``timezone:``."""
     if not name:
         raise UsageError(
             f"no time zone for the clock of {needed_by}, which has no zone",
@@ -409,7 +409,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     name : str or None
         IANA zone.
     needed_by : str
-        Owner of the clock, for the message.
+        Name of the clock's owner for the message.
 
     Raises
     ------
@@ -483,7 +483,7 @@ def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def wall_to_utc(wall_ns: IntArray, options: ReadOptions, *, needed_by: str) -> Instants:
-    """Convert times without a zone to UTC by the options: local unless ``clock: utc`` is set."""
+    """Convert times without a zone to UTC. They are local unless ``clock: utc`` is set in the options."""
     if options.clock == "utc":
         none = np.zeros(len(wall_ns), dtype=bool)
         return Instants(wall_ns.astype("datetime64[ns]"), none, none)
@@ -508,8 +508,8 @@ def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
     count = len(cells)
     if count == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool)
-    # times increase, so the date and minute of consecutive equal times are parsed only once:
-    # sixteen characters as two integers: two comparisons a row
+    # Times increase, so parse each date and minute once per run of equal values. Sixteen characters are compared as two
+    # integers per row.
     half = np.ascontiguousarray(cells[:, :16]).view(np.uint64)
     starts = np.flatnonzero(np.concatenate(([True], (half[1:, 0] != half[:-1, 0]) | (half[1:, 1] != half[:-1, 1]))))
     length = np.diff(np.append(starts, count))
@@ -574,7 +574,7 @@ def parse_texts(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolAr
     count = len(column)
     wall, offset = np.zeros((2, count), dtype=np.int64)
     valid, zoned = np.zeros((2, count), dtype=bool)
-    # room for nine digits and an offset, so that every row can be cut at the same places
+    # leave space for nine digits and an offset, so that every row can be cut at the same columns
     width = max(column.dtype.itemsize, 30)
     cells = column.astype(f"S{width}").view(np.uint8).reshape(count, width)
     digits = (cells[:, 20:29] >= 48) & (cells[:, 20:29] <= 57)
@@ -612,7 +612,7 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
     -------
     instants : Instants
     valid : bool array, shape (n,)
-        Invalid times are False, and 1970-01-01 in ``instants``.
+        False for invalid times, which are 1970-01-01 in ``instants``.
     """
     wall, valid, offset, zoned = parse_texts(column)
     naive = valid & ~zoned
@@ -636,7 +636,7 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
 
 
 def _are_near(times: AnyArray, others: AnyArray) -> bool:
-    """Check whether most times lie within a quarter of an hour of some others."""
+    """Check whether most times are within a quarter of an hour of one of the other times."""
     ordered = np.sort(others)
     at = np.searchsorted(ordered, times)
     apart = [np.abs(times - ordered[place.clip(0, len(ordered) - 1)]) for place in (at - 1, at)]
@@ -700,7 +700,7 @@ def frame(
             content[name] = array(values[name], dtype=np.float64) if name in values else np.full(count, np.nan)
     for name, column in values.items():
         if name not in content:
-            # a copy: the same array may serve several streams
+            # copy the array, because several streams may use it
             content[name] = np.array(column)
     columns: pd.DataFrame = pd.DataFrame(content, copy=False)
     return columns

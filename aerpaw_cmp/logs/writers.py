@@ -33,7 +33,7 @@ def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]
     timezone : str
         IANA zone of the simulated clock.
     digits : int
-        Digits of the fraction, 0, 3 or 6; cut, not rounded, as ``strftime`` does.
+        Number of digits of the fraction: 0, 3 or 6. Further digits are cut off, as by ``strftime``.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]
     index = pd.DatetimeIndex(np.asarray(times, dtype="datetime64[ns]"), tz="UTC")
     try:
         local = index.tz_convert(timezone).tz_localize(None).to_numpy().astype("datetime64[us]")
-    except Exception as error:  # zoneinfo and pandas raise several kinds for a wrong name
+    except Exception as error:  # zoneinfo and pandas raise several kinds of exceptions for a wrong name
         raise UsageError(f"unknown time zone {timezone!r}", expected="an IANA name, e.g. America/New_York") from error
     texts = [str(text).replace("T", " ") for text in np.datetime_as_string(local, unit="us")]
     return texts if digits == 6 else [text[: 20 + digits] if digits else text[:19] for text in texts]
@@ -98,7 +98,7 @@ def format_vehicle_out(frame: pd.DataFrame, timezone: str) -> bytes:
 
 
 def _short(value: float, places: int) -> str:
-    """Return a number rounded like DroneKit and written like Python, -999 as an integer."""
+    """Return a number as DroneKit rounds it and Python prints it, with -999 as an integer."""
     return "-999" if value == -999.0 else repr(round(value, places) + 0.0)
 
 

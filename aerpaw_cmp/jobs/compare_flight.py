@@ -653,7 +653,7 @@ def fitted_receiver(data: FlightData, tower: str) -> FittedReceiver | None:
 def _receiver_forecast(
     data: FlightData, series: RankSeries
 ) -> tuple[FloatArray | None, ForecastScore | None, tuple[str, ...]]:
-    """Return the receiver's probability of each rank (n, 4), its score, and this flight's logs if it was fitted on them."""
+    """Return the probability of each rank (n, 4), its score, and the logs of this flight that trained the receiver."""
     receiver = fitted_receiver(data, series.tower)
     if receiver is None:
         return None, None, ()

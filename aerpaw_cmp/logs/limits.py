@@ -223,8 +223,8 @@ def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArr
     """Return masks (n,) of rows off the track and of rows at rest at an end, and speed and row of the first.
 
     Rows between two fast steps form a run. The longest run that moves is the track. A run that the track cannot reach
-    in time is off the track if it is short, or if it does not move and the log begins or ends with it. Any other run is
-    a continuation elsewhere, as after a time without fixes.
+    in time is off the track if it is short, or if it does not move and the log begins or ends with it. Any other run
+    continues the track elsewhere, for example after a time without fixes.
     """
     count = len(time_s)
     astray, at_rest = np.zeros((2, count), dtype=np.bool_)

@@ -53,7 +53,7 @@ def gps_utc_s(week: FloatArray, milliseconds: FloatArray) -> FloatArray:
 
 
 def offset_s(utc_s: FloatArray, time_s: FloatArray) -> float | None:
-    """Return UTC minus the autopilot's clock, or None if no message has both."""
+    """Return UTC minus the autopilot's clock, or None if no message has both times."""
     known = (utc_s > 1e9) & (utc_s < _MOST_S) & (np.abs(time_s) < _MOST_S)
     return float(np.median(utc_s[known] - time_s[known])) if known.any() else None
 

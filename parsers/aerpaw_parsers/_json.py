@@ -111,7 +111,7 @@ def first(head: bytes) -> dict[str, Any] | None:
         if not text:
             continue
         value, _ = _loaded(text)
-        if value is None:  # perhaps an object over several lines
+        if value is None:  # the line may begin an object over several lines
             place = head.find(b"{")
             try:
                 value, _ = json.JSONDecoder().raw_decode(head[max(place, 0) :].decode("utf-8", "replace"))
@@ -171,7 +171,7 @@ def column(entries: list[dict[str, Any]], *names: str) -> FloatArray:
 
 
 def inside(entry: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return an object within an object, or an empty one."""
+    """Return an object within an object, or an empty object if it is missing."""
     value = entry.get(name)
     return value if isinstance(value, dict) else {}
 

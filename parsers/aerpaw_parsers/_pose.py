@@ -246,13 +246,13 @@ _JITTER_M, _STEADY = 0.1, 0.9
 def above_takeoff(rows: Rows, values: dict[str, AnyArray], datum: str, lost: BoolArray) -> tuple[FloatArray, Height]:
     """Return heights above take-off, and the attributes about their source.
 
-    Heights above sea level or an unknown datum count from the height at rest on the ground before the climb, which is
-    not a hover. If there is no such rest, they count from the first position.
+    Heights above sea level or an unknown datum count from the height at rest on the ground before the climb. A
+    hover does not count as rest. If there is no such rest, they count from the first position.
 
     Parameters
     ----------
     rows : Rows
-        Their ``height_from`` is the source of the datum.
+        The rows, whose ``height_from`` states the source of the datum.
     values : dict
         ``latitude_deg``, ``longitude_deg`` and ``altitude_m`` as in the log.
     datum : str

@@ -36,7 +36,7 @@ _IsHeader = Callable[[list[str]], bool]
 
 
 def split_row(line: bytes, separator: str) -> list[str]:
-    """Return the fields of a line, without separators inside quotes."""
+    """Split a line into fields, but not at separators inside quotes."""
     text = line.decode("utf-8-sig", errors="replace")
     if '"' not in text:
         return text.split(separator)
@@ -59,7 +59,8 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
             names = [name.strip() for name in split_row(line, separator)]
             below = [name.strip() for name in split_row(lines[i + 1], separator)] if i + 1 < len(lines) else []
             filled = [name or group for group, name in zip(names, below, strict=False)]
-            # merged cells above the names, such as those of a tower: the empty cells are filled with the names below
+            # if merged cells, such as tower names, are above the names, their empty cells are filled with the names
+            # below
             grouped = any(name and not group for group, name in zip(names, below, strict=False))
             grouped &= len(below) == len(names) and not any(map(_VALUE.match, below))
             if len(names) > 1 and is_header(filled if grouped else names):
@@ -521,7 +522,7 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     Returns
     -------
     Sheet
-        It has the columns of all headers, if there are several.
+        The table, with the columns of all headers if there are several.
     """
     below = ~lines.blank
     below[: at + 1] = False
@@ -541,7 +542,7 @@ _MOST_LINES = 40
 
 
 def _logical(lines: Sequence[tuple[int, bytes]], separator: str, width: int) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows of lines with the number of the first line of each: a quoted cell may have line breaks.
+    """Yield rows, each with the number of its first line, because a quoted cell may have line breaks.
 
     A lone quote, such as an inch mark, does not join lines: lines are joined only if they form a row as wide as the
     header.
@@ -932,7 +933,7 @@ def _has_levels(sheet: Sheet, column: int) -> bool:
 
 
 def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:
-    """Return UTC from columns of GPS weeks and of seconds or milliseconds of the week, or None if one is missing."""
+    """Return UTC from columns of GPS weeks and (milli)seconds of the week, or None if a column is missing."""
     week, second = sheet.find("gps_week"), sheet.find("gps_seconds")
     if second is None and time is not None and "gps" in sheet.plain[time]:
         second = time

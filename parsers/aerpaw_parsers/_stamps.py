@@ -377,7 +377,7 @@ def read(
     clock : str
         Argument of :func:`aerpaw_cmp.logs.rows.instants_of`.
     cells : array, shape (n,)
-        Bytes or floats for it.
+        The times for this function, as bytes or floats.
     warnings : list of str
     """
     # browsers write a narrow space before AM
@@ -520,7 +520,7 @@ def are_seconds(value: FloatArray, unit: str) -> bool:
 def _numbers(
     value: FloatArray, unit: str | None, options: ReadOptions, *, gps: bool, zone: str
 ) -> tuple[str, AnyArray, list[str]]:
-    """Return numbers as epochs by their size, else as relative times."""
+    """Return numbers as epochs if they are large enough, else as relative times."""
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
     step, likely = _step(value), _likely_units(value)
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
@@ -551,7 +551,7 @@ def _numbers(
     text = f"the times are numbers without a unit: read as {_NAMES[unit]}, which is a guess"
     text = f"{text} (the log lasts {_lasting(value, unit)}; {lasting})"
     advice = f"if it is wrong, write the unit in the column's name, such as 'time [{others[0]}]'"
-    # A log that begins within the first hour counts from its start. A later one counts from midnight, unless the user
+    # A log that begins within the first hour counts from its start. A later log counts from midnight, unless the user
     # knows the time of zero.
     if unit == "ms" and of_day and whole and np.nanmin(value) >= 3_600_000:
         if len(options.time_origin or "") <= len("2025-03-02"):
@@ -580,7 +580,7 @@ def _lasting(value: FloatArray, unit: str) -> str:
 GPS_S, LEAP_S = 315_964_800, 18
 # Scales of time without leap seconds, and how far they are ahead of UTC since 2017 [s].
 SCALES_S = {"gpst": LEAP_S, "gpstime": LEAP_S, "tai": 37}
-# GPS time of January 2018 and of February 2030. As epochs they are of 2008 and 2020.
+# GPS time of January 2018 and of February 2030. Read as epochs, they are in 2008 and 2020.
 _GPS_S_OF = (1.2e9, 1.58e9)
 _GPS_COUNT = "the times count from 1980 (GPS time): 18 leap seconds were subtracted"
 # Date of day number zero, and the range of day numbers for the years 2000 to 2099.
@@ -609,7 +609,7 @@ def _of_day(
     written = next((item["zone"] for item in matches if item and item["zone"]), None) or zone
     first = seconds[np.isfinite(seconds)][:1]
     named, start_s = _NEMO_NAME.search(options.file_name), _session_start_s(options)
-    own_form = written == "Z" and any(text.startswith("T") for text in texts[:3])  # Nemo Handy's
+    own_form = written == "Z" and any(text.startswith("T") for text in texts[:3])  # the form of Nemo Handy
     if not own_form or not len(first):
         return _on_a_date(seconds, options, [], written)
     # Nemo Handy marks its local times as UTC, and some exports are off by hours: its summary contains the start
@@ -632,7 +632,7 @@ _NEAR_S = 300.0
 
 
 def _session_start_s(options: ReadOptions) -> float | None:
-    """Return the second of the day at which the session began, by Nemo's summary, a CSV in the same folder."""
+    """Return the second of the day when the session began, according to Nemo's summary (a CSV in the same folder)."""
     summary = options.neighbour(options.file_name.rpartition(".")[0] + ".csv") if options.neighbour else None
     start = _SESSION_START.search(summary[:4096]) if summary else None
     return None if start is None else int(start[1]) * 3600.0 + int(start[2]) * 60.0
@@ -655,7 +655,7 @@ def _wall_cells(day: np.datetime64, seconds: FloatArray, zone: str, options: Rea
     stamps = day + np.round(np.nan_to_num(seconds) * 1e6).astype("timedelta64[us]")
     cells = np.datetime_as_string(stamps, unit="us").astype(np.bytes_)
     date = str(stamps[np.argmax(np.isfinite(seconds))])[:10]
-    # at noon, since clocks change at night
+    # use the offset at noon, because clocks change at night
     offset = _Zones(options, zone).offset(None, f"{date} 12:00:00").encode()
     return np.where(np.isnan(seconds), b"-", np.char.add(cells, offset))
 

@@ -24,7 +24,7 @@ _ROW = re.compile(
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether there is a cell with a time."""
+    """Check whether a file contains a cell with a time."""
     # search a fixed text first, because an expression that is anchored to line starts is slow
     first = _ROW.search(head) if b"Found CELL " in head else None
     return first is not None and bool(first[1] or first[8])

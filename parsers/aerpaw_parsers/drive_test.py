@@ -97,10 +97,10 @@ class _Cell:
 
     rat: str
     place: str
-    columns: dict[str, int] = field(default_factory=dict)  # by the fields of a reading
+    columns: dict[str, int] = field(default_factory=dict)  # column by field of a reading
     ports: list[int] = field(default_factory=list)  # levels of single ports, in addition to that of the cell
     marks: list[int] = field(default_factory=list)  # identities besides the PCI
-    quantity: str = "RSRP"  # of the level
+    quantity: str = "RSRP"  # quantity of the level
 
     @property
     def serving(self) -> bool:
@@ -185,7 +185,9 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
             continue
         levels = {key: home for key, home in cells.items() if "rsrp_dbm" in home.columns}
         homes = [home for key, home in levels.items() if key[1] == role and (not rat or key[0] in ("", rat))]
-        if "pci" in cell.columns and role == "serving" and not homes:  # a PCI with a single level 'rsrp1' or 'RSRP[0]'
+        if (
+            "pci" in cell.columns and role == "serving" and not homes
+        ):  # the PCI may belong to a single level such as 'rsrp1' or 'RSRP[0]'
             near = [home for home in levels.values() if not home.place.startswith("n")]
             homes = [home for home in near if not rat or home.rat in ("", rat)]
         if len(homes) == 1:
@@ -401,7 +403,7 @@ def _is_statistic(sheet: _sheet.Sheet, column: int) -> bool:
 
 
 def _of_a_scheduler(rows: Rows, sheet: _sheet.Sheet) -> bool:
-    """Check whether a base station wrote the table, with columns of the uplink only."""
+    """Check whether a base station wrote the table, with only columns of the uplink."""
     words = {word for name in sheet.plain for word in name.split()}
     if not (words & {"ul", "uplink", "pusch", "pucch"}) or words & {"dl", "downlink", "pdsch", "csi"}:
         return False

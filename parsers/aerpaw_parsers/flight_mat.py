@@ -47,7 +47,7 @@ _TEXT = re.compile(_text.TIME)
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether it is a MATLAB file whose first variables are those of a merged flight.
+    """Check whether a file is a MATLAB file whose first variables are those of a merged flight.
 
     A 7.3 file may have its names anywhere: only names in the sniffed bytes are tested.
     """

@@ -2,8 +2,8 @@
 
 The columns of a CSV are never guessed: flight.yaml names them. Times are texts (``YYYY-mm-dd HH:MM:SS[.f][offset]``, or
 forms of other programs such as ``15.07.2024 11:49:27,231``) or numbers. Numbers count from ``time_origin`` if it is
-given, else from 1970 in UTC; ``clock: local_as_utc`` is for wall time stored as UTC. They are seconds, unless the name
-of the column, or the steps between the rows, require another unit.
+given, else from 1970 in UTC; ``clock: local_as_utc`` is for wall time stored as UTC. Numbers are seconds, unless the
+name of the column, or the steps between the rows, require another unit.
 """
 
 from __future__ import annotations
@@ -106,7 +106,9 @@ def _is_of(quantity: dictionary.Quantity, name: str, unit: str | None) -> bool:
         return quantity.role == "rss" or (quantity.unit == "dB" and unit != "dBm")
     if name == "ri_raw":
         return quantity.role == "rank"
-    of_axes = quantity.role == "velocity" and name.startswith("velocity")  # 'vx' is east where x is
+    of_axes = quantity.role == "velocity" and name.startswith(
+        "velocity"
+    )  # 'vx' is the velocity to the east if x is east
     return name not in COLUMNS["telemetry"] or quantity.name in (name, *_NO_POSE) or of_axes
 
 

@@ -22,7 +22,7 @@ _MODE = re.compile(rb"<altitudeMode>\s{0,40}(\w{1,20})")
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether it is a KML with times and levels in named data."""
+    """Check whether a file is a KML with times and levels in named data."""
     return kml.is_kml(head) and all(sign.search(head) for sign in _SIGNS)
 
 
@@ -51,7 +51,7 @@ def _reading(text: bytes) -> dict[str, str]:
         mode = _MODE.search(text)
         height = "Altitude AGL" if mode is not None and mode[1] == b"relativeToGround" else "Altitude above sea level"
         if not place[2].strip(b"0.") or (mode is not None and mode[1].startswith(b"clamp")):
-            place[2] = b""  # drawn on the ground, without a height
+            place[2] = b""  # the point is drawn on the ground and has no height
         values |= {name: cell.decode() for name, cell in zip((*_PLACE, height), place, strict=True) if cell}
     return values
 

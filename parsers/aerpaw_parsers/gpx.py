@@ -31,7 +31,7 @@ _START = re.compile(rb"<" + _TAG + rb"\b")
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether it is a GPX with points."""
+    """Check whether a file is a GPX with points."""
     return re.search(rb"<(?:\w{1,20}:)?gpx\b", head[:4096]) is not None and _START.search(head) is not None
 
 
@@ -92,7 +92,7 @@ def _overlap(rows: Rows, track: IntArray) -> bool:
 
 def _track(rows: Rows, sheet: _sheet.Sheet, name: str) -> Stream | None:
     stream = _pose.from_sheet(rows, sheet, name=name, source="GPX")
-    # GPX has one height, ele, which receivers give above sea level
+    # GPX has one height, ele, which receivers write above sea level
     return stream and replace(stream, attributes={**stream.attributes, "height_from": "program"})
 
 

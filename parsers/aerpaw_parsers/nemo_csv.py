@@ -1,7 +1,7 @@
 """CSV of a Keysight Nemo phone: ``index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi``.
 
 Times are milliseconds relative to an origin that is not in the file. The rank is that of the scheduled PDSCH and counts
-from one. Most rows have only a rank, or only RSRP, SINR and CQI; these are also separate streams.
+from one. Most rows have only a rank, or only RSRP, SINR and CQI. These three are also separate streams.
 """
 
 from __future__ import annotations

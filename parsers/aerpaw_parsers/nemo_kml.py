@@ -32,7 +32,7 @@ _POSITION = ("latitude_deg", "longitude_deg", "altitude_m")
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether it is a KML with a Nemo description."""
+    """Check whether a file is a KML with a Nemo description."""
     return kml.is_kml(head) and _HINT.search(head) is not None and b"(lat, lon) = (" in head
 
 

@@ -36,7 +36,7 @@ _FRAMES_S = 1.28
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether it is output of OAI with CSI or levels."""
+    """Check whether a file is output of OAI with CSI or levels."""
     if not any(word in head for word in (b"MAC]", b"PHY]", b"Frame.Slot", b"dlsch_rounds", b"i1 = ")):
         return False  # this test is a thousand times faster than the expressions
     return any(pattern.search(head) for pattern in (_CSI, _LEVEL, _UE)) and re.search(

@@ -23,7 +23,7 @@ _CSI = ("lte_csi", "nr5g_csi")
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether it contains tables of AT answers."""
+    """Check whether a file contains tables of AT answers."""
     return b"|----+" in head and re.search(rb'\|\s*\d+\s*\|\s*"?\+Q(ENG|NWCFG):', head) is not None
 
 

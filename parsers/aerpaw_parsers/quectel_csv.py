@@ -36,7 +36,7 @@ from aerpaw_cmp.logs.rows import Rows, built, checked_ranks
 from aerpaw_cmp.readers import TIME, ZONE, Attribute, Reader, ReadOptions, ReadResult, Stream
 
 _C = rb"[^,\n]{0,80}"
-# The logger's CSV, or a console whose lines carry a stamp (ts, a terminal program).
+# The logger's CSV, or a console whose lines have a stamp (ts, a terminal program).
 _T = rb"^\[?(?P<time>" + TIME + ZONE + rb")(?:,|\]?[ \t]{1,4})"
 
 

@@ -43,7 +43,7 @@ _TORN = re.compile(rb"^\[?[-0-9/]{10}[ T][0-9:.]{8,18}\]? +\d{1,4} +(?:0x)?[0-9a
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether it is the console with its title line, or the log with scheduler metrics."""
+    """Check whether a file is the console with its title line, or the log with scheduler metrics."""
     known = b" rnti " in head or b"[METRICS" in head
     return known and not head.startswith(_text.MARKUP) and any(mark.search(head) for mark in (_TITLE, _SCHEDULER))
 
@@ -52,7 +52,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Return the rank stream ``gnb`` with CQI and MCS, or raise UsageError if no time zone is given."""
     pattern = _LOG if _SCHEDULER.search(data) and not _TITLE.search(data) else _ROW
     begun = pattern.search(data)
-    own_stamp = begun is not None and not begun[0].startswith(b"[")  # not written by ts
+    own_stamp = begun is not None and not begun[0].startswith(b"[")  # the stamp was not written by ts
     if own_stamp and options.clock is None:
         options = replace(options, clock="utc")  # the program's log and metrics are in UTC
     rows = matched(

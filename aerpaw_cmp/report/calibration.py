@@ -67,7 +67,7 @@ class CalibrationData(Made):
     settings_text: str = ""
 
 
-ONE_FLIGHT = "Nothing is scored: one flight alone. Next: add a second flight."
+ONE_FLIGHT = "A single flight cannot be scored. Next: add a second flight."
 
 # Sentence and next step, by the verdict of :func:`~aerpaw_cmp.compare.verdict.by_flight` on learned antennas.
 HELPS: dict[str, tuple[str, str]] = {
@@ -83,7 +83,7 @@ HELPS: dict[str, tuple[str, str]] = {
         "The difference of {effect:+.1f} dB is not significant (95 %: {low:+.1f} to {high:+.1f} dB).",
         "add flights with other headings",
     ),
-    "no interval": ("The difference is {effect:+.1f} dB; two flights give no interval.", "add a third flight"),
+    "no interval": ("The difference is {effect:+.1f} dB; no interval from two flights.", "add a third flight"),
 }
 
 # Sentence and next step, by the verdict of :func:`~aerpaw_cmp.compare.verdict.antenna_or_place` on the UAV's frame.
@@ -247,9 +247,9 @@ def scores_card(data: CalibrationData) -> Card:
     rows = {**data.scores, **{f"control: {name}": scores for name, scores in data.controls.items()}}
     keys = ("rmse_db", "rmse_4s_db", *BASELINES)
     means = Table(
-        caption="RMSE in dB after one offset per flight and channel, mean over flights and channels; a dash: could not "
-        "be left out.",
-        columns={"What was left out": HEAD, **each, **baselines, "series": 0},
+        caption="RMSE in dB after one offset per flight and channel, mean over flights and channels; a dash: it could "
+        "not be held out.",
+        columns={"Held out": HEAD, **each, **baselines, "series": 0},
         rows=[(SPLIT_TITLE.get(name, name), *(_mean(of, key) for key in keys), len(of)) for name, of in rows.items()],
     )  # fmt: skip
     every = Table(
@@ -308,8 +308,9 @@ def ground_card(data: CalibrationData) -> Card:
 def rank_card(data: CalibrationData) -> Card:
     """Return the card of the rank receiver's forecasts on held-out flights."""
     table = Table(
-        caption="A receiver fitted on the other flights; log score in nats per report, lower is better. The constant "
-        "forecast has the shares of the training flights. Total variation is that of the expected histogram.",
+        caption="The receiver is fitted on the other flights. Log score in nats per report, lower is better. The "
+        "constant forecast has the rank shares of the training flights. Total variation is that of the expected "
+        "histogram.",
         columns={"Held out": TEXT, "Flight": HEAD, "Tower": TEXT, "kappa": 2, "log score": 3, "constant": 3,
                  "total variation": 3, "agreement": 2, "most frequent rank": 2},
         rows=_rows(data.rank, ("flight", "tower", "kappa", "log_score", "constant_log_score",

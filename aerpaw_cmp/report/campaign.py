@@ -417,8 +417,8 @@ def step_words(data: CampaignData) -> list[str]:
     smallest = max(judged, key=lambda node: node.smallest_db)
     return [
         *out,
-        f"A step of {smallest.smallest_db:.1f} dB shows on its first date with a probability of 90 % (the largest such "
-        f"step, at {smallest.node}). About 1 date in 100 shows a false step.",
+        f"A step of {smallest.smallest_db:.1f} dB is detected on its first date with a probability of 90 % (the "
+        f"largest such step, at {smallest.node}). About 1 date in 100 shows a false step.",
     ]
 
 
@@ -823,7 +823,7 @@ def settings_of(data: CampaignData, files: Sequence[str]) -> Card:
     """Return the card of the settings, versions and files of the campaign."""
     code = Markup("<code>{}: {}</code>")
     table = Table(
-        caption="What each setting changes in the flight files.", columns={"Setting": HEAD, "Changes": TEXT},
+        caption="Changes of the flight files in each setting.", columns={"Setting": HEAD, "Changes": TEXT},
         rows=[(name, Markup(", ").join(code.format(*entry) for entry in change.items()) or "nothing")
               for name, change in data.settings.items()],
     )  # fmt: skip
@@ -848,7 +848,7 @@ def campaign_page(data: CampaignData, files: Sequence[str]) -> str:
     if data.flights:
         failures = f" ({failed} with failures)" if failed else ""
         flights, settings = counted(len(data.flights), "flight"), counted(len(data.settings), "setting")
-        lead = f"{flights}{failures} under {settings}, measured against ray tracing."
+        lead = f"{flights}{failures} under {settings}, compared with ray tracing."
     return Page(
         kind="campaign", title=data.title, tag="synthetic" if data.synthetic else "", verdict=" ".join(verdict(data)),
         cautions=[*known[:MANY], *beyond], about=[f"{lead} Made {minute(data.generated)}"],

@@ -149,7 +149,7 @@ def channel_dataset(channel: Channel) -> Dataset:
     elif along.number is not None:
         described["time"] |= {"long_name": "number of the pose: the route has no times", "units": "1"}
     if channel.level_db is not None:
-        described["level_db"]["comment"] = f"unit: {channel.level_unit}; the paths and H do not use what was learned"
+        described["level_db"]["comment"] = f"unit: {channel.level_unit}; paths and H do not include learned antennas"
         # only the levels depend on logs
         for name in ("level_db", "level_sd_db"):
             described[name][KEY] = " ".join(channel.trained_on)
@@ -188,7 +188,7 @@ def _quantities(channel: Channel) -> Iterator[tuple[str, AnyArray | None, tuple[
     yield "level_sd_db", sd, _LINK, "1", "standard deviation of level_db [dB], larger far from the training samples"
     yield "cfr", cfr, (*ports, "subcarrier"), "1", "channel matrix at the subcarriers"
     yield "subcarrier_hz", offsets, ("subcarrier",), "Hz", "offset of a subcarrier from the carrier"
-    yield "time", _times(channel.along), ("time",), "s", "seconds since the start of the route, whose date is not known"
+    yield "time", _times(channel.along), ("time",), "s", "seconds since the start of the route (date unknown)"
     sources, along = (ends.sources_m[:, 0], "time") if ends.moving else (ends.sources_m, "tower")
     for i, name in enumerate(("east", "north", "up")):
         yield f"{name}_m", ends.poses.position_m[:, i], ("time",), "m", f"{name} of the site origin, UAV"
@@ -197,7 +197,7 @@ def _quantities(channel: Channel) -> Iterator[tuple[str, AnyArray | None, tuple[
         yield f"velocity_{name}_mps", velocity, ("time",), "m s-1", f"velocity {name}, UAV"
 
 
-_GAIN = "gain of a path at the carrier, its phase included; 0 without a path"
+_GAIN = "gain of a path at the carrier, including its phase; 0 without a path"
 
 
 def _times(along: Along) -> FloatArray:

@@ -79,8 +79,8 @@ def charts_of(data: ReportData) -> list[Chart]:
         if score is not None and score.reliability:
             charts.append(Chart(
                 section=f"rss/{panel.tower}/{panel.channel}",
-                title=f"{panel.name}: is the probability of detection calibrated?",
-                caption="Fifths of the predicted probability against the share that the receiver detected; on the line "
+                title=f"{panel.name}: is the predicted probability of detection correct?",
+                caption="Share that the receiver detected, per fifth of the predicted probability. On the line, "
                 f"the forecast is calibrated. Brier score {score.brier:.3f}, this flight's own share "
                 f"{score.constant_brier:.3f}; log score {score.log_score:.3f}, own share "
                 f"{score.constant_log_score:.3f} ({learned_on(score)}).",
@@ -140,7 +140,7 @@ def _costs(models: Sequence[ModelRow]) -> dict[str, Any]:
 
 def flown(data: ReportData) -> list[Chart]:
     """Return charts of measured and simulated levels over time, one per channel of a flight, for the page of a map."""
-    start, caption = start_of(data), "Ray tracing is drawn less the offset of the channel."
+    start, caption = start_of(data), "Ray tracing is drawn minus the offset of the channel."
     clock = {"label": "", "start": str(start.astype("datetime64[ms]"))}
     axis = clock if has_wall_clock(start) else {"label": "Time after the first sample [s]", "start": ""}
     return [

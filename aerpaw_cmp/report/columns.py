@@ -53,7 +53,7 @@ class Column:
 
 
 _TIMES = (
-    Column("time_utc", "", "ISO 8601, UTC; empty: the log has relative times and no origin was given"),
+    Column("time_utc", "", "ISO 8601, UTC; empty if the log has relative times without an origin"),
     Column("time_s", "s", "seconds after the first row of this tower and channel"),
 )
 
@@ -100,11 +100,11 @@ RSS: tuple[Column, ...] = (
            lambda p: {name: model.level_dbm for name, model in p.baselines.items()}, optional=True),
     Column("simulated_sd_db", "dB", "standard deviation of a sample, all parts", _stated("simulated_sd_db"),
            optional=True),
-    Column("gain_sd_db", "dB", "part of the learned antennas in simulated_sd_db", _stated("gain_sd_db"),
+    Column("gain_sd_db", "dB", "part of simulated_sd_db from the learned antennas", _stated("gain_sd_db"),
            optional=True),
-    Column("own_sd_db", "dB", "part of own shadowing in simulated_sd_db", _stated("own_sd_db"), optional=True),
-    Column("noise_sd_db", "dB", "part of receiver noise in simulated_sd_db", _stated("noise_sd_db"), optional=True),
-    Column("fading_sd_db", "dB", "part of fading in simulated_sd_db", _stated("fading_sd_db"), optional=True),
+    Column("own_sd_db", "dB", "part of simulated_sd_db from own shadowing", _stated("own_sd_db"), optional=True),
+    Column("noise_sd_db", "dB", "part of simulated_sd_db from receiver noise", _stated("noise_sd_db"), optional=True),
+    Column("fading_sd_db", "dB", "part of simulated_sd_db from fading", _stated("fading_sd_db"), optional=True),
     Column("simulated_low_dbm", "dBm", "lower end of the 90 % interval", _stated("simulated_low_dbm"), optional=True),
     Column("simulated_high_dbm", "dBm", "upper end of the 90 % interval", _stated("simulated_high_dbm"), optional=True),
     *_TOWER_PLACES,

@@ -273,7 +273,7 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
     """Return the card of one prediction: means over channels, then each channel."""
     errors: dict[str, str | int] = {"Bias [dB]": 1, "RMSE [dB]": 1, "after offset": 1, "over 1 s": 1}
     means = Table(
-        caption="Means over channels; a dash where the levels have no reference in common with the log, or no band.",
+        caption="Means over channels; a dash: no common reference with the log, or no band.",
         columns={"Model": HEAD, "Channels": 0, **errors, "Correlation": 2, "CRPS [dB]": 2, "In 90 %": SHARE},
         rows=[list(row.values()) for row in verdict["means"]],
     )
@@ -287,8 +287,8 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
     )  # fmt: skip
     name, ours = verdict["prediction"], "ray tracing (this report)"
     above = Table(
-        caption="Share of samples at or above a threshold. Levels without a reference in common with the log count "
-        "after the offset.",
+        caption="Share of samples at or above a threshold. Levels without a common reference with the log are "
+        "compared after the offset.",
         columns={"Tower, channel": HEAD, "Threshold [dB]": 1, "Measured": SHARE, "Prediction": SHARE,
                  "Ray tracing": SHARE},
         rows=[
@@ -368,14 +368,14 @@ def serving_card(data: ReportData) -> Card:
         return Card()
     names, counts = shown_confusion(serving)
     table = Table(
-        caption="Samples by the cell that served (rows) and the cell predicted strongest. Levels are as simulated, "
+        caption="Samples by the cell that served (rows) and the predicted strongest cell. Levels are as simulated, "
         "without offsets.",
         columns={"Served": HEAD, **dict.fromkeys(names, 0), "no path": 0},
         rows=[(name, *row.tolist()) for name, row in zip(names, counts, strict=True)],
     )  # fmt: skip
     text = paragraph(
-        "The cell predicted strongest served in", bold(percent(serving.hit_share, 1)),
-        f"of {number(serving.n, 0)} samples; always naming the cell that served most hits "
+        "The cell that is predicted to be the strongest served in", bold(percent(serving.hit_share, 1)),
+        f"of {number(serving.n, 0)} samples; always predicting the most frequent serving cell is right in "
         f"{percent(serving.majority_share, 1)}.",
         "The prediction is no better than that." if serving.hit_share <= serving.majority_share else "",
         "The complete matrix is in metrics.json, key serving.",
@@ -394,7 +394,7 @@ def _tower(p: RankResult) -> Card:
     best = f"Over continuous K the best is {number(score.curve.best_k)} {interval(score.curve.best_k_ci95)}."
     table = Table(
         caption=f"Distances between the reported and the simulated rank at {p.tower}. Brackets: 95 % interval. p: "
-        "chance of such a distance if both had one distribution.",
+        "probability of such a distance if both had the same distribution.",
         columns={"K": HEAD, "Agreement by pose": RIGHT, "Kappa": 2, "Total variation": RIGHT, "Wasserstein": 2, "p": 3,
                  "Out of coverage": 0},
         rows=[
@@ -425,7 +425,7 @@ def engine_card(data: ReportData) -> Card:
 
 def _audited_paths(a: AuditResult) -> Table:
     return Table(
-        caption="Paths and levels of the two engines on a spread of links.",
+        caption="Paths and levels of the two engines on links spread over all series.",
         columns={"Reference": HEAD, "Links": 0, "Paths missing": 0,
                  "Paths that Sionna RT did not sample": 0, "Largest RSS difference [dB]": 3,
                  **{f"Other rank at K = {k_key(k)}": RIGHT for k in a.rank_disagreement},
@@ -460,7 +460,7 @@ def _audited_fields(f: FieldAudit | None) -> list[Table]:
     doubtful = f"{number(f.doubtful, 0)} paths or links were not checked, because rounding decides them."
     note = paragraph(
         failed if f.failed else passed, doubtful if f.doubtful else "", f"Not covered: {'; '.join(f.not_covered)}.",
-        "The second implementation alone checks foliage, array layouts and patterns that Sionna does not have. Both "
+        "Only the second implementation checks foliage, array layouts and patterns that Sionna does not have. Both "
         "references use the paths of the array centre.",
     )  # fmt: skip
     return [Table(

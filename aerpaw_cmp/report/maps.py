@@ -212,13 +212,13 @@ class MapsData(Made):
     metrics: Mapping[str, Any] = field(default_factory=dict)
 
 
-LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
+LEAST = "Lowest coverage: {percent:.1f} % of the positions at {where}"
 
 # Sentence and next step, by the cause of :func:`~aerpaw_cmp.compare.verdict.coverage_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
     "none": (LEAST + ".", "`aerpaw-cmp plan` for a flight that measures it"),
-    "trees": (LEAST + "; trees take most of the rest.", "fly higher, or {thinner}"),
-    "blocked": (LEAST + "; buildings and terrain take most of the rest.", "fly higher, or add a tower"),
+    "trees": (LEAST + "; trees cause most of the gaps.", "fly higher, or {thinner}"),
+    "blocked": (LEAST + "; buildings and terrain cause most of the gaps.", "fly higher, or add a tower"),
     "no path": ("There is no path to any position at {where}.", "check the towers and the area of the site"),
     "extrapolated": (
         LEAST + ". {outside:.0f} % of the positions are outside the flown area, where the correction is extrapolated.",

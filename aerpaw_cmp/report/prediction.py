@@ -53,7 +53,7 @@ AGAINST_FREE_SPACE = {
     ),
     "no interval": ("The flight is too short for an interval of the difference from free space.", ""),
     "two flights": (
-        "On held-out {over} the RMSE differs from free space by {effect:+.1f} dB; two flights give no interval.", ""
+        "On held-out {over} the RMSE differs from free space by {effect:+.1f} dB; no interval from two flights.", ""
     ),
 }  # fmt: skip
 
@@ -390,7 +390,7 @@ def _dataset(data: PredictionPage) -> Dataset:
     first, time = series[0], series[0]["time_s"].to_numpy(np.float64)
     timed = data.kind == "route" and bool((np.diff(time) > 0.0).all())
     along = "time" if timed else "point"
-    meaning = "seconds since the start of the route, whose date is not known" if timed else "number of the position"
+    meaning = "seconds since the start of the route (date unknown)" if timed else "number of the position"
     axis = time if timed else np.arange(len(time), dtype=np.int32)
     variables: dict[str, Any] = {along: (along, axis, {"long_name": meaning, "units": "s" if timed else "1"})}
     links = data.levels[["tower", "channel"]].astype(str)

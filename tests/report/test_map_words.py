@@ -15,11 +15,11 @@ from aerpaw_cmp.report.maps import MapsData, RssMap, first_words, warnings
         (
             {"opaque": 0.99},
             {},
-            "The map contains no measurement. Least coverage: 99.0 % of the positions at 30 m. Next: ",
+            "The map contains no measurement. Lowest coverage: 99.0 % of the positions at 30 m. Next: ",
         ),
-        ({"opaque": 0.6, "none": 0.95}, {}, "trees take most of the rest. Next: fly higher, or map with `--foliage"),
+        ({"opaque": 0.6, "none": 0.95}, {}, "trees cause most of the gaps. Next: fly higher, or map with `--foliage"),
         ({"opaque": 0.6, "attenuating": 0.9, "none": 0.95}, {}, "Next: fly higher, or compare the rows of attenuating"),
-        ({"opaque": 0.6, "none": 0.62}, {}, "buildings and terrain take most of the rest"),
+        ({"opaque": 0.6, "none": 0.62}, {}, "buildings and terrain cause most of the gaps"),
         ({"none": 0.0}, {}, "There is no path to any position at 30 m. Next: check the towers"),
         ({"none": 0.99}, {"outside_flown": 0.7}, "70 % of the positions are outside the flown area"),
     ],
@@ -39,7 +39,7 @@ def test_several_heights_name_the_best_and_the_worst(maps_data: MapsData) -> Non
     joint = {m.height_m: m.coverage for m in maps_data.rss if m.tower == "joint" and m.antennas == "SISO"}
     text = first_words(maps_data)
     assert f"Best height: {max(joint, key=lambda h: joint[h]):g} m, {100 * max(joint.values()):.1f} %." in text
-    assert f"Least coverage: {100 * min(joint.values()):.1f} % of the positions at 30 m" in text
+    assert f"Lowest coverage: {100 * min(joint.values()):.1f} % of the positions at 30 m" in text
     alike = tuple(dataclasses.replace(item, coverage=1.0) for item in maps_data.rss)
     assert "Best height" not in first_words(dataclasses.replace(maps_data, rss=alike))
 

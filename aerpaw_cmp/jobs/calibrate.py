@@ -55,8 +55,8 @@ def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[st
     Returns
     -------
     dict of str to LearnedLock
-        Models by antenna. There is none for receivers that keep their lock, nor with fewer than three flights, which
-        cannot be scored.
+        Models by antenna. Receivers that keep their lock have no model. With fewer than three flights there are no
+        models, because they could not be scored.
     """
     able = [o for o in observed if o.locked is not None and np.isfinite(o.locked).any()]
     if len(flights_of(able)) < 3:

@@ -236,7 +236,9 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
 
 def _powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArray:
     """Return the squared singular values of the modelled channels, shape (geometries, n, 4)."""
-    order = sorted(range(len(geometries)), key=lambda i: geometries[i].mount_deg)  # neighbours share a mount
+    order = sorted(
+        range(len(geometries)), key=lambda i: geometries[i].mount_deg
+    )  # sorted, so that neighbouring geometries share a mount
     singular = singular_values_of(
         [geometries[i] for i in order], samples.link.tower_arrays[samples.tower], samples.tower_m,
         samples.link.uav_array, samples.poses, samples.link.carrier_hz,

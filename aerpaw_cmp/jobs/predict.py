@@ -698,7 +698,7 @@ class CorrectedMaps:
             yield layer(quantity="SD of the corrected RSS", unit="dB", values=grid.raster(item.sd_db))
 
     def rss_maps(self, grid: Grid) -> Iterator[page.RssMap]:
-        """Yield the maps and distributions of both versions for figures."""
+        """Yield the maps and distributions of raw and corrected levels for figures."""
         for version in ("raw", "corrected"):
             for item in self.levels:
                 values = item.raw_dbm if version == "raw" else item.corrected_dbm

@@ -66,7 +66,7 @@ _EXPECTED = (
 # A file of more bytes, or with more rows (towers times positions), is refused: a row needs 200 bytes of memory.
 _MOST_BYTES, _MOST_ROWS = 4 * LARGEST_TABLE, 5_000_000
 
-# A prediction is refused as one of another area if all its positions are farther from the site's origin [m].
+# A prediction is refused as a prediction of another area if all its positions are farther from the site's origin [m].
 _FAR_M = 50_000.0
 
 # A sample is scored by the nearest predicted time within this [s], or within half of the prediction's step.

@@ -196,7 +196,7 @@ def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
     if not runs.any():
         return none, ""
     for first, end in zip(begins[runs], last[runs], strict=True):
-        none[rows[first + 1 : end + 1]] = True  # the first row has the position of the aircraft
+        none[rows[first + 1 : end + 1]] = True  # keep the first row, because its position is that of the aircraft
     longest = int(np.argmax(np.where(runs, lasts_s, 0.0)))
     line, speed_mps = int(frame["line"].iloc[rows[begins[longest]]]), moved_m[longest] / lasts_s[longest]
     return none, (

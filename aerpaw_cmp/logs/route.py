@@ -406,7 +406,7 @@ def _add_row(route: _Route, row: Sequence[str], columns: Mapping[str, int], unit
     ----------
     route : _Route
     row : sequence of str
-        Its cells.
+        Cells of the row.
     columns : mapping
         Column of each quantity, -1 if it is missing.
     units : sequence of str

@@ -210,7 +210,7 @@ def matched(
         Mask of the matching rows (0-based lines) that are comments.
     options : ReadOptions
     reader : str
-        Its name.
+        Name of the reader.
     clock : str
         See :func:`instants_of`.
 
@@ -318,7 +318,7 @@ def instants_of(
         ``wall`` (text, local unless it has an offset), ``epoch_s``, ``epoch_ms``, ``epoch_us`` (UTC),
         ``relative_ns`` .. ``relative_h`` (from ``time_origin``, else from 1970-01-01).
     reader : str
-        Its name, for messages.
+        Name of the reader, for messages.
 
     Returns
     -------

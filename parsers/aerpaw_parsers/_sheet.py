@@ -877,7 +877,7 @@ def _zone_column(sheet: Sheet, column: int, zone: str, texts: list[str], options
         sheet.notes[column] = f"column {sheet.names[column]!r}: {unknown[:30]!r} is not a known zone: not used"
     elif zone and word and word != zone:
         sheet.notes[column] = (
-            f"column {sheet.names[column]!r} contains {word}, but the name of the time column {zone}: {zone} is used"
+            f"column {sheet.names[column]!r} contains {word}, but the time column names {zone}: {zone} is used"
         )
     elif word and options.timezone not in (None, word) and not all(map(_DATED.fullmatch, texts[:3])):
         text = f"column {sheet.names[column]!r} has the zone of the times, {word}: --timezone is not used"
@@ -960,7 +960,7 @@ def _counts(sheet: Sheet, column: int) -> bool:
 
 
 def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]]) -> None:
-    """Refuse a table whose rows are shifted against its header, by the ranges of the dictionary.
+    """Refuse a table whose rows are shifted against its header, according to the ranges of the dictionary.
 
     Raises
     ------

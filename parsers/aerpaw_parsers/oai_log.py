@@ -5,9 +5,9 @@ average RSRP -78 (16 meas)``. UE: ``RI = 2 i1 = 0.0.0, i2 = 1, SINR = 20 dB, CQI
 dBm,`` in front. All three add one to the index of the report before they print it: RI counts from one. A gNB prints
 the last report, not a mean.
 
-The time is a stamp of ``ts``, or in srsRAN's form, at the beginning of the line or of a line above it. Without stamps
-it is OAI's own seconds (``log_config ... time``), which count from an unknown origin unless they are an epoch. Without
-these, each ``Frame.Slot`` line, which comes every 128 frames, counts 1.28 s.
+The time is a stamp of ``ts``, or in srsRAN's form, at the beginning of the line or of a line above it. Without stamps,
+the time is OAI's own seconds (``log_config ... time``), which count from an unknown origin unless they are an epoch.
+If there are no seconds either, each ``Frame.Slot`` line, which comes every 128 frames, counts 1.28 s.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     if header is not None and header[2] != b"latitude(deg)":
         raise InputError(
             f"an RTKLIB solution of {ascii(header[2])[2:-1]}", expected="latitude and longitude in degrees",
-            cause="the option out-solformat: solve again with 'llh' and out-degform 'deg'",
+            cause="another out-solformat: solve again with 'llh' and out-degform 'deg'",
         )  # fmt: skip
     scale_s = _SCALE_S[header[1]] if header is not None else 0
     above_sea = header is not None and b"geodetic" in data[: header.start()]  # the default is the ellipsoid

@@ -54,7 +54,7 @@ def _list(value: Any) -> list[Any]:
 
 
 def _merged(meta: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the captures, each with the global fields that are missing in it."""
+    """Return the captures, each completed with the global fields that it does not have."""
     common = {key: value for key, value in _json.inside(meta, "global").items() if ":" in key}
     captures = _json.listed(meta, "captures")
     for capture in captures:

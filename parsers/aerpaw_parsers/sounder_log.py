@@ -209,7 +209,7 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     bad: list[tuple[int, str]] = []
     ok = (before >= 0) & (after < len(ends.line))
     same = np.concatenate(([False], np.diff(before) == 0)) & (before >= 0)
-    bad += [(int(i), "'*' without a sample before it or an offset after it: so the length of the run is unknown")
+    bad += [(int(i), "'*' without a sample before it or an offset after it: the length of the run is unknown")
             for i in stars.line[~ok]]  # fmt: skip
     bad += [(int(i), "a second '*' in one run") for i in stars.line[ok & same]]
     chosen = np.flatnonzero(ok & ~same)
@@ -333,7 +333,7 @@ def _name(options: ReadOptions) -> tuple[str, bool]:
 
 
 def _warnings(tally: Counter[str], of_times: list[str], options: ReadOptions) -> Iterator[str]:
-    """Yield sentences about the counts."""
+    """Yield warnings about the numbers of repeated, lost and missing samples."""
     if tally["repeated"]:
         samples = counted(tally["repeated"], "sample was", "samples were")
         yield f"{samples} restored: the log has '*' (of the program od) for values that repeat. Flagged 'repeated'"

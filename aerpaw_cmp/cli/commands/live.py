@@ -80,7 +80,7 @@ def tap(
     for summary in summaries:
         rates = ", ".join(f"{name} {rate:.2f} Hz" for name, rate in summary.rates_hz.items())
         lost = (
-            f", {counted(summary.lost_records, 'record')} lost (the disk did not take them)"
+            f", {counted(summary.lost_records, 'record')} lost (the disk could not store them)"
             if summary.lost_records
             else ""
         )
@@ -106,7 +106,7 @@ class StatusLine:
         return "\n" if self._terminal else ""
 
     def __call__(self, name: str, now: Any) -> None:
-        """Show the status of a modem. The name is empty if there is only one."""
+        """Show the status of a modem. The name is empty if there is only one modem."""
         from ...live.ports import format_status
 
         head = f"{name}: " if name else ""

@@ -92,10 +92,12 @@ def diff(
     first: Annotated[Path, Argument(help="Folder of a report.")],
     second: Annotated[Path, Argument(help="The other report of the same flight.")],
     out: Annotated[Path | None, output("Folder for diff.html and diff.json  [default: not written]")] = None,
-    strict: Annotated[bool, Option("--strict", help="Exit code 1 when a number differs by more than 0.01 dB.")] = False,
+    strict: Annotated[
+        bool, Option("--strict", help="End with exit code 1 if a number differs by more than 0.01 dB.")
+    ] = False,
     force: Force = False,
 ) -> int:
-    """Compare two reports of a flight: settings, inputs, versions, numbers on common samples."""
+    """Compare two reports of a flight: settings, inputs, versions, and numbers on common samples."""
     from ...jobs.diff_reports import run_diff
     from ...report.diff import diff_metrics
 
@@ -163,7 +165,7 @@ def campaign(
     ] = None,
     fresh: Annotated[bool, Option("--fresh", help="Ignore stored outcomes and store none.")] = False,
     dry_run: DryRun = False,
-    strict: Annotated[bool, Option("--strict", help="Exit code 1 also when a stated check failed.")] = False,
+    strict: Annotated[bool, Option("--strict", help="Also end with exit code 1 if a check failed.")] = False,
     force: Force = False,
 ) -> int:
     """Compare many flights under many settings."""

@@ -4,13 +4,13 @@
     python benchmarks/all.py [--only scaling ingest] [--history FILE] [--no-history]
     make bench-check                                  # or: python benchmarks/all.py --check [NAME ...]
 
-The run takes about ten minutes on two idle cores; conditions (machine, load, versions) stand beside the numbers. A
-benchmark that fails or whose peer is not installed is told and does not stop the others. One line of JSON is appended
-to ``benchmarks/history.jsonl``, from which ``benchmarks/performance.py`` makes docs/performance.md.
+The run takes about ten minutes on two idle cores. The conditions (machine, load, versions) are stored with the numbers.
+If a benchmark fails, or its peer is not installed, this is reported, and the others continue. One line of JSON is
+appended to ``benchmarks/history.jsonl``, from which ``benchmarks/performance.py`` makes docs/performance.md.
 
-``--check`` runs every file of this folder at its smallest size and says which does not come to its end: numbers of such
-sizes mean nothing and are not kept. What needs the field data is left out where AERPAW_CMP_FIELD_DATA is not set. It
-takes some twenty minutes.
+``--check`` runs every file of this folder at its smallest size, and reports the files that do not finish. Numbers of
+such sizes are not meaningful and are not stored. Benchmarks that need the field data are skipped if
+AERPAW_CMP_FIELD_DATA is not set. The check takes about twenty minutes.
 """
 
 import argparse

@@ -1,9 +1,10 @@
 """Measure the power of the clock test: inject lags into every real flight of a folder.
 
-Each flight is drafted as it comes and its radio times are shifted. A planted lag of a second and more is found (called
-shifted, the lag in the interval), wrong (the interval misses it) or undecided; a smaller one is found where nothing but
-"ok", or a shift whose interval holds it, is said. The clocks of these logs agree within some second: the count allows
-for that, so an interval that lies beside a small lag is not counted; "called shifted as logged" is.
+Each flight is drafted as usual, and its radio times are shifted. A lag of one second or more is found (verdict
+"shifted", with the lag in the interval), wrong (the interval does not contain it) or undecided. A smaller lag counts
+as found if the verdict is "ok", or "shifted" with an interval that contains it. The clocks of these logs agree within
+about one second. Therefore an interval that misses a small lag is not counted as wrong. Flights that are called
+"shifted" as logged are counted.
 
     python benchmarks/clock_power.py FOLDER [--timezone America/New_York] [--only TEXT] [--quiet]
 """

@@ -1,8 +1,8 @@
 """Draft the logs of a folder: each file alone, each folder, and with --pairs each track with each radio log.
 
-Prints, per draft, the samples that a report would score, or the reason why none. Exit code 1 if a draft gives neither.
-Of the pairs all are drafted that share time, or of which one has a relative clock; of the others, which no user would
-draft together, a sample of --others.
+The script prints, for each draft, the samples that a report would score, or the reason why there are none. The exit
+code is 1 if a draft gives neither. All pairs are drafted that share time or contain a relative clock. No user would
+draft the other pairs together, so only a sample of them (--others) is drafted.
 
     python benchmarks/drafts.py FOLDER [--timezone America/New_York] [--pairs] [--others 100]
 """

@@ -2,8 +2,8 @@
 
     python benchmarks/exports.py [--samples 1000000] [--formats kmz,netcdf]
 
-A made-up flight: one link with positions, four levels and a residual, random numbers with a seed. What is measured is
-the writing alone, in CPU time; the peak is that of the whole process, beside one that makes the samples and no file.
+The flight is invented: one link with positions, four levels and a residual, all random with a seed. Only the writing is
+measured, in CPU time. The peak is that of the process. For comparison, another process makes the samples and no file.
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""Simulated results of a campaign and of a flight, without any replay.
+"""Invented results of a campaign and of a flight, without any replay.
 
-Nothing is replayed. What is put in is known (offsets that drift, settings that differ, a hill of residuals), so that a
-page made from it can be checked against it; the size is a season's.
+The input is known (offsets that drift, settings that differ, an area with larger residuals), so a page can be checked
+against it. The size is that of a long measurement campaign.
 """
 
 from collections.abc import Mapping

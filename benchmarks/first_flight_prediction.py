@@ -1,11 +1,11 @@
 """Score predictions before any flight on real flights, without using their levels.
 
 Each flight's track is predicted by ray tracing with isotropic antennas and the stated prior of
-:class:`~aerpaw_cmp.jobs.sources.Prior`. One offset per flight is subtracted, because before a flight no
-power, cable or receiver gain is known. Printed per campaign: the share of samples inside the 90 % band, the CRPS
-beside that of free space with one constant standard deviation (the best constant for all campaigns, which favours free
-space), and the mean standard deviation. The exit code is 1 if the pooled share lies outside 82 to 96 %, a campaign's
-below 75 %, or free space has the better CRPS.
+:class:`~aerpaw_cmp.jobs.sources.Prior`. One offset per flight is subtracted, because before a flight no power, cable
+or receiver gain is known. The script prints the share of samples inside the 90 % band, the CRPS and the mean standard
+deviation per campaign. For comparison, it prints the CRPS of free space with one constant standard deviation, which is
+the best constant for all campaigns and so favours free space. The exit code is 1 if the pooled share is outside 82 to
+96 %, if a campaign's share is below 75 %, or if free space has the better CRPS.
 
     python benchmarks/first_flight_prediction.py FIELD
 """

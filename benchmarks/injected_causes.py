@@ -1,15 +1,17 @@
-"""Injected faults: is the cause of the error of a flight named rightly, and is a healthy flight not accused?
+"""Inject faults: is the cause of a flight's error named rightly, and is a healthy flight not accused?
 
     python benchmarks/injected_causes.py FIELD [--seed 1] [--only TEXT] [--keep FOLDER] [--healthy]
 
 Each real flight at LW1 is predicted from the other flights of its campaign (learned again without it) and drafted from
-its healthy log. A fault is written into the columns of the log, which is read, replayed and compared as a report does.
+its healthy log. A fault is written into the columns of the log, which is read, replayed and compared as in a report.
 Simulated flights have isotropic antennas, a ground reflection and correlated fading, and no learned antennas. Sizes,
 times, channels and directions are drawn by the seed. ``OUTSIDE`` and :mod:`outside_causes` have kinds that the
-candidates do not contain: no name is right there, except where a name describes the kind. Prints a row per kind: right,
-silent, silent at a cost below 0.3 dB, wrong with the names that took the blame. With ``--healthy`` it prints the causes
-of whole flights, thirds and sixths without a fault. Exit code 1 if more than 3 % of the real or of the simulated cases
-have a wrong name, or less than 80 % of the listed kinds that cost more than 0.3 dB are named rightly.
+candidates do not contain. For these no name is right, except where a name describes the kind.
+
+The script prints a row per kind: right, silent, silent at a cost below 0.3 dB, and wrong with the names that were
+given. With ``--healthy`` it prints the causes of complete flights, thirds and sixths without a fault. The exit code is
+1 if more than 3 % of the real or of the simulated cases have a wrong name, or if less than 80 % of the listed kinds
+that cost more than 0.3 dB are named rightly.
 """
 
 # ruff: noqa: ARG005  a fault takes a level, its table and a generator, and some need one of them

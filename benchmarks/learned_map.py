@@ -1,14 +1,21 @@
 """Measure errors and intervals of learned antennas and their residual field on held-out parts of real flights.
 
-``flights``: dataset 12, each flight from the other two. ``blocks``: 300 m blocks (and 20 m around them) of each flight,
-the rest of it known and one other flight; the same, antennas learned on the third flight too; both others known.
-``lte``: 25 of a flight's samples from M others by the protocol of the data's authors (single samples, take-off and
-landing left out, scales from another height, 300 draws), the other height known: root mean square over all draws, and
-in brackets the median over draws, which the authors print; last, all of the flight known but 20 s about the target.
-``crps``: with the residual field and without, each flight left out, or the eighths of a single one; the field is
-chosen inside what is known. ``ranks``: log score of the receiver that another flight taught, alone and with a residual
-field on its logits (a kernel logistic; a shift is the same number at all places), learned on the rest of the flight
-but 300 m and 20 s about them, on what was reported before, or on the flight that taught the receiver.
+``flights``: each flight of dataset 12 is predicted from the other two.
+
+``blocks``: blocks of 300 m (and 20 m around them) of each flight are held out. Known are the rest of the flight and one
+other flight, or the same with antennas learned also on the third flight, or both other flights.
+
+``lte``: 25 samples of a flight are predicted from M others by the protocol of the data's authors (single samples
+without take-off and landing, scales from another height, 300 draws), with the other height known. Printed are the root
+mean square over all draws, and in brackets the median over draws, which the authors print. The last row knows all of
+the flight except 20 s around the target.
+
+``crps``: predictions with and without the residual field, with each flight held out, or eighths of a single flight. The
+field is chosen on the known flights.
+
+``ranks``: the log score of a receiver that was learned on another flight, alone and with a residual field on its logits
+(a kernel logistic, whose shift is the same at all places). The field is learned on the rest of the flight except 300 m
+and 20 s around the target, on earlier reports, or on the training flight of the receiver.
 
     AERPAW_CMP_FIELD_DATA=... python benchmarks/learned_map.py [--only flights blocks lte crps ranks] [--quick]
 """
@@ -45,7 +52,7 @@ from benchmarks.published import tasks
 DATASET12 = ("40m_fs10MHz", "40m_fs5MHz", "70m_fs20MHz")
 LTE = ("lte_plotdata2", "lte_plotdata4")
 AFAR = ("afar_300_loc_1", "afar_300_loc_2", "afar_309_loc_2", "afar_328_loc_1", "afar_328_loc_3", "afar_288_loc_1")
-# Its levels are no task of the benchmark: one flight of the folder has them with positions.
+# Its levels are not a task of the benchmark: one flight of the folder has them with positions.
 NR = {
     "timezone": "America/New_York",
     "site": {"file": "lake_wheeler", "coordinates": "A", "without_buildings": True},

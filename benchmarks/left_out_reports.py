@@ -1,12 +1,16 @@
 """Reports of real flights that the site has not seen, and the joint calibration on held-out flights and campaigns.
 
-Each flight that the packaged site learned from is held out, the site is learned again from the others, the flight's log
-is drafted and reported with no line edited, and the first sentence of the page and its numbers are printed: RMSE as
-logged and over 4 s, share inside the 90 % interval, all samples with the receiver's floor, P(locked), rank.
+Each training flight of the packaged site is held out, and the site is learned again from the others. The flight's log
+is then drafted and reported without editing the draft. The script prints the first sentence of the page and its
+numbers: RMSE as logged and over 4 s, share inside the 90 % interval, RMSE of all samples with the receiver's floor,
+P(lock), rank.
+
 With ``--thirds`` the flights at LW1 are cut in three, and each third is drafted and reported alone. With ``--raw`` the
 flights of dataset 12 are written as AERPAW writes them: a power log per channel, and a vehicle log.
-Then, or alone with ``--joint``: the calibration of all campaigns of one airframe on held-out campaigns, flights,
-heights, sectors and headings, with and without the one flight of AADM, next to rotated copies; with the goals.
+
+At the end, or alone with ``--joint``, the calibration of all campaigns of one airframe is scored on held-out campaigns,
+flights, heights, sectors and headings. This is done with and without the one flight of AADM, and with rotated copies as
+a control. The goals are printed, too.
 
     python benchmarks/left_out_reports.py FIELD [--only TEXT] [--keep FOLDER] [--thirds | --joint | --raw]
 """

@@ -1,7 +1,7 @@
 """Compare times with peers: path search with PathSolver, ingest with pandas, ranks with NumPy's SVD.
 
-Both sides run in one process; 1 000 places of the bench scene (61 faces, depth 2) and a power log. Kriging beside
-PyKrige is benchmarks/kriging.py.
+Both programs run in one process, on 1 000 positions of the bench scene (61 faces, depth 2) and on a power log. Kriging
+is compared with PyKrige in benchmarks/kriging.py.
 
     python benchmarks/peers.py [--quick]
 """

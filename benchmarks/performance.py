@@ -2,9 +2,9 @@
 
     python benchmarks/performance.py [--measure] [--history FILE] [--docs FOLDER]
 
-The last run of the history that measured everything it was asked for is shown; earlier ones make the table of the
-peers' ratios over time. Extrapolations are one line each: the largest measured size, the fitted power, and the size
-that is asked about; how far that is beyond what was measured stands beside it.
+The page shows the last run of the history that measured everything it was asked for. Earlier runs are used for the
+table of the peers' ratios over time. Each extrapolation is one line with the largest measured size, the fitted power,
+the requested size, and how far it is beyond the largest measured size.
 """
 
 import argparse
@@ -165,7 +165,7 @@ def peers(history: list[dict[str, Any]]) -> list[str]:
     having = [run for run in history if results[run["date"]]][-8:]
     if not having:
         return []
-    # until 2026-11-23 the ratios stood alone
+    # until 2026-11-23 only the ratios were stored
     ratios = [results[run["date"]].get("ratios", results[run["date"]]) for run in having]
     names = list(dict.fromkeys(name for some in ratios for name in some))
     head = "| times faster than | " + " | ".join(f"{r['date'][:10]}, {r['version']}" for r in having) + " |"

@@ -1,17 +1,17 @@
-"""Inject errors into simulated flights: is the cause named correctly, and is no cause named without an error?
+"""Inject errors into simulated flights: is the cause named correctly, and is no flight without an error accused?
 
     python benchmarks/planted_causes.py [--flights 300] [--seed 1] [--oracle]
 
-Flights at the towers of the packaged site: lawnmowers, orbits, radials and random waypoints, with climbs, hovers, gaps
-and 1 to 10 samples a second. Levels hold what no model has: a ground reflection, a tower's pattern, fading of two
-memories and heavy tails. One flight in six is sound, one in six has two troubles at once. Prints the named cause
-against the planted one; a flight with two is named rightly with either. With ``--oracle`` it prints how many troubles
-can be named at all: by who knows the level without noise, and names a trouble where all that explain the flight without
-it are less likely by some margin.
+The flights at the towers of the packaged site are lawnmowers, orbits, radials and random waypoints, with climbs,
+hovers, gaps and 1 to 10 samples per second. The levels contain effects that no model has: a ground reflection, a
+tower's pattern, fading with two correlation times, and heavy tails. One flight in six has no error, and one in six has
+two errors. The script prints the named cause against the injected one. If there are two errors, either name is right.
+With ``--oracle`` it prints how many errors can be named at all, by a judge that knows the level without noise. This
+judge names an error if all explanations of the flight without it are less likely by a margin.
 
-Exit code 1 if less than 80 % of the troubles are named rightly or more than 3 % of all flights are given a cause that
-they do not have. These are the limits of :mod:`injected_causes`: a wrong name costs the user a search, while a missing
-name costs only the help.
+The exit code is 1 if less than 80 % of the errors are named rightly, or if more than 3 % of all flights get the name
+of a cause that they do not have. These are the limits of :mod:`injected_causes`: a wrong name sends the user on a
+fruitless search, while a missing name only leaves the user without a hint.
 """
 
 import argparse
@@ -201,7 +201,7 @@ def drawn(troubles: tuple[str, ...], draw: np.random.Generator) -> tuple[LevelEv
     measured = clean + unmodelled(draw, true, at) + fading(draw, time)
     late, clipped = 0.0, np.zeros(len(time), dtype=np.bool_)
     locked = serving = None
-    # what stands in the way dims the link, and not what a receiver writes of it
+    # an obstacle attenuates the link, and not what a receiver writes about it
     for trouble in sorted(troubles, key="blocked".__ne__):
         before, sign = measured.copy(), draw.choice([-1.0, 1.0])
         if trouble == "clock":

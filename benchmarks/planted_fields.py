@@ -1,7 +1,7 @@
 """Residual fields with planted strengths: what is recovered, whether intervals hold, and what a large map costs.
 
-Each simulated set is three lawnmower flights of one area at two heights, of the model :data:`PLANTED`; two flights are
-known and the third is predicted. Scales are learned on the two known flights alone.
+Each simulated set has three lawnmower flights of one area at two heights, drawn from the model :data:`PLANTED`. Two
+flights are known, and the third is predicted. Scales are learned on the two known flights alone.
 
     python benchmarks/planted_fields.py [--sets 67] [--targets 20000] [--json]
 """

@@ -1,8 +1,8 @@
-"""A whole run of ``aerpaw-cmp predict`` from many simulated flights at many points: seconds of each stage, peak memory.
+"""A run of ``aerpaw-cmp predict`` from many simulated flights at many points: seconds of each stage, peak memory.
 
-Twenty lawnmowers at two heights around LW1, two channels at 2 Hz, logs of the real formats by ``aerpaw-cmp simulate``.
-A field of 3 dB over places of some 60 m that all flights share is added to the logged levels, so that the residual
-field is worth having. The points are drawn over the area of the flights and beyond it.
+Twenty lawnmowers at two heights around LW1 have two channels at 2 Hz. ``aerpaw-cmp simulate`` writes their logs in the
+real formats. A field of 3 dB over about 60 m, which all flights share, is added to the logged levels, so that the
+residual field lowers the error. The points are drawn over the area of the flights and beyond it.
 
     python benchmarks/predict_scale.py [--points 100000] [--heading 90] [--no-field] [--keep DIR] [--json]
 """

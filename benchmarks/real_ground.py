@@ -1,9 +1,9 @@
 """Measure the effect of each part of Lake Wheeler's map and ground on the levels and ranks of every field flight.
 
-Each part is added alone to free ground without buildings and woods, at one reflection. Levels: RMSE with it minus RMSE
-without it, each with its own offset, paired (95 %). Rank: agreement and total variation, paired, each eighth of the
-flight left out in turn (jackknife, 95 %, Student's t of 7). Then a fit of the woods' specific attenuation and height on
-the four towers of AADM.
+Each part is added alone to flat ground without buildings and woods, at one reflection. For levels, the RMSE without the
+part is subtracted from the RMSE with it. Each has its own offset, and the comparison is paired (95 %). For ranks,
+agreement and total variation are paired, with each eighth of the flight held out in turn (jackknife, 95 %, Student's t
+of 7). At the end, the woods' specific attenuation and height are fitted on the four towers of AADM.
 
 Run: AERPAW_CMP_FIELD_DATA=DIR python benchmarks/real_ground.py [--only NAME ...] [--no-fit] [-o FILE]
 """

@@ -2,16 +2,16 @@
 
 poses     replay of 5 towers, 4 x 4 elements, 12 buildings, depth 2
 towers    replay of 10 000 poses, 12 buildings, depth 2
-faces     paths of 100 poses of one tower, depth 2, ever more buildings (five faces each, and the ground)
+faces     paths of 100 poses of one tower, depth 2, with more and more buildings (five faces each, and the ground)
 samples   comparison of one channel with its intervals (1000 bootstrap replicates), no replay
 report    report of a flight of two channels without audit, by its samples; --large --seconds 3600: ten hours
-flights   campaign of ever more flights of 130 s, one tower, two channels, two settings, one worker
+flights   campaign of more and more flights of 130 s, one tower, two channels, two settings, one worker
 workers   the campaign of the most flights with one and with two workers
 
     python benchmarks/scaling.py [--axes poses faces ...] [--large]
 
-Seconds of the processor, and of the wall where work is shared out, without imports; MiB are the peak of the process.
-A power is that between the two largest sizes; a size that is refused is told with its reason.
+Times are processor seconds without imports, and also wall seconds if several processes share the work. MiB are the peak
+of the process. A power is fitted between the two largest sizes. If a size is refused, the reason is printed.
 """
 
 import argparse

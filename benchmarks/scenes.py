@@ -4,14 +4,14 @@ python benchmarks/scenes.py [--scenes munich,etoile,florence] [--depths 1,2] [--
     [--prisms 1000,5000] [--sionna 100000,1000000] [--limits 1000000,10000000] [--slots 24,26]
     [--json FILE]
 
-Scenes are those that the installed Sionna RT ships. Each row runs in a process of its own, which gives its memory; the
-compiled code must have been compiled before (the first row says how long that took). Receivers lie within 200 m of one
-transmitter, half at street level, half 30 to 60 m up.
+The scenes are those of the installed Sionna RT. Each row runs in a separate process, whose memory is measured. Compiled
+code must exist before (the first row states how long the compilation took). Receivers are within 200 m of one
+transmitter, half of them at street level and half 30 to 60 m above.
 
---sionna    PathSolver with so many rays on the same triangles, at the first of the depths: its paths that we lack
-            (missing), ours that it lacks (extra), each of which is asked of Sionna's own scene: a ray test of every
-            segment, shortened by 2 cm
---limits, --slots   its max_num_paths_per_src and its table of candidates (2 to this power): each with each
+--sionna    PathSolver with this number of rays on the same triangles, at the first of the depths. Its paths that ours
+            does not have are "missing", and ours that it does not have are "extra". Each of them is checked in Sionna's
+            own scene by a ray test of every segment, shortened by 2 cm
+--limits, --slots   its max_num_paths_per_src and its table of candidates (2 to this power), in all combinations
 """
 
 import argparse
@@ -135,7 +135,7 @@ def prism_row(task: dict[str, Any]) -> dict[str, Any]:
     clock = Clock()
     rng = np.random.default_rng(2)
     count = task["prisms"]
-    side = 35.0 * count**0.5  # as dense as a suburb, whatever its size
+    side = 35.0 * count**0.5  # as dense as a suburb, for any size
     spots = rng.uniform(-side / 2, side / 2, (count, 2))
     buildings = tuple(
         Building(f"b{k}", box(e, n, e + rng.uniform(8, 20), n + rng.uniform(8, 20)), float(rng.uniform(5, 15)))

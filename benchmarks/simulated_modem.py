@@ -90,7 +90,7 @@ class FaultyModem(ModemSimulator):
     def unplug(self) -> None:
         """Pull the cable: the port hangs up and its node goes away."""
         with self._lock:
-            self._pending = None  # nobody can tell whether it was read
+            self._pending = None  # it is unknown whether it was read
             old, self._master, self._received = self._master, -1, b""
             self._unlink()
             os.close(old)

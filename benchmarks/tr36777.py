@@ -9,10 +9,10 @@ The constants were held against annex B of the report (v15.0.0) as the Python pa
 two public implementations: NIST's MATLAB model for sensing (path loss, probability of sight) and NVIDIA's Aerial RAN
 (shadowing in sight). All agree, except that NIST's has 4 pi for 40 pi in the loss of RMa-AV out of sight.
 
-Outside proof: the large-scale calibration of TR 38.901, 7.9.6.1, has targets in UMa-AV at a height of 200 m, seen from
-isotropic sites at 6 GHz; `calibration` runs it with lengths taken from this engine's H, beside the percentiles of nine
-companies (R1-2509126). It covers sites, units, the path loss in sight and its shadowing; not sector antennas, RMa-AV or
-links out of sight: annex C of TR 36.777 has their curves as drawings alone, and no table of them was found.
+Independent check: the large-scale calibration of TR 38.901, 7.9.6.1, has targets in UMa-AV at a height of 200 m, seen
+from isotropic sites at 6 GHz; `calibration` runs it with lengths taken from this engine's H, beside the percentiles of
+nine companies (R1-2509126). It covers sites, units, the path loss in sight and its shadowing; not sector antennas,
+RMa-AV or links out of sight: annex C of TR 36.777 has their curves as drawings alone, and no table of them was found.
 
 Run: python benchmarks/tr36777.py [--ues N] [--seed S] [--json]
 """

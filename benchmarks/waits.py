@@ -1,8 +1,8 @@
-"""Whole commands that a user waits for, as processes: processor seconds and peak memory of the next run.
+"""Commands that a user waits for, as processes: processor seconds and peak memory of a repeated run.
 
-Each runs once before, so that every cache is warm, then in turns with ``import sionna.rt, matplotlib.pyplot, pandas``:
-machines differ in speed, and one moves by a fifth within minutes, so that the ratio of the two medians decides. Those
-on real logs need AERPAW_CMP_FIELD_DATA.
+Each command runs once before, so that every cache is filled. Then it runs in turns with ``import sionna.rt,
+matplotlib.pyplot, pandas``. Machines differ in speed, and the speed of one machine changes by a fifth within minutes,
+so the ratio of the two medians decides. Commands on real logs need AERPAW_CMP_FIELD_DATA.
 
     python benchmarks/waits.py [--only NAME] [--json]
 """

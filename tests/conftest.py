@@ -22,7 +22,7 @@ from aerpaw_cmp.common.text import counted
 from tests.real_logs import REAL
 
 # In CI the same examples run every time, so that a red run can be repeated; elsewhere every run looks further.
-# No deadlines: a busy machine is no fault.
+# No deadlines: a busy machine is not an error.
 settings.register_profile("further", deadline=None)
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.load_profile("fixed" if os.environ.get("CI") else "further")

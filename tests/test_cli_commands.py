@@ -45,7 +45,7 @@ def test_formats_shows_every_reader(capsys: pytest.CaptureFixture[str]) -> None:
 
     listed = json.loads(out_of(capsys, "formats", "--json"))["readers"]
     assert {r["name"] for r in listed} == {r.name for r in catalogue()}
-    logs = [r for r in listed if r["kinds"]]  # the others name files that are no log
+    logs = [r for r in listed if r["kinds"]]  # the others name files that are not logs
     assert all(r["sample"] for r in logs)
     assert len(logs) >= 29
 

@@ -117,7 +117,7 @@ def test_the_readme_names_commands_that_exist() -> None:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_links_between_documents_lead_somewhere(document: Path) -> None:
-    prose = re.sub(r"`[^`]*`", "", document.read_text())  # brackets in code are no links
+    prose = re.sub(r"`[^`]*`", "", document.read_text())  # brackets in code are not links
     targets = re.findall(r"\]\(([^)#\s]+)", prose)
     missing = [target for target in targets if "://" not in target and not (document.parent / target).exists()]
     assert missing == []

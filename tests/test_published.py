@@ -314,7 +314,7 @@ def test_real_tasks_on_the_files_at_hand(tmp_path: Path) -> None:
     scores = published.enter(real, ["level_dataset12_heading"], ["free_space", "boosted_trees"])[
         "level_dataset12_heading"
     ]
-    # another heading, the same place and height: free space leaves 5.6 dB (field README)
+    # another heading, the same place and height: the RMSE of free space is 5.6 dB (field README)
     assert scores["free_space"]["rmse_db"] == pytest.approx(5.6, abs=0.2)
     assert scores["boosted_trees"]["rmse_db"] < scores["free_space"]["rmse_db"]
 

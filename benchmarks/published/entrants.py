@@ -144,7 +144,7 @@ def _trees(known: pd.DataFrame, asked: pd.DataFrame, _: Flights) -> Answer:
         model = HistGradientBoostingRegressor(max_iter=100, learning_rate=0.1, max_depth=5, random_state=0)
         return model.fit(x[rows], y[rows])
 
-    # the spread is that of one half of each flight predicted from the other: trees know their own samples by heart
+    # the spread is that of one half of each flight predicted from the other: trees reproduce their own training samples
     error = np.where(half, fitted(~half).predict(x), fitted(half).predict(x)) - y
     model = fitted(np.ones(len(y), dtype=bool))
     level, _ = anchored(lambda rows: _free_space(rows) + model.predict(features(rows)), known, asked)

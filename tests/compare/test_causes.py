@@ -70,7 +70,7 @@ def test_the_clock_has_the_lag_of_its_judgement_and_no_other() -> None:
     other = replace(sound, name="LW2 A", measured_db=early, clock=_clock(-2.0, "shifted"))
     both = flight_cause([replace(sound, measured_db=late, clock=_clock(3.93, "shifted")), other])
     assert both is not None
-    assert (both.name, both.channels) == ("clock", ("LW1 A",)), "the sentence of one clock is not said of another"
+    assert (both.name, both.channels) == ("clock", ("LW1 A",)), "the sentence of one clock is not used for another"
     for clock in (None, _clock(4.0, "cannot tell"), _clock(4.0, "ok"), _clock(4.0, "shifted", APPLIED)):
         assert _named(replace(sound, measured_db=late, clock=clock)) != "clock"
     for lag_s in (-20.0, 25.0):  # further off than is looked: nor is any other trouble

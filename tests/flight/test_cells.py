@@ -89,7 +89,7 @@ def test_serving_cells_are_compared_with_the_strongest_predicted(phone: Path, ex
     serving = serving_of(data.rss, results)  # type: ignore[arg-type]
     assert serving is not None
     assert (serving.n, serving.hit_share, serving.majority_share) == (100, hits, 0.5)
-    assert serving_of(data.rss[:1], results[:1]) is None, "one cell is no choice"  # type: ignore[arg-type]
+    assert serving_of(data.rss[:1], results[:1]) is None, "a single cell leaves no choice"  # type: ignore[arg-type]
 
 
 def test_the_report_of_a_phone_shows_the_matrix_of_metrics_json(phone: Path) -> None:

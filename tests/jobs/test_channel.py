@@ -249,7 +249,7 @@ def test_the_gain_of_an_emulator_has_no_transmit_power_and_sums_as_the_flight_sa
     gain = complex_of(book, "gain")
     powers = {"power": (np.abs(gain) ** 2).sum(axis=0), "coherent": np.abs(gain.sum(axis=0)) ** 2}
     expected = {name: 10.0 * np.log10(power.mean(axis=(2, 3))) for name, power in powers.items()}
-    assert np.abs(expected["power"] - expected["coherent"]).max() > 0.5, "the two are told apart"
+    assert np.abs(expected["power"] - expected["coherent"]).max() > 0.5, "the two are distinguished"
     given = pd.read_csv(place / "channel.csv").gain_db.to_numpy().reshape(16, 2)
     np.testing.assert_allclose(given, expected[field], atol=1e-3)
 

@@ -79,7 +79,9 @@ def test_the_closed_form_along_both_tracks(case):
     compared = compare_rss_series(data, data.rss[0], replayed)
     t = np.arange(0.0, SECONDS, 0.5)
     lost = (t > 50) & (t < 60)
-    np.testing.assert_array_equal(compared.posed, ~lost)  # a gap of the rover's log is no pose, as one of the UAV's
+    np.testing.assert_array_equal(
+        compared.posed, ~lost
+    )  # there is no pose in a gap of the rover's log, as in one of the UAV's
     assert compared.score.n == (~lost).sum()
     error = compared.measured_db - compared.simulated_dbm
     # the track is linear between rows, and so is the way: what is left is the rounding of the coordinates

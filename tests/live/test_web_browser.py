@@ -107,7 +107,9 @@ def fly(driver):
         return flight
 
     yield make
-    said = [entry for entry in complaints(driver) if "ERR_" not in entry["message"]]  # a server that ends is no fault
+    said = [
+        entry for entry in complaints(driver) if "ERR_" not in entry["message"]
+    ]  # a server that ends is not an error
     driver.get("about:blank")
     for flight in running:
         flight.server.__exit__()

@@ -73,7 +73,7 @@ def test_what_is_cut_damaged_or_a_bomb_is_one_message(tmp_path: Path, pack: Pack
         with pytest.raises(AerpawCmpError):
             ingest(place, options=OPTIONS)
     place.write_bytes(bomb)
-    # deflate cannot compress so much: the claimed size of a gzip file is checked, and it is not a log
+    # deflate cannot compress by this ratio: the claimed size of a gzip file is checked, and it is not a log
     with pytest.raises(InputError, match="no record" if pack is gzip.compress else "times its size"):
         ingest(place, options=OPTIONS, reader="sounder_log")
     place.write_bytes(intact[:-9])

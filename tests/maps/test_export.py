@@ -92,7 +92,7 @@ def test_out_of_coverage_is_its_own_colour():
     assert colours[3].tolist() == export._colours(LAYERS[0], 0, 1)[0].tolist(), "Z of both kinds is the same grey"
     assert (colours[[2, 4]] != colours[3]).any(axis=1).all()
     servers = Layer("serving_tower", np.zeros(len(GRID), dtype=int), "1", "Serving", ("LW1", "LW2"))
-    assert export._colours(servers, 0, 1)[0].tolist() != colours[3].tolist(), "the first tower is no gap"
+    assert export._colours(servers, 0, 1)[0].tolist() != colours[3].tolist(), "the first tower is not a gap"
 
 
 def test_constant_and_empty_layers_can_be_drawn(tmp_path):

@@ -68,7 +68,7 @@ def test_borders_part_the_serving_areas(places):
     """On a border, two towers are equally near. A step to either side changes the serving tower."""
     towers = np.array(places, dtype=float)
     borders = voronoi_borders(towers, AREA)
-    assert borders, "all towers stand in the area"
+    assert borders, "all towers are in the area"
     for border in borders:
         a, b = border.towers
         along = border.line_m[1] - border.line_m[0]

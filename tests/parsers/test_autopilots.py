@@ -102,7 +102,7 @@ def test_a_filter_far_from_the_receiver_of_its_log_is_reported(north_deg: float,
     data = LOGS["ardupilot_bin"]
     for i in range(COUNT):
         place = struct.pack("<ii", 357_300_000 + i, -787_000_000 - i)
-        first = data.index(place)  # POS stands in front of GPS
+        first = data.index(place)  # POS comes before GPS
         data = data[:first] + moved + data[first + 4 :]
     warnings = by_name("ardupilot_bin").read(data, ReadOptions()).warnings
     assert any("5 of 5 positions are 44 m (median) from those of the receiver" in text for text in warnings) is apart

@@ -161,7 +161,7 @@ def test_a_last_record_without_line_end_is_flagged(reader: str, sample: str) -> 
     if cut is None or cut.accepted != result.accepted:
         assert (
             reader in ("sounder_log", "dji_srt") or sample == "pretty"
-        )  # the layout tells a cut line, or an object ends below
+        )  # a truncated line is recognised by the layout, or by the end of an object
         return
     flagged = [flag for stream in cut.streams for flag in stream.frame.loc[stream.frame["line"] == last, "flag"]]
     assert flagged

@@ -36,7 +36,9 @@ def test_neighbours_are_of_the_radio_access_that_the_table_names_alone() -> None
     lte_and_nr = read(
         "drive_test", b"Time,LTE PCI,LTE RSRP,NR PCI,NR RSRP,N1 PCI,N1 RSRP\n2025-03-02 10:00:00,5,-90,6,-80,7,-99\n"
     )
-    assert {cell.name for cell in lte_and_nr.streams} == {"lte_pci5", "nr_pci6", "pci7"}, "of which of two, nobody says"
+    assert {cell.name for cell in lte_and_nr.streams} == {"lte_pci5", "nr_pci6", "pci7"}, (
+        "it is unknown which of the two is meant"
+    )
 
 
 def test_a_bare_rank_beside_a_level_is_the_rank_of_the_channel() -> None:

@@ -135,7 +135,7 @@ def test_offsets_of_a_run_go_on_from_the_sample_before() -> None:
 def test_a_foot_bounds_the_last_run_by_its_offset_and_its_time(first: int) -> None:
     result = read(sample(0, first), star(1), line(3, f"{first + 12:07o}"))
     assert seconds(result) == [0, 1, 2]
-    assert [reject.reason[:8] for reject in result.rejected] == ["no value"], "the foot is no sample"
+    assert [reject.reason[:8] for reject in result.rejected] == ["no value"], "the foot line is not a sample"
 
 
 @pytest.mark.parametrize("offset", [0, 4])

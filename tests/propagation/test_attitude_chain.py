@@ -49,7 +49,7 @@ def mount_of(**angles):
     return ArraySettings(**angles).build(0.1, Path()).mount
 
 
-# the tower stands east of the UAV; roll is right wing down, pitch nose up, yaw clockwise from north
+# the tower is east of the UAV; roll is right wing down, pitch nose up, yaw clockwise from north
 CASES = [
     ("heading east", (0, 0, 90), {}, (1, 0, 0)),
     ("heading north", (0, 0, 0), {}, (0, -1, 0)),

@@ -123,7 +123,7 @@ def test_opaque_blocks_by_crown_and_trunk_and_none_does_not() -> None:
     source = np.array([[-50.0, 0, 12], [-50, 0, 2], [-50, 3, 2]])
     target = source * [-1, 1, 1]
     args = (source, np.zeros((3, 0, 3)), target, stand)
-    assert foliage_loss_db(*args, Opaque()).tolist() == [np.inf, np.inf, 0.0]  # crown, trunk, beside the trunk
+    assert foliage_loss_db(*args, Opaque()).tolist() == [np.inf, np.inf, 0.0]  # crown, trunk, next to the trunk
     assert foliage_loss_db(*args, NoFoliage()).tolist() == [0, 0, 0]
     attenuated = foliage_loss_db(*args, P833(0.5, 38.0))
     chord = 2 * 5 * (20 - 12) / 15

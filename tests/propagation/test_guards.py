@@ -82,7 +82,7 @@ def test_a_batch_with_nearly_as_many_paths_as_fit_is_refused(many):
 def test_refinement_drops_duplicates_and_points_outside_their_face(scenes):
     faces = site_faces(scenes.site([Building("b", box(40, -20, 45, 20), 30.0)]))
     wall = int(np.flatnonzero(faces.normal[:, 0] == -1.0)[0])
-    # the second would reflect beside the wall, the third is where the tower is
+    # the second would reflect next to the wall, the third is where the tower is
     targets = np.array([[20.0, 10.0, 15.0], [20.0, 70.0, 15.0], SOURCES[0], [0.0, 0.0, -10.0]])
     pose, sequence = np.array([0, 0, 1, 2, 3, 3]), np.full((6, 2), -1)
     sequence[:3, 0] = wall

@@ -183,7 +183,7 @@ def test_pose_straight_above_the_tower(scenes):
     link = scenes.link(site, tower_comparison_array(), uav_square(mount=down), uav_transmits=False)
     result = replay(site, link, scenes.poses([[0.0, 0.0, 60.0], [0.0, 0.0, 10.0 + 1e-3], [0.0, 0.0, 3.0]]))
     assert np.isfinite(result.h).all()
-    assert result.has_path[:, 0].tolist() == [True, False, True]  # 1 mm is no link
+    assert result.has_path[:, 0].tolist() == [True, False, True]  # 1 mm is too short for a link
     assert sorted(result.paths.depth[result.paths.pose == 0]) == [0, 1]
 
 

@@ -184,12 +184,12 @@ def test_prepare_points_drjit_to_what_works(
         assert llvm.prepare_llvm() == folder / "libLLVM.so.19.1"
         assert os.environ[llvm.LIBRARY_VARIABLE] == str(folder / "libLLVM.so.19.1")
         monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "")
-    assert len(made) == 1, "a good trial is remembered"
+    assert len(made) == 1, "a good trial is stored"
     put(folder, "libLLVM.so.19.1")
     os.utime(folder / "libLLVM.so.19.1", ns=(1, 1))
     llvm._trials.cache_clear()
     llvm.prepare_llvm()
-    assert len(made) == 2, "a new file is tried anew"
+    assert len(made) == 2, "a new file is tried again"
     llvm._trials.cache_clear()
 
 

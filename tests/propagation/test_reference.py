@@ -207,7 +207,7 @@ def test_of_wall_and_ground_a_path_meets_first_what_it_reaches_first(scenes, wal
         ((-10, 0, 5), (1e-4, 3, 4), (0,), False), ((-10, 0, 8), (-10, 6, 8), (0,), None),  # in its upper rim
         ((-10, 0, 8), (-10, 6, 7.9), (0,), True), ((-10, 0, 8), (-10, 6, 8.1), (0,), False),
         ((-10, 0, 5), (20, 0, 5), (), False), ((-10, 0, 8), (20, 0, 8), (), None), ((-10, 0, 8), (20, 0, 8.1), (), True),
-        ((-10, 20, 5), (20, 20, 5), (), None), ((-10, 21, 5), (20, 21, 5), (), True),  # along a wall, and beside it
+        ((-10, 20, 5), (20, 20, 5), (), None), ((-10, 21, 5), (20, 21, 5), (), True),  # along a wall, and next to it
         ((5, 0, 30), (5, 0, 9), (), True), ((5, 0, 30), (5, 0, 7), (), False), ((12, 0, 30), (12, 0, 1), (), True),
     ],
 )  # fmt: skip
@@ -296,7 +296,7 @@ def test_chord_through_a_crown_in_closed_form():
     assert reference.crown_depth_m(tree, (0, 0, 8), (20, 0, 8)) == pytest.approx(6.0, abs=1e-9)
     assert reference.crown_depth_m(tree, (10, 0, 30), (10, 0, 0)) == pytest.approx(16.0, abs=1e-9)
     assert reference.crown_depth_m(tree, (0, 0, 2), (20, 0, 2), trunks=True) == pytest.approx(0.4, abs=1e-9)
-    assert reference.crown_depth_m(tree, (0, 3.9, 8), (20, 3.9, 8)) == 0.0  # below its rim, beside the cone
+    assert reference.crown_depth_m(tree, (0, 3.9, 8), (20, 3.9, 8)) == 0.0  # below its rim, next to the cone
 
 
 def _wrap(monkeypatch, where, name, change):

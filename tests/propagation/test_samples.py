@@ -27,7 +27,7 @@ def pilot_that_sees(thresholds):
 def test_rays_are_raised_until_two_pilots_agree():
     pilot, asked = pilot_that_sees([0, 100_000])
     choice = enough_samples(pilot, FACES, 50)
-    assert asked == [10_000, 40_000]  # the second face needs more than both: agreement is no proof
+    assert asked == [10_000, 40_000]  # the second face needs more than both: agreement is not a proof
     pilot, asked = pilot_that_sees([20_000, 100_000])
     choice = enough_samples(pilot, FACES, 50)
     assert asked == [10_000, 40_000, 160_000, 640_000]

@@ -129,7 +129,7 @@ def test_rays_chosen_by_pilots_find_every_path(sionna, scenes, lone):
 def test_second_replay_traces_nothing(sionna, scenes, lone, tmp_path, monkeypatch):
     site, poses = lone
     link = scenes.link(site)
-    monkeypatch.setenv("AERPAW_CMP_CACHE", str(tmp_path))  # the sionna engine caches unless told not to
+    monkeypatch.setenv("AERPAW_CMP_CACHE", str(tmp_path))  # the sionna engine caches unless this is switched off
     first = replay(site, link, poses, Search("sionna", samples=1000, batch=BATCH))
 
     def fail(*args, **settings):
@@ -330,7 +330,7 @@ def test_a_second_search_compiles_nothing(sionna, scenes, lone):
                 Search("sionna", samples=samples, batch=5, max_depth=1),
             )  # fmt: skip
             big = [kernel for kernel in compiled() if kernel["operation_count"] > 1000]
-            assert not (shift and big), "a search like the one before was compiled anew"
+            assert not (shift and big), "a search like the one before was compiled again"
 
 
 def test_a_batch_without_room_is_searched_again_with_more(sionna, scenes, lone, monkeypatch):

@@ -218,7 +218,7 @@ def test_every_damage_of_an_entry_is_seen_and_told(case, tmp_path):
         assert np.array_equal(again.rss_dbm, first.rss_dbm, equal_nan=True)
     entry.write_bytes(intact[:-1])
     assert any("damaged entry" in line for line in replay(*case, run=Run(cache_dir=tmp_path)).left_out)
-    assert replay(*case, run=Run(cache_dir=tmp_path)).from_cache, "mended by the last search"
+    assert replay(*case, run=Run(cache_dir=tmp_path)).from_cache, "repaired by the last search"
 
 
 @pytest.mark.parametrize("fault", ["far", "far_nan_turn", "no_turn"])

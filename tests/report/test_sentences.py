@@ -1,6 +1,6 @@
 """Every sentence of the six pages with its condition: tests/report/sentences.md.
 
-    python -m tests.report.test_sentences        writes that table anew, to be read before it is committed
+    python -m tests.report.test_sentences        writes that table again; read it before you commit it
 
 The table is made from the modules of words, the captions of figures and the templates. A page that shows words which
 the table does not have, or a table that is not that of the code, fails.

@@ -66,7 +66,7 @@ def test_the_packaged_map_is_openstreetmaps_and_says_so() -> None:
     assert [b.height_m for b in site.buildings if "LiDAR" in b.source] == [6.8, 5.5, 4.2, 6.7, 5.8, 5.5]
     assert sum(f.area.area for f in site.forests) / 1e4 == pytest.approx(91.6, abs=0.1)  # of the extract, in hectares
     assert any("no map here" in note and "LW5" in note for note in site.notes)
-    # neither the barn north-west of LW1 nor any other building stands there on the map
+    # the map has no building there, not even the barn north-west of LW1
     at_lw1 = [b for b in site.buildings if b.footprint.distance(Point(0, 0)) < 150]
     assert len(at_lw1) >= 6
     assert not [b for b in at_lw1 if b.footprint.centroid.x < 0 < b.footprint.centroid.y]
@@ -97,7 +97,7 @@ def test_ground_is_flat_unless_offsets_are_asked_for() -> None:
     assert [t.ground_m for t in flat.towers.values()] == [0.0] * 5
     assert [t.ground_m for t in lifted.towers.values()] == [0.0, -4.45, -10.23, 6.53, 15.03]
     assert lifted.towers["LW5"].position_m[2] == pytest.approx(25.03)
-    at = np.array([tower.position_m[:2] for tower in lifted.towers.values()]).T  # beside LW1 no flight sinks to LW3's
+    at = np.array([tower.position_m[:2] for tower in lifted.towers.values()]).T  # near LW1 no flight descends to LW3's
     assert list(lifted.ground_under_m(*at)) == [0.0, -4.45, -10.23, 0.0, 0.0]
 
 

@@ -143,7 +143,7 @@ class Levels:
 
 
 def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> Levels:
-    """Return the levels of a series that are compared, by the rules of ``rss`` of the flight file."""
+    """Return the levels of a series that are compared, according to ``rss`` in the flight file."""
     posed = replayed.valid.copy()
     if settings.minimum_height_m is not None:
         posed[posed] = replayed.poses.position_m[:, 2] >= settings.minimum_height_m

@@ -424,7 +424,7 @@ class Comparison:
         return _tree(nodes)
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw calibrated and simulated levels over time on axes as in :meth:`Flight.plot`."""
+        """Draw calibrated and simulated levels over time on matplotlib axes, as :meth:`Flight.plot` does."""
         axes = axes if axes is not None else _new_axes()
         for item in self.result.rss:
             name, measured_dbm = f"{item.tower} {item.channel}", item.measured_db + item.score.offset_db

@@ -534,7 +534,7 @@ class Memory:
         self._gain_db: Predictor = by_degree(lambda samples: known[samples.antenna].gain_db(samples))
 
     def levels(self, each: Sequence[LinkSamples]) -> Levels:
-        """Return levels as in :meth:`Flown.levels`.
+        """Return levels in the form of :meth:`Flown.levels`.
 
         The model extrapolates outside the site and in directions that few training samples have.
         """

@@ -606,7 +606,7 @@ def _zone_s(text: bytes) -> int | None:
 
 
 def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> tuple[Instants, BoolArray]:
-    """Convert times as text to UTC, by the offset in the text, else as wall clock of the zone.
+    """Convert times as text to UTC with the offset in the text, else as wall clock of the zone.
 
     Returns
     -------

@@ -53,7 +53,7 @@ QUALITIES = Reading._fields[7:]
 
 
 def reading(row: int, fields: Mapping[str, float], *, rat: str, serving: bool) -> Reading:
-    """Return the :class:`Reading` of one cell from the fields of an object or of a table row, by their names."""
+    """Return the :class:`Reading` of one cell from the named fields of an object or of a table row."""
     known: dict[str, float] = {}
     for name, value in fields.items():
         what = dictionary.meaning(name)
@@ -63,7 +63,7 @@ def reading(row: int, fields: Mapping[str, float], *, rat: str, serving: bool) -
     return Reading(row, rat, serving=serving, **values)  # type: ignore[arg-type]
 
 
-# Quantities of the dictionary, by the fields of a reading.
+# Quantity of the dictionary for each field of a reading.
 QUANTITIES = {"pci": "PCI", "arfcn": "ARFCN", "rsrp_dbm": "RSRP", "rsrq_db": "RSRQ", "rssi_dbm": "RSSI",
               "sinr_db": "SINR", "pathloss_db": "path loss"}  # fmt: skip
 

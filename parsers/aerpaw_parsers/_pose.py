@@ -98,7 +98,7 @@ def without_fix(sheet: _sheet.Sheet) -> BoolArray:
             # MAVLink writes 1 without a fix and 3 with a fix; the quality of NMEA is 1 with a fix and never 3
             of_mavlink = re.search("type|status|mode", words) is not None and (values >= 3).any()
             none = values <= float(of_mavlink or ((values == 3).any() and "qual" not in words))
-        # a column with this value throughout is not filled by the program
+        # a column that has this value in every row is not filled by the program
         if (values[~none] > 0).any():
             unfixed |= none
     return unfixed
@@ -256,7 +256,7 @@ def above_takeoff(rows: Rows, values: dict[str, AnyArray], datum: str, lost: Boo
     values : dict
         ``latitude_deg``, ``longitude_deg`` and ``altitude_m`` as in the log.
     datum : str
-        Datum as in the dictionary.
+        Datum of the heights, as named in the dictionary.
     lost : bool array, shape (n,)
         Rows without a position.
     """
@@ -313,7 +313,7 @@ def _without_first_zeros(altitude: FloatArray, time: AnyArray | None) -> FloatAr
 
     If times are given, as for an unknown datum, the step must also be faster than any climb.
     """
-    # argmax is also 0 for heights that are 0 throughout: nothing is removed
+    # argmax is also 0 if all heights are 0: nothing is removed
     begun = int(np.argmax(np.nan_to_num(altitude) != 0))
     if not begun or np.nanmin(np.abs(altitude[begun:])) < _NEAR_ZERO_M:
         return altitude
@@ -354,7 +354,7 @@ def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitud
 
 
 def _attitude(rows: Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
-    """Return angles in degrees. The unit is that in the name, else that of the program, else decided by the values."""
+    """Return angles in degrees. Their unit is in the name, known from the program, or guessed from the values."""
     columns = {key: column for key in ANGLES if (column := sheet.find(key)) is not None}
     values = {key: sheet.numbers(column) for key, column in columns.items()}
     named = any(sheet.unit(column) for column in columns.values())

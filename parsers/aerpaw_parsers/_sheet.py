@@ -495,7 +495,7 @@ def of_readings(
     ----------
     lines : Lines
     readings : sequence of (int, mapping)
-        0-based line of each reading, and its cells by the names of their columns.
+        0-based line of each reading, and its cells, with the names of their columns as keys.
     rejected : list of RejectedLine
     """
     names = list(dict.fromkeys(name for _, cells in readings for name in cells))
@@ -712,7 +712,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     """
     known = {i: m.quantity for i, m in enumerate(sheet.meanings) if m is not None and not m.indirect}
     mapped = column is not None
-    if not mapped:  # columns that the user named are not checked by their values
+    if not mapped:  # do not check the values of columns that the user named
         _refuse_positions_elsewhere(sheet)
         bounded = {i: q for i, q in known.items() if q.role in ("position", "cell", "rss") and q.can_be[1] < np.inf}
         _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in bounded.items()])
@@ -862,7 +862,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
 
 
 def _devices(sheet: Sheet) -> IntArray | None:
-    """Return the number of the device of each row by all columns of devices, or None if there is no such column."""
+    """Number the devices, and return the number for each row, or None if there is no column of devices."""
     columns = [i for i, meaning in enumerate(sheet.meanings) if meaning and meaning.quantity.name == "device"]
     texts = zip(*(sheet.texts(i) for i in columns), strict=True) if columns else ()
     return pd.factorize(pd.Series(list(texts), dtype=object))[0] if columns else None

@@ -360,15 +360,15 @@ def read(
     texts : sequence of str
     options : ReadOptions
     unit : {"ns", "us", "ms", "s", "min", "h"}, optional
-        Unit of numbers that count from an unknown origin, by the name of the column.
+        Unit of numbers that count from an unknown origin, according to the name of the column.
     european : bool
         True if the table has decimal commas: the day then comes before the month.
     zone : str
-        Zone of times without a zone, by the name of the column.
+        Zone of times without a zone, according to the name of the column.
     gps : bool
-        True if numbers are GPS time by the name of the column.
+        True if numbers are GPS time according to the name of the column.
     day_first : bool, optional
-        The order of dates by the name of the column.
+        The order of dates according to the name of the column.
     device : int array, shape (n,), optional
         Number of the device that wrote each row; midnights are found per device.
 

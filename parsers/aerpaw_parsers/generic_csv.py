@@ -179,7 +179,7 @@ def _tables(lines: Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
 
 
 def _stream(rows: Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], name: str, unit: str) -> Stream | None:
-    """Return the stream of mapped columns by the rules of its kind, and flag rows with words in place of numbers."""
+    """Return the stream of mapped columns according to its kind, and flag rows with words in place of numbers."""
     options, flag = rows.options, rows.flag.copy()
     values: dict[str, AnyArray] = {key: _values(sheet, column, key, options) for key, column in where.items()}
     if {*_pose.PLACE[:2]} <= set(values):

@@ -219,7 +219,7 @@ def _flags(record: dict[str, Any]) -> list[str]:
 
 
 def _columns(answers: list[Answer], names: Mapping[str, str]) -> Columns:
-    """Return columns of some answers, by their names and the keys under which they were decoded."""
+    """Return columns of some answers. ``names`` maps each column to the key of its decoded value."""
     spans = [(int(record["sent_utc_ns"]), int(record["last_utc_ns"])) for _, record, _, _ in answers]
     columns: Columns = {
         "time": np.array([(sent + last) // 2 for sent, last in spans], dtype=np.int64).astype("datetime64[ns]"),

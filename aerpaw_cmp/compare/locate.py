@@ -1,8 +1,9 @@
 """Position estimate of a transmitter at an unknown place, from the levels of one flight.
 
-The model of a level: it falls with the logarithm of the distance, by an unknown slope. Both antennas add a gain over
-elevation, azimuth and the directions of the airframe. Shadowing is correlated over place or time. A level below the
-floor of the receiver is known to be below it, and no more. Several strengths and lengths count by their evidence.
+In the model, the level falls with the logarithm of the distance, by an unknown slope. Both antennas add gains that
+depend on elevation, azimuth and the directions of the airframe. Shadowing is correlated over position or time. Of a
+level below the floor of the receiver, only this fact is known. Several strengths and lengths are tried and weighted by
+their evidence.
 """
 
 from __future__ import annotations
@@ -22,20 +23,21 @@ from ..common.units import BoolArray, FloatArray, spread_out, unmasked
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """One assumption on what scatters the levels about their mean over distance.
+    """One set of assumptions about the variation of levels around their mean over distance.
 
     Parameters
     ----------
     shadow_db, length_m, time_s : float
-        Standard deviation of the shadowing [dB], and over which distance and time its correlation falls by a factor e.
+        Standard deviation of the shadowing [dB], and the distance and time over which its correlation falls by a factor
+        e.
     scatter_db : float
-        Standard deviation of medians over some seconds [dB].
+        Standard deviation of medians over a few seconds, without shadowing [dB].
     azimuth_db, airframe_db : float
         Standard deviation of the node's gain over azimuth, and of the airframe's gain over its directions [dB].
     learned : bool
-        The airframe has its learned gain, and ``airframe_db`` is a factor of the standard deviation of that gain.
+        True if the learned gain of the airframe is used. Then ``airframe_db`` is a factor of its standard deviation.
     log_weight : float
-        Logarithm of the weight before a level was measured.
+        Logarithm of the prior weight.
     """
 
     shadow_db: float
@@ -63,16 +65,16 @@ class Case:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LevelModel:
-    """Standard deviations of a level about its mean over distance, before a level was measured.
+    """The prior of a level around its mean over distance.
 
     Parameters
     ----------
     slope, slope_sd : float
         Exponent of the distance.
     elevation_sd_db : float
-        Gain that both antennas and the ground add over the elevation.
+        Standard deviation of the gain over elevation, from both antennas and the ground.
     cases : tuple of Case
-        The evidence is a mean over the cases, by their weights.
+        Cases over which the evidence is averaged, by their weights.
     """
 
     slope: float = 3.0
@@ -84,17 +86,17 @@ class LevelModel:
 # Standard deviation of a learned gain per degree of its harmonics, as a factor of that of its table.
 _LEARNED_SD = 0.25
 
-# Log odds of a learned gain against an unknown one, before a level was measured.
+# Prior log odds of a learned gain against an unknown gain.
 _KNOWN_ODDS = 3.0
 
-# Gains over azimuth and over the directions of the airframe [dB]. Without the attitude, the axes of the airframe are
-# those of the site, and stronger gains count as well, by their weights. With the attitude they do not: the error of one
-# of six real flights rose from 41 to 67 m.
+# Gains over azimuth and over the directions of the airframe [dB]. If the attitude is unknown, the axes of the airframe
+# are those of the site, and stronger gains are also tried, with weights. If it is known, they are not: they raised the
+# error of one of six real flights from 41 to 67 m.
 _GAINS = (0.8, 1.5)
 _STRONG_GAINS = {_GAINS: 0.55, (3.0, 3.0): 0.28, (6.0, 6.0): 0.17}
 
-# Shadowing over the half minute of a hover, and over place. Strong shadowing over a short length with little scatter is
-# not tried, because it is hard to distinguish from strong scatter.
+# Shadowing is correlated over half a minute (as in a hover), and over position. Strong shadowing over a short length
+# with little scatter is not tried, because it is hard to distinguish from strong scatter.
 _LENGTHS_M = (15.0, 45.0, 100.0)
 _SHADOWS = (
     Case(shadow_db=8.0, scatter_db=4.0, time_s=30.0),
@@ -111,7 +113,7 @@ UNKNOWN = LevelModel(cases=tuple(case.with_gains(*_GAINS) for case in _SHADOWS))
 
 
 def known_cases(shadow_db: float, scatter_db: float) -> tuple[Case, ...]:
-    """Return the cases of a level between two learned antennas, with the shadowing that their flights had."""
+    """Return the cases of a level between two learned antennas, with the shadowing of their training flights."""
     own = [Case(shadow_db=shadow_db, scatter_db=scatter_db, length_m=length) for length in _LENGTHS_M]
     own.append(Case(shadow_db=shadow_db, scatter_db=scatter_db, time_s=30.0))
     return tuple(replace(case, airframe_db=_LEARNED_SD, learned=True) for case in (*own, *_SHADOWS))
@@ -120,28 +122,29 @@ def known_cases(shadow_db: float, scatter_db: float) -> tuple[Case, ...]:
 # The cases of an unknown node if the attitude of the UAV is not known.
 _UNTURNED = tuple(case.with_gains(*gains, weight) for case, (gains, weight) in product(_SHADOWS, _STRONG_GAINS.items()))
 
-# Standard deviation per axis of what the model cannot see (a tilted antenna, a wall), chosen on six flights with a
-# surveyed rover (docs/formats.md).
+# Standard deviation per axis of effects that are not modelled (a tilted antenna, a wall). It was chosen on six flights
+# with a surveyed rover (docs/formats.md).
 SYSTEMATIC_M = 20.0
 
-# The estimated place is the maximum of the posterior after a blur by this standard deviation [m], because the maximum
-# of a rough posterior is at a random place.
+# The posterior is blurred by this standard deviation [m] before its maximum is taken as the estimate, because the
+# maximum of a rough posterior is at a random position.
 _SMOOTH_M = 45.0
 
-# Medians are taken over at least this time, and there are at most this many.
+# Shortest window of a median [s], and largest number of medians.
 WINDOW_S, _MOST_BINS = 4.0, 120
 
-# Tried heights of the antenna [m] and their prior probability: a rover, a tower.
+# Heights of the antenna that are tried [m], with their prior probability: a rover, and a tower.
 _HEIGHTS_M = {1.5: 0.7, 10.0: 0.3}
 
 # Smallest number of bins for a search.
 FEWEST = 20
 
-# Places are tried up to this distance beyond the track, at this spacing. Likely places are divided into a third of it.
+# Distance beyond the track up to which positions are tried, and their spacing. Likely positions are divided to a third
+# of it.
 _REACH_M, _SPACING_M = 400.0, 40.0
 
-# The first grid has at most this many positions, at 2, 4, 8 ... times the spacing; then the likeliest
-# places are divided until the spacing is reached.
+# Largest numbers of positions of the first grid, and after dividing. The first grid has 1, 2, 4, 8 ... times the
+# spacing. The likeliest positions are then divided until the spacing is reached.
 _MOST_GRID, _MOST_DIVIDED = 500, 500
 
 # The level of a node this far away hardly changes along a flight; levels that fit it as well as the best place do not
@@ -149,33 +152,33 @@ _MOST_GRID, _MOST_DIVIDED = 500, 500
 # constant levels and hovers.
 _AFAR_M, _PLACED_ODDS = 30_000.0, 0.5
 
-# Places are ignored if their log evidence is lower than that of the best place by more than this.
+# Positions are ignored if their log evidence is lower than the maximum by more than this.
 _POSSIBLE = 8.0
 
 # The likeliest places are divided by three to the east and to the north.
 _MOST_REFINED = 100
 
-# Standard deviation of a level about which nothing is known.
+# Prior standard deviation of the unknown level at 100 m.
 _FREE_DB = 100.0
 
-# Newton steps of the Laplace approximation, and the change [dB] at which they end; there is one maximum.
+# Largest number of Newton steps of the Laplace approximation, and change [dB] at which they end.
 _STEPS, _SETTLED_DB = 12, 0.03
 
 # Number of places whose matrices are in memory at the same time.
 _AT_ONCE = 128
 
-# A search uses at most this many cases, and none that is less likely than the best by more [nat]. They are compared at
-# this many of the places that are possible with a usual case.
+# Largest number of cases of a search, and largest difference in log likelihood from the best case [nat]. Cases are
+# compared at this number of positions that are possible with a usual case.
 _MOST_CASES, _LIKELY, _JUDGED = 8, 4.0, 60
 
-# Largest number of levels below the floor that are used: the time grows with the cube of this number.
+# Largest number of levels below the floor that are used, because the time grows with its cube.
 _MOST_BELOW = 20
 _USUAL = Case(shadow_db=8.0, scatter_db=4.0, length_m=45.0, azimuth_db=_GAINS[0], airframe_db=_GAINS[1])
 
 
 @dataclass(frozen=True, slots=True)
 class LevelTrack:
-    """Levels along a track, thinned for a search.
+    """The levels along a track, thinned for a search.
 
     Parameters
     ----------
@@ -183,15 +186,15 @@ class LevelTrack:
     position_m : (n, 3)
         East, north, up.
     level_db : (n,)
-        Medians, at least the floor.
+        Medians of levels, raised to at least the floor.
     floor_db : float
         Level below which the receiver measures nothing, or -inf.
     airframe_db : callable, optional
-        Returns the learned gain (m, n) and its standard deviation (m, n) towards two unit vectors (m, n, 3). The first
-        is at the UAV, in the frame of the aircraft. The second is at the node, in the frame of the site. None if no
-        antenna is known.
+        Function that returns the learned gain (m, n) and its standard deviation (m, n) for two unit vectors (m, n, 3).
+        The first is the direction at the UAV in the aircraft frame, the second the direction at the node in the site
+        frame. None if no antenna is known.
     rotation : (n, 3, 3), optional
-        From the aircraft's frame to that of the site.
+        Rotation from the aircraft frame to the site frame.
     """
 
     time_s: FloatArray
@@ -212,7 +215,7 @@ def level_track(
 ) -> LevelTrack:
     """Return medians of levels over windows of :data:`WINDOW_S` or longer.
 
-    A median is below the floor if more than half of its samples are.
+    A median is below the floor if more than half of the samples in its window are.
 
     Parameters
     ----------
@@ -233,7 +236,7 @@ def level_track(
     time, place, level = time[finite], place[finite], np.maximum(level[finite], floor_db)
     if not len(time):
         return LevelTrack(time, place, level, floor_db)
-    # a little longer, or the last sample would have its own bin
+    # slightly longer, because the last sample would otherwise have its own bin
     window = max(WINDOW_S, float(np.ptp(time)) / _MOST_BINS * 1.001)
     groups = np.unique(((time - time.min()) // window).astype(np.int64), return_inverse=True)[1]
     order = np.argsort(groups, kind="stable")
@@ -248,7 +251,7 @@ def level_track(
 
 @dataclass(frozen=True, slots=True)
 class Fits:
-    """The log evidence of places (m,), and the slope and its standard deviation (m,) if the node is there."""
+    """The log evidence (m,) of positions, with slope and its standard deviation (m,) for a node at each position."""
 
     evidence: FloatArray
     slope: FloatArray
@@ -256,7 +259,7 @@ class Fits:
 
 
 def fit_places(track: LevelTrack, places_m: ArrayLike, model: LevelModel = UNKNOWN) -> Fits:
-    """Compute the log evidence of the levels if the node is at each of some places.
+    """Return the log evidence of the levels for each candidate position of the node.
 
     Parameters
     ----------
@@ -268,9 +271,9 @@ def fit_places(track: LevelTrack, places_m: ArrayLike, model: LevelModel = UNKNO
 
     Notes
     -----
-    The level is mean + F c + shadowing + scatter, c ~ N(0, 1). F has a term for the level at 100 m, one for the
-    slope, two for the elevation, four for the azimuth at the node, and eight for the direction at the airframe. Levels
-    above the floor have a normal distribution. Those below have the probability to be there, given the others, by
+    The level is mean + F c + shadowing + scatter, c ~ N(0, 1). F has a term for the level at 100 m, one for the slope,
+    two for the elevation, four for the azimuth at the node, and eight for the direction at the airframe. Levels above
+    the floor have a normal distribution. The probability of levels below the floor, given all others, is computed by
     Laplace's approximation at the maximum of the posterior (Rasmussen and Williams, 2006, section 3.4).
     """
     places = unmasked(places_m).reshape(-1, 3)
@@ -302,10 +305,10 @@ class _Shadowing:
 
 
 def _features(track: LevelTrack, places: FloatArray, model: LevelModel, learned: bool) -> FloatArray:
-    """Return what coefficients of unit variance add to a level, and the level above its mean last (n, m, terms + 1)."""
+    """Return the effects of unit-variance coefficients on a level, then the level above its mean (n, m, terms + 1)."""
     ray = track.position_m[None] - places[:, None]
     across = np.hypot(ray[..., 0], ray[..., 1])
-    # relative to 100 m; below one metre the level does not follow the distance
+    # relative to 100 m, and at least 1 m, because the model is not valid below
     decades = np.log10(np.maximum(np.hypot(across, ray[..., 2]), 1.0) / 100.0)
     elevation, towards = elevation_rad(ray), ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9)
     east, north, _ = np.moveaxis(towards, -1, 0)
@@ -326,7 +329,7 @@ def _features(track: LevelTrack, places: FloatArray, model: LevelModel, learned:
     return np.ascontiguousarray(np.stack(columns, axis=-1).swapaxes(0, 1))
 
 
-# Number of terms of level, slope and elevation, of the azimuth, and of the airframe.
+# Number of terms of level, slope and elevation, then of azimuth, then of the airframe.
 _TERMS = (4, 4, 8)
 
 
@@ -353,7 +356,7 @@ def _fit(
 
 
 def _whitened(features: FloatArray, seen: BoolArray, shadow: _Shadowing) -> tuple[FloatArray, FloatArray]:
-    """Return whitened features (m, k, terms + 1) above the floor, and what these leave of those below (m, j, ...)."""
+    """Return whitened features above the floor (m, k, terms + 1), and features below it (m, j, ...) given these."""
     flat = features.reshape(len(features), -1)
     above = shadow.root @ flat[seen]
     below = flat[~seen] - shadow.across @ above
@@ -376,7 +379,7 @@ def _fit_case(case: Case, above: FloatArray, below: FloatArray, shadow: _Shadowi
         mean = (terms @ pull[:, :, None])[:, :, 0] - below[:, :, -1]
         held, force = _below_floor(mean, shadow.left + terms @ terms.swapaxes(1, 2), case.scatter_db)
         evidence, pull = evidence + held, pull + (terms.swapaxes(1, 2) @ force[:, :, None])[:, :, 0]
-    # the variance of the slope is that given the levels above the floor: the others hardly narrow it
+    # use the variance given the levels above the floor, because other levels hardly reduce it
     return evidence, (inverse[:, :, 1] * pull).sum(axis=1), (inverse[:, :, 1] ** 2).sum(axis=1)
 
 
@@ -384,7 +387,7 @@ _LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))
 
 
 def _below_floor(mean: FloatArray, covariance: FloatArray, scatter_db: float) -> tuple[FloatArray, FloatArray]:
-    """Return the log probability (m,) that levels are below the floor, and how the floor pulls them (m, j) [1 / dB].
+    """Return the log probability (m,) that levels are below the floor, and its gradient (m, j) [1 / dB].
 
     Parameters
     ----------
@@ -410,7 +413,7 @@ def _below_floor(mean: FloatArray, covariance: FloatArray, scatter_db: float) ->
 
 
 def _likelihood(latent: FloatArray, scatter_db: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the log probability of scattered levels to be below zero, its gradient, and minus its curvature (m, j)."""
+    """Return the log probability that levels with scatter are below 0, its gradient, and minus its curvature (m, j)."""
     from scipy.special import log_ndtr
 
     z = -latent / scatter_db
@@ -419,7 +422,7 @@ def _likelihood(latent: FloatArray, scatter_db: float) -> tuple[FloatArray, Floa
     return value, -hazard / scatter_db, np.clip(hazard * (hazard + z), 1e-12, 1.0) / scatter_db**2
 
 
-# Cells of the regions [m] and their largest number. Smaller parts of a region are ignored.
+# Side of the cells of a region [m], largest number of cells, and smallest share of a part of a region that is shown.
 _CELL_M, _MOST_CELLS, _LEAST_SHARE = 5.0, 1_000_000, 0.03
 
 
@@ -430,11 +433,11 @@ class Mode:
     Parameters
     ----------
     place_m : (2,)
-        Its likeliest place, east and north.
+        Its likeliest position, east and north.
     share : float
         Share of the posterior in this part.
     radius_m : float
-        Radius about the place within which nine tenths of this part are.
+        Radius of the circle about this position that contains 90 % of this part.
     """
 
     place_m: FloatArray
@@ -470,7 +473,7 @@ class Regions:
 
     def likeliest(self) -> FloatArray:
         """Return the middle (2,) of the likeliest cell."""
-        # rounded: a place and its mirror image differ in the last digit alone
+        # round, so that rounding does not decide between a position and its mirror image
         column, row = np.unravel_index(self.share.round(12).argmax(), self.share.shape)
         return np.array([self.east_m[column], self.north_m[row]])
 
@@ -505,7 +508,7 @@ class Regions:
 def _blurred(places: FloatArray, share: FloatArray, axes: Sequence[FloatArray], sd_m: float) -> FloatArray:
     """Return the blurred shares on a grid (columns, rows).
 
-    Places are on a lattice, so that each axis is blurred alone.
+    Positions are on a lattice, so that each axis can be blurred separately.
     """
     (east, i), (north, j) = (np.unique(p.round(6), return_inverse=True) for p in places.T[:2])
     lattice = np.zeros((len(east), len(north)))
@@ -517,7 +520,7 @@ def _blurred(places: FloatArray, share: FloatArray, axes: Sequence[FloatArray], 
 
 
 def _within(step_m: FloatArray, share: FloatArray, part: float) -> float:
-    """Return the length of steps (n, 2) within which a part of their shares (n,) is."""
+    """Return the radius that contains a part of the shares (n,) at steps (n, 2) from the centre."""
     away = np.hypot(*step_m.T)
     order = np.argsort(away)
     held = np.cumsum(share[order])
@@ -535,15 +538,16 @@ class NodeEstimate:
     radius90_m : float
         Radius about the place that contains 90 % of the posterior.
     height_m : (low, high)
-        Range of the heights that are possible.
+        Range of possible heights.
     slope, slope_sd : float
         Exponent of the distance and its standard deviation.
     anywhere : float
-        Log evidence of any place within reach.
+        Log evidence of all positions within reach together.
     placed : bool
-        The levels fit a place within reach better than a place 30 km away.
+        True if the levels fit a position within reach better than a position 30 km away.
     at_edge : bool
-        More than a few percent of the posterior are at the edge of the search: the node may be farther away.
+        True if more than a few percent of the posterior are at the edge of the search, so that the node may be farther
+        away.
     regions : Regions
     """
 
@@ -571,12 +575,12 @@ def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
     Raises
     ------
     InputError
-        Too few levels.
+        If there are too few levels.
 
     Notes
     -----
-    Evidence over a grid of places at :data:`_HEIGHTS_M`, and a prior by the distance from the track; the posterior is
-    blurred by :data:`SYSTEMATIC_M`.
+    The posterior is the evidence on a grid of positions at the heights :data:`_HEIGHTS_M`, times a prior that depends
+    on the distance from the track. It is blurred by :data:`SYSTEMATIC_M`.
     """
     from scipy.special import logsumexp
 
@@ -601,7 +605,7 @@ def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
     log_share = fits.evidence + _log_height(places) + _log_near(track, places)
     log_share[: len(fine)] -= np.log(9.0)
     share = np.exp(log_share - logsumexp(log_share))
-    # places that are far apart are blurred more: the region must not fall into spots
+    # blur widely spaced positions more, so that the region does not fall apart into spots
     regions = Regions.of(places, share, SYSTEMATIC_M * step / _SPACING_M)
     best = Regions.of(places, share, _SMOOTH_M * step / _SPACING_M).likeliest()
     nearest = int(np.hypot(*(places[:, :2] - best).T).argmin())
@@ -630,7 +634,7 @@ def _thinned(track: LevelTrack) -> LevelTrack:
 
 
 def _likely_cases(track: LevelTrack, grid: FloatArray, model: LevelModel) -> LevelModel:
-    """Return the model with its likely cases alone, by the places of a grid (n, 2) that fit one case best."""
+    """Return the model with only its likely cases, at the positions of a grid (n, 2) that fit a usual case."""
     from scipy.special import logsumexp
 
     if len(model.cases) <= _MOST_CASES:
@@ -645,8 +649,9 @@ def _likely_cases(track: LevelTrack, grid: FloatArray, model: LevelModel) -> Lev
     return replace(model, cases=tuple(model.cases[i] for i in sorted(likely)))
 
 
-# A radio is near the track that was flown for it: a Cauchy distribution in the plane. Its width is that of the track
-# (root mean square distance from its centre) times this factor, or that for towers [m].
+# Prior of the position: a Cauchy distribution of the distance from the track, because flights are planned near the
+# radio. Its width is this factor times the RMS distance of the track from its centre. For towers, it is the second
+# value [m].
 _NEAR, _NEAR_TOWERS_M = 1.5, 150.0
 
 
@@ -682,10 +687,10 @@ def _at_heights(grid: FloatArray) -> FloatArray:
 def _searched(
     track: LevelTrack, grid: FloatArray, spacing_m: float, model: LevelModel
 ) -> tuple[FloatArray, FloatArray, float, float]:
-    """Divide the likeliest places of a grid until their spacing is :data:`_SPACING_M`.
+    """Return the likeliest positions of a grid, divided until their spacing is :data:`_SPACING_M`.
 
     Returns places (m, 3), their log evidence (m,), their spacing [m] and the log evidence of any place of the grid. If
-    too many places are possible, the spacing stays: the levels do not determine the place better.
+    too many positions are possible, they are not divided, because the levels do not determine the position better.
     """
     from scipy.special import logsumexp
 
@@ -709,13 +714,13 @@ def _on_edge(places: FloatArray, grid: FloatArray, spacing_m: float) -> BoolArra
 
 
 def _divided(places: FloatArray, steps_m: Sequence[float]) -> FloatArray:
-    """Return each place (m, 3) moved by all pairs of steps to the east and to the north."""
+    """Return each position (m, 3), moved by all pairs of steps to the east and north."""
     moved = np.array([(e, n, 0.0) for e in steps_m for n in steps_m])
     return np.asarray((places[:, None] + moved).reshape(-1, 3))
 
 
-# Model that compares a known place with any other place: nearly free space and unknown antennas. Chosen on simulated
-# flights.
+# Model for comparing a known position with any other: nearly free space, and unknown antennas. It was chosen on
+# simulated flights.
 _TOWERS = LevelModel(
     slope=2.1,
     slope_sd=0.3,
@@ -729,15 +734,15 @@ _TOWER_SPACING_M = 60.0
 
 
 def place_odds(track: LevelTrack, known_m: ArrayLike) -> FloatArray:
-    """Return the log odds (k,) of known places, such as towers, against any place about the track.
+    """Return the log odds (k,) of known positions, such as towers, against any position around the track.
 
-    The evidence is integrated over place, gain, slope and antennas, so that another place wins only if it fits better
-    than its additional freedom explains.
+    The evidence is integrated over position, gain, slope and antennas, so that another position is preferred only if it
+    fits better than by its additional freedom.
 
     Parameters
     ----------
     track : LevelTrack
-        Its antennas are treated as unknown, and levels below the floor as levels at the floor.
+        Track, whose antennas count as unknown, and whose levels below the floor count as levels at the floor.
     known_m : (k, 3)
     """
     from scipy.special import logsumexp

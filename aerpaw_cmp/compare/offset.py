@@ -1,8 +1,8 @@
 """The constant offset between a measurement and a simulation, and its uncertainty.
 
-The offset is **added to the measurement**. Its grid consists of integers divided by ``1 / step``, not of accumulated
-floats. A tie goes to the offset nearer zero. An optimum at the edge of the search range is flagged: it is an error to
-investigate, not a result.
+The offset is **added to the measurement**. Offsets on the grid are integers divided by ``1 / step``, so that rounding
+errors do not accumulate. Of two equally good offsets, the one nearer zero is used. An optimum at the edge of the search
+range is flagged, because it indicates an error and is not a result.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ SPAN_DB = (-50.0, 50.0)
 # Search step of arXiv 2502.10324, section V [dB].
 STEP_DB = 0.1
 
-# A longer grid results from a wrong step or range, and would not fit in memory.
+# Largest number of offsets. A longer grid is the result of a wrong step or range, and would not fit in memory.
 MAXIMUM_OFFSETS = 10_000_000
 
-# Larger levels [dB] count as this one.
+# Larger levels [dB] are limited to this value.
 _LARGEST_DB = 1e150
 
-# Distances that differ by less than this share of a step are ties (0.15 lies between 0.1 and 0.2).
+# Distances that differ by less than this share of a step are equal (0.15 is exactly between 0.1 and 0.2).
 _TIE = 1e-9
 
 
@@ -45,7 +45,7 @@ class OffsetFit:
     n : int
         Number of pairs with both sides finite.
     at_edge : bool
-        True if the optimum is the first or last offset of the range: the true offset can be outside.
+        True if the optimum is the first or last offset of the range, so that the true offset may be outside.
     """
 
     offset_db: float
@@ -58,12 +58,12 @@ _NO_FIT = OffsetFit(float("nan"), float("nan"), 0, False)
 
 
 def offset_grid(step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB) -> FloatArray:
-    """Return the offsets to try [dB]: the multiples of ``step_db`` inside ``span_db``, each correctly rounded.
+    """Return the offsets to try [dB]: all multiples of ``step_db`` within ``span_db``, correctly rounded.
 
     Raises
     ------
     ValueError
-        If the step is not positive or no multiple lies inside the span.
+        If the step is not positive, or no multiple is within the span.
 
     Examples
     --------
@@ -81,14 +81,14 @@ def offset_grid(step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB
         raise ValueError(f"no multiple of {step_db} dB lies between {low} and {high} dB")
     count = np.arange(first, last + 1, dtype=np.float64)
     per_db = 1.0 / step_db
-    # 3 / 10 is 0.3; 3 * 0.1 is not
+    # divide, because 3 / 10 is exactly 0.3, and 3 * 0.1 is not
     integral = abs(per_db - round(per_db)) < 1e-9 * per_db and round(per_db) >= 1
     return count / round(per_db) if integral else count * step_db
 
 
 def nearest_offset(grid_db: FloatArray, target_db: float, step_db: float = STEP_DB) -> int:
-    """Return the index of the offset nearest to ``target_db``. A tie goes to the offset nearer zero."""
-    # clip the target to the grid: in float64, 1e30 is equally far from all offsets
+    """Return the index of the offset nearest to ``target_db``. Of two equally near offsets, return that nearer zero."""
+    # clip the target to the grid, because in float64 all offsets are equally far from 1e30
     distance = np.abs(grid_db - np.clip(target_db, grid_db[0], grid_db[-1]))
     near = np.flatnonzero(distance <= distance.min() + _TIE * step_db)
     return int(near[np.argmin(np.abs(grid_db[near]))])
@@ -96,15 +96,15 @@ def nearest_offset(grid_db: FloatArray, target_db: float, step_db: float = STEP_
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moments:
-    """The number of pairs of a sequence, and mean [dB] and variance [dB^2] of simulated minus measured."""
+    """The number of pairs of a sequence, with mean [dB] and variance [dB^2] of simulated minus measured."""
 
     n: int
     mean_db: float
     variance_db2: float
 
     def rmse_db(self, offset_db: FloatArray) -> FloatArray:
-        """Return the RMSE at offsets [dB], of their shape: RMSE^2(o) = variance + (mean - o)^2."""
-        # without squaring a difference of 1e200
+        """Return the RMSE for each offset [dB]: RMSE^2(o) = variance + (mean - o)^2."""
+        # hypot, because squaring a difference of 1e200 would overflow
         return np.asarray(np.hypot(np.sqrt(self.variance_db2), self.mean_db - offset_db))
 
     def fit_at(self, grid_db: FloatArray, best: int) -> OffsetFit:
@@ -127,7 +127,7 @@ def difference_moments(measured_db: ArrayLike, simulated_db: ArrayLike) -> Momen
     finite = np.isfinite(measured) & np.isfinite(simulated)
     if not finite.any():
         return Moments(n=0, mean_db=float("nan"), variance_db2=float("nan"))
-    # sums and squares of +-1e308 would overflow: no level is near it
+    # clip, because sums and squares of +-1e308 would overflow; no real level is that large
     first, second = (np.clip(side[finite], -_LARGEST_DB, _LARGEST_DB) for side in (measured, simulated))
     values = second - first
     return Moments(n=len(values), mean_db=float(values.mean()), variance_db2=float(values.var()))
@@ -145,16 +145,16 @@ def grid_offset(
     Parameters
     ----------
     measured_db, simulated_db : array_like, same shape
-        Levels [dB]. Pairs with a NaN (or an infinity: no power) on either side do not count.
+        Levels [dB]. Pairs with a NaN or an infinity (no power) on either side are ignored.
     step_db : float
-        Grid step [dB]; the offsets are integers over ``1 / step_db``.
+        Grid step [dB]. Offsets are integers divided by ``1 / step_db``.
     span_db : (low, high)
         First and last offset [dB].
 
     Returns
     -------
     OffsetFit
-        The offset is added to the measurement; ties go to the offset nearer zero.
+        The best offset, to be added to the measurement. Of two equally good offsets, it is the one nearer zero.
 
     Raises
     ------
@@ -163,8 +163,8 @@ def grid_offset(
 
     Notes
     -----
-    The best offset is the mean difference, rounded to the grid (:meth:`Moments.rmse_db`). Sums of squares of offset
-    levels would lose the digits that decide a tie. Source: arXiv 2502.10324, section V.
+    The best offset is the mean difference, rounded to the grid (:meth:`Moments.rmse_db`). Sums of squares of shifted
+    levels would not be accurate enough to decide between two equal offsets. Source: arXiv 2502.10324, section V.
 
     Examples
     --------
@@ -195,19 +195,19 @@ def pooled_moments(
     moments : mapping of (flight, tower, channel) to Moments
         Moments of all sequences.
     per : {"link", "tower", "channel", "flight", "all"}
-        Which sequences share an offset.
+        Group of sequences that share an offset.
     span_db : (float, float)
         Search range [dB].
 
     Returns
     -------
     dict
-        Per (flight, tower, channel): the shared offset with the RMSE and the number of pairs of that sequence alone.
+        By (flight, tower, channel): the shared offset, with RMSE and number of pairs of that sequence.
 
     Notes
     -----
-    The best shared offset is the mean difference over all pairs, rounded to the grid and limited to its range.
-    RMSE^2(o) = variance + (mean - o)^2 of each sequence.
+    The best shared offset is the mean difference over all pairs, rounded to the grid and limited to its range. For each
+    sequence, RMSE^2(o) = variance + (mean - o)^2.
     """
     axes, grid = _GROUP[per], offset_grid(span_db=span_db)
     groups: dict[Hashable, list[tuple[str, str, str]]] = {}
@@ -220,7 +220,7 @@ def pooled_moments(
             fits |= dict.fromkeys(members, _NO_FIT)
             continue
         total = sum(item.n for item in filled)
-        # sum about the first mean: sums of levels near -90 dB would lose the digits that decide a tie
+        # sum relative to the first mean, because sums of levels near -90 dB would be less accurate
         mean = filled[0].mean_db + sum((item.mean_db - filled[0].mean_db) * (item.n / total) for item in filled)
         best = nearest_offset(grid, mean)
         fits |= {key: moments[key].fit_at(grid, best) for key in members}

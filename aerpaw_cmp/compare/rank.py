@@ -1,7 +1,7 @@
 """The rank of a channel, and the comparison of two sequences of ranks.
 
-``rank`` counts the singular values above ``sigma_1 / K`` (strictly). Rank 0 means that there is no channel. Measured RI
-is a float, NaN where the modem reported no CSI, and never 0.
+The rank is the number of singular values strictly above ``sigma_1 / K``. Rank 0 means that there is no channel. The
+measured RI is a float. It is NaN where the modem reported no CSI, and never 0.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from .statistics import (
     share_interval,
 )
 
-# Ranks of the histograms: 1 to 4 (RI of the AERPAW modems).
+# Largest rank in histograms. The modems of AERPAW report RI 1 to 4.
 MAX_RANK = 4
 
-# Matrix entries per SVD batch: bounds memory.
+# Number of matrix entries per SVD batch, which limits the memory.
 _CHUNK = 1 << 20
 
 
@@ -45,7 +45,7 @@ def singular_values(h: ArrayLike) -> FloatArray:
     Returns
     -------
     ndarray, (..., min(n_rx, n_tx))
-        Descending. Zeros for an all-zero matrix, NaN if an entry is not finite.
+        Singular values in descending order. Zeros for a matrix of zeros, NaN if an entry is not finite.
 
     Examples
     --------
@@ -70,8 +70,8 @@ def singular_values(h: ArrayLike) -> FloatArray:
 def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
     """Return the ranks of singular-value profiles (..., m), as in :func:`channel_rank`. A NaN profile has rank 0.
 
-    Singular values that tie with ``sigma_1 / k`` do not count (strict). SVD noise is a few ulp of ``sigma_1``, so a
-    tie is decided with a margin of ``8 eps sigma_1``: 1 and 0.1 at K = 10 is rank 1 for any rounding.
+    Singular values equal to ``sigma_1 / k`` do not count. Rounding errors of an SVD are a few ulp of ``sigma_1``, so
+    values within ``8 eps sigma_1`` count as equal. Values 1 and 0.1 at K = 10 therefore always have rank 1.
 
     Source: arXiv 2502.10324 eq. 3.
     """
@@ -83,7 +83,7 @@ def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
     largest = values.max(axis=-1, keepdims=True)
     margin = 8.0 * np.finfo(np.float64).eps
     above = values > largest * (1.0 / k + margin)
-    # the largest one counts by definition, also at K = 1 where it ties with itself only by rounding
+    # the largest value counts by definition if it is positive
     alive = (largest[..., 0] > 0) & np.isfinite(largest[..., 0])
     rank = above.sum(axis=-1)
     if k > 1:
@@ -93,21 +93,21 @@ def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
 
 
 def channel_rank(h: ArrayLike, k: float) -> IntArray:
-    """Count the singular values above ``sigma_1 / k`` (strict) of every channel matrix.
+    """Return the rank of every channel matrix: the number of singular values strictly above ``sigma_1 / k``.
 
     Source: arXiv 2502.10324 eq. 3.
 
     Parameters
     ----------
     h : array_like, complex, (..., n_rx, n_tx)
-        Channel matrices; any scale.
+        Channel matrices, in any scale.
     k : float
         Ratio of singular values, >= 1 (the paper's K = 10, 100, 1000; its "10, 20, 30 dB").
 
     Returns
     -------
     ndarray of int, (...)
-        0 = no channel (all entries zero, or an entry is NaN or infinite: no path reached the receiver).
+        Ranks. 0 means no channel: all entries are zero, or an entry is NaN or infinite.
 
     Raises
     ------
@@ -133,12 +133,12 @@ def _ranks(rank: ArrayLike) -> FloatArray:
 
 
 def histogram(rank: ArrayLike) -> FloatArray:
-    """Return the shares of rank 1 to :data:`MAX_RANK`, without 0 (no channel) and NaN (no CSI).
+    """Return the shares of rank 1 to :data:`MAX_RANK`, ignoring 0 (no channel) and NaN (no CSI).
 
     Parameters
     ----------
     rank : array_like
-        Ranks, any shape. Higher ranks are an error.
+        Ranks, in any shape. Ranks above :data:`MAX_RANK` are an error.
 
     Returns
     -------
@@ -164,7 +164,7 @@ def one_hot(rank: IntArray | FloatArray, ranks: int = MAX_RANK) -> FloatArray:
 
 
 def agreement(measured: ArrayLike, simulated: ArrayLike) -> float:
-    """Return the share of equal ranks over poses at which both exist (not NaN, not 0), NaN if there are none.
+    """Return the share of equal ranks among poses with both ranks (not NaN, not 0), or NaN without such poses.
 
     Examples
     --------
@@ -187,7 +187,7 @@ def total_variation(first: ArrayLike, second: ArrayLike) -> float:
 
 
 def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
-    """Return the Wasserstein-1 distance of two rank histograms [ranks]: how far shares must move, in ranks.
+    """Return the Wasserstein-1 distance of two rank histograms: by how many ranks shares must move on average.
 
     Examples
     --------
@@ -195,14 +195,14 @@ def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
     3.0
     """
     step = np.cumsum(unmasked(first) - unmasked(second))
-    # the last step is the sum of all shares, which is 0 except for rounding
+    # omit the last step, which is 0 except for rounding
     return float(np.abs(step[:-1]).sum())
 
 
 def _both(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray]:
     """Return both ranks as integers, 0 if missing."""
     ranks = _ranks(measured), _ranks(simulated)
-    # no report (NaN) compares as False, and becomes 0
+    # comparisons with NaN (no report) are False, so NaN becomes 0
     first, second = (np.where(rank >= 1, rank, 0).astype(np.int64) for rank in ranks)
     return first, second
 
@@ -215,12 +215,12 @@ def _pairs(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArra
 
 
 def confusion_matrix(measured: ArrayLike, simulated: ArrayLike) -> IntArray:
-    """Count the pairs of measured and simulated rank, each 0 to :data:`MAX_RANK`, with 0 for a missing rank.
+    """Return the confusion matrix of measured and simulated ranks, 0 to :data:`MAX_RANK`, where 0 means missing.
 
     Returns
     -------
     ndarray of int, (max_rank + 1, max_rank + 1)
-        Row: measured (0: NaN, no CSI). Column: simulated (0: no channel). All samples are counted.
+        Number of samples. Rows are measured ranks (0: no CSI), columns simulated ranks (0: no channel).
     """
     row, column = _both(measured, simulated)
     size = MAX_RANK + 1
@@ -230,10 +230,10 @@ def confusion_matrix(measured: ArrayLike, simulated: ArrayLike) -> IntArray:
 
 
 def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
-    """Return Cohen's kappa: agreement beyond that of the two histograms by chance.
+    """Return Cohen's kappa: the agreement beyond chance, given both histograms.
 
     Kappa is 1 if the ranks are always equal, and 0 if they agree as often as by chance. It is NaN without a pair, and
-    for two equal constants, which show nothing. Cohen (1960), doi:10.1177/001316446002000104.
+    for two equal constants. Cohen (1960), doi:10.1177/001316446002000104.
 
     Examples
     --------
@@ -246,18 +246,19 @@ def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
     size = int(max(measured_rank.max(), simulated_rank.max())) + 1
     shares = [np.bincount(rank, minlength=size) / len(rank) for rank in (measured_rank, simulated_rank)]
     observed, chance = float(np.mean(measured_rank == simulated_rank)), float(shares[0] @ shares[1])
-    # two equal constants: 0 / 0
+    # kappa of two equal constants is 0 / 0
     return (observed - chance) / (1.0 - chance) if chance < 1.0 - 1e-12 else float("nan")
 
 
-# Number of parts of a flight that are swapped: each is much longer than most correlations, and there are 2048 swaps.
+# Number of parts of a flight that are swapped. Parts are much longer than most correlations, and there are 2048 swaps.
 _PARTS = 12
 
 
 def histogram_test(measured: ArrayLike, simulated: ArrayLike) -> float:
-    """Return the p-value of the total variation between both histograms, by swapping parts of the flight.
+    """Return the p-value of the total variation between both histograms, from swaps of parts of the flight.
 
-    If measured and simulated ranks came from one distribution, swapping them in a part would change nothing.
+    If measured and simulated ranks had the same distribution, swapping them in a part of the flight would have no
+    effect on average.
 
     Parameters
     ----------
@@ -275,10 +276,10 @@ def histogram_test(measured: ArrayLike, simulated: ArrayLike) -> float:
     # swapping a part changes the sign of its difference
     starts = np.unique(np.arange(_PARTS) * len(measured_rank) // _PARTS)
     sums = np.add.reduceat(one_hot(measured_rank) - one_hot(simulated_rank), starts, axis=0)
-    # swapping the other parts instead has the same distance: the last part is never swapped
+    # never swap the last part, because swapping all other parts instead has the same result
     signs = 1 - 2 * ((np.arange(2 ** (len(sums) - 1))[:, None] >> np.arange(len(sums))) & 1)
     swapped = np.abs(signs @ sums).sum(axis=1)
-    # the tolerance allows for rounding: swaps with an equal result sum in another order
+    # allow for rounding, because swaps with equal results are summed in another order
     return float(np.mean(swapped >= np.abs(sums.sum(axis=0)).sum() - 1e-9))
 
 
@@ -302,7 +303,7 @@ class KCurve:
     k, agreement : (m,)
         Values of K, and the agreement of simulated with measured ranks at each.
     best_k : float
-        K with the best agreement: the middle, on the log scale, of the first run of best K. NaN without a pair.
+        K with the best agreement. Of several, it is the middle (on a log scale) of the first run. NaN without a pair.
     best_k_ci95 : (low, high)
         Range of K whose agreement is not significantly worse on the same samples (95 %), one grid step wider on either
         side.
@@ -337,14 +338,14 @@ def k_curve(
     """
     grid = k_grid() if k is None else unmasked(k)
     ri, profile = _ranks(measured), unmasked(sigma)
-    # whether there is a channel does not depend on K
+    # any K, because it does not matter for the existence of a channel
     paired = (ri >= 1) & (rank_from_singular_values(profile, 10.0) >= 1)
     if not paired.any():
         return KCurve(k=grid, agreement=np.full(len(grid), np.nan))
-    # one byte per sample and K: there are 118 K for each sample of a long flight
+    # store one byte per sample and K, because there are 118 values of K
     equal = np.stack([rank_from_singular_values(profile[paired], value) == ri[paired] for value in grid], axis=1)
     agree, place = equal.mean(axis=0), None if place_m is None else place_m[paired]
-    # the middle, on the logarithmic scale on which K is tried, of the first run of best K
+    # middle of the first run of best K, on the logarithmic scale of the grid
     first = int(np.argmax(agree))
     run = np.flatnonzero(np.append(agree[first:], -1.0) < agree[first] - 1e-12)[0]
     ends = NO_INTERVAL
@@ -368,8 +369,8 @@ class Staleness:
     hold_s : float
         Median time for which a report was held [s]. NaN for fewer than two reports.
     verdict : str
-        ``"fresh"`` (at most every tenth row repeats), ``"held"``, ``"constant"`` (one value throughout: staleness
-        cannot be seen) or ``"no rank"``.
+        ``"fresh"`` (at most every tenth row is a repetition), ``"held"``, ``"constant"`` (there is only one value, so
+        repetitions cannot be detected) or ``"no rank"``.
     """
 
     fresh: BoolArray
@@ -388,9 +389,9 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, further: Mapping[str, Arra
     rank : array_like, (n,)
         RI, NaN if missing.
     further : mapping of str to array_like (n,), optional
-        Further numbers of the same report (RSRP, SINR, CQI). A row that repeats **all** of them is a repetition,
-        because RSRP and SINR hardly ever repeat by chance. Without these numbers the changes of RI decide: if they
-        occur at multiples of a period of several rows, there is one report per period.
+        Other numbers of the same report (RSRP, SINR, CQI). A row that repeats **all** of them is a repetition, because
+        RSRP and SINR hardly ever repeat by chance. Without such numbers, the changes of RI are used: if they occur at
+        multiples of a period of several rows, there is one report per period.
     """
     time, ri = unmasked(time_s), _ranks(rank)
     known = np.isfinite(ri)
@@ -398,7 +399,7 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, further: Mapping[str, Arra
         return Staleness(np.zeros(len(ri), dtype=bool), 0, float("nan"), "no rank")
     columns = [ri, *(np.asarray(v, dtype=np.float64) for v in (further or {}).values())]
     if len(columns) > 1:
-        # a row without further numbers cannot show a repetition
+        # without other numbers, a row cannot be recognised as a repetition
         has_values = np.any([np.isfinite(c) for c in columns[1:]], axis=0)
         fresh = known & (_changes(columns) | ~has_values)
     else:
@@ -411,7 +412,7 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, further: Mapping[str, Arra
 
 
 def _changes(columns: Sequence[FloatArray]) -> BoolArray:
-    """Find the rows that differ from the previous row in any column (NaN equals NaN). The first row counts."""
+    """Return a mask of the first row, and of rows that differ from the row before in any column (NaN equals NaN)."""
     changed = np.zeros(len(columns[0]), dtype=bool)
     changed[:1] = True
     for c in columns:
@@ -420,12 +421,12 @@ def _changes(columns: Sequence[FloatArray]) -> BoolArray:
 
 
 def _period_starts(ri: FloatArray) -> BoolArray:
-    """Return the possible first rows of reports: one per period if RI changes at multiples of a period, else all."""
+    """Return a mask of first rows of reports: one per period if RI changes at multiples of a period, else all rows."""
     change = np.flatnonzero(_changes([ri]))[1:]
     if len(change) < 8:  # too few changes to distinguish a period from chance
         return np.ones(len(ri), dtype=bool)
     periods = np.arange(2, max(3, len(ri) // 8))
-    # the largest period for which at least 95 % of the changes fall on one phase
+    # use the largest period for which at least 95 % of the changes have the same phase
     for period in periods[::-1]:
         phase = np.bincount(change % period, minlength=period)
         if phase.max() >= 0.95 * len(change):
@@ -447,9 +448,9 @@ class RankFit:
     out_of_coverage : int
         Number of poses without a channel.
     agreement, kappa, total_variation, wasserstein : float
-        Agreement with and distance from the measured ranks, each with a 95 % interval.
+        Agreement with the measured ranks and distances from them, each with a 95 % interval.
     confusion : (5, 5) int
-        Rows measured, columns simulated, rank 0 (missing) first.
+        Confusion matrix. Rows are measured, columns simulated ranks, starting with rank 0 (missing).
     p_histogram : float
         The p-value of :func:`histogram_test`.
     """
@@ -476,7 +477,7 @@ class RankComparison:
     Parameters
     ----------
     n, n_effective : int, float
-        Number of measured ranks, and the number of independent ranks that fix the mean equally well.
+        Number of measured ranks, and number of independent ranks whose mean would be equally accurate.
     n_no_csi : int
         Number of rows without RI.
     histogram : (4,)
@@ -513,7 +514,7 @@ def compare_rank(
     Parameters
     ----------
     measured : array_like, (n,)
-        RI from 1, in time order, NaN if missing. 0 is refused: it means "no CSI" in every source.
+        RI in time order, counted from 1, NaN if missing. A 0 is refused, because it means "no CSI" in all logs.
     h : array_like, complex, (n, n_rx, n_tx)
         Simulated channels at the same poses, all zero without a path.
     ks : sequence of float
@@ -523,7 +524,7 @@ def compare_rank(
     sinr_db : array_like, (n,), optional
         Reported SINR [dB], used to detect repeated reports.
     place_m : (n, 3), optional
-        East, north and up, NaN if unknown [m]: intervals then consider correlation over place, too.
+        East, north and up [m], NaN if unknown. With positions, intervals also allow for correlation over position.
 
     Returns
     -------
@@ -606,9 +607,9 @@ def compare_ranks(measured: ArrayLike, simulated: ArrayLike, place_m: FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommonestRank:
-    """The forecast without a model: always the rank that was reported most often.
+    """The forecast without a model, which is always the rank that was reported most often.
 
-    A model is useful if its agreement is larger. The kappa of this forecast is 0. ``rank`` is 0 if there is no report.
+    A useful model has a larger agreement. The kappa of this forecast is 0. ``rank`` is 0 if there is no report.
     """
 
     rank: int
@@ -617,7 +618,7 @@ class CommonestRank:
 
 
 def commonest_rank(measured: ArrayLike, place_m: FloatArray | None = None) -> CommonestRank:
-    """Return the most frequent of the measured ranks (n,), NaN if missing, and its share.
+    """Return the most frequent of the measured ranks (n,) and its share. NaN is ignored.
 
     Positions ``place_m`` (n, 3) [m] are used as by :func:`compare_rank`.
 
@@ -639,7 +640,7 @@ def commonest_rank(measured: ArrayLike, place_m: FloatArray | None = None) -> Co
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankRepeat:
-    """The agreement of two passes over the same positions, which no model can be expected to exceed.
+    """The agreement of two passes over the same positions. No model can be expected to exceed it.
 
     Parameters
     ----------
@@ -665,7 +666,7 @@ def repeat_rank(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> 
     first, second : Visit
         Visits whose values are ranks. 0 and NaN are ignored.
     radius_m : float
-        A sample pairs with the nearest one of the other pass within this distance.
+        A sample is paired with the nearest sample of the other pass within this distance.
 
     Returns
     -------
@@ -689,7 +690,7 @@ def _pair_intervals(
     if len(a) < FEWEST:
         return [NO_INTERVAL] * 4
     equal, *influences = _influences((a == b).astype(np.float64), one_hot(a), one_hot(b))
-    # agreement is a share: at 0 and 1, where no sample differs, Wilson's interval still has a width
+    # Wilson's interval for the agreement, because it has a width even at shares of 0 and 1
     return [share_interval(equal, place_m, a.astype(np.float64))] + [
         influence_interval(value, influence, place_m, bounds)
         for value, influence, bounds in zip(
@@ -699,10 +700,10 @@ def _pair_intervals(
 
 
 def _influences(equal: FloatArray, first: FloatArray, second: FloatArray) -> list[FloatArray]:
-    """Return what a pose adds to agreement, kappa, total variation and Wasserstein distance (n,), to first order."""
+    """Return each pose's first-order contribution (n,) to agreement, kappa, total variation, and Wasserstein distance."""
     p, q = first.mean(axis=0), second.mean(axis=0)
     by_chance, beyond_chance = first @ q + second @ p, max(1.0 - float(p @ q), 1e-12)
-    # the slope of an absolute value is its sign
+    # the derivative of an absolute value is the sign
     apart = np.sign(np.cumsum(p - q))
     return [
         equal,
@@ -713,5 +714,5 @@ def _influences(equal: FloatArray, first: FloatArray, second: FloatArray) -> lis
 
 
 def kappa_influence(measured: IntArray, simulated: IntArray) -> FloatArray:
-    """Return what each pose adds to kappa (n,), to first order, of paired ranks (n,) from 1 to ``MAX_RANK``."""
+    """Return the first-order contribution (n,) of each pose to kappa, for paired ranks (n,) from 1 to ``MAX_RANK``."""
     return _influences((measured == simulated).astype(np.float64), one_hot(measured), one_hot(simulated))[1]

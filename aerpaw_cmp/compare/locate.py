@@ -158,7 +158,7 @@ _POSSIBLE = 8.0
 # The likeliest places are divided by three to the east and to the north.
 _MOST_REFINED = 100
 
-# Prior standard deviation of the unknown level at 100 m.
+# Prior standard deviation of the level at 100 m, which is unknown.
 _FREE_DB = 100.0
 
 # Largest number of Newton steps of the Laplace approximation, and change [dB] at which they end.

@@ -700,7 +700,7 @@ def _pair_intervals(
 
 
 def _influences(equal: FloatArray, first: FloatArray, second: FloatArray) -> list[FloatArray]:
-    """Return each pose's first-order contribution (n,) to agreement, kappa, total variation, and Wasserstein distance."""
+    """Return each pose's first-order effect (n,) on agreement, kappa, total variation and Wasserstein distance."""
     p, q = first.mean(axis=0), second.mean(axis=0)
     by_chance, beyond_chance = first @ q + second @ p, max(1.0 - float(p @ q), 1e-12)
     # the derivative of an absolute value is the sign

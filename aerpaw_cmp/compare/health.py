@@ -1,7 +1,7 @@
-"""Health of a receiver: the errors of held-out flights, and the test of a later flight for a step of the level.
+"""Health of a receiver: usual errors on held-out flights, and tests of a later flight for a changed level.
 
-Means of the error over 4 s have an offset, a correlated and a white part. The sizes of both parts come from flights
-that were predicted without being learned from: sizes that are fitted to a faulty flight would include its fault.
+Means of the error over 4 s consist of an offset, a correlated part and a white part. The sizes of both parts come from
+held-out flights. If they were fitted to a faulty flight, they would include its fault.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from ..common.units import FloatArray
 from ..site.learned import LearnedHealth, LearnedSeries
 from .level import floored_fit
 
-# Means over this time are judged [s]; over more where a flight has more than the largest number of them.
+# Averaging time [s], and largest number of means. Longer flights are averaged over longer times.
 BIN_S, _MOST_BINS = 4.0, 1000
-# Pairs of means up to this time and distance from each other determine the correlation.
+# Largest time and distance between two means from which the correlation is estimated.
 _LONGEST_S, _LONGEST_M = 100.0, 150.0
-# Standard deviation of the RMSE over flights as a share of the RMSE, and of the difference of two channels [dB], before
-# any flight was seen. Each counts as two flights. Six held-out series of one campaign have 8 % and 0.3 dB.
+# Prior standard deviations over flights: of the RMSE as a share of the RMSE, and of the difference of two channels
+# [dB]. Each counts as two flights. Six held-out series of one campaign have 8 % and 0.3 dB.
 _RMSE_SHARE, _DIFFERENCE_SD_DB = 0.08, 1.0
 _LEAST_SD_DB = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOut:
-    """Errors of one flight on one channel, predicted without that flight.
+    """The errors of one flight on one channel, which was predicted without that flight.
 
     Parameters
     ----------
     time_s, place_m : (n,), (n, 3)
-        Instants in order [s] and positions of the UAV [m].
+        Ascending times [s], and positions of the UAV [m].
     measured_db, predicted_db : (n,)
-        Before any offset; NaN where there is none.
+        Levels before any offset; NaN if missing.
     floor_db : float
-        Both levels count as no lower than this [dB]; minus infinity without a floor.
+        Floor to which both levels are raised [dB]; minus infinity without a floor.
     locked : (n,), optional
-        1 in lock, 0 without, NaN unknown.
+        Receiver lock: 1 in lock, 0 without lock, NaN unknown.
     """
 
     time_s: FloatArray
@@ -51,7 +51,7 @@ class HeldOut:
 
     @property
     def error_db(self) -> FloatArray:
-        """Error (n,) with the floor on both sides [dB]."""
+        """Error (n,) after raising both levels to the floor [dB]."""
         if self.floor_db == -math.inf:
             return self.measured_db - self.predicted_db
         offset_db = floored_fit(self.measured_db, self.predicted_db, self.floor_db).offset_db
@@ -60,7 +60,7 @@ class HeldOut:
 
     @property
     def longest_run_s(self) -> float:
-        """Longest time in which all readings are equal [s]."""
+        """Longest time without any change of the readings [s]."""
         known = np.isfinite(self.measured_db)
         time_s = self.time_s[known]
         ends = np.flatnonzero(np.append(np.diff(self.measured_db[known]) != 0.0, True))
@@ -69,14 +69,14 @@ class HeldOut:
 
 
 def learned_health(flights: Sequence[HeldOut], differences_db: dict[str, list[float]]) -> LearnedHealth:
-    """Return the health of one channel from held-out flights.
+    """Return the usual errors of one channel, from held-out flights.
 
     Parameters
     ----------
     flights : sequence of HeldOut
         One or more flights.
     differences_db : dict of str to list of float
-        By other channel of the tower: the offset of this channel minus that of the other channel, per flight.
+        Offset of this channel minus that of another channel of the tower, per flight, by the name of the other channel.
     """
     errors_db = [f.error_db for f in flights]
     series = [binned(f.time_s, error_db) for f, error_db in zip(flights, errors_db, strict=True)]
@@ -108,35 +108,35 @@ def learned_health(flights: Sequence[HeldOut], differences_db: dict[str, list[fl
 
 
 def _sd(values: Sequence[float], prior: float) -> float:
-    """Return the standard deviation of values, with a guess that counts as two of them."""
+    """Return the standard deviation of values, with a prior that counts as two values."""
     spread = float(np.square(np.array(values) - np.mean(values)).sum())
     return math.sqrt((2.0 * prior**2 + spread) / (len(values) + 1.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Noise:
-    """Parts of the error in means over 4 s: SD and correlation time of the correlated part, SD of the white part."""
+    """The noise in 4-s means: SD and correlation time of the correlated part, and SD of the white part."""
 
     slow_sd_db: float
     correlation_s: float
     white_sd_db: float
 
     def whiten(self, time_s: FloatArray, columns: FloatArray) -> FloatArray:
-        """Return columns (n, k) in which the noise at instants (n,) is white, with unit variance."""
+        """Return columns (n, k), transformed so that the noise at times (n,) is white with unit variance."""
         apart_s = np.abs(time_s[:, None] - time_s[None])
         covariance = self.slow_sd_db**2 * np.exp(-apart_s / self.correlation_s)
         covariance[np.diag_indices(len(time_s))] += max(self.white_sd_db, _LEAST_SD_DB) ** 2
         return np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), columns))
 
     def square(self, time_s: FloatArray, error_db: FloatArray) -> float:
-        """Return the square of whitened errors (n,) about the best offset."""
+        """Return the sum of squares of whitened errors (n,) after the best offset."""
         white = self.whiten(time_s, np.column_stack([np.ones(len(time_s)), error_db]))
         unit = white[:, 0] / max(float(np.linalg.norm(white[:, 0])), 1e-12)
         return float(np.square(white[:, 1] - unit * (unit @ white[:, 1])).sum())
 
 
 def binned(time_s: FloatArray, error_db: FloatArray, width_s: float = BIN_S) -> tuple[FloatArray, FloatArray]:
-    """Return the means (m,) over bins of time, about their own mean, and the instants (m,) of the bins."""
+    """Return times (m,) and means (m,) of the error over bins of time, after subtracting the mean."""
     known = np.isfinite(error_db)
     time_s, error_db = time_s[known], error_db[known]
     if not len(time_s):
@@ -149,12 +149,12 @@ def binned(time_s: FloatArray, error_db: FloatArray, width_s: float = BIN_S) -> 
 
 
 def _interpolated(at: FloatArray, flight: HeldOut) -> FloatArray:
-    """Return the positions (m, 3) of the UAV at instants (m,)."""
+    """Return the positions (m, 3) of the UAV at times (m,)."""
     return np.column_stack([np.interp(at, flight.time_s, axis) for axis in flight.place_m.T])
 
 
 def _noise(series: Sequence[tuple[FloatArray, FloatArray]]) -> Noise:
-    """Return the noise of some flights (instants, errors)."""
+    """Return the noise of flights, each given by times and errors."""
     apart = [np.abs(time_s[:, None] - time_s[None]) for time_s, _ in series]
     errors = [error for _, error in series]
     variance, correlation_s = _decay(apart, errors, _LONGEST_S)
@@ -166,7 +166,7 @@ def _noise(series: Sequence[tuple[FloatArray, FloatArray]]) -> Noise:
 
 
 def _decay(apart: Sequence[FloatArray], errors: Sequence[FloatArray], longest: float) -> tuple[float, float]:
-    """Return variance and length of an exponential that fits the products of errors over their separations (n, n)."""
+    """Return variance and length of an exponential, fitted to products of errors over their separations (n, n)."""
     pairs = [np.triu(at < longest, 1) for at in apart]
     separation = np.concatenate([at[near] for at, near in zip(apart, pairs, strict=True)])
     product = np.concatenate([np.outer(e, e)[near] for e, near in zip(errors, pairs, strict=True)])
@@ -180,27 +180,27 @@ def _decay(apart: Sequence[FloatArray], errors: Sequence[FloatArray], longest: f
 
 # --- a later flight -------------------------------------------------------------------------------------------------
 
-# Chi-squared of a step of two channels that healthy flights exceed once in a thousand; more for each further channel.
-# Simulated healthy flights of 830 s: 95 % below 14 to 15, 99 % below 17 to 20.
+# Smallest chi-squared of a step on two channels, and addition per further channel. Healthy flights exceed it once in a
+# thousand. In simulated healthy flights of 830 s, 95 % are below 14 to 15, and 99 % below 17 to 20.
 _STEP_CHI2, _FURTHER_CHI2 = 25.0, 4.0
-# A step must be this much better than a change over these times or over the flight, as twice a log likelihood.
+# Twice the log likelihood of a step must exceed that of a slower change, over these times [s] or over the flight, by
+# this.
 _BEFORE_SLOWER, _SLOW_S = 5.0, (100.0, 200.0)
-# The step must reduce the variance of the errors by this share of its own variance.
+# A step must reduce the variance of the errors by at least this share of its own variance.
 _LEAST_TAKEN = 0.5
-# The mean square of the whitened error of healthy flights is at most 1.2 at LW1.
+# Largest mean square of the whitened error after a step. For healthy flights at LW1 it is at most 1.2.
 _MOST_SQUARE = 1.6
-# Least number of means before and after a step: a minute.
+# Smallest number of means before and after a step (one minute).
 _LEAST_EACH_SIDE = 15
-# The residual after a step must not show another step: twice the log likelihood that 99 % of simulated healthy flights
-# have.
+# Largest chi-squared of another step in the residual. 99 % of simulated healthy flights are below it.
 _MOST_LEFT_CHI2 = 18.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judged:
-    """Error of one channel of a later flight, measured minus predicted, with the learned antenna that predicted it.
+    """The error of one channel of a later flight, measured minus predicted, with the learned antenna of the prediction.
 
-    ``start_s`` is the instant at which ``time_s`` is 0, on a time scale that all channels of the flight share.
+    ``start_s`` is the time at which ``time_s`` is 0, on a time scale that is common to all channels of the flight.
     """
 
     name: str
@@ -213,7 +213,7 @@ class Judged:
 
     @property
     def health(self) -> LearnedHealth:
-        """Health of the channel, if its antenna has one."""
+        """Usual errors of the channel, which must be known for its antenna."""
         assert self.learned.health is not None
         return self.learned.health
 
@@ -224,13 +224,13 @@ class Judged:
         return Noise(slow_sd_db=h.slow_sd_db, correlation_s=h.correlation_s, white_sd_db=h.white_sd_db)
 
     def square(self, error_db: FloatArray) -> float:
-        """Return the square of the whitened means of errors (n,) about the best offset."""
+        """Return the sum of squares of the whitened means of errors (n,), after the best offset."""
         return self.noise.square(*binned(self.time_s, error_db))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """A step of the level: its instant [s], chi-squared over all channels, and its size by channel [dB]."""
+    """A step of the level: time [s], chi-squared over all channels, and size by channel [dB]."""
 
     at_s: float
     chi2: float
@@ -238,10 +238,10 @@ class Step:
 
 
 def step_chi2(time_s: FloatArray, error_db: FloatArray, *, noise: Noise) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return instants (m,), chi-squared (m,) and size (m,) [dB] of a step, by generalised least squares.
+    """Return times (m,), chi-squared (m,) and sizes (m,) [dB] of possible steps, by generalised least squares.
 
-    The last elements are slower changes, over 100 and 200 s about each instant and over the whole flight. They have the
-    instant NaN.
+    The last elements are slower changes, over 100 and 200 s around each time, and over the whole flight. Their time is
+    NaN.
 
     Notes
     -----
@@ -264,10 +264,10 @@ def step_chi2(time_s: FloatArray, error_db: FloatArray, *, noise: Noise) -> tupl
 
 
 def step_of(channels: Sequence[Judged]) -> Step | None:
-    """Return the step that all channels of a flight show together, or None if their errors are usual.
+    """Return the common step of all channels of a flight, or None if there is none.
 
-    A step must exceed what healthy flights show, must be likelier than a slower change, and must leave the error of a
-    healthy flight.
+    A step must be larger than steps in healthy flights and likelier than a slower change, and the error after
+    subtracting it must be that of a healthy flight.
     """
     series = [binned(c.time_s, c.error_db) for c in channels]
     least = _STEP_CHI2 + _FURTHER_CHI2 * max(len(channels) - 2, 0)
@@ -317,21 +317,22 @@ def _likeliest(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OddLevel:
-    """A channel whose level differs from that of held-out flights [dB], and the channels that show it in words."""
+    """A channel whose level differs from that of held-out flights [dB], and text that names the channels."""
 
     name: str
     where: str
     difference_db: float
 
 
-# An offset or a difference of offsets is odd from this number of standard deviations and decibels on.
+# An offset or a difference of offsets is unusual if it exceeds both this number of standard deviations and of decibels.
 _ODD_SD, _ODD_DB = 3.5, 4.0
 
 
 def level_of(channels: Sequence[Judged]) -> OddLevel | None:
-    """Return the channel whose offset, or its difference to another channel, differs most from the usual one.
+    """Return the channel whose offset, or difference from another channel, is most unusual. None if all are usual.
 
-    The difference of two channels varies less than the offset of each, which depends on the gain that the flight used.
+    The difference of two channels varies less than the offset of each, because offsets depend on the gain setting of
+    the flight.
     """
     off = [_excess(c) for c in channels]
     odd = []
@@ -354,7 +355,7 @@ def level_of(channels: Sequence[Judged]) -> OddLevel | None:
 
 
 def _excess(channel: Judged) -> tuple[float, float] | None:
-    """Return the offset above the usual one and the standard deviation of its mean over this flight [dB]."""
+    """Return the offset minus the usual offset, and its standard deviation on this flight [dB]."""
     level, noise = channel.learned.level, channel.noise
     known = np.isfinite(channel.error_db)
     if level is None or level.unit != channel.unit or not known.any():

@@ -1,4 +1,4 @@
-"""The metric card of a predicted level: the same numbers for this program, for others and for the baselines."""
+"""Metrics of a predicted level, computed in the same way for this program, other programs and baselines."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from .offset import grid_offset
 # Averaging window of the second error [s].
 WINDOW_S = 1.0
 
-# A level with a smaller standard deviation is constant, apart from rounding [dB].
+# A level with a smaller standard deviation [dB] counts as constant.
 _CONSTANT_DB = 1e-6
 
-# Search range of the one offset [dB]: wide enough for logs in dB re full scale against a path loss.
+# Search range of the offset [dB], wide enough to compare logs in dB re full scale with a path loss.
 _RANGE_DB = (-400.0, 400.0)
 
 
@@ -33,27 +33,28 @@ class Exceedance:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LevelCard:
-    """Scores of one predicted level over the samples that prediction and measurement share.
+    """The scores of one predicted level on the samples that both prediction and measurement have.
 
     Parameters
     ----------
     n : int
-        Samples with a measured and a predicted level.
+        Number of samples with a measured and a predicted level.
     bias_db, rmse_db : float, optional
-        Mean of measured minus predicted, and the RMSE, as predicted; None if the two have no common reference.
+        Mean of measured minus predicted and RMSE, without an offset. None if the levels have no common reference.
     offset_db, rmse_offset_db : float
-        The offset that is added to the measurement (on the 0.1 dB grid), and the RMSE after it. Both are fitted on the
+        Offset that is added to the measurement (on the 0.1 dB grid), and RMSE after this offset. It is fitted on the
         scored samples.
     rmse_1s_db : float
-        The same of means over 1 s.
+        RMSE of means over 1 s, after their own offset.
     correlation, slope : float
-        Pearson; decibels of the measurement per predicted decibel (least squares). NaN if the prediction is constant.
+        Pearson correlation, and slope of measured over predicted level (least squares). NaN if the prediction is
+        constant.
     crps_db, coverage_90 : float, optional
         Continuous ranked probability score and share inside the 90 % band; None without a band.
     exceedance : tuple of Exceedance
-        Share of samples above thresholds, as predicted where levels have a common reference, else after the offset.
+        Shares of samples above thresholds. If the levels have no common reference, the offset is applied first.
     outages_missed, outages_invented : int
-        Measured outages where a level was predicted; measured levels where none was predicted.
+        Number of outages where a level was predicted, and of levels where an outage was predicted.
     """
 
     n: int
@@ -80,11 +81,11 @@ class PredictedLevel:
     level_db : (n,)
         The predicted median.
     absolute : bool
-        The levels have the reference of the measurement: no offset is needed.
+        True if the levels have the reference of the measurement, so that no offset is needed.
     sd_db : (n,), optional
         Standard deviation of one sample.
     low_db, high_db : (n,), optional
-        Ends of the 90 % interval; by default those of the normal distribution of ``sd_db``.
+        Ends of the 90 % interval. By default, they follow from a normal distribution with ``sd_db``.
     """
 
     level_db: FloatArray
@@ -101,7 +102,7 @@ def level_card(
     thresholds_db: Sequence[float],
     scored: BoolArray | None = None,
 ) -> LevelCard:
-    """Return the card of a predicted level.
+    """Return the scores of a predicted level.
 
     Parameters
     ----------
@@ -113,7 +114,8 @@ def level_card(
     thresholds_db : sequence of float
         Measured levels whose exceedance is compared.
     scored : (n,) bool, optional
-        Samples that the prediction is about: a NaN in its level there predicts an outage. Default: those with a level.
+        Samples that the prediction covers. There, a predicted NaN means a predicted outage. By default, samples with a
+        predicted level.
 
     Returns
     -------
@@ -136,7 +138,7 @@ def level_card(
     covariance = float(np.mean((expected - expected.mean()) * (measured - measured.mean())))
     absolute = predicted.absolute
     crps, inside = _distribution(error, predicted, both) if absolute else (None, None)
-    # an outage on either side is below any threshold
+    # an outage counts as below any threshold
     theirs = np.where(reached, level - (0.0 if absolute else fit.offset_db), -np.inf)[scored]
     ours = np.where(heard, measured_db, -np.inf)[scored]
     return LevelCard(
@@ -162,7 +164,7 @@ def level_card(
 def _distribution(
     error_db: FloatArray, predicted: PredictedLevel, both: BoolArray
 ) -> tuple[float | None, float | None]:
-    """Return CRPS and coverage of the 90 % band as predicted. None for what is not stated."""
+    """Return CRPS and coverage of the predicted 90 % band. None if the prediction does not state them."""
     from scipy.special import ndtri
 
     level_db, low_db, high_db, crps = predicted.level_db[both], predicted.low_db, predicted.high_db, None
@@ -174,7 +176,7 @@ def _distribution(
     return crps, None if ends is None else float(np.mean((error_db >= ends[0]) & (error_db <= ends[1])))
 
 
-# The nose of a predicted point and that of a sample differ by less than this [deg].
+# Largest difference between the headings of a predicted point and a sample [deg].
 _TURNED_DEG = 45.0
 
 
@@ -195,7 +197,7 @@ def nearest_points(
         Headings of the nose at the samples.
     points_m : (points, 3)
     yaw_deg : (points,), optional
-        Headings that were predicted. Unless all points and any sample have one, headings do not count.
+        Headings of the predicted points. Headings are used only if all points and at least one sample have one.
     reach_m : float
         Largest distance of a near point.
 
@@ -220,12 +222,12 @@ def nearest_points(
     return index, known & (np.linalg.norm(apart[:, :3], axis=1) <= 1.0) & (np.linalg.norm(apart[:, 3:], axis=1) <= 1.0)
 
 
-# Share of the samples, and their least number, that mark the lowest level as a detection floor.
+# The lowest level is a detection floor if at least this share, and this number, of the samples have it.
 _FLOOR_SHARE, _FLOOR_COUNT = 0.01, 10
 
 
 def detection_floor_db(level_db: FloatArray) -> float | None:
-    """Return the lowest level [dB] if a receiver repeats it, because it is then its detection floor, else None."""
+    """Return the detection floor of a receiver [dB], which is its lowest level if that is repeated often, else None."""
     known = level_db[np.isfinite(level_db)]
     if not len(known) or np.ptp(known) == 0.0:
         return None

@@ -1,15 +1,14 @@
 """The verdicts on a flight, a campaign, a calibration, a prediction and a map.
 
-A verdict is an effect with a 95 % interval and a cause. It determines the first sentences of a page. Causes of the
-error of a flight are in :mod:`.causes`. A cause is named only if its interval excludes "no effect". If several causes
-are tested, a false one is named in at most :data:`_FALSE_ALARMS` of the cases.
+A verdict consists of an effect with a 95 % interval, and a cause. It determines the first sentences of a page. Causes
+of the error of a flight are in :mod:`.causes`. A cause is named only if its interval excludes "no effect". If several
+causes are tested, a false one is named in at most :data:`_FALSE_ALARMS` of the cases.
 
-The file also compares ray tracing with the best baseline over all channels of a flight. It computes offsets from the
+The module also compares ray tracing with the best baseline over all channels of a flight. It computes offsets from the
 other flights of a campaign, and finds the nights at which offsets of nodes step.
 
-Two reports of one flight are compared on their common samples, sample by sample, because their errors share the
-measurement and most of the model. The first report is subtracted from the second: a negative difference of an error
-means that the second is better.
+Two reports of one flight are compared sample by sample, because they have the same measurement and mostly the same
+model. Differences are second minus first report, so a negative difference of an error means that the second is better.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
     rows = [dict(panel.further.compared_with) for panel in panels]
     for name in dict.fromkeys(name for row in rows for name in row):
         members = [i for i, row in enumerate(rows) if name in row]
-        # a log that was copied to another channel counts once
+        # count copies of a log on several channels once
         measured = [panels[i].measured_db.tobytes() for i in members]
         for i, pair in zip(members, corrected([rows[i][name] for i in members], measured), strict=True):
             rows[i][name] = pair
@@ -59,7 +58,7 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 
 
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Return the channels with an offset and enough samples, without copies, and with a signal if any has one."""
+    """Return channels with an offset and enough samples, without copies and (if any has a signal) dead channels."""
     some = [p for p in without_copies(panels) if not p.score.at_edge]
     enough = [p for p in some if p.score.n >= FEWEST and math.isfinite(p.score.rmse_db)]
     return [panel for panel in enough if not is_dead(panel)] or enough
@@ -70,12 +69,12 @@ def without_copies(panels: Iterable[RssResult]) -> list[RssResult]:
     return list({panel.measured_db.tobytes(): panel for panel in reversed(list(panels))}.values())[::-1]
 
 
-# Fading makes a received level vary by more than this [dB], even at one position.
+# Because of fading, a received level varies by more than this [dB], even at one position.
 _DEAD_DB = 1.0
 
 
 def is_dead(panel: RssResult) -> bool:
-    """Check whether a channel has no signal: the middle 80 % of its level span less than 1 dB, and predictions more."""
+    """Check whether a channel has no signal: 80 % of its levels are within 1 dB, unlike the predictions."""
     known = panel.posed & np.isfinite(panel.measured_db) & np.isfinite(panel.simulated_dbm)
     if not known.any():
         return False
@@ -84,7 +83,7 @@ def is_dead(panel: RssResult) -> bool:
 
 
 def is_one_place(panels: Iterable[RssResult]) -> bool:
-    """Check whether no model predicts a change of 1 dB, as during a hover, so that all models fit like a constant."""
+    """Check whether no model predicts a change of 1 dB, as in a hover. Then all models fit like a constant."""
     every = [[panel.simulated_dbm, *(b.level_dbm for b in panel.baselines.values())] for panel in scored(panels)]
     levels = [level[np.isfinite(level)] for models in every for level in models if np.isfinite(level).any()]
     return bool(levels) and max(map(middle_span, levels)) < _DEAD_DB
@@ -107,7 +106,7 @@ def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
 
 
 def lock_lost(panel: RssResult) -> DetectionScore | None:
-    """Return the score of a receiver that lost its lock by its log, None for other receivers."""
+    """Return the detection score of a receiver whose log shows lost lock, or None for other receivers."""
     score = panel.further.detection
     return score if score is not None and score.locks else None
 
@@ -115,7 +114,7 @@ def lock_lost(panel: RssResult) -> DetectionScore | None:
 def flight_verdict(panels: Sequence[RssResult]) -> FlightVerdict | None:
     """Compare ray tracing with the baseline of the smallest error, over all scored channels at once.
 
-    All samples of a receiver that lost its lock count, with lower levels raised to its floor.
+    For a receiver that lost its lock, all samples are used, with lower levels raised to its floor.
     """
     panels = scored(panels)
     residuals = [_residuals(panel) for panel in panels]
@@ -198,7 +197,7 @@ def left_out_offsets(n: ArrayLike, mean_db: ArrayLike, *, span_db: tuple[float, 
     grid = offset_grid(span_db=span_db)
     result = np.full(len(count), np.nan)
     for i in np.flatnonzero(other_samples > 0):
-        # sum the others: the difference of two large sums would lose the digits of a short flight
+        # sum over the other flights, because a difference of two large sums would be inaccurate for a short flight
         mean_of_others = np.delete(total, i).sum() / other_samples[i]
         result[i] = grid[nearest_offset(grid, float(mean_of_others))]
     return result
@@ -256,7 +255,7 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
     n (1 - r) / (1 + r), because consecutive flights can correlate. r is the correlation of consecutive flights,
     corrected for its bias of -(1 + 3 r) / n (Kendall 1954, doi:10.2307/2332720); a negative r counts as 0.
     """
-    from scipy.special import stdtrit  # scipy.stats would load for 0.2 s what one quantile needs
+    from scipy.special import stdtrit  # importing scipy.stats would take 0.2 s for one quantile
 
     array = unmasked(values)
     array = array[np.isfinite(array)]
@@ -270,14 +269,14 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
     if n >= _MANY_FLIGHTS and change.any():
         r = float(change[1:] @ change[:-1] / (change @ change))
         r = float(np.clip(r + (1.0 + 3.0 * r) / n, 0.0, 1.0))
-        # at least the flights that an interval requires: with one, Student's t has no degree of freedom
+        # at least the number that an interval requires, because Student's t needs degrees of freedom
         independent = max(n * (1.0 - r) / (1.0 + r), FEWEST_FLIGHTS)
     reach = float(stdtrit(independent - 1.0, 0.975)) * float(array.std(ddof=1)) / independent**0.5
     return MeanOfFlights(n=n, mean=mean, low=mean - reach, high=mean + reach)
 
 
 def verdict_of(difference: MeanOfFlights) -> RankingVerdict:
-    """Check whether a setting is shown to be worse than the first."""
+    """Return the verdict whether a setting is significantly worse than the first."""
     if not np.isfinite(difference.low):
         return "no interval"
     return "worse" if difference.low > 0 else "not significant"
@@ -289,7 +288,7 @@ _FALSE_ALARMS = 0.02
 # Smallest number of flights of a campaign in which one flight can be reported as different.
 _FEWEST_TO_COMPARE = 5
 
-# An offset that differs by less [dB] changes no decision, even if it is significant.
+# Smaller differences of an offset [dB] are not reported, even if they are significant.
 LEAST_DB = 2.0
 
 NONE = "none"
@@ -347,7 +346,7 @@ def campaign_verdict(
     Notes
     -----
     Each candidate splits the flights in two, and is tested by a two-sample t test with pooled variance. For one flight
-    this is the test of the externally Studentised residual. The smallest chance is multiplied by the number of
+    this is the test of the externally Studentised residual. The smallest p-value is multiplied by the number of
     candidates (Bonferroni).
     """
     shifts = [shift for shift in _shifts(errors_db, offsets_db, order) if math.isfinite(shift[0])]
@@ -363,7 +362,7 @@ def _shifts(
     for i, chance, effect, ends in _each_alone(np.log([errors_db[name] for name in names])):
         low, high = np.exp(ends)
         ratio = Verdict(cause="outlying error", effect=math.exp(effect), interval=(low, high), where=names[i])
-        # a flight with a smaller error than the others is not a problem
+        # ignore flights with a smaller error than all others
         yield (chance if effect > 0.0 else math.nan), ratio
     about: dict[str, list[float]] = {}
     for link, of in offsets_db.items():
@@ -371,7 +370,7 @@ def _shifts(
         values = np.array([of[name] for name in flown_here])
         for name, value in zip(flown_here, values - values.mean() if len(flown_here) else values, strict=True):
             about.setdefault(name, []).append(float(value))
-        # at least two flights on either side: a single one is an outlying flight, not a step
+        # at least two flights on either side, because a single flight is an outlier and not a step
         for k in range(2, len(flown_here) - 1):
             chance, effect, ends = _split(values, np.arange(len(flown_here)) >= k)
             where = f"{link} from {flown_here[k]}"
@@ -388,7 +387,7 @@ def _each_alone(values: FloatArray) -> Iterator[tuple[int, float, float, Interva
 
 
 def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interval]:
-    """Return chance, difference of means (inside minus outside) and its 95 % interval, with pooled variance."""
+    """Return p-value, difference of means (inside minus outside) and its 95 % interval, with pooled variance."""
     from scipy.special import stdtr, stdtrit  # importing scipy.stats would take 0.2 s for two functions
 
     freedom, n = len(values) - 2, int(inside.sum())
@@ -397,7 +396,7 @@ def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interva
     within, without = values[inside], values[~inside]
     effect = float(within.mean() - without.mean())
     square = float(((within - within.mean()) ** 2).sum() + ((without - without.mean()) ** 2).sum()) / freedom
-    # the flights can be equal to the last digit, for example copies
+    # a lower limit, because flights can be exactly equal, for example copies
     error = math.sqrt(max(square, 1e-12) * (1.0 / n + 1.0 / (len(values) - n)))
     reach = float(stdtrit(freedom, 0.975)) * error
     return 2.0 * float(stdtr(freedom, -abs(effect) / error)), effect, (effect - reach, effect + reach)
@@ -490,7 +489,7 @@ def stated_errors(
     error_db, sd_db : (n,)
         Measured minus predicted, and the standard deviation stated for it, in time order [dB].
     common_db : float or (n,)
-        Part of that standard deviation that a whole flight can share (an offset) [dB].
+        Part of that standard deviation that is common to a flight (an offset) [dB].
     place_m : (n, 3), optional
         The same as in :func:`~aerpaw_cmp.compare.statistics.mean_draws`.
 

@@ -1,15 +1,16 @@
 """Intervals of correlated samples, and passes over the same positions.
 
-Neighbouring samples of a flight are correlated, and one flight hardly determines for how long. Intervals of a mean, a
-power and a ratio of powers therefore consider many correlations. The sequence is described by its slowest cosine terms
-(Mueller and Watson 2008, doi:10.1111/j.1468-0262.2008.00868.x): for a given correlation, they are normal with a known
-covariance. Correlations over time last from three times the flight to none. They are exponential, with and without
-white noise, or smooth (Matern 3/2). Correlations over place follow the track. Each counts by its likelihood and by a
-prior weight, which keeps the coverage of 95 % intervals from falling for any of them. The weights alone would make
-other intervals too wide, so the draws are also widened or narrowed by the correlations that the sequence shows. Weights
-and widening factors were found by simulation (``benchmarks/interval_weights.py``).
+Neighbouring samples of a flight are correlated, and a single flight hardly determines the correlation time. Intervals
+of a mean, a power and a ratio of powers therefore average over many possible correlations. The sequence is described by
+its slowest cosine terms (Mueller and Watson 2008, doi:10.1111/j.1468-0262.2008.00868.x): for a given correlation, they
+are normal with a known covariance. Correlation times range from zero to three times the flight. The correlation
+functions are exponential, with and without white noise, or smooth (Matern 3/2). Correlations over position follow the
+track. Each correlation is weighted by its likelihood and by a prior weight, chosen so that 95 % intervals have
+sufficient coverage for all of them. Because the weights alone would make some intervals too wide, the draws are also
+widened or narrowed, depending on the correlations that the sequence shows. Weights and widening factors were found by
+simulation (``benchmarks/interval_weights.py``).
 
-Statistics of ranks and of paired models are means of what each sample adds to them, and have the same intervals.
+Statistics of ranks and of paired models are means of contributions of the samples, so they have the same intervals.
 
 Passes over the same positions are compared for every pair of flights: 199 000 pairs for 200 flights with ten links. The
 positions of a flight are therefore put into one k-d tree, pairs whose boxes are apart are not searched, and
@@ -32,12 +33,12 @@ from numpy.typing import ArrayLike
 
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, Printed, unmasked, wrap_degrees
 
-# Number of cosine terms of a long sequence that determine its correlation. Faster terms count for the power alone.
-# Shorter sequences use the largest possible one of a few numbers, because each number has its own table.
+# Number of cosine terms that determine the correlation of a long sequence. Faster terms are used only for the power.
+# Shorter sequences use the largest possible of a few numbers, because each number needs its own table.
 TERMS = 48
 _FEWER = np.array([9, 12, 16, 24, 34, TERMS])
 
-# Number of samples below which there is no interval.
+# Smallest number of samples for an interval.
 FEWEST = 20
 
 # Length of the sequence divided by its correlation length (exp(-rate) is the correlation of the two ends).
@@ -46,13 +47,13 @@ RATES = np.geomspace(0.3, 500.0, 18)
 # Shares of white noise in the slowest fluctuations.
 WHITE_SHARES = (0.0, 2e-3, 3e-2)
 
-# White noise in the terms of a smooth correlation, which fall with the fourth power of their order.
+# White noise that is added to the terms of a smooth correlation, which fall with the fourth power of their order.
 _SMOOTH_FLOOR = 1e-7
 
 Kind = Literal["mean", "power", "ratio", "influence"]
 
 # Correlation lengths, divided by the root mean square distance of a track from its centre. Consecutive lengths have a
-# ratio of the root of 2: the square of the correlation of one length is that of half the length.
+# ratio of the root of 2, because the square of a correlation is the correlation with half its length.
 LENGTHS = 0.06 * 2.0 ** (0.5 * np.arange(12))
 
 # Shares of white noise or of fading that are mixed with each correlation over place. They refer to the power of the
@@ -61,24 +62,27 @@ PLACE_WHITE = 0.002 * 2.0 ** np.arange(9)
 PLACE_FADING = (0.1, 0.25, 0.5, 0.75)
 _FADING_RATE = 40.0
 
-# Weight of a correlation over place relative to the mean weight of one over time, and the length above which it falls
-# as 1 / length, by kind. The terms hardly distinguish such lengths, but the mean and the power of a test depend on
-# them. Found by simulation. Differences of squares are correlated over half of the errors' length.
+# By kind: weight of a correlation over position relative to the mean weight of a correlation over time, and length
+# above which the weight falls as 1 / length. The terms hardly distinguish such lengths, but the mean and the power of a
+# test depend on them. The values were found by simulation. Differences of squares have half the correlation length of
+# errors.
 _PLACE_WEIGHT = {"mean": (0.06, 1.0), "power": (0.06, 1.0), "ratio": (0.12, 0.2), "influence": (0.07, 1.0)}
 
 # Largest number of positions from which the correlations of a track are computed.
 _THINNED = 400
 
-# Share of samples without a position above which only time counts, and root mean square distance from the centre of
-# the track [m] below which only time counts. The logged positions of a hover are noise.
+# Only correlation over time is used if more than this share of samples has no position, or if the RMS distance from the
+# centre of the track is below this [m]: the logged positions of a hover are noise.
 _UNPLACED, _HOVER_M = 0.1, 15.0
 
-# Logarithms of the weights in tenths, by kind, form (rough with each white share, then smooth) and rate. Widening of
-# the draws in hundredths, by the weighted shares of the correlations and by the shares without weights.
+# File with logarithms of the weights in tenths, by kind, form (exponential with each white share, then smooth) and
+# rate, and with the widening of the draws in hundredths, per weighted share of each correlation and per unweighted
+# share.
 _TABLES = Path(__file__).with_name("memory_weights.json")
 
 # Factor of the upward standard deviation of the logarithm of the power relative to that of the fourth moment, by
-# simulation with Student's t of four degrees of freedom. Most sequences with heavy tails look calmer than the process.
+# simulation with Student's t of four degrees of freedom. Most sequences from a process with heavy tails contain fewer
+# large errors than the process.
 CALM = 1.8
 
 # Number of parts of a flight whose powers are compared, the multiple of the median power above which a part is loud,
@@ -86,8 +90,8 @@ CALM = 1.8
 # steady flights have two loud parts, or 4 % for 100 samples of Student's t with four degrees of freedom.
 _PARTS, _LOUD, _FEWEST_FOR_PARTS = 12, 4.0, 60
 
-# Smallest widening factor, at which the interval contains eight of ten draws. Without it, the factor could reach 0 for
-# an unusual mixture of correlations.
+# Smallest widening factor. With it, the interval contains 80 % of the draws. Without this limit, the factor could reach
+# 0 for an unusual mixture of correlations.
 _LEAST_STRETCH = 0.6
 
 # Draws come in pairs of opposite sign, so that swapping two models reverses an interval exactly.
@@ -96,7 +100,7 @@ _PAIRS = 2048
 
 @dataclass(frozen=True, slots=True)
 class Memories:
-    """The distributions of mean and cosine terms for m correlations, normal up to a common scale.
+    """The normal distributions of mean and cosine terms for m correlations, up to a common scale.
 
     ``whiten`` (m, terms, terms) makes the terms independent. ``log_det`` (m,) is the logarithm of its determinant.
     For known terms, ``slope`` (m, terms) and ``variance`` (m,) determine mean and variance of the mean of the sequence.
@@ -116,7 +120,7 @@ class Memories:
     def of(
         cls, covariances: FloatArray, beyond: float | FloatArray = 0.0, freedom: float | FloatArray = np.inf
     ) -> Memories:
-        """Return the record for covariances of mean and terms (m, terms + 1, terms + 1)."""
+        """Create the record from covariances (m, terms + 1, terms + 1) of mean and terms."""
         whiten = np.linalg.inv(np.linalg.cholesky(covariances[:, 1:, 1:]))
         cross = covariances[:, 0, 1:]
         slope = np.einsum("mij,mi->mj", whiten, np.einsum("mij,mj->mi", whiten, cross))
@@ -143,7 +147,7 @@ def memories(terms: int = TERMS) -> Memories:
 
 
 def place_memories(place_m: FloatArray, terms: int = TERMS) -> Memories | None:
-    """Compute the distributions for errors that are correlated over place.
+    """Return the distributions for errors that are correlated over position.
 
     Parameters
     ----------
@@ -155,8 +159,8 @@ def place_memories(place_m: FloatArray, terms: int = TERMS) -> Memories | None:
     Returns
     -------
     Memories or None
-        For each mixture of :data:`PLACE_WHITE` and :data:`PLACE_FADING`, all :data:`LENGTHS`. None if only time counts
-        (:func:`only_time`).
+        All :data:`LENGTHS` for each mixture of :data:`PLACE_WHITE` and :data:`PLACE_FADING`. None if only correlation
+        over time is used (:func:`only_time`).
 
     Notes
     -----
@@ -205,7 +209,7 @@ def _unit(covariance: FloatArray) -> FloatArray:
 
 
 def only_time(place_m: FloatArray | None) -> str:
-    """Return the reason why intervals consider correlation over time alone, empty if they consider place as well.
+    """Return the reason why intervals use only correlation over time, or an empty text if they also use position.
 
     Parameters
     ----------
@@ -253,8 +257,8 @@ def weights(kind: Kind) -> FloatArray:
 
 @cache
 def stretches(kind: Kind) -> FloatArray:
-    """Return the widening of the draws (2, m) per weighted share of each correlation, and per share without weights."""
-    if kind in ("ratio", "influence"):  # weights alone limit false verdicts to 5 %
+    """Return the widening of the draws (2, m): per weighted share of each correlation, and per unweighted share."""
+    if kind in ("ratio", "influence"):  # for these kinds, the weights are enough to limit false verdicts to 5 %
         return np.repeat([[1.0], [0.0]], len(weights(kind)), axis=1)
     return 0.01 * _table(f"{kind} stretch").reshape(2, -1)
 
@@ -269,7 +273,7 @@ class Terms:
 
 
 def cosine_terms(values: FloatArray) -> Terms:
-    """Return the cosine terms, scaled so that their squares add up to the mean square about the mean."""
+    """Return the cosine terms of a sequence, scaled so that their squares sum to its variance."""
     from scipy.fft import dct
 
     n = len(values)
@@ -283,14 +287,14 @@ def cosine_terms(values: FloatArray) -> Terms:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """The possible correlations of a sequence over time, then place, with weights (m,) and widening (2, m)."""
+    """The possible correlations of a sequence, over time, then over position, with weights (m,) and widening (2, m)."""
 
     parts: tuple[Memories, ...]
     weights: FloatArray
     stretches: FloatArray
 
     def joined(self, name: str) -> FloatArray:
-        """Return a column of the records over time and place."""
+        """Return a column of both records, over time and over position."""
         return np.concatenate([getattr(part, name) for part in self.parts])
 
 
@@ -313,7 +317,7 @@ def likelihoods(slow: FloatArray, parts: Sequence[Memories] = ()) -> tuple[Float
     square = np.concatenate([np.square(slow @ part.whiten.swapaxes(1, 2)).sum(axis=-1).T for part in parts], axis=-1)
     log_det = np.concatenate([part.log_det for part in parts])
     log = log_det - 0.5 * slow.shape[-1] * np.log(np.maximum(square, 1e-300))
-    # relative to the largest: likelihoods exceed the range of floats
+    # relative to the largest, because likelihoods exceed the range of floats
     return np.exp(log - log.max(axis=-1, keepdims=True)), square
 
 
@@ -336,7 +340,7 @@ def _picked(slow: FloatArray, known: Known) -> tuple[IntArray, FloatArray, float
     weighted = likelihood * known.weights
     running = np.cumsum(weighted)
     uniform, chi_squared, *_ = _random(len(slow))
-    # a uniform number near 1 can round to the sum
+    # limit the index, because a uniform number near 1 can round to the sum
     index = np.minimum(np.searchsorted(running, uniform * running[-1]), len(running) - 1)
     own, even = known.stretches
     stretch = float(weighted @ own / running[-1] + likelihood @ even / likelihood.sum())
@@ -346,10 +350,10 @@ def _picked(slow: FloatArray, known: Known) -> tuple[IntArray, FloatArray, float
 def _stretched(drawn: FloatArray, by: float) -> FloatArray:
     """Move draws away from their median, so that 2.5 % on each side are where the odds to the power ``by`` were."""
     tail = 1.0 / (1.0 + 39.0**by)  # 39 to 1 are the odds of 2.5 %
-    # quantiles in half the time of np.quantile
+    # interpolate directly, in half the time of np.quantile
     asked, ranks = (tail, 0.025, 0.5, 0.975, 1.0 - tail), np.linspace(0.0, 1.0, len(drawn))
     low, usual_low, middle, usual_high, high = np.interp(asked, ranks, np.sort(drawn))
-    # keep the order: the interval of a correlation uses pairs of draws of mean and power
+    # keep the order of the draws, because the interval of a correlation uses pairs of draws of mean and power
     below, above = (middle - low) / (middle - usual_low), (high - middle) / (usual_high - middle)
     return np.asarray(middle + (drawn - middle) * np.where(drawn < middle, below, above))
 
@@ -361,16 +365,16 @@ def memory_share(values: FloatArray) -> float:
 
 
 def mean_draws(values: FloatArray, kind: Kind = "mean", place_m: FloatArray | None = None) -> FloatArray:
-    """Draw the mean of the process minus the mean of the sequence.
+    """Return draws of the mean of the process minus the mean of the sequence.
 
     Parameters
     ----------
     values : (n,)
         In time order, at least :data:`FEWEST`.
     kind : {"mean", "ratio", "influence"}
-        Errors, differences of their squares, or what samples add to a statistic.
+        Kind of the values: errors, differences of their squares, or contributions of samples to a statistic.
     place_m : (n, 3), optional
-        East, north and up of each sample, NaN if unknown [m]. Correlation over place is then considered, too.
+        East, north and up of each sample [m], NaN if unknown. With positions, correlation over position is also used.
     """
     if np.ptp(values) == 0.0:
         return np.zeros(2 * _PAIRS)
@@ -386,20 +390,21 @@ def mean_draws(values: FloatArray, kind: Kind = "mean", place_m: FloatArray | No
 def heavy_tails(values: FloatArray) -> float:
     """Return the standard deviation of the logarithm of the mean square for heavy tails (see :data:`CALM`).
 
-    The innovations of a first-order autoregression show the tails, because a sample sums over many innovations.
+    The tails are estimated from the innovations of a first-order autoregression, because every sample is a sum over
+    many innovations.
     """
     away, n = values - values.mean(), len(values) - 1
     keep = min(float(away[1:] @ away[:-1]) / float(away @ away), 1.0)
     both = away[1:] - keep * away[:-1], away[:-1] - keep * away[1:]  # in both directions of time
     square = max((np.square(e) for e in both), key=lambda e: float(e @ e) / max(float(e.mean()) ** 2, 1e-300))
-    # Subtract half of the standard error: a short normal sequence shows heavy tails by chance.
+    # Subtract part of the standard error, because a short normal sequence can show heavy tails by chance.
     excess = float(square @ square) / n / max(float(square.mean()) ** 2, 1e-300) - 3.0 - np.sqrt(6.0 / n)
     # A long sequence contains the rare large errors that are missing in a short one. Found by simulation, like CALM.
     return float(np.sqrt(max(excess, 0.0) / n) * (300.0 / n) ** 0.1)
 
 
 def loud_part(values: FloatArray) -> tuple[float, float]:
-    """Find parts of a sequence (n,) that are much louder than the others.
+    """Find parts of a sequence (n,) with much larger errors than all other parts.
 
     Returns
     -------
@@ -424,9 +429,9 @@ def loud_part(values: FloatArray) -> tuple[float, float]:
 
 
 def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatArray:
-    """Draw the average mean square about their own mean of sequences with this length and spacing.
+    """Return draws of the expected variance of sequences with this length and spacing.
 
-    Draws have the order of :func:`mean_draws`. A correlation longer than the sequence adds to its mean alone.
+    Draws have the order of :func:`mean_draws`. A correlation longer than the sequence affects only its mean.
 
     Parameters
     ----------
@@ -442,18 +447,18 @@ def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatA
     known = known_memories("power", len(terms.slow), place_m)
     index, scale, stretch = _picked(terms.slow, known)
     *_, normal, second_normal = _random(len(terms.slow))
-    # errors over place repeat when the flight returns, so that their power has fewer independent squares
+    # errors over position repeat when the flight returns, so their power has fewer independent squares
     placed = np.minimum(scale * known.joined("beyond")[index] / max(terms.fast_power, 1e-300), 1.0)
     third = 2.0 / 9.0 * np.maximum(1.0 / terms.fast_freedom, placed**2 / known.joined("freedom")[index])
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
     fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
     share, ratio = loud_part(values)
-    # a loud part makes the tails of the flight heavy, and is included below
+    # reduce the effect of heavy tails, because a loud part also makes tails heavy and is included below
     heavy = (0.7 if share else 1.0) * heavy_tails(values)
     tails = np.exp(heavy * np.where(normal > 0.0, CALM, 1.0) * normal)
     drawn = (scale * known.joined("power")[index] + fast) * tails
     log = _stretched(np.log(drawn), stretch)
-    # a loud part has fewer independent samples than the flight: increase the variance as for a weighted mean
+    # a loud part has fewer independent samples than the flight, so increase the variance as for a weighted mean
     more = np.sqrt(share * ratio**2 + 1.0 - share) / (share * ratio + 1.0 - share)
     middle = np.median(log)
     return np.tile(np.exp(middle + more * (log - middle)), 2)
@@ -465,7 +470,7 @@ _NORMAL_95 = 1.959964
 # Width of an interval relative to its value above which only its lower end is reported.
 _BOUND = 2.0
 
-# Number of segments of a flight. The share in each comes from the others.
+# Number of segments of a flight. The regression coefficient in each comes from all other segments.
 _SEGMENTS = 24
 
 # Nominal share of flights with a false verdict on any channel. A nominal 0.05 has 1 to 10 % in simulations, because
@@ -477,7 +482,7 @@ NO_INTERVAL: Interval = (float("nan"), float("nan"))
 
 
 def independent_samples(values: FloatArray, place_m: FloatArray | None = None) -> float:
-    """Return the number of independent samples that determine the mean of a sequence equally well.
+    """Return the number of independent samples whose mean would be as accurate as that of the sequence.
 
     Parameters
     ----------
@@ -513,7 +518,7 @@ class ErrorIntervals:
     n_effective : float
         Number of independent samples that would determine the offset equally well. NaN without an interval.
     notes : tuple of str
-        Sentences on the limits of the intervals.
+        Sentences about the limits of the intervals.
     """
 
     offset_db: Interval
@@ -554,7 +559,7 @@ def error_intervals(
 
 
 def _notes(values: FloatArray, place_m: FloatArray | None) -> Iterator[str]:
-    """Yield sentences on the limits of the intervals of a sequence (n,)."""
+    """Yield sentences about the limits of the intervals of a sequence (n,)."""
     if place_m is not None and (reason := only_time(place_m)):
         yield f"The intervals consider correlation over time only: {reason}."
     share, ratio = loud_part(values)
@@ -601,7 +606,7 @@ def influence_interval(
     estimate : float
         The statistic of the samples.
     influence : (n,)
-        What each sample adds to the statistic, to first order and up to a constant, in time order.
+        First-order contribution of each sample to the statistic, up to a constant, in time order.
     place_m : (n, 3), optional
         The same as in :func:`mean_draws`.
     bounds : (low, high)
@@ -614,7 +619,7 @@ def influence_interval(
 
     Notes
     -----
-    The interval of the mean of ``influence`` by the weights over time of paired differences. On simulated ranks it
+    This is the interval of the mean of ``influence``, with the weights of paired differences. On simulated ranks it
     covers the truth as often as by the weights of offsets. At 1000 samples and 150 m it has 1.3 times the width for a
     known correlation, instead of 1.8 times.
     """
@@ -627,8 +632,8 @@ def influence_interval(
 def spread_interval(values: FloatArray, place_m: FloatArray | None = None) -> Interval:
     """Return the 95 % interval of the standard deviation of a correlated sequence (n,) in time order.
 
-    The upper end of an interval wider than :data:`_BOUND` times the value is infinite: it is a lower bound. Positions
-    ``place_m`` (n, 3) [m] are used as by :func:`mean_draws`.
+    If the interval is wider than :data:`_BOUND` times the value, its upper end is infinite, so that it is a lower
+    bound. Positions ``place_m`` (n, 3) [m] are used as by :func:`mean_draws`.
     """
     if len(values) < FEWEST:
         return NO_INTERVAL
@@ -666,7 +671,7 @@ _FLAT = 0.2
 
 
 def is_flat(measured_db: FloatArray, predicted_db: Iterable[FloatArray]) -> bool:
-    """Check whether a level (n,), n > 0, hardly varies although every prediction (n,) of it does [dB]."""
+    """Check whether a level (n,), n > 0, hardly varies although every prediction (n,) varies [dB]."""
     return middle_span(measured_db) < _FLAT * min(map(middle_span, predicted_db))
 
 
@@ -742,8 +747,8 @@ def paired_difference(
     error_db, other_error_db : array_like, (n,)
         Measured minus predicted, in time order [dB]. Samples with a NaN on either side are ignored.
     free_offset : bool
-        True if each model has its own offset, so that errors count about their mean. False for held-out errors, which
-        count as they are.
+        True if each model has its own offset, so that the mean of its errors is subtracted. False for held-out errors,
+        which are used unchanged.
     place_m : (n, 3), optional
         The same as in :func:`mean_draws`.
 
@@ -756,7 +761,7 @@ def paired_difference(
     Let d be the difference of the two predictions, which the route determines, and b the coefficient of a regression of
     the error on d. The difference of the mean square errors is (2 b - 1) times the mean square of d. Its random part is
     d times the residual of that regression (Harvey, Leybourne and Newbold 1998, doi:10.1080/07350015.1998.10524759). In
-    each segment, b comes from the other segments, so that a segment that determines b alone counts as an accident.
+    each segment, b comes from the other segments, so that a single segment cannot determine b.
 
     Examples
     --------
@@ -781,7 +786,7 @@ def paired_difference(
         bounds = squares[0] / scale, squares[1] / scale
         if bounds[0] <= 0.0 <= bounds[1] and (bounds[0] < -other_rmse or bounds[1] > rmse):
             bounds = NO_INTERVAL
-        # the central 68 %, so that heavy tails do not count
+        # use the central 68 %, so that heavy tails have no effect
         spread = float(0.5 * np.diff(np.quantile(drawn, [0.1587, 0.8413]))[0]) / scale
         chance = 2.0 * min(float(np.mean(drawn <= 0.0)), float(np.mean(drawn >= 0.0)), 0.5)
     return PairedDifference(
@@ -799,7 +804,7 @@ def paired_difference(
 
 
 def undecided(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the random part of the difference of mean squares that each sample (n,) adds [dB^2]."""
+    """Return the random contribution (n,) of each sample to the difference of mean squares [dB^2]."""
     apart = first - second
     segment = np.arange(len(apart)) * _SEGMENTS // len(apart)
     products, squares = (np.bincount(segment, values, _SEGMENTS) for values in (first * apart, apart * apart))
@@ -884,7 +889,7 @@ def share_interval(
     place_m : (n, 3), optional
         The same as in :func:`mean_draws`.
     sequence : (n,), optional
-        The sequence that the indicator comes from: its effective size counts at a share of 0 or 1.
+        The sequence from which the indicator was computed. Its effective size is used if the share is 0 or 1.
 
     Returns
     -------
@@ -893,8 +898,8 @@ def share_interval(
 
     Notes
     -----
-    Wilson's interval for the number of independent samples that would fix the mean equally well. It is sensible at
-    shares of 0 and 1, where the samples do not vary. Wilson (1927), doi:10.1080/01621459.1927.10502953.
+    Wilson's interval for the number of independent samples whose mean would be equally accurate. It has a positive
+    width even at shares of 0 and 1, where the samples do not vary. Wilson (1927), doi:10.1080/01621459.1927.10502953.
     """
     n = len(indicator)
     if n < FEWEST:
@@ -926,7 +931,7 @@ class Visit:
 
 
 def same_places(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> tuple[IntArray, IntArray]:
-    """Pair each sample of one pass with the nearest sample of the other within a radius [m]. Return both indices."""
+    """Return indices of pairs: each sample of one pass with the nearest sample of the other within a radius [m]."""
     known = [np.isfinite(v.position_m).all(axis=1) & np.isfinite(v.value) for v in (first, second)]
     mine, theirs = (_Places(v.position_m, v.heading_deg, k) for v, k in zip((first, second), known, strict=True))
     return mine.partners(theirs, radius_m, _HEADING_WITHIN_DEG)
@@ -1052,7 +1057,7 @@ def pass_pairs(
     cell_m : float
         Side of the square cells on the map [m].
     radius_m : float
-        A sample of the first pass pairs with the nearest one of the second within this distance.
+        A sample of the first pass is paired with the nearest sample of the second pass within this distance.
     heading_within_deg : float, optional
         Largest difference of the headings of a pair, if both passes have headings. None allows any heading.
 
@@ -1087,7 +1092,7 @@ def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Place
         flown=flown,
         level=_entered(flown, placed & np.isfinite(flown.level_db), places),
         residual=_entered(flown, scored, places),
-        # one integer per cell: NumPy intersects rows of two columns by sorting records, ten times slower
+        # one integer per cell, because intersecting rows of two columns is ten times slower in NumPy
         cells=(cells[:, 0] << 32) + cells[:, 1],
         means=means,
         heights=heights,
@@ -1095,7 +1100,7 @@ def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Place
 
 
 def _entered(flown: Pass, good: BoolArray, places: dict[bytes, _Places]) -> bytes:
-    """Store the positions of some samples and return their key, which links that were sampled together share."""
+    """Store the positions of some samples, and return a key that is equal for links that were sampled together."""
     digest = hashlib.blake2b(good.tobytes(), digest_size=16)
     digest.update(np.ascontiguousarray(flown.position_m).tobytes())
     if flown.heading_deg is not None:

@@ -572,24 +572,25 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
     return Verdict(cause=cause, effect=worst.covered, where=f"{worst.height_m:g} m")
 
 
-# Number of latest nights that are tested for a step, and the nominal chance of a false step per night over all nodes.
-# Seven nights show smaller steps than one. The true chance is one false step in a hundred nights, also if consecutive
-# nights correlate by 0.7, and half of that at 0.5 (``python -m tests.compare.test_steps 500``). It exceeds the nominal
-# one, because a robust fit with missing links has longer tails than Student's t.
+# Number of latest nights that are tested for a step, and nominal probability of a false step per night over all nodes.
+# Seven nights show smaller steps than one night. The true probability is 1 % per night, even if consecutive nights
+# correlate by 0.7, and half of that at 0.5 (``python -m tests.compare.test_steps 500``). It exceeds the nominal
+# probability, because a robust fit with missing links has longer tails than Student's t.
 _CHANCES = {1: 0.0025, 7: 0.0005}
 
 # Smallest number of nights that determine the standard deviation well enough to test for a step.
 _FEWEST_NIGHTS = 10
 
-# Robust standard deviations above which a residual counts less (Huber), for example a link with a car in front of it.
+# Number of robust standard deviations above which a residual has less weight (Huber), such as that of a link blocked by
+# a car.
 _HUBER = 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """A change of an offset: its first night, the night at whose end it was found, and its size with 95 % interval.
+    """A change of an offset: its first night, the night after which it was found, and its size with 95 % interval.
 
-    ``back`` is the night at which the old level returned after one or two nights, else empty.
+    ``back`` is the night at which the old level returned, if that was after one or two nights, else empty.
     """
 
     night: str
@@ -603,8 +604,8 @@ class Step:
 class NodeOffset:
     """The offset of one end of links over the nights of a campaign [dB], relative to its median.
 
-    ``sd_db`` is its standard deviation between steps, and ``smallest_db`` the step that is found the same night with a
-    probability of 90 %. Both are NaN if there are too few nights.
+    ``sd_db`` is its standard deviation between steps, and ``smallest_db`` is the step that is found in the same night
+    with a probability of 90 %. Both are NaN if there are too few nights.
     """
 
     node: str
@@ -644,8 +645,8 @@ def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict
     -----
     ``offset(night, link) = link + transmitter(night) + receiver(night)`` by least squares with Huber's weights. The
     constant of a link is the median of its residuals, fitted iteratively. The plain median of its offsets would depend
-    on missing nights before or after a step. The common part of transmitters or receivers (weather) is the median of
-    the other nodes, and is subtracted if there are four or more.
+    on missing nights before or after a step. The common part of all transmitters or receivers (such as weather) is the
+    median of the other nodes. It is subtracted if there are four or more nodes.
 
     Examples
     --------
@@ -668,7 +669,7 @@ def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict
         fitted = np.linalg.solve(normal, ((weight * change) @ design)[..., None])[..., 0]
         residual = np.abs(change - fitted @ design.T)
         scale = 1.4826 * _median(np.where(known, residual, np.nan), 1)
-        # a scale of 0 (all links agree) lets every link count in full
+        # with a scale of 0 (all links agree), every link has full weight
         weight = known * np.minimum(1.0, _HUBER * scale / np.maximum(residual, 1e-12) + (scale <= 0.0))
         base = _median(raw - fitted @ design.T, 0)
     number = known.astype(float) @ design
@@ -685,7 +686,7 @@ def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict
 
 
 def _median(values: FloatArray, axis: int) -> FloatArray:
-    """Return the median of the known values along an axis, which is kept. NaN if there are none."""
+    """Return the median of the known values along an axis, whose length becomes 1. NaN without known values."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a link without a night, a night without a link
         return np.asarray(np.nanmedian(values, axis=axis, keepdims=True))
@@ -693,7 +694,7 @@ def _median(values: FloatArray, axis: int) -> FloatArray:
 
 @dataclass(slots=True)
 class _Segment:
-    """The consecutive nights without a step, and sum of squares and degrees of freedom of the segments before them.
+    """The latest nights without a step, with sum of squares and degrees of freedom of the segments before them.
 
     ``values`` has a row per night: offset [dB] and weight, which is the number of links.
     """
@@ -715,7 +716,7 @@ class _Segment:
     def inflation(self) -> float:
         """Return the variance of a mean of consecutive nights divided by that of independent nights.
 
-        The correlation is raised by its standard error, because chance can make it too small.
+        The correlation is increased by its standard error, because its estimate can be too small by chance.
         """
         mean, _ = self.level()
         about = np.array([(value - mean) * weight**0.5 for value, weight in self.values])
@@ -724,7 +725,7 @@ class _Segment:
         return (1.0 + correlation) / (1.0 - correlation)
 
     def step_to(self, nights: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
-        """Return the step to the mean of some nights, half its 95 % interval, and the chance of one as large."""
+        """Return the step to the mean of some nights, half its 95 % interval, and the p-value of a step this large."""
         from scipy.special import stdtr, stdtrit  # importing scipy.stats would take 0.2 s for two functions
 
         square, freedom = self.pooled()
@@ -732,8 +733,8 @@ class _Segment:
             return 0.0, np.inf, 1.0
         inflation = self.inflation()
         (before, weight), (after, weight_after) = self.level(), _mean(nights)
-        # The level before is a mean of consecutive nights, too. One or two nights show no correlation, and count as
-        # independent, so that the end of rain can be found.
+        # The level before is also a mean of consecutive nights. One or two nights count as independent, because they do
+        # not show a correlation, and because the end of rain must be found.
         level = (inflation if len(self.values) > 2 else 1.0) / weight
         share = (inflation if len(nights) > 1 else 1.0) / weight_after + level
         error = float(np.sqrt(max(square, 1e-12) / freedom * share))
@@ -769,7 +770,7 @@ def _mean(nights: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) -> NodeOffset:
-    """Find the steps of one node's offset, night by night, each from the nights before it alone.
+    """Find the steps of one node's offset, night by night. Each step is found from the nights before it only.
 
     Parameters
     ----------
@@ -777,7 +778,7 @@ def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) 
     night : sequence of str
     offsets : NightOffsets
     nodes : int
-        Number of nodes that are tested together. All of them have one false step in a hundred nights.
+        Number of nodes that are tested together. All nodes together have one false step in a hundred nights.
 
     Returns
     -------
@@ -794,7 +795,7 @@ def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) 
                 continue
             if _split_nights(here, window)[0].step_to(here.values[-window:])[2] >= chance / nodes:
                 continue
-            # Find the night of the step by least squares: nights before it in the window would make it too small.
+            # Find the night of the step by least squares, because nights before the step would make it look too small.
             window = max(range(1, min(max(_CHANCES), len(here.values) - 1) + 1), key=lambda n: _between(here, n))
             earlier, nights = _split_nights(here, window)
             step, reach, _ = earlier.step_to(nights)
@@ -840,12 +841,12 @@ class Overlap:
 
     @property
     def only_first(self) -> int:
-        """The number of samples of the first report alone."""
+        """The number of samples that only the first report has."""
         return self.first - self.common
 
     @property
     def only_second(self) -> int:
-        """The number of samples of the second report alone."""
+        """The number of samples that only the second report has."""
         return self.second - self.common
 
 
@@ -863,9 +864,9 @@ class LevelDifference:
     measured_max_db, simulated_max_db, simulated_rms_db : float
         Largest and root mean square difference of the levels on common samples [dB]. NaN if there are none.
     offset_db : Changed
-        Fitted offset as reported.
+        Fitted offset, as in the reports.
     rmse : PairedDifference
-        Difference on common scored samples, each report with its own best offset there. The first model of the record
+        Difference on common scored samples, with the best offset of each report on them. The first model of the record
         is the second report.
     """
 
@@ -916,11 +917,12 @@ def level_difference(
     first, second : tuple of three (n,)
         Level measured (without offset), replayed, and residual of each report on the common samples in time order [dB].
     scored : (int, int)
-        Samples with a residual in each whole report.
+        Number of samples with a residual in each complete report.
     offsets_db : (float, float)
         Fitted offset of each [dB].
     place_m : (n, 3), optional
-        Positions of the common samples, NaN if unknown [m]: the interval then considers correlation over place, too.
+        Positions of the common samples [m], NaN if unknown. With positions, the interval also allows for correlation
+        over position.
 
     Returns
     -------
@@ -958,7 +960,7 @@ def _largest(values: FloatArray) -> float:
 def _changed(
     first: float, second: float, *, added: FloatArray | None = None, place_m: FloatArray | None = None
 ) -> Changed:
-    """Return the change of a statistic. ``added`` (n,) is what each sample adds to it, for the interval."""
+    """Return the change of a statistic. ``added`` (n,) contains the contribution of each sample, for the interval."""
     change = second - first
     ends = NO_INTERVAL if added is None else statistics.influence_interval(change, added, place_m)
     return Changed(first=first, second=second, difference=change, ci95=ends)
@@ -988,13 +990,13 @@ def rank_difference(
     RankDifference
         Number of samples whose rank changed, and the change of agreement and kappa with intervals.
     """
-    # a missing report and a missing path are both 0 here, and a change to or from 0 counts
+    # missing reports and missing paths are both 0, and a change to or from 0 counts
     pairs = np.nan_to_num(np.array([np.column_stack(first), np.column_stack(second)]))
     ranked = ((pairs >= 1) & (pairs <= MAX_RANK)).all(axis=(0, 2))
     both = pairs[:, ranked].astype(np.int64)
     place = None if place_m is None else place_m[ranked]
     changed = (pairs[0] != pairs[1]).sum(axis=0)
-    # the sequence of differences: the common part of both reports cancels
+    # use the sequence of differences, in which the common part of both reports cancels
     equal = (both[..., 0] == both[..., 1]).astype(np.float64)
     kappas = np.array([kappa_influence(*ranks.T) for ranks in both]) if ranked.any() else equal
     agree, kappa = (

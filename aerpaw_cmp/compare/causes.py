@@ -1,14 +1,14 @@
 """Likely cause of a level error: a fault of the log, its settings or its site that explains the error by likelihood.
 
-Each fault changes the predicted level: by known decibels, by columns with free coefficients, or at samples that the
-receiver clipped. The level of clipped samples is their own mean, and they fade less. The offset is fitted as well. The
-residual is noise with a long and a short correlation time, because slow fading is not a fault.
+Each fault changes the predicted level in one of three ways: by known decibels, by columns with free coefficients, or at
+samples that the receiver clipped. Clipped samples are predicted by their own mean, and they fade less. The offset is
+fitted as well. The residual is noise with a long and a short correlation time, because slow fading is not a fault.
 
 An explanation is a single fault or a pair, and the second fault of a pair is searched in the residual of the first.
-Explanations compete by their marginal likelihood over all channels. Coefficients, angles, heights, places and instants
-are averaged over their possible values, so that an explanation with many free numbers pays for them. A fault is named
-if the explanations with it are likelier by a margin than all others, and if it reduces the RMSE as required. A paired
-test of two models would need a flight much longer than a fault lasts.
+Explanations are compared by their marginal likelihood over all channels. Coefficients, angles, heights, positions and
+times are averaged over their possible values, which penalises explanations with many free numbers. A fault is named if
+the explanations with it are likelier by a margin than all others, and if it reduces the RMSE as required. A paired test
+of two models is not used, because it would need flights much longer than the duration of a fault.
 
 A new fault is a function that yields its :class:`Trial`, and an entry of :data:`CANDIDATES`.
 """
@@ -31,19 +31,20 @@ from .result import Cause, ClockResult
 
 # Samples are averaged over this time [s]. Longer flights have longer means, so that their number is limited.
 BIN_S, _MOST_BINS = 1.0, 2000
-# Means in which the UAV moves [m] and turns [deg] by less are joined: the fading of a hover is one number, not many.
-# A slow orbit of 1.5 m/s keeps each second.
+# Means between which the UAV moves [m] and turns [deg] by less than this are joined, because the fading of a hover is
+# one number and not many. A slow orbit at 1.5 m/s is not joined.
 _NEAR_M, _NEAR_DEG = 1.0, 5.0
 _FEWEST_BINS, _ENOUGH_BINS = 24, 100
 FEWEST_SAMPLES = 100
-# A fault occurs in one flight of ten. It is named from odds of five to one.
+# Prior and limit of the log odds: a fault occurs in one of ten flights, and is named if its odds are at least five to
+# one.
 _SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
 # Largest number of words in the sentence and the next step of a cause, because the first paragraph has at most sixty.
 MOST_CAUSE_WORDS = 28
 # A cause must reduce the RMSE by this share. Half of it suffices if the log odds per channel reach the second number,
 # because a floor leaves the error of all levels above it.
 _LEAST_SHARE, _CERTAIN = 0.1, 30.0
-# The sentence states the RMSE without the cause and with it. The two numbers must differ in print.
+# The sentence states the RMSE without and with the cause. As printed, the two numbers must differ by this [dB].
 SHOWN_DB = 0.1
 # Half of the 95 % point of chi-squared with one degree of freedom.
 _NEAR = 1.92
@@ -58,9 +59,9 @@ class LevelEvidence:
     Parameters
     ----------
     time_s : (n,)
-        Instants in order [s].
+        Ascending times [s].
     measured_db, predicted_db : (n,)
-        Levels before any offset; NaN where there is none.
+        Levels before any offset; NaN if missing.
     place_m : (n, 3)
         Positions of the UAV [m].
     uav_azimuth_deg, uav_elevation_deg : (n,)
@@ -70,7 +71,7 @@ class LevelEvidence:
     name, unit : str
         Name of the channel and unit of its measured level.
     start : datetime64
-        Instant at which ``time_s`` is 0.
+        Time at which ``time_s`` is 0.
     antenna : {"isotropic", "measured", "learned"}
         Kind of the UAV's antenna.
     turned_db, raised_db : mapping of float to (n,)
@@ -83,7 +84,7 @@ class LevelEvidence:
     other_towers_db : mapping of str to (n,)
         Predicted level of each other tower of the site.
     locked, serving : (n,), optional
-        1 in lock or served by this cell, 0 not, NaN unknown; None if the log has no such column.
+        1 if in lock (or served by this cell), 0 if not, NaN if unknown. None if the log has no such column.
     clock : ClockResult, optional
         Test result of the radio clock.
     """
@@ -110,19 +111,19 @@ class LevelEvidence:
     floored: bool = False
     """True if the settings remove levels at the floor, so that only upward fading of the lowest links remains."""
     limits_known: bool = False
-    """True if both levels are no lower than the receiver's floor already, as the page counts them."""
+    """True if both levels were already raised to the receiver's floor, as in the numbers of the page."""
     learned: LearnedSeries | None = None
     """Learned antenna of the tower with the errors of held-out flights, if the flight uses one."""
     transmit_power_dbm: float = 0.0
     """Transmit power of the predicted level."""
     distance_db: FloatArray | None = None
-    """Part (n,) of the predicted level that depends on the distance alone."""
+    """Part (n,) of the predicted level that depends only on the distance."""
     displaced_db: Mapping[tuple[float, float], FloatArray] = field(default_factory=dict)
     """Change of the predicted level with the tower elsewhere, by distance [m] and azimuth [deg]."""
     swapped_db: FloatArray | None = None
     """Change of the predicted level (n,) if the log belongs to the other channel of the tower."""
     least: BoolArray | None = None
-    """Samples (n,) at the least level of the log if that level is frequent, exactly or within its noise."""
+    """Mask (n,) of samples at the lowest level of the log (exactly, or within its noise), if that level is frequent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -199,7 +200,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             named[either] = shown
     if not named:
         return _by_health(None, tables)
-    # name a gain over directions last, because it imitates many faults
+    # a gain over directions comes last, because it can look like many faults
     either = min(named, key=lambda e: (_CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
     cause = _named(sorted(either, key=lambda n: n not in best), named[either], _lead(either, odds))
     return _by_health(cause, tables) if _OF_HEALTH & either else cause
@@ -208,7 +209,8 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
 def _by_health(cause: Cause | None, tables: Sequence[_Models]) -> Cause | None:
     """Return the cause after steps and offsets were compared with those of held-out flights.
 
-    A fit within the flight cannot separate a step from slow fading. Where all channels have a health, it decides.
+    A fit within a flight cannot distinguish a step from slow fading. If the usual errors of all channels are known,
+    they decide.
     """
     known = [(judged, table) for table in tables if (judged := _judged(table[_SOUND])) is not None]
     if not known:
@@ -254,7 +256,7 @@ def _rivalled(step: Step, known: Sequence[tuple[Judged, _Models]]) -> bool:
         for names, model in table.items():
             if len(names) == 1 and "gain step" not in names:
                 columns = sum(0 if trial.columns is None else trial.columns.shape[1] for trial in model.trials)
-                # a free coefficient that explains nothing lowers the square by 1 on average
+                # a free coefficient without any effect reduces the sum of squares by 1 on average
                 fall = before - channel.square(model.residual_db) - columns
                 squares[max(names)] = squares.get(max(names), 0.0) + max(fall, 0.0)
     return max(squares.values(), default=0.0) > step.chi2 - _RARE
@@ -267,7 +269,7 @@ def _lead(names: Set[str], odds: Mapping[frozenset[str], float]) -> float:
 
 
 def _alternatives(best: Set[str], odds: Mapping[frozenset[str], float], least: float) -> list[frozenset[str]]:
-    """Return the causes that are likelier by a margin than all else, pairs that cannot be distinguished first."""
+    """Return the causes that are likelier than all others by a margin. Indistinguishable pairs come first."""
     out = []
     leads = {name: _lead({name}, odds) for name in sorted(best - {_UNNAMED})}
     certain = {name for name, lead in leads.items() if lead >= least + 2.0 * _DISTINCT}
@@ -281,7 +283,8 @@ def _alternatives(best: Set[str], odds: Mapping[frozenset[str], float], least: f
     return sorted(out, key=lambda either: -len(either))
 
 
-# A cause that leads by less than this above the margin is named together with the next one, if that explains the error.
+# If the log odds of a cause exceed the margin by less than this, the next cause is also named, if it explains the
+# error.
 _DISTINCT = 1.7
 
 
@@ -292,13 +295,13 @@ class _Conditions:
     lead: float = -math.inf
     """Log odds per channel against all explanations without it."""
     share: float = 0.1
-    """Least reduction of the RMSE."""
+    """Smallest reduction of the RMSE, as a share."""
     learned_share: float = 0.0
-    """The least reduction of the RMSE with learned antennas, which have an error of some decibels on each flight."""
+    """The same with learned antennas, whose error is a few decibels on every flight."""
     part: float = 0.0
-    """Least share of the reduction that all candidates reach together, for flights without learned antennas."""
+    """Smallest share of the reduction that all candidates together achieve, for flights without learned antennas."""
     of_uav: bool = False
-    """The cause changes the levels of all channels."""
+    """True if the cause changes the levels of all channels."""
     restores: bool = False
     """True if the cause must bring the error back to that of held-out flights, for flights with learned antennas."""
     follows: float | None = None
@@ -309,7 +312,7 @@ class _Conditions:
 
 _CONDITIONS = {
     "attitude": _Conditions(of_uav=True),
-    # slow fading imitates a weak shadow
+    # a high limit, because slow fading looks like a weak shadow
     "blocked": _Conditions(share=0.2),
     "channels": _Conditions(part=0.5, restores=True),
     "clock": _Conditions(part=0.5, restores=True),
@@ -318,7 +321,7 @@ _CONDITIONS = {
     "heading": _Conditions(learned_share=0.25, part=0.5, of_uav=True, restores=True, follows=0.9),
     "height": _Conditions(part=0.5, of_uav=True, restores=True, follows=0.9),
     "pattern": _Conditions(learned_share=0.25, part=0.5, restores=True, follows=1.0),
-    # the nearest of all places explains a part of many errors
+    # high limits, because the best of many positions explains a part of many errors
     "place": _Conditions(lead=2.5, share=0.3, part=0.75, restores=True, follows=0.9),
     "saturation": _Conditions(part=0.5, restores=True),
     "telemetry": _Conditions(part=0.5, of_uav=True, restores=True, follows=0.9),
@@ -339,7 +342,7 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     if not all(frozenset([name]) in table for table in shown) or lead < need.lead:
         return False
     alone = [table[frozenset([name])] for table in shown]
-    # the cause alone must reduce the RMSE, not only the changes from second to second
+    # the cause alone must reduce the RMSE, not only changes between neighbouring samples
     if need.of_uav and any(model.gain <= 0.0 for model in alone):
         return False
     known_db, alone_db = _rmse_db(sound), _rmse_db(alone)
@@ -359,9 +362,9 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
         enough = not need.part or alone_db <= known_db - need.part * (known_db - _together_db(shown))
         restored = False
     else:
-        # the error was larger than on any held-out flight, and is usual with the cause
+        # the error is larger than on any held-out flight, and usual after correcting the cause
         restored = need.restores and name != _CATCH_ALL and known_db > usual[1] >= alone_db
-        # an error that held-out flights have, too, does not need such a cause
+        # do not name such a cause for an error that held-out flights also have
         least_db = usual[1] if name in OF_DIRECTION else usual[0] if name == "saturation" and not certain else 0.0
         enough = known_db > least_db and alone_db <= (1.0 if need.restores else need.most_left) * usual[1]
     return enough and (share <= 1.0 - least_share or certain or restored)
@@ -410,7 +413,7 @@ def _together_db(shown: Sequence[_Models]) -> float:
             columns += [] if trial.change_db is None else [trial.change_db]
             columns += [] if trial.columns is None else list(trial.columns.T)
         design, target = np.column_stack(columns), e.measured_db - e.predicted_db
-        # the level at a place on top of the UAV is infinite
+        # omit infinite levels, for a position at the UAV itself
         design = design[:, np.isfinite(design).all(axis=0)]
         residual = target - design @ np.linalg.lstsq(design, target, rcond=1e-9)[0]
         squares.append((residual**2).sum() / max(len(target) - design.shape[1], 1))
@@ -554,13 +557,13 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
         if name not in ("uav_azimuth_deg", "tower_azimuth_deg"):
             # treat missing flags as 1: a gap in the log is not an error
             return mean(np.nan_to_num(value, nan=1.0) if name in ("locked", "serving") else value)
-        # the mean of 359 and 1 degrees is 0
+        # average directions, because the mean of 359 and 1 degrees is 0
         turn = np.exp(1j * np.radians(value))
         return np.degrees(np.angle(mean(turn.real) + 1j * mean(turn.imag)))
 
     changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
     at = level == level.min()
-    # if levels are rounded, each is frequent, but the least one is rarer than the next
+    # compare with the next level: if levels are rounded, all are frequent, but the lowest is rarer than the next
     next_often = (level == level[~at].min()).sum() if not at.all() else 0
     often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level), next_often)
     changed["least"] = np.bincount(place, at) > 0.5 * count if often else _undetected(mean(evidence.measured_db))
@@ -634,9 +637,9 @@ def _fitted(e: LevelEvidence, *trials: Trial, at: Memories = START, climb: bool 
     fit = fit_with_memories(target[link] / scale, design[link] / scale[:, None], at, climb)
     likelihood, residual = fit.log_likelihood - float(np.log(scale).sum()), np.zeros(len(target))
     residual[link] = fit.residual_db * scale
-    if clipped.any():  # values beyond the limit of a receiver do not depend on the link
+    if clipped.any():  # clipped levels do not depend on the link
         residual[clipped] = e.measured_db[clipped] - e.measured_db[clipped].mean()
-        # charge for two fitted numbers, their mean and spread (Schwarz)
+        # Schwarz's penalty for two fitted numbers, mean and spread
         spread = max(float(residual[clipped].std()), _LEAST_SPREAD_DB)
         likelihood -= float(clipped.sum()) * (math.log(spread) + 0.5) + math.log(float(clipped.sum()))
     return MemoryFit(likelihood, residual, fit.memories)
@@ -662,7 +665,7 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
         yield from _drifting(e)
         return
     yield from _drifting(e)
-    # levels of another time, or in reverse order, must not be attributed to other causes
+    # also try levels of another time or in reverse order, so that they are not attributed to other causes
     since, length = e.time_s - e.time_s[0], max(float(np.ptp(e.time_s)), 1e-9)
     backwards = np.interp(length - since, since, e.predicted_db)
     if _nearer(e, backwards):
@@ -772,7 +775,7 @@ def _spline(knots: FloatArray, at: FloatArray) -> FloatArray:
     Loading scipy.interpolate would take 0.1 s.
     """
     n, share = len(knots), (np.append(knots, at)[:, None] - knots[0]) / np.ptp(knots)
-    # without terms at the second and the last but one knot, the ends need no given slope
+    # omit terms at the second and second-last knot, so that no slopes at the ends are needed
     terms = np.hstack([share ** np.arange(min(n, 4)), np.maximum(share - share[2 : n - 2, 0], 0.0) ** 3])
     return np.asarray(np.linalg.solve(terms[:n].T, terms[n:].T).T)
 
@@ -796,7 +799,7 @@ def _heading(e: LevelEvidence) -> Iterator[Trial]:
 def _attitude(e: LevelEvidence) -> Iterator[Trial]:
     """Yield an attitude that the settings do not use, or should not use."""
     for mode, change in e.attitude_db.items():
-        idle = mode != "ignored"  # to ignore an attitude that was logged is the rarer remedy
+        idle = mode != "ignored"  # ignoring a logged attitude is the less likely remedy
         yield Trial(
             name="attitude", cost=0.0 if idle else _RARE, change_db=change, next_step=f"`rt: {{attitude: {mode}}}`",
             sentence="the UAV's attitude is not used" if idle else "the logged attitude does not fit the level",
@@ -864,7 +867,7 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     radii = np.array(sorted({radius for radius, _ in e.displaced_db}))
     azimuths = np.array(sorted({azimuth for _, azimuth in e.displaced_db}))
     table = np.array([[e.displaced_db[radius, azimuth] for azimuth in azimuths] for radius in radii])
-    # weight each radius by the area that it represents, because radii grow by a factor, and by its probability
+    # weight each radius by the area that it represents (radii grow by a factor) and by its probability
     weight = np.repeat(radii**2 * (1.0 + (radii / _NEAR_PLACE_M) ** 2) ** -1.5, len(azimuths))
     coarse, cost = _likeliest(e, e.predicted_db + table.reshape(len(weight), -1), weight=weight)
     i, j = np.unravel_index(coarse, table.shape[:2])
@@ -975,7 +978,7 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
         if _is_slope(e, factor, fit.memories) and fit.log_likelihood > max(least, slope):
             yield trial
             return
-    # a cause that changes levels like another slope or exponent must be likelier than these, which have no name
+    # alternatives without a name: a cause must be likelier than another slope or exponent
     yield from (others[0], *others[2:])
 
 
@@ -1049,7 +1052,7 @@ def _floor(e: LevelEvidence) -> Iterator[Trial]:
 
 def _saturation(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a receiver that shows no level above its ceiling."""
-    drowned = e.unit == "dB" and bool(np.median(e.measured_db) < 0.0)  # signals below the noise overload no receiver
+    drowned = e.unit == "dB" and bool(np.median(e.measured_db) < 0.0)  # such signals do not overload a receiver
     if not drowned and not _is_flat(e):
         yield from _clipping(e, -1.0)
 
@@ -1111,7 +1114,7 @@ def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
         shown = limit + side * 10.0 * np.log10(1.0 + 10.0 ** (side * (level - limit) / 10.0))
         offset += float(np.mean(e.measured_db - shown))
     trial = _limited(e, limit, side)
-    # a prediction that fades too deeply at a few samples does not show a limit of the receiver
+    # require enough samples: a prediction that fades too deeply at a few samples is not evidence of a limit
     if trial is None or (side * (limit - level) > _FAR_DB).mean() < _LEAST_FAR:
         return None
     fading = 1.0 / (1.0 + 10.0 ** (side * (limit - level) / 10.0))
@@ -1134,7 +1137,7 @@ _LIMITS = {
 
 def _shift(residual: FloatArray, masks: FloatArray, phi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the level shift in each mask (m, n), its standard error and the gain in log likelihood."""
-    # remove what the previous sample predicts, so that slow fading is not taken for a shift
+    # subtract the prediction from the previous sample, so that slow fading is not mistaken for a shift
     y = residual[1:] - phi * residual[:-1]
     x = masks[:, 1:] - phi * masks[:, :-1]
     y, x = y - y.mean(), x - x.mean(axis=1, keepdims=True)
@@ -1149,7 +1152,7 @@ _SEARCHED_PHI = (0.6, 0.93)
 _WIDTHS_DEG = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 # Degrees over which the edge of a shadow fades: a Fresnel zone some hundred metres away.
 _EDGE_DEG = 4.0
-# Least loss behind an obstacle. A smaller loss in a sector is usually caused by an antenna.
+# Smallest loss behind an obstacle [dB]. A smaller loss in a sector is usually caused by an antenna.
 _LEAST_LOSS_DB = 6.0
 _MOSTSTARTS = 600
 
@@ -1192,7 +1195,7 @@ _CHECK_GAIN = "check the receiver's gain; compare both parts separately"
 
 
 def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a shift that lasts from an instant to the end."""
+    """Yield a shift of the level from some time until the end of the flight."""
     residual, n = e.measured_db - e.predicted_db, len(e.time_s)
     starts = np.arange(_LEAST_BINS * 2, n - _LEAST_BINS * 2)
     if not len(starts):

@@ -246,7 +246,7 @@ def audit_summary(audit: AuditResult) -> str:
     str
     """
     fields = audit.fields
-    texts = [f"Audit, {counted(audit.links, 'link')} against {audit.reference}: {audit_paths(audit)}."]
+    texts = [f"Audit of {counted(audit.links, 'link')} against {audit.reference}: {audit_paths(audit)}."]
     if fields is not None:
         texts.append(
             f"Field: {counted(fields.paths, 'path')} against {audit.reference}'s own coefficients, worst "

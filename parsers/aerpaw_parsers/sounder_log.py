@@ -180,7 +180,7 @@ def _reason(line: bytes) -> str:
     if b"\0" in line:
         return "NUL bytes in the line (the file system was not synced when the power failed)"
     if not line.startswith(b"["):
-        return "the line does not begin with '[time]': it was not written through 'ts'"
+        return "the line does not begin with '[time]', which the program 'ts' writes"
     if not re.match(_HEAD, line):
         return "the time stamp is incomplete or of another form (truncated line?)"
     return "neither 'offset value', nor '*': not an od line"

@@ -126,7 +126,8 @@ HEAD = """\
 """
 LINK = (
     f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: true,"
-    " bandwidth_hz: 20e6}  # out of coverage below the noise of this bandwidth; all as in your experiment?\n"
+    " bandwidth_hz: 20e6}  # levels below the noise of this bandwidth are out of coverage;"
+    " are all values those of your experiment?\n"
 )
 _DOWNLINK = (
     f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: false}}"
@@ -438,7 +439,7 @@ def _settings(lines: Sequence[_Line], context: _Context, known: Proposal) -> lis
         reasons = ["without take-off and landing"] if low else []
         if kind == "rss" and context.flown is not None:
             chosen |= {"field": "power"}
-            reasons.append("powers of paths are added: phases of a real ground are not known")
+            reasons.append("powers of paths are added, because the phases of real ground reflections are unknown")
             if span := _span_of_offsets([offset for line in lines for offset in line.offsets_db]):
                 chosen |= span
                 reasons.append("the levels are outside the usual search range of offsets")
@@ -493,7 +494,7 @@ def _shaded(lines: Sequence[_Line], context: _Context) -> tuple[str, list[str]]:
     keys, comments = "", []
     if wooded >= _SHADED_SHARE:
         keys += ", foliage: attenuating"
-        comments.append(f"# {wooded:.0%} of the sight lines pass through woods: woods attenuate.\n")
+        comments.append(f"# {wooded:.0%} of the sight lines pass through woods, so woods attenuate.\n")
     if hidden >= _SHADED_SHARE:
         keys += ", diffraction: edges"
         comments.append(f"# {hidden:.0%} of the sight lines are behind buildings: edges diffract.\n")

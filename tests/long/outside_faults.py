@@ -40,7 +40,7 @@ class Fault:
 
 
 FAULTS = (
-    Fault("take-off ground not added to the track", "aerpaw_cmp/flight/data.py", "takeoff_m, ground = site.takeoff_ground_m,", "takeoff_m, ground = 0.0,", RAW),
+    Fault("take-off ground not added to the track", "aerpaw_cmp/flight/data.py", "takeoff_m = site.takeoff_ground_m  #", "takeoff_m = 0.0  #", RAW),
     Fault("take-off ground not added to ranks", "aerpaw_cmp/flight/data.py", "takeoff_m = site.takeoff_ground_m  # altitude_m", "takeoff_m = 0.0  # altitude_m", RAW),
     Fault("attitude held between rows", "aerpaw_cmp/flight/track.py", "Rotation.from_matrix(matrices))(t).as_matrix())", "Rotation.from_matrix(matrices))(at[np.searchsorted(at, t, side='right') - 1]).as_matrix())", "tests/flight/test_track.py"),
     Fault("attitude late by half a second", "aerpaw_cmp/flight/track.py", "Rotation.from_matrix(matrices))(t).as_matrix())", "Rotation.from_matrix(matrices))(np.maximum(t - 0.5, at[0])).as_matrix())", "tests/flight/test_track.py"),
@@ -66,7 +66,7 @@ FAULTS = (
     Fault("speed of light 3e8 m/s", "aerpaw_cmp/common/units.py", "SPEED_OF_LIGHT_MPS / frequency_hz", "3e8 / frequency_hz", "tests/common/test_units.py tests/propagation/test_reference.py"),
     Fault("H not transposed where the UAV transmits", "aerpaw_cmp/propagation/field/sum.py", "if link.uav_transmits else matrices", "if not link.uav_transmits else matrices", "tests/propagation/test_reference.py tests/propagation/test_channel.py", "single elements: H is one number"),
     Fault("offset subtracted in place of added", "aerpaw_cmp/compare/level.py", "measured + fit.offset_db - simulated", "measured - fit.offset_db - simulated", "tests/compare/test_rss.py", "residuals are drawn, offset and RMSE stay right"),
-    Fault("RMSE about zero in place of the offset", "aerpaw_cmp/compare/offset.py", "rmse = float(np.hypot(np.sqrt(variance), mean - grid[best]))", "rmse = float(np.hypot(np.sqrt(variance), mean))", "tests/compare/test_offset.py"),
+    Fault("RMSE about zero in place of the offset", "aerpaw_cmp/compare/offset.py", "return np.asarray(np.hypot(np.sqrt(self.variance_db2), self.mean_db - offset_db))", "return np.asarray(np.hypot(np.sqrt(self.variance_db2), self.mean_db + 0.0 * offset_db))", "tests/compare/test_offset.py"),
     Fault("95 % interval made 90 %", "aerpaw_cmp/compare/statistics.py", "np.nanquantile(drawn, [0.025, 0.975])", "np.nanquantile(drawn, [0.05, 0.95])", "tests/compare/test_statistics.py", "the audit computes no interval"),
     Fault("95 % interval of a pair made 90 %", "aerpaw_cmp/compare/statistics.py", "low, high = np.quantile(drawn, [0.025, 0.975])", "low, high = np.quantile(drawn, [0.05, 0.95])", "tests/compare/test_statistics.py", "the audit computes no interval"),
     Fault("a part left out gets an offset from inside", "aerpaw_cmp/compare/calibration.py", "error = (o.samples.residual_db - gain)[outside]", "error = (o.samples.residual_db - gain)[inside]", "tests/compare/test_calibration.py", NO_LEVEL),

@@ -45,7 +45,9 @@ def test_ground_is_a_half_space_and_walls_are_not() -> None:
 
 
 def test_bands_are_held() -> None:
-    with pytest.raises(UsageError, match=r"medium_dry_ground.* at 28 GHz; expected 1-10 GHz, or numbers") as caught:
+    with pytest.raises(
+        UsageError, match=r"medium_dry_ground.* at 28 GHz; expected 1-10 GHz, or stated constants"
+    ) as caught:
         material("medium_dry_ground").relative_permittivity(28e9)
     proposed = material(str(caught.value.expected).split("'")[1])  # what the message proposes can be used
     at_edge = material("medium_dry_ground").relative_permittivity(10e9).real

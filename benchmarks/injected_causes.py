@@ -267,8 +267,8 @@ OUTSIDE: Mapping[str, Fault] = {
     "levels backwards": levels_by(lambda x, t, d: x[::-1].copy(), every=True),
     "levels of another minute": levels_by(lambda x, t, d: np.roll(x, len(x) // 3), every=True),
 }  # fmt: skip
-# A fault of a height or a clock that grows is what a height or a clock explains.
-ALSO = {"height creeps": ("height",), "levels of another minute": ("clock",)}
+# A fault of a height or a clock that grows is what a height or a clock explains, and an exponent has its name.
+ALSO = {"height creeps": ("height",), "levels of another minute": ("clock",), "path-loss exponent": ("exponent",)}
 
 
 @dataclass(frozen=True)

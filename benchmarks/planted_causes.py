@@ -29,10 +29,10 @@ from aerpaw_cmp.compare.causes import (
     SHOWN_DB,
     LevelEvidence,
     Trial,
-    fall_without_lag_db,
     flight_cause,
 )
 from aerpaw_cmp.flight.clock import Along, ClockChannel, judge_clock
+from aerpaw_cmp.jobs.likely_cause import fall_without_lag_db
 from aerpaw_cmp.site.siteyaml import load_site
 
 Array = NDArray[np.float64]

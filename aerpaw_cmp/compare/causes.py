@@ -26,7 +26,7 @@ import numpy as np
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, wrap_degrees
 from ..site.learned import LearnedSeries
 from .health import Judged, Step, level_of, step_of
-from .noise import LEAST_VARIANCE, START, Memories, MemoryFit, fit_with_memories
+from .noise import LEAST_VARIANCE, START, Memories, MemoryFit, fit_with_memories, shift_in_masks, squares_of_halves
 from .result import Cause, ClockResult
 
 # Samples are averaged over this time [s]. Longer flights have longer means, so that their number is limited.
@@ -72,6 +72,8 @@ class LevelEvidence:
         Name of the channel and unit of its measured level.
     start : datetime64
         Time at which ``time_s`` is 0.
+    tower : str
+        Tower of the channel.
     antenna : {"isotropic", "measured", "learned"}
         Kind of the UAV's antenna.
     turned_db, raised_db : mapping of float to (n,)
@@ -99,6 +101,7 @@ class LevelEvidence:
     name: str = ""
     unit: str = "dBm"
     start: np.datetime64 = _EPOCH
+    tower: str = ""
     antenna: str = "measured"
     turned_db: Mapping[float, FloatArray] = field(default_factory=dict)
     raised_db: Mapping[float, FloatArray] = field(default_factory=dict)
@@ -189,13 +192,16 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         if any(either < pair for pair in named):
             continue
         name = max(either & best)
-        # the UAV has one height and one attitude, so all channels must show that these are wrong
+        # the UAV has one height and one attitude, and a tower one place, so all their channels must show the error
         of_all = all(_conditions(each).of_uav for each in either)
         shown = [table for table in tables if of_all or name in _names(_best(table, best))]
+        if any(_conditions(each).of_tower for each in either):
+            towers = {table[_SOUND].evidence.tower for table in shown}
+            shown = [table for table in tables if table[_SOUND].evidence.tower in towers]
         # the sentence quotes the channel that shows the cause most clearly
         shown.sort(key=lambda table: -_best(table, {name}).gain)
         if all(
-            _explains(other, shown, _lead({other}, odds) / len(channels), (best & certain) - either) for other in either
+            _explains(other, shown, _lead(either, odds) / len(shown), (best & certain) - either) for other in either
         ):
             named[either] = shown
     if not named:
@@ -293,7 +299,7 @@ class _Conditions:
     """The conditions that a cause must meet before it is named."""
 
     lead: float = -math.inf
-    """Log odds per channel against all explanations without it."""
+    """Log odds per channel against all explanations without it, unless the cause halves the RMSE."""
     share: float = 0.1
     """Smallest reduction of the RMSE, as a share."""
     learned_share: float = 0.0
@@ -302,6 +308,8 @@ class _Conditions:
     """Smallest share of the reduction that all candidates together achieve, for flights without learned antennas."""
     of_uav: bool = False
     """True if the cause changes the levels of all channels."""
+    of_tower: bool = False
+    """True if the cause changes the levels of all channels of a tower."""
     restores: bool = False
     """True if the cause must bring the error back to that of held-out flights, for flights with learned antennas."""
     follows: float | None = None
@@ -317,12 +325,13 @@ _CONDITIONS = {
     "channels": _Conditions(part=0.5, restores=True),
     "clock": _Conditions(part=0.5, restores=True),
     "decibels": _Conditions(most_left=math.inf),
-    "gain step": _Conditions(lead=2.5, part=0.5),
+    "exponent or decibels": _Conditions(part=0.5, of_uav=True, follows=0.9, most_left=math.inf),
+    "gain step": _Conditions(lead=2.5, part=0.75),
     "heading": _Conditions(learned_share=0.25, part=0.5, of_uav=True, restores=True, follows=0.9),
     "height": _Conditions(part=0.5, of_uav=True, restores=True, follows=0.9),
-    "pattern": _Conditions(learned_share=0.25, part=0.5, restores=True, follows=1.0),
+    "pattern": _Conditions(lead=3.0, learned_share=0.25, part=0.5, restores=True, follows=1.0),
     # high limits, because the best of many positions explains a part of many errors
-    "place": _Conditions(lead=2.5, share=0.3, part=0.75, restores=True, follows=0.9),
+    "place": _Conditions(lead=2.5, share=0.3, part=0.75, of_tower=True, restores=True, follows=0.9),
     "saturation": _Conditions(part=0.5, restores=True),
     "telemetry": _Conditions(part=0.5, of_uav=True, restores=True, follows=0.9),
     "tower": _Conditions(part=0.75, follows=1.0, most_left=math.inf),
@@ -339,15 +348,17 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     ``beside`` are the other causes of the likeliest explanation.
     """
     need, sound = _conditions(name), [table[_SOUND] for table in shown]
-    if not all(frozenset([name]) in table for table in shown) or lead < need.lead:
+    if not all(frozenset([name]) in table for table in shown):
         return False
     alone = [table[frozenset([name])] for table in shown]
     # the cause alone must reduce the RMSE, not only changes between neighbouring samples
-    if need.of_uav and any(model.gain <= 0.0 for model in alone):
+    if (need.of_uav or need.of_tower) and any(model.gain <= 0.0 for model in alone):
         return False
     known_db, alone_db = _rmse_db(sound), _rmse_db(alone)
     before_db, after_db = (_rmse_db([_best(table, of) for table in shown]) for of in (beside, {*beside, name}))
     share = max(alone_db / known_db, after_db / before_db) if known_db and before_db else 1.0
+    if lead < need.lead and (need.of_tower or share > _HALF):
+        return False
     least_share = max(need.share, need.learned_share * (sound[0].evidence.antenna == "learned"))
     certain = lead >= _CERTAIN and least_share <= _LEAST_SHARE and share <= 1.0 - 0.5 * _LEAST_SHARE
     if need.follows and any(m.residual_db.std() >= need.follows * m.evidence.measured_db.std() for m in alone):
@@ -372,25 +383,18 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
 
 def _holds_in_halves(models: Sequence[_Model]) -> bool:
     """Check whether a gain over directions that is fitted to one half of the flight reduces the error of the other."""
-    before = after = 0.0
-    for model in models:
-        e, columns = model.evidence, model.trials[0].columns
-        assert columns is not None
-        error_db = e.measured_db - e.predicted_db
-        first = np.arange(len(error_db)) < len(error_db) // 2
-        for fitted, other in ((first, ~first), (~first, first)):
-            x, y = columns[fitted] - columns[fitted].mean(axis=0), error_db[fitted] - error_db[fitted].mean()
-            noise = _CORRELATED_BINS * max(float(y.var()), LEAST_VARIANCE) * np.eye(columns.shape[1])
-            gain = columns @ np.linalg.solve(x.T @ x + noise, x.T @ y)
-            before += len(error_db) * float(error_db[other].var())
-            after += len(error_db) * float((error_db - gain)[other].var())
-    return after <= _MOST_IN_HALVES**2 * before
+    pairs = ((m.evidence.measured_db - m.evidence.predicted_db, m.trials[0].columns) for m in models)
+    squares = [squares_of_halves(error, columns, _CORRELATED_BINS) for error, columns in pairs if columns is not None]
+    before, after = np.sum(squares, axis=0)
+    return bool(after <= _MOST_IN_HALVES**2 * before)
 
 
 # Number of means per independent sample of the error, and largest ratio of the error of the other half with and without
 # the gain. Halves may show different directions, so a pattern with the next log odds per channel is not tested. Learned
 # antennas leave an error of 3 dB and more, so a pattern is not the cause of an error below the last number [dB].
 _CORRELATED_BINS, _MOST_IN_HALVES, _SURE_GAIN, _LEAST_DB = 10.0, 0.85, 20.0, 2.5
+# A cause that reduces the RMSE to this share needs no further log odds.
+_HALF = 0.5
 
 
 def _usual_db(shown: Sequence[_Models]) -> tuple[float, float] | None:
@@ -432,19 +436,6 @@ def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
     return False
 
 
-def fall_without_lag_db(channels: Iterable[LevelEvidence]) -> float:
-    """Return by how much the RMSE of some channels falls if the lags of their clocks are corrected [dB]."""
-    before, after = list[FloatArray](), list[FloatArray]()
-    for e in channels:
-        lag = 0.0 if e.clock is None else e.clock.radio_minus_telemetry_s
-        known = np.isfinite(e.measured_db) & np.isfinite(e.predicted_db)
-        time_s, measured_db, predicted_db = e.time_s[known], e.measured_db[known], e.predicted_db[known]
-        if len(time_s):
-            for errors, level_db in ((before, predicted_db), (after, np.interp(time_s - lag, time_s, predicted_db))):
-                errors.append(measured_db - level_db - (measured_db - level_db).mean())
-    return float(np.concatenate(before).std() - np.concatenate(after).std()) if before else 0.0
-
-
 def _names(model: _Model) -> frozenset[str]:
     return frozenset(trial.name for trial in model.trials)
 
@@ -484,7 +475,7 @@ def _models(e: LevelEvidence) -> _Models:
     pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
     models += [model(first.trials[0], second.trials[0], at=first.memories) for first, second in pairs]
     # unnamed slopes do not compete with half or twice the decibels
-    named = any("decibels" in _names(m) and m.gain > 0.0 for m in alone)
+    named = any(any("decibels" in name for name in _names(m)) and m.gain > 0.0 for m in alone)
     for first in likely:
         rest = [trial for trial in _candidates(_without(e, first)) if trial.name or not named]
         further = best_of(((first.trials[0], second) for second in rest), first.memories)
@@ -844,11 +835,18 @@ def _growing(e: LevelEvidence) -> FloatArray:
 
 def _misread(e: LevelEvidence) -> Iterator[Trial]:
     """Yield telemetry with other units, signs or columns than its reader assumes."""
-    for meaning, change in e.misread_db.items():
+    # no factor corrects heights that jump
+    jumps = (np.abs(np.diff(e.place_m[:, 2])) > _JUMP_M + _FASTEST_MPS * np.diff(e.time_s)).any()
+    possible = {meaning: change for meaning, change in e.misread_db.items() if not (jumps and "heights" in meaning)}
+    for meaning, change in possible.items():
         yield Trial(
             name="telemetry", cost=math.log(len(e.misread_db)), sentence=meaning,
             next_step="check the telemetry's columns and units", change_db=change,
         )  # fmt: skip
+
+
+# A UAV climbs with at most 6 m/s, which are 20 m/s if feet are read as metres.
+_JUMP_M, _FASTEST_MPS = 5.0, 25.0
 
 
 def _tower(e: LevelEvidence) -> Iterator[Trial]:
@@ -963,6 +961,19 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     others = [Trial(columns=columns) for columns in rivals]
     # without antennas in the prediction, twice the decibels are those of a path-loss exponent of 4
     alike = e.distance_db is not None and bool((e.predicted_db - e.distance_db).std() < SHOWN_DB)
+    if alike:
+        # near its maximum, the log likelihood is a parabola
+        near = float(np.polyfit(e.predicted_db, e.measured_db, 1)[0])
+        best, sd = _slope(e, near, 0.1, _fitted(e, others[0]).memories)
+        if best >= _STEEP:
+            doubled = ", or decibels are doubled" if abs(best - 2.0) <= 1.96 * sd else ""
+            yield Trial(
+                name="exponent or decibels", cost=math.log(2.0), columns=rivals[0],
+                sentence=f"the path-loss exponent is {2.0 * best:.1f}{doubled}",
+                next_step="check the unit of the levels",
+                estimate=(2.0 * best, 2.0 * best - 3.92 * sd, 2.0 * best + 3.92 * sd),
+            )  # fmt: skip
+            return
     for factor, words in ((0.5, "half"), (2.0, "twice"))[: 1 if alike else 2]:
         trial = Trial(
             name="decibels", cost=2.0 * _RARE + math.log(2.0), change_db=(factor - 1.0) * e.predicted_db,
@@ -984,6 +995,8 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
 
 # Prior standard deviation of the slope of measured over predicted levels.
 _SLOPE = 0.5
+# Least slope that an exponent explains, because heights and antennas change the slope by less.
+_STEEP = 1.25
 # Largest relative difference of a slope from 0.5 and 2, for any antennas and for learned ones. The slope of learned
 # antennas on held-out flights is 0.95 to 1.09.
 _SLOPE_SHARE, _LEARNED_SLOPE_SHARE = {0.5: 0.1, 2.0: 0.05}, {0.5: 0.12, 2.0: 0.1}
@@ -992,14 +1005,18 @@ _SLOPE_SHARE, _LEARNED_SLOPE_SHARE = {0.5: 0.1, 2.0: 0.05}, {0.5: 0.12, 2.0: 0.1
 def _is_slope(e: LevelEvidence, factor: float, at: Memories) -> bool:
     """Check whether the 95 % interval of the slope is near a factor."""
     step = factor * (_SLOPE_SHARE if e.learned is None else _LEARNED_SLOPE_SHARE)[factor]
+    best, sd = _slope(e, factor, step, at)
+    return abs(best - factor) <= step and abs(best - factor) + 1.96 * sd < 2.0 * step
+
+
+def _slope(e: LevelEvidence, factor: float, step: float, at: Memories) -> tuple[float, float]:
+    """Return the slope of measured over predicted levels, and its SD. It is NaN if the levels do not determine it."""
     changes = (Trial(change_db=(factor + i * step - 1.0) * e.predicted_db) for i in (-1, 0, 1))
-    # the log likelihood is a parabola in the slope
     below, middle, above = (_fitted(e, change, at=at, climb=False).log_likelihood for change in changes)
     bend = below - 2.0 * middle + above
     if bend >= 0.0:
-        return False
-    best, sd = factor + 0.5 * step * (below - above) / bend, step / math.sqrt(-bend)
-    return abs(best - factor) <= step and abs(best - factor) + 1.96 * sd < 2.0 * step
+        return math.nan, math.nan
+    return factor + 0.5 * step * (below - above) / bend, step / math.sqrt(-bend)
 
 
 # --- faults of the receiver ----------------------------------------------------------------------------------------
@@ -1135,19 +1152,6 @@ _LIMITS = {
 # --- faults of a part of the flight --------------------------------------------------------------------------------
 
 
-def _shift(residual: FloatArray, masks: FloatArray, phi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the level shift in each mask (m, n), its standard error and the gain in log likelihood."""
-    # subtract the prediction from the previous sample, so that slow fading is not mistaken for a shift
-    y = residual[1:] - phi * residual[:-1]
-    x = masks[:, 1:] - phi * masks[:, :-1]
-    y, x = y - y.mean(), x - x.mean(axis=1, keepdims=True)
-    power = np.einsum("ij,ij->i", x, x)
-    shift = np.divide(x @ y, power, out=np.zeros(len(x)), where=power > 1e-9)
-    left = np.maximum(y @ y - shift**2 * power, 1e-12)
-    error = np.sqrt(np.divide(left, len(y) * power, out=np.zeros(len(x)), where=power > 1e-9))
-    return shift, error, -0.5 * len(y) * np.log(left / max(float(y @ y), 1e-12))
-
-
 _SEARCHED_PHI = (0.6, 0.93)
 _WIDTHS_DEG = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 # Degrees over which the edge of a shadow fades: a Fresnel zone some hundred metres away.
@@ -1163,7 +1167,7 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
     coarse = [(middle, width) for width in _WIDTHS_DEG for middle in np.arange(0.0, 360.0, 5.0).tolist()]
     shadows = _shadows(e, coarse)
     for phi in _SEARCHED_PHI:
-        shift, _, gain = _shift(residual, shadows, phi)
+        shift, _, gain = shift_in_masks(residual, shadows, phi)
         inside = shadows.sum(axis=1)
         possible = (inside >= _LEAST_BINS) & (shadows.shape[1] - inside >= _LEAST_BINS) & (shift < -_LEAST_LOSS_DB)
         if not possible.any():
@@ -1172,7 +1176,7 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
         cost, (middle, width) = _concentration(gain, np.ones(len(gain))), coarse[int(np.argmax(gain))]
         around = [(middle + i, max(width + j, 2.0)) for i in range(-6, 7) for j in range(-8, 9)]
         finer = _shadows(e, around)
-        shift, error, gain = _shift(residual, finer, phi)
+        shift, error, gain = shift_in_masks(residual, finer, phi)
         at = int(np.argmax(np.where(shift < -_LEAST_LOSS_DB, gain, -np.inf)))
         (middle, width), loss, reach = around[at], -float(shift[at]), 1.96 * float(error[at])
         first = (middle - 0.5 * width) % 360.0
@@ -1207,7 +1211,7 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     creep = _STEP_DB * (np.arange(n) / n)[:, None]
     yield Trial(columns=creep)
     for phi in _SEARCHED_PHI:
-        shift, error, gain = _shift(residual, masks, phi)
+        shift, error, gain = shift_in_masks(residual, masks, phi)
         at = int(np.argmax(gain))
         instant = (e.start + np.timedelta64(round(float(e.time_s[starts[at]])), "s")).astype("datetime64[s]")
         step, reach = float(shift[at]), 1.96 * float(error[at])

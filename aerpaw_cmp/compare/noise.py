@@ -137,3 +137,32 @@ def fit_with_memories(residual: FloatArray, design: FloatArray, at: Memories, cl
 
 
 LEAST_VARIANCE = 1e-12
+
+
+def shift_in_masks(residual: FloatArray, masks: FloatArray, phi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the level shift in each mask (m, n), its standard error and the gain in log likelihood."""
+    # subtract the prediction from the previous sample, so that slow fading is not mistaken for a shift
+    y = residual[1:] - phi * residual[:-1]
+    x = masks[:, 1:] - phi * masks[:, :-1]
+    y, x = y - y.mean(), x - x.mean(axis=1, keepdims=True)
+    power = np.einsum("ij,ij->i", x, x)
+    shift = np.divide(x @ y, power, out=np.zeros(len(x)), where=power > 1e-9)
+    left = np.maximum(y @ y - shift**2 * power, 1e-12)
+    error = np.sqrt(np.divide(left, len(y) * power, out=np.zeros(len(x)), where=power > 1e-9))
+    return shift, error, -0.5 * len(y) * np.log(left / max(float(y @ y), 1e-12))
+
+
+def squares_of_halves(error: FloatArray, columns: FloatArray, memory: float) -> tuple[float, float]:
+    """Return the sums of squares of an error (n,) without and with a fit of columns (n, k) to the other half.
+
+    ``memory`` is the number of samples per independent sample of the error.
+    """
+    before = after = 0.0
+    first = np.arange(len(error)) < len(error) // 2
+    for fitted, other in ((first, ~first), (~first, first)):
+        x, y = columns[fitted] - columns[fitted].mean(axis=0), error[fitted] - error[fitted].mean()
+        noise = memory * max(float(y.var()), LEAST_VARIANCE) * np.eye(columns.shape[1])
+        left = error - columns @ np.linalg.solve(x.T @ x + noise, x.T @ y)
+        before += len(error) * float(error[other].var())
+        after += len(error) * float(left[other].var())
+    return before, after

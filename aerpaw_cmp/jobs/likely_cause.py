@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from typing import TypeVar
 
@@ -17,7 +17,6 @@ from ..compare.causes import (
     OF_DIRECTION,
     SHOWN_DB,
     LevelEvidence,
-    fall_without_lag_db,
     flight_cause,
     gains_by_direction,
 )
@@ -97,7 +96,11 @@ def _late_clock(evidence: Sequence[LevelEvidence], towers: Sequence[str]) -> Cau
     for tower in dict.fromkeys(towers):
         here = [e for e, at in zip(evidence, towers, strict=True) if at == tower]
         clock = here[0].clock
-        if clock is not None and clock.shifted and fall_without_lag_db(here) >= SHOWN_DB:
+        if clock is None or not clock.shifted:
+            continue
+        low, high = clock.ci95_s
+        # an interval wider than the lag shows levels that are late in a part of the flight only
+        if high - low <= abs(clock.radio_minus_telemetry_s) and fall_without_lag_db(here) >= SHOWN_DB:
             late.setdefault(clock.in_words, []).append(tower)
     if not late:
         return None
@@ -111,6 +114,19 @@ def _late_clock(evidence: Sequence[LevelEvidence], towers: Sequence[str]) -> Cau
         next_step="`rss: {lag: apply}`",
         channels=tuple(e.name for e, at in zip(evidence, towers, strict=True) if at in found),
     )
+
+
+def fall_without_lag_db(channels: Iterable[LevelEvidence]) -> float:
+    """Return by how much the RMSE of some channels falls if the lags of their clocks are corrected [dB]."""
+    before, after = list[FloatArray](), list[FloatArray]()
+    for e in channels:
+        lag = 0.0 if e.clock is None else e.clock.radio_minus_telemetry_s
+        known = np.isfinite(e.measured_db) & np.isfinite(e.predicted_db)
+        time_s, measured_db, predicted_db = e.time_s[known], e.measured_db[known], e.predicted_db[known]
+        if len(time_s):
+            for errors, level_db in ((before, predicted_db), (after, np.interp(time_s - lag, time_s, predicted_db))):
+                errors.append(measured_db - level_db - (measured_db - level_db).mean())
+    return float(np.concatenate(before).std() - np.concatenate(after).std()) if before else 0.0
 
 
 _CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT` with two flights of this site"
@@ -254,6 +270,7 @@ def _evidence(
              "isotropic": all(isinstance(p, Isotropic) for p in patterns), "measured": True}  # fmt: skip
     return LevelEvidence(
         name=result.name,
+        tower=series.tower,
         unit=series.unit,
         start=series.time.min() if len(series.time) else np.datetime64(0, "s"),
         antenna=next(name for name, holds in kinds.items() if holds),

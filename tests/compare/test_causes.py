@@ -1,5 +1,6 @@
 """The likely cause of a flight's error: named where it was planted, silent where nothing was or two explain it."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from scipy.stats import multivariate_normal
 from aerpaw_cmp.compare import causes, noise
 from aerpaw_cmp.compare.causes import LevelEvidence, Trial, flight_cause, gains_by_direction
 from aerpaw_cmp.compare.result import APPLIED, ESTIMATED, ClockResult
+from aerpaw_cmp.jobs import likely_cause
 from aerpaw_cmp.jobs.likely_cause import heights_meant, is_simulated
 from aerpaw_cmp.logs.readers import ReadOptions, identify
 from benchmarks.planted_causes import NONE, TROUBLES, situation
@@ -381,7 +383,7 @@ def test_a_free_form_pays_for_its_numbers_and_a_wide_search_for_its_width() -> N
 def test_shifts_are_those_of_least_squares_on_whitened_samples_with_an_offset(phi: float) -> None:
     residual = np.cumsum(np.random.default_rng(4).normal(size=80)) + 3.0
     masks = np.array([np.arange(80) >= 30, np.arange(80) % 7 / 7.0, np.zeros(80)])
-    shift, error, gain = causes._shift(residual, masks, phi)
+    shift, error, gain = noise.shift_in_masks(residual, masks, phi)
     y = residual[1:] - phi * residual[:-1]
     for k, mask in enumerate(masks[:2]):
         design = np.column_stack([np.ones(79), mask[1:] - phi * mask[:-1]])
@@ -473,7 +475,7 @@ def test_an_exponent_of_the_distance_or_a_gain_over_elevation_is_no_unit() -> No
     assert _named(replace(walk, measured_db=noise + antenna + 2.0 * distance)) != "decibels"
     # twice the decibels of free space alone are an exponent of 4
     bare = replace(e, predicted_db=distance, distance_db=distance - 3.0, turned_db={})
-    assert _named(replace(bare, measured_db=noise + 2.0 * distance)) == NONE
+    assert _named(replace(bare, measured_db=noise + 2.0 * distance)) == "exponent or decibels"
 
 
 def test_a_cause_brings_the_error_back_to_that_of_other_flights() -> None:
@@ -631,3 +633,93 @@ def test_another_slope_is_no_antenna_and_no_height() -> None:
     steep = sound.measured_db + 0.6 * sound.predicted_db
     height = {rise: 0.4 * rise / 40.0 * sound.predicted_db for rise in (-15.0, 15.0, 40.0)}
     assert _named(replace(sound, measured_db=steep, raised_db=height)) == NONE
+
+
+@pytest.mark.parametrize(("slope", "words"), [
+    (2.0, ("exponent is 4.", "or decibels are doubled")), (1.5, ("exponent is 3.", "")), (1.1, None),
+])  # fmt: skip
+def test_levels_that_fall_faster_without_antennas_have_another_exponent(
+    slope: float, words: tuple[str, str] | None
+) -> None:
+    """Without antennas in the prediction, doubled decibels and an exponent of 4 are the same."""
+    sound = _sound()
+    bare = replace(
+        sound, turned_db={}, antenna="isotropic", other_towers_db={}, distance_db=sound.predicted_db - 3.0,
+        uav_azimuth_deg=sound.time_s * 7.0, uav_elevation_deg=-20.0 - 10.0 * np.sin(sound.time_s / 7.0),
+    )  # fmt: skip
+    other = replace(bare, name="LW1 B", measured_db=_sound(seed=4).measured_db)
+    steep = [replace(e, measured_db=e.measured_db + (slope - 1.0) * e.predicted_db) for e in (bare, other)]
+    cause = flight_cause(steep)
+    if words is None:
+        assert cause is None
+        return
+    assert cause is not None
+    assert cause.name == "exponent or decibels"
+    assert words[0][:-1] in cause.sentence
+    assert ("decibels are doubled" in cause.sentence) == bool(words[1])
+    assert cause.estimate == pytest.approx(2.0 * slope, abs=0.15)
+    assert len(f"{cause.sentence} {cause.next_step}".split()) <= causes.MOST_CAUSE_WORDS
+    assert _named(steep[0], other) == NONE, "an exponent is that of all channels"
+
+
+def test_heights_that_jump_are_not_in_another_unit() -> None:
+    evidence = _planted()["telemetry"]
+    meaning = {"the logged heights are in feet": evidence.misread_db["in feet"]}
+    assert _named(replace(evidence, misread_db=meaning)) == "telemetry"
+    place_m = evidence.place_m + np.outer(90.0 * (evidence.time_s > 120.0), [0.0, 0.0, 1.0])
+    assert _named(replace(evidence, misread_db=meaning, place_m=place_m)) == NONE
+
+
+def test_a_displaced_tower_is_that_of_all_its_channels() -> None:
+    sound = _sound()
+    change = 6.0 * np.cos(sound.time_s / 17.0)
+    displaced = {(radius, azimuth): (radius / 170.0) * np.cos(np.radians(azimuth)) * change
+                 for radius in (40.0, 105.0, 170.0, 275.0) for azimuth in np.arange(0.0, 360.0, 22.5)}  # fmt: skip
+    one = replace(sound, tower="LW1", displaced_db=displaced, turned_db={}, measured_db=sound.measured_db + change)
+    other = replace(one, name="LW1 B", measured_db=_sound(seed=4).measured_db)
+    assert _named(one) == "place"
+    assert _named(one, other) == NONE
+    assert _named(one, replace(other, tower="LW2")) == "place"
+
+
+def test_causes_that_are_equally_likely_need_the_odds_of_a_place_together() -> None:
+    """A displaced track and swapped axes change the levels in the same way here."""
+    sound = _sound()
+    change = 6.0 * np.cos(sound.time_s / 17.0)
+    displaced = {(radius, azimuth): (radius / 170.0) * np.cos(np.radians(azimuth)) * change
+                 for radius in (40.0, 105.0, 170.0, 275.0) for azimuth in np.arange(0.0, 360.0, 22.5)}  # fmt: skip
+    alike = replace(sound, displaced_db=displaced, misread_db={"axes are swapped": change + 0.0}, turned_db={})
+    assert set(_named(replace(alike, measured_db=sound.measured_db + change)).split(" or ")) == {"place", "telemetry"}
+
+
+def test_a_step_that_halves_the_error_needs_no_further_odds(monkeypatch: pytest.MonkeyPatch) -> None:
+    sound = _sound()
+    monkeypatch.setitem(causes._CONDITIONS, "gain step", replace(causes._CONDITIONS["gain step"], lead=math.inf))
+    assert _named(replace(sound, measured_db=sound.measured_db + 8.0 * (sound.time_s > 150))) == "gain step"
+    assert _named(replace(sound, measured_db=sound.measured_db + 2.0 * (sound.time_s > 150))) == NONE
+
+
+@pytest.mark.parametrize(("left_db", "named"), [(2.8, "gain step"), (1.8, NONE)])
+def test_a_step_that_leaves_much_that_others_explain_is_not_named(
+    monkeypatch: pytest.MonkeyPatch, left_db: float, named: str
+) -> None:
+    """A step must remove three quarters of what all candidates remove together."""
+    sound, extra = _sound(), np.random.default_rng(8).normal(0.0, 3.0, 300)
+    monkeypatch.setattr(causes, "_together_db", lambda _: left_db)
+    assert _named(replace(sound, measured_db=sound.measured_db + 8.0 * (sound.time_s > 150) + extra)) == named
+
+
+def test_an_antenna_pattern_needs_log_odds_or_half_of_the_error() -> None:
+    sound, extra = _sound(), np.random.default_rng(8).normal(0.0, 2.0, 300)
+    lobes = np.sin(np.radians(2.0 * sound.uav_azimuth_deg))
+    for size_db, odds, named in ((3.0, 4.0, True), (3.0, 2.0, False), (7.0, 2.0, True)):
+        binned = causes._binned(replace(sound, measured_db=sound.measured_db + size_db * lobes + extra))
+        assert binned is not None
+        assert causes._explains("pattern", [causes._models(binned)], odds, set()) == named
+
+
+def test_a_lag_with_an_interval_wider_than_itself_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(likely_cause, "fall_without_lag_db", lambda _: 0.4)
+    sure, vague = _clock(3.0, "shifted"), replace(_clock(3.0, "shifted"), ci95_s=(1.0, 4.5))
+    assert likely_cause._late_clock([replace(_sound(), clock=sure)], ["LW1"]) is not None
+    assert likely_cause._late_clock([replace(_sound(), clock=vague)], ["LW1"]) is None

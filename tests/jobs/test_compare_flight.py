@@ -49,7 +49,11 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
         (True, None, 0.4, None),  # nothing is asked after an error below 1 dB
     ):
         late = SimpleNamespace(
-            name="LW1 A", antenna="", clock=SimpleNamespace(shifted=shifted, in_words="0.40 s ahead")
+            name="LW1 A",
+            antenna="",
+            clock=SimpleNamespace(
+                shifted=shifted, in_words="0.40 s ahead", radio_minus_telemetry_s=0.4, ci95_s=(0.3, 0.5)
+            ),
         )
         right = SimpleNamespace(name="LW2 A", antenna="", clock=SimpleNamespace(shifted=False))
         named = None if other is None else Cause(name=other, sentence="", next_step="")
@@ -80,7 +84,8 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
 def test_late_clocks_of_one_computer_have_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(likely_cause, "fall_without_lag_db", lambda _: 0.4)
     names = ("LW1", "LW2", "LW3")
-    lags: Any = [SimpleNamespace(name=f"{at} A", clock=SimpleNamespace(shifted=at != "LW3", in_words="0.40 s ahead"))
+    lags: Any = [SimpleNamespace(name=f"{at} A", clock=SimpleNamespace(
+                shifted=at != "LW3", in_words="0.40 s ahead", radio_minus_telemetry_s=0.4, ci95_s=(0.3, 0.5)))
                  for at in names]  # fmt: skip
     cause = likely_cause._late_clock(lags, names)
     assert cause is not None

@@ -105,7 +105,7 @@ def test_the_netcdf_file_has_h_as_the_sum_of_its_paths(written, cf_faults):
     assert book.delay_s.to_numpy()[0] == pytest.approx(direct / SPEED_OF_LIGHT_MPS, rel=1e-12)
     assert (book.doppler_hz.to_numpy()[0, :, 0] > 0.0).all()  # it comes nearer all the way
     assert np.diff(book.time) == pytest.approx(2.0)
-    assert "date is not known" in book.time.attrs["long_name"]
+    assert "date unknown" in book.time.attrs["long_name"]
     assert only_unnamed_time(cf_faults(outcome.files[0]))
 
 

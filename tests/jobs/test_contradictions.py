@@ -14,4 +14,4 @@ def test_a_campaign_that_another_airframe_predicts_worse_than_free_space_is_name
     controls = {"rotated by 90 deg": [score("a", 7.0), score("b", 7.0), score("c", 5.1)], "world frame": []}
     said = _contradictions(scores, controls, campaigns)
     assert [text.split()[0] for text in said] == ["bad", "turned"]
-    assert "RMSE 6.40 dB with their airframe, 7.00 dB with it rotated, 6.00 dB in free space" in said[0]
+    assert "RMSE 6.40 dB with their airframe, 7.00 dB with this airframe rotated, 6.00 dB in free space" in said[0]

@@ -168,7 +168,7 @@ def test_foreign_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no antenna pattern of a known format"):
         read_pattern_text(path)
     path.write_text("azimuth_deg,gain_dbi\n0,3\n")
-    with pytest.raises(InputError, match="one cut of two"):
+    with pytest.raises(InputError, match="one of two cuts"):
         read_pattern_text(path)
     path.write_bytes(b"\x00\xff\x80" * 100)
     with pytest.raises(InputError, match="not UTF-8 text"):

@@ -963,14 +963,15 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     alike = e.distance_db is not None and bool((e.predicted_db - e.distance_db).std() < SHOWN_DB)
     if alike:
         # near its maximum, the log likelihood is a parabola
-        near = float(np.polyfit(e.predicted_db, e.measured_db, 1)[0])
-        best, sd = _slope(e, near, 0.1, _fitted(e, others[0]).memories)
+        best, sd = _slope(e, np.polyfit(e.predicted_db, e.measured_db, 1)[0], 0.1, _fitted(e, others[0]).memories)
         if best >= _STEEP:
-            doubled = ", or decibels are doubled" if abs(best - 2.0) <= 1.96 * sd else ""
+            # obstacles near the ground cause such an exponent; in the air it is unlikely
+            doubled = abs(best - 2.0) <= 1.96 * sd and np.nanmedian(e.place_m[:, 2]) > _NEAR_GROUND_M
+            words = ", or decibels are doubled" if doubled else ""
             yield Trial(
                 name="exponent or decibels", cost=math.log(2.0), columns=rivals[0],
-                sentence=f"the path-loss exponent is {2.0 * best:.1f}{doubled}",
-                next_step="check the unit of the levels",
+                sentence=f"the path-loss exponent is {2.0 * best:.1f}{words}",
+                next_step="check the unit of the levels" if doubled else "look for obstacles that the map lacks",
                 estimate=(2.0 * best, 2.0 * best - 3.92 * sd, 2.0 * best + 3.92 * sd),
             )  # fmt: skip
             return
@@ -995,8 +996,9 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
 
 # Prior standard deviation of the slope of measured over predicted levels.
 _SLOPE = 0.5
-# Least slope that an exponent explains, because heights and antennas change the slope by less.
-_STEEP = 1.25
+# Least slope that an exponent explains, because heights and antennas change the slope by less, and largest height of a
+# receiver among obstacles [m].
+_STEEP, _NEAR_GROUND_M = 1.25, 10.0
 # Largest relative difference of a slope from 0.5 and 2, for any antennas and for learned ones. The slope of learned
 # antennas on held-out flights is 0.95 to 1.09.
 _SLOPE_SHARE, _LEARNED_SLOPE_SHARE = {0.5: 0.1, 2.0: 0.05}, {0.5: 0.12, 2.0: 0.1}

@@ -646,6 +646,7 @@ def test_levels_that_fall_faster_without_antennas_have_another_exponent(
     bare = replace(
         sound, turned_db={}, antenna="isotropic", other_towers_db={}, distance_db=sound.predicted_db - 3.0,
         uav_azimuth_deg=sound.time_s * 7.0, uav_elevation_deg=-20.0 - 10.0 * np.sin(sound.time_s / 7.0),
+        place_m=sound.place_m * [1.0, 1.0, 0.0] + [0.0, 0.0, 40.0],
     )  # fmt: skip
     other = replace(bare, name="LW1 B", measured_db=_sound(seed=4).measured_db)
     steep = [replace(e, measured_db=e.measured_db + (slope - 1.0) * e.predicted_db) for e in (bare, other)]
@@ -660,6 +661,10 @@ def test_levels_that_fall_faster_without_antennas_have_another_exponent(
     assert cause.estimate == pytest.approx(2.0 * slope, abs=0.15)
     assert len(f"{cause.sentence} {cause.next_step}".split()) <= causes.MOST_CAUSE_WORDS
     assert _named(steep[0], other) == NONE, "an exponent is that of all channels"
+    walk = flight_cause([replace(e, place_m=e.place_m * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.5]) for e in steep])
+    assert walk is not None
+    assert "decibels" not in f"{walk.sentence} {walk.next_step}", "houses explain the exponent of a walk"
+    assert "obstacles" in walk.next_step
 
 
 def test_heights_that_jump_are_not_in_another_unit() -> None:

@@ -6,13 +6,14 @@ numbers: RMSE as logged and over 4 s, share inside the 90 % interval, RMSE of al
 P(lock), rank.
 
 With ``--thirds`` the flights at LW1 are cut in three, and each third is drafted and reported alone. With ``--raw`` the
-flights of dataset 12 are written as AERPAW writes them: a power log per channel, and a vehicle log.
+flights of dataset 12 are written as AERPAW writes them: a power log per channel, and a vehicle log. With ``--locate``
+the rover of each AFAR flight is located by its levels, without learned antennas and with those of the other flights.
 
 At the end, or alone with ``--joint``, the calibration of all campaigns of one airframe is scored on held-out campaigns,
 flights, heights, sectors and headings. This is done with and without the one flight of AADM, and with rotated copies as
 a control. The goals are printed, too.
 
-    python benchmarks/left_out_reports.py FIELD [--only TEXT] [--keep FOLDER] [--thirds | --joint | --raw]
+    python benchmarks/left_out_reports.py FIELD [--only TEXT] [--keep FOLDER] [--thirds | --joint | --raw | --locate]
 """
 
 import argparse
@@ -34,6 +35,7 @@ import yaml
 from scipy.io import loadmat, savemat
 
 import aerpaw_cmp
+from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.compare.calibration import (
     SPLITS,
     Learned,
@@ -140,12 +142,36 @@ def as_raw(log: Path, folder: Path) -> Path:
     return folder
 
 
+def run(words: Sequence[object]) -> subprocess.CompletedProcess[str]:
+    """Run a command of the tool."""
+    return subprocess.run([sys.executable, "-m", "aerpaw_cmp", *map(str, words)], capture_output=True, text=True)
+
+
+def located(log: Path, site: Path, folder: Path, rover: tuple[float, float]) -> list[tuple[float, float]]:
+    """Return errors and radii of ``locate`` [m], without learned antennas and with those of a site, and print them."""
+    bare = folder / "bare.yaml"
+    shutil.copyfile(site, bare)
+    found = []
+    for name, of in (("without learned antennas", bare), ("with those of the other flights", site)):
+        flight = folder / "node.yaml"
+        run(["ingest", log, "--timezone", TIMEZONE, "--site", of, "--draft", flight, "--force"])
+        done = run(["locate", flight, "-o", folder / "node", "--force", "--json"])
+        if done.returncode:
+            raise SystemExit(f"{log.name}: {done.stderr.strip()[-300:]}")
+        answer = json.loads(done.stdout)
+        place = answer["position"]
+        error_m = float(np.hypot(*SiteFrame(*rover).to_local(place["latitude_deg"], place["longitude_deg"])))
+        found.append((error_m, float(answer["region90_m"])))
+        print(f"{log.name}, {name}: error {error_m:.1f} m, 90 % radius {found[-1][1]:.0f} m", flush=True)
+    return found
+
+
 def reported(log: Path, site: Path, folder: Path) -> tuple[str, dict[str, Any]]:
     """First sentence of a report of the draft, and its metrics."""
     flight, out = folder / "flight.yaml", folder / "report"
     draft = ["ingest", log, "--timezone", TIMEZONE, "--site", site, "--draft", flight, "--force"]
     for words in (draft, ["report", flight, "-o", out, "--figures", "none", "--audit", "none", "--force"]):
-        done = subprocess.run([sys.executable, "-m", "aerpaw_cmp", *map(str, words)], capture_output=True, text=True)
+        done = run(words)
         if done.returncode:
             return f"{words[0]}: exit {done.returncode}: {done.stderr.strip()[-300:]}", {}
     page = (out / "report.html").read_text(encoding="utf-8")
@@ -243,10 +269,15 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder that holds what was learned, for the next run")
     parser.add_argument("--thirds", action="store_true", help="of the flights at LW1, each third alone")
     parser.add_argument("--raw", action="store_true", help="dataset 12 as raw sounder and vehicle logs")
+    parser.add_argument("--locate", action="store_true", help="the rover of each AFAR flight, by its levels")
     parser.add_argument("--joint", action="store_true", help="the joint calibration alone")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        names = NAMES[: 1 if asked.raw else 2 if asked.thirds else None]
+        names = ("afar",) if asked.locate else NAMES[: 1 if asked.raw else 2 if asked.thirds else None]
+        rovers, found = list[tuple[float, float]](), []
+        if asked.locate:
+            lines = (asked.field / "sounder" / "rover_positions.txt").read_text(encoding="utf-8").splitlines()
+            rovers = [(float(a), float(b)) for a, b in (line.split(",") for line in lines[:3])]
         for name in () if asked.joint else names:
             recipe, means = recipe_of_campaign(name), dict[str, list[float]]()
             content = yaml.safe_load(recipe.read_text(encoding="utf-8"))
@@ -260,12 +291,19 @@ def main() -> None:
                     site_without(recipe, flight, asked.field, folder)
                 log = asked.field / load_flight(recipe.parent / flight).logs[0].path
                 log = as_raw(log, folder / "raw") if asked.raw else log
+                if asked.locate:
+                    found.append(located(log, site, folder, rovers[int(log.stem[-1]) - 1]))
+                    continue
                 for part in thirds(log, folder) if asked.thirds else [log]:
                     show(part, *reported(part, site, folder), means)
             if means:
                 text = ", ".join(f"{key} {sum(each) / len(each):.3f}" for key, each in means.items())
                 print(f"{name}, means over series: {text}", flush=True)
-        if not (asked.thirds or asked.raw or asked.only):
+        for case, values in zip(("without", "with"), np.array(found).swapaxes(0, 1) if found else (), strict=False):
+            inside = int((values[:, 0] <= values[:, 1]).sum())
+            text = f"mean error {values[:, 0].mean():.1f} m, {inside} of {len(values)} inside the 90 % region"
+            print(f"{case} learned antennas: {text}, largest radius {values[:, 1].max():.0f} m", flush=True)
+        if not (asked.thirds or asked.raw or asked.only or asked.locate):
             joint(asked.field, Path(scratch))
 
 

@@ -81,8 +81,9 @@ class LevelEvidence:
         for antennas without a pattern.
     attitude_db : mapping of str to (n,)
         Change of the predicted level with other values of ``rt.attitude``.
-    misread_db : mapping of str to (n,)
-        Change of the predicted level if the telemetry has another meaning, by that meaning in words.
+    misread_db, scaled_db : mapping of str to (n,)
+        Change of the predicted level if the telemetry has another meaning, or its heights have another unit, by that
+        meaning in words.
     other_towers_db : mapping of str to (n,)
         Predicted level of each other tower of the site.
     locked, serving : (n,), optional
@@ -107,6 +108,7 @@ class LevelEvidence:
     raised_db: Mapping[float, FloatArray] = field(default_factory=dict)
     attitude_db: Mapping[str, FloatArray] = field(default_factory=dict)
     misread_db: Mapping[str, FloatArray] = field(default_factory=dict)
+    scaled_db: Mapping[str, FloatArray] = field(default_factory=dict)
     other_towers_db: Mapping[str, FloatArray] = field(default_factory=dict)
     locked: FloatArray | None = None
     serving: FloatArray | None = None
@@ -475,7 +477,7 @@ def _models(e: LevelEvidence) -> _Models:
     pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
     models += [model(first.trials[0], second.trials[0], at=first.memories) for first, second in pairs]
     # unnamed slopes do not compete with half or twice the decibels
-    named = any(any("decibels" in name for name in _names(m)) and m.gain > 0.0 for m in alone)
+    named = any(m.gain > 0.0 and _names(m) & {"decibels", "exponent or decibels"} for m in alone)
     for first in likely:
         rest = [trial for trial in _candidates(_without(e, first)) if trial.name or not named]
         further = best_of(((first.trials[0], second) for second in rest), first.memories)
@@ -837,10 +839,9 @@ def _misread(e: LevelEvidence) -> Iterator[Trial]:
     """Yield telemetry with other units, signs or columns than its reader assumes."""
     # no factor corrects heights that jump
     jumps = (np.abs(np.diff(e.place_m[:, 2])) > _JUMP_M + _FASTEST_MPS * np.diff(e.time_s)).any()
-    possible = {meaning: change for meaning, change in e.misread_db.items() if not (jumps and "heights" in meaning)}
-    for meaning, change in possible.items():
+    for meaning, change in {**e.misread_db, **({} if jumps else e.scaled_db)}.items():
         yield Trial(
-            name="telemetry", cost=math.log(len(e.misread_db)), sentence=meaning,
+            name="telemetry", cost=math.log(len(e.misread_db) + len(e.scaled_db)), sentence=meaning,
             next_step="check the telemetry's columns and units", change_db=change,
         )  # fmt: skip
 

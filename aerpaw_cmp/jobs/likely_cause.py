@@ -285,9 +285,9 @@ def _evidence(
         raised_db=changed(link.raised_db(), known_both_db),
         attitude_db=changed(link.attitude_db(data.settings.rt.attitude)),
         misread_db=changed(
-            link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid][some], scaled=scaled),
-            known_both_db,
+            link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid][some]), known_both_db
         ),
+        scaled_db=changed(link.scaled_db(data) if scaled else {}, known_both_db),
         other_towers_db={name: predicted + change for name, change in changed(link.other_towers_db()).items()},
         locked=None if series.locked is None else series.locked[order],
         serving=None if series.serving is None else series.serving[order],
@@ -371,17 +371,25 @@ class _Direct:
             levels[radius, azimuth] = known_db + np.interp(np.arange(n), at, change)
         return levels
 
-    def misread_db(self, data: FlightData, time: Times, *, scaled: bool = True) -> dict[str, FloatArray]:
-        """Return levels by another meaning of the telemetry, at the instants of the poses (m,)."""
+    def scaled_db(self, data: FlightData) -> dict[str, FloatArray]:
+        """Return levels with the logged heights in another unit."""
+        position_m = self.replayed.poses.position_m
+        if data.track is None or self.replayed.track is None:
+            return {}
+        ground_m = np.array([0.0, 0.0, data.track.ground_m])
+        return {
+            meaning: self.level(position_m=ground_m + (position_m - ground_m) * [1.0, 1.0, scale], tower=True)
+            for meaning, scale in _HEIGHTS.items()
+        }
+
+    def misread_db(self, data: FlightData, time: Times) -> dict[str, FloatArray]:
+        """Return levels with another meaning of the telemetry, other than units, at the times of the poses (m,)."""
         position_m, track, used = self.replayed.poses.position_m, self.replayed.track, data.settings.rt.attitude
         if data.track is None or track is None:
             return {}
         begin_m = data.track.pose_at(np.array([data.track.start_ns], dtype="datetime64[ns]")).position_m[0, :2]
-        ground_m = np.array([0.0, 0.0, data.track.ground_m])
-        positions = {_MIRRORED: np.column_stack([begin_m + (position_m[:, :2] - begin_m)[:, ::-1], position_m[:, 2]])}
-        for meaning, scale in _HEIGHTS.items() if scaled else ():
-            positions[meaning] = ground_m + (position_m - ground_m) * [1.0, 1.0, scale]
-        levels = {meaning: self.level(position_m=moved_m, tower=True) for meaning, moved_m in positions.items()}
+        mirrored_m = np.column_stack([begin_m + (position_m[:, :2] - begin_m)[:, ::-1], position_m[:, 2]])
+        levels = {_MIRRORED: self.level(position_m=mirrored_m, tower=True)}
         if used != "ignored" and self._has_pattern and track.attitude_known.any():
             for meaning in MISREAD:
                 # channels with the same times share the attitude

@@ -670,9 +670,9 @@ def test_levels_that_fall_faster_without_antennas_have_another_exponent(
 def test_heights_that_jump_are_not_in_another_unit() -> None:
     evidence = _planted()["telemetry"]
     meaning = {"the logged heights are in feet": evidence.misread_db["in feet"]}
-    assert _named(replace(evidence, misread_db=meaning)) == "telemetry"
+    assert _named(replace(evidence, misread_db={}, scaled_db=meaning)) == "telemetry"
     place_m = evidence.place_m + np.outer(90.0 * (evidence.time_s > 120.0), [0.0, 0.0, 1.0])
-    assert _named(replace(evidence, misread_db=meaning, place_m=place_m)) == NONE
+    assert _named(replace(evidence, misread_db={}, scaled_db=meaning, place_m=place_m)) == NONE
 
 
 def test_a_displaced_tower_is_that_of_all_its_channels() -> None:

@@ -33,6 +33,7 @@ from ..compare.level import nearest_in_time
 from ..compare.rank import agreement, cohen_kappa, histogram, total_variation
 from ..compare.receiver import score_forecast
 from ..compare.referee import (
+    LevelCard,
     PredictedLevel,
     detection_floor_db,
     level_card,
@@ -40,7 +41,7 @@ from ..compare.referee import (
     nearest_points,
 )
 from ..compare.result import BASELINE_TITLE, FlightResult, RankResult, RssResult
-from ..compare.statistics import FEWEST, paired_difference
+from ..compare.statistics import FEWEST, PairedDifference, paired_difference
 from ..flight.data import FlightData, load_data
 from ..flight.drafting.draft import DraftOptions, drafts
 from ..flight.gains import load_with_learned
@@ -458,6 +459,34 @@ def _check_names(table: pd.DataFrame, data: FlightData, path: Path) -> None:
 # --- scores --------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesVerdict:
+    """The cards of one tower and channel.
+
+    Parameters
+    ----------
+    tower, channel, unit : str
+    matched, unmatched : int
+        Samples of the flight with and without a prediction nearby.
+    floor_db : float, optional
+        Detection floor that the predicted levels show (an emulated receiver).
+    cards : mapping of str to LevelCard
+        By model, the prediction first, then ray tracing and the baselines, on the same samples. A model with too few
+        levels has no card.
+    differences : mapping of str to PairedDifference
+        By model, RMSE of the prediction minus that of the model, each after one offset, with its interval.
+    """
+
+    tower: str
+    channel: str
+    unit: str
+    matched: int
+    unmatched: int
+    floor_db: float | None
+    cards: Mapping[str, LevelCard]
+    differences: Mapping[str, PairedDifference]
+
+
 # Numbers of a card that the tables show, with their headings.
 _HEADS = {
     "bias_db": "bias dB", "rmse_db": "RMSE dB", "rmse_offset_db": "RMSE after offset dB", "rmse_1s_db": "RMSE 1 s dB",
@@ -499,13 +528,13 @@ def judge(
             path=given.path,
         )
     name, remarks = given.path.name, given.remarks
-    matched, lost = (sum(s[key] for s in series) for key in ("matched", "unmatched"))
+    matched, lost = sum(s.matched for s in series), sum(s.unmatched for s in series)
     if lost > 0.1 * (matched + lost):
         where = "times of the prediction" if given.timed else f"predicted positions (within {near_m:g} m)"
         remarks += (f"{name}: {counted(lost, 'sample')} lie outside the {where} and are not scored.",)
-    levels: dict[str, dict[str, _Series]] = {}
+    levels: dict[str, dict[str, SeriesVerdict]] = {}
     for entry in series:
-        levels.setdefault(entry["tower"], {})[entry["channel"]] = entry
+        levels.setdefault(entry.tower, {})[entry.channel] = entry
     means = _means(series)
     heads = "series", "model", "n", *_HEADS.values(), "prediction minus model dB", "95 % low", "95 % high"
     score: dict[str, Any] = json_safe({
@@ -523,33 +552,33 @@ def judge(
     return score
 
 
-def _means(series: Sequence[_Series]) -> list[dict[str, Any]]:
+def _means(series: Sequence[SeriesVerdict]) -> list[dict[str, Any]]:
     """Return the means over channels of each model. A number that is missing for a channel is None."""
     rows = []
-    for model in dict.fromkeys(name for entry in series for name in entry["cards"]):
-        cards = [entry["cards"][model] for entry in series if model in entry["cards"]]
+    for model in dict.fromkeys(name for entry in series for name in entry.cards):
+        cards = [entry.cards[model] for entry in series if model in entry.cards]
         values = {key: [getattr(card, key) for card in cards] for key in _HEADS}
         means = {key: None if None in of else float(np.mean(of)) for key, of in values.items()}
         rows.append({"model": model, "channels": len(cards), **means})
     return rows
 
 
-def _rows(series: Sequence[_Series]) -> Iterator[tuple[Any, ...]]:
+def _rows(series: Sequence[SeriesVerdict]) -> Iterator[tuple[Any, ...]]:
     """Yield one row per series and model for page and card.json."""
     for entry in series:
-        for name, card in entry["cards"].items():
-            pair = entry["differences"].get(name)
+        for name, card in entry.cards.items():
+            pair = entry.differences.get(name)
             apart = (None,) * 3 if pair is None else (pair.difference_db, *pair.difference_ci95_db)
-            link = f"{entry['tower']} {entry['channel']}"
+            link = f"{entry.tower} {entry.channel}"
             yield link, name, card.n, *(getattr(card, key) for key in _HEADS), *apart
 
 
-def _sentence(name: str, series: Sequence[_Series], mean: Mapping[str, Any]) -> str:
+def _sentence(name: str, series: Sequence[SeriesVerdict], mean: Mapping[str, Any]) -> str:
     """Return both errors, whether the difference is significant, and the errors as predicted (``mean``)."""
     text = f"{name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel. Ray tracing has no level there."
-    if both := [entry for entry in series if OURS in entry["differences"]]:
-        theirs, mine = (np.mean([entry["cards"][model].rmse_offset_db for entry in both]) for model in (name, OURS))
-        verdicts = Counter(entry["differences"][OURS].verdict for entry in both)
+    if both := [entry for entry in series if OURS in entry.differences]:
+        theirs, mine = (np.mean([entry.cards[model].rmse_offset_db for entry in both]) for model in (name, OURS))
+        verdicts = Counter(entry.differences[OURS].verdict for entry in both)
         decided = [f"significantly {kind} on {verdicts[kind]}" for kind in ("better", "worse") if verdicts[kind]]
         text = (
             f"{name}: RMSE {theirs:.1f} dB after one offset per channel, ray tracing {mine:.1f} dB on the same samples "
@@ -560,23 +589,13 @@ def _sentence(name: str, series: Sequence[_Series], mean: Mapping[str, Any]) -> 
         band = mean["coverage_90"]
         inside = "" if band is None else f"; the 90 % band contains {100 * band:.0f} % of the samples"
         text += f" As predicted, without an offset: RMSE {mean['rmse_db']:.1f} dB{inside}."
-    matched, lost = (sum(entry[key] for entry in series) for key in ("matched", "unmatched"))
+    matched, lost = sum(s.matched for s in series), sum(s.unmatched for s in series)
     if lost:
         return f"{text} {counted(matched, 'sample')} have a prediction, {counted(lost, 'sample')} have none."
     return f"{text} All {counted(matched, 'sample')} have a prediction."
 
 
-# The cards of one tower and channel:
-# - ``tower channel unit``;
-# - ``matched unmatched``: samples of the flight with and without a prediction nearby;
-# - ``floor_db``: detection floor that the predicted levels show (an emulated receiver), or None;
-# - ``cards``: LevelCard by model, the prediction first, then ray tracing and the baselines, on the same samples. A
-#   model with too few levels has no card;
-# - ``differences``: PairedDifference by model, RMSE of the prediction minus that of the model, each after one offset.
-_Series = dict[str, Any]
-
-
-def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m: float) -> _Series | None:
+def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m: float) -> SeriesVerdict | None:
     """Return the cards of one tower and channel. None if too few samples have a prediction."""
     part = split_by_series(given.table, item.tower, item.channel)
     heading_deg = item.geometry.get("heading_deg")
@@ -607,13 +626,13 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
     }
     errors = {key: np.where(scored, item.measured_db - models[key][0].level_db, np.nan) for key in cards}
     theirs = errors.pop(name)
-    return {
-        "tower": item.tower, "channel": item.channel, "unit": item.unit,
-        "matched": int(near.sum()), "unmatched": int((item.posed & ~near).sum()),
-        "floor_db": detection_floor_db(part["level"].to_numpy(np.float64)),
-        "cards": cards,
-        "differences": {key: paired_difference(theirs, of, place_m=item.position_m) for key, of in errors.items()},
-    }  # fmt: skip
+    return SeriesVerdict(
+        tower=item.tower, channel=item.channel, unit=item.unit,
+        matched=int(near.sum()), unmatched=int((item.posed & ~near).sum()),
+        floor_db=detection_floor_db(part["level"].to_numpy(np.float64)),
+        cards=cards,
+        differences={key: paired_difference(theirs, of, place_m=item.position_m) for key, of in errors.items()},
+    )  # fmt: skip
 
 
 def split_by_series(table: pd.DataFrame, tower: str, channel: str) -> pd.DataFrame:

@@ -417,7 +417,7 @@ class OrdinaryKriging:
             rule = self._weights(self.points_m_[covered], targets, skip)
             if (largest := np.abs(rule.weight).sum(axis=1).max(initial=0.0)) > LARGEST_WEIGHTS:
                 warnings.warn(
-                    f"weights of samples add up to {largest:.0e}: estimates may lie as far outside the samples. "
+                    f"weights of samples add up to {largest:.0e}: estimates may exceed the samples by that factor. "
                     "Likely cause: a correlation that is flat at 0 (Gaussian) without a nugget",
                     RuntimeWarning,
                     stacklevel=3,

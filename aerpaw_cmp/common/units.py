@@ -40,16 +40,19 @@ THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0
 
 
 class Printed(float):
-    """A number in a sentence. Its minus is printed as a minus sign; hyphens in names are not changed.
+    """A number in a sentence. Its minus is printed as a minus sign, and a number that rounds to zero has no sign.
 
     Examples
     --------
-    >>> f"{Printed(-10.4):+.1f}"
-    '−10.4'
+    >>> f"{Printed(-10.4):+.1f}", f"{Printed(-0.04):+.1f} dB"
+    ('−10.4', '0.0 dB')
     """
 
     def __format__(self, form: str) -> str:
-        return super().__format__(form).replace("-", "\N{MINUS SIGN}")
+        text = super().__format__(form)
+        if set(text) <= set("+-0.,e"):
+            return text.lstrip("+-")
+        return text.replace("-", "\N{MINUS SIGN}")
 
 
 def unmasked(values: ArrayLike, dtype: Any = np.float64) -> AnyArray:

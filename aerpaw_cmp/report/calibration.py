@@ -15,7 +15,7 @@ from ..common.jsonable import json_object
 from ..common.units import FloatArray
 from ..compare.calibration import BASELINES, Score, mean_rmse
 from ..compare.verdict import Verdict, antenna_or_place, by_flight
-from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, write_page
+from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, write_page
 from .flight_words import said_of
 from .page import Made, about
 from .places import BODY, COMPASS, Places, payload
@@ -312,7 +312,7 @@ def rank_card(data: CalibrationData) -> Card:
         "constant forecast has the rank shares of the training flights. Total variation is that of the expected "
         "histogram.",
         columns={"Held out": TEXT, "Flight": HEAD, "Tower": TEXT, "kappa": 2, "log score": 3, "constant": 3,
-                 "total variation": 3, "agreement": 2, "most frequent rank": 2},
+                 "total variation": 3, "agreement": SHARE, "most frequent rank": SHARE},
         rows=_rows(data.rank, ("flight", "tower", "kappa", "log_score", "constant_log_score",
                                "total_variation_expected",
                                "agreement", "majority_agreement")),

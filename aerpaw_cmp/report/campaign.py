@@ -22,7 +22,7 @@ from ..compare.verdict import NodeOffset, Step, Verdict, campaign_verdict, poole
 from ..site.site import Site
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, settings_card
 from .charts import Chart
-from .flight_words import first_sentence, pretty, ranking_sentence, said_of
+from .flight_words import RANK_WORDS, first_sentence, pretty, ranking_sentence, said_of, signed
 from .page import Made, about, json_text, write_file
 from .places import RESIDUAL, Places, payload
 from .texts import interval, k_key, minute, more, number
@@ -407,8 +407,8 @@ def step_words(data: CampaignData) -> list[str]:
     last = max(node.night[-1] for node in judged)
     steps = sorted(((step.night, node.node, step) for node in judged for step in node.steps), key=lambda s: s[:2])
     out = [
-        f"On {minute(night)} the offset of {name} steps by {step.step_db:+.1f} dB "
-        f"(95 %: {step.step_ci95_db[0]:+.1f} to {step.step_ci95_db[1]:+.1f} dB)"
+        f"On {minute(night)} the offset of {name} steps by {signed(step.step_db)} dB "
+        f"(95 %: {signed(step.step_ci95_db[0])} to {signed(step.step_ci95_db[1])} dB)"
         + (f" and is back on {minute(step.back)}." if step.back else ".")
         for night, name, step in reversed(steps)
     ]
@@ -491,7 +491,7 @@ def verdict(data: CampaignData) -> list[str]:
     scored = [(row.rmse_db, row.n) for row in rows]
     known = {name: [row.baselines.get(name, np.nan) for row in rows] for row in rows for name in row.baselines}
     errors = {name: pooled_db(each, [row.n for row in rows]) for name, each in known.items() if np.isfinite(each).all()}
-    out = [first_sentence(scored, errors, [row.verdicts for row in rows], "flights x channels")]
+    out = [first_sentence(scored, errors, [row.verdicts for row in rows])]
     held_out = [row.held_out_rmse_db for row in rows if np.isfinite(row.held_out_rmse_db)]
     mean_own = float(np.mean([row.rmse_db for row in rows]))
     if held_out:
@@ -651,11 +651,9 @@ def result_card(data: CampaignData) -> Card:
 
 
 def _ranking(data: CampaignData) -> Table:
-    held_out = "held-out error over flights: each flight scored with the offset of the other flights"
-    kind = held_out if data.season.held_out else "error over flights, each with its own offset"
+    offset = "the offset of the other flights" if data.season.held_out else "its own offset"
     return Table(
-        caption=f"Settings by their mean {kind}. Difference from the best setting: mean difference on the same "
-        "flights, towers and channels, with a 95 % interval over flights; the first was chosen on these flights.",
+        caption=f"Settings by their mean error over flights. Each flight is scored with {offset}.",
         columns={"Rank": 0, "Setting": HEAD, "Flights": 0, "Mean error [dB]": RIGHT, "Median [dB]": 1,
                  "10 % to 90 % [dB]": RIGHT, "Difference from the best setting [dB]": 2, "95 %": 2,
                  "Against the best": TEXT},
@@ -665,6 +663,9 @@ def _ranking(data: CampaignData) -> Table:
              r.difference_ci95_db or "", r.verdict)
             for place, r in enumerate(data.season.over_all(), 1)
         ],
+        notes=["The difference from the best setting is computed on the same flights, towers and channels, and its "
+               "95 % interval over the flights. The best setting was selected on these flights, so expect a larger "
+               "error on other flights."],
     )  # fmt: skip
 
 
@@ -696,10 +697,10 @@ def _mean_errors(data: CampaignData) -> Table:
 
 def _transfers(data: CampaignData) -> Table:
     return Table(
-        caption="Rank: total variation with the K of the other flights (transferred), and with the best K of the "
-        f"flight itself (fitted here){more(data.rank_transfers, ROWS_SHOWN)}.",
-        columns={"Setting": TEXT, "Flight": HEAD, "Tower": TEXT, "Selected on": TEXT, "K": RIGHT,
-                 "Total variation, transferred": RIGHT, "Kappa": 2, "Own K": RIGHT, "Total variation, fitted here": 3},
+        caption="Rank with a K that was selected on the other flights, and with the best K of the flight itself"
+        f"{more(data.rank_transfers, ROWS_SHOWN)}.",
+        columns={"Setting": TEXT, "Flight": HEAD, "Tower": TEXT, "Other flights": TEXT, "K of the other flights": RIGHT,
+                 "Total variation": RIGHT, "Kappa": 2, "Own K": RIGHT, "Total variation, own K": 3},
         rows=[(t.setting, t.flight, t.tower, ", ".join(t.chosen_on), k_key(t.k), bold(number(t.total_variation, 3)),
                t.kappa, k_key(t.own_k), t.own_total_variation) for t in data.rank_transfers[:ROWS_SHOWN]],
     )  # fmt: skip
@@ -708,18 +709,19 @@ def _transfers(data: CampaignData) -> Table:
 def season_card(data: CampaignData) -> Card:
     """Return the card of the campaign over time: offsets of nodes over the dates, and their steps."""
     table = Table(
-        caption="Steps of offsets: date, size with 95 % interval, and date of the return to the old level. “Detects”: "
-        "step that is detected on its first date with a probability of 90 %. campaign.json has every date.",
-        columns={"Node": HEAD, "Dates": 0, "Std. dev. [dB]": 1, "Detects [dB]": 1, "Steps": TEXT},
+        caption="Steps of the offset of each node, with their dates and 95 % intervals.",
+        columns={"Node": HEAD, "Dates": 0, "Std. dev. [dB]": 1, "Detectable step [dB]": 1, "Steps": TEXT},
         rows=[(n.node, len(n.night), n.sd_db, n.smallest_db, "; ".join(map(_step, n.steps)) or "none")
               for n in data.season.nodes],
+        notes=["A detectable step is found on its first date with a probability of 90 %. campaign.json contains the "
+               "offsets of all dates."],
     )  # fmt: skip
     return Card(title="Over the campaign", id="season", link="Over time", chart="season", parts=[Card(tables=[table])])
 
 
 def _step(step: Step) -> str:
     back = f", back on {minute(step.back)}" if step.back else ""
-    return f"{minute(step.night)}: {step.step_db:+.1f} dB ({interval(step.step_ci95_db)}){back}"
+    return f"{minute(step.night)}: {signed(step.step_db)} dB ({interval(step.step_ci95_db)}){back}"
 
 
 def failures_card(data: CampaignData) -> Card:
@@ -740,9 +742,9 @@ def offsets_card(data: CampaignData) -> Card:
 
 def _pooled(data: CampaignData) -> Table:
     return Table(
-        caption=f"Offsets shared per {data.calibration} (added to the measurement), the offsets of the members, "
-        f"and the mean RMSE with each{more(data.pooled, ROWS_SHOWN)}.",
-        columns={"Setting": TEXT, "Group": HEAD, "Members": 0, "Shared offset [dB]": RIGHT, "Own offsets [dB]": 1,
+        caption=f"One offset for all channels of a {data.calibration}, compared with an offset for each channel of "
+        f"each flight{more(data.pooled, ROWS_SHOWN)}.",
+        columns={"Setting": TEXT, "Group": HEAD, "Channels": 0, "Shared offset [dB]": RIGHT, "Own offsets [dB]": 1,
                  "Std. dev. [dB]": 1, "RMSE, own offsets [dB]": 1, "RMSE, shared [dB]": 1},
         rows=[(g.setting, g.group, len(g.members), number(g.offset_db) + (" (edge)" if g.at_search_edge else ""),
                g.range_db, g.spread_db, g.own_rmse_db, g.pooled_rmse_db) for g in data.pooled[:ROWS_SHOWN]],
@@ -756,20 +758,22 @@ def _pairs(data: CampaignData) -> Table:
         return ", ".join(number(rmse.get((name, pair.tower, pair.channel))) for name in (pair.first, pair.second))
 
     return Table(
-        caption=f"Two flights at the same positions (within {number(data.radius_m, 0, 'm')}, headings within "
-        f"{number(data.heading_within_deg, 0)}°), and the RMSE of the setting “{data.reference}”. “After the "
-        f"model”: difference of their residuals. “By cell”: mean residuals in cells of "
-        f"{number(data.cell_m, 0, 'm')} at all heights. With a correlation near 1 the model has the same errors on "
-        f"both flights{more(data.repeats, ROWS_SHOWN)}.",
-        columns={"Link": HEAD, "Flights": TEXT, "Pairs": 0, "Share": SHARE, "Differ by [dB]": RIGHT, "95 %": 1,
-                 "One pass (÷√2)": 1, "After the model": 1, "RMSE of both": RIGHT, "By cell: RMS": 1, "Correlation": 2,
-                 "Cells": 0, "Height difference": RIGHT},
+        caption=f"Differences of two flights at the same positions{more(data.repeats, ROWS_SHOWN)}.",
+        columns={"Link": HEAD, "Flights": TEXT, "Pairs": 0, "Share": SHARE, "Levels differ by [dB]": RIGHT, "95 %": 1,
+                 "Error of one flight [dB]": 1, "Residuals differ by [dB]": 1, "RMSE of both [dB]": RIGHT,
+                 "Cell means differ by [dB]": 1, "Correlation of cell means": 2, "Cells": 0,
+                 "Height difference": RIGHT},
         rows=[
             (f"{r.tower} {r.channel}", f"{r.first}, {r.second}", r.n, r.share, bold(number(r.rmse_db)),
              r.rmse_ci95_db or "", r.single_db, r.residual_rmse_db, errors(r), r.place_rmse_db,
              r.place_correlation, r.cells, number(r.height_difference_m, 0, "m"))
             for r in data.repeats[:ROWS_SHOWN]
         ],
+        notes=[f"Two samples are a pair if they are within {number(data.radius_m, 0, 'm')} and their headings agree "
+               f"within {number(data.heading_within_deg, 0)}°. The error of one flight is the difference of the levels "
+               f"divided by √2. RMSE and residuals are those of the setting “{data.reference}”. Cell means are mean "
+               f"residuals in cells of {number(data.cell_m, 0, 'm')} over all heights. If their correlation is near 1, "
+               "the model has the same errors on both flights."],
     )  # fmt: skip
 
 
@@ -786,7 +790,8 @@ def _levels(data: CampaignData) -> Table:
         rows = sorted(rows, key=lambda r: -np.nan_to_num(r.rmse_db, nan=-1.0))[:ROWS_SHOWN]
     models = list(dict.fromkeys(name for row in data.rss for name in row.baselines))
     return Table(
-        caption=f"RSS. Offset and RMSE are fitted on the samples of the row; each baseline has its own offset{few}.",
+        caption="Levels. Offset and RMSE are fitted to the samples of the row. Each baseline has its own offset"
+        f"{few}.",
         columns={"Flight": HEAD, "Setting": TEXT, "Link": TEXT, "Offset [dB]": RIGHT, "RMSE [dB]": RIGHT, "95 %": 1,
                  "Held-out RMSE [dB]": 1, **{f"{pretty(name)} [dB]": 1 for name in models},
                  "Against baselines (95 %)": TEXT, "RMSE, shared offset [dB]": 1, "Correlation": 2, "Samples": 0,
@@ -809,13 +814,13 @@ def _clock(r: RssRow) -> str:
 
 def _ranks(data: CampaignData) -> Table:
     return Table(
-        caption="Rank: agreement by pose, Cohen's kappa (0 is chance) and total variation between the histograms, for "
-        f"each K{more(data.rank, ROWS_SHOWN)}.",
+        caption=f"Channel rank, reported and simulated, for each K{more(data.rank, ROWS_SHOWN)}.",
         columns={"Flight": HEAD, "Setting": TEXT, "Tower": TEXT, "K": RIGHT, "Samples": 0, "Agreement": RIGHT,
-                 "Commonest rank agrees": 2, "Kappa": 2, "Total variation": RIGHT, "Best K": 1},
-        rows=[(r.flight, r.setting, r.tower, k_key(r.k), r.n, estimate(r.agreement, r.agreement_ci95),
+                 "Most frequent rank agrees": SHARE, "Kappa": 2, "Total variation": RIGHT, "Best K": 1},
+        rows=[(r.flight, r.setting, r.tower, k_key(r.k), r.n, estimate(r.agreement, r.agreement_ci95, SHARE),
                r.commonest_agreement, r.kappa, estimate(r.total_variation, r.total_variation_ci95, 3, "<b>{}</b>"),
                r.best_k) for r in data.rank[:ROWS_SHOWN]],
+        notes=[RANK_WORDS],
     )  # fmt: skip
 
 

@@ -49,23 +49,31 @@ def _numeric(form: str | int) -> bool:
     return isinstance(form, int) or form in (RIGHT, SHARE)
 
 
-def estimate(value: float | None, ends: Interval | None, decimals: int = 2, mark: str = "{}") -> Markup:
+def estimate(value: float | None, ends: Interval | None, form: str | int = 2, mark: str = "{}") -> Markup:
     """Return a number as HTML, with its interval in small type.
 
     Parameters
     ----------
     value : float, optional
     ends : Interval, optional
-    decimals : int
+    form : str or int
+        Decimals, or :data:`SHARE` for a percentage.
     mark : str
         HTML around the number, such as ``<b>{}</b>``.
 
     Returns
     -------
     Markup
+
+    Examples
+    --------
+    >>> print(estimate(0.916, (0.9, 0.93), SHARE))
+    92 % <span class="small">[90, 93]</span>
     """
-    text = Markup(mark).format(number(value, decimals))
-    return Markup('{} <span class="small">{}</span>').format(text, interval(ends, decimals))
+    if form == SHARE and ends is not None:
+        ends = 100 * ends[0], 100 * ends[1]
+    shown = interval(ends, form if isinstance(form, int) else 0)
+    return Markup('{} <span class="small">{}</span>').format(Markup(mark).format(cell(value, form)), shown)
 
 
 def bold(text: Any) -> Markup:

@@ -19,7 +19,7 @@ from ..compare.verdict import LevelDifference, Overlap, RankDifference
 from .cards import HEAD, RIGHT, TEXT, Card, Page, Table, bold
 from .flight_words import count
 from .page import json_text, write_file
-from .texts import cut, interval, minute, number, short
+from .texts import cut, interval, minute, number, percent, short
 
 # Differences up to this are ignored, because tables are rounded to four decimals, and offsets to one.
 TOLERANCE_DB = 0.01
@@ -191,13 +191,15 @@ def _levels(diff: ReportDiff) -> Table:
 
 def _ranks(diff: ReportDiff) -> Table:
     return Table(
-        caption="Rank on the samples that both reports have; agreement and kappa where all four ranks exist.",
+        caption="Rank on the samples that both reports have. Agreement and kappa count only samples for which both "
+        "reports have a measured and a simulated rank. The change of agreement is in percentage points.",
         columns={"Tower": HEAD, "K": RIGHT, "Simulated ranks changed": RIGHT, "Change of agreement, 95 %": RIGHT,
                  "Agreement first, second": RIGHT, "Change of kappa, 95 %": RIGHT, "Kappa first, second": RIGHT,
                  "Reported ranks changed": 0, "Samples in both": 0, "In one report only": RIGHT},
         rows=[
             (one.tower, one.k, bold(number(one.n_changed, 0)),
-             f"{number(one.agreement.difference, 3)} {interval(one.agreement.ci95, 3)}", _both(one.agreement, 3),
+             f"{percent(one.agreement.difference, 1)} {interval(tuple(100 * end for end in one.agreement.ci95))}",
+             f"{percent(one.agreement.first, 1)}, {percent(one.agreement.second, 1)}",
              f"{number(one.kappa.difference, 3)} {interval(one.kappa.ci95, 3)}", _both(one.kappa, 3),
              one.n_reported_changed, one.samples.common, _alone_in_each(one.samples))
             for one in diff.ranks

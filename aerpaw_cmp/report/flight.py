@@ -181,14 +181,14 @@ def result_card(data: ReportData) -> Card:
 def _levels(data: ReportData) -> Table:
     models = list(dict.fromkeys(name for item in data.rss for name in item.baselines))
     return Table(
-        caption="RSS after the best constant offset. RMSE in dB; every model has its own offset. Brackets: 95 % "
-        "interval.",
+        caption="RMSE of the received level in dB, with its 95 % interval in brackets. Every model has its own best "
+        "constant offset.",
         columns={"Tower": HEAD, "Channel": TEXT, "Offset [dB]": RIGHT, "RMSE ray tracing": RIGHT,
                  **{f"RMSE {words.pretty(name)}": 1 for name in models},
                  "Correlation": 2, "Samples": 0, "Out of coverage": 0},
         rows=[
             (p.tower, p.channel, number(p.score.offset_db) + (" (edge)" if p.score.at_edge else ""),
-             estimate(p.score.rmse_db, p.score.rmse_ci95_db, decimals=1, mark="<b>{}</b>"),
+             estimate(p.score.rmse_db, p.score.rmse_ci95_db, 1, mark="<b>{}</b>"),
              *(p.baselines[name].rmse_db if name in p.baselines else None for name in models),
              p.score.correlation, p.score.n, p.score.n_out_of_coverage)
             for p in data.rss
@@ -209,13 +209,12 @@ def _ranks(data: ReportData) -> Table:
                          agreement, at.kappa, at.out_of_coverage))  # fmt: skip
     grounds = any(p.further.agreement_sd_by_ground for p in data.rank)
     return Table(
-        caption="Channel rank: shares of rank 1 to 4 in coverage. K: singular values of the channel matrix above the "
-        "largest one divided by K count. Total variation: distance between the two distributions, 0 to 1. Agreement: "
-        "share of samples with the same rank. Kappa: agreement beyond chance, 1 is perfect, 0 is chance."
-        + (" ±: standard deviation by the shape of the ground between its known heights." if grounds else ""),
+        caption="Shares of channel rank 1 to 4 in coverage, as the modem reported and as simulated.",
         columns={"Tower": HEAD, "Source": TEXT, **{f"Rank {rank}": SHARE for rank in RANKS},
                  "Total variation": RIGHT, "Agreement": RIGHT, "Kappa": 2, "Out of coverage": 0},
         rows=rows,
+        notes=[words.RANK_WORDS + (" The number after ± is the standard deviation that results from the unknown shape "
+                                   "of the ground between its known heights." if grounds else "")],
     )  # fmt: skip
 
 
@@ -273,14 +272,15 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
     """Return the card of one prediction: means over channels, then each channel."""
     errors: dict[str, str | int] = {"Bias [dB]": 1, "RMSE [dB]": 1, "after offset": 1, "over 1 s": 1}
     means = Table(
-        caption="Means over channels; a dash: no common reference with the log, or no band.",
+        caption="Mean scores over the channels. A dash means that the prediction has no common reference with the "
+        "log, or no 90 % band.",
         columns={"Model": HEAD, "Channels": 0, **errors, "Correlation": 2, "CRPS [dB]": 2, "In 90 %": SHARE},
         rows=[list(row.values()) for row in verdict["means"]],
     )
     every = verdict["table"]["rows"]
     channels = Table(
-        caption="Each channel. Last two columns: RMSE of the prediction minus that of the model, after offsets, and "
-        "its 95 % interval [dB]; negative: the prediction is better.",
+        caption="Scores of each channel. The difference is the RMSE of the prediction minus that of the model, after "
+        "offsets, with its 95 % interval [dB]. If it is negative, the prediction is better.",
         columns={"Tower, channel": HEAD, "Model": TEXT, "Samples": 0, **errors, "Correlation": 2, "CRPS [dB]": 2,
                  "In 90 %": SHARE, "Difference": 2, "95 %": 2},
         rows=[[*row[:11], None if row[11] is None else (row[11], row[12])] for row in every], look="dense",
@@ -327,9 +327,8 @@ def models_card(data: ReportData) -> Card:
     notes = {row.model: ", ".join(["recommended"] * row.recommended + ["fastest sufficient"] * row.fastest_sufficient)
              for row in shown}  # fmt: skip
     pooled = Table(
-        caption="RMSE in dB on held-out areas over all channels, and its difference to the best model on the same "
-        "samples with a 95 % interval. Recommended: the simplest replay within one standard error of the best replay. "
-        "Fastest sufficient: the fastest model whose difference to the best model is not significant.",
+        caption="RMSE on held-out areas over all channels, and its difference to the best model on the same samples, "
+        "with its 95 % interval.",
         columns={"No.": RIGHT, "Model": HEAD, "RMSE [dB]": 1, "Difference to the best [dB]": RIGHT, "Time [s]": 2,
                  "Note": TEXT},
         rows=[
@@ -337,7 +336,9 @@ def models_card(data: ReportData) -> Card:
              estimate(row.difference_to_best_db, row.difference_to_best_ci95_db), row.seconds, notes[row.model])
             for number, row in enumerate(shown, 1)
         ],
-        notes=[f"Within 0.01 dB of a row above on every channel: {'; '.join(same)}."] if same else [],
+        notes=["The recommended model is the simplest replay within one standard error of the best replay. The fastest "
+               "sufficient model is the fastest whose difference to the best model is not significant.",
+               *([f"Within 0.01 dB of a row above on every channel: {'; '.join(same)}."] if same else [])],
     )  # fmt: skip
     each = Table(
         caption="RMSE in dB on held-out areas, and in brackets the 95 % interval of its difference to the best model.",
@@ -368,8 +369,8 @@ def serving_card(data: ReportData) -> Card:
         return Card()
     names, counts = shown_confusion(serving)
     table = Table(
-        caption="Samples by the cell that served (rows) and the predicted strongest cell. Levels are as simulated, "
-        "without offsets.",
+        caption="Numbers of samples by serving cell (rows) and predicted strongest cell (columns). Simulated levels "
+        "have no offset.",
         columns={"Served": HEAD, **dict.fromkeys(names, 0), "no path": 0},
         rows=[(name, *row.tolist()) for name, row in zip(names, counts, strict=True)],
     )  # fmt: skip
@@ -393,12 +394,12 @@ def _tower(p: RankResult) -> Card:
     score = p.score
     best = f"Over continuous K the best is {number(score.curve.best_k)} {interval(score.curve.best_k_ci95)}."
     table = Table(
-        caption=f"Distances between the reported and the simulated rank at {p.tower}. Brackets: 95 % interval. p: "
-        "probability of such a distance if both had the same distribution.",
+        caption=f"Reported and simulated rank at {p.tower}, with 95 % intervals in brackets. p is the probability of "
+        "such a total variation if both had the same distribution.",
         columns={"K": HEAD, "Agreement by pose": RIGHT, "Kappa": 2, "Total variation": RIGHT, "Wasserstein": 2, "p": 3,
                  "Out of coverage": 0},
         rows=[
-            (k_key(k), estimate(at.agreement, at.agreement_ci95), at.kappa,
+            (k_key(k), estimate(at.agreement, at.agreement_ci95, SHARE), at.kappa,
              estimate(at.total_variation, at.total_variation_ci95), at.wasserstein, at.p_histogram, at.out_of_coverage)
             for k, at in score.simulated.items()
         ],
@@ -425,7 +426,7 @@ def engine_card(data: ReportData) -> Card:
 
 def _audited_paths(a: AuditResult) -> Table:
     return Table(
-        caption="Paths and levels of the two engines on links spread over all series.",
+        caption="Paths and levels of the two engines on the same links, which are spread over all channels.",
         columns={"Reference": HEAD, "Links": 0, "Paths missing": 0,
                  "Paths that Sionna RT did not sample": 0, "Largest RSS difference [dB]": 3,
                  **{f"Other rank at K = {k_key(k)}": RIGHT for k in a.rank_disagreement},

@@ -103,6 +103,14 @@ def headline(data: ReportData) -> str:
     return f"{kind} flight {data.flight} was replayed{engine} at {data.site.name} and compared: {' and '.join(parts)}."
 
 
+# Explanation of the columns of a table of ranks.
+RANK_WORDS = (
+    "A singular value of the channel matrix counts towards the rank if it is greater than the largest one divided by "
+    "K. Agreement is the share of samples with the same rank. Kappa is the agreement beyond chance: 1 is perfect, and "
+    "0 is chance. Total variation is the distance between the shares of reported and simulated ranks, from 0 to 1."
+)
+
+
 # --- summary -----------------------------------------------------------------------------------------------------
 
 
@@ -128,22 +136,19 @@ def first_sentence(
     scored: Sequence[tuple[float, int]],
     baselines_db: Mapping[str, float],
     verdicts: Sequence[Mapping[str, str]],
-    unit: str = "channels",
 ) -> str:
-    """Return the sentence with the error of ray tracing, that of one baseline, and the verdict of the paired intervals.
+    """Return the sentence about the error of ray tracing and of one baseline in all flights of a campaign.
 
     The baseline is the best one that is better than ray tracing, or otherwise the best one.
 
     Parameters
     ----------
     scored : sequence of (float, int)
-        RMSE [dB] and samples of each series.
+        RMSE [dB] and samples of each channel of each flight.
     baselines_db : mapping of str to float
-        Pooled RMSE of each baseline that all series have [dB].
+        Pooled RMSE of each baseline that all channels have [dB].
     verdicts : sequence of mapping
-        Verdict of the paired interval of each series, by baseline.
-    unit : str
-        Plural name of a series.
+        Verdict of the paired interval of each channel, by baseline.
 
     Returns
     -------
@@ -152,8 +157,10 @@ def first_sentence(
 
     Examples
     --------
-    >>> first_sentence([(6.72, 9), (6.72, 9)], {"free_space": 6.0}, [{"free_space": "not significant"}] * 2)
-    'Ray tracing: RMSE 6.7 dB; free space: 6.0 dB. The difference is not significant on any of 2 channels (95 %).'
+    >>> first_sentence([(6.72, 9)], {"free_space": 6.0}, [{"free_space": "not significant"}])
+    'Ray tracing: RMSE 6.7 dB; free space: 6.0 dB. The difference is not significant (95 %).'
+    >>> first_sentence([(6.72, 9)] * 3, {"free_space": 6.0}, [{}] * 3).partition(". ")[2]
+    'There is no interval of the difference, because no flight has enough independent samples.'
     """
     error = f"Ray tracing: RMSE {pooled_db(*map(list, zip(*scored, strict=True))):.1f} dB"
     if not baselines_db:
@@ -162,9 +169,9 @@ def first_sentence(
     lost = [name for name, of in counts.items() if of["worse"] > of["better"]]
     name = min(lost or baselines_db, key=lambda baseline: baselines_db[baseline])
     better, worse, undecided = (counts[name][verdict] for verdict in ("better", "worse", NO_INTERVAL))
-    of = "" if len(scored) == 1 else f" on {worse or better or 'any'} of {len(scored)} {unit}"
+    of = "" if len(scored) == 1 else f" on {worse or better or 'any'} of {len(scored)} channels of the flights"
     if undecided == len(verdicts):
-        significance = "The flight is too short to distinguish them."
+        significance = "There is no interval of the difference, because no flight has enough independent samples."
     elif not better and not worse:
         significance = f"The difference is not significant{of} (95 %)."
     else:

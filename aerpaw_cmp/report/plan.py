@@ -78,8 +78,7 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
                "beat a lawnmower of the same length."],
     )  # fmt: skip
     curve = Table(
-        caption="Expected standard deviation after a shorter or longer flight: the best of three candidates, flown for "
-        "a part of the battery or beyond it. A longer flight may contain the shorter one.",
+        caption="Expected standard deviation by flight time, after the best of three candidates of that length.",
         columns={"Time [min]": 1, "Length [km]": 1, "SD [dB]": 1},
         rows=[(p["minutes"], p["length_m"] / 1000, p["sd_db"]) for p in data.curve],
     )  # fmt: skip

@@ -49,7 +49,7 @@ def test_every_date_of_a_step_is_named_with_the_latest_first(data):
     nodes = (NodeOffset(node="LW3", steps=(old,), **sizes), NodeOffset(node="LW1", steps=(rain,), **sizes))
     words = campaign_words.step_words(dataclasses.replace(data, season=dataclasses.replace(data.season, nodes=nodes)))
     assert words[:-1] == [
-        "On 2026-06-20 the offset of LW1 steps by -3.0 dB (95 %: -4.0 to -2.0 dB) and is back on 2026-06-21.",
+        "On 2026-06-20 the offset of LW1 steps by −3.0 dB (95 %: −4.0 to −2.0 dB) and is back on 2026-06-21.",
         "On 2026-06-13 the offset of LW3 steps by +1.9 dB (95 %: +1.2 to +2.6 dB).",
         "No offset steps on 2026-06-24, the last date.",
     ]
@@ -134,7 +134,7 @@ def test_the_page_opens_with_a_verdict_against_the_baselines_and_explains_its_me
     said, means, stands_out = campaign_words.verdict(shown)
     assert said == (
         "Ray tracing: RMSE 7.0 dB; free space: 6.0 dB. "
-        f"Ray tracing is significantly worse on {n} of {n} flights x channels (95 %)."
+        f"Ray tracing is significantly worse on {n} of {n} channels of the flights (95 %)."
     )
     assert "7.0 dB with each flight's own offset, 7.9 dB with the offset of the other flights" in means
     assert "Expect 7.9 dB on a new flight" in means

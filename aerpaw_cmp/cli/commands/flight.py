@@ -141,8 +141,8 @@ def _print_forecasts(rank: Mapping[str, Any]) -> None:
     """Print the scores of the rank forecasts of fitted receivers, if there are any."""
     known = [{"tower": tower, **(m.get("receiver") or {}), "n": m["n"]} for tower, m in rank.items()]
     columns = {
-        "tower": "tower", "kappa": "kappa:.2f", "95 %": "kappa_ci95:.2f", "agreement": "agreement:.3f",
-        "commonest": "majority_agreement:.3f", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",
+        "tower": "tower", "kappa": "kappa:.2f", "95 %": "kappa_ci95:.2f", "agreement": "agreement:.0%",
+        "commonest": "majority_agreement:.0%", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",
         "n": "n",
     }  # fmt: skip
     known = [forecast for forecast in known if forecast.get("kappa") is not None]
@@ -176,7 +176,7 @@ def _print_report_summary(outcome: Any) -> None:
         for tower, m in outcome.metrics["rank"].items()
         for k, fit in m["simulated"].items()
     ]
-    columns = {"tower": "tower", "K": "k", "agreement": "agreement:.3f", "total variation": "total_variation:.3f"}
+    columns = {"tower": "tower", "K": "k", "agreement": "agreement:.0%", "total variation": "total_variation:.3f"}
     records(thresholds, {**columns, "n": "n"}, "Rank, measured against replayed")
     _print_forecasts(outcome.metrics["rank"])
     for verdict in outcome.metrics.get("referee", []):
@@ -238,8 +238,8 @@ def calibrate(
         {**forecast, "split": split.replace("_", " ")} for split, scores in m["rank"].items() for forecast in scores
     ]
     columns = {
-        "held out": "split", "flight": "flight", "tower": "tower", "kappa": "kappa:.3f", "agree": "agreement:.3f",
-        "commonest": "majority_agreement:.3f", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",
+        "held out": "split", "flight": "flight", "tower": "tower", "kappa": "kappa:.3f", "agree": "agreement:.0%",
+        "commonest": "majority_agreement:.0%", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",
         "TV": "total_variation_expected:.3f",
     }  # fmt: skip
     records(forecasts, columns, "Rank on held-out data")

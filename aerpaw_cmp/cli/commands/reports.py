@@ -192,7 +192,7 @@ def _print_campaign_summary(outcome: Any) -> None:
     if names:
         table(["setting", *names], rows, "Mean RMSE over towers and channels (dB), each with its own offset")
     heads = {"setting": "setting", "flight": "flight", "tower": "tower", "K": "k:g"}
-    numbers = {"total variation": "total_variation:.3f", "agreement": "agreement:.2f", "kappa": "kappa:.2f"}
+    numbers = {"total variation": "total_variation:.3f", "agreement": "agreement:.0%", "kappa": "kappa:.2f"}
     records(m["rank"], heads | numbers, "Rank")
     for sentence in m["season"]["steps"]:
         show(sentence)

@@ -20,6 +20,7 @@ from ..compare.offset import Moments, difference_moments
 from ..compare.statistics import Interval
 from ..compare.verdict import NodeOffset, Step, Verdict, campaign_verdict, pooled_db
 from ..site.site import Site
+from .canvas import mark
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, settings_card
 from .charts import Chart
 from .flight_words import RANK_WORDS, first_sentence, pretty, ranking_sentence, said_of, signed
@@ -537,13 +538,12 @@ def charts_of(data: CampaignData) -> list[Chart]:
     number = {night: float(i) for i, night in enumerate(dates)}
     shown = sorted(nodes, key=lambda node: (not node.steps, -np.ptp(node.offset_db or (0.0,))))[:_NODES_SHOWN]
     marks = [
-        {"kind": "line", "name": node.node, "x": np.array([number[night] for night in node.night]),
-         "y": np.array(node.offset_db)}
+        mark("line", node.node, np.array([number[night] for night in node.night]), np.array(node.offset_db))
         for node in shown
-    ]  # fmt: skip
+    ]
     for name, step, level in ((n.node, s, n.offset_db[n.night.index(s.shown)]) for n in shown for s in n.steps):
         ends = level + np.array(step.step_ci95_db) - step.step_db
-        marks.append({"kind": "line", "name": f"step of {name}", "x": np.full(2, number[step.shown]), "y": ends})
+        marks.append(mark("line", f"step of {name}", np.full(2, number[step.shown]), ends))
     return [Chart(
         section="season", title="Offsets over the campaign",
         caption="Offset of each node over the dates, minus the part that all nodes share (weather, a transmitter). "

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, spread_out
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site, Tower, Trees
@@ -44,8 +44,11 @@ WAYPOINT = "#555555"
 
 RANK_MARKER = {0: "x", 1: "o", 2: "s", 3: "^", 4: "D"}
 
+# Colours and line styles of a chart. The styles distinguish curves in grey.
+COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")
+_LINES = ("-", (0, (5, 2)), (0, (1, 1.3)), (0, (6, 2, 1, 2)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
+
 POINTS_PER_LINE = 3000
-POINTS_PER_CLOUD = 30_000
 _RASTER_DPI = 130
 
 
@@ -278,46 +281,59 @@ def thinned(at: FloatArray, values: FloatArray, limit: int = POINTS_PER_LINE) ->
     return at[rows], values[rows]
 
 
-def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
-    """Return the indices of the points of a cloud that should be drawn.
-
-    Clouds with more than ``limit`` points are thinned evenly, and their extremes are retained.
+def mark(kind: str, name: str, x: AnyArray, y: AnyArray | None = None, **more: Any) -> dict[str, Any]:
+    """Return a mark of a chart: ``line`` or ``dots`` (x, y), ``band`` (x, low, high), or ``spans`` (x, ends).
 
     Parameters
     ----------
-    values : (n,)
-        Ordinates in the order of the abscissa; NaN is ignored.
-    limit : int
-        Number of points.
+    kind, name : str
+        Kind, and name in the legend.
+    x, y : (n,)
+    more
+        Further coordinates (n,), such as ``low`` and ``high``, and the look, as in :func:`draw_marks`.
 
-    Examples
-    --------
-    >>> values = np.sin(np.arange(1e5) / 9e3)
-    >>> values[31_415] = 7.0
-    >>> rows = cloud(values, 2000)
-    >>> 2000 <= len(rows) <= 3200, bool(values[rows].max() == 7.0), len(cloud(values[:50]))
-    (True, True, 50)
+    Returns
+    -------
+    dict
     """
-    if len(values) <= limit:
-        return np.arange(len(values))
-    return np.union1d(spread_out(len(values), limit), keep_extremes([values], 1200))  # extremes per two pixels
+    return {"kind": kind, "name": name, "x": x, **({} if y is None else {"y": y}), **more}
 
 
-def dots(ax: Axes, at: FloatArray, values: FloatArray, size: float = 2.0, **options: Any) -> None:
-    """Draw a cloud of points, thinned and rasterised.
+def draw_marks(ax: Axes, marks: Sequence[Mapping[str, Any]]) -> None:
+    """Draw the marks of a chart (:mod:`~aerpaw_cmp.report.charts`), the first at the bottom.
 
     Parameters
     ----------
     ax : Axes
-    at, values : (n,)
-    size : float
-        Size of a dot.
-    options
-        Options of :meth:`matplotlib.axes.Axes.plot`.
+    marks : sequence of mapping
+        Marks of :func:`mark`. The look may have ``colour``, ``dash`` (line style), ``alpha``, ``marker``, ``size`` and
+        ``hatch``. ``spans`` fill the background between ``x`` and ``ends`` up to the share ``height`` of the axes. The
+        script of a page does not draw them.
     """
-    rows = cloud(values)
-    options = {"marker": ".", **options}
-    ax.plot(at[rows], values[rows], linestyle="none", markersize=size, rasterized=True, **options)
+    for number, item in enumerate(marks):
+        kind, x = item["kind"], item["x"]
+        colour = item.get("colour", COLOURS[number % len(COLOURS)])
+        look: dict[str, Any] = {"color": colour, "label": item["name"], "zorder": 2.0 + number / 100}
+        if kind == "band":
+            ax.fill_between(x, item["low"], item["high"], linewidth=0, alpha=item.get("alpha", 1.0), **look)
+        elif kind == "line":
+            dash = item.get("dash", _LINES[number % len(_LINES)])
+            x, y = thinned(x, item["y"])
+            # a point between two gaps is not part of a line, so it gets a dot
+            gap = np.pad(np.isnan(y), 1, constant_values=True)
+            alone = ~gap[1:-1] & gap[:-2] & gap[2:]
+            ax.plot(x, y, linestyle=dash, linewidth=1.2, marker="o", markersize=1.3, markevery=alone, **look)
+        elif kind == "dots":
+            size, marker = item.get("size", 4.0 if len(x) <= 200 else 1.3), item.get("marker", "o")
+            # as a picture inside an SVG, because a day of samples would be a file of many megabytes
+            ax.plot(x, item["y"], linestyle="none", marker=marker, markersize=size, rasterized=True, **look)
+        elif len(x):
+            bars = ax.broken_barh(
+                np.column_stack([x, item["ends"] - x]), (0.0, item.get("height", 1.0)), label=item["name"],
+                transform=ax.get_xaxis_transform(), facecolor=colour, edgecolor="#888888", linewidth=0.0,
+                hatch=item.get("hatch"), zorder=0.5,
+            )  # fmt: skip
+            bars.set_rasterized(len(x) > 300)
 
 
 def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
@@ -331,78 +347,6 @@ def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
     # add zeros at both ends, so that every segment has two edges
     edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
     return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-
-
-# Number of segments that a time axis can show. It exceeds the number of pixels.
-_SPANS = 2000
-
-
-def draw_out_of_coverage(
-    ax: Axes, seconds: FloatArray, mask: BoolArray, label: str, *, height: float = 1.0, hatch: str = "////"
-) -> None:
-    """Draw hatched spans over a share of the height of the axes.
-
-    Parameters
-    ----------
-    ax : Axes
-    seconds : (n,)
-        Times of the samples.
-    mask : (n,) bool
-        Samples out of coverage.
-    label : str
-        Text of the legend.
-    height : float
-        Share of the height of the axes that the spans fill, from the bottom.
-    hatch : str
-        Hatch pattern of matplotlib.
-    """
-    if not mask.any():
-        return
-    # extend each segment by half a step on each side, so that a single sample is visible
-    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
-    first, last = runs(mask)
-    # join segments closer than a pixel
-    apart = seconds[first[1:]] - seconds[last[:-1]] >= (seconds[-1] - seconds[0]) / _SPANS
-    first, last = first[np.append(True, apart)], last[np.append(apart, True)]
-    spans = list(zip(seconds[first] - step / 2, seconds[last] - seconds[first] + step, strict=True))
-    bars = ax.broken_barh(
-        spans, (0.0, height), transform=ax.get_xaxis_transform(), facecolor="#EEEEEE", edgecolor="#888888",
-        hatch=hatch, linewidth=0.0, label=label, zorder=0.5 if height == 1.0 else 4.0,
-    )  # fmt: skip
-    bars.set_rasterized(len(spans) > 300)
-
-
-def draw_waypoints(
-    ax: Axes, waypoints: Iterable[tuple[str, np.datetime64]], start: np.datetime64, *, names: bool = True
-) -> None:
-    """Draw vertical lines at the named times of the flight.
-
-    Parameters
-    ----------
-    ax : Axes
-        Its x axis is in seconds.
-    waypoints : iterable of (str, datetime64)
-        Label and time of each waypoint.
-    start : datetime64
-        Zero of the x axis.
-    names : bool
-        True to write the labels, too.
-    """
-    for number, (label, time) in enumerate(waypoints):
-        at = float((time - start) / np.timedelta64(1, "s"))
-        ax.axvline(at, color=WAYPOINT, linewidth=0.8, linestyle=(0, (2, 2)), label="waypoint" if number == 0 else None)
-        if names:
-            ax.annotate(
-                label, (at, 1.0), xycoords=ax.get_xaxis_transform(), xytext=(0, 2),
-                textcoords="offset points", ha="center", va="bottom", fontsize=8, color=WAYPOINT,
-            )  # fmt: skip
-
-
-def legend_below(ax: Axes, columns: int = 4) -> None:
-    """Draw a legend below the axes, so that it does not hide data."""
-    handles, labels = ax.get_legend_handles_labels()
-    if handles:
-        ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns, borderaxespad=0.0)
 
 
 # --- site ---------------------------------------------------------------------------------------
@@ -588,24 +532,3 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
         bar.solids.set_rasterized(True)
         bar.solids.set_edgecolor("face")
     return bar
-
-
-def legend_of(ax: Axes, shown: Callable[[str], bool]) -> tuple[list[Any], list[str]]:
-    """Return handles and labels of the legend entries that ``shown`` accepts."""
-    handles, labels = ax.get_legend_handles_labels()
-    pick = [i for i, label in enumerate(labels) if shown(label)]
-    return [handles[i] for i in pick], [labels[i] for i in pick]
-
-
-def robust_limits(ax: Axes, levels: Sequence[FloatArray], around: float | None = None) -> None:
-    """Limit the ordinate to the 0.2 to 99.8 % range with a margin, so that a few deep nulls do not extend it."""
-    values = np.concatenate([level[np.isfinite(level)] for level in levels])
-    if not len(values):
-        ax.set_ylim(-1.0, 1.0)
-        return
-    low, high = np.percentile(values, [0.2, 99.8])
-    if around is not None:
-        reach = max(abs(low - around), abs(high - around), 1.0)
-        low, high = around - reach, around + reach
-    margin = max(0.08 * (high - low), 0.5)
-    ax.set_ylim(low - margin, high + margin)

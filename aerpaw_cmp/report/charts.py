@@ -1,7 +1,7 @@
 """Charts that the script of a page draws, and the confusion matrix of serving cells.
 
-A chart has marks over two axes. A mark is a ``band`` (x, low, high), a ``line`` (x, y) or ``dots`` (x, y, and whiskers
-from low to high). ``rows`` are names that replace the numbers of the ordinate.
+A chart has marks (:func:`~aerpaw_cmp.report.canvas.mark`) over two axes. Dots may have whiskers from ``low`` to
+``high``. ``rows`` are names that replace the numbers of the ordinate. Figures (:func:`drawn`) show the same marks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ..compare.ladder import ModelRow, distinct
 from ..compare.level import DetectionScore, ServingComparison
 from ..compare.result import RankResult
 from ..logs.records import has_wall_clock
-from .canvas import placed, seconds_since
+from .canvas import draw_marks, mark, placed, seconds_since
 from .flight_data import RANKS, ReportData, start_of
 from .flight_words import AS_SET, learned_on
 
@@ -28,10 +28,6 @@ if TYPE_CHECKING:
 
 # Number of means along the flight, about one per pixel.
 _FORECAST_COLUMNS = 600
-
-# Line styles that distinguish curves in grey.
-_LINES = ("-", (0, (5, 2)), (0, (1, 1.3)), (0, (6, 2, 1, 2)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
-COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,14 +48,7 @@ def drawn(panels: Mapping[str, Mapping[str, Any]]) -> Figure:
     for ax in axes.flat[len(panels) :]:
         ax.set_visible(False)
     for ax, (title, content) in zip(axes.flat, panels.items(), strict=False):
-        for number, mark in enumerate(content["marks"]):
-            look = {"color": mark.get("colour", COLOURS[number % len(COLOURS)]), "label": mark["name"]}
-            if mark["kind"] == "band":
-                ax.fill_between(mark["x"], mark["low"], mark["high"], linewidth=0, **look)
-            elif mark["kind"] == "line":
-                ax.plot(mark["x"], mark["y"], linestyle=_LINES[number % len(_LINES)], linewidth=1.3, **look)
-            else:
-                ax.plot(mark["x"], mark["y"], linestyle="none", marker="o", markersize=4, **look)
+        draw_marks(ax, content["marks"])
         ax.set(title=title, xlabel=content["x"]["label"], ylabel=content["y"]["label"])
         ax.set_ylim(*content["y"].get("ends", ax.get_ylim()))
     curves = [ax.get_legend_handles_labels() for ax in axes.flat[: len(panels)]]
@@ -117,11 +106,10 @@ def _errors(models: Sequence[ModelRow]) -> dict[str, Any]:
     rmse, apart = (np.array([getattr(row, key) for _, row in of])
                    for key in ("rmse_heldout_db", "difference_to_best_db"))  # fmt: skip
     low, high = np.array([row.difference_to_best_ci95_db for _, row in of]).T + rmse - apart
-    mark = {"kind": "dots", "name": "RMSE, all channels", "x": rmse, "y": np.array([float(i) for i, _ in of])}
+    dots = mark("dots", "RMSE, all channels", rmse, np.array([float(i) for i, _ in of]), low=low, high=high)
     names = [f"{number}  {row.model}" for number, row in enumerate(models, 1)]
     chosen = next((i for i, row in of if row.recommended), -1)
-    return {"rows": names, "chosen": chosen, "x": {"label": "RMSE on held-out areas [dB]"},
-            "marks": [{**mark, "low": low, "high": high}]}  # fmt: skip
+    return {"rows": names, "chosen": chosen, "x": {"label": "RMSE on held-out areas [dB]"}, "marks": [dots]}
 
 
 def _costs(models: Sequence[ModelRow]) -> dict[str, Any]:
@@ -130,11 +118,8 @@ def _costs(models: Sequence[ModelRow]) -> dict[str, Any]:
     for name, fastest in (("other models", False), ("fastest sufficient", True)):
         of = [(number, row) for number, row in enumerate(models, 1)
               if np.isfinite(row.rmse_heldout_db) and row.fastest_sufficient == fastest]  # fmt: skip
-        marks.append({
-            "kind": "dots", "name": name, "labels": [str(number) for number, _ in of],
-            "x": np.array([row.seconds for _, row in of]), "y": np.array([row.rmse_heldout_db for _, row in of]),
-        })  # fmt: skip
-    marks = [mark for mark in marks if mark["labels"]]
+        seconds, rmse = np.array([[row.seconds, row.rmse_heldout_db] for _, row in of]).reshape(-1, 2).T
+        marks += [mark("dots", name, seconds, rmse, labels=[str(number) for number, _ in of])] if of else []
     return {"x": {"label": "Computing time [s]"}, "y": {"label": "RMSE on held-out areas [dB]"}, "marks": marks}
 
 
@@ -147,9 +132,9 @@ def flown(data: ReportData) -> list[Chart]:
         Chart(section="flights", title=f"{data.flight}, {panel.name}", caption=caption, content={
             "x": axis, "y": {"label": f"RSS [{panel.unit}]"},
             "marks": [
-                {"kind": kind, "name": name, "x": seconds_since(panel.time, start), "y": level}
-                for kind, name, level in (("dots", "measured", panel.measured_db),
-                                          ("line", "ray tracing", panel.simulated_dbm - panel.score.offset_db))
+                mark(*what, seconds_since(panel.time, start), level)
+                for *what, level in (("dots", "measured", panel.measured_db),
+                                     ("line", "ray tracing", panel.simulated_dbm - panel.score.offset_db))
             ],
         })
         for panel in data.rss if panel.score.n
@@ -164,8 +149,8 @@ def _detection(score: DetectionScore) -> dict[str, Any]:
         "x": {"label": "Predicted probability of detection [%]", "ends": [0, 100]},
         "y": {"label": "Detected samples [%]", "ends": [0, 100]},
         "marks": [
-            {"kind": "dots", "name": "fifths of the samples", "x": said, "y": seen},
-            {"kind": "line", "name": "calibrated", "x": ends, "y": ends},
+            mark("dots", "fifths of the samples", said, seen),
+            mark("line", "calibrated", ends, ends),
         ],
     }
 
@@ -185,11 +170,10 @@ def _forecast(data: ReportData, panel: RankResult) -> dict[str, Any]:
         "x": {"label": "", "start": str(start.astype("datetime64[ms]"))},
         "y": {"label": "Probability [%]", "ends": [0, 100]},
         "marks": [
-            {"kind": "band", "name": f"rank {rank}", "x": at, "low": edges[:, i], "high": edges[:, i + 1],
-             "colour": CLASS_COLOURS[rank]}
+            mark("band", f"rank {rank}", at, low=edges[:, i], high=edges[:, i + 1], colour=CLASS_COLOURS[rank])
             for i, rank in enumerate(RANKS)
         ],
-    }  # fmt: skip
+    }
 
 
 # Largest number of cells with their own row. All other cells share one row.

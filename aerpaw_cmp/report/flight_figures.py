@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import numpy as np
 
 from ..common.kml import CLASS_COLOURS
 from ..common.text import counted
-from ..common.units import FloatArray, spread_out
+from ..common.units import BoolArray, FloatArray, spread_out
 from ..compare.result import PairResult, RankResult, RssResult
 from ..site.site import Site
 from .canvas import (
@@ -25,18 +26,14 @@ from .canvas import (
     WAYPOINT,
     FigureSpec,
     colour_bar,
-    dots,
-    draw_out_of_coverage,
+    draw_marks,
     draw_site,
-    draw_waypoints,
     frame_around,
-    legend_below,
-    legend_of,
+    mark,
     plan_shape,
-    robust_limits,
+    runs,
     seconds_since,
     subplots,
-    thinned,
     time_axis,
 )
 from .flight_data import RANKS, ReportData, Track, start_of, used_towers
@@ -122,80 +119,114 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     site_plan.set_title("Whole site")
     close.set_title("The flight")
     site_plan.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
-    close.legend(
-        *legend_of(close, lambda label: label.startswith("flight")), loc="upper center", bbox_to_anchor=(0.5, -0.12)
-    )
+    close.legend(handles=[points], loc="upper center", bbox_to_anchor=(0.5, -0.12))
     return fig
 
 
 def altitude(data: ReportData, track: Track) -> Figure:
-    """Draw height over time, with waypoints."""
+    """Draw height over time."""
+    height = mark("line", "height of the UAV", seconds_since(track.time, start_of(data)), track.up_m)
+    return over_time(data, [({"label": "Height above ground [m]"}, [height])], [2.2])
+
+
+# --- over time ----------------------------------------------------------------------------------
+
+
+def over_time(data: ReportData, panels: Sequence[tuple[Mapping[str, Any], Sequence[Any]]], high_in: Any) -> Figure:
+    """Draw charts one below the other over the time of a flight, with its waypoints.
+
+    Parameters
+    ----------
+    data : ReportData
+    panels : sequence of (mapping, sequence of mapping)
+        Ordinate with ``label`` and optional ``ends`` and ``ticks``, and the marks of each chart over the seconds after
+        the first time of the report.
+    high_in : sequence of float
+        Height of each chart [inch].
+
+    Returns
+    -------
+    Figure
+    """
     start = start_of(data)
-    seconds = seconds_since(track.time, start)
-    fig, ax = subplots((9.2, 2.9))
-    ax.plot(*thinned(seconds, track.up_m), color=SIMULATED, linewidth=1.2, label="height of the UAV")
-    draw_waypoints(ax, data.moments, start)
-    time_axis(ax, start)
-    ax.set_ylabel("Height above ground [m]")
-    ax.set_ylim(bottom=min(0.0, float(np.nanmin(track.up_m, initial=0.0))))
-    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    points = [(label, float((time - start) / np.timedelta64(1, "s"))) for label, time in data.moments]
+    fig, grid = subplots((9.2, 0.7 + sum(high_in)), len(panels), 1, sharex=True, height_ratios=high_in, squeeze=False)
+    for row, (ax, (ordinate, marks)) in enumerate(zip(grid[:, 0], panels, strict=True)):
+        draw_marks(ax, marks)
+        for label, at in points:
+            name = "waypoint" if row == 0 and label == points[0][0] else None
+            ax.axvline(at, color=WAYPOINT, linewidth=0.8, linestyle=(0, (2, 2)), label=name)
+            if row == 0:
+                ax.annotate(label, (at, 1.01), xycoords=ax.get_xaxis_transform(), ha="center", fontsize=8)
+        if "ticks" in ordinate:
+            ax.set_yticks(ordinate["ticks"])
+        ax.set(ylabel=ordinate["label"], ylim=ordinate.get("ends") or _limits(marks))
+        handles, labels = ax.get_legend_handles_labels()
+        names = [textwrap.fill(label, 26) for label in labels]
+        legend = ax.legend(handles, names, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        for handle in legend.get_lines():  # the dots of the chart would be too small here
+            handle.set_markersize(5.0 if handle.get_linestyle() == "None" else 0.0)
+    time_axis(grid[-1, 0], start)
     return fig
 
 
-# --- RSS ----------------------------------------------------------------------------------------
+def _limits(marks: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
+    """Return the 0.2 to 99.8 % range of lines and dots with a margin, so that a few deep nulls do not extend it."""
+    values = np.concatenate([item["y"][np.isfinite(item["y"])] for item in marks if "y" in item])
+    low, high = np.percentile(values, [0.2, 99.8]) if len(values) else (-1.0, 1.0)
+    margin = max(0.08 * (high - low), 0.5)
+    return low - margin, high + margin
+
+
+def _spans(seconds: FloatArray, mask: BoolArray, name: str, **look: Any) -> dict[str, Any]:
+    """Return the mark of the segments of True samples at these times (n,)."""
+    # extend each segment by half a step on each side, so that a single sample is visible
+    half = float(np.median(np.diff(seconds))) / 2 if len(seconds) > 1 else 0.5
+    first, last = runs(mask)
+    # join segments closer than a pixel
+    apart = seconds[first[1:]] - seconds[last[:-1]] >= (seconds[-1] - seconds[0]) / _MOST_SPANS
+    first, last = first[np.append(True, apart)[: len(first)]], last[np.append(apart, True)[: len(last)]]
+    look = {"colour": "#EEEEEE", "hatch": "////", **look}
+    return mark("spans", name, seconds[first] - half, ends=seconds[last] + half, **look)
+
+
+# Number of segments that a time axis can show. It exceeds the number of pixels.
+_MOST_SPANS = 2000
+NO_PATH, SHADE = "out of coverage: no path in the simulation", "#DDDDDD"
 
 
 def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
     """Draw over time: the level as logged, simulation and baselines minus their offsets, and the residual."""
-    start, score = start_of(data), panel.score
-    seconds = seconds_since(panel.time, start)
-    fig, (ax, below) = subplots((9.2, 5.6), 2, 1, sharex=True, height_ratios=(2.6, 1.0))
-    draw_out_of_coverage(ax, seconds, panel.simulated_out_of_coverage, "out of coverage: no path in the simulation")
-    draw_out_of_coverage(
-        ax, seconds, panel.measured_out_of_coverage, "no signal in the measurement", height=0.05, hatch="xxxxx"
-    )
-    measured, residual = panel.measured_db, panel.residual_db
+    seconds, score = seconds_since(panel.time, start_of(data)), panel.score
     simulated = _moved(panel.simulated_dbm, score.offset_db)
-    label = f"measured, as logged ({count(score.n)} scored)"
-    dots(ax, seconds, measured, 2.5, color=MEASURED, label=label, zorder=3.5)
-    for name, baseline in panel.baselines.items():
-        colour, dashes = BASELINE[name]
-        ax.plot(
-            *thinned(seconds, _moved(baseline.level_dbm, baseline.offset_db)), color=colour, linestyle=dashes,
-            linewidth=1.2, zorder=2.5 if name == "two_ray" else 3.7,  # its dense fringes would hide other lines
-            label=f"{pretty(name)} (own offset)",
-        )  # fmt: skip
-    label = f"ray tracing, {_offset(score.offset_db)}"
-    ax.plot(*thinned(seconds, simulated), color=SIMULATED, linewidth=1.0, label=label, zorder=3)
+    silent = panel.measured_out_of_coverage
+    marks = [
+        _spans(seconds, panel.simulated_out_of_coverage, NO_PATH),
+        _spans(seconds, silent, "no signal in the measurement", height=0.05, hatch="xxxxx"),
+    ]
     if panel.stated is not None:
-        some = slice(None, None, max(1, len(seconds) // POINTS_PER_LINE))
         band = panel.stated.columns(simulated)
-        low, high = (band[f"simulated_{end}_dbm"][some] for end in ("low", "high"))
-        ax.fill_between(seconds[some], low, high, color=SIMULATED, alpha=0.15, linewidth=0, label="90 % band", zorder=1)
-    dots(ax, seconds, simulated, 1.5, color=SIMULATED, zorder=3)  # a line does not show a point between two gaps
-    draw_waypoints(ax, data.moments, start)
-    robust_limits(ax, [measured, simulated])
-    ax.set_ylabel(f"RSS [{panel.unit}]")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), ncols=3, markerscale=3)
-    dots(below, seconds, residual, color="#0072B2", label="measured − simulated")
-    below.axhline(0.0, color=SIMULATED, linewidth=0.8)
-    if np.isfinite(score.rmse_db):
-        for sign in (-1, 1):
-            below.axhline(
-                sign * score.rmse_db, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 3)),
-                label=f"RMSE {score.rmse_db:.1f} dB" if sign == 1 else None,
-            )  # fmt: skip
-    draw_waypoints(below, data.moments, start, names=False)
-    robust_limits(below, [residual], around=0.0)
-    below.set_ylabel("Residual [dB]")
-    time_axis(below, start)
-    shown = legend_of(below, lambda label: label.startswith(("measured", "RMSE")))
-    below.legend(*shown, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1)
-    return fig
-
-
-def _offset(offset_db: float) -> str:
-    return f"minus its offset of {signed(offset_db)} dB" if np.isfinite(offset_db) else "no offset"
+        low, high = band["simulated_low_dbm"], band["simulated_high_dbm"]
+        marks.append(mark("band", "90 % band", seconds, low=low, high=high, colour=SIMULATED, alpha=0.15))
+    lines = {}
+    for name, baseline in panel.baselines.items():
+        (colour, dash), level = BASELINE[name], _moved(baseline.level_dbm, baseline.offset_db)
+        lines[name] = mark("line", f"{pretty(name)} (own offset)", seconds, level, colour=colour, dash=dash)
+    # the dense fringes of two-ray ground would hide other lines
+    marks += [lines.pop("two_ray")] if "two_ray" in lines else []
+    offset = f"minus its offset of {signed(score.offset_db)} dB" if np.isfinite(score.offset_db) else "no offset"
+    marks += [
+        mark("line", f"ray tracing, {offset}", seconds, simulated, colour=SIMULATED, dash="-"),
+        mark("dots", f"measured, as logged ({count(score.n)} scored)", seconds, panel.measured_db, colour=MEASURED),
+        *lines.values(),
+    ]
+    rmse = np.full(2, score.rmse_db)
+    residual = [
+        mark("band", f"±RMSE, {number(score.rmse_db, 1, 'dB')}", seconds[[0, -1]], low=-rmse, high=rmse, colour=SHADE),
+        mark("dots", "measured − simulated", seconds, panel.residual_db, colour="#0072B2"),
+    ]
+    levels = {"label": f"RSS [{panel.unit}]"}
+    return over_time(data, [(levels, marks), ({"label": "Residual [dB]"}, residual)], [3.6, 1.5])
 
 
 def _moved(level_dbm: FloatArray, offset_db: float) -> FloatArray:
@@ -206,23 +237,21 @@ def _moved(level_dbm: FloatArray, offset_db: float) -> FloatArray:
 def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssResult]) -> Figure:
     """Draw both channels of a tower and the ray tracing. Segments in which the channels differ are shaded (Fig. 15)."""
     start, (first, second) = start_of(data), panels
-    fig, ax = subplots((9.2, 3.6))
-    for span in pair.score.spans:
-        ax.axvspan(*seconds_since(np.array(instants(pair.time, span)), start), color="0.88", linewidth=0, zorder=0)
+    ends = [seconds_since(np.array(instants(pair.time, span)), start) for span in pair.score.spans]
+    parted = np.array(ends).reshape(-1, 2).T
     moved = second.score.offset_db - first.score.offset_db
     shown = ((first, 0.0, MEASURED, "as logged"), (second, moved, SECOND, f"moved by {signed(moved)} dB"))
-    for panel, by, colour, words in shown:
-        seconds = seconds_since(panel.time, start)
-        dots(ax, seconds, panel.measured_db + by, 2.5, color=colour, label=f"{panel.channel}, {words}")
     seconds, simulated = seconds_since(first.time, start), _moved(first.simulated_dbm, first.score.offset_db)
-    draw_out_of_coverage(ax, seconds, first.simulated_out_of_coverage, "out of coverage: no path in the simulation")
-    ax.plot(*thinned(seconds, simulated), color=SIMULATED, linewidth=1.0, label="ray tracing")
-    draw_waypoints(ax, data.moments, start)
-    time_axis(ax, start)
-    ax.set_ylabel(f"RSS [{first.unit}]")
-    robust_limits(ax, [first.measured_db, second.measured_db + moved, simulated])
-    legend_below(ax, 3)
-    return fig
+    marks = [
+        mark("spans", "channels differ", parted[0], ends=parted[1], colour=SHADE),
+        _spans(seconds, first.simulated_out_of_coverage, NO_PATH),
+        mark("line", "ray tracing", seconds, simulated, colour=SIMULATED, dash="-"),
+    ]
+    marks += [
+        mark("dots", f"{p.channel}, {words}", seconds_since(p.time, start), p.measured_db + by, colour=colour)
+        for p, by, colour, words in shown
+    ]
+    return over_time(data, [({"label": f"RSS [{first.unit}]"}, marks)], [2.9])
 
 
 # --- rank ---------------------------------------------------------------------------------------
@@ -242,20 +271,18 @@ def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: F
     title : str
     """
     draw_site(ax, site)
+    entries = []
     for value, at in ((value, rank == value) for value in (0, *RANKS) if (rank == value).any()):
         style: dict[str, Any] = {"color": "black", "linewidths": 0.8}
         if value:
             style = {"facecolor": CLASS_COLOURS[value], "edgecolors": "#222222", "linewidths": 0.25}
-        ax.scatter(
+        entries.append(ax.scatter(
             east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **style,
             label=f"{f'rank {value}' if value else 'no path'} ({count(int(at.sum()))})",
             zorder=3.0 + 1.0 / at.sum(),  # rare ranks on top, so that they are visible
-        )  # fmt: skip
+        ))  # fmt: skip
     ax.set_title(title)
-    ax.legend(
-        *legend_of(ax, lambda label: label.startswith(("rank", "no path"))), loc="upper center",
-        bbox_to_anchor=(0.5, -0.13), ncols=3, markerscale=1.6, columnspacing=1.0,
-    )  # fmt: skip
+    ax.legend(handles=entries, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, markerscale=1.6)
 
 
 def rank_maps(data: ReportData, panel: RankResult) -> Figure:
@@ -304,68 +331,39 @@ def rank_histograms(panel: RankResult) -> Figure:
     ax.set_xticks(RANKS, [f"{r}" for r in RANKS])
     ax.set(xlabel="Channel rank", ylabel="Share of the samples in coverage [%]")
     ax.grid(axis="x", visible=False)
-    legend_below(ax)
+    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return fig
 
 
 def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
     """Draw the measured rank and the rank for every K over time, above SINR and singular values."""
-    start = start_of(data)
-    seconds = seconds_since(panel.time, start)
-    rows = 1 + len(panel.rank)
-    below = [1.3] * (panel.sinr_db is not None) + [2.2]
-    ratios = [1.0] * rows + below
-    fig, axes = subplots((9.2, 1.1 * sum(ratios) + 0.5), len(ratios), 1, sharex=True, height_ratios=ratios)
-    _draw_measured_rank(axes[0], seconds, panel)
-    for ax, (k, rank) in zip(axes[1:], panel.rank.items(), strict=False):
-        ax.plot(
-            seconds, np.where(rank == 0, np.nan, rank), linestyle="none", marker="|", markersize=7, rasterized=True,
-            color=SIMULATED, label=f"K = {k_key(k)}",
-        )  # fmt: skip
-        draw_out_of_coverage(ax, seconds, rank == 0, "out of coverage: no path")
-    for ax in axes[:rows]:
-        draw_waypoints(ax, data.moments, start, names=ax is axes[0])
-        ax.set_yticks(RANKS)
-        ax.set(ylim=(0.5, 4.5), ylabel="Rank")
-        ax.legend(*legend_of(ax, lambda label: label != "waypoint"), loc="center left", bbox_to_anchor=(1.0, 0.5))
+    seconds = seconds_since(panel.time, start_of(data))
+    fresh, tick = panel.score.staleness.fresh, {"marker": "|", "size": 7}
+    held_over, reported = (np.where(at, panel.measured, np.nan) for at in (~fresh, fresh))
+    measured = [mark("dots", "measured", seconds, reported, colour="#0072B2", **tick)]
+    if not fresh.all():
+        grey = {"marker": "|", "size": 4, "colour": "#9A9A9A"}
+        measured.insert(0, mark("dots", "measured, held over", seconds, held_over, **grey))
+    ranks = {"label": "Rank", "ends": (0.5, 4.5), "ticks": RANKS}
+    panels: list[Any] = [(ranks, measured)]
+    for k, rank in panel.rank.items():
+        simulated = np.where(rank == 0, np.nan, rank)
+        level = mark("dots", f"K = {k_key(k)}", seconds, simulated, colour=SIMULATED, **tick)
+        panels.append((ranks, [_spans(seconds, rank == 0, "out of coverage: no path"), level]))
     if panel.sinr_db is not None:
-        dots(axes[rows], seconds, panel.sinr_db, color="#0072B2", label="SINR")
-        axes[rows].set_ylabel("SINR [dB]")
-        axes[rows].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
-    _draw_singular_values(axes[-1], seconds, panel)
-    time_axis(axes[-1], start)
-    return fig
+        panels.append(({"label": "SINR [dB]"}, [mark("dots", "SINR", seconds, panel.sinr_db, colour="#0072B2")]))
+    ratios = [
+        mark("dots", f"σ{chr(0x2082 + i)}/σ₁", seconds, values, colour=colour)
+        for i, (values, colour) in enumerate(zip(panel.singular_ratio_db.T, _SINGULAR, strict=False))
+    ]
+    ratios += [
+        mark("line", f"1/K, K = {k_key(k)}", seconds[[0, -1]], np.full(2, -20 * np.log10(k))) for k in panel.rank
+    ]
+    # values below -110 dB are rounding errors
+    lowest = max(min(float(np.nanmin(item["y"], initial=-20.0)) for item in ratios) - 6.0, -110.0)
+    panels.append(({"label": "Singular value\nover largest [dB]", "ends": (lowest, 2.0)}, ratios))
+    return over_time(data, panels, [1.1] * (len(panels) - 1) + [2.2])
 
 
-def _draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankResult) -> None:
-    """Draw reported ranks as ticks. Ranks that repeat an earlier report are smaller and grey."""
-    held_over = ~panel.score.staleness.fresh
-    for mask, label, colour, size in (
-        (~held_over, "measured", "#0072B2", 7),
-        (held_over, "measured, held over", "#9A9A9A", 4),
-    ):
-        if mask.any():
-            ax.plot(
-                seconds[mask], panel.measured[mask], linestyle="none", marker="|", markersize=size, color=colour,
-                rasterized=True, label=label,
-            )  # fmt: skip
-
-
-def _draw_singular_values(ax: Axes, seconds: FloatArray, panel: RankResult) -> None:
-    """Draw singular values relative to the largest, with every threshold K."""
-    values = panel.singular_ratio_db
-    for column, colour in enumerate(("#111111", "#0072B2", "#9AD0F0")[: values.shape[1]]):
-        dots(ax, seconds, values[:, column], color=colour, label=f"σ{chr(0x2082 + column)}/σ₁")
-    for k in panel.rank:
-        level = -20 * np.log10(k)
-        ax.axhline(level, color=TOWER, linewidth=0.9, linestyle=(0, (5, 2)), label="thresholds 1/K")
-        ax.annotate(
-            f"K = {k_key(k)}", (0.004, level), xycoords=ax.get_yaxis_transform(), fontsize=7, va="bottom", color=TOWER,
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6}, zorder=6,
-        )  # fmt: skip
-    lowest = [-20 * np.log10(k) for k in panel.rank] + values[np.isfinite(values)].tolist()
-    ax.set_ylim(max(min(lowest, default=-20.0) - 6.0, -110.0), 2.0)  # values below -110 dB are rounding errors
-    ax.set_ylabel("Singular value\nover largest [dB]")
-    # one legend entry for all thresholds
-    entries = dict(zip(*ax.get_legend_handles_labels()[::-1], strict=True))
-    ax.legend(entries.values(), entries.keys(), loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
+# Colours of the singular values after the first.
+_SINGULAR = ("#111111", "#0072B2", "#9AD0F0")

@@ -28,7 +28,7 @@ from ..maps.grid import PAPER_SPACING_M
 from ..maps.variogram import BiExponential, BinnedCorrelation
 from ..site.site import Site
 from . import canvas
-from .canvas import FigureSpec, beyond, colour_bar, draw_areas, draw_tower, placed
+from .canvas import FigureSpec, beyond, colour_bar, draw_areas, draw_tower, mark, placed
 from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, bold, paragraph, settings_card
 from .charts import Chart, drawn, flown
 from .flight_data import RANKS, ReportData
@@ -440,7 +440,7 @@ def distribution(members: Sequence[RssMap]) -> dict[str, Any]:
         level = np.sort(shown.values[np.isfinite(shown.values)])
         share = (shown.values.size - len(level) + np.arange(1, len(level) + 1)) / shown.values.size
         some = spread_out(len(level), 400)  # steps of 1/400 are not visible
-        marks.append({"kind": "line", "name": shown.tower, "x": level[some], "y": 100.0 * share[some]})
+        marks.append(mark("line", shown.tower, level[some], 100.0 * share[some]))
     return {"x": {"label": "RSS [dBm]"}, "y": {"label": "Positions below [%]", "ends": [0, 100]}, "marks": marks}
 
 
@@ -453,19 +453,18 @@ def rank_shares(members: Sequence[RankMap]) -> dict[str, Any]:
     share = 100.0 * np.array([member.share for member in members])
     edges = np.repeat(np.column_stack([np.zeros(len(at)), share.cumsum(axis=1)]), 2, axis=0)
     marks = [
-        {"kind": "band", "name": f"rank {rank}" if rank else "out of coverage", "x": sides, "low": edges[:, rank],
-         "high": edges[:, rank + 1], "colour": CLASS_COLOURS[rank]}
-        for rank in (0, *RANKS)
-    ]  # fmt: skip
+        mark("band", f"rank {rank}" if rank else "out of coverage", sides, low=low, high=high, colour=colour)
+        for rank, low, high, colour in zip((0, *RANKS), edges.T, edges.T[1:], CLASS_COLOURS, strict=False)
+    ]
     return {"x": {"label": "Height [m]"}, "y": {"label": "Positions [%]", "ends": [0, 100]}, "marks": marks}
 
 
 def correlation(binned: BinnedCorrelation, fit: BiExponential | None) -> dict[str, Any]:
     """Return a chart of the correlation against distance, with its fitted curve."""
-    marks: list[Any] = [{"kind": "dots", "name": "data", "x": binned.distance_m, "y": binned.correlation}]
+    marks = [mark("dots", "data", binned.distance_m, binned.correlation)]
     if fit is not None:
         at = np.linspace(0.0, binned.distance_m[-1], 251)
-        marks.append({"kind": "line", "name": f"bi-exponential, RMSE {fit.rmse:.4f}", "x": at, "y": fit(at)})
+        marks.append(mark("line", f"bi-exponential, RMSE {fit.rmse:.4f}", at, fit(at)))
     return {"x": {"label": "Distance [m]"}, "y": {"label": "Correlation"}, "marks": marks}
 
 
@@ -474,7 +473,7 @@ def error_curves(members: Sequence[MapError], worst: float) -> dict[str, Any]:
     marks = []
     for method, rows in grouped(sorted(members, key=lambda e: e.altitude_m), lambda e: e.method).items():
         at, mae = np.array([[row.altitude_m, row.mae] for row in rows]).T
-        marks.append({"kind": "line", "name": method, "x": at, "y": mae})
+        marks.append(mark("line", method, at, mae))
     y = {"label": "MAE of the rank", "ends": [0.0, 1.08 * worst if worst > 0 else 1.0]}
     return {"x": {"label": "Height [m]"}, "y": y, "marks": marks}
 

@@ -276,29 +276,29 @@ def test_names_are_drawn_as_they_are(small_report):
     assert "σ₂/σ₁" in seen
 
 
-def test_a_cloud_of_a_long_flight_is_thinned_and_its_extremes_stay(monkeypatch):
-    """Only some samples are drawn, spread over the complete flight. A spike or a gap between them is still drawn."""
-    rng = np.random.default_rng(5)
-    values = rng.normal(0, 1, 100_000)
-    values[[12_345, 77_777]] = 40.0, -30.0
-    values[50_000:50_400] = np.nan
-    rows = canvas.cloud(values, 5_000)
-    assert {0, 12_345, 77_777, 99_999} <= set(rows.tolist())
-    assert 5_000 <= len(rows) <= 6_200
-    assert np.diff(rows).max() <= 21
-    drawn = values[rows]
-    assert abs(np.nanmedian(drawn)) < 0.1, "the middle of the cloud is not its extremes"
-    assert len(canvas.cloud(np.full(70, np.nan), 10)) >= 10
+def test_dots_of_a_long_flight_are_a_picture_inside_the_svg(report_data):
+    panel = long_panel(report_data.rss[2], 4)
+    fig = figures.rss_over_time(dataclasses.replace(report_data, rss=(panel,)), panel)
+    (dots,) = [line for line in fig.axes[0].lines if line.get_label().startswith("measured")]
+    assert dots.get_rasterized()
+    np.testing.assert_array_equal(dots.get_ydata(), panel.measured_db)
 
 
 def test_very_many_outages_are_joined_where_no_eye_parts_them():
-    seconds, (_, ax) = np.arange(100_000.0), canvas.subplots((4.0, 4.0))
+    seconds = np.arange(100_000.0)
     for period, count in ((10, 1), (1000, 100)):
-        canvas.draw_out_of_coverage(ax, seconds, seconds % period < period / 2, "out")
-        spans = [path.get_extents() for path in ax.collections[-1].get_paths()]
-        assert len(spans) == count
-        assert spans[0].x0 == -0.5
-    assert spans[0].x1 == 499.5
+        spans = figures._spans(seconds, seconds % period < period / 2, "out")
+        assert len(spans["x"]) == len(spans["ends"]) == count
+        assert spans["x"][0] == -0.5
+    assert spans["ends"][0] == 499.5
+    assert len(figures._spans(seconds, seconds < 0, "out")["x"]) == 0
+
+
+def test_a_point_between_two_gaps_of_a_line_has_a_dot():
+    _, ax = canvas.subplots((4.0, 4.0))
+    level = np.array([1.0, 2.0, np.nan, 3.0, np.nan, np.nan, 4.0, 5.0])
+    canvas.draw_marks(ax, [canvas.mark("line", "level", np.arange(8.0), level)])
+    assert np.flatnonzero(ax.lines[0].get_markevery()).tolist() == [3]
 
 
 def test_both_channels_of_a_tower_stand_in_one_panel_of_report_and_map(report_data, maps_data):
@@ -315,7 +315,8 @@ def test_both_channels_of_a_tower_stand_in_one_panel_of_report_and_map(report_da
     np.testing.assert_allclose(np.sort(lines["USRP1"]), np.sort(first.measured_db))
     np.testing.assert_allclose(np.sort(lines["USRP2"]), np.sort(second.measured_db + moved))
     assert np.nanmax(lines["ray tracing"]) == pytest.approx(np.nanmax(first.simulated_dbm) - first.score.offset_db)
-    assert len(ax.patches) == len(report_data.pairs[0].score.spans) > 0
+    (shaded,) = [each for each in ax.collections if each.get_label() == "channels differ"]
+    assert len(shaded.get_paths()) == len(report_data.pairs[0].score.spans) > 0
     assert ax.get_ylabel() == f"RSS [{first.unit}]"
     with_flight = map_figures.figure_specs(dataclasses.replace(maps_data, flights=(report_data,)))
     assert [spec.name for spec in with_flight if spec.name.startswith("rss_channels")] == [f"{spec.name}_sample"]

@@ -30,7 +30,7 @@ from ..flight.drafting.proposals import remembered
 from ..flight.gains import flight_of
 from ..flight.settings import FlightFile, LinkSettings, LinksSettings
 from ..flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
-from ..maps.grid import Grid, Layer, class_names
+from ..maps.grid import RANK_CLASSES, Grid, Layer
 from ..propagation.geometry import Poses, rotation_from_aircraft
 from ..report import maps as page
 from ..report.prediction import (
@@ -685,7 +685,7 @@ class CorrectedMaps:
                 out.append(Layer(f"{name}_{at}", np.round(values, 2), unit, text))
         for (tower, height), p in self.ranks.items():
             name = f"rank_learned_h{height:03.0f}m_{re.sub(r'[^0-9A-Za-z]', '_', tower)}"
-            out.append(Layer(name, likeliest(p), "1", f"Rank, learned receiver, {tower}, {height:g} m", class_names(4)))
+            out.append(Layer(name, likeliest(p), "1", f"Rank, learned receiver, {tower}, {height:g} m", RANK_CLASSES))
         return out
 
     def page_layers(self, grid: Grid) -> Iterator[page.MapLayer]:

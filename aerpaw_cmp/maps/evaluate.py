@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,7 +32,7 @@ from ..common.errors import UsageError
 from ..common.units import FloatArray, IntArray, unmasked
 from . import kriging, variogram
 from .grid import Grid, MapResult, serving_tower
-from .kriging import OrdinaryKriging, coverage_patterns
+from .kriging import OrdinaryKriging, Sampling, coverage_patterns
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -177,26 +177,6 @@ def _sorted(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> tuple[FloatAr
 # --- predictors -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _Near:
-    """The input at t targets: m samples each (t, m, dims), their values (t, m, fields) and distances (t, m)."""
-
-    points_m: FloatArray
-    values: FloatArray
-    distance_m: FloatArray
-    targets_m: FloatArray
-
-
-@dataclass(eq=False, kw_only=True)
-class Sampling:
-    """The samples that a target uses, as in :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`."""
-
-    neighbours: int = 20
-    radius_m: float = 150.0
-    selection: Literal["nearest", "random"] = "nearest"
-    seed: int = 0
-
-
 class _Local(Sampling):
     """The base of predictors that use near samples, which ignores NaN in each field."""
 
@@ -238,13 +218,11 @@ class _Local(Sampling):
             for start in range(0, len(same), CHUNK):
                 rows = same[start : start + CHUNK]
                 index = chosen.index[rows, :m]
-                estimate[rows] = self._combine(
-                    _Near(samples[index], values[index], chosen.distance_m[rows, :m], targets[rows])
-                )
+                estimate[rows] = self._combine(targets[rows], samples[index], values[index])
         return estimate
 
-    def _combine(self, near: _Near) -> FloatArray:
-        """Return the estimate (t, fields)."""
+    def _combine(self, targets: FloatArray, samples: FloatArray, values: FloatArray) -> FloatArray:
+        """Return estimates (t, fields) at targets (t, dims) from samples (t, m, dims) and values (t, m, fields)."""
         raise NotImplementedError
 
 
@@ -265,12 +243,12 @@ class IndexInterpolation(_Local):
     kind: Literal["spline", "makima"]
     grid: Grid
 
-    def _combine(self, near: _Near) -> FloatArray:
+    def _combine(self, targets: FloatArray, samples: FloatArray, values: FloatArray) -> FloatArray:
         curve: Callable[..., FloatArray] = {"spline": spline, "makima": makima}[self.kind]
-        index, at = self.grid.index_of(near.points_m), self.grid.index_of(near.targets_m)
+        index, at = self.grid.index_of(samples), self.grid.index_of(targets)
         if (index < 0).any() or (at < 0).any():
             raise UsageError("a point outside the grid has no position index", expected="points on the grid")
-        return curve(index, near.values, at)
+        return curve(index, values, at)
 
 
 class InverseDistance(_Local):
@@ -279,15 +257,16 @@ class InverseDistance(_Local):
     Source: Shepard 1968, doi:10.1145/800186.810616.
     """
 
-    def _combine(self, near: _Near) -> FloatArray:
-        at = near.distance_m < kriging.TIE_M
+    def _combine(self, targets: FloatArray, samples: FloatArray, values: FloatArray) -> FloatArray:
+        far = np.linalg.norm(samples - targets[:, None], axis=-1)
+        at = far < kriging.TIE_M
         # use distances relative to the nearest sample, to prevent overflow
-        ratio = near.distance_m[:, :1] / np.where(at, 1.0, near.distance_m)
+        ratio = far[:, :1] / np.where(at, 1.0, far)
         weight = np.where(at.any(axis=1, keepdims=True), at.astype(np.float64), ratio**2)
         weight /= weight.sum(axis=1, keepdims=True)
         # average differences from one sample, so that equal values stay equal
-        first = near.values[:, :1]
-        return np.asarray(first[:, 0] + (weight[:, :, None] * (near.values - first)).sum(axis=1))
+        first = values[:, :1]
+        return np.asarray(first[:, 0] + (weight[:, :, None] * (values - first)).sum(axis=1))
 
 
 class ServingTowerMean:
@@ -334,19 +313,8 @@ class ServingTowerMean:
         return mean, np.full_like(mean, np.nan)
 
 
-class Predictor(Protocol):
-    """The interface that :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging` and the baselines share."""
-
-    def fit(self, points_m: ArrayLike, values: ArrayLike) -> Any:
-        """Store samples and return the predictor."""
-
-    def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return estimate and variance at targets."""
-        ...
-
-    def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
-        """Return estimate and variance at each sample from the other samples."""
-        ...
+# The classes that share ``fit``, ``predict`` and ``leave_one_out``.
+Predictor = OrdinaryKriging | _Local | ServingTowerMean
 
 
 @dataclass(frozen=True, slots=True)

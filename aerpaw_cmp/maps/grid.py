@@ -36,8 +36,11 @@ PAPER_SPACING_M = 30.0
 # Limit that detects a mistyped spacing: a map of 1e8 positions would take days.
 _MAXIMUM_CELLS_A_SIDE = 10_000
 
-# Class of a position without any path.
-OUT_OF_COVERAGE = "Z"
+# The arrays of the paper have four elements at each end, so no channel matrix has a higher rank.
+HIGHEST_RANK = 4
+
+# Names of the ranks 0 to 4 as classes. The first is that of a position without any path.
+RANK_CLASSES = ("Z", "1", "2", "3", "4")
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,11 +232,6 @@ def _bisector_segment(
     return np.stack([middle + low * along, middle + high * along])
 
 
-def class_names(highest: int = 4) -> tuple[str, ...]:
-    """Return names of the rank classes: ``Z``, ``1``, ..."""
-    return (OUT_OF_COVERAGE, *(str(rank) for rank in range(1, highest + 1)))
-
-
 @dataclass(frozen=True, slots=True)
 class Layer:
     """One map to draw or to export.
@@ -281,8 +279,6 @@ PAPER_RANK_ALTITUDES_M = (3.0, *(float(h) for h in range(30, 111, 10)))
 PAPER_KS = (10.0, 100.0, 1000.0)
 # Positions per call. H of five towers with 4 x 4 elements then takes 2.6 MB.
 CHUNK = 2048
-# The arrays of the paper have four elements at each end, so no channel matrix has a higher rank.
-HIGHEST_RANK = 4
 # Largest ratio of singular values that is drawn and exported. Values below 1e-9 of the largest are rounding errors.
 RATIO_LIMIT_DB = 180.0
 
@@ -501,7 +497,7 @@ def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
             at = f"h{in_name(height)}m_{who}"
             for k, rank in zip(result.ks, ranks, strict=True):
                 name = f"rank_k{in_name(k, 0)}_{at}"
-                layers.append(layer(name, rank, "1", f"Rank, K = {k:g}", class_names(HIGHEST_RANK), height_m=height))
+                layers.append(layer(name, rank, "1", f"Rank, K = {k:g}", RANK_CLASSES, height_m=height))
             layers.append(layer(f"spread_{at}", ratios[0], "dB", "Singular-value spread s1/s2", height_m=height))
             layers.append(layer(f"condition_{at}", ratios[1], "dB", "Condition number s1/s4", height_m=height))
     return layers

@@ -37,7 +37,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -113,21 +113,24 @@ def nearest(
     return chosen
 
 
-class Rule(Protocol):
-    """The settings of a predictor that determine which samples a target uses."""
+@dataclass(eq=False, kw_only=True)
+class Sampling:
+    """The samples that a target uses, as in :class:`OrdinaryKriging`."""
 
-    neighbours: int
-    radius_m: float
-    selection: Literal["nearest", "random"]
-    seed: int
+    neighbours: int = 20
+    radius_m: float = 150.0
+    selection: Literal["nearest", "random"] = "nearest"
+    seed: int = 0
 
 
-def by_rule(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, skip: IntArray | None = None) -> Neighbours:
+def by_rule(
+    rule: Sampling | OrdinaryKriging, samples_m: FloatArray, targets_m: FloatArray, skip: IntArray | None = None
+) -> Neighbours:
     """Return the samples of each target that a predictor uses: the nearest ones, or random ones.
 
     Parameters
     ----------
-    rule : Rule
+    rule : Sampling or OrdinaryKriging
     samples_m, targets_m, skip
         The same as in :func:`nearest`.
 
@@ -199,7 +202,9 @@ def _tie_order(distance: FloatArray, who: IntArray, samples_m: FloatArray, targe
     return np.lexsort((who, *keys, _in_micrometres(distance)), axis=-1)
 
 
-def _random_within(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, skip: IntArray | None) -> Neighbours:
+def _random_within(
+    rule: Sampling | OrdinaryKriging, samples_m: FloatArray, targets_m: FloatArray, skip: IntArray | None
+) -> Neighbours:
     """Return M samples drawn without replacement within the radius, a possible reading of the paper's Step 1."""
     from scipy.spatial import cKDTree
 

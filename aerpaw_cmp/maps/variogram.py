@@ -19,7 +19,7 @@ go up. Bin 0 contains each position with itself, where the correlation is 1 by d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -120,10 +120,9 @@ def fit_biexponential(distance_m: ArrayLike, correlation: ArrayLike) -> BiExpone
     """
     problem = _Projection.of(distance_m, correlation)
     if len(problem.d) < 4:
-        single = problem.single()
-        return problem.result(single, f"{counted(len(problem.d), 'point')} cannot determine four coefficients")
-    best = problem.double()
-    return problem.judge(best)
+        reason = f"{counted(len(problem.d), 'point')} cannot determine four coefficients"
+        return problem.curve(problem.single_rates(), [reason])
+    return problem.double()
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,17 +159,17 @@ class _Projection:
         chosen = np.take_along_axis(candidates, pick, axis=-2)[..., 0, :]
         return chosen, np.take_along_axis(residual, pick, axis=-2)[..., 0, :]
 
-    def double(self) -> FloatArray:
-        """Return logarithms of the two best rates, the faster first."""
-        # with the bins of the paper, neighbouring rates differ by a factor of 1.5
-        axis = np.linspace(*self.log_rates, 48)
-        first, second = np.triu_indices(len(axis), 1)
-        grid = np.column_stack([axis[second], axis[first]])
-        cost = (self.amplitudes(grid)[1] ** 2).sum(axis=1)
-        # search roughly from each start, and exactly only from the best result
-        refined = np.stack([self._search(grid[cell], 1e-5) for cell in np.argsort(cost)[:STARTS]])
-        valley = refined[np.argmin((self.amplitudes(refined)[1] ** 2).sum(axis=1))]
-        return np.sort(self._search(valley, 1e-15))[::-1]
+    def cost(self, log_rates: FloatArray) -> FloatArray:
+        """Return the sum of squared residuals (...) for logarithms of rates (..., 2)."""
+        return np.asarray((self.amplitudes(log_rates)[1] ** 2).sum(axis=-1))
+
+    def curve(self, log_rates: FloatArray, reasons: Sequence[str]) -> BiExponential:
+        """Return the curve with these rates. It is degenerate if there are reasons."""
+        (c1, c3), (c2, c4) = self.amplitudes(log_rates)[0].tolist(), (-np.exp(log_rates)).tolist()
+        rmse = float(np.sqrt(self.cost(log_rates) / len(self.d)))
+        return BiExponential(
+            c1=c1, c2=c2, c3=c3, c4=c4, rmse=rmse, degenerate=bool(reasons), message="; ".join(reasons)
+        )
 
     def _search(self, start: FloatArray, tolerance: float) -> FloatArray:
         """Return the local minimum that is reached from a start."""
@@ -179,7 +178,7 @@ class _Projection:
         fit = least_squares(
             lambda log_rates: self.amplitudes(log_rates)[1],
             np.clip(start, self.log_rates[0] + 1e-9, self.log_rates[1] - 1e-9),
-            jac=self._slopes,
+            jac="3-point",
             bounds=self.log_rates,
             xtol=tolerance,
             ftol=tolerance,
@@ -187,66 +186,43 @@ class _Projection:
         )
         return np.asarray(fit.x)
 
-    def _slopes(self, log_rates: FloatArray) -> FloatArray:
-        """Return central differences (n, 2) of the residuals over the logarithms of the rates."""
-        # the cube root of the precision of float64 is the step with the smallest error
-        steps = 1e-5 * np.eye(2)
-        ahead, behind = self.amplitudes(log_rates + np.stack([steps, -steps]))[1]
-        return np.asarray((ahead - behind).T / 2e-5)
-
-    def single(self) -> float:
-        """Return the logarithm of the rate of the best single exponential: the best of 200, refined."""
+    def single_rates(self) -> FloatArray:
+        """Return the logarithm of the rate of the best single exponential twice: the best of 200, refined."""
         from scipy.optimize import minimize_scalar
 
         axis = np.linspace(*self.log_rates, 200)
-        best = int(np.argmin([self._single_cost(a) for a in axis]))
+        best = int(np.argmin(self.cost(np.column_stack([axis, axis]))))
         bracket = (axis[max(best - 1, 0)], axis[min(best + 1, len(axis) - 1)])
-        fit = minimize_scalar(self._single_cost, bounds=bracket, method="bounded", options={"xatol": 1e-13})
-        return float(fit.x)
-
-    def _single_amplitude(self, log_rate: float) -> float:
-        basis = np.exp(-np.exp(log_rate) * self.d)
-        amplitude = float(basis @ self.y / max(basis @ basis, TINY))
-        return min(max(amplitude, 0.0), 1.0)
-
-    def _single_cost(self, log_rate: float) -> float:
-        curve = self._single_amplitude(log_rate) * np.exp(-np.exp(log_rate) * self.d)
-        return float(((curve - self.y) ** 2).sum())
-
-    def result(self, log_rate: float, message: str) -> BiExponential:
-        """Return a single exponential as a degenerate pair with c1 = 0."""
-        # with c1 = 0 any c2 yields the same curve; this one satisfies c2 <= c4
-        rate = -float(np.exp(log_rate))
-        rmse = float(np.sqrt(self._single_cost(log_rate) / len(self.d)))
-        return BiExponential(
-            c1=0.0, c2=rate, c3=self._single_amplitude(log_rate), c4=rate, rmse=rmse, degenerate=True, message=message
+        fit = minimize_scalar(
+            lambda rate: float(self.cost(np.full(2, rate))), bounds=bracket, method="bounded", options={"xatol": 1e-13}
         )
+        return np.full(2, fit.x)
 
-    def judge(self, log_rates: FloatArray) -> BiExponential:
-        """Return the fitted curve, and whether the data determine its two exponentials."""
-        amplitude, residual = self.amplitudes(log_rates)
-        cost, n = float((residual**2).sum()), len(self.d)
-        single = self.single()
-        cost_single = self._single_cost(single)
-        c1, c3 = (float(a) for a in amplitude)
-        c2, c4 = (-float(rate) for rate in np.exp(log_rates))
+    def double(self) -> BiExponential:
+        """Return the best curve, and whether the data determine its two exponentials."""
+        # with the bins of the paper, neighbouring rates differ by a factor of 1.5
+        axis = np.linspace(*self.log_rates, 48)
+        first, second = np.triu_indices(len(axis), 1)
+        grid = np.column_stack([axis[second], axis[first]])
+        # search roughly from each start, and exactly only from the best result
+        refined = np.stack([self._search(grid[cell], 1e-5) for cell in np.argsort(self.cost(grid))[:STARTS]])
+        log_rates = np.sort(self._search(refined[np.argmin(self.cost(refined))], 1e-15))[::-1]
+        (c1, c3), n = self.amplitudes(log_rates)[0], len(self.d)
         # if both curves are exact, the ratio must be 1 and not 0 / 0
         scale = 1e-20 * float((self.y**2).sum())
-        # Bayesian information criterion with a penalty for two more coefficients
-        gain = n * np.log((cost_single + scale) / (cost + scale)) - 2 * np.log(n)
+        ratio = (self.cost(self.single_rates()) + scale) / (self.cost(log_rates) + scale)
         reasons = {
-            "one exponential fits as well": gain <= 0,
+            # Bayesian information criterion with a penalty for two more coefficients
+            "one exponential fits as well": n * np.log(ratio) - 2 * np.log(n) <= 0,
             "one of the two exponentials has no amplitude": min(c1, c3) <= 1e-3 * max(c1, c3),
             # two rates within 5 % represent a single exponential
             "both exponentials decay at the same rate": log_rates[0] - log_rates[1] < 0.05,
             "the faster decay ends before the first distance, so its rate cannot be determined":
                 log_rates[0] > self.log_rates[1] - 1e-3,
             "the slower decay does not show within the largest distance":
-                -c4 * self.d.max() < 1e-3 or log_rates[1] < self.log_rates[0] + 1e-3,
+                np.exp(log_rates[1]) * self.d.max() < 1e-3 or log_rates[1] < self.log_rates[0] + 1e-3,
         }  # fmt: skip
-        found = [text for text, applies in reasons.items() if applies]
-        rmse = float(np.sqrt(cost / n))
-        return BiExponential(c1=c1, c2=c2, c3=c3, c4=c4, rmse=rmse, degenerate=bool(found), message="; ".join(found))
+        return self.curve(log_rates, [text for text, applies in reasons.items() if applies])
 
 
 def _candidate_amplitudes(basis: FloatArray, target: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from ..common.text import counted
 from ..common.units import FloatArray, spread_out
 from ..compare.verdict import Coverage, coverage_verdict
 from ..maps.evaluate import TREATMENTS
-from ..maps.grid import PAPER_SPACING_M
+from ..maps.grid import PAPER_SPACING_M, RANK_CLASSES
 from ..maps.variogram import BiExponential, BinnedCorrelation
 from ..site.site import Site
 from . import canvas
@@ -45,10 +45,6 @@ if TYPE_CHECKING:
 
 # Name of the joint map, in which the nearest tower serves each position.
 JOINT = "joint"
-
-
-# Names of the values of a map of ranks. Positions out of coverage are 0 in files, and NaN in a layer.
-_RANK_CLASSES = ("Z", *map(str, RANKS))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,7 +112,7 @@ class RankMap(MapLayer):
 
     quantity: str = "Rank"
     unit: str = ""
-    classes: tuple[str, ...] = _RANK_CLASSES
+    classes: tuple[str, ...] = RANK_CLASSES
     tower: str = JOINT
     share: FloatArray
 
@@ -618,7 +614,7 @@ def layer_numbers(layer: MapLayer) -> dict[str, Any]:
     }
     if layer.classes:
         counts = np.bincount(finite.astype(np.int64), minlength=len(layer.classes)).astype(np.float64)
-        if layer.classes[0] == _RANK_CLASSES[0]:  # class 0 is "no path"
+        if layer.classes[0] == RANK_CLASSES[0]:  # class 0 is "no path"
             counts[0] = layer.values.size - len(finite)
         return result | {"share": dict(zip(layer.classes, counts / layer.values.size, strict=True))}
     names = ("min", "p10", "median", "p90", "max")
@@ -701,7 +697,7 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
 
 def _class_colours(classes: Sequence[str]) -> list[str]:
     """Return one colour per class: the colours of ranks, or else colours that differ in hue and lightness."""
-    if tuple(classes) == _RANK_CLASSES:
+    if tuple(classes) == RANK_CLASSES:
         return ["", *(CLASS_COLOURS[rank] for rank in RANKS)]
     if not classes:
         return []
@@ -753,7 +749,7 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
         coverage=[{"tower": m.tower, "antennas": m.antennas, "foliage": m.foliage, "altitude_m": m.height_m,
                    "coverage": m.coverage} for m in data.rss],
         rank=[{"k": m.k, "foliage": m.foliage, "altitude_m": m.height_m,
-               "share": dict(zip(_RANK_CLASSES, m.share, strict=True))} for m in data.rank],
+               "share": dict(zip(RANK_CLASSES, m.share, strict=True))} for m in data.rank],
         layers=[layer_numbers(layer) for layer in page_layers(data)],
         mae=data.errors,
         paper=data.paper,

@@ -13,7 +13,7 @@ from matplotlib.image import imread
 
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.maps import export
-from aerpaw_cmp.maps.grid import Grid, Layer, class_names, voronoi_borders
+from aerpaw_cmp.maps.grid import RANK_CLASSES, Grid, Layer, voronoi_borders
 
 FRAME = SiteFrame(35.7275, -78.6960)
 GRID = Grid.over_area((-90.0, 90.0, -60.0, 60.0))
@@ -21,7 +21,7 @@ RSS = np.linspace(-120.0, -40.0, len(GRID))
 RSS[3] = np.nan
 RANK = np.arange(len(GRID)) % 5
 LAYERS = [
-    Layer("rank_k10_h030m_joint", RANK, "1", "Rank, K = 10, 30 m", class_names()),
+    Layer("rank_k10_h030m_joint", RANK, "1", "Rank, K = 10, 30 m", RANK_CLASSES),
     Layer("rss_h030m_joint", RSS, "dBm", "RSS < 30 m & more"),
 ]
 TOWERS = {"LW1": [-50.0, 0.0, 10.0], "LW<2>": [50.0, 10.0, 10.0]}

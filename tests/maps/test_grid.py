@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.maps.grid import (
     Grid,
-    class_names,
     serving_tower,
     voronoi_borders,
 )
@@ -102,7 +101,3 @@ def test_collinear_and_coincident_towers_have_borders_or_none():
     assert sorted(abs(lines[0].line_m[:, 1])) == [1065.0, 1065.0]
     assert voronoi_borders([[0.0, 0.0], [0.0, 0.0]], AREA) == ()
     assert voronoi_borders([[0.0, 0.0]], AREA) == ()
-
-
-def test_out_of_coverage_is_a_class_of_its_own():
-    assert class_names() == ("Z", "1", "2", "3", "4")

@@ -9,7 +9,7 @@ from aerpaw_cmp.common.cf import file_attributes, netcdf_bytes
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.maps import export
-from aerpaw_cmp.maps.grid import Grid, Layer, MapResult, class_names, serving_tower, voronoi_borders
+from aerpaw_cmp.maps.grid import RANK_CLASSES, Grid, Layer, MapResult, serving_tower, voronoi_borders
 
 FRAME = SiteFrame(35.7275, -78.6960)
 AREA = (-90.0, 90.0, -60.0, 90.0)
@@ -55,7 +55,7 @@ def write(path):
         comment="A gap has no path.",
     )
     level = Layer("rss_sd_h030m_LW1", np.arange(len(GRID)) / 4.0, "dB", "Standard deviation")
-    rank = Layer("rank_learned_h030m_LW1", np.arange(len(GRID)) % 5, "1", "Rank", class_names(4))
+    rank = Layer("rank_learned_h030m_LW1", np.arange(len(GRID)) % 5, "1", "Rank", RANK_CLASSES)
     path.write_bytes(netcdf_bytes(export.maps_dataset(MAPS, FRAME, about, [level, rank])))
     return path
 

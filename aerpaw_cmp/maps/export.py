@@ -17,19 +17,21 @@ values that ``serving_tower`` selects from the maps of each tower. NetCDF requir
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..common import kml
 from ..common.cf import DB, DBM, Dataset, flags, site_crs
 from ..common.geodesy import SiteFrame
 from ..common.kml import CLASS_COLOURS
 from ..common.text import guarded
-from ..common.units import AnyArray, FloatArray
+from ..common.units import AnyArray, FloatArray, IntArray
 from .grid import HIGHEST_RANK, RATIO_LIMIT_DB, Border, Grid, Layer, MapResult
 
 PIXELS_PER_CELL = 8
@@ -121,9 +123,9 @@ def write_kmz(path: str | Path, maps: MapLayers, *, title: str = "Coverage and r
         parts.append(kml.line(name, at, "<tessellate>1</tessellate>", style=kml.line_style("ffffffff", 2)))
     pictures = {}
     for layer in maps.layers:
-        low, high = _range(layer)
-        pictures[f"maps/{layer.name}.png"] = _picture(maps.grid, layer, low, high)
-        pictures[f"legends/{layer.name}.png"] = _legend(layer, low, high)
+        scale = scale_of(layer)
+        pictures[f"maps/{layer.name}.png"] = _picture(maps.grid, layer, scale)
+        pictures |= scale.legend(4.2)
     return kml.write_archive(Path(path), title, maps.credit, "".join(parts), pictures)
 
 
@@ -141,65 +143,110 @@ def _bounding_box(maps: MapLayers) -> tuple[float, float, float, float]:
     return float(top), float(low), float(right), float(left)
 
 
-def _range(layer: Layer) -> tuple[float, float]:
-    """Return the colour range, from the 2nd to the 98th percentile."""
-    # positions next to a tower are far above all others and would use most colours
-    finite = np.asarray(layer.values, dtype=np.float64)
-    finite = finite[np.isfinite(finite)]
-    if not finite.size:
-        return 0.0, 1.0
-    low, high = np.percentile(finite, [2, 98])
-    return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
+# Number of colours of a scale of numbers.
+LEVELS = 10
 
 
-def _colours(layer: Layer, low: float, high: float) -> AnyArray:
-    """Return colours (n, 4) between 0 and 1. Positions out of coverage are grey and half transparent."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scale:
+    """The colours of one quantity, with the name of each colour. The last colour means out of coverage.
+
+    ``key`` is the name of its styles and pictures. ``edges`` are the limits between the other colours. Values below
+    ``lowest`` count as out of coverage.
+    """
+
+    key: str
+    title: str
+    colours: tuple[str, ...]
+    labels: tuple[str, ...]
+    edges: AnyArray
+    lowest: float = -np.inf
+
+    def bin_of(self, values: ArrayLike) -> IntArray:
+        """Return the index of the colour of each value (n,)."""
+        array = np.asarray(values, dtype=np.float64)
+        missing = np.isnan(array) | (array < self.lowest)
+        return np.where(missing, len(self.colours) - 1, np.searchsorted(self.edges, array, side="right"))
+
+    def legend(self, width_in: float = 2.6) -> dict[str, bytes]:
+        """Return the legend as PNG, by its name in a KMZ."""
+        picture = kml.list_legend(self.title, dict(zip(self.labels, self.colours, strict=True)), width_in)
+        return {f"legends/{self.key}.png": picture}
+
+
+def number_scale(key: str, title: str, values: AnyArray, palette: str = "viridis", *, centred: bool = False) -> Scale:
+    """Return a scale of numbers from the 2nd to the 98th percentile, in round steps.
+
+    Parameters
+    ----------
+    key, title : str
+    values : (n,)
+        NaN and infinite values are ignored.
+    palette : str
+        Name of a palette of matplotlib.
+    centred : bool
+        True if 0 is in the middle of the scale.
+
+    Returns
+    -------
+    Scale
+    """
     from matplotlib import colormaps
-    from matplotlib.colors import to_rgba_array
+    from matplotlib.colors import to_hex
 
-    grey = to_rgba_array(CLASS_COLOURS[0])[0] * np.array([1, 1, 1, 0.5])
+    # a few values next to a tower are far above all others and would use most colours
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, [2, 98]) if len(finite) else (0.0, 0.0)
+    if centred:
+        low, high = -max(-low, high), max(-low, high)
+    step = _round_step((high - low) / (LEVELS - centred))
+    first = -step * (LEVELS / 2 - 1) if centred else step * (np.floor(low / step) + 1)
+    edges = first + step * np.arange(LEVELS - 1)
+    between = [f"{below:g} to {above:g}" for below, above in itertools.pairwise(edges)]
+    colours = (to_hex(colormaps[palette]((i + 0.5) / LEVELS)) for i in range(LEVELS))
+    labels = (f"below {edges[0]:g}", *between, f"above {edges[-1]:g}", "out of coverage")
+    return Scale(key=key, title=title, colours=(*colours, CLASS_COLOURS[0]), labels=labels, edges=edges)
+
+
+def _round_step(step: float) -> float:
+    """Return a step rounded up to 1, 2 or 5 times a power of ten. A step of 0 becomes 1."""
+    power = 10.0 ** np.floor(np.log10(step)) if step > 0 else 1.0
+    # with a margin, because a rounding error must not turn a step of 2 into 5
+    return float(next(m for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9)) * power)
+
+
+def class_scale(key: str, title: str, names: Sequence[str]) -> Scale:
+    """Return a scale of the values 0, 1, ... with these names. The name "Z" means out of coverage."""
+    first = int(names[0] == "Z")
+    classes = range(first, len(names))
+    return Scale(
+        key=key, title=title, labels=(*names[first:], "out of coverage"), lowest=first,
+        edges=np.array(classes[1:]) - 0.5,
+        # the first colour is that of positions out of coverage
+        colours=(*(CLASS_COLOURS[1 + i % (len(CLASS_COLOURS) - 1)] for i in range(len(classes))), CLASS_COLOURS[0]),
+    )  # fmt: skip
+
+
+def scale_of(layer: Layer) -> Scale:
+    """Return the colours of a layer."""
     if layer.classes:
-        number = np.clip(np.asarray(layer.values, dtype=np.int64), 0, len(layer.classes) - 1)
-        colours = to_rgba_array(_class_palette(layer))
-        return np.where((number == 0)[:, None] & (layer.classes[0] == "Z"), grey, colours[number])
-    values = np.asarray(layer.values, dtype=np.float64)
-    # a ratio to a singular value of zero is infinite, and has the colour of the top of the scale
-    share = np.clip((np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) / (high - low), 0, 1)
-    return np.where(np.isnan(values)[:, None], grey, colormaps["viridis"](share))
+        return class_scale(layer.name, layer.title, layer.classes)
+    return number_scale(layer.name, f"{layer.title} [{layer.unit}]", np.asarray(layer.values, dtype=np.float64))
 
 
-def _class_palette(layer: Layer) -> list[str]:
-    # the first colour is the grey of "no path", so no class with a channel may use it
-    start = 0 if layer.classes[0] == "Z" else 1
-    return [CLASS_COLOURS[start + i % (len(CLASS_COLOURS) - start)] for i in range(len(layer.classes))]
-
-
-def _picture(grid: Grid, layer: Layer, low: float, high: float) -> bytes:
+def _picture(grid: Grid, layer: Layer, scale: Scale) -> bytes:
     """Return a PNG with a block of pixels per cell, so that viewers that smooth it do not mix classes."""
+    from matplotlib.colors import to_rgba_array
     from PIL import Image
 
-    colours = (255 * _colours(layer, low, high)).round().astype(np.uint8)
-    cells = Image.fromarray(np.ascontiguousarray(grid.raster(colours)[::-1]))  # rows of pictures begin in the north
+    palette = (255 * to_rgba_array(scale.colours)).round().astype(np.uint8)
+    palette[-1, 3] = 128  # the ground is visible where there is no path
+    # rows of pictures begin in the north
+    cells = Image.fromarray(np.ascontiguousarray(grid.raster(palette[scale.bin_of(layer.values)])[::-1]))
     picture = cells.resize((PIXELS_PER_CELL * cells.width, PIXELS_PER_CELL * cells.height), Image.Resampling.NEAREST)
     buffer = io.BytesIO()
     picture.save(buffer, "PNG")
     return buffer.getvalue()
-
-
-def _legend(layer: Layer, low: float, high: float) -> bytes:
-    if layer.classes:
-        names = ["out of coverage" if name == "Z" else name for name in layer.classes]
-        return kml.list_legend(layer.title, dict(zip(names, _class_palette(layer), strict=True)), 4.2)
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
-
-    digits = max(0, int(np.ceil(1.0 - np.log10(high - low))))  # enough to show a tenth of the range
-    labels = [f"{level:.{digits}f} {layer.unit}" for level in np.linspace(high, low, 5)]
-    # both ends include the values beyond the limits
-    labels[0], labels[-1] = f"≥ {labels[0]}", f"≤ {labels[-1]}"
-    colours = [to_hex(colour) for colour in colormaps["viridis"](np.linspace(1.0, 0.0, 5))]
-    legend = dict(zip(labels, colours, strict=True)) | {"out of coverage": CLASS_COLOURS[0]}
-    return kml.list_legend(layer.title, legend, 4.2)
 
 
 _PLANE = ("y", "x")

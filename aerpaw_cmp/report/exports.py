@@ -24,10 +24,11 @@ from ..common import kml
 from ..common.cf import DB, DBM, Dataset, file_attributes, netcdf_bytes, wgs84
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
-from ..common.kml import CLASS_COLOURS, xml_text
+from ..common.kml import xml_text
 from ..common.stages import Progress, logged
-from ..common.units import AnyArray, FloatArray, IntArray
+from ..common.units import AnyArray, FloatArray
 from ..logs.records import has_wall_clock
+from ..maps.export import Scale, class_scale, number_scale
 from .canvas import keep_extremes
 from .columns import DECIMALS, RANK, RSS, Column, tables
 from .flight_data import ReportData
@@ -260,14 +261,14 @@ def write_kmz(export: Export, folder: Path) -> list[Path]:
     body = [*(_style(scale) for scale in scales.values()), _towers(export), _flown(export)]
     for number, link in enumerate(shown):
         lines = "".join(_lines(link, budget, clock=export.clock, visible=number == 0))
-        body.append(kml.folder(link.name, link.scale.legend, lines, visible=number == 0))
+        body.append(kml.folder(link.name, f"legends/{link.scale.key}.png", lines, visible=number == 0))
     words = [*export.remarks, "Lines are drawn at their height above the ground below."]
     if max((len(item.rows) for item in shown), default=0) > budget:
         words.append(
             f"Thinned to about {budget} points per line, with minimum and maximum of every segment; all samples are in "
             "rss.csv and rank.csv."
         )
-    legends = {scale.legend: _legend(scale) for scale in scales.values()}
+    legends = {name: picture for scale in scales.values() for name, picture in scale.legend().items()}
     path = folder / "samples.kmz"
     return [kml.write_archive(path, export.data.title, " ".join(words), "".join(body), legends)]
 
@@ -346,88 +347,28 @@ def _lines(shown: _Shown, budget: int, *, clock: bool, visible: bool) -> Iterato
 def _label(shown: _Shown, values: AnyArray, number: int) -> str:
     """Return the text of a line: its values, or the name of its class."""
     known = values[np.isfinite(values)]
-    if shown.scale.edges is None or not len(known):
+    if shown.column.flags or not len(known):
         return shown.scale.labels[number]
     low, high = known.min(), known.max()
     return (f"{low:.1f}" if high - low < 0.05 else f"{low:.1f} to {high:.1f}") + f" {shown.column.unit}"
 
 
-def _legend(scale: Scale) -> bytes:
-    return kml.list_legend(scale.title, dict(zip(scale.labels, scale.colours, strict=True)))
-
-
 # --- colours ---------------------------------------------------------------------------------------------------------
 
-# Number of colours of a scale of numbers.
-LEVELS = 10
-# Colour of samples without a value (grey).
-OUT = CLASS_COLOURS[0]
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Scale:
-    """The colours of one quantity, with the ``edges`` (m + 1,) of their ranges, or None if the values are classes."""
-
-    key: str
-    title: str
-    colours: tuple[str, ...]
-    labels: tuple[str, ...]
-    edges: FloatArray | None = None
-
-    @property
-    def legend(self) -> str:
-        """The name of the picture of this scale in the archive."""
-        return f"legends/{self.key}.png"
-
-    def bin_of(self, values: FloatArray) -> IntArray:
-        """Return the index of the colour of each value (n,). The last colour means out of coverage."""
-        last, known = len(self.colours) - 1, np.nan_to_num(values)
-        inner = np.arange(1.5, last) if self.edges is None else self.edges[1:-1]
-        missing = ~np.isfinite(values) | ((known < 1) & (self.edges is None))
-        return np.where(missing, last, np.searchsorted(inner, known, side="right"))
-
-
-RANKS = Scale(
-    key="rank", title="Rank", colours=(*CLASS_COLOURS[1:5], OUT),
-    labels=("rank 1", "rank 2", "rank 3", "rank 4", "no path or no report"),
-)  # fmt: skip
+RANKS = class_scale("rank", "Rank", ("Z", "rank 1", "rank 2", "rank 3", "rank 4"))
 
 
 def _scales_of(points: Points) -> dict[str, Scale]:
     """Return the scale of each coloured column. Levels share one scale, residuals another, and ranks have classes."""
     if points.kind == "rank":
-        return {c.name: RANKS for c in points.columns if c.name.startswith(("measured_rank", "simulated_rank"))}
+        names = [c.name for c in points.columns if c.name.startswith(("measured_rank", "simulated_rank"))]
+        return dict.fromkeys(names, RANKS)
     names = ["calibrated_db", "simulated_dbm"]
-    levels, apart = points.table[names].to_numpy(), np.abs(points.table["residual_db"].to_numpy())
-    low, high = np.nanpercentile(levels, [2, 98]) if np.isfinite(levels).any() else (-100.0, -60.0)
-    most = float(np.nanpercentile(apart, 98)) if np.isfinite(apart).any() else 5.0
-    step = _round_step((high - low) / LEVELS)
-    edges = (np.floor(low / step) + np.arange(LEVELS + 1)) * step
-    level = _numbers("level", "Level [dBm]", edges, "viridis")
-    edges = (np.arange(LEVELS) - (LEVELS - 1) / 2) * _round_step(2 * most / (LEVELS - 1))
-    residual = _numbers("residual", "Measured minus replayed [dB]", edges, "RdBu_r")
+    level = number_scale("level", "Level [dBm]", points.table[names].to_numpy().ravel())
+    apart = points.table["residual_db"].to_numpy()
+    residual = number_scale("residual", "Measured minus replayed [dB]", apart, "RdBu_r", centred=True)
     return dict.fromkeys(names, level) | {"residual_db": residual}
-
-
-def _round_step(step: float) -> float:
-    """Return a step rounded up to 1, 2 or 5 times a power of ten."""
-    if not step > 0:
-        return 1.0
-    power = 10.0 ** np.floor(np.log10(step))
-    # with a margin, because a rounding error must not turn a step of 2 into 5
-    return float(next(m for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9)) * power)
-
-
-def _numbers(key: str, title: str, edges: AnyArray, palette: str) -> Scale:
-    """Return a scale with colours of a palette of matplotlib between the edges."""
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
-
-    count = len(edges) - 1
-    colours = [to_hex(colormaps[palette]((i + 0.5) / count)) for i in range(count)]
-    between = [f"{low:g} to {high:g}" for low, high in itertools.pairwise(edges[1:-1])]
-    labels = (f"below {edges[1]:g}", *between, f"above {edges[-2]:g}", "out of coverage")
-    return Scale(key=key, title=title, colours=(*colours, OUT), labels=labels, edges=edges)
 
 
 # --- files of a report ------------------------------------------------------------------------------------------------

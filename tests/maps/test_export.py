@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib import colormaps
+from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from aerpaw_cmp.common.geodesy import SiteFrame
@@ -66,11 +66,10 @@ def test_kmz_has_a_map_and_a_legend_per_layer(tmp_path):
     # the picture begins in the north-west: position of the last row, first column
     size = export.PIXELS_PER_CELL
     assert picture.shape[:2] == (GRID.shape[0] * size, GRID.shape[1] * size)
-    classes = export._colours(LAYERS[0], 0, 1)
-    np.testing.assert_allclose(
-        picture[size // 2, size // 2], classes[(GRID.shape[0] - 1) * GRID.shape[1]], atol=1 / 250
-    )
-    np.testing.assert_allclose(picture[-size // 2, size // 2], classes[0], atol=1 / 250)
+    scale = export.scale_of(LAYERS[0])
+    for row, number in ((size // 2, (GRID.shape[0] - 1) * GRID.shape[1]), (-size // 2, 0)):
+        expected = to_rgb(scale.colours[scale.bin_of(RANK[number])])
+        np.testing.assert_allclose(picture[row, size // 2, :3], expected, atol=1 / 250)
     assert legend[..., :3].std() > 0.05, "an empty legend"
 
 
@@ -88,11 +87,13 @@ def test_same_map_same_bytes(tmp_path):
 
 
 def test_out_of_coverage_is_its_own_colour():
-    colours = export._colours(LAYERS[1], -120.0, -40.0)
-    assert colours[3].tolist() == export._colours(LAYERS[0], 0, 1)[0].tolist(), "Z of both kinds is the same grey"
-    assert (colours[[2, 4]] != colours[3]).any(axis=1).all()
-    servers = Layer("serving_tower", np.zeros(len(GRID), dtype=int), "1", "Serving", ("LW1", "LW2"))
-    assert export._colours(servers, 0, 1)[0].tolist() != colours[3].tolist(), "the first tower is not a gap"
+    ranks, levels = map(export.scale_of, LAYERS)
+    assert levels.colours[-1] == ranks.colours[-1], "out of coverage is the same grey in all layers"
+    assert levels.colours.count(levels.colours[-1]) == 1
+    assert levels.bin_of([np.nan, -np.inf, np.inf]).tolist() == [export.LEVELS, 0, export.LEVELS - 1]
+    assert ranks.bin_of([0, 1, 4, np.nan]).tolist() == [4, 0, 3, 4]
+    servers = export.class_scale("serving", "Serving", ("LW1", "LW2"))
+    assert servers.bin_of([0, 1]).tolist() == [0, 1], "the first tower is not a gap"
 
 
 def test_constant_and_empty_layers_can_be_drawn(tmp_path):
@@ -116,10 +117,10 @@ def test_wrong_layers_are_a_bug():
         over(GRID, [Layer("a", np.zeros(3), "1", "a")])
 
 
-def test_colours_span_the_middle_96_percent():
-    levels = Layer("level", np.array([0.0, 10.0, 20.0, 30.0, 40.0, 50.0]), "dB", "Level")
-    assert export._range(levels) == pytest.approx((1.0, 49.0))
-    assert export._range(Layer("flat", np.full(6, 3.0), "dB", "Flat")) == (2.5, 3.5)
-    assert export._range(Layer("none", np.full(6, np.nan), "dB", "None")) == (0.0, 1.0)
-    expected = colormaps["viridis"](np.array([0.0, 0.0, 0.5, 1.0, 1.0, 1.0]))
-    np.testing.assert_allclose(export._colours(levels, 10.0, 30.0), expected)
+def test_colours_span_the_middle_96_percent_in_round_steps():
+    scale = export.number_scale("level", "Level", np.array([*np.linspace(0.0, 50.0, 99), 900.0, np.inf, np.nan]))
+    np.testing.assert_allclose(scale.edges, np.arange(5.0, 50.0, 5.0))
+    assert scale.labels[0] == "below 5"
+    assert scale.labels[-3:] == ("40 to 45", "above 45", "out of coverage")
+    residual = export.number_scale("residual", "Residual", np.linspace(-3.0, 9.0, 50), "RdBu_r", centred=True)
+    np.testing.assert_allclose(residual.edges, np.arange(-8.0, 9.0, 2.0))

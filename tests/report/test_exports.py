@@ -11,6 +11,7 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.compare.gains import NO_SPREAD, StatedSpread
+from aerpaw_cmp.maps.export import Scale
 from aerpaw_cmp.report import columns as export
 from aerpaw_cmp.report import exports as formats
 from aerpaw_cmp.report import exports as kmz
@@ -198,7 +199,7 @@ def test_netcdf_passes_the_checker_of_the_conventions_it_claims(data, tmp_path, 
 
 
 def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(kmz, "_legend", lambda _: b"")
+    monkeypatch.setattr(Scale, "legend", lambda *_: {})
     epoch = np.datetime64(0, "ns")
 
     def moved(panel):
@@ -217,7 +218,7 @@ def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatc
 
 
 def test_a_flight_with_rank_alone_and_one_with_nothing(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(kmz, "_legend", lambda _: b"")
+    monkeypatch.setattr(Scale, "legend", lambda *_: {})
     alone = dataclasses.replace(data, rss=())
     (tmp_path / "a").mkdir()
     names = {p.name for p in formats.write_exports(points.of_report(alone), tmp_path / "a", formats.FORMATS)}
@@ -270,7 +271,7 @@ def test_every_rank_has_its_own_colour():
     """Rank 4 had the colour and the name of rank 3."""
     numbers = kmz.RANKS.bin_of(np.array([1.0, 2.0, 3.0, 4.0, 0.0, np.nan]))
     assert [kmz.RANKS.labels[i] for i in numbers[:4]] == ["rank 1", "rank 2", "rank 3", "rank 4"]
-    assert {kmz.RANKS.labels[i] for i in numbers[4:]} == {"no path or no report"}
+    assert {kmz.RANKS.labels[i] for i in numbers[4:]} == {"out of coverage"}
 
 
 def test_formats_are_chosen_by_name():
@@ -297,7 +298,7 @@ def test_a_missing_library_is_named_with_its_extra(data, tmp_path, monkeypatch):
 def test_a_limit_of_the_disk_is_an_oserror_in_every_format(name, data, tmp_path, monkeypatch):
     """A library that writes its own files must not end the process or hide an error."""
     resource = pytest.importorskip("resource")
-    monkeypatch.setattr(kmz, "_legend", lambda _: b"")
+    monkeypatch.setattr(Scale, "legend", lambda *_: {})
     export = points.of_report(data)
     formats.write_exports(export, tmp_path, [name])  # what it loads is loaded now
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # it would be cut, and kept

@@ -39,7 +39,6 @@ from ..maps.evaluate import (
     TREATMENTS,
     InverseDistance,
     Predictor,
-    Sampling,
     Score,
     ServingTowerMean,
     Study,
@@ -50,7 +49,7 @@ from ..maps.evaluate import (
 )
 from ..maps.export import maps_dataset
 from ..maps.grid import PAPER_BUDGET, Grid, LinkBudget
-from ..maps.kriging import OrdinaryKriging
+from ..maps.kriging import OrdinaryKriging, Sampling
 from ..maps.store import Budget, Reach, TileStore, Tiling
 from ..maps.variogram import BiExponential, BinnedCorrelation, field_correlation, vertical_correlation
 from ..propagation.field.foliage import crown_index, foliage_loss_db, foliage_model, stand_loss_db
@@ -70,7 +69,9 @@ from .workers import InProcess, Lost, Workers
 # Modes of the trees, from no loss to total loss. The paper uses the last mode.
 FOLIAGE = ("none", "attenuating", "opaque")
 
+# Short names of layers.
 RATIOS = ("spread", "condition")
+BUDGET = ("margin_mimo", "snr_mimo")
 
 # Interpolators of the paper.
 INTERPOLATORS = ("Kriging", "makima", "spline")
@@ -642,8 +643,8 @@ def maps_record(
         rank=rank,
         rank_by_tower=tuple(by_tower),
         layers=(
-            *_further_layers(outcome),
-            *(() if flown is None else flown.page_layers(result.grid)),
+            *(layer for layer in _further_layers(outcome) if layer.name in BUDGET or layer.foliage == s.shown),
+            *(() if flown is None else flown.layers(result.grid)),
             *_linked_layers(outcome),
         ),
         correlation=_correlations(outcome),
@@ -664,7 +665,8 @@ def _rss_maps(result: job.MapResult, mode: str, budget: LinkBudget) -> Iterator[
             for tower in (*result.tower_names, None):
                 values = result.rss(antennas, tower)[row]
                 yield page.RssMap(
-                    tower=tower or page.JOINT,
+                    name=f"rss_{antennas}",
+                    tower=tower or job.JOINT,
                     antennas=antennas.upper(),
                     height_m=height,
                     values=result.grid.raster(values),
@@ -678,12 +680,13 @@ def _rank_maps(result: job.MapResult, mode: str, tower: str | None = None) -> It
     ranks, shares = result.ranks(tower), result.rank_shares(tower)
     for (column, k), (row, height) in itertools.product(enumerate(result.ks), enumerate(result.rank_altitudes_m)):
         yield page.RankMap(
+            name=f"rank_k{job.in_name(k)}",
             k=k,
             height_m=height,
             values=result.grid.raster(np.where(ranks[row, column] > 0, ranks[row, column], np.nan)),
             share=shares[row, column],
             foliage=mode,
-            tower=tower or page.JOINT,
+            tower=tower or job.JOINT,
         )
 
 
@@ -695,54 +698,44 @@ def _rank_versions(outcome: MapOutcome) -> Iterator[page.RankMap]:
         yield from outcome.corrected.rank_maps(outcome.shown.grid)
 
 
-def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
-    """Yield layers for the linked map only: towers in coverage, and the serving tower."""
+def _linked_layers(outcome: MapOutcome) -> Iterator[job.Layer]:
+    """Yield layers for the page only: towers in coverage, and the serving tower if there are several."""
     kinds: tuple[job.Antennas, ...] = ("mimo", "siso")
     budget = outcome.settings.budget
     for mode, result in outcome.ordered():
-        raster = result.grid.raster
         for antennas in kinds:
-            layer = partial(page.MapLayer, antennas=antennas.upper(), foliage=mode)
+            layer = partial(job.Layer, antennas=antennas.upper(), foliage=mode)
             each = budget.covered(result.rss_mimo_dbm if antennas == "mimo" else result.rss_siso_dbm)
             for row, height in enumerate(result.rss_altitudes_m):
-                covering = raster(each[row].sum(axis=0))
+                covering = result.grid.raster(each[row].sum(axis=0))
                 yield layer(quantity="Towers in coverage", unit="towers", height_m=height, values=covering)
+    if len(outcome.shown.tower_names) > 1:
+        yield _serving(outcome)
+
+
+def _serving(outcome: MapOutcome) -> job.Layer:
+    """Return the layer of the nearest tower."""
     shown = outcome.shown
-    if len(shown.tower_names) > 1:
-        yield page.MapLayer(
-            quantity="Serving tower", unit="", values=shown.grid.raster(shown.serving.astype(np.float64)),
-            classes=shown.tower_names,
-        )  # fmt: skip
+    serving = shown.grid.raster(shown.serving.astype(np.float64))
+    return job.Layer(name="serving_tower", quantity="Serving tower", unit="", values=serving, classes=shown.tower_names)
 
 
-def _budget_layers(outcome: MapOutcome) -> Iterator[cells.Layer]:
-    """Yield the margin above the threshold and the SNR of the nearest tower, per foliage mode and height."""
-    budget = outcome.settings.budget
+def _further_layers(outcome: MapOutcome) -> Iterator[job.Layer]:
+    """Yield margin above the threshold, SNR, singular-value spread and condition number of the nearest tower."""
+    budget, ratios = outcome.settings.budget, {"spread": "Singular-value spread", "condition": "Condition number"}
     for mode, result in outcome.ordered():
-        for row, height in enumerate(result.rss_altitudes_m):
-            level, at = result.rss()[row], f"{job.in_name(height)}m_joint_{mode}"
-            layer = partial(cells.Layer, unit="dB", height_m=height, of="nearest tower", foliage=mode)
+        layer, raster = partial(job.Layer, unit="dB", tower=job.JOINT, foliage=mode), result.grid.raster
+        for height, level in zip(result.rss_altitudes_m, result.rss(), strict=True):
             if budget.level_dbm is not None:
-                above, name = np.round(level - budget.level_dbm, 2), f"Margin above {budget.level_dbm:.1f} dBm"
-                yield layer(name=f"margin_mimo_h{at}", values=above, quantity=name)
+                above, quantity = raster(level - budget.level_dbm), f"Margin above {budget.level_dbm:.1f} dBm"
+                yield layer(name="margin_mimo", quantity=quantity, height_m=height, values=above)
             if budget.noise_dbm is not None:
-                yield layer(name=f"snr_mimo_h{at}", values=np.round(level - budget.noise_dbm, 2), quantity="SNR")
-
-
-def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
-    """Yield margin and SNR, singular-value spread and condition number."""
-    result, s = outcome.shown, outcome.settings
-    raster = result.grid.raster
-    for layer in _budget_layers(outcome):
-        yield page.MapLayer(
-            quantity=layer.quantity, unit="dB", values=raster(layer.values), foliage=layer.foliage,
-            height_m=layer.height_m,
-        )  # fmt: skip
-    for name, values in (("Singular-value spread", result.spread_db), ("Condition number", result.condition_db)):
-        joint = values[..., result.serving, np.arange(len(result.grid))]
-        for row, height in enumerate(result.rank_altitudes_m):
-            shown = raster(np.minimum(joint[row], job.RATIO_LIMIT_DB))
-            yield page.MapLayer(quantity=name, unit="dB", foliage=s.shown, height_m=height, values=shown)
+                above = raster(level - budget.noise_dbm)
+                yield layer(name="snr_mimo", quantity="SNR", height_m=height, values=above)
+        for name, quantity in ratios.items():
+            joint = np.minimum(result.of_tower(getattr(result, f"{name}_db")), job.RATIO_LIMIT_DB)
+            for height, values in zip(result.rank_altitudes_m, joint, strict=True):
+                yield layer(name=name, quantity=quantity, height_m=height, values=raster(values))
 
 
 def _correlations(outcome: MapOutcome) -> dict[str, tuple[BinnedCorrelation, BiExponential | None]]:
@@ -809,24 +802,33 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
 
     ``progress`` receives the reason if maps.nc is omitted.
     """
-    site, grid = outcome.site, outcome.shown.grid
-    flown = [*_budget_layers(outcome), *([] if outcome.corrected is None else outcome.corrected.layers())]
-    joint, every = (_all_layers(outcome, towers_too=too) + flown for too in (False, True))
-    names = {layer.name for layer in joint}
-    every = [layer for layer in every if layer.name in names or not layer.name.startswith(RATIOS)]
-    shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
+    site, grid, flown = outcome.site, outcome.shown.grid, outcome.corrected
+    layers: list[job.Layer] = [_serving(outcome)]
+    for mode, result in outcome.ordered():
+        layers += _rss_maps(result, mode, outcome.settings.budget)
+        for tower in (None, *result.tower_names):
+            layers += _rank_maps(result, mode, tower)
+    layers += _further_layers(outcome)
+    corrected = [] if flown is None else [*flown.layers(grid), *flown.rank_maps(grid)]
+    joint = [layer for layer in layers if layer.tower in ("", job.JOINT) and layer.name not in RATIOS]
+    further = [layer for layer in joint if layer.name in BUDGET]
     named = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
     table = export.MapLayers(
-        grid=grid, frame=site.frame, layers=every, towers_m=named, borders=outcome.shown.borders, credit=site.credit
+        grid=grid,
+        frame=site.frame,
+        layers=layers + corrected,
+        towers_m=named,
+        borders=outcome.shown.borders,
+        credit=site.credit,
     )
     written = [
         export.write_csv(folder / "layers.csv", table),
-        export.write_kmz(folder / "maps.kmz", replace(table, layers=shown), title=site.name),
+        export.write_kmz(folder / "maps.kmz", replace(table, layers=joint + corrected), title=site.name),
     ]
     if outcome.store is not None:
         written.append(outcome.store.write_zarr(folder / ZARR, site.frame, _about_maps(site)))
     try:
-        maps = maps_dataset(dict(outcome.ordered()), site.frame, _about_maps(site), flown)
+        maps = maps_dataset(dict(outcome.ordered()), site.frame, _about_maps(site), further + corrected)
         (folder / "maps.nc").write_bytes(netcdf_bytes(maps))
         written.append(folder / "maps.nc")
     except UsageError as missing:
@@ -840,18 +842,3 @@ def _about_maps(site: Site) -> dict[str, str]:
         title=site.name, source="ray tracing", comment="A missing level or a rank of 0 means that there is no path."
     )
     return about | ({"acknowledgement": site.credit} if site.credit else {})
-
-
-def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:
-    """Return the layers of all modes, with the mode in their names. The serving tower is included once."""
-    result: list[cells.Layer] = []
-    for mode, maps in outcome.ordered():
-        serving, *layers = job.layers_of(maps, towers_too=towers_too)
-        result += [] if result else [serving]
-        for layer in layers:
-            # 0.01 dB is finer than the site's data allow, and needs a third of the bytes
-            values = layer.values if layer.classes else np.round(layer.values, 2)
-            if layer.name.startswith(RATIOS):
-                values = np.minimum(values, job.RATIO_LIMIT_DB)
-            result.append(replace(layer, name=f"{layer.name}_{mode}", foliage=mode, values=values))
-    return result

@@ -6,7 +6,6 @@ receiver. Levels of a map are in dBm, without the mean offset between the logs a
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -30,7 +29,7 @@ from ..flight.drafting.proposals import remembered
 from ..flight.gains import flight_of
 from ..flight.settings import FlightFile, LinkSettings, LinksSettings
 from ..flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
-from ..maps.grid import RANK_CLASSES, Grid, Layer
+from ..maps.grid import Grid, Layer
 from ..propagation.geometry import Poses, rotation_from_aircraft
 from ..report import maps as page
 from ..report.prediction import (
@@ -671,31 +670,16 @@ class CorrectedMaps:
     ranks: dict[tuple[str, float], FloatArray]
     prediction: PredictionPage
 
-    def layers(self) -> list[Layer]:
-        """Return the layers for the files next to the page."""
-        out = []
+    def layers(self, grid: Grid) -> Iterator[Layer]:
+        """Yield the layers of page and files: corrected and raw level, and standard deviation."""
         for item in self.levels:
-            at = f"h{item.height_m:03.0f}m_{re.sub(r'[^0-9A-Za-z]', '_', item.link)}"
-            for name, title, unit, values in (
-                ("rss_raw", "RSS, raw replay", "dBm", item.raw_dbm),
-                ("rss_corrected", "RSS, corrected by flights", "dBm", item.corrected_dbm),
-                ("rss_sd", "Standard deviation of the corrected RSS", "dB", item.sd_db),
-            ):
-                text = f"{title}, {item.link}, {item.height_m:g} m"
-                out.append(Layer(f"{name}_{at}", np.round(values, 2), unit, text))
-        for (tower, height), p in self.ranks.items():
-            name = f"rank_learned_h{height:03.0f}m_{re.sub(r'[^0-9A-Za-z]', '_', tower)}"
-            out.append(Layer(name, likeliest(p), "1", f"Rank, learned receiver, {tower}, {height:g} m", RANK_CLASSES))
-        return out
-
-    def page_layers(self, grid: Grid) -> Iterator[page.MapLayer]:
-        """Yield the layers of the linked map: raw and corrected level, and standard deviation."""
-        for item in self.levels:
-            layer = partial(page.MapLayer, link=item.link, height_m=item.height_m)
+            layer = partial(Layer, link=item.link, height_m=item.height_m)
             for version, values in (("corrected", item.corrected_dbm), ("raw", item.raw_dbm)):
-                shown = grid.raster(values)
-                yield layer(quantity="RSS, raw and corrected", unit="dBm", version=version, values=shown)
-            yield layer(quantity="SD of the corrected RSS", unit="dB", values=grid.raster(item.sd_db))
+                yield layer(
+                    name=f"rss_{version}", quantity="RSS, raw and corrected", unit="dBm", version=version,
+                    values=grid.raster(values),
+                )  # fmt: skip
+            yield layer(name="rss_sd", quantity="SD of the corrected RSS", unit="dB", values=grid.raster(item.sd_db))
 
     def rss_maps(self, grid: Grid) -> Iterator[page.RssMap]:
         """Yield the maps and distributions of raw and corrected levels for figures."""
@@ -716,7 +700,7 @@ class CorrectedMaps:
             share = np.concatenate([[np.isnan(p[:, 0]).mean()], np.nan_to_num(p).mean(axis=0)])
             rank = likeliest(p)
             values = grid.raster(np.where(rank > 0, rank, np.nan))
-            yield page.RankMap(height_m=height, values=values, share=share, tower=tower)
+            yield page.RankMap(name="rank_learned", height_m=height, values=values, share=share, tower=tower)
 
 
 def likeliest(p: FloatArray) -> FloatArray:

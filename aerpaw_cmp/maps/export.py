@@ -4,7 +4,8 @@
 its standard deviation or classes. A position out of coverage is an empty cell of the CSV, or the class 0 ("Z"). Samples
 along a flight are written by :mod:`aerpaw_cmp.report.exports`.
 
-    maps = MapLayers(grid=grid, frame=site.frame, layers=(Layer("level_db", level, "dBm", "Level"),))
+    level = Layer(name="level_db", quantity="Level", unit="dBm", values=grid.raster(level_dbm))
+    maps = MapLayers(grid=grid, frame=site.frame, layers=(level,))
     write_csv(folder / "level.csv", maps)
 
 Each function replaces an existing file and returns its path.
@@ -47,7 +48,7 @@ class MapLayers:
     frame : SiteFrame
         Frame that converts local metres to latitude and longitude.
     layers : sequence of Layer
-        Values in index order, (positions,), NaN out of coverage.
+        Layers with different names.
     towers_m : mapping of str to (3,)
         Positions of the towers, east, north, up.
     borders : sequence of Border
@@ -65,11 +66,11 @@ class MapLayers:
     credit: str = ""
 
     def __post_init__(self) -> None:
-        n, names = len(self.grid), [layer.name for layer in self.layers]
-        wrong = [f"{layer.name} {np.shape(layer.values)}" for layer in self.layers if np.shape(layer.values) != (n,)]
+        shape, names = self.grid.shape, [layer.column for layer in self.layers]
+        wrong = [f"{layer.column} {layer.values.shape}" for layer in self.layers if layer.values.shape != shape]
         twice = sorted({name for name in names if names.count(name) > 1})
         if wrong or twice:
-            raise ValueError(f"layers of the wrong shape: {wrong}, with the same name: {twice}; the grid has {n} cells")
+            raise ValueError(f"layers of the wrong shape: {wrong}, with the same name: {twice}; the grid is {shape}")
 
     def lonlat(self, points_m: Any) -> FloatArray:
         """Return longitude and latitude (n, 2) [deg] of points east and north, to 1 cm."""
@@ -90,7 +91,7 @@ def write_csv(path: str | Path, maps: MapLayers) -> Path:
         "row": np.repeat(np.arange(rows), columns), "column": np.tile(np.arange(columns), rows),
         "east_m": points[:, 0], "north_m": points[:, 1],
         "latitude_deg": np.round(latitude, 9), "longitude_deg": np.round(longitude, 9),
-        **{layer.name: layer.values for layer in maps.layers},
+        **{layer.column: layer.cells for layer in maps.layers},
     }  # fmt: skip
     # guard text, because names of towers may be third-party input, and a spreadsheet executes a cell that begins with =
     target = Path(path)
@@ -108,10 +109,10 @@ def write_kmz(path: str | Path, maps: MapLayers, *, title: str = "Coverage and r
     parts = [
         kml.folder(
             layer.title,
-            f"legends/{layer.name}.png",
+            f"legends/{layer.column}.png",
             # KML writes alpha, blue, green, red; with c0 a quarter of the imagery below is visible
             f"<GroundOverlay><name>map</name><visibility>{int(number == 0)}</visibility><color>c0ffffff</color>"
-            f"<Icon><href>maps/{layer.name}.png</href></Icon><LatLonBox>{box}</LatLonBox></GroundOverlay>",
+            f"<Icon><href>maps/{layer.column}.png</href></Icon><LatLonBox>{box}</LatLonBox></GroundOverlay>",
             visible=number == 0,
         )
         for number, layer in enumerate(maps.layers)
@@ -124,7 +125,7 @@ def write_kmz(path: str | Path, maps: MapLayers, *, title: str = "Coverage and r
     pictures = {}
     for layer in maps.layers:
         scale = scale_of(layer)
-        pictures[f"maps/{layer.name}.png"] = _picture(maps.grid, layer, scale)
+        pictures[f"maps/{layer.column}.png"] = _picture(maps.grid, layer, scale)
         pictures |= scale.legend(4.2)
     return kml.write_archive(Path(path), title, maps.credit, "".join(parts), pictures)
 
@@ -230,8 +231,8 @@ def class_scale(key: str, title: str, names: Sequence[str]) -> Scale:
 def scale_of(layer: Layer) -> Scale:
     """Return the colours of a layer."""
     if layer.classes:
-        return class_scale(layer.name, layer.title, layer.classes)
-    return number_scale(layer.name, f"{layer.title} [{layer.unit}]", np.asarray(layer.values, dtype=np.float64))
+        return class_scale(layer.column, layer.title, layer.classes)
+    return number_scale(layer.column, f"{layer.title} [{layer.unit}]", layer.cells)
 
 
 def _picture(grid: Grid, layer: Layer, scale: Scale) -> bytes:
@@ -242,7 +243,7 @@ def _picture(grid: Grid, layer: Layer, scale: Scale) -> bytes:
     palette = (255 * to_rgba_array(scale.colours)).round().astype(np.uint8)
     palette[-1, 3] = 128  # the ground is visible where there is no path
     # rows of pictures begin in the north
-    cells = Image.fromarray(np.ascontiguousarray(grid.raster(palette[scale.bin_of(layer.values)])[::-1]))
+    cells = Image.fromarray(np.ascontiguousarray(grid.raster(palette[scale.bin_of(layer.cells)])[::-1]))
     picture = cells.resize((PIXELS_PER_CELL * cells.width, PIXELS_PER_CELL * cells.height), Image.Resampling.NEAREST)
     buffer = io.BytesIO()
     picture.save(buffer, "PNG")
@@ -278,15 +279,15 @@ def maps_dataset(
     variables = {**_places(first, frame), **_levels(maps), **_ranks(maps)}
     variables["foliage"] = _text("foliage", maps, "how trees act")
     for layer in further:
-        plane = first.grid.raster(np.asarray(layer.values))
+        plane = first.grid.raster(layer.cells)
         if layer.classes:
             # rank_1 instead of 1, because a number next to flag_values could be mistaken for a value
             codes = tuple(f"rank_{c}" if c.isdigit() else c for c in layer.classes)
-            variables[layer.name] = _PLANE, plane.astype(np.int8), _codes(codes, layer.title)
+            variables[layer.column] = _PLANE, plane, _codes(codes, layer.title)
         else:
             unit = {"dBm": DBM, "dB": DB}.get(layer.unit, layer.unit)
             about_layer = {"long_name": layer.title, "units": unit, "comment": f"unit: {layer.unit}"}
-            variables[layer.name] = _PLANE, plane.astype(np.float32), about_layer | _ON_PLANE
+            variables[layer.column] = _PLANE, plane.astype(np.float32), about_layer | _ON_PLANE
     return Dataset(variables, about)
 
 

@@ -19,14 +19,14 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.errors import UsageError
+from ..common.jsonable import number_key
 from ..common.units import THERMAL_NOISE_DBM_HZ, AnyArray, FloatArray, IntArray, db_from_power, unmasked
 from ..compare.rank import rank_from_singular_values
 
@@ -232,45 +232,85 @@ def _bisector_segment(
     return np.stack([middle + low * along, middle + high * along])
 
 
-@dataclass(frozen=True, slots=True)
+# Name of the joint map, in which the nearest tower serves each position.
+JOINT = "joint"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Layer:
-    """One map to draw or to export.
+    """A map layer of one quantity, on the page and in files.
 
     Parameters
     ----------
+    quantity, unit : str
+        Quantity and unit. On the page, layers of the same quantity share a colour scale and can be subtracted.
+    values : (rows, columns)
+        Values, starting in the south-west; NaN out of coverage.
     name : str
-        Identifier such as ``"rank_k10_h030m_joint"``: letters, digits, underscores.
-    values : (n,)
-        Values in index order. NaN (0 for classes) means out of coverage.
-    unit : str
-        Unit, for example ``"dBm"``; ``"1"`` for classes and ratios.
-    quantity : str
-        Name of the quantity, for example ``"RSS MIMO"``.
+        Short name in files, such as ``"rss_mimo"``. Empty for a layer that is only on the page.
     classes : tuple of str
-        Names of the values 0, 1, ... of a layer of classes.
+        Names of the values 0, 1, ..., for a layer of classes. The name "Z" of the value 0 means out of coverage.
+    version, link, tower, antennas, foliage : str
+        Properties that distinguish layers of a quantity, empty if they do not apply. The tower :data:`JOINT` means the
+        nearest tower.
+    k : float, optional
+        Singular-value ratio of a rank.
     height_m : float
         Height above ground [m]; NaN for a layer without a height.
-    of : str
-        The tower, ``"nearest tower"``, or empty.
-    foliage : str
-        The foliage mode, or empty.
     """
 
-    name: str
-    values: AnyArray
-    unit: str
     quantity: str
+    unit: str
+    values: FloatArray = field(repr=False, compare=False)
+    name: str = ""
     classes: tuple[str, ...] = ()
-    height_m: float = math.nan
-    of: str = ""
+    version: str = ""
+    link: str = ""
+    tower: str = ""
+    antennas: str = ""
+    k: float | None = None
     foliage: str = ""
+    height_m: float = math.nan
+
+    @property
+    def axes(self) -> dict[str, str]:
+        """The properties of this layer as texts, by the label of the menu on the page."""
+        k = "" if self.k is None else number_key(self.k)
+        height = "" if math.isnan(self.height_m) else f"{self.height_m:g} m"
+        axes = {"Version": self.version, "Link": self.link, "Tower": self.tower, "Antennas": self.antennas, "K": k,
+                "Foliage": self.foliage, "Height": height}  # fmt: skip
+        return {name: value for name, value in axes.items() if value}
+
+    def place(self, axis: str) -> float:
+        """Return a number for sorting the choices of an axis: the joint map first, then rising K and heights."""
+        return {"Tower": float(self.tower != JOINT), "K": self.k, "Height": self.height_m}.get(axis) or 0.0
+
+    @property
+    def column(self) -> str:
+        """The name in files: letters, digits and underscores, such as ``rank_k10_h030m_joint_opaque``."""
+        # pad with zeros, so that layers sorted by name are also sorted by height
+        height = "" if math.isnan(self.height_m) else f"h{in_name(self.height_m, 3)}m"
+        parts = self.name, height, re.sub(r"\W", "_", self.tower or self.link), self.foliage
+        return "_".join(part for part in parts if part)
 
     @property
     def title(self) -> str:
-        """The text of a legend: quantity, height, tower and foliage."""
-        height = "" if math.isnan(self.height_m) else f"{self.height_m:g} m"
-        parts = self.quantity, height, self.of, self.foliage and f"foliage {self.foliage}"
-        return ", ".join(part for part in parts if part)
+        """The text of a legend: quantity and properties."""
+        known = {"Tower": "nearest tower"} if self.tower == JOINT else {}
+        shown = {**self.axes, **known}
+        return ", ".join([self.quantity, *(f"K = {v}" if n == "K" else v for n, v in shown.items())])
+
+    @property
+    def cells(self) -> AnyArray:
+        """The values of files in index order (n,), rounded to 0.01. Classes are integers, with 0 for NaN."""
+        flat = self.values.ravel()
+        # 0.01 dB is finer than the data of the site allow, and needs a third of the bytes
+        return np.nan_to_num(flat).astype(np.int8) if self.classes else np.round(flat, 2)
+
+
+def in_name(number: float, digits: int = 0) -> str:
+    """Return a height or K as part of a layer's name: 030 for 30 with three digits, 12p5 for 12.5."""
+    return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")
 
 
 # Section VII of the paper has ranks also at 3 m, to show blockage, and levels at three heights.
@@ -478,35 +518,6 @@ def _ratios_db(singular_values: FloatArray) -> FloatArray:
     # a singular value of zero has an infinite ratio, which figures and files limit to RATIO_LIMIT_DB
     strongest = db_from_power(np.where(covered, sigma[..., 0], 1.0) ** 2)
     return np.stack([np.where(covered, strongest - db_from_power(sigma[..., i] ** 2), np.nan) for i in (1, -1)])
-
-
-def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
-    """Return the maps of a result as layers: joint maps, and with ``towers_too`` also the maps of each tower."""
-    layers = [Layer("serving_tower", result.serving, "1", "Serving tower", result.tower_names)]
-    kinds: tuple[Antennas, ...] = ("siso", "mimo")
-    for tower in (None, *(result.tower_names if towers_too else ())):
-        # names of layers become columns, files in the KMZ and variables of NetCDF
-        who = re.sub(r"\W", "_", tower) if tower else "joint"
-        layer = partial(Layer, of=tower or "nearest tower")
-        for antennas in kinds:
-            for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
-                name = f"rss_{antennas}_h{in_name(height)}m_{who}"
-                layers.append(layer(name, values, "dBm", f"RSS {antennas.upper()}", height_m=height))
-        spread, condition = (result.of_tower(values, tower) for values in (result.spread_db, result.condition_db))
-        for height, ranks, *ratios in zip(result.rank_altitudes_m, result.ranks(tower), spread, condition, strict=True):
-            at = f"h{in_name(height)}m_{who}"
-            for k, rank in zip(result.ks, ranks, strict=True):
-                name = f"rank_k{in_name(k, 0)}_{at}"
-                layers.append(layer(name, rank, "1", f"Rank, K = {k:g}", RANK_CLASSES, height_m=height))
-            layers.append(layer(f"spread_{at}", ratios[0], "dB", "Singular-value spread s1/s2", height_m=height))
-            layers.append(layer(f"condition_{at}", ratios[1], "dB", "Condition number s1/s4", height_m=height))
-    return layers
-
-
-def in_name(number: float, digits: int = 3) -> str:
-    """Return a height or K as part of a layer's name: 030 for 30, 12p5 for 12.5."""
-    # pad with zeros, so that layers sorted by name are also sorted by height
-    return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")
 
 
 # Name, smallest and largest value, unit, and likely cause of a value outside the range, by field of a link budget.

@@ -329,7 +329,7 @@ def draw_marks(ax: Axes, marks: Sequence[Mapping[str, Any]]) -> None:
             ax.plot(x, item["y"], linestyle="none", marker=marker, markersize=size, rasterized=True, **look)
         elif len(x):
             bars = ax.broken_barh(
-                np.column_stack([x, item["ends"] - x]), (0.0, item.get("height", 1.0)), label=item["name"],
+                list(zip(x, item["ends"] - x, strict=True)), (0.0, item.get("height", 1.0)), label=item["name"],
                 transform=ax.get_xaxis_transform(), facecolor=colour, edgecolor="#888888", linewidth=0.0,
                 hatch=item.get("hatch"), zorder=0.5,
             )  # fmt: skip

@@ -132,9 +132,9 @@ def flown(data: ReportData) -> list[Chart]:
         Chart(section="flights", title=f"{data.flight}, {panel.name}", caption=caption, content={
             "x": axis, "y": {"label": f"RSS [{panel.unit}]"},
             "marks": [
-                mark(*what, seconds_since(panel.time, start), level)
-                for *what, level in (("dots", "measured", panel.measured_db),
-                                     ("line", "ray tracing", panel.simulated_dbm - panel.score.offset_db))
+                mark("dots", "measured", seconds_since(panel.time, start), panel.measured_db),
+                mark("line", "ray tracing", seconds_since(panel.time, start),
+                     panel.simulated_dbm - panel.score.offset_db),
             ],
         })
         for panel in data.rss if panel.score.n

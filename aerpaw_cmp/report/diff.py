@@ -198,7 +198,8 @@ def _ranks(diff: ReportDiff) -> Table:
                  "Reported ranks changed": 0, "Samples in both": 0, "In one report only": RIGHT},
         rows=[
             (one.tower, one.k, bold(number(one.n_changed, 0)),
-             f"{percent(one.agreement.difference, 1)} {interval(tuple(100 * end for end in one.agreement.ci95))}",
+             f"{percent(one.agreement.difference, 1)} "
+             f"{interval((100 * one.agreement.ci95[0], 100 * one.agreement.ci95[1]))}",
              f"{percent(one.agreement.first, 1)}, {percent(one.agreement.second, 1)}",
              f"{number(one.kappa.difference, 3)} {interval(one.kappa.ci95, 3)}", _both(one.kappa, 3),
              one.n_reported_changed, one.samples.common, _alone_in_each(one.samples))

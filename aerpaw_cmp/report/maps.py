@@ -24,7 +24,7 @@ from ..common.text import counted
 from ..common.units import FloatArray, spread_out
 from ..compare.verdict import Coverage, coverage_verdict
 from ..maps.evaluate import TREATMENTS
-from ..maps.grid import PAPER_SPACING_M, RANK_CLASSES
+from ..maps.grid import JOINT, PAPER_SPACING_M, RANK_CLASSES, Layer
 from ..maps.variogram import BiExponential, BinnedCorrelation
 from ..site.site import Site
 from . import canvas
@@ -43,59 +43,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Name of the joint map, in which the nearest tower serves each position.
-JOINT = "joint"
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MapLayer:
-    """A map layer of one quantity.
-
-    Parameters
-    ----------
-    quantity, unit : str
-        Quantity and unit. Layers of the same quantity share a colour scale and can be subtracted.
-    values : (rows, columns)
-        Values, starting in the south-west; NaN out of coverage.
-    classes : tuple of str
-        Names of the values 0, 1, ..., for a layer of classes.
-    version, link, tower, antennas, foliage : str
-        Properties that distinguish layers of a quantity, empty if they do not apply. The tower "joint" means the
-        nearest tower.
-    k : float, optional
-        Singular-value ratio of a rank.
-    height_m : float
-        Height above ground [m]; NaN for a layer without a height.
-    """
-
-    quantity: str
-    unit: str
-    values: FloatArray = field(repr=False, compare=False)
-    classes: tuple[str, ...] = ()
-    version: str = ""
-    link: str = ""
-    tower: str = ""
-    antennas: str = ""
-    k: float | None = None
-    foliage: str = ""
-    height_m: float = math.nan
-
-    @property
-    def axes(self) -> dict[str, str]:
-        """The properties of this layer as texts, by the label of the menu on the page."""
-        k = "" if self.k is None else k_key(self.k)
-        height = "" if math.isnan(self.height_m) else f"{self.height_m:g} m"
-        axes = {"Version": self.version, "Link": self.link, "Tower": self.tower, "Antennas": self.antennas, "K": k,
-                "Foliage": self.foliage, "Height": height}  # fmt: skip
-        return {name: value for name, value in axes.items() if value}
-
-    def place(self, axis: str) -> float:
-        """Return a number for sorting the choices of an axis: the joint map first, then rising K and heights."""
-        return {"Tower": float(self.tower != JOINT), "K": self.k, "Height": self.height_m}.get(axis) or 0.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RssMap(MapLayer):
+class RssMap(Layer):
     """The RSS of one tower, or of the nearest tower. ``coverage`` is the share of covered positions."""
 
     quantity: str = "RSS"
@@ -104,7 +53,7 @@ class RssMap(MapLayer):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RankMap(MapLayer):
+class RankMap(Layer):
     """The rank for one K. ``share`` (5,) contains the shares of positions out of coverage and with rank 1 to 4.
 
     If K is None, the rank is the most probable rank of a learned receiver, and ``share`` contains mean probabilities.
@@ -174,7 +123,7 @@ class MapsData(Made):
         Sentence with power, noise floor and threshold, if they differ from the paper.
     flights : tuple of ReportData
         Flights of ``--with``, after replay and comparison.
-    layers : tuple of MapLayer
+    layers : tuple of Layer
         Layers other than RSS and rank.
     correlation : mapping of str to (BinnedCorrelation, BiExponential)
         Correlation against distance, and its fitted curve or None, by title.
@@ -198,7 +147,7 @@ class MapsData(Made):
     flights: tuple[ReportData, ...] = ()
     rank: tuple[RankMap, ...] = ()
     rank_by_tower: tuple[RankMap, ...] = ()
-    layers: tuple[MapLayer, ...] = ()
+    layers: tuple[Layer, ...] = ()
     correlation: Mapping[str, tuple[BinnedCorrelation, BiExponential | None]] = field(default_factory=dict)
     errors: tuple[MapError, ...] = ()
     paper: tuple[PaperRow, ...] = ()
@@ -593,7 +542,7 @@ LEVEL, _CLASSES = "level", "classes"
 # --- layers ---------------------------------------------------------------------------------------------------------
 
 
-def page_layers(data: MapsData) -> list[MapLayer]:
+def page_layers(data: MapsData) -> list[Layer]:
     """Return all layers of the page, sorted by quantity."""
     versions = [
         replace(m, quantity="Rank, raw and corrected", version=f"{'corrected' if m.k is None else 'raw'}, {m.source}",
@@ -603,7 +552,7 @@ def page_layers(data: MapsData) -> list[MapLayer]:
     return [*data.rss, *data.rank, *data.rank_by_tower, *versions, *data.layers]
 
 
-def layer_numbers(layer: MapLayer) -> dict[str, Any]:
+def layer_numbers(layer: Layer) -> dict[str, Any]:
     """Return the numbers of a layer: share in coverage, percentiles, shares of classes. Missing numbers are None."""
     finite = layer.values[np.isfinite(layer.values)]
     result: dict[str, Any] = {
@@ -651,7 +600,7 @@ def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST
     )
 
 
-def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer], stride: int) -> dict[str, Any]:
+def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[Layer], stride: int) -> dict[str, Any]:
     arrays = PackedArrays()
     east, north = data.east_m[::stride], data.north_m[::stride]
     by_quantity = grouped(layers, lambda layer: layer.quantity)
@@ -671,7 +620,7 @@ def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer],
     }
 
 
-def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, stride: int) -> dict[str, Any]:
+def _quantity(name: str, layers: Sequence[Layer], arrays: PackedArrays, stride: int) -> dict[str, Any]:
     """Return the content for one quantity: its axes, and the array number for each combination of their values."""
     places: dict[str, dict[str, float]] = {}
     for layer in layers:

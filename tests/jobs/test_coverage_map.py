@@ -352,8 +352,8 @@ def test_coverage_is_the_share_of_levels_at_the_threshold(site, tmp_path):
     shares = {(m.tower, m.antennas): m.coverage for m in record.rss}
     assert 0.2 < shares["A", "SISO"] < 0.8
     assert shares["A", "SISO"] == pytest.approx(np.mean(away <= reach_m))
-    layers = {layer.name: layer for layer in coverage_map._budget_layers(outcome)}
-    assert set(layers) == {"margin_mimo_h030m_joint_none", "snr_mimo_h030m_joint_none"}
+    layers = {layer.column: layer for layer in coverage_map._further_layers(outcome)}
+    assert {"margin_mimo_h030m_joint_none", "snr_mimo_h030m_joint_none"} <= set(layers)
     apart = layers["snr_mimo_h030m_joint_none"].values - layers["margin_mimo_h030m_joint_none"].values
     np.testing.assert_allclose(apart, 30.0, atol=0.011)
 

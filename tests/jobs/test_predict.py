@@ -23,6 +23,7 @@ from aerpaw_cmp.jobs.calibrate_rank import rank_samples
 from aerpaw_cmp.jobs.flight_run import run_flight
 from aerpaw_cmp.jobs.referee import judge, read_foreign
 from aerpaw_cmp.jobs.sources import TargetOptions, Targets, find_targets, named_flights
+from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.propagation.geometry import Link, rotation_from_aircraft, single_element
 from aerpaw_cmp.propagation.replay import trace
 from aerpaw_cmp.report.prediction import prediction_metrics, write_prediction
@@ -388,8 +389,9 @@ def test_corrected_levels_are_brought_to_the_raw_replay_by_the_planted_offset(pr
     raw = trace("lake_wheeler", Link(3.3e9, {"LW1": single_element()}, single_element()), [[-300.0, 150.0, 30.0]])
     assert levels.raw_dbm[0] == pytest.approx(raw.rss_dbm[0, 0], abs=1e-6)
     maps = predict.CorrectedMaps(levels=(levels,), ranks={}, prediction=prediction.page)
-    assert [layer.name for layer in maps.layers()] == [
-        f"rss_{kind}_h030m_LW1_USRP1" for kind in ("raw", "corrected", "sd")
+    row = Grid(np.arange(len(level), dtype=float), np.zeros(1), 1.0)
+    assert [layer.column for layer in maps.layers(row)] == [
+        f"rss_{kind}_h030m_LW1_USRP1" for kind in ("corrected", "raw", "sd")
     ]
 
 

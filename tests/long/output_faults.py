@@ -166,7 +166,7 @@ def compute_once(jobs: dict[str, Job], folder: Path) -> None:
     for room, name in computed:
         setattr(room, name, _remembered(getattr(room, name), lambda *_, **__: ""))
     canvas.render = _remembered(canvas.render, lambda spec, *_, **__: str(spec.name))
-    export._legend = _remembered(export._legend, lambda layer, *_, **__: str(layer.name))
+    export.Scale.legend = _remembered(export.Scale.legend, lambda scale, *_, **__: str(scale.key))  # type: ignore[method-assign]
     typer_main.get_command = _remembered(typer_main.get_command, lambda *_, **__: "")  # the options of all commands
     for job in jobs.values():
         for variant in VARIANTS if job.kind == "folder" else ():

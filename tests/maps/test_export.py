@@ -17,12 +17,19 @@ from aerpaw_cmp.maps.grid import RANK_CLASSES, Grid, Layer, voronoi_borders
 
 FRAME = SiteFrame(35.7275, -78.6960)
 GRID = Grid.over_area((-90.0, 90.0, -60.0, 60.0))
-RSS = np.linspace(-120.0, -40.0, len(GRID))
+RSS = np.linspace(-120.0, -40.0, len(GRID)).round(2)
 RSS[3] = np.nan
 RANK = np.arange(len(GRID)) % 5
+
+
+def layer(values, quantity, **more):
+    return Layer(values=GRID.raster(np.asarray(values, dtype=float)), quantity=quantity, **{"unit": "dB", **more})
+
+
+JOINT = {"tower": "joint", "height_m": 30.0}
 LAYERS = [
-    Layer("rank_k10_h030m_joint", RANK, "1", "Rank, K = 10, 30 m", RANK_CLASSES),
-    Layer("rss_h030m_joint", RSS, "dBm", "RSS < 30 m & more"),
+    layer(np.where(RANK > 0, RANK, np.nan), "Rank", name="rank_k10", k=10.0, classes=RANK_CLASSES, **JOINT),
+    layer(RSS, "RSS < 30 m & more", name="rss", unit="dBm", **JOINT),
 ]
 TOWERS = {"LW1": [-50.0, 0.0, 10.0], "LW<2>": [50.0, 10.0, 10.0]}
 BORDERS = voronoi_borders(list(TOWERS.values()), (-90.0, 90.0, -60.0, 60.0))
@@ -62,7 +69,7 @@ def test_kmz_has_a_map_and_a_legend_per_layer(tmp_path):
     hrefs = [node.text for node in tree.iter(f"{kml}href")]
     assert sorted(hrefs) == sorted(names[1:])
     assert [node.find(f"{kml}visibility").text for node in tree.iter(f"{kml}GroundOverlay")] == ["1", "0"]
-    assert {node.text for node in tree.iter(f"{kml}name")} >= {"LW1", "LW<2>", "RSS < 30 m & more"}
+    assert {node.text for node in tree.iter(f"{kml}name")} >= {"LW1", "LW<2>", "RSS < 30 m & more, nearest tower, 30 m"}
     # the picture begins in the north-west: position of the last row, first column
     size = export.PIXELS_PER_CELL
     assert picture.shape[:2] == (GRID.shape[0] * size, GRID.shape[1] * size)
@@ -97,10 +104,10 @@ def test_out_of_coverage_is_its_own_colour():
 
 
 def test_constant_and_empty_layers_can_be_drawn(tmp_path):
-    flat = Layer("flat", np.full(len(GRID), 3.0), "dB", "flat")
-    empty = Layer("empty", np.full(len(GRID), np.nan), "dB", "empty")
-    endless = Layer("endless", np.full(len(GRID), np.inf), "dB", "endless")
-    assert export.write_kmz(tmp_path / "m.kmz", over(GRID, [flat, empty, endless])).stat().st_size > 0
+    odd = [
+        layer(np.full(len(GRID), value), name, name=name) for name, value in (("a", 3.0), ("b", np.nan), ("c", np.inf))
+    ]
+    assert export.write_kmz(tmp_path / "m.kmz", over(GRID, odd)).stat().st_size > 0
 
 
 def test_what_is_made_of_a_map_credits_it(tmp_path):
@@ -114,7 +121,7 @@ def test_wrong_layers_are_a_bug():
     with pytest.raises(ValueError, match="same name"):
         over(GRID, [LAYERS[0], LAYERS[0]])
     with pytest.raises(ValueError, match="shape"):
-        over(GRID, [Layer("a", np.zeros(3), "1", "a")])
+        over(GRID, [Layer(name="a", values=np.zeros((3, 1)), unit="1", quantity="a")])
 
 
 def test_colours_span_the_middle_96_percent_in_round_steps():

@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.maps.evaluate import Sampling, interpolation_study, rank_fields
+from aerpaw_cmp.maps.evaluate import interpolation_study, rank_fields
 from aerpaw_cmp.maps.grid import (
+    JOINT,
     PAPER_RANK_ALTITUDES_M,
     Evaluation,
     Grid,
-    layers_of,
+    Layer,
+    in_name,
     map_job,
     rank_of_singular_values,
 )
+from aerpaw_cmp.maps.kriging import Sampling
 
 GRID = Grid.over_area((-300.0, 300.0, -300.0, 300.0))
 TOWERS = {"A": np.array([-200.0, 0.0, 10.0]), "B": np.array([200.0, 50.0, 10.0])}
@@ -129,27 +132,15 @@ def test_memory_grows_with_results_only():
     assert many < few + 200_000
 
 
-def test_layers_are_named_once(result):
-    layers = layers_of(result, towers_too=True)
-    names = [layer.name for layer in layers]
-    assert len(set(names)) == len(names) == 1 + 3 * (2 * 2 + 4 * (2 + 2))
-    assert "rank_k10_h003m_joint" in names
-    assert "rss_mimo_h070m_B" in names
-    assert all(layer.values.shape == (len(GRID),) for layer in layers)
-
-
 def test_layer_names_take_any_altitude_k_and_tower():
-    engine = Engine()
-    maps = map_job(
-        GRID, {"A": TOWERS["A"]}, engine, rss_altitudes_m=(0.5, 1.0), rank_altitudes_m=(2.5,), ks=(12.5, 1e6)
-    )
-    names = {layer.name for layer in layers_of(maps)}
-    assert {
-        "rss_siso_h0p5m_joint",
-        "rss_siso_h001m_joint",
-        "rank_k12p5_h2p5m_joint",
-        "rank_k1000000_h2p5m_joint",
-    } <= names
+    def column(name, **about):
+        return Layer(name=name, quantity="", unit="", values=np.zeros((1, 1)), **about).column
+
+    assert column("rss_siso", height_m=0.5, tower=JOINT) == "rss_siso_h0p5m_joint"
+    assert column("rss_siso", height_m=1.0, tower=JOINT, foliage="none") == "rss_siso_h001m_joint_none"
+    assert column(f"rank_k{in_name(12.5)}", height_m=2.5, tower="A b") == "rank_k12p5_h2p5m_A_b"
+    assert column(f"rank_k{in_name(1e6)}", height_m=2.5, link="LW1 x") == "rank_k1000000_h2p5m_LW1_x"
+    assert column("serving_tower") == "serving_tower"
 
 
 def test_rank_study_runs_the_papers_comparison(result):

@@ -54,8 +54,14 @@ def write(path):
         source="ray tracing",
         comment="A gap has no path.",
     )
-    level = Layer("rss_sd_h030m_LW1", np.arange(len(GRID)) / 4.0, "dB", "Standard deviation")
-    rank = Layer("rank_learned_h030m_LW1", np.arange(len(GRID)) % 5, "1", "Rank", RANK_CLASSES)
+    number = GRID.raster(np.arange(len(GRID)))
+    level = Layer(
+        name="rss_sd", tower="LW1", height_m=30.0, values=number / 4.0, unit="dB", quantity="Standard deviation"
+    )
+    rank = Layer(
+        name="rank_learned", tower="LW1", height_m=30.0, values=number % 5, unit="", quantity="Rank",
+        classes=RANK_CLASSES,
+    )  # fmt: skip
     path.write_bytes(netcdf_bytes(export.maps_dataset(MAPS, FRAME, about, [level, rank])))
     return path
 

@@ -14,7 +14,7 @@ from aerpaw_cmp.compare.verdict import flight_verdict
 from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.maps.variogram import BiExponential, BinnedCorrelation
 from aerpaw_cmp.report.flight_data import InputFile, ReportData, Track, Waypoint
-from aerpaw_cmp.report.maps import MapError, MapLayer, MapsData, PaperRow, RankMap, RssMap
+from aerpaw_cmp.report.maps import Layer, MapError, MapsData, PaperRow, RankMap, RssMap
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Tower, Trees
 from benchmarks.fabricated import rank_result, rss_result
 
@@ -199,7 +199,7 @@ def make_maps() -> MapsData:
     return MapsData(
         title="Coverage and rank of Lake Wheeler", name="lw", site=site, generated="2026-11-21T00:00:00Z", east_m=east, north_m=north,
         borders_m=lines, rss=tuple(rss), rank=tuple(rank),
-        layers=(*(MapLayer(quantity="Singular value spread", unit="dB", height_m=h, values=20 + d / 30 + h / 10) for h in (30.0, 70.0)), MapLayer(quantity="Foliage loss", unit="dB", height_m=30.0, values=np.where(wood, -12.0, 0.0)),),
+        layers=(*(Layer(quantity="Singular value spread", unit="dB", height_m=h, values=20 + d / 30 + h / 10) for h in (30.0, 70.0)), Layer(quantity="Foliage loss", unit="dB", height_m=30.0, values=np.where(wood, -12.0, 0.0)),),
         correlation={"Rank, horizontal": (BinnedCorrelation(distance, distance, model(distance) + 0.01 * np.cos(distance), np.ones(len(distance), int), 2556, 7), model)},
         errors=tuple(errors),
         paper=(PaperRow(where="Fig. 12", what="c1", paper="0.2932", ours="0.2931", figure="correlation"), PaperRow(where="Fig. 13", what="lowest MAE", paper="K = 10", ours="K = 10", figure="mae_leave_one_out")),

@@ -14,7 +14,7 @@ from aerpaw_cmp import report
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.report import maps as map_explorer
 from aerpaw_cmp.report import maps as maps_html
-from aerpaw_cmp.report.maps import JOINT, MapLayer
+from aerpaw_cmp.report.maps import JOINT, Layer
 from aerpaw_cmp.report.packed import NONE
 from aerpaw_cmp.report.page import as_json
 
@@ -65,7 +65,7 @@ def test_numbers_of_a_layer_are_those_of_the_tables(maps_data):
 
 
 def test_a_layer_without_any_value_has_no_numbers():
-    layer = MapLayer(quantity="RSS", unit="dBm", values=np.full((2, 3), np.nan))
+    layer = Layer(quantity="RSS", unit="dBm", values=np.full((2, 3), np.nan))
     numbers = map_explorer.layer_numbers(layer)
     assert numbers["covered"] == 0.0
     assert np.isnan([numbers[name] for name in ("mean", "median", "min", "max")]).all()
@@ -118,9 +118,9 @@ def test_one_cell_and_absurd_values(maps_data):
     odd = dataclasses.replace(
         maps_data, rss=(), rank=(), east_m=np.array([3.0]), north_m=np.array([7.0]),
         layers=(
-            MapLayer(quantity="huge", unit="1", values=np.array([[1e30]])),
-            MapLayer(quantity="none", unit="", values=np.array([[np.nan]])),
-            MapLayer(quantity="endless", unit="dB", values=np.array([[np.inf]])),
+            Layer(quantity="huge", unit="1", values=np.array([[1e30]])),
+            Layer(quantity="none", unit="", values=np.array([[np.nan]])),
+            Layer(quantity="endless", unit="dB", values=np.array([[np.inf]])),
         ),
     )  # fmt: skip
     content = json.loads(as_json(map_explorer.payload(odd)))

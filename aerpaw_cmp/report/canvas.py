@@ -73,13 +73,12 @@ def style(kind: str = "screen") -> Iterator[None]:
 
     The style ``paper`` embeds fonts, and its serif letters have 8 pt after scaling to the width of an IEEE page.
     """
-    import matplotlib
+    from matplotlib.style import context
 
     settings = {
         "font.family": "sans-serif",
         "font.sans-serif": ["DejaVu Sans"],
         "font.size": 9.0,
-        "text.usetex": False,  # a third-party matplotlibrc in the working folder could run LaTeX
         "text.parse_math": False,  # the name of a waypoint may contain $
         "axes.titlesize": 10.0,
         "axes.titleweight": "bold",
@@ -91,18 +90,13 @@ def style(kind: str = "screen") -> Iterator[None]:
         "axes.grid": True,
         "grid.color": "#E2E2E2",
         "grid.linewidth": 0.6,
-        "legend.frameon": True,
         "legend.framealpha": 0.9,
         "legend.edgecolor": "#DDDDDD",
         "legend.fontsize": 8.0,
         "hatch.linewidth": 0.5,
-        "figure.dpi": 100.0,
         "savefig.dpi": _RASTER_DPI,
         "svg.fonttype": "path",  # the page must look the same if the font is missing
         "svg.hashsalt": "aerpaw-cmp",  # the same numbers produce the same bytes
-        "path.simplify": True,
-        "figure.autolayout": False,  # subplots() sets the layout
-        "figure.constrained_layout.use": False,
     }
     if kind == "paper":
         settings |= {
@@ -113,7 +107,8 @@ def style(kind: str = "screen") -> Iterator[None]:
             "pdf.fonttype": 42,
             "savefig.dpi": 300.0,
         }
-    with matplotlib.rc_context(settings):
+    # begin with the defaults, because a third-party matplotlibrc in the working folder could run LaTeX
+    with context(["default", settings]):
         yield
 
 
@@ -123,42 +118,6 @@ def subplots(size: tuple[float, float], *shape: int, **options: Any) -> tuple[Fi
 
     fig = Figure(figsize=size, layout="constrained")
     return fig, fig.subplots(*shape, **options)
-
-
-def placed(
-    size: tuple[float, float], rows: int, columns: int, *, gap_in: tuple[float, float] = (0.15, 0.4),
-    right_in: float = 0.15, bottom_in: float = 0.9, **options: Any,
-) -> tuple[Figure, Any]:  # fmt: skip
-    """Return a figure and its axes (rows, columns) at fixed positions.
-
-    An automatic layout of a grid of axes takes as long as drawing it, so all positions are given in inches.
-
-    Parameters
-    ----------
-    size : (width, height)
-    rows, columns : int
-    gap_in : (across, up)
-        Distance between axes.
-    right_in, bottom_in : float
-        Margins, for a colour bar and for a legend.
-    options
-        Options of :meth:`matplotlib.figure.Figure.subplots`.
-
-    Returns
-    -------
-    tuple of Figure and array of Axes (rows, columns)
-    """
-    from matplotlib.figure import Figure
-
-    (width, height), left, top = size, 0.7, 0.3
-    wide = (width - left - right_in - (columns - 1) * gap_in[0]) / columns
-    high = (height - top - bottom_in - (rows - 1) * gap_in[1]) / rows
-    fig = Figure(figsize=size)
-    grid = {
-        "left": left / width, "right": 1.0 - right_in / width, "bottom": bottom_in / height,
-        "top": 1.0 - top / height, "wspace": gap_in[0] / wide, "hspace": gap_in[1] / high,
-    }  # fmt: skip
-    return fig, fig.subplots(rows, columns, squeeze=False, gridspec_kw=grid, **options)
 
 
 def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
@@ -322,7 +281,8 @@ def draw_marks(ax: Axes, marks: Sequence[Mapping[str, Any]]) -> None:
             # a point between two gaps is not part of a line, so it gets a dot
             gap = np.pad(np.isnan(y), 1, constant_values=True)
             alone = ~gap[1:-1] & gap[:-2] & gap[2:]
-            ax.plot(x, y, linestyle=dash, linewidth=1.2, marker="o", markersize=1.3, markevery=alone, **look)
+            look |= {"marker": "o", "markersize": 1.3, "markevery": alone} if alone.any() else {}
+            ax.plot(x, y, linestyle=dash, linewidth=1.2, **look)
         elif kind == "dots":
             size, marker = item.get("size", 4.0 if len(x) <= 200 else 1.3), item.get("marker", "o")
             # as a picture inside an SVG, because a day of samples would be a file of many megabytes
@@ -507,8 +467,8 @@ def beyond(values: FloatArray, low: float, high: float) -> str:
     return ("both" if over else "min") if under else ("max" if over else "neither")
 
 
-def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither", cax: Any = None) -> Any:
-    """Draw a colour bar and return it. It has arrows at ends that values exceed, and an SVG contains it as a picture.
+def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither") -> None:
+    """Draw a colour bar next to axes. It has arrows at ends that values exceed, and an SVG contains it as a picture.
 
     Parameters
     ----------
@@ -520,15 +480,7 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
     label : str
     extend : {"neither", "min", "max", "both"}
         Ends that values exceed.
-    cax : Axes, optional
-        Axes of the bar, for a figure of :func:`placed`.
-
-    Returns
-    -------
-    matplotlib.colorbar.Colorbar
     """
-    bar = fig.colorbar(mappable, cax=cax, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
-    if bar.solids is not None:
-        bar.solids.set_rasterized(True)
-        bar.solids.set_edgecolor("face")
-    return bar
+    bar = fig.colorbar(mappable, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
+    bar.solids.set_rasterized(True)
+    bar.solids.set_edgecolor("face")

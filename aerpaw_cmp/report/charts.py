@@ -18,7 +18,7 @@ from ..compare.ladder import ModelRow, distinct
 from ..compare.level import DetectionScore, ServingComparison
 from ..compare.result import RankResult
 from ..logs.records import has_wall_clock
-from .canvas import draw_marks, mark, placed, seconds_since
+from .canvas import draw_marks, mark, seconds_since, subplots
 from .flight_data import RANKS, ReportData, start_of
 from .flight_words import AS_SET, learned_on
 
@@ -44,7 +44,7 @@ def drawn(panels: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Draw charts of one kind, by their titles, in one figure with at most three per row."""
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
-    fig, axes = placed((9.2, 0.6 + 3.2 * rows), rows, columns, gap_in=(0.7, 0.8))
+    fig, axes = subplots((9.2, 0.6 + 3.2 * rows), rows, columns, squeeze=False)
     for ax in axes.flat[len(panels) :]:
         ax.set_visible(False)
     for ax, (title, content) in zip(axes.flat, panels.items(), strict=False):
@@ -53,7 +53,7 @@ def drawn(panels: Mapping[str, Mapping[str, Any]]) -> Figure:
         ax.set_ylim(*content["y"].get("ends", ax.get_ylim()))
     curves = [ax.get_legend_handles_labels() for ax in axes.flat[: len(panels)]]
     if all(names == curves[0][1] for _, names in curves):
-        fig.legend(*curves[0], loc="lower center", ncols=6)
+        fig.legend(*curves[0], loc="outside lower center", ncols=6)
     else:
         for ax in axes.flat[: len(panels)]:
             ax.legend(loc="best", fontsize=7.5)

@@ -28,7 +28,7 @@ from ..maps.grid import JOINT, PAPER_SPACING_M, RANK_CLASSES, Layer
 from ..maps.variogram import BiExponential, BinnedCorrelation
 from ..site.site import Site
 from . import canvas
-from .canvas import FigureSpec, beyond, colour_bar, draw_areas, draw_tower, mark, placed
+from .canvas import FigureSpec, beyond, colour_bar, draw_areas, draw_tower, mark, subplots
 from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, bold, paragraph, settings_card
 from .charts import Chart, drawn, flown
 from .flight_data import RANKS, ReportData
@@ -319,8 +319,8 @@ def overlay_legend(axes: Sequence[Axes]) -> list[Any]:
     return [Patch(**MISSING, label="out of coverage"), *drawn.values()]
 
 
-def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure, list[Axes]]:
-    """Return a figure with axes for ``count`` maps, labels on its outer axes, and a margin on the right [inch]."""
+def map_axes(data: MapsData, count: int) -> tuple[Figure, list[Axes]]:
+    """Return a figure with axes for ``count`` maps, and labels on its outer axes."""
     west, east, south, north = extent_m(data)
     columns = min(count, COLUMNS)
     rows = -(-count // columns)
@@ -328,7 +328,7 @@ def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure
     width = min((7.4 - 0.15 * columns) / columns, 3.2)  # the remaining width is for the colour bar and the labels
     height = float(np.clip(width * (north - south) / (east - west), 0.8, 6.5))
     size = 9.2, rows * (height + 0.35) + 1.0
-    fig, grid = placed(size, rows, columns, gap_in=(0.3, 0.4), right_in=right_in, sharex=True, sharey=True)
+    fig, grid = subplots(size, rows, columns, sharex=True, sharey=True, squeeze=False)
     axes: list[Axes] = list(grid.ravel())
     for ax in axes[count:]:
         ax.set_visible(False)
@@ -345,17 +345,15 @@ def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure
 
 def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]) -> Figure:
     """Draw the maps of each tower and the joint map, for one choice of antennas and height, with limits [dBm]."""
-    fig, axes = map_axes(data, len(maps), 1.0)
+    fig, axes = map_axes(data, len(maps))
     image = None
     for ax, shown in zip(axes, maps, strict=True):
         alone = None if shown.tower == JOINT else shown.tower
         image = draw_map(ax, data, shown.values, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
         ax.set_title(f"{shown.tower}: {100 * shown.coverage:.0f} %", fontsize=9)
     levels = np.concatenate([entry.values.ravel() for entry in maps])
-    low, high = axes[-1].get_position().y0, axes[0].get_position().y1
-    bar = fig.add_axes((0.91, low + 0.1 * (high - low), 0.016, 0.8 * (high - low)))
-    colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits), bar)
-    fig.legend(handles=overlay_legend(axes), loc="lower center", ncols=3)
+    colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits))
+    fig.legend(handles=overlay_legend(axes), loc="outside lower center", ncols=3)
     return fig
 
 
@@ -371,7 +369,7 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
         draw_map(ax, data, shown.values, cmap=colours, norm=norm)
         ax.set_title(f"{shown.height_m:g} m", fontsize=9)
     entries = [Patch(facecolor=CLASS_COLOURS[r], edgecolor="black", label=f"rank {r}") for r in RANKS]
-    fig.legend(handles=[*entries, *overlay_legend(axes)], loc="lower center", ncols=5)
+    fig.legend(handles=[*entries, *overlay_legend(axes)], loc="outside lower center", ncols=5)
     return fig
 
 

@@ -27,22 +27,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Colours of Okabe and Ito (jfly.uni-koeln.de/color) that differ in lightness.
-MEASURED = "#56B4E9"
-SECOND = "#7A3FA0"
-SIMULATED = "#111111"
-BASELINE = {
-    "free_space": ("#D55E00", (0, (5, 2))),
-    "two_ray": ("#009E73", (0, (1, 1.5))),
-    "log_distance": ("#CC79A7", (0, (6, 2, 1, 2))),
-    "constant": ("#0072B2", (0, (8, 3))),
-}
 TOWER = "#C1121F"
 _BUILDING = "#8A8A8A"
 _FOREST = "#B9D8B0"
-WAYPOINT = "#555555"
-
-RANK_MARKER = {0: "x", 1: "o", 2: "s", 3: "^", 4: "D"}
 
 # Colours and line styles of a chart. The styles distinguish curves in grey.
 COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")

@@ -15,27 +15,8 @@ from ..common.text import counted
 from ..common.units import BoolArray, FloatArray, spread_out
 from ..compare.result import PairResult, RankResult, RssResult
 from ..site.site import Site
-from .canvas import (
-    BASELINE,
-    MEASURED,
-    POINTS_PER_LINE,
-    RANK_MARKER,
-    SECOND,
-    SIMULATED,
-    TOWER,
-    WAYPOINT,
-    FigureSpec,
-    colour_bar,
-    draw_marks,
-    draw_site,
-    frame_around,
-    mark,
-    plan_shape,
-    runs,
-    seconds_since,
-    subplots,
-    time_axis,
-)
+from . import canvas
+from .canvas import FigureSpec, mark
 from .flight_data import RANKS, ReportData, Track, start_of, used_towers
 from .flight_words import count, instants, pretty, signed
 from .texts import k_key, number, safe_name
@@ -43,6 +24,21 @@ from .texts import k_key, number, safe_name
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+# Colours of Okabe and Ito (jfly.uni-koeln.de/color) that differ in lightness.
+MEASURED = "#56B4E9"
+SECOND = "#7A3FA0"
+SIMULATED = "#111111"
+BASELINE = {
+    "free_space": ("#D55E00", (0, (5, 2))),
+    "two_ray": ("#009E73", (0, (1, 1.5))),
+    "log_distance": ("#CC79A7", (0, (6, 2, 1, 2))),
+    "constant": ("#0072B2", (0, (8, 3))),
+}
+WAYPOINT = "#555555"
+
+RANK_MARKER = {0: "x", 1: "o", 2: "s", 3: "^", 4: "D"}
 
 
 def figure_specs(data: ReportData) -> list[FigureSpec]:
@@ -88,34 +84,36 @@ def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
 
 def trajectory(data: ReportData, track: Track) -> Figure:
     """Draw the flight on the plan of the site, and enlarged with its height as colour."""
-    fig, (site_plan, close) = subplots((9.2, 5.4), 1, 2, width_ratios=(1.0, 1.35))
+    fig, (site_plan, close) = canvas.subplots((9.2, 5.4), 1, 2, width_ratios=(1.0, 1.35))
     # draw tracks of towers that move, because a symbol shows only the middle of the track
     ways = {item.tower: item.tower_m[:, :2] for item in data.series if item.tower_m is not None}
     for ax in (site_plan, close):
-        draw_site(ax, data.site)
+        canvas.draw_site(ax, data.site)
         for name, way in ways.items():
-            line = way[spread_out(len(way), POINTS_PER_LINE)].T
-            ax.plot(*line, color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5, label=f"track of {name}")
+            line = way[spread_out(len(way), canvas.POINTS_PER_LINE)].T
+            ax.plot(
+                *line, color=canvas.TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5, label=f"track of {name}"
+            )
     flown = np.column_stack([track.east_m, track.north_m])
-    some = spread_out(len(flown), POINTS_PER_LINE)  # evenly spaced points show the shape of the track
+    some = spread_out(len(flown), canvas.POINTS_PER_LINE)  # evenly spaced points show the shape of the track
     site_plan.plot(*flown[some].T, color="#0072B2", linewidth=1.0, label="flight", zorder=4)
     points = close.scatter(
         track.east_m, track.north_m, c=track.up_m, cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,
         label="flight (colour: height)",
     )  # fmt: skip
     places = {name: tower.position_m[None, :2] for name, tower in data.site.towers.items()}
-    frame_around(site_plan, *np.concatenate([flown, *places.values()]).T, least_m=200.0, shape=0.75)
+    canvas.frame_around(site_plan, *np.concatenate([flown, *places.values()]).T, least_m=200.0, shape=0.75)
     extent, centre = np.nanmax([*np.ptp(flown, axis=0), 100.0]), np.nanmean(flown, axis=0)
     used = (places[name] for name in used_towers(data))
     # omit distant towers, because the flight would be a dot next to them
     near = [place for place in used if np.linalg.norm(place - centre) < extent]
-    frame_around(close, *np.concatenate([flown, *near, *ways.values()]).T)
+    canvas.frame_around(close, *np.concatenate([flown, *near, *ways.values()]).T)
     for waypoint in data.waypoints:
         close.annotate(
             waypoint.label, (waypoint.east_m, waypoint.north_m), fontsize=8, ha="center", va="center", zorder=7,
             bbox={"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": WAYPOINT},
         )  # fmt: skip
-    colour_bar(fig, points, close, "Height above ground [m]")
+    canvas.colour_bar(fig, points, close, "Height above ground [m]")
     site_plan.set_title("Whole site")
     close.set_title("The flight")
     site_plan.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
@@ -125,7 +123,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
 
 def altitude(data: ReportData, track: Track) -> Figure:
     """Draw height over time."""
-    height = mark("line", "height of the UAV", seconds_since(track.time, start_of(data)), track.up_m)
+    height = mark("line", "height of the UAV", canvas.seconds_since(track.time, start_of(data)), track.up_m)
     return over_time(data, [({"label": "Height above ground [m]"}, [height])], [2.2])
 
 
@@ -150,9 +148,11 @@ def over_time(data: ReportData, panels: Sequence[tuple[Mapping[str, Any], Sequen
     """
     start = start_of(data)
     points = [(label, float((time - start) / np.timedelta64(1, "s"))) for label, time in data.moments]
-    fig, grid = subplots((9.2, 0.7 + sum(high_in)), len(panels), 1, sharex=True, height_ratios=high_in, squeeze=False)
+    fig, grid = canvas.subplots(
+        (9.2, 0.7 + sum(high_in)), len(panels), 1, sharex=True, height_ratios=high_in, squeeze=False
+    )
     for row, (ax, (ordinate, marks)) in enumerate(zip(grid[:, 0], panels, strict=True)):
-        draw_marks(ax, marks)
+        canvas.draw_marks(ax, marks)
         for label, at in points:
             name = "waypoint" if row == 0 and label == points[0][0] else None
             ax.axvline(at, color=WAYPOINT, linewidth=0.8, linestyle=(0, (2, 2)), label=name)
@@ -166,7 +166,7 @@ def over_time(data: ReportData, panels: Sequence[tuple[Mapping[str, Any], Sequen
         legend = ax.legend(handles, names, loc="center left", bbox_to_anchor=(1.0, 0.5))
         for handle in legend.get_lines():  # the dots of the chart would be too small here
             handle.set_markersize(5.0 if handle.get_linestyle() == "None" else 0.0)
-    time_axis(grid[-1, 0], start)
+    canvas.time_axis(grid[-1, 0], start)
     return fig
 
 
@@ -182,7 +182,7 @@ def _spans(seconds: FloatArray, mask: BoolArray, name: str, **look: Any) -> dict
     """Return the mark of the segments of True samples at these times (n,)."""
     # extend each segment by half a step on each side, so that a single sample is visible
     half = float(np.median(np.diff(seconds))) / 2 if len(seconds) > 1 else 0.5
-    first, last = runs(mask)
+    first, last = canvas.runs(mask)
     # join segments closer than a pixel
     apart = seconds[first[1:]] - seconds[last[:-1]] >= (seconds[-1] - seconds[0]) / _MOST_SPANS
     first, last = first[np.append(True, apart)[: len(first)]], last[np.append(apart, True)[: len(last)]]
@@ -197,7 +197,7 @@ NO_PATH, SHADE = "out of coverage: no path in the simulation", "#DDDDDD"
 
 def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
     """Draw over time: the level as logged, simulation and baselines minus their offsets, and the residual."""
-    seconds, score = seconds_since(panel.time, start_of(data)), panel.score
+    seconds, score = canvas.seconds_since(panel.time, start_of(data)), panel.score
     simulated = _moved(panel.simulated_dbm, score.offset_db)
     silent = panel.measured_out_of_coverage
     marks = [
@@ -237,18 +237,18 @@ def _moved(level_dbm: FloatArray, offset_db: float) -> FloatArray:
 def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssResult]) -> Figure:
     """Draw both channels of a tower and the ray tracing. Segments in which the channels differ are shaded (Fig. 15)."""
     start, (first, second) = start_of(data), panels
-    ends = [seconds_since(np.array(instants(pair.time, span)), start) for span in pair.score.spans]
+    ends = [canvas.seconds_since(np.array(instants(pair.time, span)), start) for span in pair.score.spans]
     parted = np.array(ends).reshape(-1, 2).T
     moved = second.score.offset_db - first.score.offset_db
     shown = ((first, 0.0, MEASURED, "as logged"), (second, moved, SECOND, f"moved by {signed(moved)} dB"))
-    seconds, simulated = seconds_since(first.time, start), _moved(first.simulated_dbm, first.score.offset_db)
+    seconds, simulated = canvas.seconds_since(first.time, start), _moved(first.simulated_dbm, first.score.offset_db)
     marks = [
         mark("spans", "channels differ", parted[0], ends=parted[1], colour=SHADE),
         _spans(seconds, first.simulated_out_of_coverage, NO_PATH),
         mark("line", "ray tracing", seconds, simulated, colour=SIMULATED, dash="-"),
     ]
     marks += [
-        mark("dots", f"{p.channel}, {words}", seconds_since(p.time, start), p.measured_db + by, colour=colour)
+        mark("dots", f"{p.channel}, {words}", canvas.seconds_since(p.time, start), p.measured_db + by, colour=colour)
         for p, by, colour, words in shown
     ]
     return over_time(data, [({"label": f"RSS [{first.unit}]"}, marks)], [2.9])
@@ -270,7 +270,7 @@ def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: F
         Ranks 1 to 4; 0 if there is no path, NaN if unknown.
     title : str
     """
-    draw_site(ax, site)
+    canvas.draw_site(ax, site)
     entries = []
     for value, at in ((value, rank == value) for value in (0, *RANKS) if (rank == value).any()):
         style: dict[str, Any] = {"color": "black", "linewidths": 0.8}
@@ -292,12 +292,12 @@ def rank_maps(data: ReportData, panel: RankResult) -> Figure:
     columns = 2 if len(maps) > 1 else 1
     rows = -(-len(maps) // columns)
     east, north, _ = panel.position_m.T
-    shape = plan_shape(east, north)
+    shape = canvas.plan_shape(east, north)
     # 1.6 inches are for title, axis label and a legend of two lines
-    fig, axes = subplots((9.2, rows * (3.9 / shape + 1.6)), rows, columns, squeeze=False)
+    fig, axes = canvas.subplots((9.2, rows * (3.9 / shape + 1.6)), rows, columns, squeeze=False)
     for ax, (title, rank) in zip(axes.ravel(), maps, strict=False):
         _rank_map(ax, data.site, east, north, rank, title)
-        frame_around(ax, east, north, shape=shape)
+        canvas.frame_around(ax, east, north, shape=shape)
     for ax in axes.ravel()[len(maps) :]:
         ax.set_visible(False)
     return fig
@@ -307,7 +307,7 @@ def rank_histograms(panel: RankResult) -> Figure:
     """Draw the shares of rank 1 to 4, measured and for every K, with intervals if known."""
     from matplotlib import colormaps
 
-    fig, ax = subplots((9.2, 3.4))
+    fig, ax = canvas.subplots((9.2, 3.4))
     reported = int(np.isfinite(panel.measured).sum())
     score = panel.score
     series = [(f"measured ({counted(reported, 'sample')})", score.histogram, score.histogram_ci95)]
@@ -337,7 +337,7 @@ def rank_histograms(panel: RankResult) -> Figure:
 
 def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
     """Draw the measured rank and the rank for every K over time, above SINR and singular values."""
-    seconds = seconds_since(panel.time, start_of(data))
+    seconds = canvas.seconds_since(panel.time, start_of(data))
     fresh, tick = panel.score.staleness.fresh, {"marker": "|", "size": 7}
     held_over, reported = (np.where(at, panel.measured, np.nan) for at in (~fresh, fresh))
     measured = [mark("dots", "measured", seconds, reported, colour="#0072B2", **tick)]

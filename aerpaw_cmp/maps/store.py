@@ -268,13 +268,13 @@ class TileStore:
 
     def __init__(self, folder: Path, tiling: Tiling, job: Mapping[str, Any], empty: Mapping[str, MapResult]) -> None:
         try:
-            import zarr
+            import zarr  # noqa: F401
         except ImportError:
             raise UsageError(
                 "zarr is not installed, and a map in tiles is a Zarr store",
                 expected="pip install 'aerpaw-cmp[geo]' with Python 3.11 or newer, or a larger --spacing",
             ) from None
-        self.folder, self.tiling, self._empty, self._zarr, self.damaged = folder, tiling, empty, zarr, 0
+        self.folder, self.tiling, self._empty, self.damaged = folder, tiling, empty, 0
         self._job = hashlib.sha256(json.dumps([job, tiling.cells], sort_keys=True).encode()).hexdigest()[:16]
 
     def missing(self) -> list[int]:
@@ -354,28 +354,23 @@ class TileStore:
         grid = self.tiling.grid
         like = maps_dataset(self._empty, frame, about).to_xarray()
         planes = [name for name, variable in like.variables.items() if {"y", "x"} <= {*variable.dims}]
-        axes = like.drop_vars(planes).assign_coords(
+        store = like.drop_vars(planes).assign_coords(
             x=("x", grid.east_m, like.x.attrs), y=("y", grid.north_m, like.y.attrs)
         )
-        axes.to_zarr(path, mode="w-", consolidated=False, zarr_format=3)
-        group = self._zarr.open_group(path, mode="r+", zarr_format=3)
+        chunks, tile = {}, np.minimum(self.tiling.cells, grid.shape).tolist()
         for name in planes:
-            variable = like[name].variable
-            leading = variable.shape[:-2]
-            tile = np.minimum(self.tiling.cells, grid.shape).tolist()
-            plain = {
-                key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in variable.attrs.items()
-            }
-            group.create_array(
-                name, shape=(*leading, *grid.shape), chunks=(*leading, *tile),
-                dtype=variable.dtype, fill_value=np.nan if variable.dtype.kind == "f" else 0,
-                dimension_names=variable.dims, attributes=plain,
-            )  # fmt: skip
+            (*leading, _, _), kind = like[name].shape, like[name].dtype
+            # one number in the shape of the plane, which takes no memory; its chunks are not written
+            fill = np.array(np.nan if kind.kind == "f" else 0, dtype=kind)
+            store[name] = like[name].dims, np.broadcast_to(fill, (*leading, *grid.shape)), like[name].attrs
+            chunks[name] = {"chunks": (*leading, *tile), "fill_value": fill.item(), "_FillValue": None}
+        store.to_zarr(path, mode="w-", consolidated=False, zarr_format=3, encoding=chunks, write_empty_chunks=False)
         for number in range(len(self.tiling)):
             rows, columns = self.tiling.part(number)
-            computed = maps_dataset(self.read(number)[0], frame, about).variables
-            for name in planes:
-                group[name][..., rows, columns] = computed[name].values
+            computed = maps_dataset(self.read(number)[0], frame, about).to_xarray()
+            computed[planes].drop_vars(computed.coords).to_zarr(
+                path, mode="r+", consolidated=False, region={"y": rows, "x": columns}
+            )
         return path
 
     def remove(self) -> None:

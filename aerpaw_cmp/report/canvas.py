@@ -392,10 +392,8 @@ def plan_axes(ax: Axes) -> None:
     ax.set(xlabel="East of the site origin [m]", ylabel="North of the site origin [m]")
 
 
-def frame_around(
-    ax: Axes, east: FloatArray, north: FloatArray, *, margin: float = 0.08, least_m: float = 60.0, shape: float = 1.0
-) -> None:
-    """Set the limits of a plan around points, with a margin and a minimum extent.
+def frame_around(ax: Axes, east: FloatArray, north: FloatArray, *, margin: float = 0.08, shape: float = 1.0) -> None:
+    """Set the limits of a plan around points, with a margin and an extent of at least 60 m.
 
     Parameters
     ----------
@@ -404,8 +402,6 @@ def frame_around(
         Points [m]; NaN is ignored.
     margin : float
         Share of the extent on each side.
-    least_m : float
-        Minimum width and height [m].
     shape : float
         Width over height of the plan.
     """
@@ -415,8 +411,8 @@ def frame_around(
     if not good.any():
         return
     east, north = east[good], north[good]
-    width = max(float(np.ptp(east)) * (1 + 2 * margin), least_m)
-    height = max(float(np.ptp(north)) * (1 + 2 * margin), least_m)
+    width = max(float(np.ptp(east)) * (1 + 2 * margin), 60.0)
+    height = max(float(np.ptp(north)) * (1 + 2 * margin), 60.0)
     # extend the limits to the shape of the plan, because both scales are equal
     width, height = max(width, height * shape), max(height, width / shape)
     middle_east, middle_north = (east.min() + east.max()) / 2, (north.min() + north.max()) / 2

@@ -176,25 +176,17 @@ def _forecast(data: ReportData, panel: RankResult) -> dict[str, Any]:
     }
 
 
-# Largest number of cells with their own row. All other cells share one row.
+# Largest number of cells in the table of serving cells.
 MOST_CELLS = 16
-OTHER = "others"
 
 
-def shown_confusion(serving: ServingComparison, most: int = MOST_CELLS) -> tuple[list[str], AnyArray]:
+def shown_confusion(serving: ServingComparison) -> tuple[list[str], AnyArray]:
     """Return the names of cells and a readable confusion matrix (cells, cells + 1), whose last column is "no path".
 
-    Cells that neither served nor were predicted are omitted. If there are more than ``most``, the cells with the fewest
-    samples are added up as "others".
+    Only the :data:`MOST_CELLS` cells with the most samples are included, and no cell that neither served nor was
+    predicted.
     """
     counts = np.asarray(serving.confusion)
     weight = counts.sum(axis=1) + counts[:, :-1].sum(axis=0)
-    order = [int(i) for i in np.argsort(-weight, kind="stable") if weight[i] > 0]
-    first, few = sorted(order[:most]), sorted(order[most:])
-    names = [serving.cells[i] for i in first]
-    columns = np.column_stack([counts[:, first], counts[:, few].sum(axis=1)] if few else [counts[:, first]])
-    columns = np.column_stack([columns, counts[:, -1]])
-    table = columns[first]
-    if few:
-        table, names = np.vstack([table, columns[few].sum(axis=0)]), [*names, OTHER]
-    return names, table
+    most = np.sort(np.argsort(-weight, kind="stable")[: min(MOST_CELLS, np.count_nonzero(weight))])
+    return [serving.cells[i] for i in most], counts[np.ix_(most, [*most, -1])]

@@ -58,18 +58,14 @@ _TIMES = (
 )
 
 
-def _place(axis: int) -> Callable[[RssResult | RankResult], FloatArray]:
-    return lambda series: series.position_m[:, axis]
-
-
 def _tower_place(axis: int) -> Callable[[RssResult | RankResult], FloatArray | None]:
     return lambda series: None if series.tower_m is None else series.tower_m[:, axis]
 
 
 _PLACES = (
-    Column("east_m", "m", "UAV position, metres east of the site origin", _place(0)),
-    Column("north_m", "m", "metres north", _place(1)),
-    Column("up_m", "m", "metres above the ground at the origin", _place(2)),
+    Column("east_m", "m", "UAV position, metres east of the site origin", lambda p: p.position_m[:, 0]),
+    Column("north_m", "m", "metres north", lambda p: p.position_m[:, 1]),
+    Column("up_m", "m", "metres above the ground at the origin", lambda p: p.position_m[:, 2]),
 )
 _TOWER_PLACES = (
     Column("tower_east_m", "m", "position of a tower that moves, metres east", _tower_place(0), optional=True),
@@ -78,8 +74,13 @@ _TOWER_PLACES = (
 )
 
 
-def _stated(name: str) -> Callable[[RssResult], FloatArray | None]:
-    return lambda series: None if series.stated is None else series.stated.columns(series.simulated_dbm)[name]
+def _stated(name: str, unit: str, meaning: str) -> Column:
+    """Return a column of the stated error of a prediction."""
+
+    def values(series: RssResult) -> FloatArray | None:
+        return None if series.stated is None else series.stated.columns(series.simulated_dbm)[name]
+
+    return Column(name, unit, meaning, values, optional=True)
 
 
 RSS: tuple[Column, ...] = (
@@ -98,15 +99,13 @@ RSS: tuple[Column, ...] = (
            lambda p: p.simulated_out_of_coverage.astype(int), _NO_YES),
     Column("{}_dbm", "dBm", "level of the baseline {}",
            lambda p: {name: model.level_dbm for name, model in p.baselines.items()}, optional=True),
-    Column("simulated_sd_db", "dB", "standard deviation of a sample, all parts", _stated("simulated_sd_db"),
-           optional=True),
-    Column("gain_sd_db", "dB", "part of simulated_sd_db from the learned antennas", _stated("gain_sd_db"),
-           optional=True),
-    Column("own_sd_db", "dB", "part of simulated_sd_db from own shadowing", _stated("own_sd_db"), optional=True),
-    Column("noise_sd_db", "dB", "part of simulated_sd_db from receiver noise", _stated("noise_sd_db"), optional=True),
-    Column("fading_sd_db", "dB", "part of simulated_sd_db from fading", _stated("fading_sd_db"), optional=True),
-    Column("simulated_low_dbm", "dBm", "lower end of the 90 % interval", _stated("simulated_low_dbm"), optional=True),
-    Column("simulated_high_dbm", "dBm", "upper end of the 90 % interval", _stated("simulated_high_dbm"), optional=True),
+    _stated("simulated_sd_db", "dB", "standard deviation of a sample, all parts"),
+    _stated("gain_sd_db", "dB", "part of simulated_sd_db from the learned antennas"),
+    _stated("own_sd_db", "dB", "part of simulated_sd_db from own shadowing"),
+    _stated("noise_sd_db", "dB", "part of simulated_sd_db from receiver noise"),
+    _stated("fading_sd_db", "dB", "part of simulated_sd_db from fading"),
+    _stated("simulated_low_dbm", "dBm", "lower end of the 90 % interval"),
+    _stated("simulated_high_dbm", "dBm", "upper end of the 90 % interval"),
     *_TOWER_PLACES,
 )  # fmt: skip
 

@@ -369,8 +369,8 @@ def serving_card(data: ReportData) -> Card:
         return Card()
     names, counts = shown_confusion(serving)
     table = Table(
-        caption="Numbers of samples by serving cell (rows) and predicted strongest cell (columns). Simulated levels "
-        "have no offset.",
+        caption="Numbers of samples by serving cell (rows) and predicted strongest cell (columns), for the cells with "
+        "the most samples. Simulated levels have no offset.",
         columns={"Served": HEAD, **dict.fromkeys(names, 0), "no path": 0},
         rows=[(name, *row.tolist()) for name, row in zip(names, counts, strict=True)],
     )  # fmt: skip

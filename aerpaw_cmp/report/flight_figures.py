@@ -83,41 +83,31 @@ def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
 
 
 def trajectory(data: ReportData, track: Track) -> Figure:
-    """Draw the flight on the plan of the site, and enlarged with its height as colour."""
-    fig, (site_plan, close) = canvas.subplots((9.2, 5.4), 1, 2, width_ratios=(1.0, 1.35))
+    """Draw the flight on the plan of the site, with its height as colour."""
+    fig, ax = canvas.subplots((9.2, 7.6))
+    canvas.draw_site(ax, data.site)
     # draw tracks of towers that move, because a symbol shows only the middle of the track
     ways = {item.tower: item.tower_m[:, :2] for item in data.series if item.tower_m is not None}
-    for ax in (site_plan, close):
-        canvas.draw_site(ax, data.site)
-        for name, way in ways.items():
-            line = way[spread_out(len(way), canvas.POINTS_PER_LINE)].T
-            ax.plot(
-                *line, color=canvas.TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5, label=f"track of {name}"
-            )
-    flown = np.column_stack([track.east_m, track.north_m])
-    some = spread_out(len(flown), canvas.POINTS_PER_LINE)  # evenly spaced points show the shape of the track
-    site_plan.plot(*flown[some].T, color="#0072B2", linewidth=1.0, label="flight", zorder=4)
-    points = close.scatter(
+    for name, way in ways.items():
+        look = {"color": canvas.TOWER, "linewidth": 1.2, "linestyle": (0, (4, 2)), "zorder": 4.5}
+        ax.plot(*way[spread_out(len(way), canvas.POINTS_PER_LINE)].T, label=f"track of {name}", **look)
+    points = ax.scatter(
         track.east_m, track.north_m, c=track.up_m, cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,
         label="flight (colour: height)",
     )  # fmt: skip
-    places = {name: tower.position_m[None, :2] for name, tower in data.site.towers.items()}
-    canvas.frame_around(site_plan, *np.concatenate([flown, *places.values()]).T, least_m=200.0, shape=0.75)
+    flown = np.column_stack([track.east_m, track.north_m])
     extent, centre = np.nanmax([*np.ptp(flown, axis=0), 100.0]), np.nanmean(flown, axis=0)
-    used = (places[name] for name in used_towers(data))
+    places = (data.site.towers[name].position_m[None, :2] for name in used_towers(data))
     # omit distant towers, because the flight would be a dot next to them
-    near = [place for place in used if np.linalg.norm(place - centre) < extent]
-    canvas.frame_around(close, *np.concatenate([flown, *near, *ways.values()]).T)
+    near = [place for place in places if np.linalg.norm(place - centre) < extent]
+    canvas.frame_around(ax, *np.concatenate([flown, *near, *ways.values()]).T)
     for waypoint in data.waypoints:
-        close.annotate(
+        ax.annotate(
             waypoint.label, (waypoint.east_m, waypoint.north_m), fontsize=8, ha="center", va="center", zorder=7,
             bbox={"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": WAYPOINT},
         )  # fmt: skip
-    canvas.colour_bar(fig, points, close, "Height above ground [m]")
-    site_plan.set_title("Whole site")
-    close.set_title("The flight")
-    site_plan.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
-    close.legend(handles=[points], loc="upper center", bbox_to_anchor=(0.5, -0.12))
+    canvas.colour_bar(fig, points, ax, "Height above ground [m]")
+    fig.legend(loc="outside lower center", ncols=6)
     return fig
 
 

@@ -68,7 +68,6 @@ SMALLEST: dict[str, list[str]] = {
     "pages": ["--only", "long", "--repeats", "1"],
     "peers": ["--quick"],
     "performance": ["--docs", "{folder}/performance.md"],
-    "route_ahead": ["--minutes", "1"],
     "planted_causes": ["--flights", "16"],
     "planted_fields": ["--sets", "1", "--targets", "200"],
     "published": ["tasks", "--data", "sample_logs"],

@@ -1,6 +1,6 @@
 """Gaussian process of the residual of a prediction over position, height, direction and time of flight.
 
-The same covariance is used for maps, routes, held-out blocks and the rest of a flight::
+The same covariance is used for maps, routes and held-out blocks::
 
     residual = mean + place(east, north, up, direction) + offset(flight) + drift(flight, time) + noise
 
@@ -12,10 +12,6 @@ over positions. Channels are fitted separately.
 :class:`Known` computes the standard deviation after a planned flight. For that, a Gaussian process needs only the
 directions and positions of the route, not the levels. The antennas are modelled by :mod:`.gains`, and their residual by
 a field.
-
-:class:`RouteAhead` predicts the rest of a flight whenever levels arrive, from a trend and a Gaussian process of its
-residual. The trend is the one whose earlier predictions had the lowest CRPS. It can be zero. Only the latest
-:data:`KEEP` means over :data:`BIN_S` are used, so that an update takes the same time throughout the flight.
 """
 
 from __future__ import annotations
@@ -33,7 +29,6 @@ from ..common.errors import InputError
 from ..common.gaussian import Factor
 from ..common.units import FloatArray, IntArray, spread_out
 from .gains import GainFit, GainModel, LinkSamples, fit_gain
-from .level import crps_normal
 
 Part = Literal["mean", "place", "offset", "drift"]
 PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
@@ -553,162 +548,3 @@ class Known:
 def rms_db(sd_db: Mapping[str, FloatArray]) -> float:
     """Return the root mean square over all targets and antennas [dB]."""
     return math.sqrt(float(np.mean(np.concatenate([sd**2 for sd in sd_db.values()]))))
-
-
-BIN_S = 2.0
-KEEP = 150
-LEAST = 8
-# A trend is scored by its predictions of levels this long ahead [s].
-AHEAD_S = 20.0
-
-# Weight of an error relative to the error one bin later, so that old errors are forgotten.
-_FORGET = 0.98
-
-LENGTHS_M = (30.0, 120.0)
-SPEED_MPS = 8.0
-NONE = "none"
-
-_MODELS = {
-    length: FieldModel(
-        place_sd_db=3.0,
-        length_m=length,
-        height_m=length,
-        turn=math.inf,
-        offset_sd_db=0.0,
-        drift_sd_db=1.0,
-        drift_s=20.0,
-        noise_sd_db=1.5,
-    )
-    for length in LENGTHS_M
-}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ahead:
-    """The predicted rest of the route: indices of its points (m,), median level, SD of a sample, and trend."""
-
-    index: IntArray
-    level_db: FloatArray
-    sd_db: FloatArray
-    trend: str
-
-    @property
-    def interval_db(self) -> tuple[FloatArray, FloatArray]:
-        """The 90 % interval of one sample at each point: lower and upper ends (m,)."""
-        # 1.645 is the 95 % quantile of the normal distribution
-        return self.level_db - 1.645 * self.sd_db, self.level_db + 1.645 * self.sd_db
-
-
-class RouteAhead:
-    """A prediction of the rest of a route, updated with every record.
-
-    Parameters
-    ----------
-    route_m : (m, 3)
-        Points of the route in the order of flight [m].
-    trends : mapping of str to (m,)
-        Models of the level at these points [dB], up to a constant. A trend of zero, "none", is added.
-    """
-
-    def __init__(self, route_m: FloatArray, trends: Mapping[str, FloatArray]) -> None:
-        self.route_m = np.asarray(route_m, dtype=np.float64)
-        self._trends = {**{k: np.asarray(v, dtype=np.float64) for k, v in trends.items()},
-                        NONE: np.zeros(len(self.route_m))}  # fmt: skip
-        self._scores: dict[tuple[str, float], tuple[float, float]] = {}
-        # closed bins, and records of the open bin, each with time, east, north, up, level and all trends
-        self._bins, self._open = np.empty((0, 5 + len(self._trends))), list[tuple[float, ...]]()
-        self._reached, self.squares, self.samples = 0, 0.0, 0
-
-    def add(self, time_s: float, place_m: FloatArray, level_db: float, trends: Mapping[str, float]) -> Ahead | None:
-        """Add a record. If this completes a bin, return the prediction of the rest of the route, else None.
-
-        Parameters
-        ----------
-        time_s : float
-            Time [s], not before that of the previous record.
-        place_m : (3,)
-            Position [m].
-        level_db : float
-            Measured level.
-        trends : mapping of str to float
-            Level of each model at this position.
-
-        Returns
-        -------
-        Ahead or None
-        """
-        values = (time_s, *map(float, place_m), level_db, *(trends.get(name, 0.0) for name in self._trends))
-        if not np.isfinite(values).all():
-            return None
-        closes = bool(self._open) and time_s - self._open[0][0] >= BIN_S
-        if closes:
-            self._close()
-        self._open.append(values)
-        return self._predict(np.asarray(place_m, dtype=np.float64)) if closes else None
-
-    def _close(self) -> None:
-        rows = np.array(self._open)
-        closed = rows.mean(axis=0)
-        self.squares += float(((rows[:, 4] - closed[4]) ** 2).sum())
-        self.samples += len(rows) - 1
-        self._judge(closed)
-        self._bins = np.vstack([self._bins, closed])[-KEEP:]
-        self._open.clear()
-
-    def _judge(self, closed: FloatArray) -> None:
-        """Score every trend by its prediction for a bin (5 + trends,), made :data:`AHEAD_S` earlier."""
-        # use only bins that are old enough, because neighbouring levels predict any bin well
-        known = self._bins[: int(np.searchsorted(self._bins[:, 0], closed[0] - AHEAD_S))]
-        if len(known) < LEAST:
-            return
-        for length, model in _MODELS.items():
-            moments = _moments(model, known, known[:, 5:], closed[None, :4])
-            for name, trend, (mean, sd) in zip(self._trends, closed[5:], moments, strict=True):
-                score = float(crps_normal(closed[4] - trend - mean, sd)[0])
-                total, weight = self._scores.get((name, length), (0.0, 0.0))
-                self._scores[name, length] = (_FORGET * total + score, _FORGET * weight + 1.0)
-
-    def _predict(self, place: FloatArray) -> Ahead | None:
-        """Return the prediction of the rest of the route from the position of the UAV."""
-        if len(self._bins) < LEAST:
-            return None
-        # search only a little ahead, because the nearest point can be on another leg where the route crosses itself
-        window = slice(self._reached, self._reached + max(50, len(self.route_m) // 10))
-        self._reached += int(np.linalg.norm(self.route_m[window] - place, axis=1).argmin())
-        index = np.arange(self._reached, len(self.route_m))
-        known = {key: total / weight for key, (total, weight) in self._scores.items()}
-        # before the first score, use no trend and the longest length
-        trend, length = min(known, key=lambda key: known[key], default=(NONE, LENGTHS_M[-1]))
-        steps = np.linalg.norm(np.diff(self.route_m[index], axis=0, prepend=place[None]), axis=1)
-        later = np.column_stack([self._bins[-1, 0] + np.cumsum(steps) / SPEED_MPS, self.route_m[index]])
-        own = 5 + list(self._trends).index(trend)
-        [(mean, sd)] = _moments(_MODELS[length], self._bins, self._bins[:, own : own + 1], later)
-        within = math.sqrt(self.squares / self.samples) if self.samples else 0.0
-        level = self._trends[trend][index] + mean
-        return Ahead(index=index, level_db=level, sd_db=np.hypot(sd, within), trend=trend)
-
-
-def _moments(
-    model: FieldModel, bins: FloatArray, trends: FloatArray, targets: FloatArray
-) -> list[tuple[FloatArray, FloatArray]]:
-    """Return, for each trend, mean and standard deviation (m,) of the residual of a bin at targets.
-
-    All trends (n, k) at the bins (n, 5 or more) use the same matrix factor. The strengths are scaled to the data: ``s^2
-    = y' inv(K) y / n``. Bins and targets (m, 4) begin with time and position.
-    """
-    rows, ends = _rows(bins), _rows(targets)
-    value = bins[:, 4:5] - trends
-    factor = Factor.of(_noisy(model, covariance(model, rows, rows)))
-    middle = value.mean(axis=0)
-    white = factor.whiten(value - middle)
-    # with a lower limit, because after a constant level all intervals would have zero width
-    scale = np.maximum((white**2).sum(axis=0) / len(bins), 1e-2)
-    mean, explained = factor.condition(covariance(model, ends, rows), white)
-    prior = float(covariance(model, ends.part([0]), ends.part([0]))[0, 0])
-    variance = np.maximum(prior - explained, 0.0) + model.noise_sd_db**2
-    return [(middle[k] + mean[:, k], np.sqrt(scale[k] * variance)) for k in range(len(middle))]
-
-
-def _rows(bins: FloatArray) -> Rows:
-    n = len(bins)
-    return Rows(position_m=bins[:, 1:4], direction=np.zeros((n, 3)), time_s=bins[:, 0], flight=np.zeros(n, np.int64))

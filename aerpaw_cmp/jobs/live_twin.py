@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..common.errors import InputError, UsageError
-from ..common.units import MINIMUM_HEIGHT_M, FloatArray, spread_out
-from ..compare.field_gp import RouteAhead
+from ..common.units import MINIMUM_HEIGHT_M, FloatArray
 from ..compare.rank import channel_rank
 from ..flight.data import choose_site, gather, read_logs
 from ..flight.gains import load_with_learned
 from ..flight.replay import replay_poses
 from ..flight.settings import FlightFile, LogSettings
-from ..flight.simulate import planned_poses
 from ..live.predict import Predict, Prediction, TelemetryFollower, TelemetrySample, predict_along
 from ..live.simulator import flight_rank
 from ..logs.readers import by_name
 from ..logs.writers import format_vehicle_out
 from ..maps.grid import Grid
-from ..propagation.field.baselines import free_space_dbm
 from ..propagation.geometry import Link, Poses, rotation_from_aircraft
 from ..report.live import live_map
 from ..site.site import Site
@@ -32,9 +28,6 @@ from ..site.site import Site
 _MAP_HEIGHTS_M = (10.0, 30.0, 50.0, 70.0, 90.0, 110.0)
 # Number of cells on the longer side of the background map.
 _MAP_CELLS = 70
-_ROUTE_STEP_S = 2.0
-# Largest number of points of the remaining route in one record.
-_ROUTE_SHOWN = 40
 _DEMO_OFFSET_DB = -38.0
 _DEMO_FADING_DB = 2.5
 
@@ -77,27 +70,10 @@ class LiveTwin:
         log = _telemetry_log(self.settings)
         reader = by_name(log.reader or "vehicle_out")
         follower = TelemetryFollower(self.telemetry, reader, log.options(self.settings.timezone))
-        return predict_along(follower, partial(self.at, ahead=self.route_ahead()))
+        return predict_along(follower, self.at)
 
-    def route_ahead(self) -> RouteAhead | None:
-        """Return the prediction of the planned route, which learns during the flight, or None if there is no plan."""
-        plan = self.settings.flight.plan
-        if plan is None:
-            return None
-        _, place, yaw = planned_poses(plan, self.site.takeoff_ground_m, _ROUTE_STEP_S)
-        rotation = np.broadcast_to(np.eye(3), (len(place), 3, 3))
-        if self.settings.rt.attitude != "ignored":
-            rotation = rotation_from_aircraft(0.0 * yaw, 0.0 * yaw, yaw)
-        _, level = self._replayed(place, rotation)
-        return RouteAhead(place, {"replay": level, "free space": self._free_space(place)})
-
-    def _free_space(self, place_m: FloatArray) -> FloatArray:
-        tower = self.site.towers[self.settings.rank.tower].position_m
-        link = self.settings.link.rank
-        return np.asarray(free_space_dbm(tower[None, :], place_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
-
-    def at(self, sample: TelemetrySample, ahead: RouteAhead | None = None) -> Prediction:
-        """Return the prediction at a pose of the telemetry. With ``ahead`` it also learns from measurements."""
+    def at(self, sample: TelemetrySample) -> Prediction:
+        """Return the prediction at a pose of the telemetry."""
         if not np.isfinite([sample.latitude_deg, sample.longitude_deg, sample.altitude_m]).all():
             return Prediction()
         place, rotation = self._pose(sample)
@@ -109,25 +85,7 @@ class LiveTwin:
             east_m=east,
             north_m=north,
             up_m=up,
-            learn=None if ahead is None or not rank[0] else partial(self._learn, ahead, place, float(level[0])),
         )
-
-    def _learn(
-        self, ahead: RouteAhead, place: FloatArray, level: float, utc_ns: int, rsrp_dbm: float
-    ) -> dict[str, Any] | None:
-        """Return the prediction of the remaining route after a record, or None between two time bins."""
-        free = float(self._free_space(place[None])[0])
-        forecast = ahead.add(utc_ns / 1e9, place, rsrp_dbm, {"replay": level, "free space": free})
-        if forecast is None:
-            return None
-        low, high = forecast.interval_db
-        columns = np.column_stack([ahead.route_m[forecast.index, :2], forecast.level_db, low, high])
-        columns = columns[np.isfinite(columns).all(axis=1)]
-        if not len(columns):
-            return None
-        shown = columns[spread_out(len(columns), _ROUTE_SHOWN)].round(1)
-        median, least, most = columns[:, 2:].mean(axis=0).round(1).tolist()
-        return {"trend": forecast.trend, "level_dbm": median, "interval_dbm": [least, most], "points": shown.tolist()}
 
     def map(self) -> dict[str, Any]:
         """Return predicted rank and level over the site at several heights, for a level UAV with heading north."""

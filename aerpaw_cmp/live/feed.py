@@ -39,7 +39,6 @@ _DISK_LOW_BYTES = 200 * 2**20
 _STEP_SHOWN_S = 30.0
 # Shorter steps are in the log only: they move a sample by less than the error of its position.
 _STEP_S = 0.2
-_POINTS_AHEAD = 40
 
 MEASURED = ("t", "rank", "rsrp", "sinr")
 PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_low", "level_high", "east", "north", "up")
@@ -110,7 +109,6 @@ class _Modem:
     disk_fault: str = ""
     offset_db: float | None = None
     inside: list[int] | None = None
-    ahead: dict[str, Any] | None = None
     age_s: float | None = None
     delay_s: float | None = None
     fix: float | None = None
@@ -128,7 +126,7 @@ class _Modem:
     sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=64))
     open: dict[str, Alarm] = field(default_factory=dict)
 
-    _SHOWN = (*_STATUS, "name", "port", "rank", "rsrp_dbm", "sinr_db", "offset_db", "inside", "ahead", "ended")
+    _SHOWN = (*_STATUS, "name", "port", "rank", "rsrp_dbm", "sinr_db", "offset_db", "inside", "ended")
 
     def shown(self) -> dict[str, Any]:
         """Return the present values that the page shows."""
@@ -291,8 +289,6 @@ class Feed:
             return
         modem.age_s, modem.delay_s = _finite(record.get("telemetry_age_s")), _finite(record.get("telemetry_delay_s"))
         modem.fix, modem.offset_db = _finite(record.get("fix")), _finite(record.get("offset_db"))
-        if (rest := record.get("ahead")) is not None:
-            modem.ahead = _rest_of_route(rest)
         modem.inside = [int(count) for count in record.get("inside") or ()] or None
         if record.get("east_m") is not None and not (modem.fix is not None and 0 <= modem.fix < 3):
             modem.gps_s = t
@@ -388,12 +384,3 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
     elif modem.unsynchronised:
         alarms["clock"] = "the clock is not synchronised (NTP or GPS): times may not fit the telemetry"
     return alarms
-
-
-def _rest_of_route(rest: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the rest of a route as the page shows it. Raise ValueError if a level is not a number."""
-    level, (low, high) = float(rest["level_dbm"]), map(float, rest["interval_dbm"])
-    points = [[float(v) for v in point[:5]] for point in rest["points"][:_POINTS_AHEAD]]
-    if not all(map(math.isfinite, [level, low, high, *(v for point in points for v in point)])):
-        raise ValueError("a level that is not a number")
-    return {"trend": str(rest["trend"])[:20], "level": level, "interval": [low, high], "points": points}

@@ -25,8 +25,6 @@ from ..logs.readers import Reader, ReadOptions
 
 RANKS = (1, 4)
 
-Learn = Callable[[int, float], "dict[str, Any] | None"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
@@ -46,8 +44,6 @@ class Prediction:
         Age of the newest line of the telemetry log. None: there is no line yet.
     telemetry_delay_s : float or None
         Smallest recent delay of the telemetry lines. Negative if the telemetry's clock is ahead of ours.
-    learn : callable, optional
-        ``learn(utc_ns, rsrp_dbm)`` takes a measurement here and returns an updated rest of the route, or None.
     """
 
     rank: int | None = None
@@ -58,7 +54,6 @@ class Prediction:
     fix: float | None = None
     telemetry_age_s: float | None = None
     telemetry_delay_s: float | None = None
-    learn: Learn | None = None
 
 
 # ``predict(utc_ns)``; None: the pose at that time is unknown.
@@ -211,9 +206,6 @@ class PredictionWorker:
                 fields["level_interval_dbm"] = [_rounded(now.level_dbm + bound) for bound in bounds]
             if asked.rsrp_dbm is not None:
                 self._level.add(asked.rsrp_dbm - now.level_dbm)
-        if asked.rsrp_dbm is not None and now.learn is not None:
-            rest = now.learn(asked.utc_ns, asked.rsrp_dbm)
-            fields |= {} if rest is None else {"ahead": rest}
         fields["inside"] = [self._rank.inside, self._rank.given, self._level.inside, self._level.given]
         return fields
 

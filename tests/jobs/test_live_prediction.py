@@ -16,7 +16,6 @@ from aerpaw_cmp.flight.data import choose_site, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import plan_trajectory, telemetry_frame
 from aerpaw_cmp.jobs.live_twin import FlownAgain, LiveTwin
-from aerpaw_cmp.live.predict import TelemetrySample
 from aerpaw_cmp.logs.writers import format_vehicle_out
 from aerpaw_cmp.propagation.geometry import Poses
 from aerpaw_cmp.propagation.options import Search
@@ -53,34 +52,6 @@ def test_prediction_follows_a_growing_log(tmp_path: Path) -> None:
         later = predict(start.value + (second + 30) * 10**9)
         assert (later.rank, later.east_m) == (None, None), "the UAV's position is not known yet"
         assert later.telemetry_age_s == pytest.approx(30.0)
-
-
-def test_the_rest_of_the_route_is_predicted_from_what_was_measured(tmp_path: Path) -> None:
-    """The measured level is the replay minus 31 dB.
-
-    The rest of the route must be predicted 31 dB lower too, with the replay as trend.
-    """
-    settings = load_flight(FLIGHT)
-    trajectory = plan_trajectory(settings.flight.plan)
-    site = choose_site(settings.site, FLIGHT.parent)
-    twin = LiveTwin.of(FLIGHT, tmp_path / "none.txt")
-    ahead, rests, random = twin.route_ahead(), [], np.random.default_rng(1)
-    for second in np.arange(20.0, 120.0, 0.5):
-        east, north, up = trajectory.position_at(np.array([second]))[0]
-        latitude, longitude = site.frame.to_geographic(east, north)
-        sample = TelemetrySample(int(second * 1e9), float(latitude), float(longitude), up, 0.0, 0.0, 0.0)
-        now = twin.at(sample, ahead)
-        if now.learn is not None:
-            rest = now.learn(int(second * 1e9), now.level_dbm - 31.0 + random.normal(0.0, 1.0))
-            rests += [] if rest is None else [rest]
-    last = rests[-1]
-    assert last["trend"] == "replay"
-    level = twin._replayed(trajectory.position_at(np.array([124.0, 130.0])), np.stack([np.eye(3)] * 2))[1] - 31.0
-    low, high = np.array(last["points"])[:, 3:].T
-    assert low.min() < level.mean() < high.max()
-    assert last["interval_dbm"][0] < last["level_dbm"] < last["interval_dbm"][1]
-    end = trajectory.position_at(np.array([trajectory.duration_s]))[0]
-    assert last["points"][-1][:2] == pytest.approx(end[:2], abs=0.1)
 
 
 def test_tap_writes_predictions_and_residuals(tmp_path: Path) -> None:

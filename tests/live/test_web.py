@@ -399,18 +399,6 @@ def test_measurements_and_predictions_stand_in_rows():
     assert (shown["rank"], shown["offset_db"], shown["inside"], shown["predicts"]) == (2, -40.0, [1, 1, 0, 0], True)
 
 
-def test_the_rest_of_the_route_is_shown_but_not_where_it_holds_no_number():
-    hand = Hand()
-    sent = hand.answer()
-    rest = {"trend": "replay", "level_dbm": -90, "interval_dbm": [-97, -83], "points": [[1, 2, -90, -97, -83]] * 60}
-    hand.predict(sent, ahead=rest)
-    shown = hand.feed.after("")[0]["modems"][0]["ahead"]
-    assert (shown["trend"], shown["level"], len(shown["points"])) == ("replay", -90.0, 40)
-    for bad in ({**rest, "level_dbm": float("nan")}, {"points": "x"}, {**rest, "points": [[1, 2, "a"]]}):
-        hand.predict(sent, ahead=bad)
-        assert hand.feed.after("")[0]["modems"][0]["ahead"] == shown
-
-
 def test_two_modems_stand_side_by_side():
     hand = Hand(("left", "right"))
     hand.answer(rank=1, modem=0)

@@ -132,7 +132,6 @@
       if (now.disk_free_bytes !== null) rows.push(["Disk left", now.disk_free_bytes > 2 ** 30 ? number(now.disk_free_bytes / 2 ** 30, 1, "GiB") : number(now.disk_free_bytes / 2 ** 20, 0, "MiB")]);
       if (now.predicts) rows.unshift(["Predicted rank", k < 0 ? "–" : integer(c.predicted[k]) + (Number.isFinite(c.low[k]) ? ` (${c.low[k]}${c.low[k] < c.high[k] ? "–" + c.high[k] : ""})` : "")],
         ["Residual, RSRP", k < 0 ? "–" : number(c.rsrp[k] - c.level[k], 1, "dB")]);
-      if (now.ahead) rows.push(["Rest of the route", `${number(now.ahead.level, 0)} dBm, 90 %: ${span(now.ahead.interval[0], now.ahead.interval[1], "dBm")}`], ["Trend", now.ahead.trend]);
       cells(facts, rows);
       if (now.predicts && k >= 0) { mark(facts.children[0].lastChild, c.rank[k], c.low[k], c.high[k]); mark(facts.children[1].lastChild, c.rsrp[k], c.levelLow[k], c.levelHigh[k]); }
     });
@@ -358,7 +357,6 @@
       pen.globalAlpha = 1;
     }
     for (const faces of scene.site.buildings) for (const face of faces) polygon(pen, face.map(p => project(p[0], p[1])), css("--building"), css("--soft"));
-    drawAhead(pen);
     drawFlight(pen);
     for (const t of scene.site.towers) {
       const [x, y] = project(t.at[0], t.at[1]), own = t.name === scene.tower;
@@ -369,17 +367,6 @@
     drawKey(pen, w, full, kind);
     const offset = state.modems[state.chosen].now.offset_db;
     at("map-words").textContent = kind === "none" ? `Tower ${scene.tower}.` : `Background: ${kind} predicted for tower ${scene.tower} at ${number(scene.heights[level], 0)} m, UAV level, heading north${kind === "rank" ? `, K = ${scene.k}` : `, ${number(levelRange()[0] + (offset ?? 0), 0)} to ${number(levelRange()[1] + (offset ?? 0), 0)} dBm${offset === null ? " before any offset" : ""}`}.`;
-  }
-
-  function drawAhead(pen) { // the rest of the planned route, a dot per point with the level that is expected there
-    const ahead = state.modems[state.chosen]?.now.ahead;
-    if (!ahead) return;
-    const levels = ahead.points.map(p => p[2]), low = Math.min(...levels), wide = Math.max(...levels) - low || 1;
-    polyline(pen, ahead.points.map(p => project(p[0], p[1])), css("--soft"), 1);
-    for (const p of ahead.points) {
-      const [x, y] = project(p[0], p[1]);
-      pen.beginPath(); pen.arc(x, y, 4, 0, 2 * Math.PI); pen.globalAlpha = 0.25 + 0.75 * (p[2] - low) / wide; pen.fillStyle = css("--accent"); pen.fill(); pen.globalAlpha = 1; pen.strokeStyle = css("--halo"); pen.lineWidth = 1; pen.stroke();
-    }
   }
 
   function drawFlight(pen) {

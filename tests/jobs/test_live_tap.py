@@ -80,5 +80,5 @@ def test_the_token_of_the_environment_outlives_a_restart(modems, tmp_path, monke
     assert url.startswith("http://127.0.0.1:")
     assert url.endswith("/?token=field-day")
     with urlopen(Request(url), timeout=5) as answer:
-        assert b"<title>Live twin" in answer.read()
+        assert b"<title>Live rank and level" in answer.read()
     tap.join()

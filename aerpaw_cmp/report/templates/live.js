@@ -1,6 +1,6 @@
 "use strict";
-// The live twin: takes what the tap sends, keeps it, draws it. A lost connection comes back by itself and asks for
-// what it missed; rows are counted, so none is taken a second time.
+// The page of the tap: it stores the data that the tap sends and draws them. If the connection is lost, it reconnects and requests
+// the data that it missed. Rows are numbered, so that none is stored twice.
 (() => {
   const { at, css, number, cells, later, shade, polygon, polyline } = common;
   const scene = JSON.parse(at("scene").textContent), mapped = Boolean(scene.site);

@@ -32,7 +32,7 @@ from ..common.errors import UsageError
 from ..common.units import FloatArray, IntArray, unmasked
 from . import kriging, variogram
 from .grid import Grid, MapResult, serving_tower
-from .kriging import OrdinaryKriging, Sampling, coverage_patterns
+from .kriging import OrdinaryKriging, Sampling, as_table, coverage_patterns
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -181,17 +181,15 @@ class _Local(Sampling):
     """The base of predictors that use near samples, which ignores NaN in each field."""
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
-        """Store samples (n, dims) with values (n,) or (n, fields). NaN means out of coverage."""
-        self.points_m_ = unmasked(points_m)
-        fields = unmasked(values)
+        """Store samples (n, dims) with values (n, ...). NaN means out of coverage."""
+        self.points_m_, fields = unmasked(points_m), unmasked(values)
         if len(fields) != len(self.points_m_):
             raise UsageError(f"{len(fields)} values for {len(self.points_m_)} points")
-        self._one_field = fields.ndim == 1
-        self.values_ = fields[:, None] if self._one_field else fields
+        self._shape, self.values_ = fields.shape[1:], as_table(fields)
         return self
 
     def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the estimate at targets (t, dims), ``(t,)`` or ``(t, fields)``, and NaN for the variance."""
+        """Return the estimate (t, ...) at targets (t, dims), and NaN for the variance."""
         return self._estimate(unmasked(targets_m), leave_out=False)
 
     def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
@@ -204,7 +202,7 @@ class _Local(Sampling):
             samples, values = self.points_m_[covered], self.values_[np.ix_(covered, columns)]
             skip = kriging.renumbered(covered) if leave_out else None
             estimate[:, columns] = self._one_pattern(samples, values, targets, skip)
-        estimate = estimate[:, 0] if self._one_field else estimate
+        estimate = estimate.reshape(len(targets), *self._shape)
         return estimate, np.full_like(estimate, np.nan)
 
     def _one_pattern(
@@ -282,14 +280,11 @@ class ServingTowerMean:
         self.towers_m = towers_m
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
-        """Sum the samples (n, dims) with values (n,) or (n, fields) by tower. NaN is ignored."""
-        fields = unmasked(values)
-        self._one_field = fields.ndim == 1
-        self.values_ = fields[:, None] if self._one_field else fields
+        """Sum the samples (n, dims) with values (n, ...) by tower. NaN is ignored."""
+        self.values_ = unmasked(values)
         self.tower_ = serving_tower(points_m, self.towers_m)
         finite = np.isfinite(self.values_)
-        towers = len(np.asarray(self.towers_m))
-        self.total_ = np.zeros((towers, self.values_.shape[1]))
+        self.total_ = np.zeros((len(np.asarray(self.towers_m)), *self.values_.shape[1:]))
         self.count_ = np.zeros_like(self.total_)
         # do not use +=, which adds only one of several values with the same index
         np.add.at(self.total_, self.tower_, np.where(finite, self.values_, 0.0))
@@ -309,7 +304,6 @@ class ServingTowerMean:
 
     def _mean(self, total: FloatArray, count: FloatArray) -> tuple[FloatArray, FloatArray]:
         mean = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
-        mean = mean[:, 0] if self._one_field else mean
         return mean, np.full_like(mean, np.nan)
 
 
@@ -350,8 +344,7 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
 def leave_one_out(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> Score:
     """Score the estimate of each position from all others, as in the paper, for values (n, altitudes, K)."""
     data = unmasked(values)
-    estimate, _ = model.fit(points_m, data.reshape(len(data), -1)).leave_one_out()
-    return score(data, estimate.reshape(data.shape))
+    return score(data, model.fit(points_m, data).leave_one_out()[0])
 
 
 def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: float = 300.0) -> Score:
@@ -388,14 +381,13 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / block_m + 1e-9).astype(np.int64)
     _, block = np.unique(cell, axis=0, return_inverse=True)
     data = unmasked(values)
-    flat = data.reshape(len(data), -1)
-    estimate = np.full_like(flat, np.nan)
+    estimate = np.full_like(data, np.nan)
     for number in np.unique(block):
         test = block.ravel() == number
         # if one block contains all samples, there are no training samples, and it is not scored
         if not test.all():
-            estimate[test], _ = model.fit(points[~test], flat[~test]).predict(points[test])
-    return score(data, estimate.reshape(data.shape))
+            estimate[test], _ = model.fit(points[~test], data[~test]).predict(points[test])
+    return score(data, estimate)
 
 
 # Lowest altitude of interpolation in the paper, which uses 3 m only to show blockage.

@@ -32,7 +32,7 @@ from ..common.cf import DB, DBM, Dataset, flags, site_crs
 from ..common.geodesy import SiteFrame
 from ..common.kml import CLASS_COLOURS
 from ..common.text import guarded
-from ..common.units import AnyArray, FloatArray, IntArray
+from ..common.units import AnyArray, FloatArray, IntArray, unmasked
 from .grid import HIGHEST_RANK, RATIO_LIMIT_DB, Border, Grid, Layer, MapResult
 
 PIXELS_PER_CELL = 8
@@ -165,7 +165,7 @@ class Scale:
 
     def bin_of(self, values: ArrayLike) -> IntArray:
         """Return the index of the colour of each value (n,)."""
-        array = np.asarray(values, dtype=np.float64)
+        array = unmasked(values)
         missing = np.isnan(array) | (array < self.lowest)
         return np.where(missing, len(self.colours) - 1, np.searchsorted(self.edges, array, side="right"))
 

@@ -34,6 +34,7 @@ neighbours, regardless of the order of the samples.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import KW_ONLY, dataclass
@@ -344,8 +345,8 @@ class OrdinaryKriging:
         ----------
         points_m : (n, 2) or (n, 3)
             East, north (, up) [m].
-        values : (n,) or (n, fields)
-            Values; NaN out of coverage.
+        values : (n, ...)
+            Values of one or more fields; NaN out of coverage.
 
         Raises
         ------
@@ -355,16 +356,13 @@ class OrdinaryKriging:
         self._check_settings()
         points = _as_points(points_m)
         fields = unmasked(values)
-        if len(fields) != len(points) or fields.ndim not in (1, 2):
-            raise UsageError(
-                f"values of shape {fields.shape} for {len(points)} points", expected="(n,) or (n, fields) with n points"
-            )
+        if fields.shape[:1] != points.shape[:1]:
+            raise UsageError(f"values of shape {fields.shape} for {len(points)} points", expected="one value per point")
         if np.isinf(fields).any():
             raise UsageError("an infinite sample value", expected="finite values, NaN where out of coverage")
         # estimates are returned in the shape of the values
-        self._one_field = fields.ndim == 1
-        fields = fields[:, None] if self._one_field else fields
-        self.points_m_, self.values_, self.place_ = _merge_places(points, fields)
+        self._shape = fields.shape[1:]
+        self.points_m_, self.values_, self.place_ = _merge_places(points, as_table(fields))
         self.sill_ = self._sill_of(self.values_)
         return self
 
@@ -406,9 +404,9 @@ class OrdinaryKriging:
         return np.ma.filled(centred.var(axis=0, ddof=1), 0.0)
 
     def _shaped(self, estimate: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        if self.bounds is not None:
-            estimate = np.clip(estimate, *self.bounds)
-        return (estimate[:, 0], variance[:, 0]) if self._one_field else (estimate, variance)
+        estimate = estimate if self.bounds is None else np.clip(estimate, *self.bounds)
+        shape = len(estimate), *self._shape
+        return estimate.reshape(shape), variance.reshape(shape)
 
     # --- estimation ----------------------------------------------------------------------------------------------
 
@@ -626,6 +624,11 @@ def _reference(values: FloatArray) -> FloatArray:
         return np.zeros(values.shape[1])
     first = values[finite.argmax(axis=0), np.arange(values.shape[1])]
     return np.asarray(np.where(finite.any(axis=0), first, 0.0))
+
+
+def as_table(values: FloatArray) -> FloatArray:
+    """Return values (n, ...) as (n, fields)."""
+    return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 def coverage_patterns(values: FloatArray) -> Iterator[tuple[BoolArray, IntArray]]:

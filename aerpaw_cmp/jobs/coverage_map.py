@@ -51,7 +51,7 @@ from ..maps.export import maps_dataset
 from ..maps.grid import PAPER_BUDGET, Grid, LinkBudget
 from ..maps.kriging import OrdinaryKriging, Sampling
 from ..maps.store import Budget, Reach, TileStore, Tiling
-from ..maps.variogram import BiExponential, BinnedCorrelation, field_correlation, vertical_correlation
+from ..maps.variogram import BiExponential, BinnedCorrelation, field_correlation
 from ..propagation.field.foliage import crown_index, foliage_loss_db, foliage_model, stand_loss_db
 from ..propagation.field.sum import channel_matrices, rss_dbm
 from ..propagation.geometry import Link, PathSet, Poses, linear_array, single_element
@@ -566,7 +566,7 @@ def check_study(place: Site, settings: MapSettings) -> None:
 def study_maps(outcome: MapOutcome, stages: Stages) -> None:
     """Compute correlation, interpolation and its errors on the maps of the paper's foliage mode."""
     s, result = outcome.settings, outcome.shown
-    heights, rank = rank_fields(result)
+    rank = rank_fields(result)[1]
     local = Sampling(neighbours=s.neighbours, radius_m=s.reach_m, seed=s.seed)
     with stages("leave one out"):
         zeros, towers = rank_fields(result, "zero")[1], result.towers_m
@@ -579,7 +579,6 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
         points, width = result.grid.points_m, s.spacing_m
         outcome.correlations = {
             "horizontal": field_correlation(points, rank, width_m=width),
-            "vertical": vertical_correlation(heights, np.moveaxis(rank, 0, -1)),
             "RSS": field_correlation(points, result.rss().T, width_m=width),
         }
     with stages("held-out tests"):
@@ -740,7 +739,7 @@ def _further_layers(outcome: MapOutcome) -> Iterator[job.Layer]:
 
 def _correlations(outcome: MapOutcome) -> dict[str, tuple[BinnedCorrelation, BiExponential | None]]:
     """Return each correlation against distance, with its fitted curve if there is one, by title."""
-    titles = {"horizontal": "Rank, one height", "vertical": "Rank, across heights", "RSS": "RSS, one height"}
+    titles = {"horizontal": "Rank, one height", "RSS": "RSS, one height"}
     studies = {key: outcome.studies[key] for key in TREATMENTS if key in outcome.studies}
     fitted = {f"Rank vectors, {TREATMENTS[key]}": (study.correlation, study.fit) for key, study in studies.items()}
     return fitted | {titles[key]: (binned, None) for key, binned in outcome.correlations.items()}

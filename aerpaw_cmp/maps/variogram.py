@@ -1,14 +1,13 @@
 """Correlation of the channel at two positions against their distance, and the paper's curve that is fitted to it.
 
-Three correlations are averaged over pairs of positions in bins of distance:
+Two correlations are averaged over pairs of positions in bins of distance:
 
 - :func:`vector_correlation` is that of the paper (arXiv 2502.10324, section VI-A): the Pearson correlation of the
   vectors of two positions, which contain the ranks of all altitudes and K. It mixes horizontal and vertical changes.
 - :func:`field_correlation` is horizontal: each field (one altitude, one K) is standardised over the positions, and the
   values of two positions are multiplied.
-- :func:`vertical_correlation` is the Pearson correlation of the maps of two altitudes over the positions.
 
-All three can be used for RSS and rank. NaN is out of coverage. The caller decides whether a rank of 0 is a number or
+Both can be used for RSS and rank. NaN is out of coverage. The caller decides whether a rank of 0 is a number or
 NaN.
 
 Bins follow the paper. Bin ``n`` contains the pairs whose distance is nearest to ``n`` times the width; half-way values
@@ -258,8 +257,6 @@ BLOCK = 256
 # Bins are as wide as d_rx (section VI-A), and distances reach 500 m (section VII-C).
 _PAPER_WIDTH_M = 30.0
 _PAPER_MAXIMUM_M = 500.0
-# The paper's step between altitudes.
-_HEIGHT_BIN_M = 10.0
 # Smallest number of components that both positions of a pair must have. With two, the correlation would always be +1
 # or -1.
 _MINIMUM_COMMON = 3
@@ -324,7 +321,7 @@ def vector_correlation(
     lacking = present.sum(axis=1) < _MINIMUM_COMMON
     constant = ~lacking & _is_constant(data, present)
     varying = ~(lacking | constant)
-    bins = _bin_pairs(points[varying], _PairwisePearson(data[varying], _MINIMUM_COMMON), width_m, maximum_m)
+    bins = _bin_pairs(points[varying], _pairwise_pearson(data[varying]), width_m, maximum_m)
     return BinnedCorrelation(*bins, int(varying.sum()), int(constant.sum()))
 
 
@@ -361,46 +358,6 @@ def field_correlation(
     scaled = centred / np.sqrt((centred**2).sum(axis=0) / np.maximum(count, 1))
     bins = _bin_pairs(points, _mean_product(scaled, present), width_m, maximum_m)
     return BinnedCorrelation(*bins, int(present.any(axis=1).sum()), int(constant.sum()))
-
-
-def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorrelation:
-    """Return the correlation of the maps of two altitudes, binned by their difference in height.
-
-    Parameters
-    ----------
-    altitudes_m : (altitudes,)
-        Heights [m].
-    maps : (altitudes, n) or (altitudes, fields, n)
-        Rank or RSS at the same positions, with a field per K. The Pearson correlation of two altitudes is computed for
-        each field over the positions with both values, and averaged over the fields.
-
-    Returns
-    -------
-    BinnedCorrelation
-        ``positions`` counts altitudes, ``pairs`` pairs of altitudes and fields. Constant maps are excluded and counted.
-    """
-    altitudes = unmasked(altitudes_m)
-    data = unmasked(maps)
-    if data.ndim == 2:
-        data = data[:, None, :]
-    if data.ndim != 3 or len(data) != len(altitudes):
-        raise UsageError(f"maps of shape {data.shape} for {len(altitudes)} altitudes")
-    levels, fields, _ = data.shape
-    first, second = np.triu_indices(levels)
-    gap = np.abs(altitudes[first] - altitudes[second])
-    value = np.empty((len(first), fields))
-    excluded = 0
-    for field in range(fields):
-        rows = data[:, field]
-        present = np.isfinite(rows)
-        usable = (present.sum(axis=1) >= 2) & ~_is_constant(rows, present)
-        excluded += int((~usable).sum())
-        table = _PairwisePearson(np.where(usable[:, None], rows, np.nan), 2)(np.arange(levels), np.arange(levels))
-        value[:, field] = table[first, second]
-    # half-way values go up
-    n = int(np.floor(gap.max(initial=0.0) / _HEIGHT_BIN_M + 0.5)) + 1
-    sums = _sums(np.repeat(gap, fields), value.ravel(), _HEIGHT_BIN_M, n)
-    return BinnedCorrelation(*_means(sums, _HEIGHT_BIN_M), levels, excluded)
 
 
 # --- pairs ----------------------------------------------------------------------------------------------------------
@@ -462,34 +419,29 @@ class Variogram:
         return self.model_(distance_m)
 
 
-class _PairwisePearson:
-    """The Pearson correlation over the components that both vectors have, by matrix products of masked vectors."""
+def _pairwise_pearson(data: FloatArray) -> Block:
+    """Return the Pearson correlation over the components that both vectors have, by products of masked vectors."""
+    known = np.isfinite(data).astype(np.float64)
+    filled = np.where(known > 0, data, 0.0)
+    # subtract the mean of each vector first, so that the differences below do not lose digits
+    mean = filled.sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1)
+    value = np.where(known > 0, data - mean, 0.0)
+    square = value**2
 
-    def __init__(self, data: FloatArray, minimum_common: int) -> None:
-        self.present = np.isfinite(data).astype(np.float64)
-        count = self.present.sum(axis=1, keepdims=True)
-        filled = np.where(self.present > 0, data, 0.0)
-        # subtract the mean of each vector first, so that the differences below do not lose digits
-        mean = filled.sum(axis=1, keepdims=True) / np.maximum(count, 1)
-        self.value = np.where(self.present > 0, data - mean, 0.0)
-        self.square = self.value**2
-        self.minimum_common = minimum_common
-
-    def __call__(self, rows: IntArray, columns: IntArray) -> FloatArray:
-        mine, theirs = self.present[rows], self.present[columns].T
-        x, y = self.value[rows], self.value[columns].T
+    def of(rows: IntArray, columns: IntArray) -> FloatArray:
+        mine, theirs, x, y = known[rows], known[columns].T, value[rows], value[columns].T
         n = mine @ theirs
         safe = np.maximum(n, 1.0)
         sum_x, sum_y = x @ theirs, mine @ y
-        square_x, square_y = self.square[rows] @ theirs, mine @ self.square[columns].T
-        vary_x = square_x - sum_x**2 / safe
-        vary_y = square_y - sum_y**2 / safe
-        covary = x @ y - sum_x * sum_y / safe
+        square_x, square_y = square[rows] @ theirs, mine @ square[columns].T
+        vary_x, vary_y = square_x - sum_x**2 / safe, square_y - sum_y**2 / safe
         # a smaller variance is the rounding error of the difference
-        good = (n >= self.minimum_common) & (vary_x > 1e-12 * square_x) & (vary_y > 1e-12 * square_y)
+        good = (n >= _MINIMUM_COMMON) & (vary_x > 1e-12 * square_x) & (vary_y > 1e-12 * square_y)
         scale = np.sqrt(np.where(good, vary_x * vary_y, 1.0))
         # rounding can bring the correlation of equal vectors above 1
-        return np.where(good, np.clip(covary / scale, -1.0, 1.0), np.nan)
+        return np.where(good, np.clip((x @ y - sum_x * sum_y / safe) / scale, -1.0, 1.0), np.nan)
+
+    return of
 
 
 def _mean_product(scaled: FloatArray, present: BoolArray) -> Block:
@@ -512,17 +464,10 @@ def _sums(distance_m: FloatArray, value: FloatArray, width_m: float, bins: int) 
     return np.stack([np.bincount(number[good], weight, bins) for weight in weights])
 
 
-def _means(sums: FloatArray, width_m: float) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Return nominal and mean distance, mean value and number of pairs of each bin. The means of empty bins are NaN."""
-    distance, value, pairs = sums
-    some = np.where(pairs > 0, pairs, np.nan)
-    return width_m * np.arange(len(pairs), dtype=np.float64), distance / some, value / some, pairs.astype(np.int64)
-
-
 def _bin_pairs(
     points: FloatArray, value_of: Block, width_m: float, maximum_m: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Return the means of each bin over all pairs of positions up to ``maximum_m``."""
+    """Return nominal and mean distance, mean value and number of pairs of each bin. The means of empty bins are NaN."""
     if not (width_m > 0 and maximum_m >= width_m and np.isfinite(maximum_m)):
         raise UsageError(f"bins of {width_m} m up to {maximum_m} m", expected="0 < width <= maximum, both finite")
     sums = np.zeros((3, int(np.floor(maximum_m / width_m + 1e-9)) + 1))
@@ -535,7 +480,9 @@ def _bin_pairs(
         # count each pair once
         once = (columns[None, :] >= rows[:, None]) & (distance <= maximum_m + 1e-6)
         sums += _sums(distance[once], value_of(rows, columns)[once], width_m, sums.shape[1])
-    return _means(sums, width_m)
+    total_m, value, pairs = sums
+    some = np.where(pairs > 0, pairs, np.nan)
+    return width_m * np.arange(len(pairs), dtype=np.float64), total_m / some, value / some, pairs.astype(np.int64)
 
 
 def _blocks_within(points: FloatArray, reach_m: float) -> Iterator[tuple[IntArray, IntArray]]:

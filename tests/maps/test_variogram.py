@@ -13,7 +13,6 @@ from aerpaw_cmp.maps.variogram import (
     field_correlation,
     fit_biexponential,
     vector_correlation,
-    vertical_correlation,
 )
 
 RNG = np.random.default_rng(3)
@@ -135,21 +134,6 @@ def test_field_correlation_leaves_missing_values_out():
     z = (fields - np.nanmean(fields, axis=0)) / np.nanstd(fields, axis=0)
     assert bins.correlation[1] == pytest.approx((z[0, 0] * z[1, 0] + z[1, 0] * z[2, 0]) / 2)
     assert bins.correlation[2] == pytest.approx((z[0] * z[2]).mean())
-
-
-def test_vertical_correlation_closed_form():
-    """Maps a, a + b: correlation of the sums of independent parts."""
-    n = 40_000
-    rng = np.random.default_rng(12)
-    part = rng.normal(size=(3, n))
-    maps = np.stack([part[0], part[0] + part[1], part[0] + part[1] + part[2], np.ones(n)])
-    bins = vertical_correlation([30.0, 40.0, 50.0, 60.0], maps)
-    assert bins.distance_m.tolist() == [0.0, 10.0, 20.0, 30.0]
-    assert bins.correlation[0] == pytest.approx(1.0)
-    assert bins.correlation[1] == pytest.approx((np.sqrt(1 / 2) + np.sqrt(2 / 3)) / 2, abs=0.01)
-    assert bins.correlation[2] == pytest.approx(np.sqrt(1 / 3), abs=0.01)
-    assert bins.pairs.tolist() == [3, 2, 1, 0]
-    assert bins.excluded_constant == 1
 
 
 # --- the curve ------------------------------------------------------------------------------------------------------

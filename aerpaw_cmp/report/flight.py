@@ -199,22 +199,29 @@ def _levels(data: ReportData) -> Table:
 
 def _ranks(data: ReportData) -> Table:
     rows: list[Sequence[Any]] = []
+    best = []
     for p in data.rank:
-        rows.append((p.tower, "measured", *p.score.histogram, "", "", "", ""))
+        rows.append((p.tower, "measured", *p.score.histogram, *[""] * 6))
         for k, at in p.score.simulated.items():
-            agreement = Markup(percent(at.agreement))
+            agreement = estimate(at.agreement, at.agreement_ci95, SHARE)
             if (by_ground := (p.further.agreement_sd_by_ground or {}).get(f"{k:g}")) is not None:
                 agreement += Markup(' <span class="small">±{}</span>').format(number(100 * by_ground, 0))
             rows.append(("", f"K = {k_key(k)}", *at.histogram, estimate(at.total_variation, at.total_variation_ci95),
-                         agreement, at.kappa, at.out_of_coverage))  # fmt: skip
+                         at.p_histogram, agreement, at.kappa, at.wasserstein, at.out_of_coverage))  # fmt: skip
+        if math.isfinite(p.score.curve.best_k):
+            best.append(f"{number(p.score.curve.best_k)} {interval(p.score.curve.best_k_ci95)} at {p.tower}")
     grounds = any(p.further.agreement_sd_by_ground for p in data.rank)
     return Table(
-        caption="Shares of channel rank 1 to 4 in coverage, as the modem reported and as simulated.",
+        caption="Shares of channel rank 1 to 4 in coverage, as the modem reported and as simulated, with 95 % "
+        "intervals in brackets.",
         columns={"Tower": HEAD, "Source": TEXT, **{f"Rank {rank}": SHARE for rank in RANKS},
-                 "Total variation": RIGHT, "Agreement": RIGHT, "Kappa": 2, "Out of coverage": 0},
+                 "Total variation": RIGHT, "p": 3, "Agreement": RIGHT, "Kappa": 2, "Wasserstein": 2,
+                 "Out of coverage": 0},
         rows=rows,
-        notes=[words.RANK_WORDS + (" The number after ± is the standard deviation that results from the unknown shape "
-                                   "of the ground between its known heights." if grounds else "")],
+        notes=[words.RANK_WORDS + " p is the probability of such a total variation if both had the same distribution."
+               + (f" Over all K, the agreement is largest at K = {', '.join(best)}." if best else "")
+               + (" The number after ± is the standard deviation that results from the unknown shape of the ground "
+                  "between its known heights." if grounds else "")],
     )  # fmt: skip
 
 
@@ -384,30 +391,6 @@ def serving_card(data: ReportData) -> Card:
     return Card(title="Serving cells", id="serving", link="Serving cells", fold=True, text=[text], tables=[table])
 
 
-def ranks_card(data: ReportData) -> Card:
-    """Return the card of the channel rank, with a part for each tower."""
-    parts = [_tower(panel) for panel in data.rank]
-    return Card(title="Channel rank", id="rank", link="Rank", fold=True, parts=parts)
-
-
-def _tower(p: RankResult) -> Card:
-    score = p.score
-    best = f"Over continuous K the best is {number(score.curve.best_k)} {interval(score.curve.best_k_ci95)}."
-    table = Table(
-        caption=f"Reported and simulated rank at {p.tower}, with 95 % intervals in brackets. p is the probability of "
-        "such a total variation if both had the same distribution.",
-        columns={"K": HEAD, "Agreement by pose": RIGHT, "Kappa": 2, "Total variation": RIGHT, "Wasserstein": 2, "p": 3,
-                 "Out of coverage": 0},
-        rows=[
-            (k_key(k), estimate(at.agreement, at.agreement_ci95, SHARE), at.kappa,
-             estimate(at.total_variation, at.total_variation_ci95), at.wasserstein, at.p_histogram, at.out_of_coverage)
-            for k, at in score.simulated.items()
-        ],
-    )  # fmt: skip
-    text = [paragraph(words.rank_verdict(p), best if math.isfinite(score.curve.best_k) else "")]
-    return Card(title=p.tower, group="rank-tower", text=text, tables=[table])
-
-
 def engine_card(data: ReportData) -> Card:
     """Return the card of the replay engine and its audit."""
     e = data.engine
@@ -525,7 +508,7 @@ def method_card(data: ReportData, files: Sequence[str]) -> Card:
 
 # Cards in the order of the page. A new card is another function here.
 CARDS = (
-    result_card, channels_card, referee_card, models_card, serving_card, ranks_card, engine_card,
+    result_card, channels_card, referee_card, models_card, serving_card, engine_card,
     inputs_card,
 )  # fmt: skip
 

@@ -206,12 +206,12 @@ def blank_pictures() -> Iterator[None]:
 
     from aerpaw_cmp.report import canvas
 
-    def save_as(fig: Any, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
-        return dict(blank(tuple(fig.get_size_inches()), tuple(formats), kind))  # the caller may take from it
+    def save_as(fig: Any, formats: Sequence[str]) -> dict[str, bytes]:
+        return dict(blank(tuple(fig.get_size_inches()), tuple(formats)))  # the caller may take from it
 
     @cache
-    def blank(size: tuple[float, float], formats: tuple[str, ...], kind: str) -> dict[str, bytes]:
-        return real(Figure(figsize=size), formats, kind)
+    def blank(size: tuple[float, float], formats: tuple[str, ...]) -> dict[str, bytes]:
+        return real(Figure(figsize=size), formats)
 
     real = canvas.save_as
     with pytest.MonkeyPatch.context() as patch:

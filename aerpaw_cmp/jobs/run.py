@@ -191,7 +191,6 @@ class ReportOptions:
         Largest distance between a sample and its predicted position, for other programs.
     figures : {"none", "svg", "png", "pdf", "all"}
         Format of figures as files: none, one format, or all formats.
-    style : {"screen", "paper"}
     export : sequence of str
         Formats of the samples.
     """
@@ -202,7 +201,6 @@ class ReportOptions:
     against: Sequence[Path] = ()
     against_distance_m: float = AGAINST_DISTANCE_M
     figures: str = "none"
-    style: str = "screen"
     export: Sequence[str] = ()
 
 
@@ -272,9 +270,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             target.write(sealed(text))
             record = replace(record, extra_metrics={**record.extra_metrics, "recommended": sentence})
         with output.filling() as place:
-            written = write_report(
-                record, place, drawn=chosen.figures, style=chosen.style, exports=formats, stages=stages
-            )
+            written = write_report(record, place, drawn=chosen.figures, exports=formats, stages=stages)
             if cards:
                 text = json.dumps(cards, indent=1, ensure_ascii=False)
                 (place / "card.json").write_text(text + "\n", encoding="utf-8")
@@ -284,15 +280,11 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
 
 def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[str, ...]:
     """Return the formats of the exports. Raise UsageError for options that exclude each other."""
-    from ..report.canvas import STYLES
     from ..report.exports import chosen_formats
     from ..report.flight import FIGURES
 
-    for word, words in ((chosen.figures, FIGURES), (chosen.style, STYLES)):
-        if word not in words:
-            raise UsageError(f"found {word!r}", expected="one of " + ", ".join(words), cause="--figures or --style")
-    if chosen.style != "screen" and chosen.figures == "none":
-        raise UsageError(f"--style {chosen.style} without figures", expected="--figures svg, png, pdf or all, too")
+    if chosen.figures not in FIGURES:
+        raise UsageError(f"--figures {chosen.figures}", expected=f"one of {', '.join(FIGURES)}")
     beside, home = (chosen.recommend or flight).parent, flight.parent
     if options.logs_root is None and os.path.realpath(beside) != os.path.realpath(home):
         # paths in a flight file are relative to its folder

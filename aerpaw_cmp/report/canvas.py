@@ -47,19 +47,12 @@ class FigureSpec:
     draw: Callable[[], Figure]
 
 
-STYLES = ("screen", "paper")
 FORMATS = ("png", "svg", "pdf")
-
-# Width of a figure over two columns of an IEEE page.
-_IEEE_WIDTH_IN = 7.16
 
 
 @contextmanager
-def style(kind: str = "screen") -> Iterator[None]:
-    """Apply the look of every figure without changing the settings of the user.
-
-    The style ``paper`` embeds fonts, and its serif letters have 8 pt after scaling to the width of an IEEE page.
-    """
+def style() -> Iterator[None]:
+    """Apply the look of every figure without changing the settings of the user."""
     from matplotlib.style import context
 
     settings = {
@@ -83,17 +76,9 @@ def style(kind: str = "screen") -> Iterator[None]:
         "hatch.linewidth": 0.5,
         "savefig.dpi": _RASTER_DPI,
         "svg.fonttype": "path",  # the page must look the same if the font is missing
+        "pdf.fonttype": 42,  # publishers require embedded fonts
         "svg.hashsalt": "aerpaw-cmp",  # the same numbers produce the same bytes
     }
-    if kind == "paper":
-        settings |= {
-            "font.family": "serif",
-            "font.serif": ["Liberation Serif", "Times New Roman", "Nimbus Roman", "DejaVu Serif"],
-            "font.size": 10.3,  # 8 pt after scaling to the width of the page
-            "axes.titleweight": "normal",
-            "pdf.fonttype": 42,
-            "savefig.dpi": 300.0,
-        }
     # begin with the defaults, because a third-party matplotlibrc in the working folder could run LaTeX
     with context(["default", settings]):
         yield
@@ -107,15 +92,12 @@ def subplots(size: tuple[float, float], *shape: int, **options: Any) -> tuple[Fi
     return fig, fig.subplots(*shape, **options)
 
 
-def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
-    """Return the figure by format. In the style ``paper``, it is as wide as two columns of an IEEE page."""
+def save_as(fig: Figure, formats: Sequence[str]) -> dict[str, bytes]:
+    """Return the figure by format."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.ticker import AutoLocator
 
-    if kind == "paper":
-        width, height = fig.get_size_inches()
-        fig.set_size_inches(_IEEE_WIDTH_IN, height * _IEEE_WIDTH_IN / width)
-    fig.set_dpi(300.0 if kind == "paper" else _RASTER_DPI)
+    fig.set_dpi(_RASTER_DPI)
     for axis in (axis for ax in fig.axes for axis in (ax.xaxis, ax.yaxis)):
         locator = axis.get_major_locator()
         if isinstance(locator, AutoLocator):
@@ -141,10 +123,10 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
     return {name: file.getvalue() for name, file in images.items()}
 
 
-def render(spec: FigureSpec, formats: Sequence[str] = ("png",), kind: str = "screen") -> dict[str, bytes]:
+def render(spec: FigureSpec, formats: Sequence[str] = ("png",)) -> dict[str, bytes]:
     """Draw a figure and return it by format."""
-    with style(kind):
-        return save_as(spec.draw(), formats, kind)
+    with style():
+        return save_as(spec.draw(), formats)
 
 
 # --- parts --------------------------------------------------------------------------------------

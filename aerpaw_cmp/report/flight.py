@@ -554,7 +554,6 @@ def write_report(
     folder: str | Path,
     *,
     drawn: str = "none",
-    style: str = "screen",
     exports: Sequence[str] = (),
     stages: Stages | None = None,
 ) -> WrittenReport:
@@ -567,7 +566,6 @@ def write_report(
         An empty folder, such as that of :meth:`aerpaw_cmp.common.outputs.OutputFolder.filling`.
     drawn : str
         One of :data:`FIGURES`.
-    style : {"screen", "paper"}
     exports : sequence of str
         Formats of :data:`aerpaw_cmp.report.exports.FORMATS` for the samples, in addition to CSV.
     stages : Stages, optional
@@ -591,7 +589,7 @@ def write_report(
         for name, text in (("rss.csv", csv_text(RSS, data.rss)), ("rank.csv", csv_text(RANK, data.rank))):
             # also write a table without rows, so that every report has the same files
             written.append(write_file(folder / name, text))
-        pictures = write_figures(specs, folder / "figures", formats, style, stages.progress)
+        pictures = write_figures(specs, folder / "figures", formats, stages.progress)
     written += pictures
     if exports:
         from .exports import of_report, write_exports

@@ -135,7 +135,6 @@ def write_figures(
     specs: Sequence[FigureSpec],
     folder: Path,
     formats: Sequence[str] = ("png",),
-    kind: str = "screen",
     progress: Progress = logged,
 ) -> list[Path]:
     """Draw figures, write each in all formats, and return the files.
@@ -147,8 +146,6 @@ def write_figures(
         Created if it does not exist.
     formats : sequence of str
         Formats of matplotlib, such as ``"svg"``, ``"png"``, ``"pdf"``.
-    kind : str
-        Style, as in :func:`render`.
     progress : Progress
         Called with the share of figures that have been drawn.
 
@@ -159,7 +156,7 @@ def write_figures(
     written: list[Path] = []
     for number, spec in enumerate(specs):
         progress("figures", number / len(specs))
-        pictures = render(spec, formats, kind)
+        pictures = render(spec, formats)
         written += [write_file(folder / f"{spec.name}.{form}", content) for form, content in pictures.items()]
     if specs:
         progress("figures", 1.0)

@@ -196,7 +196,6 @@ def test_a_quiet_draft_shows_the_lines_to_check_and_takes_the_bandwidth_from_nam
     ("command", "found"),
     [
         (["ingest", "{flight}", "--site", "lake_wheeler"], "--site without --draft"),
-        (["report", "{flight}", "--style", "paper"], "--style paper without figures"),
         (["campaign", "{campaign}", "--fresh", "--keep", "kept"], "--fresh and --keep"),
         (["campaign", "{zoned}"], "'timezone' without 'soundings'"),
         (["predict", "{route}", "--site", "lake_wheeler", "--spacing", "10"], "--spacing along a route"),

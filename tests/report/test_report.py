@@ -24,7 +24,7 @@ def test_whole_report(small_report, tmp_path):
 @pytest.mark.parametrize(("drawn", "suffixes"), [("none", set()), ("svg", {".svg"}), ("all", {".svg", ".png", ".pdf"})])
 def test_figures_are_drawn_as_asked(small_report, tmp_path, drawn, suffixes):
     data = dataclasses.replace(small_report, rss=(), pairs=(), rank=())
-    files = write.write_report(data, tmp_path, drawn=drawn, style="paper").files
+    files = write.write_report(data, tmp_path, drawn=drawn).files
     figures = [f for f in files if f.parent.name == "figures"]
     assert {f.suffix for f in figures} == suffixes
     assert len(figures) == len(suffixes) * len(figure_specs(data))

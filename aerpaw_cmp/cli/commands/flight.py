@@ -20,7 +20,7 @@ from ..shown import answered, number, print_files, records, say, show, table, wa
         "aerpaw-cmp sample -o sample && aerpaw-cmp report sample/flight.yaml",
         "aerpaw-cmp report flight.yaml -o reports/mine --audit none",
         "aerpaw-cmp report flight.yaml --dry-run",
-        "aerpaw-cmp report flight.yaml --figures all --style paper",
+        "aerpaw-cmp report flight.yaml --figures all",
         "aerpaw-cmp report flight.yaml --export kmz",
         "aerpaw-cmp report flight.yaml --with calibrated.yaml",
         "aerpaw-cmp report flight.yaml --against prediction",
@@ -56,9 +56,6 @@ def report(
         Literal["none", "svg", "png", "pdf", "all"],
         Option(help="Format of figures as separate files: none, one format, or all formats."),
     ] = "none",
-    style: Annotated[
-        Literal["screen", "paper"], Option(help="Figure style: screen, or paper (IEEE width, fonts embedded).")
-    ] = "screen",
     export: Export = None,
     dry_run: DryRun = False,
     force: Force = False,
@@ -73,7 +70,6 @@ def report(
         against=tuple(against or ()),
         against_distance_m=against_distance,
         figures=figures,
-        style=style,
         export=export or (),
     )
     options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)

@@ -189,4 +189,4 @@ def shown_confusion(serving: ServingComparison) -> tuple[list[str], AnyArray]:
     counts = np.asarray(serving.confusion)
     weight = counts.sum(axis=1) + counts[:, :-1].sum(axis=0)
     most = np.sort(np.argsort(-weight, kind="stable")[: min(MOST_CELLS, np.count_nonzero(weight))])
-    return [serving.cells[i] for i in most], counts[np.ix_(most, [*most, -1])]
+    return [serving.cells[i] for i in most], counts[np.ix_(most, np.append(most, -1))]

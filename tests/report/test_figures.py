@@ -1,5 +1,4 @@
 import dataclasses
-import io
 import re
 from itertools import pairwise
 
@@ -9,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.colors import to_rgb
-from PIL import Image
 
 from aerpaw_cmp.common.kml import CLASS_COLOURS
 from aerpaw_cmp.compare.result import RankResult, RssResult
@@ -208,19 +206,6 @@ def test_residual_sign_is_measured_minus_simulated(report_data):
 def test_grey_steps_of_the_ranks_are_apart():
     grey = [np.dot(to_rgb(CLASS_COLOURS[r]), (0.299, 0.587, 0.114)) for r in (1, 2, 3, 4)]
     assert min(np.diff(grey)) > 0.12
-
-
-def test_drawing_without_the_unseen_pass_gives_the_same_picture(small_report):
-    """``Figure.savefig`` draws an additional time before each file. Skipping this pass must not move anything."""
-    spec = next(p for p in figures.figure_specs(small_report) if p.name == "trajectory")
-    with canvas.style():
-        ours = canvas.save_as(spec.draw(), ("svg", "png"))["png"]
-        theirs = io.BytesIO()
-        spec.draw().savefig(theirs, format="png")
-    our_pixels, their_pixels = (
-        np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) for png in (ours, theirs.getvalue())
-    )
-    np.testing.assert_array_equal(our_pixels, their_pixels)
 
 
 def relative(data: ReportData) -> ReportData:

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..common.errors import UsageError
 from ..common.jsonable import number_key
-from ..common.units import THERMAL_NOISE_DBM_HZ, AnyArray, FloatArray, IntArray, db_from_power, unmasked
+from ..common.units import THERMAL_NOISE_DBM_HZ, AnyArray, FloatArray, IntArray, Printed, db_from_power, unmasked
 from ..compare.rank import rank_from_singular_values
 
 # Horizontal interval d_rx of the UAV positions.
@@ -613,12 +613,12 @@ class LinkBudget:
         noise = "noise floor not known (no bandwidth)"
         if self.noise_dbm is not None:
             noise = (
-                f"noise floor {self.noise_dbm:.1f} dBm ({self.bandwidth_mhz:g} MHz, "
+                f"noise floor {Printed(self.noise_dbm):.1f} dBm ({self.bandwidth_mhz:g} MHz, "
                 f"noise figure {self.noise_figure_db:g} dB)"
             )
         threshold = "covered where any path arrives"
         if self.level_dbm is not None:
-            threshold = f"covered from {self.level_dbm:.1f} dBm"
+            threshold = f"covered from {Printed(self.level_dbm):.1f} dBm"
             if self.threshold_snr_db is not None:
                 threshold += f" (SNR {self.threshold_snr_db:g} dB)"
         return f"Transmit power {self.tx_power_dbm:g} dBm; {noise}; {threshold}."

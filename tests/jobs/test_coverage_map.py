@@ -368,7 +368,7 @@ def test_options_replace_the_link_budget_of_the_site(tmp_path):
     assert (
         coverage_map.map_settings(str(file), {})
         .budget.sentence()
-        .startswith("Transmit power 23 dBm; noise floor -98.0 dBm")
+        .startswith("Transmit power 23 dBm; noise floor −98.0 dBm")
     )
     changed = coverage_map.map_settings(str(file), {"threshold_dbm": -90.0, "tx_power_dbm": None}).budget
     assert (changed.tx_power_dbm, changed.threshold_snr_db, changed.level_dbm) == (23, None, -90.0)

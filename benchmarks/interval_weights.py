@@ -27,8 +27,8 @@ from aerpaw_cmp.compare.statistics import (
     cosine_terms,
     heavy_tails,
     likelihoods,
-    memories,
     stretches,
+    time_correlations,
     undecided,
     weights,
 )
@@ -53,7 +53,7 @@ Cell = tuple[FloatArray, FloatArray, FloatArray, float, float]
 def mean_cell(x: FloatArray, away: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Evaluate sequences (count, n) for each correlation. Their mean is ``away`` (count,) from the true mean."""
     slow = np.array([cosine_terms(row).slow for row in x])
-    known, terms = memories(slow.shape[1]), slow.shape[1]
+    known, terms = time_correlations(slow.shape[1]), slow.shape[1]
     likelihood, square = likelihoods(slow)
     reach = np.sqrt(square / terms * known.variance)
     return likelihood, stdtr(terms, (away[:, None] - slow @ known.slope.T) / reach), reach**2
@@ -64,7 +64,7 @@ def power_cell(x: FloatArray, truth: float) -> tuple[FloatArray, FloatArray, Flo
     every = [cosine_terms(row) for row in x]
     slow, fast, freedom = (np.array([getattr(t, k) for t in every]) for k in ("slow", "fast_power", "fast_freedom"))
     tails = np.array([heavy_tails(row) for row in x])
-    known, terms = memories(slow.shape[1]), slow.shape[1]
+    known, terms = time_correlations(slow.shape[1]), slow.shape[1]
     likelihood, square = likelihoods(slow)
     third, below = 2.0 / (9.0 * freedom), np.zeros_like(square)
     normals = ndtri((np.arange(48) + 0.5) / 48)

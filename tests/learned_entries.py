@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.site.learned import Entry, KnownDirections, LearnedSeries, LearnedSpread, sphere_csv
+from aerpaw_cmp.site.learned import DirectionCovariance, Entry, LearnedSeries, LearnedSpread, sphere_csv
 
 SPREAD = LearnedSpread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=0.0, fading_kurtosis=0.0, bin_s=4.0)
 ENDS = {"t": "tower_file", "u": "uav_file", "k": "known_file", "m": "tower_known_file"}
@@ -31,5 +31,5 @@ def learned_tables(channel: str = "A", notes: tuple[str, ...] = (), **tables: by
     """Tables of a series by name: flat ones but for those that ``t`` and ``u`` give."""
     notes = ("aerpaw-cmp calibrate: c", *notes)
     flat = sphere_csv(np.zeros((7, 8)), np.ones((7, 8)), notes).encode()
-    known = KnownDirections(directions=np.eye(3), covariance_db2=np.eye(3)).table(notes).encode()
+    known = DirectionCovariance(directions=np.eye(3), covariance_db2=np.eye(3)).table(notes).encode()
     return {f"{channel}.{end}.csv.gz": tables.get(end, known if end in "km" else flat) for end in ENDS}

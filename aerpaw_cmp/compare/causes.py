@@ -26,7 +26,7 @@ import numpy as np
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, wrap_degrees
 from ..site.learned import LearnedSeries
 from .health import Judged, Step, level_of, step_of
-from .noise import LEAST_VARIANCE, START, Memories, MemoryFit, fit_with_memories, shift_in_masks, squares_of_halves
+from .noise import LEAST_VARIANCE, START, NoiseFit, NoiseParameters, fit_under_noise, shift_in_masks, squares_of_halves
 from .result import Cause, ClockResult
 
 # Samples are averaged over this time [s]. Longer flights have longer means, so that their number is limited.
@@ -160,7 +160,7 @@ class _Model:
     trials: tuple[Trial, ...]
     residual_db: FloatArray
     gain: float
-    memories: Memories
+    parameters: NoiseParameters
 
 
 _Models = Mapping[frozenset[str], _Model]
@@ -430,7 +430,7 @@ def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
     """Check whether a calibration could reduce the printed error of a channel, by a gain over directions."""
     for evidence in filter(None, map(_binned, channels)):
         sound, (antenna,) = _fitted(evidence), _pattern(evidence)
-        learned = _fitted(evidence, antenna, at=sound.memories)
+        learned = _fitted(evidence, antenna, at=sound.parameters)
         left_db = float(learned.residual_db.std())
         fall_db = min(float(sound.residual_db.std()), float(evidence.measured_db.std())) - left_db
         if learned.log_likelihood > sound.log_likelihood + _SELDOM and fall_db >= SHOWN_DB:
@@ -455,33 +455,33 @@ def _models(e: LevelEvidence) -> _Models:
     """Return the likeliest model of each fault and of pairs of the best ones."""
     sound = _fitted(e)
 
-    def model(*trials: Trial, at: Memories = sound.memories, climb: bool = True) -> _Model:
-        fit = _fitted(e, *trials, at=at, climb=climb)
+    def model(*trials: Trial, at: NoiseParameters = sound.parameters, search: bool = True) -> _Model:
+        fit = _fitted(e, *trials, at=at, search=search)
         cost = sum(trial.cost for trial in trials)
         gain = fit.log_likelihood - sound.log_likelihood - cost
-        return _Model(e, trials, fit.residual_db, gain, fit.memories)
+        return _Model(e, trials, fit.residual_db, gain, fit.parameters)
 
-    def best_of(sets: Iterable[tuple[Trial, ...]], at: Memories) -> list[_Model]:
+    def best_of(sets: Iterable[tuple[Trial, ...]], at: NoiseParameters) -> list[_Model]:
         """Return the likeliest model of each set of names, best first, with its own noise."""
         best: dict[frozenset[str], _Model] = {}
         for trials in sets:
-            tried = model(*trials, at=at, climb=False)
+            tried = model(*trials, at=at, search=False)
             names = _names(tried)
             if len(names) == len(trials) and (names not in best or tried.gain > best[names].gain):
                 best[names] = tried
         likely = sorted(best.values(), key=lambda m: -m.gain)[:_MOST_TRIED]
         return sorted((model(*m.trials, at=at) for m in likely), key=lambda m: -m.gain)
 
-    alone = best_of(((trial,) for trial in _candidates(e)), sound.memories)
-    models, likely = [model(climb=False), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
+    alone = best_of(((trial,) for trial in _candidates(e)), sound.parameters)
+    models, likely = [model(search=False), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
     pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
-    models += [model(first.trials[0], second.trials[0], at=first.memories) for first, second in pairs]
+    models += [model(first.trials[0], second.trials[0], at=first.parameters) for first, second in pairs]
     # unnamed slopes do not compete with half or twice the decibels
     named = any(m.gain > 0.0 and _names(m) & {"decibels", "exponent or decibels"} for m in alone)
     for first in likely:
         rest = [trial for trial in _candidates(_without(e, first)) if trial.name or not named]
-        further = best_of(((first.trials[0], second) for second in rest), first.memories)
-        models += [*further, *(model(m.trials[1], climb=False) for m in further)]
+        further = best_of(((first.trials[0], second) for second in rest), first.parameters)
+        models += [*further, *(model(m.trials[1], search=False) for m in further)]
     return {_names(m): m for m in sorted(models, key=lambda m: m.gain)}
 
 
@@ -612,7 +612,7 @@ def _undetected(level_db: FloatArray) -> BoolArray | None:
 _LOST = 5.0
 
 
-def _fitted(e: LevelEvidence, *trials: Trial, at: Memories = START, climb: bool = True) -> MemoryFit:
+def _fitted(e: LevelEvidence, *trials: Trial, at: NoiseParameters = START, search: bool = True) -> NoiseFit:
     """Fit offset and coefficients of some faults, with the given noise or with the likeliest one near it."""
     target = e.measured_db - e.predicted_db
     clipped = np.zeros(len(target), dtype=np.bool_)
@@ -624,10 +624,10 @@ def _fitted(e: LevelEvidence, *trials: Trial, at: Memories = START, climb: bool 
         shown = shown if trial.fading is None else shown * trial.fading
     design = np.column_stack([np.full(len(target), _OFFSET_DB), *columns])
     if clipped.all():
-        return MemoryFit(-math.inf, target - target.mean(), START)
+        return NoiseFit(-math.inf, target - target.mean(), START)
     link = ~clipped
     scale = shown[link]
-    fit = fit_with_memories(target[link] / scale, design[link] / scale[:, None], at, climb)
+    fit = fit_under_noise(target[link] / scale, design[link] / scale[:, None], at, search)
     likelihood, residual = fit.log_likelihood - float(np.log(scale).sum()), np.zeros(len(target))
     residual[link] = fit.residual_db * scale
     if clipped.any():  # clipped levels do not depend on the link
@@ -635,7 +635,7 @@ def _fitted(e: LevelEvidence, *trials: Trial, at: Memories = START, climb: bool 
         # Schwarz's penalty for two fitted numbers, mean and spread
         spread = max(float(residual[clipped].std()), _LEAST_SPREAD_DB)
         likelihood -= float(clipped.sum()) * (math.log(spread) + 0.5) + math.log(float(clipped.sum()))
-    return MemoryFit(likelihood, residual, fit.memories)
+    return NoiseFit(likelihood, residual, fit.parameters)
 
 
 _LEAST_SPREAD_DB = 0.2
@@ -723,9 +723,9 @@ _LAG_STEP_S = 2.0
 _LAGS_S = np.arange(-60.0, 61.0, _LAG_STEP_S)
 
 
-def _profiled(e: LevelEvidence, trials: Mapping[float, Trial], at: Memories = START) -> Trial:
+def _profiled(e: LevelEvidence, trials: Mapping[float, Trial], at: NoiseParameters = START) -> Trial:
     """Return the trial with the likeliest of some values, and the range of values that are nearly as likely."""
-    likelihood = {value: _fitted(e, trial, at=at, climb=False).log_likelihood for value, trial in trials.items()}
+    likelihood = {value: _fitted(e, trial, at=at, search=False).log_likelihood for value, trial in trials.items()}
     best, tried = max(likelihood, key=lambda value: likelihood[value]), sorted(trials)
     width = np.gradient(tried) if len(tried) > 1 else np.ones(1)
     cost = trials[best].cost + _concentration(np.array([likelihood[value] for value in tried]), width)
@@ -759,7 +759,7 @@ def _tuned(
     curve = _spline(np.array(values), np.append(between, [*changes_db])) @ table
     finer = {value: trial(value, change) for value, change in zip((*between.tolist(), *changes_db), curve, strict=True)}
     finer.pop(0.0, None)
-    return _profiled(e, finer, _fitted(e, likely).memories)
+    return _profiled(e, finer, _fitted(e, likely).parameters)
 
 
 def _spline(knots: FloatArray, at: FloatArray) -> FloatArray:
@@ -964,7 +964,7 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     alike = e.distance_db is not None and bool((e.predicted_db - e.distance_db).std() < SHOWN_DB)
     if alike:
         # near its maximum, the log likelihood is a parabola
-        best, sd = _slope(e, np.polyfit(e.predicted_db, e.measured_db, 1)[0], 0.1, _fitted(e, others[0]).memories)
+        best, sd = _slope(e, np.polyfit(e.predicted_db, e.measured_db, 1)[0], 0.1, _fitted(e, others[0]).parameters)
         if best >= _STEEP:
             # obstacles near the ground cause such an exponent; in the air it is unlikely
             doubled = abs(best - 2.0) <= 1.96 * sd and np.nanmedian(e.place_m[:, 2]) > _NEAR_GROUND_M
@@ -985,10 +985,10 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
         if not _nearer(e, factor * e.predicted_db):
             continue
         fit = _fitted(e, trial)
-        slope, *apart = (_fitted(e, other, at=fit.memories).log_likelihood for other in others)
+        slope, *apart = (_fitted(e, other, at=fit.parameters).log_likelihood for other in others)
         # levels that remain above a floor change by fewer decibels than the link
         least = -math.inf if e.floored else max(apart) + _RARE
-        if _is_slope(e, factor, fit.memories) and fit.log_likelihood > max(least, slope):
+        if _is_slope(e, factor, fit.parameters) and fit.log_likelihood > max(least, slope):
             yield trial
             return
     # alternatives without a name: a cause must be likelier than another slope or exponent
@@ -1005,17 +1005,17 @@ _STEEP, _NEAR_GROUND_M = 1.25, 10.0
 _SLOPE_SHARE, _LEARNED_SLOPE_SHARE = {0.5: 0.1, 2.0: 0.05}, {0.5: 0.12, 2.0: 0.1}
 
 
-def _is_slope(e: LevelEvidence, factor: float, at: Memories) -> bool:
+def _is_slope(e: LevelEvidence, factor: float, at: NoiseParameters) -> bool:
     """Check whether the 95 % interval of the slope is near a factor."""
     step = factor * (_SLOPE_SHARE if e.learned is None else _LEARNED_SLOPE_SHARE)[factor]
     best, sd = _slope(e, factor, step, at)
     return abs(best - factor) <= step and abs(best - factor) + 1.96 * sd < 2.0 * step
 
 
-def _slope(e: LevelEvidence, factor: float, step: float, at: Memories) -> tuple[float, float]:
+def _slope(e: LevelEvidence, factor: float, step: float, at: NoiseParameters) -> tuple[float, float]:
     """Return the slope of measured over predicted levels, and its SD. It is NaN if the levels do not determine it."""
     changes = (Trial(change_db=(factor + i * step - 1.0) * e.predicted_db) for i in (-1, 0, 1))
-    below, middle, above = (_fitted(e, change, at=at, climb=False).log_likelihood for change in changes)
+    below, middle, above = (_fitted(e, change, at=at, search=False).log_likelihood for change in changes)
     bend = below - 2.0 * middle + above
     if bend >= 0.0:
         return math.nan, math.nan

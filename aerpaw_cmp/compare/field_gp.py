@@ -9,9 +9,9 @@ exp(-chord^2 / 2 turn^2)``. Each flight has its own ``offset``, and its own ``dr
 drift_s)``. The lengths have physical bounds (:data:`BOUNDS`), because an unbounded fit would mistake fading for a field
 over positions. Channels are fitted separately.
 
-:class:`Known` computes the standard deviation after a planned flight. For that, a Gaussian process needs only the
-directions and positions of the route, not the levels. The antennas are modelled by :mod:`.gains`, and their residual by
-a field.
+:class:`FlownFlights` computes the standard deviation after a planned flight. For that, a Gaussian process needs only
+the directions and positions of the route, not the levels. The antennas are modelled by :mod:`.gains`, and their
+residual by a field.
 """
 
 from __future__ import annotations
@@ -487,7 +487,7 @@ _PLANNED = "planned"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Known:
+class FlownFlights:
     """The flown flights and the models, from which the uncertainty at targets is computed.
 
     Parameters

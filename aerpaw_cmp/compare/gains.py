@@ -1059,7 +1059,7 @@ class Evidence:
 
 
 @dataclass(frozen=True, kw_only=True)
-class KnownProcess:
+class GainProcess:
     """A learned gain over direction: its table, and its covariance at the directions that determine it.
 
     Parameters
@@ -1121,7 +1121,7 @@ class FlightEvidence:
             self.rows = [s.binned(width) for s in series]
         self._noise = [_noise_covariance(rows) for rows in self.rows]
 
-    def of_link(self, number: int, known: Moments, airframe: KnownProcess | None = None) -> Evidence:
+    def of_link(self, number: int, known: Moments, airframe: GainProcess | None = None) -> Evidence:
         """Return the evidence for the learned antennas of both ends of one series, by its number.
 
         ``known`` returns the moments of the gain of both ends, without the part that its table of pairs does not
@@ -1144,7 +1144,7 @@ class FlightEvidence:
 
         return judged(own, of)
 
-    def of_airframe(self, known: KnownProcess) -> Evidence:
+    def of_airframe(self, known: GainProcess) -> Evidence:
         """Return the evidence for a learned airframe from all series together. The gain of each tower is unknown."""
         rows = [some for some in self.rows if len(some)]
         if not rows:

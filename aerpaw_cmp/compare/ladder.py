@@ -24,7 +24,7 @@ _LEAST_COVERED = 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Rung:
+class CandidateModel:
     """One model of the comparison.
 
     Parameters
@@ -149,12 +149,12 @@ def distinct(rows: Sequence[LadderRow], keep: str) -> tuple[list[LadderRow], lis
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ladder:
+class ModelComparison:
     """The scored models.
 
     Parameters
     ----------
-    rungs : tuple of Rung
+    candidates : tuple of CandidateModel
         Simplest first.
     error_db : tuple of tuple of (n,)
         ``error_db[model][series]``: held-out errors [dB]; NaN for samples that the models do not share.
@@ -169,7 +169,7 @@ class Ladder:
         RMSE of the recommended model and of free space on other flights [dB], if these selected the model.
     """
 
-    rungs: tuple[Rung, ...]
+    candidates: tuple[CandidateModel, ...]
     error_db: tuple[tuple[FloatArray, ...], ...]
     time_s: tuple[FloatArray, ...]
     position_m: tuple[FloatArray, ...]
@@ -220,12 +220,12 @@ def _halves(cell: IntArray, position_m: FloatArray) -> list[IntArray]:
     return np.split(cell[np.argsort(position_m[cell, side], kind="stable")], [len(cell) // 2])
 
 
-def climb(
+def compare_models(
     measured_db: Sequence[FloatArray],
     time_s: Sequence[FloatArray],
-    rungs: Sequence[Rung],
+    candidates: Sequence[CandidateModel],
     position_m: Sequence[FloatArray],
-) -> Ladder:
+) -> ModelComparison:
     """Score models on held-out areas.
 
     Parameters
@@ -234,19 +234,19 @@ def climb(
         Level of each series in time order [dB]; NaN is not scored.
     time_s : sequence of (n,)
         Times by which the errors of all series are ordered, so that correlated errors of channels are adjacent [s].
-    rungs : sequence of Rung
+    candidates : sequence of CandidateModel
         Models, simplest first. Of two equal models, the earlier one is used.
     position_m : sequence of (n, 3)
         Position of each sample [m]; areas are held out (:func:`places_of`).
 
     Returns
     -------
-    Ladder
+    ModelComparison
     """
-    enough = [_covers(measured_db, rung) for rung in rungs]
-    counted = [rung for rung, ok in zip(rungs, enough, strict=True) if ok]
+    enough = [_covers(measured_db, candidate) for candidate in candidates]
+    counted = [candidate for candidate, ok in zip(candidates, enough, strict=True) if ok]
     shared = [
-        np.asarray(np.isfinite([m, *(rung.level_db[i] for rung in counted)]).all(axis=0))
+        np.asarray(np.isfinite([m, *(candidate.level_db[i] for candidate in counted)]).all(axis=0))
         for i, m in enumerate(measured_db)
     ]
     places = [places_of(p[keep]) for p, keep in zip(position_m, shared, strict=True)]
@@ -254,32 +254,37 @@ def climb(
         tuple(
             held_out_error_db(m, level, keep, block, x) if ok else np.full(len(m), np.nan)
             for m, level, keep, block, x in zip(
-                measured_db, rung.level_db, shared, places, rung.regressor_db or [None] * len(shared), strict=True
+                measured_db,
+                candidate.level_db,
+                shared,
+                places,
+                candidate.regressor_db or [None] * len(shared),
+                strict=True,
             )
         )
-        for rung, ok in zip(rungs, enough, strict=True)
+        for candidate, ok in zip(candidates, enough, strict=True)
     )
     in_time = np.argsort(np.concatenate([*time_s, np.zeros(0)]), kind="stable")
     joined = [np.concatenate([*e, np.zeros(0)])[in_time] for e in errors]
     place = np.concatenate([*position_m, np.zeros((0, 3))])[in_time]
     rmse = tuple(_rmse(e) for e in joined)
-    replays = [i for i, rung in enumerate(rungs) if rung.regressor_db is None and np.isfinite(rmse[i])]
+    replays = [i for i, candidate in enumerate(candidates) if candidate.regressor_db is None and np.isfinite(rmse[i])]
     # a straight line is never recommended, because it is not valid at other places
     chosen = recommended = min(replays, key=lambda i: rmse[i], default=None)
     if chosen is not None:
         recommended = next(i for i in replays if i == chosen or _as_good(compared(joined[i], joined[chosen], place)))
-    return Ladder(
-        rungs=tuple(rungs), error_db=errors, time_s=tuple(time_s), position_m=tuple(position_m), rmse_db=rmse,
+    return ModelComparison(
+        candidates=tuple(candidates), error_db=errors, time_s=tuple(time_s), position_m=tuple(position_m), rmse_db=rmse,
         best=int(np.nanargmin(rmse)) if any(np.isfinite(rmse)) else None, best_replay=chosen, recommended=recommended,
     )  # fmt: skip
 
 
-def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[LadderRow]:
+def series_rows(ladder: ModelComparison, series: int, name: tuple[str, str]) -> list[LadderRow]:
     """Return the rows of one series, one per model.
 
     Parameters
     ----------
-    ladder : Ladder
+    ladder : ModelComparison
     series : int
         Index of the series.
     name : (tower, channel)
@@ -289,21 +294,21 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[Ladd
     list of LadderRow
     """
     rows = []
-    for index, rung in enumerate(ladder.rungs):
+    for index, candidate in enumerate(ladder.candidates):
         error = ladder.error_db[index][series]
         against_best = None
         if ladder.best is not None:
             against_best = compared(error, ladder.error_db[ladder.best][series], ladder.position_m[series])
         rows.append(
             LadderRow(
-                model=rung.model,
+                model=candidate.model,
                 tower=name[0],
                 channel=name[1],
                 rmse_heldout_db=_rmse(error),
                 difference_to_best_db=float("nan") if against_best is None else against_best.difference_db,
                 difference_to_best_ci95_db=NO_INTERVAL if against_best is None else against_best.difference_ci95_db,
                 n=int(np.isfinite(error).sum()),
-                seconds=rung.seconds,
+                seconds=candidate.seconds,
                 recommended=index == ladder.recommended,
                 elsewhere_db=ladder.elsewhere_db if index == ladder.recommended else None,
             )
@@ -311,12 +316,12 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[Ladd
     return rows
 
 
-def model_rows(ladder: Ladder) -> list[ModelRow]:
+def model_rows(ladder: ModelComparison) -> list[ModelRow]:
     """Return the score of each model over all channels, simplest first.
 
     Parameters
     ----------
-    ladder : Ladder
+    ladder : ModelComparison
 
     Returns
     -------
@@ -334,20 +339,20 @@ def model_rows(ladder: Ladder) -> list[ModelRow]:
     scored = [i for i, rmse in enumerate(ladder.rmse_db) if np.isfinite(rmse)]
     # sufficient: the best model, and models whose difference has a known interval that contains 0
     sufficient = [i for i in scored if i == ladder.best or pairs[i].difference_ci95_db[0] <= 0.0]
-    fastest = min(sufficient, key=lambda i: ladder.rungs[i].seconds)
+    fastest = min(sufficient, key=lambda i: ladder.candidates[i].seconds)
     return [
         ModelRow(
-            model=rung.model,
+            model=candidate.model,
             rmse_heldout_db=ladder.rmse_db[i],
             difference_to_best_db=pairs[i].difference_db,
             difference_to_best_ci95_db=pairs[i].difference_ci95_db,
             n=sum(int(np.isfinite(error).sum()) for error in ladder.error_db[i]),
-            seconds=rung.seconds,
+            seconds=candidate.seconds,
             recommended=i == ladder.recommended,
             fastest_sufficient=i == fastest,
             elsewhere_db=ladder.elsewhere_db if i == ladder.recommended else None,
         )
-        for i, rung in enumerate(ladder.rungs)
+        for i, candidate in enumerate(ladder.candidates)
     ]
 
 
@@ -461,9 +466,9 @@ def _as_good(against_best: PairedDifference) -> bool:
     return bool(against_best.difference_db <= against_best.standard_error_db)
 
 
-def _covers(measured: Sequence[FloatArray], rung: Rung) -> bool:
+def _covers(measured: Sequence[FloatArray], candidate: CandidateModel) -> bool:
     known = [np.isfinite(m) for m in measured]
-    pairs = sum(int((k & np.isfinite(x)).sum()) for k, x in zip(known, rung.level_db, strict=True))
+    pairs = sum(int((k & np.isfinite(x)).sum()) for k, x in zip(known, candidate.level_db, strict=True))
     return pairs >= _LEAST_COVERED * max(sum(int(k.sum()) for k in known), 1)
 
 

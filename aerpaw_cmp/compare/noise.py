@@ -18,7 +18,7 @@ from ..common.units import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class Memories:
+class NoiseParameters:
     """The parameters of the noise, as indices into :data:`_SLOW`, :data:`_FAST` and :data:`_SLOW_SHARE`."""
 
     slow: int
@@ -26,12 +26,12 @@ class Memories:
     share: int
 
     @property
-    def near(self) -> list[Memories]:
+    def near(self) -> list[NoiseParameters]:
         """These parameters, and all parameters with one index changed by one."""
         places, sizes = (self.slow, self.fast, self.share), (len(_SLOW), len(_FAST), len(_SLOW_SHARE))
         steps = [(0, 0), *((i, step) for i in range(3) for step in (-1, 1))]
         moved = [tuple(p + step * (k == i) for k, p in enumerate(places)) for i, step in steps]
-        return [Memories(*m) for m in moved if all(0 <= p < size for p, size in zip(m, sizes, strict=True))]
+        return [NoiseParameters(*m) for m in moved if all(0 <= p < size for p, size in zip(m, sizes, strict=True))]
 
     @property
     def log_prior(self) -> float:
@@ -49,27 +49,27 @@ _SLOW_SHARE = (0.0, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
 # The correlation length of shadowing in open land is 37 m (3GPP TR 38.901, table 7.5-6): 7 s at 5 m/s. In the prior, a
 # factor of three is one standard deviation.
 _FADES_S, _FADES_FACTOR = 7.0, math.log(3.0)
-START = Memories(4, 2, 3)
+START = NoiseParameters(4, 2, 3)
 # The search for the likeliest parameters starts at the middle of the grid and at white noise.
-_STARTS = (START, Memories(0, 0, 0))
+_STARTS = (START, NoiseParameters(0, 0, 0))
 
 
 @dataclass(frozen=True, slots=True)
-class MemoryFit:
+class NoiseFit:
     """The result of a fit: log likelihood, residual (n,) [dB] and parameters of the noise."""
 
     log_likelihood: float
     residual_db: FloatArray
-    memories: Memories
+    parameters: NoiseParameters
 
 
 @cache
-def _whitening(memories: Memories) -> tuple[tuple[float, float, float], float, float]:
+def _whitening(parameters: NoiseParameters) -> tuple[tuple[float, float, float], float, float]:
     """Return the whitening filter (3 coefficients of the input, 1 of the output), and output SD over input SD.
 
     The sum of two first-order autoregressive sequences is an ARMA(2, 1) sequence (Granger and Morris).
     """
-    slow, fast, share = _SLOW[memories.slow], _FAST[memories.fast], _SLOW_SHARE[memories.share]
+    slow, fast, share = _SLOW[parameters.slow], _FAST[parameters.fast], _SLOW_SHARE[parameters.share]
     shocks = share * (1.0 - slow**2), (1.0 - share) * (1.0 - fast**2)
     power = shocks[0] * (1.0 + fast**2) + shocks[1] * (1.0 + slow**2)
     neighbour = shocks[0] * fast + shocks[1] * slow
@@ -79,7 +79,7 @@ def _whitening(memories: Memories) -> tuple[tuple[float, float, float], float, f
     return (1.0, -slow - fast, slow * fast), theta, math.sqrt(innovation)
 
 
-def fit_with_memories(residual: FloatArray, design: FloatArray, at: Memories, climb: bool) -> MemoryFit:
+def fit_under_noise(residual: FloatArray, design: FloatArray, at: NoiseParameters, search: bool) -> NoiseFit:
     """Fit the coefficients of a design (n, k) to a residual (n,) under noise with the given parameters.
 
     Coefficients have a unit normal prior. The likelihood is integrated over the coefficients, and the residual uses
@@ -91,14 +91,14 @@ def fit_with_memories(residual: FloatArray, design: FloatArray, at: Memories, cl
         Errors of consecutive means [dB].
     design : ndarray, (n, k)
         Effect of each coefficient.
-    at : Memories
+    at : NoiseParameters
         Parameters of the noise, or the start of the search.
-    climb : bool
+    search : bool
         True to search the most likely parameters, starting from ``at`` and from fixed starts.
 
     Returns
     -------
-    MemoryFit
+    NoiseFit
         Log likelihood, residual and parameters of the noise.
     """
     from scipy.linalg.lapack import dtbtrs  # scipy.signal takes 0.4 s to load
@@ -107,8 +107,8 @@ def fit_with_memories(residual: FloatArray, design: FloatArray, at: Memories, cl
     # assume that values before the first equal the first; Fortran order, because LAPACK solves by column
     before = np.asfortranarray(columns[[0, 0, *range(n)]])
 
-    def fit(memories: Memories) -> tuple[float, FloatArray]:
-        ahead, back, root = _whitening(memories)
+    def fit(parameters: NoiseParameters) -> tuple[float, FloatArray]:
+        ahead, back, root = _whitening(parameters)
         moved = ahead[0] * before[2:] + ahead[1] * before[1:-1] + ahead[2] * before[:-2]
         moved[0] /= 1.0 - back
         white = dtbtrs(np.array([np.ones(n), np.full(n, -back)]), moved, uplo="L", overwrite_b=True)[0]
@@ -124,16 +124,16 @@ def fit_with_memories(residual: FloatArray, design: FloatArray, at: Memories, cl
         mean = along / (power + variance)
         square = float(gram[0, 0] - along @ mean) / variance
         size = (n - len(power)) * math.log(variance) + float(np.log(variance + power).sum())
-        return -0.5 * (size + square) + math.log(root) + memories.log_prior, axes @ mean
+        return -0.5 * (size + square) + math.log(root) + parameters.log_prior, axes @ mean
 
-    tried = {memories: fit(memories) for memories in ({at, *_STARTS} if climb else {at})}
-    best, last = max(tried, key=lambda memories: tried[memories][0]), None if climb else at
+    tried = {parameters: fit(parameters) for parameters in ({at, *_STARTS} if search else {at})}
+    best, last = max(tried, key=lambda parameters: tried[parameters][0]), None if search else at
     while best != last:
         last = best
-        tried |= {memories: fit(memories) for memories in last.near if memories not in tried}
-        best = max(tried, key=lambda memories: tried[memories][0])
+        tried |= {parameters: fit(parameters) for parameters in last.near if parameters not in tried}
+        best = max(tried, key=lambda parameters: tried[parameters][0])
     likelihood, coefficients = tried[best]
-    return MemoryFit(likelihood, residual - design @ coefficients, best)
+    return NoiseFit(likelihood, residual - design @ coefficients, best)
 
 
 LEAST_VARIANCE = 1e-12

@@ -99,7 +99,7 @@ _PAIRS = 2048
 
 
 @dataclass(frozen=True, slots=True)
-class Memories:
+class CorrelationSet:
     """The normal distributions of mean and cosine terms for m correlations, up to a common scale.
 
     ``whiten`` (m, terms, terms) makes the terms independent. ``log_det`` (m,) is the logarithm of its determinant.
@@ -119,7 +119,7 @@ class Memories:
     @classmethod
     def of(
         cls, covariances: FloatArray, beyond: float | FloatArray = 0.0, freedom: float | FloatArray = np.inf
-    ) -> Memories:
+    ) -> CorrelationSet:
         """Create the record from covariances (m, terms + 1, terms + 1) of mean and terms."""
         whiten = np.linalg.inv(np.linalg.cholesky(covariances[:, 1:, 1:]))
         cross = covariances[:, 0, 1:]
@@ -136,17 +136,17 @@ class Memories:
 
 
 @cache
-def memories(terms: int = TERMS) -> Memories:
+def time_correlations(terms: int = TERMS) -> CorrelationSet:
     """Return exponential correlations with each of :data:`WHITE_SHARES`, then smooth ones, at all :data:`RATES`."""
     white = np.eye(terms + 1)
     covariances = [
         (1.0 - share) * 0.5 * rate * _exponential(rate, terms).real + share * white
         for share in WHITE_SHARES for rate in RATES
     ] + [0.25 * rate * _smooth(rate, terms) + _SMOOTH_FLOOR * white for rate in RATES]  # fmt: skip
-    return Memories.of(np.array(covariances))
+    return CorrelationSet.of(np.array(covariances))
 
 
-def place_memories(place_m: FloatArray, terms: int = TERMS) -> Memories | None:
+def place_correlations(place_m: FloatArray, terms: int = TERMS) -> CorrelationSet | None:
     """Return the distributions for errors that are correlated over position.
 
     Parameters
@@ -158,7 +158,7 @@ def place_memories(place_m: FloatArray, terms: int = TERMS) -> Memories | None:
 
     Returns
     -------
-    Memories or None
+    CorrelationSet or None
         All :data:`LENGTHS` for each mixture of :data:`PLACE_WHITE` and :data:`PLACE_FADING`. None if only correlation
         over time is used (:func:`only_time`).
 
@@ -172,12 +172,12 @@ def place_memories(place_m: FloatArray, terms: int = TERMS) -> Memories | None:
     known = np.flatnonzero(np.isfinite(place_m).all(axis=1))
     step = -(-len(known) // _THINNED)
     at = known[step // 2 :: step]
-    return _place_memories(place_m[at].tobytes(), ((at + 0.5) / len(place_m)).tobytes(), terms)
+    return _place_correlations(place_m[at].tobytes(), ((at + 0.5) / len(place_m)).tobytes(), terms)
 
 
 # Channels and models of a flight share its track; each entry takes 4 MB.
 @lru_cache(maxsize=8)
-def _place_memories(positions: bytes, instants: bytes, terms: int) -> Memories:
+def _place_correlations(positions: bytes, instants: bytes, terms: int) -> CorrelationSet:
     place, instant = np.frombuffer(positions).reshape(-1, 3), np.frombuffer(instants)
     place = place - place.mean(axis=0)
     square = np.square(place).sum(axis=1)
@@ -196,7 +196,7 @@ def _place_memories(positions: bytes, instants: bytes, terms: int) -> Memories:
     white, fading = _unit(np.eye(terms + 1)), _unit(_exponential(_FADING_RATE, terms).real)
     noise = [(share, white) for share in PLACE_WHITE]
     noise += [(share, 0.9 * fading + 0.1 * white) for share in PLACE_FADING]
-    return Memories.of(
+    return CorrelationSet.of(
         np.concatenate([(1.0 - share) * placed + share * other for share, other in noise]),
         np.concatenate([(1.0 - share) * beyond for share, _ in noise]),
         np.tile(freedom, len(noise)),
@@ -286,10 +286,10 @@ def cosine_terms(values: FloatArray) -> Terms:
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class WeightedCorrelations:
     """The possible correlations of a sequence, over time, then over position, with weights (m,) and widening (2, m)."""
 
-    parts: tuple[Memories, ...]
+    parts: tuple[CorrelationSet, ...]
     weights: FloatArray
     stretches: FloatArray
 
@@ -298,22 +298,22 @@ class Known:
         return np.concatenate([getattr(part, name) for part in self.parts])
 
 
-def known_memories(kind: Kind, terms: int, place_m: FloatArray | None = None) -> Known:
+def weighted_correlations(kind: Kind, terms: int, place_m: FloatArray | None = None) -> WeightedCorrelations:
     """Return the correlations over time, and over place if positions (n, 3) [m] allow it, with their weights."""
-    over_time, weight, stretch = memories(terms), weights(kind), stretches(kind)
-    over_place = None if place_m is None else place_memories(place_m, terms)
+    over_time, weight, stretch = time_correlations(terms), weights(kind), stretches(kind)
+    over_place = None if place_m is None else place_correlations(place_m, terms)
     if over_place is None:
-        return Known((over_time,), weight, stretch)
+        return WeightedCorrelations((over_time,), weight, stretch)
     size, longest = _PLACE_WEIGHT[kind]
     by_length = size * weight.mean() * longest / np.maximum(LENGTHS, longest)
     placed = np.tile(by_length, len(over_place.power) // len(LENGTHS))
     usual = np.repeat([[1.0], [0.0]], len(placed), axis=1)
-    return Known((over_time, over_place), np.concatenate([weight, placed]), np.hstack([stretch, usual]))
+    return WeightedCorrelations((over_time, over_place), np.concatenate([weight, placed]), np.hstack([stretch, usual]))
 
 
-def likelihoods(slow: FloatArray, parts: Sequence[Memories] = ()) -> tuple[FloatArray, FloatArray]:
+def likelihoods(slow: FloatArray, parts: Sequence[CorrelationSet] = ()) -> tuple[FloatArray, FloatArray]:
     """Return the likelihood (..., m) of each correlation, integrated over the scale, and whitened sums of squares."""
-    parts = parts or (memories(slow.shape[-1]),)
+    parts = parts or (time_correlations(slow.shape[-1]),)
     square = np.concatenate([np.square(slow @ part.whiten.swapaxes(1, 2)).sum(axis=-1).T for part in parts], axis=-1)
     log_det = np.concatenate([part.log_det for part in parts])
     log = log_det - 0.5 * slow.shape[-1] * np.log(np.maximum(square, 1e-300))
@@ -334,7 +334,7 @@ def _random(terms: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]
     return chance[:, 0], 2.0 * gammaincinv(0.5 * terms, chance[:, 1]), ndtri(chance[:, 2]), ndtri(chance[:, 3])
 
 
-def _picked(slow: FloatArray, known: Known) -> tuple[IntArray, FloatArray, float]:
+def _picked(slow: FloatArray, known: WeightedCorrelations) -> tuple[IntArray, FloatArray, float]:
     """Return the correlation (draws,) and squared scale (draws,) of each draw, and the widening of all draws."""
     likelihood, square = likelihoods(slow, known.parts)
     weighted = likelihood * known.weights
@@ -379,7 +379,7 @@ def mean_draws(values: FloatArray, kind: Kind = "mean", place_m: FloatArray | No
     if np.ptp(values) == 0.0:
         return np.zeros(2 * _PAIRS)
     slow = cosine_terms(values).slow
-    known = known_memories(kind, len(slow), place_m)
+    known = weighted_correlations(kind, len(slow), place_m)
     index, scale, stretch = _picked(slow, known)
     centre = -(known.joined("slope") @ slow)[index]
     reach = np.sqrt(scale * known.joined("variance")[index]) * _random(len(slow))[2]
@@ -444,7 +444,7 @@ def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatA
     if np.ptp(values) == 0.0:
         return np.zeros(2 * _PAIRS)
     terms = cosine_terms(values)
-    known = known_memories("power", len(terms.slow), place_m)
+    known = weighted_correlations("power", len(terms.slow), place_m)
     index, scale, stretch = _picked(terms.slow, known)
     *_, normal, second_normal = _random(len(terms.slow))
     # errors over position repeat when the flight returns, so their power has fewer independent squares

@@ -27,7 +27,7 @@ from ..common.units import FloatArray
 from ..common.yamlfile import StrictModel, load_yaml
 from ..compare import calibration, gains
 from ..compare.calibration import BIN_S, Learned, Observed, Recipe, Score, flights_of, groups_of, learn
-from ..compare.gains import FlightEvidence, GainOf, KnownProcess
+from ..compare.gains import FlightEvidence, GainOf, GainProcess
 from ..compare.health import HeldOut, learned_health
 from ..compare.level import DetectionScore, learn_detection, score_detection
 from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
@@ -38,7 +38,7 @@ from ..flight.settings import AntennaSettings, load_pattern
 from ..flight.training import counted_once, flight_logs, marks_of
 from ..propagation.field.baselines import two_ray_dbm
 from ..report.calibration import sentences
-from ..site.learned import AIRFRAME_BAND, KnownDirections, LearnedHealth, LearnedLock, Source
+from ..site.learned import AIRFRAME_BAND, DirectionCovariance, LearnedHealth, LearnedLock, Source
 
 
 def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[str, Learned]) -> dict[str, LearnedLock]:
@@ -700,7 +700,7 @@ _KNOWN_SHARE, _MOST_KNOWN = 0.002, 100
 _LENGTHS: Mapping[gains.Frame, float] = {term.frame: term.length for term in gains.ANTENNA_TERMS}
 
 
-def known_directions(fit: gains.GainFit, antenna: str, frame: gains.Frame = "body") -> KnownDirections:
+def direction_covariance(fit: gains.GainFit, antenna: str, frame: gains.Frame = "body") -> DirectionCovariance:
     """Return the directions at one end that determine its gain, and the covariance there.
 
     With 60, 100 or 200 directions, the evidence for an airframe differs by at most 3 nat.
@@ -709,7 +709,7 @@ def known_directions(fit: gains.GainFit, antenna: str, frame: gains.Frame = "bod
 
     flown, length = fit.seen(frame, antenna), _LENGTHS[frame]
     at = flown[determining(flown, lambda a, b: np.exp(-cdist(a, b) / length), _KNOWN_SHARE, _MOST_KNOWN)]
-    return KnownDirections(directions=at, covariance_db2=fit.covariance(frame, antenna, at))
+    return DirectionCovariance(directions=at, covariance_db2=fit.covariance(frame, antenna, at))
 
 
 def teaching(observed: Sequence[Observed], campaigns: Mapping[str, str], fits: Mapping[str, Learned]) -> frozenset[str]:
@@ -745,10 +745,10 @@ def _contradictions(
     return out
 
 
-def _airframe(learned: Learned, antenna: str) -> KnownProcess:
+def _airframe(learned: Learned, antenna: str) -> GainProcess:
     """Return the learned gain of the UAV towards a tower's antenna, with its covariance."""
-    known = known_directions(learned.fit, antenna)
-    return KnownProcess(
+    known = direction_covariance(learned.fit, antenna)
+    return GainProcess(
         gain_db=lambda at: learned.fit.gain("body", antenna, at)[0],
         sd_db=lambda at: learned.fit.gain("body", antenna, at)[1],
         directions=known.directions,

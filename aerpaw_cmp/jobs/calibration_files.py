@@ -43,7 +43,7 @@ from ..site.learned import (
     sphere_grid,
     unit_mean_gain,
 )
-from .calibrate import Calibration, CalibrationFile, known_directions
+from .calibrate import Calibration, CalibrationFile, direction_covariance
 from .calibrate_rank import RankCalibration
 
 # Start of calibrated.yaml, which identifies an earlier output of this tool.
@@ -363,8 +363,8 @@ def _learned_series(
             content = sphere_csv(gains.gain_dbi, gains.sd_db, notes[end], decimals=2)
             tables.setdefault(files[end], content.encode())
         if files["known"] not in tables:
-            tables[files["known"]] = known_directions(calibration.fit, antenna).table(notes["known"]).encode()
-        known = known_directions(calibration.fit, antenna, "mast")
+            tables[files["known"]] = direction_covariance(calibration.fit, antenna).table(notes["known"]).encode()
+        known = direction_covariance(calibration.fit, antenna, "mast")
         tables[files["tower_known"]] = known.table(notes["tower_known"]).encode()
         both = None
         if (pair := _pair_gain(calibration, antenna)) is not None:

@@ -46,13 +46,13 @@ from ..logs.readers import ReadOptions
 from ..logs.records import has_wall_clock
 from ..report.campaign import (
     CampaignData,
+    CampaignSummary,
     Failure,
     PooledOffset,
     RankRow,
     RankTransfer,
     Repeat,
     RssRow,
-    Season,
     SettingRank,
 )
 from .flight_run import run_flight
@@ -658,7 +658,7 @@ def with_season(
         Node offsets from tower-to-tower soundings (:func:`soundings`). They replace the offsets of the flights.
     """
     rows = _held_out_rows(data.rss)
-    season = Season(reports=dict(reports or {}), nodes=tuple(sounded))
+    season = CampaignSummary(reports=dict(reports or {}), nodes=tuple(sounded))
     if not rows:
         return dataclasses.replace(data, season=season)
     data = dataclasses.replace(data, rss=tuple(rows))

@@ -29,7 +29,7 @@ from ..common.text import counted
 from ..common.units import FloatArray
 from ..common.yamlfile import KeyPath, edited, parse_yaml
 from ..compare.causes import OF_DIRECTION
-from ..compare.ladder import Ladder, Rung, climb, model_rows, series_rows
+from ..compare.ladder import CandidateModel, ModelComparison, compare_models, model_rows, series_rows
 from ..compare.result import BASELINE_TITLE, Cause, FlightResult
 from ..compare.statistics import pooled_difference
 from ..compare.verdict import is_one_place
@@ -132,10 +132,10 @@ class Model:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlightLadder:
-    """The scored models, in the order of ``ladder.rungs``. A model of None is that of the flight file."""
+class FlightComparison:
+    """The scored models, in the order of ``scores.candidates``. A model of None is that of the flight file."""
 
-    ladder: Ladder
+    scores: ModelComparison
     models: tuple[Model | None, ...]
     names: tuple[tuple[str, str], ...]
     offered: Mapping[str, str] = field(default_factory=dict)
@@ -144,7 +144,7 @@ class FlightLadder:
     @property
     def recommended(self) -> Model | None:
         """The recommended model. None if it is that of the flight file, or if no model is recommended."""
-        chosen = self.ladder.recommended
+        chosen = self.scores.recommended
         return None if chosen is None else self.models[chosen]
 
 
@@ -160,11 +160,11 @@ class _Series:
     time_s: FloatArray
 
 
-def flight_ladder(data: FlightData, replays: FlightReplay) -> FlightLadder | None:
+def flight_comparison(data: FlightData, replays: FlightReplay) -> FlightComparison | None:
     """Compare models. None for a flight without RSS, or with another engine than the image method."""
     if not data.rss or data.settings.rt.engine != "image":
         return None
-    return _Climber(data, [_sampled(data.rss, i, r, data.settings.rss) for i, r in enumerate(replays.rss)]).climb()
+    return _ModelSearch(data, [_sampled(data.rss, i, r, data.settings.rss) for i, r in enumerate(replays.rss)]).search()
 
 
 def _sampled(rss: Sequence[RssSeries], index: int, replayed: Replayed, rules: RssSettings) -> _Series:
@@ -177,7 +177,7 @@ def _sampled(rss: Sequence[RssSeries], index: int, replayed: Replayed, rules: Rs
     return _Series(replayed=replayed, levels=levels, rows=rows, picked=pose_of[rows], step=step, time_s=seconds[rows])
 
 
-class _Climber:
+class _ModelSearch:
     """The evaluation of models on the series of a flight, with one search per set of paths."""
 
     def __init__(self, data: FlightData, series: Sequence[_Series]) -> None:
@@ -197,95 +197,95 @@ class _Climber:
         ]
         self._like = [ways.index(way) for way in ways]  # for each series, the first series with the same paths
 
-    def climb(self) -> FlightLadder:
+    def search(self) -> FlightComparison:
         """Run all stages."""
-        rungs = self._lines()
-        models: list[Model | None] = [None] * len(rungs)
+        candidates = self._lines()
+        models: list[Model | None] = [None] * len(candidates)
         best = Model()
         # woods first: their loss is larger than the effect of a reflection and would hide it
         for stage in (self._antennas, self._trees, self._ground, self._buildings, self._relief):
             for model in stage(best):
                 if model not in models:
                     models.append(model)
-                    rungs.append(self._rung(model))
-            scored = self._scored(rungs)
+                    candidates.append(self._candidate(model))
+            scored = self._scored(candidates)
             if scored.best_replay is not None:
                 best = models[scored.best_replay] or best
         models.append(None)
-        rungs.append(self._as_set())
+        candidates.append(self._as_set())
         names = tuple((s.tower, s.channel) for s in self._data.rss)
-        climbed = FlightLadder(
-            ladder=self._scored(rungs),
+        comparison = FlightComparison(
+            scores=self._scored(candidates),
             models=tuple(models),
             names=names,
             offered={} if self._offer is None else self._offer.antennas,
         )
-        return self._better_than_set(self._by_flights_left_out(climbed), climbed)
+        return self._better_than_set(self._by_flights_left_out(comparison), comparison)
 
-    def _better_than_set(self, *climbed: FlightLadder) -> FlightLadder:
+    def _better_than_set(self, *comparisons: FlightComparison) -> FlightComparison:
         """Return the first comparison whose recommended model is significantly better than the flight as set.
 
         Otherwise the flight as set is recommended, or no model if the flight is a training flight without a score.
         """
-        better = (each for each in climbed if self._is_better(each.ladder) and not self._contradicts(each))
-        ladder, last = climbed[-1].ladder, len(climbed[-1].ladder.rungs) - 1
-        if ladder.recommended is not None:
-            scored = math.isfinite(ladder.rmse_db[last])
-            ladder = dataclasses.replace(ladder, recommended=last if scored else None)
-        return next(better, dataclasses.replace(climbed[-1], ladder=ladder))
+        better = (each for each in comparisons if self._is_better(each.scores) and not self._contradicts(each))
+        scores, last = comparisons[-1].scores, len(comparisons[-1].scores.candidates) - 1
+        if scores.recommended is not None:
+            scored = math.isfinite(scores.rmse_db[last])
+            scores = dataclasses.replace(scores, recommended=last if scored else None)
+        return next(better, dataclasses.replace(comparisons[-1], scores=scores))
 
-    def _contradicts(self, climbed: FlightLadder) -> bool:
+    def _contradicts(self, comparison: FlightComparison) -> bool:
         """Check whether a model ignores the attitude that its learned antennas were learned with.
 
         The training flights of the antennas are stronger evidence than a part of one flight: on a third of a flight
         such a model was 0.4 dB better, and on the complete flight 2.1 dB worse.
         """
-        chosen = climbed.ladder.recommended
-        model = None if chosen is None else climbed.models[chosen]
+        chosen = comparison.scores.recommended
+        model = None if chosen is None else comparison.models[chosen]
         tracks = [s.replayed.track for s in self._series]
         known = any(t is not None and bool(t.attitude_known.any()) for t in tracks)
         return model is not None and known and (model.antennas, model.attitude) == ("learned", "ignored")
 
-    def _is_better(self, ladder: Ladder) -> bool:
+    def _is_better(self, scores: ModelComparison) -> bool:
         """Check that a recommended model is better than the flight as set and than a constant, over all series.
 
         The constant is needed because at one position every model is only an offset, and the flattest model is best.
         """
-        if ladder.recommended is None:
+        if scores.recommended is None:
             return False
-        chosen = ladder.error_db[ladder.recommended]
+        chosen = scores.error_db[scores.recommended]
         # Both tests must pass, so no correction for two tests is needed. If one gain is not real, its test passes in at
         # most 2.5 % of the flights, and so do both tests (intersection-union, Berger 1982, doi 10.2307/1267823).
-        for other in (ladder.error_db[0], ladder.error_db[-1]):
+        for other in (scores.error_db[0], scores.error_db[-1]):
             columns = [(s.time_s, a, b) for s, a, b in zip(self._series, chosen, other, strict=True)]
-            pair = pooled_difference(columns, free_offset=False, place_m=ladder.position_m)
+            pair = pooled_difference(columns, free_offset=False, place_m=scores.position_m)
             if pair.verdict != "better" or pair.difference_db > -_SHOWN_DB:
                 return False
         return True
 
-    def _by_flights_left_out(self, climbed: FlightLadder) -> FlightLadder:
+    def _by_flights_left_out(self, comparison: FlightComparison) -> FlightComparison:
         """Recommend the learned model as calibrated, if it beats free space on held-out flights."""
         antennas = (self._offer or self._data.settings).antennas
         errors = [errors_elsewhere(antennas, series, self._data.folder)[0] for series in self._data.rss]
         known = [error for error in errors if error is not None]
         if len(known) < len(errors) or not known:
-            return climbed
+            return comparison
         learned, free = (
             float(np.sqrt(np.mean([getattr(e, key) ** 2 for e in known]))) for key in ("rmse_db", "free_space_rmse_db")
         )
         for attitude in ("logged", "level"):
             model = Model(antennas="learned", attitude=attitude)
-            at = climbed.models.index(model) if model in climbed.models else None
-            if at is not None and np.isfinite(climbed.ladder.rmse_db[at]) and learned < free:
-                ladder = dataclasses.replace(climbed.ladder, recommended=at, elsewhere_db=(learned, free))
-                return dataclasses.replace(climbed, ladder=ladder)
-        return climbed
+            at = comparison.models.index(model) if model in comparison.models else None
+            if at is not None and np.isfinite(comparison.scores.rmse_db[at]) and learned < free:
+                scores = dataclasses.replace(comparison.scores, recommended=at, elsewhere_db=(learned, free))
+                return dataclasses.replace(comparison, scores=scores)
+        return comparison
 
-    def _scored(self, rungs: Sequence[Rung]) -> Ladder:
-        return climb(
+    def _scored(self, candidates: Sequence[CandidateModel]) -> ModelComparison:
+        return compare_models(
             self._measured,
             [s.time_s for s in self._series],
-            rungs,
+            candidates,
             [s.replayed.poses.position_m[s.picked] for s in self._series],
         )
 
@@ -345,23 +345,23 @@ class _Climber:
 
     # levels
 
-    def _lines(self) -> list[Rung]:
+    def _lines(self) -> list[CandidateModel]:
         zeros = tuple(np.zeros(len(s.rows)) for s in self._series)
         ray_m = tuple(s.replayed.poses.position_m[s.picked] - self._sources(s, self._data.site) for s in self._series)
         # avoid the logarithm of 0 at the position of the antenna
         range_db = tuple(10.0 * np.log10(np.maximum(np.linalg.norm(a, axis=1), 0.1)) for a in ray_m)
         return [
-            Rung(model=name, level_db=zeros, seconds=0.0, regressor_db=x)
+            CandidateModel(model=name, level_db=zeros, seconds=0.0, regressor_db=x)
             for name, x in zip(LINES, (zeros, range_db), strict=True)
         ]
 
-    def _as_set(self) -> Rung:
+    def _as_set(self) -> CandidateModel:
         levels = tuple(s.levels.simulated_db[s.rows] for s in self._series)
         seconds = self._of_flight([s.replayed.replay.seconds for s in self._series])
         if self._learned_here and self._offer is None:
             nothing = tuple(np.full(len(level), np.nan) for level in levels)
-            return Rung(model=AS_SET + LEARNED_HERE, level_db=nothing, seconds=seconds)
-        return Rung(model=AS_SET, level_db=levels, seconds=seconds)
+            return CandidateModel(model=AS_SET + LEARNED_HERE, level_db=nothing, seconds=seconds)
+        return CandidateModel(model=AS_SET, level_db=levels, seconds=seconds)
 
     def _of_flight(self, seconds: Sequence[float]) -> float:
         """Return the seconds of a flight. Channels with a common replay are counted once."""
@@ -377,13 +377,13 @@ class _Climber:
         pairs = zip(self._data.rss, self._links, strict=True)
         return any(learned_here(self._data, series, link) for series, link in pairs)
 
-    def _rung(self, model: Model) -> Rung:
+    def _candidate(self, model: Model) -> CandidateModel:
         learned = model.antennas == "learned" or model.ground == "rough"
         if learned and self._learned_here:
             nothing = tuple(np.full(len(s.rows), np.nan) for s in self._series)
-            return Rung(model=model.name + LEARNED_HERE, level_db=nothing, seconds=0.0)
+            return CandidateModel(model=model.name + LEARNED_HERE, level_db=nothing, seconds=0.0)
         levels = [self._level(i, model) for i in range(len(self._series))]
-        return Rung(
+        return CandidateModel(
             model=model.name, level_db=tuple(f[0] for f in levels), seconds=self._of_flight([f[1] for f in levels])
         )
 
@@ -471,7 +471,7 @@ def recommended_changes(
     stated : mapping
         Plain values of the keys in the file.
     model : Model
-        See :attr:`FlightLadder.recommended`.
+        See :attr:`FlightComparison.recommended`.
     offered : mapping of str to str, optional
         Learned antennas of the site by name, for a learned model.
 
@@ -527,7 +527,7 @@ _NOT_RECOMMENDED = UsageError(
 )
 
 
-def recommended_text(settings: FlightFile, ladder: FlightLadder | None, flight: Path) -> tuple[str, str]:
+def recommended_text(settings: FlightFile, comparison: FlightComparison | None, flight: Path) -> tuple[str, str]:
     """Return the flight file with the lines changed that the recommended model needs, and a sentence on them.
 
     Raises
@@ -535,15 +535,15 @@ def recommended_text(settings: FlightFile, ladder: FlightLadder | None, flight: 
     UsageError
         If no models were compared: no RSS, or rays of another engine than the image method.
     """
-    if ladder is None or ladder.ladder.recommended is None:
+    if comparison is None or comparison.scores.recommended is None:
         raise _NOT_RECOMMENDED
     # read bytes, so that line ends stay as they are
     text = unsealed(flight.read_bytes().decode("utf-8"))
-    if ladder.recommended is None:
+    if comparison.recommended is None:
         return text, f"No model is significantly better than {flight.name}: the recommended file is a copy of it."
-    text = edited(text, recommended_changes(settings, yaml.safe_load(text), ladder.recommended, ladder.offered))
+    text = edited(text, recommended_changes(settings, yaml.safe_load(text), comparison.recommended, comparison.offered))
     parse_yaml(text, FlightFile)  # the reader must accept the written file
-    return text, f"The recommended file has the settings of the model '{ladder.recommended.name}'."
+    return text, f"The recommended file has the settings of the model '{comparison.recommended.name}'."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -558,14 +558,14 @@ class FlightRun:
         Poses, paths, fields and clock of every series.
     result : FlightResult
         Numbers of the comparison.
-    ladder : FlightLadder, optional
+    ladder : FlightComparison, optional
         Model comparison.
     """
 
     data: FlightData
     replays: FlightReplay
     result: FlightResult
-    ladder: FlightLadder | None = None
+    ladder: FlightComparison | None = None
 
 
 def run_flight(
@@ -605,21 +605,21 @@ def run_flight(
     if audit:
         with stages("audit"):
             result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress, anew=anew))
-    climbed: FlightLadder | None = None
+    comparison: FlightComparison | None = None
     if ladder:
         with stages("models"):
             stages.progress("model comparison")
-            climbed = flight_ladder(data, replays)
-            if climbed is not None:
-                rows = (series_rows(climbed.ladder, index, name) for index, name in enumerate(climbed.names))
+            comparison = flight_comparison(data, replays)
+            if comparison is not None:
+                rows = (series_rows(comparison.scores, index, name) for index, name in enumerate(comparison.names))
                 result = dataclasses.replace(
                     result,
-                    models=tuple(model_rows(climbed.ladder)),
+                    models=tuple(model_rows(comparison.scores)),
                     ladder=tuple(row for of_series in rows for row in of_series),
                 )
-    result = dataclasses.replace(result, likely_cause=cause_beyond_models(result.likely_cause, climbed))
-    result = dataclasses.replace(result, next_step=next_step(data, result, climbed))
-    return FlightRun(data=data, replays=replays, result=result, ladder=climbed)
+    result = dataclasses.replace(result, likely_cause=cause_beyond_models(result.likely_cause, comparison))
+    result = dataclasses.replace(result, next_step=next_step(data, result, comparison))
+    return FlightRun(data=data, replays=replays, result=result, ladder=comparison)
 
 
 def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
@@ -646,23 +646,23 @@ def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
     return [PlannedStage(name, work) for name, work in stages.items() if work]
 
 
-def cause_beyond_models(cause: Cause | None, climbed: FlightLadder | None) -> Cause | None:
+def cause_beyond_models(cause: Cause | None, comparison: FlightComparison | None) -> Cause | None:
     """Return the likely cause, or None if it depends on direction and the recommended model explains as much."""
-    if cause is None or cause.name not in OF_DIRECTION or climbed is None or climbed.recommended is None:
+    if cause is None or cause.name not in OF_DIRECTION or comparison is None or comparison.recommended is None:
         return cause
-    at, rmse_db = climbed.ladder.recommended, climbed.ladder.rmse_db
+    at, rmse_db = comparison.scores.recommended, comparison.scores.rmse_db
     assert at is not None
     return None if rmse_db[-1] - rmse_db[at] >= cause.rmse_db - cause.rmse_with_db else cause
 
 
-def next_step(data: FlightData, result: FlightResult, climbed: FlightLadder | None) -> str | None:
+def next_step(data: FlightData, result: FlightResult, comparison: FlightComparison | None) -> str | None:
     """Return the next step: a wider offset search, the step for the likely cause, or a better model.
 
     Parameters
     ----------
     data : FlightData
     result : FlightResult
-    climbed : FlightLadder, optional
+    comparison : FlightComparison, optional
 
     Returns
     -------
@@ -685,6 +685,6 @@ def next_step(data: FlightData, result: FlightResult, climbed: FlightLadder | No
         return result.likely_cause.next_step or None
     if is_one_place(result.rss):
         return "a flight along a route"
-    if climbed is not None and climbed.recommended is not None:
+    if comparison is not None and comparison.recommended is not None:
         return "`aerpaw-cmp report FLIGHT --recommend FILE` writes settings significantly better than these"
     return result.next_step

@@ -15,7 +15,7 @@ from ..common.stages import Stages
 from ..compare.locate import LevelTrack, NodeEstimate, locate
 from ..flight.data import check_place, choose_site, is_ratio, read_logs, site_place
 from ..flight.drafting.draft import receiver_floor_db
-from ..flight.drafting.proposals import Placer, searching_airframe, with_antennas
+from ..flight.drafting.proposals import NodeFinder, searching_airframe, with_antennas
 from ..flight.gains import load_with_learned
 from ..flight.rows import LOCK_FLOOR_DB, is_sounder_power
 from ..flight.settings import FlightFile
@@ -61,7 +61,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
             vehicle, file, level = _streams(settings, flight, options.logs_root, channel)
             check_place(site, str(flight), vehicle)
             floor = LOCK_FLOOR_DB if is_sounder_power(level) else receiver_floor_db([level])
-            track = Placer(site, vehicle).levels(level, -np.inf if floor is None else floor)
+            track = NodeFinder(site, vehicle).levels(level, -np.inf if floor is None else floor)
         with stages("locate"):
             node, uav = _antennas(settings, flight, options.logs_root, track, (file, level))
             cautions = _cautions(settings, level.channel, uav)

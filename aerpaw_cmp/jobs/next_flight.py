@@ -19,7 +19,7 @@ from ..common.stages import PlannedStage, Stages
 from ..common.text import counted
 from ..common.units import FloatArray
 from ..compare.calibration import choose
-from ..compare.field_gp import Known, rms_db
+from ..compare.field_gp import FlownFlights, rms_db
 from ..compare.gains import GainModel, LinkSamples
 from ..flight.routes import (
     NOSES,
@@ -169,7 +169,7 @@ def _plan_flight(
     work = f"{counted(len(candidates), 'candidate')}: {', '.join(candidate.route.name for candidate in candidates)}"
     stages.checked(lambda: [PlannedStage("learn, rank, curve, map", work)])
     with stages("learn"):
-        known = _flown_knowledge(series)
+        known = _flown_flights(series)
     few_targets = {a: _thinned(s, _MOST_TARGETS) for a, s in targets.items()}
 
     def leaves_db(route: Route) -> float:
@@ -392,14 +392,14 @@ def _even_directions(count: int) -> FloatArray:
     return np.asarray(np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1), dtype=np.float64)
 
 
-def _flown_knowledge(series: Sequence[LinkSamples]) -> Known:
+def _flown_flights(series: Sequence[LinkSamples]) -> FlownFlights:
     """Return strengths and spatial correction learned from earlier flights, else the defaults of the model."""
     model, residual_field = GainModel(), None
     if series:
         model = learned_antennas(series).model
         correction = choose(series, {"learned": lambda train: learned_antennas(train).predict})
         residual_field = correction.model if correction.on else None
-    return Known(series=series, model=model, field=residual_field)
+    return FlownFlights(series=series, model=model, field=residual_field)
 
 
 def _thinned(samples: LinkSamples, most: int) -> LinkSamples:

@@ -25,7 +25,7 @@ from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..compare.calibration import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base
 from ..compare.gains import BAND, LinkSamples
 from ..flight.data import FlightData, site_place, unread
-from ..flight.drafting.proposals import remembered
+from ..flight.drafting.proposals import latest_learned_links
 from ..flight.gains import flight_of
 from ..flight.settings import FlightFile, LinkSettings, LinksSettings
 from ..flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
@@ -156,7 +156,7 @@ def predict(
         if unflown is not None:
             asked = _nodes_of(where)
             every = unflown.sources()
-            if isinstance(unflown, Prior) and options.carrier_hz is None and (learned := remembered(place)):
+            if isinstance(unflown, Prior) and options.carrier_hz is None and (learned := latest_learned_links(place)):
                 remarks.append(f"Not used: the antennas learned for {', '.join(learned)} have no level.")
             sources = {name: s for name, s in every.items() if s.tower in asked} or every
         else:
@@ -392,7 +392,7 @@ def _bases(
     links = [(s.link.build([s.tower], s.folder), s.folder) for s in sources.values()]
     near = {
         name: memory
-        for name, memory in remembered(place).items()
+        for name, memory in latest_learned_links(place).items()
         if name in sources and abs(memory.series.carrier_hz / sources[name].link.carrier_hz - 1.0) <= CARRIER_BAND
     }
     learned: dict[str, list[MeasuredPattern | FlightFile]] = {

@@ -24,7 +24,7 @@ from ..compare.calibration import BIN_S, Correction, Observed, Predictor, betwee
 from ..compare.gains import NO_SPREAD, LinkSamples, LostLock, Spread, fading_of, link_directions, student_factor
 from ..compare.level import DetectionForecast
 from ..flight.data import FAR_M, FlightData, load_data, nearest_m
-from ..flight.drafting.proposals import Remembered, remembered
+from ..flight.drafting.proposals import LearnedLink, latest_learned_links
 from ..flight.gains import flight_of, load_with_learned, pair_db
 from ..flight.replay import attitude_rotation, replay_poses
 from ..flight.settings import FlightFile, LinkSettings, RssSettings, RtSettings
@@ -524,12 +524,12 @@ class Memory:
 
     Parameters
     ----------
-    known : mapping of str to Remembered
+    known : mapping of str to LearnedLink
         By antenna (``tower.channel``), each with a level.
     site : Site
     """
 
-    def __init__(self, known: Mapping[str, Remembered], site: Site) -> None:
+    def __init__(self, known: Mapping[str, LearnedLink], site: Site) -> None:
         self.known, self._site = known, site
         self._gain_db: Predictor = by_degree(lambda samples: known[samples.antenna].gain_db(samples))
 
@@ -582,7 +582,7 @@ class Memory:
 
 def memory_of(place: str | Path, site: Site) -> Memory | None:
     """Return the model of the antennas and levels learned for a site. None if no level of its towers was learned."""
-    learned = remembered(place)
+    learned = latest_learned_links(place)
     known = {name: m for name, m in learned.items() if m.series.level and m.series.tower in site.towers}
     return Memory(known, site) if known else None
 

@@ -254,7 +254,7 @@ class SettingRank:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Season:
+class CampaignSummary:
     """The result of all flights together.
 
     Parameters
@@ -312,7 +312,7 @@ class CampaignData(Made):
     site: Site | None = None
     synthetic: tuple[str, ...] = ()
     workers: int = 1
-    season: Season = Season()
+    season: CampaignSummary = CampaignSummary()
 
     @property
     def reference(self) -> str:

@@ -972,7 +972,7 @@ _COLUMNS = ("azimuth_deg", "elevation_deg", "covariance_db2 (columns up to the r
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class KnownDirections:
+class DirectionCovariance:
     """Unit vectors (m, 3) in the body frame, and the covariance (m, m) of the gain towards them [dB^2]."""
 
     directions: FloatArray
@@ -988,8 +988,8 @@ class KnownDirections:
 
 
 @parsed(_WHAT)
-def read_known(path: Path, written: Written | None = None) -> KnownDirections:
-    """Read a table of :meth:`KnownDirections.table`.
+def read_direction_covariance(path: Path, written: Written | None = None) -> DirectionCovariance:
+    """Read a table of :meth:`DirectionCovariance.table`.
 
     Raises
     ------
@@ -1001,7 +1001,7 @@ def read_known(path: Path, written: Written | None = None) -> KnownDirections:
         raise InputError("rows of another length", expected=", ".join(_COLUMNS), path=path)
     lower = np.zeros((len(rows), len(rows)))
     lower[np.tril_indices(len(rows))] = np.concatenate([row[2:] for row in rows])
-    return KnownDirections(
+    return DirectionCovariance(
         directions=vectors_of(np.array([row[:2] for row in rows])), covariance_db2=lower + np.tril(lower, -1).T
     )
 

@@ -328,16 +328,16 @@ def test_a_simulators_log_is_known_in_the_autopilots_own_messages(
 
 
 @pytest.mark.parametrize(
-    ("memories", "tolerance"), [((3, 0, 7), 0.01), ((0, 3, 0), 0.01), ((4, 2, 3), 2.0), ((2, 0, 5), 2.0)]
+    ("parameters", "tolerance"), [((3, 0, 7), 0.01), ((0, 3, 0), 0.01), ((4, 2, 3), 2.0), ((2, 0, 5), 2.0)]
 )
 @pytest.mark.parametrize("columns", [False, True])
 def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memories(
-    columns: bool, memories: tuple[int, int, int], tolerance: float
+    columns: bool, parameters: tuple[int, int, int], tolerance: float
 ) -> None:
     """Dense covariances with unit normal coefficients, at the likeliest size of the noise."""
     generator, n = np.random.default_rng(4), 200
     design = np.column_stack([np.full(n, 100.0), 3.0 * generator.normal(size=(n, 2 if columns else 0))])
-    known, apart = noise.Memories(*memories), np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    known, apart = noise.NoiseParameters(*parameters), np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     slow, fast, share = noise._SLOW[known.slow], noise._FAST[known.fast], noise._SLOW_SHARE[known.share]
     cover = share * slow**apart + (1.0 - share) * fast**apart
     residual = 3.0 + np.linalg.cholesky(cover) @ generator.normal(size=n)
@@ -349,14 +349,14 @@ def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memories(
     inverse = np.linalg.inv(cover)
     ridge = np.exp(exact.x) * np.eye(design.shape[1])
     left = residual - design @ np.linalg.solve(design.T @ inverse @ design + ridge, design.T @ inverse @ residual)
-    fit = noise.fit_with_memories(residual, design, known, climb=False)
+    fit = noise.fit_under_noise(residual, design, known, search=False)
     assert fit.log_likelihood == pytest.approx(
         known.log_prior - exact.fun + 0.5 * n * np.log(2.0 * np.pi), abs=tolerance
     )
     np.testing.assert_allclose(fit.residual_db, left, atol=max(0.2 * tolerance, 1e-3))
-    best = noise.fit_with_memories(residual, design, known, climb=True)
-    assert best.log_likelihood >= max(noise.fit_with_memories(residual, design, near, climb=False).log_likelihood
-                                      for near in best.memories.near)  # fmt: skip
+    best = noise.fit_under_noise(residual, design, known, search=True)
+    assert best.log_likelihood >= max(noise.fit_under_noise(residual, design, near, search=False).log_likelihood
+                                      for near in best.parameters.near)  # fmt: skip
 
 
 def test_a_free_form_pays_for_its_numbers_and_a_wide_search_for_its_width() -> None:
@@ -369,7 +369,7 @@ def test_a_free_form_pays_for_its_numbers_and_a_wide_search_for_its_width() -> N
         generator.normal(size=300),
         np.column_stack([np.full(300, 100.0), generator.normal(size=(300, 20))]),
     )
-    free, bound = (noise.fit_with_memories(residual, x, noise.START, climb=True) for x in (design, design[:, :1]))
+    free, bound = (noise.fit_under_noise(residual, x, noise.START, search=True) for x in (design, design[:, :1]))
     assert bound.log_likelihood - free.log_likelihood > 20.0
     value = np.linspace(-5.0, 5.0, 1001)
     peak = -0.5 * (value / 0.4) ** 2  # as wide as 0.4 times the root of 2 pi

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.ladder import (
+    CandidateModel,
     LadderRow,
-    Rung,
-    climb,
+    compare_models,
     distinct,
     held_out_error_db,
     held_out_lines,
@@ -40,17 +40,17 @@ def planted(n=2000):
     return truth, measured
 
 
-def rung(name, level):
-    return Rung(model=name, level_db=(level,), seconds=1.0)
+def candidate(name, level):
+    return CandidateModel(model=name, level_db=(level,), seconds=1.0)
 
 
 def test_truth_is_best_and_recommended_over_what_adds_nothing():
     truth, measured = planted()
     flat = np.full(len(truth), -80.0)
     useless = truth + wave(len(truth), 8, 0.3)
-    ladder = climb([measured], [np.arange(2000.0)], [rung("flat", flat), rung("truth", truth), rung("more", useless)],
+    ladder = compare_models([measured], [np.arange(2000.0)], [candidate("flat", flat), candidate("truth", truth), candidate("more", useless)],
                    [along(2000)])  # fmt: skip
-    assert ladder.rungs[ladder.recommended].model == "truth"
+    assert ladder.candidates[ladder.recommended].model == "truth"
     assert ladder.rmse_db[1] == pytest.approx(2.0, abs=0.3)
     rows = ladder_rows(ladder, [("LW1", "A")])
     assert [r.recommended for r in rows] == [False, True, False]
@@ -61,7 +61,9 @@ def test_truth_is_best_and_recommended_over_what_adds_nothing():
 def test_a_worse_model_is_never_recommended_for_being_simple():
     truth, measured = planted()
     worse = truth + wave(len(truth), 5, 3.0)
-    ladder = climb([measured], [np.arange(2000.0)], [rung("worse", worse), rung("truth", truth)], [along(2000)])
+    ladder = compare_models(
+        [measured], [np.arange(2000.0)], [candidate("worse", worse), candidate("truth", truth)], [along(2000)]
+    )
     assert ladder.recommended == ladder.best == 1
 
 
@@ -83,7 +85,7 @@ def test_models_are_scored_on_the_samples_that_all_have():
     holes[100:200] = np.nan
     deaf = np.full(len(truth), np.nan)
     deaf[:50] = -80.0
-    ladder = climb([measured], [np.arange(2000.0)], [rung("truth", truth), rung("holes", holes), rung("deaf", deaf)],
+    ladder = compare_models([measured], [np.arange(2000.0)], [candidate("truth", truth), candidate("holes", holes), candidate("deaf", deaf)],
                    [along(2000)])  # fmt: skip
     rows = ladder_rows(ladder, [("LW1", "A")])
     assert [r.n for r in rows] == [1900, 1900, 0]  # a model without levels does not take the samples of the others
@@ -94,14 +96,14 @@ def test_models_are_scored_on_the_samples_that_all_have():
 def test_two_channels_share_one_recommendation():
     truth, measured = planted()
     levels = {"flat": np.full(len(truth), -80.0), "truth": truth}
-    rungs = [Rung(model=name, level_db=(level, level), seconds=1.0) for name, level in levels.items()]
-    ladder = climb([measured, measured - 20.0], [np.arange(2000.0)] * 2, rungs, [along(2000)] * 2)
+    candidates = [CandidateModel(model=name, level_db=(level, level), seconds=1.0) for name, level in levels.items()]
+    ladder = compare_models([measured, measured - 20.0], [np.arange(2000.0)] * 2, candidates, [along(2000)] * 2)
     rows = ladder_rows(ladder, [("LW1", "A"), ("LW1", "B")])
     assert [(r.channel, r.model) for r in rows if r.recommended] == [("A", "truth"), ("B", "truth")]
 
 
 def test_nothing_measured_recommends_nothing():
-    ladder = climb([np.full(10, np.nan)], [np.arange(10.0)], [rung("flat", np.zeros(10))], [along(10)])
+    ladder = compare_models([np.full(10, np.nan)], [np.arange(10.0)], [candidate("flat", np.zeros(10))], [along(10)])
     assert ladder.recommended is None
     assert ladder_rows(ladder, [("LW1", "A")])[0].n == 0
 
@@ -120,7 +122,9 @@ def test_a_place_that_is_visited_twice_is_left_out_as_a_whole():
     # in segments of time, the way back predicts the way out
     in_time = np.repeat(np.arange(8), 100)
     assert held_out_error_db(level, np.zeros(800), everywhere, in_time)[level > 0].mean() < 7.5
-    ladder = climb([level], [np.arange(800.0)], [Rung(model="m", level_db=(np.zeros(800),), seconds=0.0)], [position])
+    ladder = compare_models(
+        [level], [np.arange(800.0)], [CandidateModel(model="m", level_db=(np.zeros(800),), seconds=0.0)], [position]
+    )
     assert ladder.error_db[0][0][level > 0] == pytest.approx(8.0)
     assert len(places_of(np.zeros((3, 2)))) == 3
     assert len(places_of(np.zeros((0, 2)))) == 0
@@ -143,12 +147,12 @@ def test_a_log_distance_line_finds_its_slope_and_is_never_the_recommended_replay
     range_db = 10.0 * np.log10(np.hypot(position[:, 0], 40.0))
     measured = -20.0 - 3.5 * range_db + rng.normal(0.0, 1.0, 800)
     zeros = np.zeros(800)
-    rungs = [
-        Rung(model="constant", level_db=(zeros,), seconds=0.0, regressor_db=(zeros,)),
-        Rung(model="line", level_db=(zeros,), seconds=0.0, regressor_db=(range_db,)),
-        Rung(model="free space", level_db=(-2.0 * range_db,), seconds=0.0),
+    candidates = [
+        CandidateModel(model="constant", level_db=(zeros,), seconds=0.0, regressor_db=(zeros,)),
+        CandidateModel(model="line", level_db=(zeros,), seconds=0.0, regressor_db=(range_db,)),
+        CandidateModel(model="free space", level_db=(-2.0 * range_db,), seconds=0.0),
     ]
-    ladder = climb([measured], [np.arange(800.0)], rungs, [position])
+    ladder = compare_models([measured], [np.arange(800.0)], candidates, [position])
     constant, line, free = ladder.rmse_db
     assert line == pytest.approx(1.0, abs=0.1)
     assert constant > free > 3.0
@@ -189,12 +193,12 @@ def test_the_fastest_sufficient_model_is_not_significantly_worse_than_the_best()
     n = 600
     truth = [rng.normal(0.0, 1.0, n) for _ in "AB"]
     position = [np.column_stack([rng.uniform(0.0, 900.0, (n, 2)), np.full(n, 40.0)]) for _ in "AB"]
-    rungs = [
-        Rung(model=model, level_db=tuple(each + rng.normal(0.0, sd, n) for each in truth), seconds=seconds)
+    candidates = [
+        CandidateModel(model=model, level_db=tuple(each + rng.normal(0.0, sd, n) for each in truth), seconds=seconds)
         for model, sd, seconds in (("worse", 3.0, 0.0), ("fast", 1.0, 0.4), ("same", 1.0, 2.0), ("slow", 1.0, 9.0))
     ]
     times = [np.arange(n, dtype=float)] * 2
-    ladder = climb(truth, times, rungs, position)
+    ladder = compare_models(truth, times, candidates, position)
     rows = {row.model: row for row in model_rows(ladder)}
     assert [model for model, row in rows.items() if row.fastest_sufficient] == ["fast"]
     assert rows["worse"].difference_to_best_ci95_db[0] > 1.0
@@ -203,7 +207,7 @@ def test_the_fastest_sufficient_model_is_not_significantly_worse_than_the_best()
     assert rows["worse"].n == 2 * n
     assert rows["worse"].difference_to_best_db == pytest.approx(rows["worse"].rmse_heldout_db - min(ladder.rmse_db))
     # without samples there is nothing to compare
-    assert model_rows(climb([each * np.nan for each in truth], times, rungs, position)) == []
+    assert model_rows(compare_models([each * np.nan for each in truth], times, candidates, position)) == []
 
 
 def test_models_that_cannot_differ_are_one_row() -> None:

@@ -9,7 +9,15 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from aerpaw_cmp.compare import statistics
-from aerpaw_cmp.compare.statistics import RATES, TERMS, WHITE_SHARES, cosine_terms, likelihoods, mean_draws, memories
+from aerpaw_cmp.compare.statistics import (
+    RATES,
+    TERMS,
+    WHITE_SHARES,
+    cosine_terms,
+    likelihoods,
+    mean_draws,
+    time_correlations,
+)
 from aerpaw_cmp.compare.verdict import stated_errors
 
 POINTS = 2000
@@ -41,7 +49,7 @@ def test_a_memory_whitens_its_terms_and_foretells_the_mean(share: int, rate: int
 
     Half the rate times the covariance has power 1 at the low end of an infinite sequence.
     """
-    white, known, at = WHITE_SHARES[share], memories(6), share * len(RATES) + rate
+    white, known, at = WHITE_SHARES[share], time_correlations(6), share * len(RATES) + rate
     covariance = (1.0 - white) * 0.5 * RATES[rate] * statistics._exponential(RATES[rate], 6) + white * np.eye(7)
     inner, cross = covariance[1:, 1:], covariance[0, 1:]
     whiten = known.whiten[at]
@@ -53,7 +61,7 @@ def test_a_memory_whitens_its_terms_and_foretells_the_mean(share: int, rate: int
 
 
 def test_the_likelihood_is_that_of_a_normal_with_its_scale_integrated_out() -> None:
-    slow, known = np.random.default_rng(1).normal(size=5), memories(5)
+    slow, known = np.random.default_rng(1).normal(size=5), time_correlations(5)
     likelihood, square = likelihoods(slow)
     scales = np.exp(np.linspace(-8.0, 8.0, 4001))
     expected = []
@@ -73,7 +81,7 @@ def test_before_any_sample_every_memory_is_possible_and_none_stands_out_from_its
 ) -> None:
     drawn = statistics.weights(kind)
     assert drawn.sum() == pytest.approx(1.0)
-    assert len(drawn) == len(memories().power)
+    assert len(drawn) == len(time_correlations().power)
     assert drawn.min() > 1e-8 * drawn.max()
     bend = np.diff(np.log(drawn).reshape(-1, len(RATES)), 2, axis=1)
     assert np.abs(bend).max() < 7.0
@@ -121,7 +129,7 @@ def test_the_ends_of_any_interval_lie_between_the_outer_thousandth_and_tenth_of_
         for seed in (n, 22):  # after 60 steps, the second walk would be outside by its shares
             values = lfilter([1.0], [1.0, -keep], np.random.default_rng(seed).normal(size=n))
             slow = cosine_terms(values).slow
-            known = [statistics.known_memories(kind, len(slow)) for kind in ("mean", "power")]
+            known = [statistics.weighted_correlations(kind, len(slow)) for kind in ("mean", "power")]
             stretches = [statistics._picked(slow, each)[2] for each in known]
             assert 0.001 < 1.0 / (1.0 + 39.0 ** max(stretches)) <= 1.0 / (1.0 + 39.0 ** min(stretches)) < 0.1
 
@@ -191,7 +199,7 @@ def test_a_memory_over_place_is_the_covariance_of_its_terms_along_the_track() ->
     basis = np.sqrt(2.0) * np.cos(np.pi * np.outer(np.arange(terms + 1), (np.arange(100) + 0.5) / 100)) / 100
     basis[0] = 0.01
     apart = np.linalg.norm(place[:, None] - place, axis=2)
-    known = statistics.place_memories(place, terms)
+    known = statistics.place_correlations(place, terms)
     assert known is not None
     for at, length in enumerate(statistics.LENGTHS * size):
         covariance = basis @ np.exp(-apart / length) @ basis.T

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.stats import spearmanr
 
-from aerpaw_cmp.compare.field_gp import FieldModel, Known, rms_db
+from aerpaw_cmp.compare.field_gp import FieldModel, FlownFlights, rms_db
 from aerpaw_cmp.compare.gains import GainModel, LinkSamples, Term, fit_gain
 from tests.compare.test_direction_gain import drawn
 
@@ -44,7 +44,7 @@ def gains(left, right):
 def test_expected_deviation_is_the_dense_posterior_of_both_flights():
     known, route = flight("a", 1, 0.0), flight("b", 2, 90.0)
     field = FieldModel(place_sd_db=2.0, length_m=40.0, height_m=30.0, turn=0.5, offset_sd_db=0.1, drift_sd_db=0.1)
-    sd_db = Known(series=[known], model=MODEL, field=field).sd_db([route], {"T.A": TARGET})["T.A"]
+    sd_db = FlownFlights(series=[known], model=MODEL, field=field).sd_db([route], {"T.A": TARGET})["T.A"]
     rows = [known, route]
     own = np.zeros((160, 160))
     for k, s in enumerate(rows):
@@ -74,15 +74,17 @@ def test_expected_deviation_is_the_dense_posterior_of_both_flights():
 def test_levels_of_the_route_and_of_known_flights_change_nothing():
     known, route = flight("a", 1, 0.0), flight("b", 2, 90.0)
     loud = dataclasses.replace(known, residual_db=np.linspace(-30, 30, 80))
-    quiet_sd, loud_sd = (Known(series=[s], model=MODEL).sd_db([route], {"T.A": TARGET})["T.A"] for s in (known, loud))
+    quiet_sd, loud_sd = (
+        FlownFlights(series=[s], model=MODEL).sd_db([route], {"T.A": TARGET})["T.A"] for s in (known, loud)
+    )
     np.testing.assert_array_equal(quiet_sd, loud_sd)
 
 
 def test_nobody_has_flown_and_an_antenna_that_no_route_sees():
-    nothing = Known(series=[], model=MODEL).sd_db([], {"T.A": TARGET})
+    nothing = FlownFlights(series=[], model=MODEL).sd_db([], {"T.A": TARGET})
     np.testing.assert_allclose(nothing["T.A"], np.hypot(2.5, 3.0))
     other = dataclasses.replace(TARGET, channel="B")
-    sd = Known(series=[flight("a", 1, 0.0)], model=MODEL).sd_db([], {"T.B": other})["T.B"]
+    sd = FlownFlights(series=[flight("a", 1, 0.0)], model=MODEL).sd_db([], {"T.B": other})["T.B"]
     np.testing.assert_allclose(sd, np.hypot(2.5, 3.0))
 
 
@@ -91,7 +93,7 @@ def test_ranking_follows_the_true_error_on_fields_of_known_covariance():
     known = flight("a", 1, 0.0)
     routes = [flight("b", 10 + k, 45.0 * k, reach=60.0 + 40.0 * k) for k in range(7)]
     routes += [flight("b", 20, 0.0, n=20), flight("b", 1, 0.0), flight("b", 22, 180.0, n=30)]
-    expected = [rms_db(Known(series=[known], model=MODEL).sd_db([r], {"T.A": TARGET})) for r in routes]
+    expected = [rms_db(FlownFlights(series=[known], model=MODEL).sd_db([r], {"T.A": TARGET})) for r in routes]
     squares = np.zeros(len(routes))
     rng = np.random.default_rng(5)
     for _ in range(20):

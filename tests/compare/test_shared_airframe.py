@@ -9,7 +9,7 @@ from aerpaw_cmp.compare.calibration import Observed, Recipe, campaign_left_out, 
 from aerpaw_cmp.compare.gains import (
     FlightEvidence,
     GainModel,
-    KnownProcess,
+    GainProcess,
     LinkSamples,
     Term,
     gain_covariance,
@@ -42,11 +42,11 @@ def observed(series):
     return [Observed(s, np.zeros(len(s)), np.zeros(len(s))) for s in series]
 
 
-def process(series) -> KnownProcess:
+def process(series) -> GainProcess:
     """The airframe that flights taught."""
     fit, antenna = learn(series, Recipe(GainModel())).fit, series[0].antenna
     at = fit.seen("body", antenna)[::3]
-    return KnownProcess(
+    return GainProcess(
         gain_db=lambda d: fit.gain("body", antenna, d)[0],
         sd_db=lambda d: fit.gain("body", antenna, d)[1],
         directions=at,

@@ -5,7 +5,7 @@ import pytest
 
 from aerpaw_cmp.compare.locate import NodeEstimate, locate
 from aerpaw_cmp.flight.drafting import proposals
-from aerpaw_cmp.flight.drafting.proposals import ListedPlace, Placer, listed_places
+from aerpaw_cmp.flight.drafting.proposals import ListedPlace, NodeFinder, listed_places
 from aerpaw_cmp.flight.rows import LOCK_FLOOR_DB
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
@@ -28,11 +28,11 @@ def test_the_rover_is_found_within_its_region(monkeypatch: pytest.MonkeyPatch) -
         (path,) = REAL.glob(name)
         (file,) = ingest([path], options=ReadOptions(timezone="America/New_York"))
         vehicle, power = (next(s for s in file.result.streams if s.name == n) for n in ("vehicle", "power"))
-        placer = Placer(site, vehicle, listed[:3])
-        track = placer.levels(power, LOCK_FLOOR_DB)
+        finder = NodeFinder(site, vehicle, listed[:3])
+        track = finder.levels(power, LOCK_FLOOR_DB)
         rover: ListedPlace = listed[int(path.stem[-1]) - 1]
         east, north = site.frame.to_local(np.array([rover.latitude_deg]), np.array([rover.longitude_deg]))
-        proposal = placer.propose(track)
+        proposal = finder.propose(track)
         estimate = estimates[-1]
         errors.append(float(np.hypot(estimate.place_m[0] - east[0], estimate.place_m[1] - north[0])))
         inside += errors[-1] <= estimate.radius90_m
@@ -42,6 +42,6 @@ def test_the_rover_is_found_within_its_region(monkeypatch: pytest.MonkeyPatch) -
     assert sum(error <= 50.0 for error in errors) >= 5, errors
     assert inside >= 5
     assert right >= 5  # the sixth is said to be line 2 or line 3
-    proposal = Placer(site, vehicle).propose(track)
+    proposal = NodeFinder(site, vehicle).propose(track)
     assert proposal is not None
     assert proposal.node == "NODE"  # and no tower

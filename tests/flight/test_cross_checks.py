@@ -12,7 +12,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.flight.cross_checks import _lowest_m, check_heights, doubts, questions
-from aerpaw_cmp.flight.drafting.proposals import Placer
+from aerpaw_cmp.flight.drafting.proposals import NodeFinder
 from aerpaw_cmp.logs.ingest import IngestedFile
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, Stream
 from aerpaw_cmp.site.siteyaml import load_site
@@ -148,12 +148,12 @@ def test_levels_doubt_a_named_tower_only_where_another_fits_far_better() -> None
     frame = pd.DataFrame({name: np.resize(frame[name].to_numpy(), 500) for name in frame.columns})
     time = np.datetime64("2024-07-02T15:00:00", "ns") + np.arange(500) * np.timedelta64(1, "s")
     frame = frame.assign(time=time, latitude_deg=latitude, longitude_deg=longitude, altitude_m=30.0)
-    placer = Placer(site, Stream("telemetry", "vehicle", frame))
+    finder = NodeFinder(site, Stream("telemetry", "vehicle", frame))
     away = np.linalg.norm(np.column_stack([east, north, np.full(500, 30.0)]) - start, axis=1)
     level = frame[["time", "line", "flag"]].assign(rss_db=-60.0 - 30.0 * np.log10(away / 100.0))
-    track = placer.levels(Stream("rss", "power", level))
-    assert placer.contradiction(track, "LW1") is None
-    doubts = [placer.contradiction(track, name) for name in names if name != "LW1"]
+    track = finder.levels(Stream("rss", "power", level))
+    assert finder.contradiction(track, "LW1") is None
+    doubts = [finder.contradiction(track, name) for name in names if name != "LW1"]
     assert "LW1" in doubts
     assert set(doubts) <= {None, "LW1"}
-    assert placer.contradiction(track, "elsewhere") is None
+    assert finder.contradiction(track, "elsewhere") is None

@@ -453,7 +453,7 @@ def test_a_ratio_to_the_noise_gets_a_span_from_its_levels(logs: Path) -> None:
     text, _ = draft(files, logs, DraftOptions(timezone=ZONE))
     settings = parse_yaml(text, FlightFile)
     (series,) = load_data(settings, logs).rss
-    placed = drafting.Placer(load_site("lake_wheeler"), next(f for f in files if "UAV" in f.path).result.streams[0])
+    placed = drafting.NodeFinder(load_site("lake_wheeler"), next(f for f in files if "UAV" in f.path).result.streams[0])
     level = next(s for f in files if "snr" in f.path for s in f.result.streams)
     expected = placed.offset_db(placed.levels(level), "LW1")
     assert series.channel

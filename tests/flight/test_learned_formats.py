@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.gains import ANTENNA_TERMS, link_directions, term_kernel
 from aerpaw_cmp.flight.data import load_data
-from aerpaw_cmp.flight.drafting.proposals import Placer, searching_airframe
+from aerpaw_cmp.flight.drafting.proposals import NodeFinder, searching_airframe
 from aerpaw_cmp.flight.gains import sphere_angles
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.logs.ingest import ingest
@@ -22,7 +22,7 @@ from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.writers import format_power_log
 from aerpaw_cmp.propagation.geometry import rotation_from_aircraft
 from aerpaw_cmp.site.learned import (
-    KnownDirections,
+    DirectionCovariance,
     LearnedLevel,
     SpherePattern,
     folder_of,
@@ -63,7 +63,7 @@ def known_site(folder: Path, turn_deg: int = 0) -> Path:
     _, _, v = sphere_grid(20.0)
     at = v.reshape(-1, 3)[18:-17]
     known, of_towers = (
-        KnownDirections(directions=at, covariance_db2=0.05 * term_kernel(term, at, at)).table(()).encode()
+        DirectionCovariance(directions=at, covariance_db2=0.05 * term_kernel(term, at, at)).table(()).encode()
         for term in ANTENNA_TERMS[:2]
     )
     uav = table(np.roll(UAV, turn_deg // 5, axis=1))
@@ -299,6 +299,6 @@ def test_levels_choose_the_airframe_for_a_node_at_an_unknown_place(turn_deg, sha
     pose, level = (ingest([tmp_path / name], options=options)[0] for name in ("track.csv", "meter a.csv"))
     (vehicle,), (power,) = pose.result.streams, level.result.streams
     assert power.attributes["unit"] == "dBm"
-    track = Placer(SITE, vehicle).levels(power)
+    track = NodeFinder(SITE, vehicle).levels(power)
     airframe = searching_airframe(known_site(tmp_path, turn_deg), (sha256, ""), track, carrier_hz)
     assert (airframe is not None) is found

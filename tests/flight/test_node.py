@@ -126,14 +126,14 @@ def test_relative_levels_are_placed_where_the_track_that_dates_them_was(tmp_path
     assert parse_yaml(text, FlightFile).rss.span_db == (40.0, 90.0)  # Friis: 62.2 dB at 100 m
 
 
-def _placer(listed: list[node.ListedPlace] | None = None) -> node.Placer:
+def _node_finder(listed: list[node.ListedPlace] | None = None) -> node.NodeFinder:
     track = _track()
     latitude, longitude = SITE.frame.to_geographic(track[:, 0], track[:, 1])
     time = np.datetime64("2025-06-01T14:00:00", "ns") + np.arange(500) * np.timedelta64(1, "s")
     frame = pd.DataFrame({"time": time, "line": 1, "flag": "", "latitude_deg": latitude, "longitude_deg": longitude,
                           "altitude_m": np.where(np.arange(500) < 9, 4.9, track[:, 2])})  # fmt: skip
     nothing = dict.fromkeys(set(COLUMNS["telemetry"]) - set(frame), np.nan)
-    return node.Placer(SITE, Stream("telemetry", "x", frame.assign(**nothing)), listed or [])
+    return node.NodeFinder(SITE, Stream("telemetry", "x", frame.assign(**nothing)), listed or [])
 
 
 def _place(at: tuple[float, float], line: int) -> node.ListedPlace:
@@ -151,7 +151,7 @@ def test_a_tower_stands_unless_a_place_wins_and_a_listed_one_wants_as_much_as_an
 ) -> None:
     """Odds of towers are in their order. A list has lines 7 and 8, and a line 6 km away whose odds are not computed."""
     names = list(SITE.towers)
-    placer = _placer(
+    finder = _node_finder(
         [_place((-100.0, 50.0), 7), _place((250.0, -90.0), 8), _place((6000.0, 0.0), 9)][: 3 * bool(listed)]
     )
     odds = np.full(len(names), -20.0)
@@ -166,10 +166,10 @@ def test_a_tower_stands_unless_a_place_wins_and_a_listed_one_wants_as_much_as_an
     monkeypatch.setattr(node, "locate", lambda _: estimate)
     monkeypatch.setattr(node, "place_odds", lambda _, places: asked.append(places) or np.array([*odds, *listed]))
     track = level_track(4.0 * np.arange(20), np.zeros((20, 3)), np.zeros(20))
-    proposal = placer.propose(track)
+    proposal = finder.propose(track)
     assert proposal is not None
     assert len(asked[0]) == len(names) + len(listed)
-    assert placer.propose(level_track(4.0 * np.arange(19), np.zeros((19, 3)), np.zeros(19))) is None
+    assert finder.propose(level_track(4.0 * np.arange(19), np.zeros((19, 3)), np.zeros(19))) is None
     if isinstance(said, int):
         assert proposal.tower is not None
         assert (proposal.node, proposal.tower["antenna_height_m"], proposal.radius_m) == ("NODE", 1.5, 0.0)
@@ -184,7 +184,7 @@ def test_a_tower_stands_unless_a_place_wins_and_a_listed_one_wants_as_much_as_an
         assert (f"({', '.join(near)} possible)" if near else "no tower fits") in proposal.question
         assert (proposal.radius_m, proposal.tower["antenna_height_m"]) == (77.0, 10.0)
         assert proposal.position_m is not None
-        again = placer.propose(track, nodes={proposal.node: proposal.position_m})
+        again = finder.propose(track, nodes={proposal.node: proposal.position_m})
         assert again is not None
         assert (again.node, again.tower) == (proposal.node, None)  # the same place has one name
     else:
@@ -192,7 +192,7 @@ def test_a_tower_stands_unless_a_place_wins_and_a_listed_one_wants_as_much_as_an
 
 
 def test_nodes_a_hundred_metres_apart_have_names_of_their_own() -> None:
-    placer = _placer()
+    finder = _node_finder()
     names, nodes = [], {}
     for east in (0.0, 99.0, 101.0, 300.0, 102.0):
         placement = node._node(np.array([east, 0.0, 1.5]), (35.0, -78.0, 1.5), "", nodes)
@@ -200,10 +200,10 @@ def test_nodes_a_hundred_metres_apart_have_names_of_their_own() -> None:
         names.append(placement.node)
     assert names == ["NODE", "NODE", "NODE2", "NODE3", "NODE2"]
     for away, near in ((4990.0, True), (5010.0, False)):
-        place = _place((placer.track.pose_at(np.array([placer.track.start_ns], "datetime64[ns]")).position_m[0, 0] + away,
+        place = _place((finder.track.pose_at(np.array([finder.track.start_ns], "datetime64[ns]")).position_m[0, 0] + away,
                         float(_track()[0, 1])), 1)  # fmt: skip
-        assert placer._near(place.latitude_deg, place.longitude_deg) is near
-    assert placer.at_site
+        assert finder._near(place.latitude_deg, place.longitude_deg) is near
+    assert finder.at_site
 
 
 @pytest.mark.parametrize(("more", "other"), [(7.9, None), (8.1, "LW2")])
@@ -214,10 +214,10 @@ def test_another_tower_is_named_where_its_evidence_is_far_above(
     evidence[1] = more
     monkeypatch.setattr(node, "fit_places", lambda *_: SimpleNamespace(evidence=evidence))
     track = level_track(4.0 * np.arange(20), np.zeros((20, 3)), np.zeros(20))
-    assert _placer().contradiction(track, "LW1") == other
-    assert _placer().contradiction(track, "LW2") is None
-    assert _placer().contradiction(track, "elsewhere") is None
-    assert _placer().contradiction(level_track([0.0], np.zeros((1, 3)), [1.0]), "LW1") is None
+    assert _node_finder().contradiction(track, "LW1") == other
+    assert _node_finder().contradiction(track, "LW2") is None
+    assert _node_finder().contradiction(track, "elsewhere") is None
+    assert _node_finder().contradiction(level_track([0.0], np.zeros((1, 3)), [1.0]), "LW1") is None
 
 
 def test_levels_are_taken_in_flight_and_their_offset_is_that_to_free_space() -> None:
@@ -225,43 +225,45 @@ def test_levels_are_taken_in_flight_and_their_offset_is_that_to_free_space() -> 
 
     Samples below five metres are ignored, and levels below the receiver's floor count as the floor.
     """
-    placer = _placer()
+    finder = _node_finder()
     time = np.datetime64("2025-06-01T14:00:00", "ns") + np.arange(400) * np.timedelta64(1, "s")
     away = np.linalg.norm(_track()[:400] - SITE.towers["LW1"].position_m, axis=1)
     level = 40.0 - 20.0 * np.log10(4.0 * np.pi * away * 3.3e9 / 299792458.0) - 17.0
     frame = pd.DataFrame({"time": time, "line": 1, "flag": "", "rss_db": level})
-    track = placer.levels(Stream("rss", "power", frame))
+    track = finder.levels(Stream("rss", "power", frame))
     assert track.time_s.min() - time[0].astype(np.int64) * 1e-9 > 8.0
-    assert placer.offset_db(track, "LW1") == pytest.approx(17.0, abs=0.2)
-    assert placer.offset_db(track, "nowhere") is None
+    assert finder.offset_db(track, "LW1") == pytest.approx(17.0, abs=0.2)
+    assert finder.offset_db(track, "nowhere") is None
     frame.loc[200:, "rss_db"] = np.nan
     frame.loc[200:299, "flag"] = "out_of_coverage"
-    lost = placer.levels(Stream("rss", "power", frame), -90.0)
+    lost = finder.levels(Stream("rss", "power", frame), -90.0)
     assert lost.below.sum() == 25
     assert lost.time_s.max() - time[0].astype(np.int64) * 1e-9 < 300.0
 
 
-def _taught() -> node.Taught:
-    """Antennas with lobes at both ends, as flights would have taught them."""
+def _learned_tower() -> node.LearnedTower:
+    """Antennas with lobes at both ends, as if learned from flights."""
     _, _, v = sphere_grid()
     tower, uav = (unit_mean_gain(5.0 * v[..., a] - 3.0 * v[..., b]) for a, b in ((0, 1), (1, 0)))
     sd = np.zeros(v.shape[:2])
     model = LevelModel(slope=2.0, slope_sd=0.2, elevation_sd_db=1.0, cases=known_cases(1.6, 1.4))
-    return node.Taught(SpherePattern("tower", tower, sd), SpherePattern("uav", uav, sd), model)
+    return node.LearnedTower(SpherePattern("tower", tower, sd), SpherePattern("uav", uav, sd), model)
 
 
-def _flown(placer: node.Placer, gains: node.Taught, at: str | tuple[float, float, float], part: slice) -> LevelTrack:
+def _flown(
+    finder: node.NodeFinder, gains: node.LearnedTower, at: str | tuple[float, float, float], part: slice
+) -> LevelTrack:
     """Free space and the gains of both ends, 2 dB of noise, along a part of the flight."""
     place = np.array(SITE.towers[at].position_m if isinstance(at, str) else at)
-    time = placer.telemetry.frame["time"].to_numpy()[part]
-    pose = placer.track.pose_at(time)
+    time = finder.telemetry.frame["time"].to_numpy()[part]
+    pose = finder.track.pose_at(time)
     ray = pose.position_m - place
     away = np.linalg.norm(ray, axis=1)
     towards = -ray / away[:, None]
     body = np.einsum("nji,nj->ni", pose.rotation, towards)
     level = gains.tower.gain_dbi(*sphere_angles(-towards)) + gains.uav.gain_dbi(*sphere_angles(body))
     level = level - 20.0 * np.log10(away) + np.random.default_rng(8).normal(0.0, 2.0, len(away))
-    return placer.levels(Stream("rss", "power", pd.DataFrame({"time": time, "line": 1, "flag": "", "rss_db": level})))
+    return finder.levels(Stream("rss", "power", pd.DataFrame({"time": time, "line": 1, "flag": "", "rss_db": level})))
 
 
 @pytest.mark.parametrize("part", [slice(100, 220), slice(300, 400), slice(0, 500)])
@@ -271,8 +273,8 @@ def test_a_cut_flight_keeps_a_tower_whose_antennas_flights_taught(
 ) -> None:
     """For a node elsewhere, the tower's antennas explain nothing."""
     monkeypatch.setattr(node, "place_odds", lambda _, towers: np.full(len(towers), -9.0))
-    placer, gains = _placer(), _taught()
-    placement = placer.propose(_flown(placer, gains, at, part), {"LW1": [gains]})
+    finder, gains = _node_finder(), _learned_tower()
+    placement = finder.propose(_flown(finder, gains, at, part), {"LW1": [gains]})
     assert placement is not None
     assert (placement.node == "LW1") == keeps
     if keeps:
@@ -286,8 +288,8 @@ def test_of_towers_that_fit_alike_the_receivers_own_is_proposed(
 ) -> None:
     """Log odds of the second quarter of a flight about LW1."""
     monkeypatch.setattr(node, "place_odds", lambda _, towers: np.array([1.6, 1.9, -1.2, -1.4, -3.8])[: len(towers)])
-    placer, gains = _placer(), _taught()
-    placement = placer.propose(_flown(placer, gains, "LW1", slice(0, 500)), {name: [] for name in usual})
+    finder, gains = _node_finder(), _learned_tower()
+    placement = finder.propose(_flown(finder, gains, "LW1", slice(0, 500)), {name: [] for name in usual})
     assert placement is not None
     assert placement.node == said
     assert f"the levels fit LW2 or LW1 as well as any other position: is it {said}?" in placement.question
@@ -302,8 +304,8 @@ def test_a_tower_stands_beside_antennas_of_which_nothing_is_known(
     at: str | tuple[float, float, float], part: slice, said: str
 ) -> None:
     """With a model of distance alone, antenna lobes look like another position. A node in range is still found."""
-    placer, gains = _placer(), _taught()
-    placement = placer.propose(_flown(placer, gains, at, part))
+    finder, gains = _node_finder(), _learned_tower()
+    placement = finder.propose(_flown(finder, gains, at, part))
     assert placement is not None
     assert placement.node == said
     assert ("as well as any other position" in placement.question) == (said != "NODE")

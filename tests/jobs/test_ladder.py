@@ -17,7 +17,14 @@ from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.drafting.proposals import offered
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.flight_run import Model, _Climber, cause_beyond_models, next_step, recommended_changes, run_flight
+from aerpaw_cmp.jobs.flight_run import (
+    Model,
+    _ModelSearch,
+    cause_beyond_models,
+    next_step,
+    recommended_changes,
+    run_flight,
+)
 from aerpaw_cmp.site.learned import Errors, folder_of, remember, sphere_csv, unit_mean_gain
 from tests.learned_entries import learned_entry, learned_series, learned_tables
 from tests.simulated import planned, simulate, write_yaml
@@ -192,9 +199,9 @@ def test_an_isotropic_flight_is_offered_what_its_site_remembers(
     Whether learned antennas are recommended depends on their error on other flights.
     """
     metrics = report(remembering(tmp_path, learned_db), capsys, "--recommend", str(tmp_path / "best.yaml"))
-    rungs = {row["model"]: row for row in metrics["ladder"]}
-    assert {"learned sphere", "learned sphere + heading"} <= set(rungs)
-    assert rungs["learned sphere + heading"]["recommended"] == chosen
+    candidates = {row["model"]: row for row in metrics["ladder"]}
+    assert {"learned sphere", "learned sphere + heading"} <= set(candidates)
+    assert candidates["learned sphere + heading"]["recommended"] == chosen
     assert bool(load_flight(tmp_path / "best.yaml").antennas) == chosen
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert ("best on other flights (3.5 dB, free space 5.0 dB)" in page) == chosen
@@ -248,22 +255,22 @@ def test_a_recommended_model_removes_diffraction(tmp_path: Path) -> None:
 def test_channels_that_share_a_replay_cost_its_seconds_once() -> None:
     """Ten channels of one replay of 5 s, and one of another tower of 2 s: 7 s, not 52 s."""
     rss = [SimpleNamespace(tower="LW1", settings_key="{}")] * 10 + [SimpleNamespace(tower="LW2", settings_key="{}")]
-    climber = SimpleNamespace(_data=SimpleNamespace(rss=rss))
-    assert _Climber._of_flight(climber, [5.0] * 10 + [2.0]) == 7.0  # type: ignore[arg-type]
+    search = SimpleNamespace(_data=SimpleNamespace(rss=rss))
+    assert _ModelSearch._of_flight(search, [5.0] * 10 + [2.0]) == 7.0  # type: ignore[arg-type]
     other = [*rss[:2], SimpleNamespace(tower="LW1", settings_key='{"carrier_hz": 1}')]
-    assert _Climber._of_flight(SimpleNamespace(_data=SimpleNamespace(rss=other)), [5.0, 4.0, 3.0]) == 8.0  # type: ignore[arg-type]
+    assert _ModelSearch._of_flight(SimpleNamespace(_data=SimpleNamespace(rss=other)), [5.0, 4.0, 3.0]) == 8.0  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("share", "line", "gains"), [(0.98, 2, False), (0.9, 2, True), (0.9, 0.9, False)])
 def test_a_gain_that_no_page_could_show_is_no_advice(share: float, line: float, gains: bool) -> None:
     """Improvements of 0.06 and 0.3 dB from 3 dB are significant, but not for a constant level at one position."""
     error_db = 3.0 * np.random.default_rng(1).normal(size=3000)
-    climber = _Climber.__new__(_Climber)
-    climber._series = [SimpleNamespace(time_s=np.arange(3000.0))]  # type: ignore[list-item]
+    search = _ModelSearch.__new__(_ModelSearch)
+    search._series = [SimpleNamespace(time_s=np.arange(3000.0))]  # type: ignore[list-item]
     errors = ([line * error_db], [share * error_db], [error_db])
     ladder = SimpleNamespace(recommended=1, error_db=errors, position_m=[np.full((3000, 3), np.nan)])
     assert paired_difference(share * error_db, error_db).verdict == "better"
-    assert climber._is_better(ladder) == gains  # type: ignore[arg-type]
+    assert search._is_better(ladder) == gains  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -275,10 +282,10 @@ def test_a_loss_over_directions_is_no_cause_where_another_model_explains_as_much
     """The recommended model gains 0.7 dB on the flight as set."""
     cause = Cause(name=name, sentence="", next_step="", rmse_db=3.4, rmse_with_db=3.4 - explained_db)
     ladder = SimpleNamespace(recommended=0, rmse_db=(3.0, 5.0, 3.7))
-    climbed: Any = SimpleNamespace(recommended=Model(), ladder=ladder)
-    assert (cause_beyond_models(cause, climbed) is cause) == stays
-    climbed.recommended = None
-    assert cause_beyond_models(cause, climbed) is cause
+    comparison: Any = SimpleNamespace(recommended=Model(), scores=ladder)
+    assert (cause_beyond_models(cause, comparison) is cause) == stays
+    comparison.recommended = None
+    assert cause_beyond_models(cause, comparison) is cause
 
 
 @pytest.mark.parametrize("logs", [None, ("ab" * 32,)])

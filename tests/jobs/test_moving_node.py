@@ -14,7 +14,7 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.audit_flight import standing
 from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series
 from aerpaw_cmp.jobs.explain import run_explain
-from aerpaw_cmp.jobs.flight_run import flight_ladder
+from aerpaw_cmp.jobs.flight_run import flight_comparison
 from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
@@ -99,11 +99,11 @@ def test_rank_and_ladder_have_the_place_of_each_sample(case):
     _, data, rss, rank = case
     assert rank[0].tower_m.shape == (len(rank[0].poses), 3)
     np.testing.assert_allclose(rank[0].tower_m, rover(np.r_[0:51, 60:121].astype(float)), atol=1e-3)
-    ladder = flight_ladder(data, FlightReplay(rss=tuple(rss), rank=()))
-    names = [rung.model for rung in ladder.ladder.rungs]
+    comparison = flight_comparison(data, FlightReplay(rss=tuple(rss), rank=()))
+    names = [candidate.model for candidate in comparison.scores.candidates]
     coherent = names.index(next(n for n in names if n.startswith("coherent ground reflection")))
-    assert ladder.ladder.rmse_db[coherent] < 0.02
-    assert ladder.ladder.rmse_db[0] > 0.5
+    assert comparison.scores.rmse_db[coherent] < 0.02
+    assert comparison.scores.rmse_db[0] > 0.5
 
 
 def test_explain_stands_where_the_rover_was(case):

@@ -16,7 +16,7 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.outputs import file_digest
-from aerpaw_cmp.flight.drafting.proposals import every_antenna, taught
+from aerpaw_cmp.flight.drafting.proposals import all_learned_links, learned_towers
 from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.training import mark_of
@@ -88,7 +88,7 @@ def test_levels_are_compared_with_antennas_of_other_flights_alone(folder, site, 
     if loses_lock:
         remember(folder / "mine.yaml", "d12", entry("A", lock=LOCK), learned_tables("A", (f"marks: {MARK}",)))
     log = log, MARK if log == "copy" else ""
-    assert {tower for tower, gains in taught(folder / site, log, loses_lock=True).items() if gains} == towers
+    assert {tower for tower, gains in learned_towers(folder / site, log, loses_lock=True).items() if gains} == towers
 
 
 def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:
@@ -433,7 +433,7 @@ def test_a_table_edited_by_hand_is_refused_with_the_command_that_learns_it(folde
     (caution,) = load_with_learned(flight(folder, {"LW1.A": "mine/d12_LW1.A"})).cautions
     assert "aerpaw-cmp calibrate c.yaml --into-site s.yaml" in caution.text
     with pytest.raises(InputError, match="is not the one that was learned"):
-        every_antenna(site)
+        all_learned_links(site)
     remember(site, "d12", entry("A"), learned_tables("A"))
     assert load_with_learned(flight(folder, {"LW1.A": "mine/d12_LW1.A"})).cautions == ()
 
@@ -454,9 +454,9 @@ def test_a_set_that_a_killed_calibration_left_is_repaired_by_learning_again(
         with pytest.raises(KeyboardInterrupt):
             remember(site, "d12", entry("A"), other)
     with pytest.raises(InputError, match="a calibration that was killed"):
-        every_antenna(site)
+        all_learned_links(site)
     remember(site, "d12", entry("A"), other)
-    assert len(every_antenna(site)) == 1
+    assert len(all_learned_links(site)) == 1
 
 
 def test_an_edited_value_is_refused_and_replaced_by_learning_again(folder: Path) -> None:

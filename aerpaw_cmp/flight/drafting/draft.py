@@ -38,15 +38,15 @@ from ..training import mark_of
 from .proposals import (
     CARRIER_HZ,
     POWER_DBM,
+    NodeFinder,
     Nodes,
     Placement,
-    Placer,
     Proposal,
     Receiver,
+    learned_towers,
     listed_places,
     propose,
     searching_airframe,
-    taught,
     with_antennas,
 )
 
@@ -204,7 +204,7 @@ def draft(
         positioned=any(_has_positions(stream) for stream in every),
         locks=any(may_lose_lock(stream) for stream in every),
         towers=tuple(site.towers),
-        placer=_placer(files, flown, site),
+        finder=_node_finder(files, flown, site),
     )
     lines = _lines(files, context)
     kinds = {stream.kind for line in lines for stream in line.compared}
@@ -229,7 +229,7 @@ def draft(
 
     # the counts in the remarks come from a dry run, which reads and gathers the flight as a report does
     proof = _proof(text_with(Proposal()), folder, [line.file for line in used])
-    known, remarks = _remembered(lines, context, proof.data)
+    known, remarks = _learned_antennas(lines, context, proof.data)
     text = text_with(known)
     parse_yaml(text, FlightFile)  # an error here is a bug of this module
     if proof.reason:
@@ -381,13 +381,13 @@ _QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers t
 _SURE_M = 100.0
 
 
-def _remembered(lines: Sequence[_Line], context: _Context, data: FlightData | None) -> tuple[Proposal, list[str]]:
+def _learned_antennas(lines: Sequence[_Line], context: _Context, data: FlightData | None) -> tuple[Proposal, list[str]]:
     """Return the learned antennas that fit, or an empty proposal and a remark if they cannot be read."""
     if data is None:
         return Proposal(), []
     site = context.options.site
     placed = [p.node for line in lines for p in line.places if p.tower is not None and p.radius_m <= _SURE_M]
-    nodes = Nodes(placed=frozenset(placed), fixed=() if context.placer is None else context.towers)
+    nodes = Nodes(placed=frozenset(placed), fixed=() if context.finder is None else context.towers)
     try:
         return propose(data, site_place(site, context.folder), str(Path(site).with_suffix("")), nodes), []
     except (InputError, UsageError) as error:
@@ -483,9 +483,9 @@ _SIGHTS, _SHADED_SHARE = 200, 0.01
 
 def _shaded(lines: Sequence[_Line], context: _Context) -> tuple[str, list[str]]:
     """Return the keys of ``rt`` for links through woods or behind buildings, and comments with their share."""
-    if context.placer is None:
+    if context.finder is None:
         return "", []
-    site, positions = context.placer.site, context.placer.positions_m(_SIGHTS)
+    site, positions = context.finder.site, context.finder.positions_m(_SIGHTS)
     towers = {_key(s, line.entry)[0] for line in lines for s in line.compared if s.kind != "telemetry"}
     names = sorted(towers & set(site.towers))
     if not names or not len(positions):
@@ -516,13 +516,13 @@ def _span_of_offsets(offsets_db: Sequence[float]) -> dict[str, Any]:
     return {"span_db": [10 * floor(low / 10.0), 10 * ceil(high / 10.0)]}
 
 
-def _placer(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, site: Site) -> Placer | None:
+def _node_finder(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, site: Site) -> NodeFinder | None:
     """Return the proposals for nodes. None if there is no track at the site."""
     if flown is None or lacks_height(flown[0]):
         return None
     listed = listed_places(Path(file.path).resolve().parent for file in files)
-    placer = Placer(site, flown[0], listed)
-    return placer if placer.at_site else None
+    finder = NodeFinder(site, flown[0], listed)
+    return finder if finder.at_site else None
 
 
 def _has_attitude(frame: Any, names: Sequence[str] = ("roll_deg", "pitch_deg", "yaw_deg")) -> bool:
@@ -571,7 +571,7 @@ class _Context:
         True if the receiver is a sounder that can lose its lock.
     towers : sequence of str
         Towers of the site.
-    placer : Placer, optional
+    finder : NodeFinder, optional
         Proposals for nodes, or None if there is no track at the site.
     """
 
@@ -584,7 +584,7 @@ class _Context:
     positioned: bool
     locks: bool
     towers: Sequence[str]
-    placer: Placer | None
+    finder: NodeFinder | None
 
     @property
     def track(self) -> Stream | None:
@@ -784,13 +784,13 @@ def _with_node(
 ) -> tuple[dict[str, Any], str, tuple[Placement, ...]]:
     """Return the keys of a log with its nodes, the question about them, and the nodes that its levels fit."""
     entry, comment = _entry(file, path, context.towers)
-    placer = context.placer
-    if placer is None:
+    finder = context.finder
+    if finder is None:
         return entry, comment, ()
     proper = (s for s in streams if not (context.has_level and is_own_radio(s)))
     levels = [context.dated(s, origin) for s in proper if s.kind == "rss" and not is_ratio(s)]
     if not comment:
-        return entry, _doubt(entry, levels, placer, context), ()
+        return entry, _doubt(entry, levels, finder, context), ()
     places: list[Placement] = []
     for cell in entry.get("cells", [None]):
         # receivers of one node are at one position, so the first level suffices
@@ -798,7 +798,7 @@ def _with_node(
         if level is None:
             continue
         nodes = _nodes([*earlier, _Line(file=file, shown="", places=tuple(places))])
-        place = _placement(file, level, placer, context, nodes)
+        place = _placement(file, level, finder, context, nodes)
         if place is None:
             continue
         places.append(place)
@@ -811,21 +811,21 @@ def _with_node(
 
 
 def _placement(
-    file: IngestedFile, level: Stream, placer: Placer, context: _Context, nodes: Mapping[str, FloatArray]
+    file: IngestedFile, level: Stream, finder: NodeFinder, context: _Context, nodes: Mapping[str, FloatArray]
 ) -> Placement | None:
     """Return the tower or position that a level fits. None if the level has too few samples."""
     site = site_place(context.options.site, context.folder)
     log = file.sha256, mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
-    track = placer.levels(level, context.floor_db(level))
+    track = finder.levels(level, context.floor_db(level))
     airframe = searching_airframe(site, log, track) if is_sounder_power(level) else None
-    return placer.propose(with_antennas(track, airframe), taught(site, log, loses_lock=False), nodes)
+    return finder.propose(with_antennas(track, airframe), learned_towers(site, log, loses_lock=False), nodes)
 
 
-def _doubt(entry: Mapping[str, Any], levels: Sequence[Stream], placer: Placer, context: _Context) -> str:
+def _doubt(entry: Mapping[str, Any], levels: Sequence[Stream], finder: NodeFinder, context: _Context) -> str:
     """Return a question if a name specifies a tower that the levels contradict."""
     for level in levels:
         node = str(entry.get("node") or level.attributes.get("node"))
-        better = placer.contradiction(placer.levels(level, context.floor_db(level)), node)
+        better = finder.contradiction(finder.levels(level, context.floor_db(level)), node)
         if better is not None:
             return f"  # the name says {node}, the levels fit {better} far better: which tower?"
     return ""
@@ -835,11 +835,11 @@ def _offset_db(
     level: Stream, entry: Mapping[str, Any], nodes: Mapping[str, FloatArray], context: _Context
 ) -> float | None:
     """Return the offset that a level needs against free space [dB]. None if its node is unknown."""
-    if context.placer is None or level.kind != "rss":
+    if context.finder is None or level.kind != "rss":
         return None
     cell = entry.get("cells", {}).get(_cell_of(level))
     node = str(cell or entry.get("node") or level.attributes.get("node"))
-    return context.placer.offset_db(context.placer.levels(level, context.floor_db(level)), node, nodes)
+    return context.finder.offset_db(context.finder.levels(level, context.floor_db(level)), node, nodes)
 
 
 def _origin(streams: Sequence[Stream], flown: tuple[Stream, Span] | None) -> Origin | None:
@@ -1054,7 +1054,7 @@ def _carrier(
     if len(tracks) == 1:
         return flown, ""
     levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
-    evidence = [max((Placer(site, s).evidence(level) for level in levels), default=-np.inf) for s, _ in tracks]
+    evidence = [max((NodeFinder(site, s).evidence(level) for level in levels), default=-np.inf) for s, _ in tracks]
     order = np.argsort(evidence)
     # all must have evidence, because a track without levels does not exclude another
     sure = np.isfinite(evidence).all() and evidence[order[-1]] - evidence[order[-2]] > _SURE_OF_VEHICLE

@@ -27,7 +27,7 @@ from ...compare.gains import (
     PAIR,
     Evidence,
     FlightEvidence,
-    KnownProcess,
+    GainProcess,
     LinkSamples,
     Moments,
     Spread,
@@ -51,7 +51,14 @@ from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
 from ...site import learned
 from ...site.antennas import MeasuredPattern
-from ...site.learned import KnownDirections, SpherePattern, check_logs, read_known, read_pair, read_sphere_csv
+from ...site.learned import (
+    DirectionCovariance,
+    SpherePattern,
+    check_logs,
+    read_direction_covariance,
+    read_pair,
+    read_sphere_csv,
+)
 from ...site.site import Site
 from ..data import RATIOS, FlightData, RssSeries, quantity_of
 from ..gains import pair_and_sd_db, sphere_angles, spread_of, with_learned
@@ -67,7 +74,7 @@ _TOWER_ODDS, _LISTED_ODDS = -0.5, -5.0
 
 # Log odds that learned antennas must add. Thirds of LW1 flights have 8 to 57 with antennas from one or two flights.
 # 158 of 165 positions elsewhere have less than the 5 that a tower needs.
-_TAUGHT_MORE = 5.5
+_LEARNED_MORE = 5.5
 
 # Log evidence by which the levels must fit another tower better than the one that a name specifies.
 CONTRADICTED = 8.0
@@ -146,7 +153,7 @@ class Placement:
 
 
 @dataclass(frozen=True, slots=True)
-class Taught:
+class LearnedTower:
     """Learned antennas of a tower and an airframe, and the scatter of levels about them."""
 
     tower: MeasuredPattern
@@ -157,7 +164,7 @@ class Taught:
 
 
 @dataclass(frozen=True)
-class Placer:
+class NodeFinder:
     """Proposals of nodes for the logs of one flight, by its telemetry."""
 
     site: Site
@@ -201,7 +208,7 @@ class Placer:
     def propose(
         self,
         track: LevelTrack,
-        taught: Mapping[str, Sequence[Taught]] = MappingProxyType({}),
+        antennas: Mapping[str, Sequence[LearnedTower]] = MappingProxyType({}),
         nodes: Mapping[str, FloatArray] = MappingProxyType({}),
     ) -> Placement | None:
         """Return the tower, listed position or estimated position that levels fit. None if there are too few levels.
@@ -209,7 +216,7 @@ class Placer:
         Parameters
         ----------
         track : LevelTrack
-        taught : mapping of str to sequence of Taught
+        antennas : mapping of str to sequence of LearnedTower
             Gains of towers and airframe that were learned from other flights, by tower.
         nodes : mapping of str to (3,)
             Positions of the nodes that were proposed for other logs of the flight [m].
@@ -222,17 +229,17 @@ class Placer:
         odds = place_odds(track, np.array(at))
         odds_tower, odds_listed = odds[: len(towers)].copy(), odds[len(towers) :]
         # only for learned antennas, or if no tower fits, because the search is the slowest step
-        estimate = locate(track) if any(taught.values()) or odds_tower.max() < _TOWER_ODDS else None
+        estimate = locate(track) if any(antennas.values()) or odds_tower.max() < _TOWER_ODDS else None
         known = np.full(len(towers), -np.inf)
         for i, tower in enumerate(towers):
             if estimate is None:
                 continue
-            if gains := [each for each in taught.get(tower.name, ()) if self._supports(track, tower.name, each)]:
-                taught_odds = max(self._taught_odds(track, tower.name, each) for each in gains) - np.log(len(gains))
+            if gains := [each for each in antennas.get(tower.name, ()) if self._supports(track, tower.name, each)]:
+                learned_odds = max(self._learned_odds(track, tower.name, each) for each in gains) - np.log(len(gains))
                 # odds against any position, as those of the search
-                taught_odds -= estimate.anywhere + _TAUGHT_MORE
-                known[i] = taught_odds if taught_odds >= _TOWER_ODDS else -np.inf
-                odds_tower[i] = max(odds_tower[i], taught_odds)
+                learned_odds -= estimate.anywhere + _LEARNED_MORE
+                known[i] = learned_odds if learned_odds >= _TOWER_ODDS else -np.inf
+                odds_tower[i] = max(odds_tower[i], learned_odds)
         if len(listed) and odds_listed.max() >= max(_LISTED_ODDS, odds_tower.max()):
             # positions in a list can be some metres apart: name all likely lines
             order = np.argsort(-odds_listed)
@@ -252,7 +259,7 @@ class Placer:
             near = [i for i in np.argsort(-odds_tower) if odds_tower[i] > odds_tower[best] - _UNDECIDED]
             alike = [towers[i].name for i in near]
             # part of a flight can fit several towers: one with learned antennas is the most likely
-            name = towers[max(near, key=lambda i: (known[i], towers[i].name in taught))].name
+            name = towers[max(near, key=lambda i: (known[i], towers[i].name in antennas))].name
             asked = "is it this tower?" if len(alike) == 1 else f"is it {name}?"
             return Placement(name, None, f"the levels fit {' or '.join(alike)} {how}: {asked}")
         assert estimate is not None  # no tower fits
@@ -272,7 +279,7 @@ class Placer:
         at_estimate = round(float(latitude[0]), 7), round(float(longitude[0]), 7), float(place[2])
         return replace(_node(place, at_estimate, about, nodes), radius_m=estimate.radius90_m)
 
-    def _supports(self, track: LevelTrack, tower: str, gains: Taught) -> bool:
+    def _supports(self, track: LevelTrack, tower: str, gains: LearnedTower) -> bool:
         """Check whether levels support the learned antennas of a tower against an unknown gain."""
         if gains.moments is None or track.rotation is None:
             return True
@@ -287,7 +294,7 @@ class Placer:
         odds = FlightEvidence([samples]).of_link(0, gains.moments)
         return odds.fits
 
-    def _taught_odds(self, track: LevelTrack, tower: str, gains: Taught) -> float:
+    def _learned_odds(self, track: LevelTrack, tower: str, gains: LearnedTower) -> float:
         """Return the log evidence of a tower with learned antennas at both ends."""
         known = replace(track, airframe_db=_gain_of(gains.uav, gains.tower))
         return float(fit_places(known, self.site.towers[tower].position_m[None, :], gains.model).evidence[0])
@@ -376,7 +383,7 @@ def _gain_of(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Remembered:
+class LearnedLink:
     """Learned antennas of one tower and channel of a site."""
 
     name: str
@@ -385,8 +392,8 @@ class Remembered:
     series: learned.LearnedSeries
     tower: SpherePattern
     uav: SpherePattern
-    known: KnownDirections
-    tower_known: KnownDirections
+    known: DirectionCovariance
+    tower_known: DirectionCovariance
 
     @property
     def receiver(self) -> str:
@@ -410,17 +417,17 @@ class Remembered:
         return self.tower.largest_sd_db**2 + self.uav.largest_sd_db**2
 
     @cached_property
-    def airframe(self) -> KnownProcess:
+    def airframe(self) -> GainProcess:
         """The gain of the UAV with its covariance."""
         return _process(self.uav, self.known, BODY)
 
     @cached_property
-    def tower_antenna(self) -> KnownProcess:
+    def tower_antenna(self) -> GainProcess:
         """The gain of the tower's antenna with its covariance."""
         return _process(self.tower, self.tower_known, MAST)
 
     @property
-    def teaches(self) -> bool:
+    def airframe_is_general(self) -> bool:
         """True if the airframe can be used at other towers.
 
         This requires a receiver that keeps its lock, and flights that predict each other.
@@ -446,8 +453,8 @@ class Remembered:
         return uav_db + tower_db + pair_db, covariance + of_tower
 
 
-def _process(pattern: SpherePattern, known: KnownDirections, term: Term) -> KnownProcess:
-    return KnownProcess(
+def _process(pattern: SpherePattern, known: DirectionCovariance, term: Term) -> GainProcess:
+    return GainProcess(
         gain_db=lambda at: pattern.gain_dbi(*sphere_angles(at)),
         sd_db=lambda at: pattern.gain_sd_db(*sphere_angles(at)),
         directions=known.directions,
@@ -456,7 +463,7 @@ def _process(pattern: SpherePattern, known: KnownDirections, term: Term) -> Know
     )
 
 
-def every_antenna(site: str | Path) -> list[Remembered]:
+def all_learned_links(site: str | Path) -> list[LearnedLink]:
     """Return the learned antennas of a site, of all entries, the latest entry last.
 
     Raises
@@ -475,30 +482,31 @@ def every_antenna(site: str | Path) -> list[Remembered]:
                 place, written = folder / pair.file, named.written(pair.file)
                 tower.pair = read_pair(place, pair.length, pair.prior_sd_db, written)
             known, of_tower = (
-                read_known(folder / file, named.written(file)) for file in (series.known_file, series.tower_known_file)
+                read_direction_covariance(folder / file, named.written(file))
+                for file in (series.known_file, series.tower_known_file)
             )
             out.append(
-                Remembered(
+                LearnedLink(
                     name=name, entry=entry, series=series, tower=tower, uav=uav, known=known, tower_known=of_tower
                 )
             )
     return out
 
 
-def remembered(site: str | Path) -> dict[str, Remembered]:
+def latest_learned_links(site: str | Path) -> dict[str, LearnedLink]:
     """Return the latest learned antennas of each ``tower.channel`` of a site.
 
     Raises
     ------
     UsageError, InputError
-        As :func:`every_antenna`.
+        As :func:`all_learned_links`.
     """
-    return {f"{known.series.tower}.{known.series.channel}": known for known in every_antenna(site)}
+    return {f"{known.series.tower}.{known.series.channel}": known for known in all_learned_links(site)}
 
 
 # Standard deviation of the path-loss exponent for antennas that were learned under free space, and the smallest scatter
 # of levels about them [dB].
-_TAUGHT_SLOPE_SD, _LEAST_SCATTER_DB = 0.2, 0.1
+_LEARNED_SLOPE_SD, _LEAST_SCATTER_DB = 0.2, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -567,14 +575,14 @@ def propose(
     Raises
     ------
     UsageError, InputError
-        See :func:`every_antenna`.
+        See :func:`all_learned_links`.
     """
     entries = learned.read_learned(place).entries
     found = Proposal()
     if data.track is not None and data.rss and entries:
         # a ratio to the noise is used only if there is no level
         levels = [s for s in data.rss if s.channel.lower() not in RATIOS] or list(data.rss)
-        observed, known = [observed_series(data, series)[0] for series in levels], every_antenna(place)
+        observed, known = [observed_series(data, series)[0] for series in levels], all_learned_links(place)
         evidence = FlightEvidence([o.samples for o in observed])
         bands = (learned.BAND, learned.AIRFRAME_BAND) if carrier_known else (math.inf, math.inf)
         chosen = _antennas_for(data, levels, known, evidence, nodes, bands[0])
@@ -594,7 +602,7 @@ def propose(
 class _Chosen:
     """The learned antennas of both ends of one entry that the levels support best, by ``tower.channel``."""
 
-    antennas: Mapping[str, Remembered]
+    antennas: Mapping[str, LearnedLink]
     odds: Evidence
 
     @property
@@ -618,24 +626,24 @@ class _Chosen:
 def _antennas_for(
     data: FlightData,
     levels: Sequence[RssSeries],
-    known: Sequence[Remembered],
+    known: Sequence[LearnedLink],
     evidence: FlightEvidence,
     nodes: Nodes,
     band: float,
 ) -> _Chosen:
     """Return the antennas of both ends of the entry with the largest odds."""
     receivers = {item.receiver for item in known}
-    tried: dict[str, list[tuple[str, Remembered, Evidence]]] = {}
+    tried: dict[str, list[tuple[str, LearnedLink, Evidence]]] = {}
     for number, series in enumerate(levels):
         for item in known:
             if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, band):
                 continue
             named_odds = _named_odds(data, series, item, receivers)
             # antennas that do not predict other flights are not offered to a receiver with another unit
-            if named_odds < 0.0 and not item.teaches:
+            if named_odds < 0.0 and not item.airframe_is_general:
                 continue
             # antennas with a different name must also fit better than their airframe with an unknown antenna
-            airframe = item.airframe if item.teaches and named_odds <= 0.0 else None
+            airframe = item.airframe if item.airframe_is_general and named_odds <= 0.0 else None
             odds = evidence.of_link(number, item.moments, airframe).with_prior(named_odds)
             if odds.over_own > 0.0:
                 tried.setdefault(item.name, []).append((f"{series.tower}.{series.channel}", item, odds))
@@ -648,13 +656,13 @@ def _antennas_for(
     return _Chosen(antennas=antennas, odds=Evidence(over_own=own, over_turned=turned))
 
 
-def _one_each(tried: Sequence[tuple[str, Remembered, Evidence]]) -> dict[str, tuple[Remembered, Evidence]]:
+def _one_each(tried: Sequence[tuple[str, LearnedLink, Evidence]]) -> dict[str, tuple[LearnedLink, Evidence]]:
     """Return the antennas of each channel, those with the largest odds first.
 
     Two channels of a tower have two antennas, so an antenna is used twice only if there are too few.
     """
     pairs = sorted(tried, key=lambda pair: -pair[2].over_own)
-    chosen: dict[str, tuple[Remembered, Evidence]] = {}
+    chosen: dict[str, tuple[LearnedLink, Evidence]] = {}
     for key, item, odds in pairs:
         if all(item is not other for other, _ in chosen.values()):
             chosen.setdefault(key, (item, odds))
@@ -675,7 +683,7 @@ _LOST_SHARE = 0.01
 
 
 def _receivers(
-    levels: Iterable[tuple[RssSeries, Observed]], known: Sequence[Remembered], chosen: _Chosen
+    levels: Iterable[tuple[RssSeries, Observed]], known: Sequence[LearnedLink], chosen: _Chosen
 ) -> dict[int, Receiver]:
     """Return the learned receiver of the levels of each log, or the question for it, by the number of the log.
 
@@ -709,7 +717,7 @@ def _receivers(
 
 
 def _receiver_odds(
-    series: RssSeries, observed: Observed, item: Remembered, antenna: Remembered | None
+    series: RssSeries, observed: Observed, item: LearnedLink, antenna: LearnedLink | None
 ) -> tuple[float, str]:
     """Return the log odds that levels are those of the receiver of an item, and the words for its level."""
     level, lock, samples = item.level, item.series.lock, observed.samples
@@ -734,15 +742,15 @@ def _receiver_odds(
 
 
 def _airframe_for(
-    data: FlightData, known: Sequence[Remembered], site: str, evidence: FlightEvidence, *, band: float
+    data: FlightData, known: Sequence[LearnedLink], site: str, evidence: FlightEvidence, *, band: float
 ) -> Proposal:
     """Return the airframe alone that the levels support, or a proposal with the odds of the best airframe only."""
     own, marks = set(flight_logs(data)), marks_of([data])
-    tried: dict[str, tuple[Remembered, Evidence]] = {}
+    tried: dict[str, tuple[LearnedLink, Evidence]] = {}
     for item in known:
         same_log = own & set(item.entry.trained_on) or any(among(mark, item.uav.marks) for mark in marks)
         near = all(_in_band(item, series, band) for series in data.rss)
-        if item.teaches and not same_log and near and item.series.uav_file not in tried:
+        if item.airframe_is_general and not same_log and near and item.series.uav_file not in tried:
             tried[item.series.uav_file] = item, evidence.of_airframe(item.airframe)
     if not tried:
         return Proposal()
@@ -767,7 +775,7 @@ _SAME_NAME, _OTHER_UNIT = 10.0, -3.0
 _MOUNTED_AS_LEARNED = 3.0
 
 
-def _named_odds(data: FlightData, series: RssSeries, item: Remembered, receivers: Container[str]) -> float:
+def _named_odds(data: FlightData, series: RssSeries, item: LearnedLink, receivers: Container[str]) -> float:
     """Return the log odds that the names of receiver, tower and channel give to learned antennas of both ends."""
     receiver = data.settings.logs[int(series.log[0])].receiver if len(series.log) else ""
     if receiver in receivers:
@@ -777,7 +785,7 @@ def _named_odds(data: FlightData, series: RssSeries, item: Remembered, receivers
     return (_SAME_NAME if same else 0.0) + (_OTHER_UNIT if other else 0.0)
 
 
-def _in_band(item: Remembered, series: RssSeries, band: float) -> bool:
+def _in_band(item: LearnedLink, series: RssSeries, band: float) -> bool:
     return abs(series.link.carrier_hz / item.series.carrier_hz - 1.0) <= band
 
 
@@ -843,7 +851,7 @@ def searching_airframe(
         return None
     known: dict[str, SpherePattern] = {}
     with suppress(InputError, UsageError):
-        for item in every_antenna(site):
+        for item in all_learned_links(site):
             near = carrier_hz is None or abs(carrier_hz / item.series.carrier_hz - 1.0) <= learned.AIRFRAME_BAND
             if item.series.shares_airframe and near and not item.learned_from(*log):
                 known.setdefault(item.series.uav_file, item.uav)
@@ -877,7 +885,7 @@ def _likely_places(track: LevelTrack) -> FloatArray:
     return np.asarray((near[:, None] + thirds * np.append(step, 0.0)).reshape(-1, 3))
 
 
-def taught(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[str, list[Taught]]:
+def learned_towers(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[str, list[LearnedTower]]:
     """Return the learned antennas of both ends by tower. Empty if the learned models are damaged.
 
     Parameters
@@ -888,9 +896,9 @@ def taught(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[
     loses_lock : bool
         True for receivers that lose their lock, False for all others.
     """
-    out: dict[str, list[Taught]] = {}
+    out: dict[str, list[LearnedTower]] = {}
     with suppress(InputError, UsageError):
-        for known in every_antenna(site):
+        for known in all_learned_links(site):
             if (known.series.lock is not None) != loses_lock:
                 continue
             each = out.setdefault(known.series.tower, [])
@@ -900,8 +908,8 @@ def taught(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[
             scatter_db = max(known.spread.noise_sd_db, _LEAST_SCATTER_DB)
             cases = known_cases(float(np.hypot(known.spread.own_sd_db, known.series.sd_db)), scatter_db)
             elevation_sd_db = known.spread.own_sd_db
-            model = LevelModel(slope=2.0, slope_sd=_TAUGHT_SLOPE_SD, elevation_sd_db=elevation_sd_db, cases=cases)
-            each.append(Taught(tower=known.tower, uav=known.uav, model=model, moments=known.moments))
+            model = LevelModel(slope=2.0, slope_sd=_LEARNED_SLOPE_SD, elevation_sd_db=elevation_sd_db, cases=cases)
+            each.append(LearnedTower(tower=known.tower, uav=known.uav, model=model, moments=known.moments))
         return out
     return {}
 
@@ -991,7 +999,7 @@ def lock_elsewhere(data: FlightData, series: RssSeries) -> learned.LearnedLock |
     """
     receiver, uav = data.settings.logs[int(series.log[0])].receiver, data.settings.antennas.get("uav")
     with suppress(InputError, UsageError):
-        named = [item for item in every_antenna(data.site_place) if item.receiver == receiver] if receiver else []
+        named = [item for item in all_learned_links(data.site_place) if item.receiver == receiver] if receiver else []
         if named:
             own, mark = logs_of(data, series), series_mark(series)
             known = any(item.learned_from(log, mark) for item in named for log in own)

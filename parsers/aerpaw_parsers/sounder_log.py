@@ -13,7 +13,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import dropwhile
 
 import numpy as np
 
@@ -73,31 +72,23 @@ _COLUMNS = {"line": np.int64, "wall": np.int64, "offset": np.int64, "value": np.
 _NONE = np.zeros(0, dtype=np.int64)
 
 
-_POWERS = 10.0 ** np.arange(_VALUE)
+_DECIMAL = re.compile(rb" *-?\d+(?:\.\d+)?")
+_OF_DECIMALS = np.isin(np.arange(256), [*b" -.0123456789"])
 
 
 def _decimals(cells: AnyArray) -> tuple[FloatArray, BoolArray]:
-    """Convert right-aligned decimals, ``(n, 16)`` uint8, to numbers, and return which of them are plain decimals.
-
-    At most fifteen digits and the power of ten that divides them are exact, so that the quotient is the nearest double,
-    equal to the result of ``float``.
-    """
-    whole, places = np.zeros(len(cells)), np.zeros(len(cells), dtype=np.uint8)
-    negative, point, strange = np.zeros((3, len(cells)), dtype=bool)
-    open_, after_digit = np.ones(len(cells), dtype=bool), np.zeros(len(cells), dtype=bool)
-    columns = np.ascontiguousarray(cells.T)
-    for column in dropwhile(lambda column: (column == 32).all(), columns):
-        value = column - np.uint8(48)  # other characters wrap to more than 9
-        digit, minus, dot, space = value <= 9, column == 45, column == 46, column == 32
-        # only spaces come before a space or a minus, and a digit before the only point
-        strange |= ~(digit | ((minus | space) & open_) | (dot & after_digit & ~point))
-        negative |= minus
-        places += point
-        point |= dot
-        whole = np.where(digit, 10.0 * whole + value, whole)
-        open_, after_digit = space, digit
-    plain = after_digit & ~strange
-    return np.where(plain, np.where(negative, -whole, whole) / _POWERS[places], 0.0), plain
+    """Convert right-aligned decimals, ``(n, 16)`` uint8, to numbers, and return which of them are plain decimals."""
+    texts = np.ascontiguousarray(cells).view(f"S{_VALUE}").ravel()
+    plain = np.ones(len(texts), dtype=bool)
+    before_point = cells[:, :-1][cells[:, 1:] == 46]
+    try:
+        if _OF_DECIMALS[cells].all() and (before_point >= 48).all():
+            return texts.astype(np.float64), plain
+    except ValueError:
+        pass
+    # a damaged line, which is rare: test each text
+    plain[:] = [_DECIMAL.fullmatch(text) is not None for text in texts.tolist()]
+    return np.where(plain, texts, b"0").astype(np.float64), plain
 
 
 def _fixed_layout(lines: _text.Lines) -> tuple[_Samples, IntArray]:

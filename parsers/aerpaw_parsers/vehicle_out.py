@@ -28,25 +28,27 @@ _NUMBERS = (
     "satellites",
 )  # fmt: skip
 _CELL = rb'"?(?P<%s>' + NUMBER + rb'|nan|NaN|None)"?'
-_TRIPLE = rb'"?[(\[]' + b", ?".join([_CELL] * 3) + rb'[)\]]"?'
-_CHARGE = rb'"?(?:' + NUMBER + rb'|nan|NaN|None|)"?'  # voltage and charge may be empty
-_VOLT = rb'"?(?P<volt>' + NUMBER + rb'|nan|NaN|None|)"?'
+_CHARGE = rb'"?(?P<volt>' + NUMBER + rb'|nan|NaN|None|)"?'  # voltage and charge may be empty
 _SEP = rb", ?"
-_BODY = (
-    _SEP.join((_TRIPLE % (b"pitch", b"yaw", b"roll"), _TRIPLE % (b"north", b"east", b"down"), _VOLT)),  # 10 fields
-    _SEP.join((*(_CELL % name for name in (b"pitch_11", b"yaw_11", b"roll_11")), _VOLT.replace(b"volt", b"volt_11"))),
-    _VOLT.replace(b"volt", b"volt_9") + rb"(?:" + _SEP + _CHARGE + rb")?",  # 8 and 9 fields
-)
+
+
+def _cells(*names: bytes) -> bytes:
+    return _SEP.join(_CELL % name for name in names)
+
+
 _FIELDS = _SEP.join(
     (
         rb'^ ?"?(?P<index>\d{1,12})"?',
-        *(_CELL % name for name in (b"longitude", b"latitude", b"altitude")),
-        rb"(?:" + rb"|".join(_BODY) + rb")",
+        _cells(b"longitude", b"latitude", b"altitude"),
+        # angles and velocities in brackets (10 fields), angles without brackets (11), or neither (8 and 9)
+        rb'(?:(?P<open>"?[(\[]"?)?' + _cells(b"pitch", b"yaw", b"roll")
+        + rb'(?(open)"?[)\]]"?, ?"?[(\[]' + _cells(b"north", b"east", b"down") + rb'[)\]]"?)' + _SEP + rb")?"
+        + _CHARGE + rb"(?(pitch)|(?:" + _SEP + _CHARGE.replace(b"P<volt>", b":") + rb")?)",
         rb'"?(?P<time>' + TIME + ZONE + rb')"?',
         rb'"?(?P<fix>-?\d{1,3})"?',
         rb'"?(?P<satellites>-?\d{1,3})"?',
     )
-)
+)  # fmt: skip
 _END = rb"[ ,\t]{0,8}\r?$"
 _MORE = rb"(?:,[^,\n]{0,80})"
 _ROW = re.compile(_FIELDS + _END, re.MULTILINE)
@@ -88,9 +90,6 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     pattern = _EITHER if mostly(data, _LONGER) and not mostly(data, _ROW) else _ROW
     rows = matched(data, pattern, options, reader="vehicle_out", reason=_reason)
     number = {name: _numbers(rows, name) for name in _NUMBERS}
-    for name in ("pitch_11", "yaw_11", "roll_11", "volt_11", "volt_9"):  # fields whose column depends on the layout
-        own = name.partition("_")[0]
-        number[own] = np.fmax(number[own], _numbers(rows, name))
     jumps = int((np.diff(number["index"]) != 1).sum())
     if jumps:
         rows.warnings.append(f"the row index jumps at {counted(jumps, 'place')}: rows are missing or files were joined")

@@ -50,7 +50,7 @@ from ..maps.evaluate import (
 from ..maps.export import maps_dataset
 from ..maps.grid import PAPER_BUDGET, Grid, LinkBudget
 from ..maps.kriging import OrdinaryKriging, Sampling
-from ..maps.store import Budget, Reach, TileStore, Tiling
+from ..maps.store import Reach, TileStore, Tiling, range_m
 from ..maps.variogram import BiExponential, BinnedCorrelation, field_correlation
 from ..propagation.field.foliage import crown_index, foliage_loss_db, foliage_model, stand_loss_db
 from ..propagation.field.sum import channel_matrices, rss_dbm
@@ -213,13 +213,9 @@ class SiteChannels:
     def __init__(self, site: Site, settings: MapSettings) -> None:
         self.settings, self.names = settings, tuple(site.towers)
         self.crowns = {mode: crown_index(site.under(mode).trees) for mode in settings.foliage}
-        budget = Budget(
-            carrier_hz=settings.carrier_hz,
-            transmit_power_dbm=settings.budget.tx_power_dbm,
-            gain_db=float(db_from_power(settings.elements)),
-            floor_dbm=THERMAL_NOISE_DBM_HZ,
-        )
-        self.reach = Reach(site, budget, max_depth=settings.max_depth)
+        power_dbm = settings.budget.tx_power_dbm + float(db_from_power(settings.elements))
+        reach_m = range_m(settings.carrier_hz, power_dbm, THERMAL_NOISE_DBM_HZ)
+        self.reach = Reach(site, reach_m, max_depth=settings.max_depth)
         self.paths = 0
         self._ready: dict[tuple[str, bytes], job.Evaluation] = {}
         self._take_site(site)

@@ -125,29 +125,14 @@ def over_grid(like: MapResult, grid: Grid, values: Mapping[str, Any]) -> MapResu
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Budget:
-    """The link budget that limits the range of a tower.
+def range_m(carrier_hz: float, power_dbm: float, floor_dbm: float) -> float:
+    """Return the distance beyond which no level is above a floor [m].
 
-    Parameters
-    ----------
-    carrier_hz, transmit_power_dbm : float
-    gain_db : float
-        Gain of the arrays when all elements add in phase.
-    floor_dbm : float
-        Levels below it are out of coverage.
+    ``power_dbm`` is the transmit power plus the gain of the arrays when all elements add in phase. The level is at most
+    :data:`_IN_PHASE_DB` above free space.
     """
-
-    carrier_hz: float
-    transmit_power_dbm: float
-    gain_db: float
-    floor_dbm: float
-
-    @property
-    def range_m(self) -> float:
-        """The distance beyond which free space plus :data:`_IN_PHASE_DB` is below the floor [m]."""
-        spare_db = self.transmit_power_dbm + self.gain_db + _IN_PHASE_DB - self.floor_dbm
-        return float(wavelength_m(self.carrier_hz) / (4 * np.pi) * 10 ** (spare_db / 20))
+    spare_db = power_dbm + _IN_PHASE_DB - floor_dbm
+    return float(wavelength_m(carrier_hz) / (4 * np.pi) * 10 ** (spare_db / 20))
 
 
 class Reach:
@@ -156,13 +141,14 @@ class Reach:
     Parameters
     ----------
     site : Site
-    budget : Budget
+    reach_m : float
+        Distance beyond which a tower is out of coverage, such as :func:`range_m`.
     max_depth : int
         Largest number of reflections.
     """
 
-    def __init__(self, site: Site, budget: Budget, *, max_depth: int) -> None:
-        self.site, self._range_m, self._depth = site, budget.range_m, max_depth
+    def __init__(self, site: Site, reach_m: float, *, max_depth: int) -> None:
+        self.site, self._reach_m, self._depth = site, reach_m, max_depth
         self._every = max_depth > 1 or site.dem is not None or site.scene is not None or not site.buildings
         footprints = shapely.envelope([building.footprint for building in site.buildings])
         places = [tower.position_m[:2] for tower in site.towers.values()]
@@ -181,7 +167,7 @@ class Reach:
 
     def of(self, box_m: FloatArray) -> Site:
         """Return the site with the towers and buildings that reach a box (lowest and highest corner, 3)."""
-        every, reach = self.site.towers.items(), self._range_m
+        every, reach = self.site.towers.items(), self._reach_m
         towers = {name: tower for name, tower in every if np.linalg.norm(_apart(tower, box_m)) <= reach}
         if not any(_apart(tower, box_m).max() <= REACH_M for tower in towers.values()):
             towers = {}

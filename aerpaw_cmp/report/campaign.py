@@ -368,14 +368,12 @@ def rss_flights(data: CampaignData) -> list[str]:
 
 def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
     """Return the mean RMSE over the links of each setting and flight [dB], NaN if there is none."""
-    errors = pd.DataFrame(
-        [(row.setting, row.flight, row.rmse_db) for row in data.rss], columns=["setting", "flight", "e"]
-    )
-    means = errors.groupby(["setting", "flight"])["e"].mean()
-    return {
-        setting: {name: float(means.get((setting, name), np.nan)) for name in rss_flights(data)}
-        for setting in data.settings
-    }
+    errors: dict[tuple[str, str], list[float]] = {}
+    for row in data.rss:
+        errors.setdefault((row.setting, row.flight), []).append(row.rmse_db)
+    means = {key: float(np.nanmean(each)) for key, each in errors.items() if np.isfinite(each).any()}
+    flights = rss_flights(data)
+    return {setting: {name: means.get((setting, name), np.nan) for name in flights} for setting in data.settings}
 
 
 def headline(data: CampaignData) -> list[str]:

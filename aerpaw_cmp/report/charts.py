@@ -85,11 +85,6 @@ def charts_of(data: ReportData) -> list[Chart]:
             "model on the same samples.",
             content=_errors(shown),
         ))  # fmt: skip
-        charts.append(Chart(
-            section="ladder", title="What does accuracy cost?",
-            caption="RMSE against the computing time of the complete flight. Numbers: rows of the table.",
-            content=_costs(shown),
-        ))  # fmt: skip
     charts += [
         Chart(
             section="forecast", title=f"{rank.tower}: rank forecast along the flight",
@@ -110,17 +105,6 @@ def _errors(models: Sequence[ModelRow]) -> dict[str, Any]:
     names = [f"{number}  {row.model}" for number, row in enumerate(models, 1)]
     chosen = next((i for i, row in of if row.recommended), -1)
     return {"rows": names, "chosen": chosen, "x": {"label": "RMSE on held-out areas [dB]"}, "marks": [dots]}
-
-
-def _costs(models: Sequence[ModelRow]) -> dict[str, Any]:
-    """Return a chart of RMSE against computing time, with one numbered dot per model."""
-    marks = []
-    for name, fastest in (("other models", False), ("fastest sufficient", True)):
-        of = [(number, row) for number, row in enumerate(models, 1)
-              if np.isfinite(row.rmse_heldout_db) and row.fastest_sufficient == fastest]  # fmt: skip
-        seconds, rmse = np.array([[row.seconds, row.rmse_heldout_db] for _, row in of]).reshape(-1, 2).T
-        marks += [mark("dots", name, seconds, rmse, labels=[str(number) for number, _ in of])] if of else []
-    return {"x": {"label": "Computing time [s]"}, "y": {"label": "RMSE on held-out areas [dB]"}, "marks": marks}
 
 
 def flown(data: ReportData) -> list[Chart]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -43,30 +44,24 @@ RANK_MARKER = {0: "x", 1: "o", 2: "s", 3: "^", 4: "D"}
 
 def figure_specs(data: ReportData) -> list[FigureSpec]:
     """Return all figures that the data allow. Equal file names get a number."""
-    used: dict[str, int] = {}
-    result = []
-    for spec in (*_track_and_level(data), *channel_specs(data), *_ranks(data)):
-        times = used[spec.name] = used.get(spec.name, 0) + 1
-        result.append(spec if times == 1 else replace(spec, name=f"{spec.name}_{times}"))
-    return result
-
-
-def _track_and_level(data: ReportData) -> Iterator[FigureSpec]:
+    specs = []
     if data.track is not None and len(data.track.time):
-        yield FigureSpec("trajectory", partial(trajectory, data, data.track))
-        yield FigureSpec("altitude", partial(altitude, data, data.track))
-    for panel in data.rss:
-        if len(panel.time):
-            name = f"rss_{safe_name(panel.tower)}_{safe_name(panel.channel)}"
-            yield FigureSpec(name, partial(rss_over_time, data, panel))
-
-
-def _ranks(data: ReportData) -> Iterator[FigureSpec]:
-    for panel in (panel for panel in data.rank if len(panel.time)):
-        stem = safe_name(panel.tower)
-        yield FigureSpec(f"rank_histogram_{stem}", partial(rank_histograms, panel))
-        yield FigureSpec(f"rank_map_{stem}", partial(rank_maps, data, panel))
-        yield FigureSpec(f"rank_time_{stem}", partial(rank_over_time, data, panel))
+        specs += [FigureSpec(draw.__name__, partial(draw, data, data.track)) for draw in (trajectory, altitude)]
+    for panel in (panel for panel in data.rss if len(panel.time)):
+        name = f"rss_{safe_name(panel.tower)}_{safe_name(panel.channel)}"
+        specs.append(FigureSpec(name, partial(rss_over_time, data, panel)))
+    specs += channel_specs(data)
+    for rank in (rank for rank in data.rank if len(rank.time)):
+        stem = safe_name(rank.tower)
+        specs.append(FigureSpec(f"rank_histogram_{stem}", partial(rank_histograms, rank)))
+        specs.append(FigureSpec(f"rank_map_{stem}", partial(rank_maps, data, rank)))
+        specs.append(FigureSpec(f"rank_time_{stem}", partial(rank_over_time, data, rank)))
+    used = Counter[str]()
+    for i, spec in enumerate(specs):
+        used[spec.name] += 1
+        if used[spec.name] > 1:
+            specs[i] = replace(spec, name=f"{spec.name}_{used[spec.name]}")
+    return specs
 
 
 def channel_specs(data: ReportData) -> Iterator[FigureSpec]:

@@ -10,7 +10,7 @@ from shapely.geometry import box
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs import coverage_map
 from aerpaw_cmp.maps.grid import Grid
-from aerpaw_cmp.maps.store import PLANES, Budget, Reach, Tiling
+from aerpaw_cmp.maps.store import PLANES, Reach, Tiling, range_m
 from aerpaw_cmp.propagation.geometry import Link, single_element
 from aerpaw_cmp.propagation.replay import trace
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
@@ -107,9 +107,8 @@ def test_a_tile_that_only_the_border_of_a_beam_touches_keeps_what_stands_on_that
     tower = {"T": Tower("T", 35.7, -78.7, 0.0, -10.0, 10.0)}
     wall, hut = Building("wall", box(20, 0, 40, 1), 30.0), Building("hut", box(29.5, -5.5, 30.5, -4.5), 30.0)
     site = Site("corner", FRAME, tower, (wall, hut), area_m=(-50.0, 50.0, -50.0, 50.0))
-    budget = Budget(carrier_hz=3.4e9, transmit_power_dbm=40.0, gain_db=0.0, floor_dbm=-150.0)
     tile = np.array([[35.0, -14.0, 10.0], [40.0, -10.0, 10.0]])
-    reached = Reach(site, budget, max_depth=1).of(tile)
+    reached = Reach(site, range_m(3.4e9, 40.0, -150.0), max_depth=1).of(tile)
     assert {building.name for building in reached.buildings} == {"wall", "hut"}
     link = Link(3.4e9, {"T": single_element()}, single_element())
     labels = []
@@ -123,10 +122,10 @@ def test_a_tower_that_is_left_out_of_a_tile_reaches_no_position_of_it():
     site = town(20, side_m=4000.0)
     free = in_one_piece(site, settings(spacing_m=200.0))[0]["none"]
     floor = float(np.nanmax(free.rss_siso_dbm)) - 3.0
-    budget = Budget(carrier_hz=3.4e9, transmit_power_dbm=40.0, gain_db=10 * np.log10(4), floor_dbm=floor)
+    reach_m = range_m(3.4e9, 40.0 + 10 * np.log10(4), floor)
     corner = np.array([[-2000.0, -2000.0, 2.0], [-1800.0, -1800.0, 2.0]])
-    near = set(Reach(site, budget, max_depth=2).of(corner).towers)
-    far = [name for name, t in site.towers.items() if np.hypot(t.east_m + 1800, t.north_m + 1800) > budget.range_m]
+    near = set(Reach(site, reach_m, max_depth=2).of(corner).towers)
+    far = [name for name, t in site.towers.items() if np.hypot(t.east_m + 1800, t.north_m + 1800) > reach_m]
     assert far
     assert not set(far) & near
     there = (np.abs(free.grid.points_m + 1900.0) <= 100.0).all(axis=1)

@@ -283,7 +283,7 @@ const common = (() => {
       const marks = spec.marks.map((m, i) => ({ ...m, hue: m.colour || css(HUES[i % HUES.length]), shape: SHAPES[i % SHAPES.length], dash: DASHES[i % DASHES.length], x: get(m.x), y: get(m.y), low: get(m.low), high: get(m.high) }));
       const reach = lists => { let low = Infinity, high = -Infinity; for (const list of lists) for (const v of list || []) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); } return low < high ? [low, high] : [low - 1, low + 1]; };
       const [west, east] = spec.x.ends || reach(marks.flatMap(m => n ? [m.x, m.low, m.high] : [m.x])), [south, north] = n ? [n - 0.4, -0.9] : spec.y.ends || reach(marks.flatMap(m => [m.y, m.low, m.high]));
-      const [p, w, h] = frame(place), room = marks.some(m => m.labels) ? 0.06 : 0, wide = east - west, tall = room * (north - south), x = { low: west - (n ? 0.02 : room) * wide, high: east + room * wide, label: spec.x.label }, y = { low: south - tall, high: north + 2 * tall, label: n ? "" : spec.y.label };
+      const [p, w, h] = frame(place), x = { low: west - (n ? 0.02 * (east - west) : 0), high: east, label: spec.x.label }, y = { low: south, high: north, label: n ? "" : spec.y.label };
       if (spec.x.start) { const begun = Date.parse(spec.x.start + "Z") / 1000; x.marks = clockTicks(west, east, w / 110, begun); x.words = v => clockText(v + begun); }
       if (spec.x.names) { const step = Math.max(1, Math.ceil(spec.x.names.length * 150 / w)); x.marks = spec.x.names.flatMap((_, i) => i % step ? [] : [i]); x.words = v => spec.x.names[v]; }
       if (n) y.marks = [];
@@ -297,7 +297,6 @@ const common = (() => {
           const [a, b] = [g.X(m.x[i]), g.Y(m.y[i])];
           dot(p, a, b, m.x.length > 200 ? 1.2 : 3.2, m.shape);
           if (m.low && Number.isFinite(m.low[i])) { p.beginPath(); p.moveTo(g.X(m.low[i]), b); p.lineTo(g.X(m.high[i]), b); p.stroke(); }
-          if (m.labels) { p.fillStyle = css("--ink"); p.fillText(m.labels[i], a + 7, b - 5); p.fillStyle = m.hue; }
         }
         p.globalAlpha = 1;
       }

@@ -1,4 +1,4 @@
-"""The ``calibrate`` job, which learns mounted antennas from several flights and scores them on held-out flights.
+"""The ``calibrate`` job, which learns antennas from several flights and scores them on held-out flights.
 
 It also learns when a receiver is in lock, from levels that are predicted from other flights.
 """
@@ -26,31 +26,33 @@ from ..common.text import counted
 from ..common.units import FloatArray
 from ..common.yamlfile import StrictModel, load_yaml
 from ..compare import calibration, gains
-from ..compare.calibration import BIN_S, Learned, Observed, Recipe, Score, flights_of, groups_of, learn
-from ..compare.gains import FlightEvidence, GainOf, GainProcess
+from ..compare.calibration import Learned, Observed, Score, flights_of, groups_of, learn
+from ..compare.gains import FlightEvidence, GainProcess
 from ..compare.health import HeldOut, learned_health
 from ..compare.level import DetectionScore, learn_detection, score_detection
 from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
-from ..flight.gains import flight_of, load_with_learned, mean_gain_db, sphere_angles
+from ..flight.gains import flight_of, load_with_learned
 from ..flight.replay import observed_series
 from ..flight.rows import LOCK_FLOOR_DB
-from ..flight.settings import AntennaSettings, load_pattern
 from ..flight.training import counted_once, flight_logs, marks_of
 from ..propagation.field.baselines import two_ray_dbm
 from ..report.calibration import sentences
 from ..site.learned import AIRFRAME_BAND, DirectionCovariance, LearnedHealth, LearnedLock, Source
 
 
-def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[str, Learned]) -> dict[str, LearnedLock]:
+def learned_locks(
+    observed: Sequence[Observed], fits: Mapping[str, Learned], start: gains.GainModel | None = None
+) -> dict[str, LearnedLock]:
     """Return a model of P(lock) by antenna, learned from levels predicted from other flights, with held-out scores.
 
     Parameters
     ----------
     observed : sequence of Observed
         Samples of all flights.
-    recipe : Recipe
     fits : mapping of str to Learned
         Gains learned without each flight.
+    start : GainModel, optional
+        Terms of the gains without two flights, and initial values of their strengths.
 
     Returns
     -------
@@ -61,7 +63,7 @@ def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[st
     able = [o for o in observed if o.locked is not None and np.isfinite(o.locked).any()]
     if len(flights_of(able)) < 3:
         return {}
-    pairs = _without_pairs(observed, recipe)
+    pairs = _without_pairs(observed, start)
     out = {}
     for antenna in dict.fromkeys(o.samples.antenna for o in able):
         lock = _learned([o for o in able if o.samples.antenna == antenna], fits, pairs)
@@ -106,7 +108,7 @@ def learned_healths(observed: Sequence[Observed], fits: Mapping[str, Learned]) -
     return out
 
 
-def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[str, str], Learned]:
+def _without_pairs(observed: Sequence[Observed], start: gains.GainModel | None) -> dict[tuple[str, str], Learned]:
     """Return gains learned without each pair of flights, by pair.
 
     P(lock) of one flight is predicted by a fit to the other flights. The levels of each of these are predicted without
@@ -114,7 +116,7 @@ def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[s
     """
     out: dict[tuple[str, str], Learned] = {}
     for one, other in combinations(groups_of(flights_of(observed)), 2):
-        learned = learn([o.samples for o in observed if o.samples.flight not in (*one, *other)], recipe)
+        learned = learn([o.samples for o in observed if o.samples.flight not in (*one, *other)], start)
         out |= {pair: learned for a in one for b in other for pair in ((a, b), (b, a))}
     return out
 
@@ -205,15 +207,6 @@ def lock_words(lock: LearnedLock) -> str:
 _ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
 
 
-class PatternsSettings(StrictModel):
-    """The measured patterns to which the learned gain is added. They are isotropic by default."""
-
-    uav: AntennaSettings | None = None
-    tower: AntennaSettings | None = None
-    towers: dict[str, AntennaSettings] = Field(default_factory=dict)
-    """Patterns by ``tower.channel``, for towers with a different pattern."""
-
-
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
 
 
@@ -232,7 +225,6 @@ class CalibrationFile(StrictModel):
     """All flights, including those of ``campaigns``."""
     campaigns: dict[_Name, CampaignSettings] = Field(default_factory=dict)
     """Campaigns by name, if antennas are learned from several campaigns together. Each becomes an entry of the site."""
-    patterns: PatternsSettings = PatternsSettings()
     source: Source = Source()
     """Title, DOI and licence of the data, and the airframe. They are stored with the learned models of a site."""
     rank: bool = False
@@ -342,7 +334,6 @@ def load_calibration(path: Path, further: Sequence[Path] = ()) -> CalibrationFil
 def calibrate(
     settings: CalibrationFile,
     flights: Sequence[FlightData],
-    folder: Path,
     logs_root: Path | None = None,
     *,
     campaigns: Mapping[str, str] | None = None,
@@ -356,9 +347,8 @@ def calibrate(
     settings : CalibrationFile
     flights : sequence of FlightData
         Flights, as returned by :func:`read_flights`.
-    folder, logs_root : Path
-        Folder for relative paths of patterns, and folder of the logs of ``score`` (by default, that of their flight
-        file).
+    logs_root : Path, optional
+        Folder of the logs of ``score``. By default it is that of their flight file.
     campaigns : mapping of str to str, optional
         Campaign of each flight, from :func:`read_flights`. By default, all flights are one campaign.
     stages : Stages, optional
@@ -382,7 +372,6 @@ def calibrate(
     observed, warnings = observe(flights)
     warnings += _unscored(observed)
     observed = in_campaigns(settings, observed, flights, campaigns)
-    recipe = recipe_of(settings, observed, logs_root or folder)
     with stages("read"):
         further = [load_data(load_with_learned(path), path.parent, logs_root) for path in score]
     series = [o.samples for o in observed]
@@ -391,17 +380,17 @@ def calibrate(
     rest += [("rank", "of all flights")] if settings.rank else []
     stages.checked(lambda: [PlannedStage(*row) for row in rest])
     with stages("fit"):
-        learned = calibration.learn(series, recipe)
+        learned = learn(series)
     with stages("ground"):
         ground = _fit_ground(flights, observed, learned)
     fits: dict[str, Learned] = {}
     with stages("scores"):
-        scores = _score_all(observed, recipe, stages, fits)
-        controls = _controls_of(observed, recipe, scores["flight_left_out"])
+        scores = _score_all(observed, stages, fits)
+        controls = _controls_of(observed)
         stages.progress("scores", 1.0)
-        locks, health = learned_locks(observed, recipe, fits), learned_healths(observed, fits)
+        locks, health = learned_locks(observed, fits), learned_healths(observed, fits)
         taught = teaching(observed, campaigns, fits)
-    warnings += [*_mount_warnings(learned), *_contradictions(scores["campaign_left_out"], controls, campaigns)]
+    warnings += _contradictions(scores["campaign_left_out"], controls, campaigns)
     if further:
         with stages("score"):
             further_scores, remarks = _score_further(further, flights, learned, observed)
@@ -539,7 +528,7 @@ def _unscored(observed: Sequence[Observed]) -> list[str]:
     """Return a remark about channels of towers that cannot be scored, because only one flight has them."""
     flights = calibration.flights_of(observed)
     if len(flights) < 2:
-        return ["only one flight: no flight can be held out, so nothing is scored, and mounts are unstable"]
+        return ["only one flight: no flight can be held out, so nothing is scored"]
     heard = {(o.samples.antenna, o.samples.flight) for o in observed}
     count = Counter(antenna for antenna, _ in heard)
     lonely = [antenna for antenna in dict.fromkeys(o.samples.antenna for o in observed) if count[antenna] == 1]
@@ -567,35 +556,6 @@ def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | Non
 
 
 # --- learning ------------------------------------------------------------------------------------------------------
-
-
-def learned_antennas(train: Sequence[gains.LinkSamples]) -> Learned:
-    """Learn the antennas of both ends, starting from the default strengths of the model."""
-    return calibration.learn(train, Recipe(gains.GainModel(bin_s=BIN_S)))
-
-
-def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
-    """Return the terms and patterns that a calibration.yaml specifies."""
-    patterns: dict[str, GainOf] = {}
-    if settings.patterns.uav is not None:
-        patterns["uav"] = gain_of(settings.patterns.uav, folder)
-    antennas = list(dict.fromkeys(o.samples.antenna for o in observed))
-    if unknown := sorted(settings.patterns.towers.keys() - set(antennas)):
-        raise UsageError(
-            f"patterns.towers.{unknown[0]}: the flights have no such tower and channel",
-            expected="one of " + ", ".join(antennas),
-        )
-    for antenna in antennas:
-        chosen = settings.patterns.towers.get(antenna, settings.patterns.tower)
-        if chosen is not None:
-            patterns[antenna] = gain_of(chosen, folder)
-    return Recipe(gains.GainModel(), patterns)
-
-
-def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
-    """Return a function for the gain [dBi] of a pattern towards unit vectors (n, 3) in its device frame."""
-    pattern = load_pattern(settings, folder)
-    return lambda direction: mean_gain_db([pattern], *sphere_angles(direction))
 
 
 def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], learned: Learned) -> GroundFit:
@@ -626,8 +586,7 @@ def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lea
         return np.asarray(stacked - stacked.mean(axis=0))
 
     series = [o.samples for o in observed]
-    unexplained = [dataclasses.replace(s, residual_db=s.residual_db - learned.patterns_db(s)) for s in series]
-    form = gains.column_forms(unexplained, learned.model, columns)
+    form = gains.column_forms(series, learned.model, columns)
     value = np.diag(form)[1:] - 2.0 * form[0, 1:]
     likelihood = -0.5 * (value - value[-1])
     return GroundFit(roughness_m=_ROUGHNESS_M, log_likelihood=tuple(map(float, likelihood)))
@@ -636,15 +595,12 @@ def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lea
 # --- scores --------------------------------------------------------------------------------------------------------
 
 
-def _score_all(
-    observed: Sequence[Observed], recipe: Recipe, stages: Stages, fits: dict[str, Learned]
-) -> dict[str, tuple[Score, ...]]:
+def _score_all(observed: Sequence[Observed], stages: Stages, fits: dict[str, Learned]) -> dict[str, tuple[Score, ...]]:
     """Score every split (flight, height, heading, sector) on samples that were not fitted. Splits share fits.
 
     Parameters
     ----------
     observed : sequence of Observed
-    recipe : Recipe
     stages : Stages
     fits : dict of str to Learned
         Receives the gains learned without each flight.
@@ -657,16 +613,16 @@ def _score_all(
     if len(calibration.flights_of(observed)) < 2:
         return scores
     splits: dict[str, Callable[[], tuple[Score, ...]]] = {
-        "flight_left_out": lambda: calibration.flight_left_out(observed, recipe, fits),
+        "flight_left_out": lambda: calibration.flight_left_out(observed, without=fits),
         **{
-            f"{name}_left_out": partial(calibration.parts_left_out, observed, recipe, fits, parts)
+            f"{name}_left_out": partial(calibration.parts_left_out, observed, fits, parts)
             for name, parts in (
                 ("altitude", calibration.altitude_parts),
                 ("heading", calibration.heading_parts),
                 ("sector", calibration.sector_parts),
             )
         },
-        "campaign_left_out": lambda: calibration.campaign_left_out(observed, recipe),
+        "campaign_left_out": lambda: calibration.campaign_left_out(observed),
     }
     for done, (split, score) in enumerate(splits.items()):
         # the controls take about as long as two splits
@@ -676,22 +632,18 @@ def _score_all(
     return scores
 
 
-def _controls_of(
-    observed: Sequence[Observed], recipe: Recipe, scores: tuple[Score, ...]
-) -> dict[str, tuple[Score, ...]]:
-    """Score the UAV's gain in wrong frames on held-out flights, as controls. ``scores`` are those of the body frame."""
+def _controls_of(observed: Sequence[Observed]) -> dict[str, tuple[Score, ...]]:
+    """Score the UAV's gain in wrong frames on held-out flights, as controls."""
     if len(calibration.flights_of(observed)) < 2:
         return {}
-    left_out, bare = calibration.flight_left_out, dataclasses.replace(recipe, patterns={})
     turns = (90.0, 180.0, 270.0) if len({o.samples.campaign for o in observed}) > 1 else ()
     turned = {
-        f"another campaign's airframe, rotated by {turn:.0f} deg": calibration.campaign_left_out(observed, bare, turn)
+        f"another campaign's airframe, rotated by {turn:.0f} deg": calibration.campaign_left_out(observed, turn)
         for turn in turns
     }
     return turned | {
-        "world frame at the UAV": left_out(calibration.world_frame(observed), bare),
-        "heading turned the wrong way": left_out(calibration.wrong_way(observed), bare),
-        "body frame, no patterns": left_out(observed, bare) if recipe.patterns else scores,
+        "world frame at the UAV": calibration.flight_left_out(calibration.world_frame(observed)),
+        "heading turned the wrong way": calibration.flight_left_out(calibration.wrong_way(observed)),
     }
 
 
@@ -754,13 +706,3 @@ def _airframe(learned: Learned, antenna: str) -> GainProcess:
         directions=known.directions,
         covariance_db2=known.covariance_db2,
     )
-
-
-def _mount_warnings(learned: Learned) -> list[str]:
-    """Return one sentence per mount that the data do not determine."""
-    return [
-        f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is most likely, with an SD of "
-        f"{mount.azimuth_sd_deg:.0f} deg"
-        for name, mount in learned.mounts.items()
-        if not mount.identified
-    ]

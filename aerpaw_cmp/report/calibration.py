@@ -19,7 +19,7 @@ from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, write
 from .flight_words import said_of
 from .page import Made, about
 from .places import BODY, COMPASS, Places, payload
-from .texts import minute, number, percent
+from .texts import minute, percent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +59,6 @@ class CalibrationData(Made):
     warnings: Sequence[str]
     scores: Mapping[str, Sequence[Mapping[str, Any]]]
     controls: Mapping[str, Sequence[Mapping[str, Any]]]
-    mounts: Mapping[str, Mapping[str, Any]]
     strengths: Mapping[str, Any]
     ground: Mapping[str, Any] | None
     antennas: Sequence[AntennaMap]
@@ -118,9 +117,9 @@ def helps(scores: Sequence[Score]) -> Verdict:
     return by_flight(_errors(scores), _errors(scores, name), name)
 
 
-def frame(controls: Mapping[str, Sequence[Score]]) -> Verdict:
-    """Test whether an antenna or the position explains the learned gain, without measured patterns."""
-    body = _errors(controls.get("body frame, no patterns", ()))
+def frame(scores: Sequence[Score], controls: Mapping[str, Sequence[Score]]) -> Verdict:
+    """Test whether an antenna or the position explains the learned gain."""
+    body = _errors(scores)
     return antenna_or_place(
         [by_flight(body, _errors(controls.get(name, ())), where) for name, where in WRONG_FRAMES.items()]
     )
@@ -149,7 +148,7 @@ def sentences(
     left_out = scores["flight_left_out"]
     if not left_out:
         return (ONE_FLIGHT,)
-    verdict, turned = helps(left_out), frame(controls)
+    verdict, turned = helps(left_out), frame(left_out, controls)
     worst = max(left_out, key=lambda score: score.rmse_db)
     ends = sorted(map(abs, turned.interval))
     helped, _, step = said_of(verdict, HELPS).partition(" Next: ")
@@ -198,7 +197,7 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
     return json_object(
         calibration=data.name,
         flights=data.flights, trained_on=data.trained_on, marks=data.marks, scores=data.scores,
-        controls=data.controls, mounts=data.mounts, strengths=data.strengths, ground=data.ground, words=data.words,
+        controls=data.controls, strengths=data.strengths, ground=data.ground, words=data.words,
         warnings=data.warnings,
         antennas=[
             {"name": a.name, "share_of_sphere_seen": _share_seen(a), "n_bins": len(a.flown)} for a in data.antennas
@@ -269,18 +268,6 @@ def _rows(splits: Mapping[str, Sequence[Mapping[str, Any]]] | None, keys: Sequen
     return [(SPLIT_TITLE.get(split, split), *(row[key] for key in keys)) for split, of in known for row in of]
 
 
-def mounts_card(data: CalibrationData) -> Card:
-    """Return the card of the mounts of antennas with a measured pattern."""
-    table = Table(
-        caption="Mounts of antennas with a measured pattern; azimuth counter-clockwise from east (tower) or from the "
-        "nose (UAV).",
-        columns={"Antenna": HEAD, "azimuth": RIGHT, "sd": RIGHT, "identified": TEXT},
-        rows=[(name, number(m["azimuth_deg"], 0, "deg"), number(m["azimuth_sd_deg"], 0, "deg"),
-               "yes" if m["identified"] else "no") for name, m in data.mounts.items()],
-    )  # fmt: skip
-    return Card(title="Antennas", id="antennas", tables=[table])
-
-
 def gains_card(data: CalibrationData) -> Card:
     """Return the card with the gain of each antenna over the sphere."""
     if not data.antennas:
@@ -320,7 +307,7 @@ def rank_card(data: CalibrationData) -> Card:
     return Card(title="Rank", id="rank", tables=[table])
 
 
-CARDS = (scores_card, mounts_card, gains_card, ground_card, rank_card)
+CARDS = (scores_card, gains_card, ground_card, rank_card)
 
 
 def write_calibration(data: CalibrationData, folder: Path) -> list[Path]:

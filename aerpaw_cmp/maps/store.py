@@ -9,8 +9,8 @@ path seen from above is the line between its ends, or two lines from a tower to 
 building is therefore omitted if a building counts that comes near
 
 - the convex hull of tower and tile (which also contains the reflections off ground and roofs), or
-- the hull of tower and wall, or the hull of wall and the part of the tile in its beam, for each wall whose beam from
-  the mirrored tower may reach the tile.
+- the hull of tower and wall, or the hull of wall and tile, for each wall whose beam from the mirrored tower may reach
+  the tile.
 
 With more reflections, terrain or a scene of triangles, every building counts.
 """
@@ -35,7 +35,7 @@ from ..common.errors import InputError, UsageError
 from ..common.files import read_bounded, write_whole
 from ..common.geodesy import SiteFrame
 from ..common.outputs import explained_os_errors
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, wavelength_m
+from ..common.units import AnyArray, BoolArray, FloatArray, wavelength_m
 from ..propagation.geometry import corners, site_faces
 from ..propagation.scene import REACH_M
 from ..propagation.search.mirror import Mirrors
@@ -158,7 +158,7 @@ class Reach:
         self.extent_m = np.sqrt(2.0) * farthest * np.array([[-1.0] * 3, [1.0] * 3])
         if self._every:
             return
-        faces = self._faces = site_faces(site)
+        faces = site_faces(site)
         bounds = shapely.bounds(footprints) + NEAR_M * np.array([-1.0, -1.0, 1.0, 1.0])
         self._near = shapely.STRtree(shapely.box(*bounds.T))
         self._ends = corners(faces, 1e9)[:, :2, :2]  # ends of the lower edge of each wall, seen from above
@@ -188,34 +188,14 @@ class Reach:
             # consider only walls: seen from above, a path over ground or roof is on the line between its ends
             lit = self._mirrors.toward(tower.position_m, box_m)
             lit = lit[self._is_wall[lit]]
-            lines += [self._way_in(at, lit), self._way_out(at, lit, tile)]
+            walls = self._ends[lit]
+            every = np.broadcast_to(tile, (len(lit), *tile.shape))
+            ways = np.insert(walls, 2, at, axis=1), np.concatenate([walls, every], axis=1)
+            lines += map(shapely.linestrings, ways)
         near = np.zeros(len(self.site.buildings), dtype=np.bool_)
         for shapes in map(shapely.convex_hull, lines):
             near[self._near.query(shapes, predicate="intersects")[1]] = True
         return near
-
-    def _way_in(self, at: FloatArray, walls: IntArray) -> AnyArray:
-        """Return shapes that contain all lines from a tower to each wall."""
-        ends = self._ends[walls]
-        return np.asarray(shapely.linestrings(np.insert(ends, 2, at, axis=1)))
-
-    def _way_out(self, at: FloatArray, walls: IntArray, tile: FloatArray) -> AnyArray:
-        """Return shapes that contain all lines from each wall, as a mirror of a tower, to the corners of a tile."""
-        ends, normal = self._ends[walls], self._faces.normal[walls, :2]
-        along = ends[:, 1] - ends[:, 0]
-        length = np.linalg.norm(along, axis=1)
-        height = normal @ at - self._faces.offset_m[walls]
-        image = at - 2.0 * height[:, None] * normal
-        slack = along * (NEAR_M / length)[:, None]
-        ray = np.stack([ends[:, 0] - slack, ends[:, 1] + slack], axis=1) - image[:, None]
-        # far behind the farthest corner of the tile, so that the end of the beam does not cut the tile
-        far = 100.0 * np.abs(image[:, None] - tile).sum(axis=2).max(initial=0.0)
-        reach = far / np.maximum(np.linalg.norm(ray, axis=2, keepdims=True), NEAR_M)
-        beam = shapely.polygons(np.concatenate([image[:, None] + ray, (image[:, None] + ray * reach)[:, ::-1]], axis=1))
-        area = shapely.polygons(tile)
-        wide = height < 0.05 * length  # the far end of the beam would be near the wall
-        lit = np.where(wide, area, shapely.intersection(beam, area))
-        return np.asarray(shapely.union(lit, shapely.linestrings(ends)))
 
 
 def _apart(tower: Tower, box_m: FloatArray) -> FloatArray:

@@ -472,25 +472,6 @@ class OrdinaryKriging:
         # rounding, or the function of a user, may exceed a correlation of 1
         return np.asarray(np.maximum(gamma, 0.0))
 
-    def _between(self, samples: FloatArray, near: IntArray) -> FloatArray:
-        """Return semivariances (pairs, t) of the neighbours ``near`` (m, t), as a lower triangle by columns.
-
-        Nearby targets share neighbours, so the semivariance of two samples is computed once.
-        """
-        first, second = np.triu_indices(len(near), 1)
-        number = np.zeros(len(samples), dtype=np.int64)
-        number[near] = 1
-        used = np.flatnonzero(number)
-        # a table of all pairs of samples would be larger than the pairs of neighbours
-        if len(used) ** 2 > len(first) * near.shape[1]:
-            return self._semivariance(samples.T[:, near[second]] - samples.T[:, near[first]])
-        number[used] = np.arange(len(used))
-        offset = samples[used].T[:, :, None] - samples[used].T[:, None]
-        np.fill_diagonal(offset[0], 1.0)  # these values are not used, and a correlation need not be finite at 0
-        table = self._semivariance(offset).ravel()
-        column, row = number[near], number[near] * len(used)
-        return np.asarray(table[row[first] + column[second]])
-
     def _solve(
         self, offset_m: FloatArray, samples: FloatArray, near: IntArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -499,7 +480,10 @@ class OrdinaryKriging:
         to_target = self._semivariance(offset_m)
         here = np.einsum("dmt,dmt->mt", offset_m, offset_m) < TIE_M**2
         to_target[here] = 0.0
-        between, regularised = self._between(samples, near), np.zeros(t, dtype=bool)
+        # semivariances (pairs, t) of the neighbours, as a lower triangle by columns
+        first, second = np.triu_indices(m, 1)
+        between = self._semivariance(samples.T[:, near[second]] - samples.T[:, near[first]])
+        regularised = np.zeros(t, dtype=bool)
         weight, variance, sound = solve_schur(between, to_target)
         if len(hard := np.flatnonzero(~sound)):
             w, variance[hard], regularised[hard] = _solve_doubtful(_square(between[:, hard], m), to_target.T[hard])
@@ -538,7 +522,7 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
     m, t = to_target.shape
     # store by columns, so that a step adds contiguous planes of memory; the two additional rows are L^-1 c and L^-1 1
     factor, weight, inverse_pivot = np.empty((m, m + 2, t)), np.empty((m, t)), np.empty((m, t))
-    # a slice of ``gamma`` is one column of the lower triangle, in the order of _between
+    # a slice of ``gamma`` is one column of the lower triangle, in the order of ``gamma``
     end = 0
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # NaN if C is not a covariance
         for j in range(m):

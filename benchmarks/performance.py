@@ -287,6 +287,9 @@ def kriging(history: list[dict[str, Any]]) -> list[str]:
         f"| {row['ratio_marginal']:.2f} |",
         "", f"27 fields at {number(counts[0])} targets: {row[f'ratio_total_{counts[0]}_27_fields']:.0f} "
         "times faster than 27 runs of PyKrige.", "",
+        "From 2026-11-29 on, semivariances are computed for each target, also if it shares samples with its "
+        "neighbours: 100 000 scattered targets take 0.83 s instead of 0.48 s on a machine under load, and maps on a "
+        "grid as long as before.", "",
     ]  # fmt: skip
 
 

@@ -522,7 +522,7 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
     m, t = to_target.shape
     # store by columns, so that a step adds contiguous planes of memory; the two additional rows are L^-1 c and L^-1 1
     factor, weight, inverse_pivot = np.empty((m, m + 2, t)), np.empty((m, t)), np.empty((m, t))
-    # a slice of ``gamma`` is one column of the lower triangle, in the order of ``gamma``
+    # a slice of ``gamma`` is one column of the lower triangle of the matrix
     end = 0
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # NaN if C is not a covariance
         for j in range(m):

@@ -363,7 +363,9 @@ class OrdinaryKriging:
         # estimates are returned in the shape of the values
         self._shape = fields.shape[1:]
         self.points_m_, self.values_, self.place_ = _merge_places(points, as_table(fields))
-        self.sill_ = self._sill_of(self.values_)
+        # subtract one value of the field, so that a constant field has a variance of exactly 0
+        centred = np.ma.masked_invalid(self.values_ - _reference(self.values_))
+        self.sill_ = np.ma.filled(centred.var(axis=0, ddof=1), 0.0)
         return self
 
     def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -397,11 +399,6 @@ class OrdinaryKriging:
         ]
         if wrong:
             raise UsageError("; ".join(wrong))
-
-    def _sill_of(self, values: FloatArray) -> FloatArray:
-        # subtract one value of the field, so that a constant field has a variance of exactly 0
-        centred = np.ma.masked_invalid(values - _reference(values))
-        return np.ma.filled(centred.var(axis=0, ddof=1), 0.0)
 
     def _shaped(self, estimate: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
         estimate = estimate if self.bounds is None else np.clip(estimate, *self.bounds)

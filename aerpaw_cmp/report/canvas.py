@@ -326,7 +326,8 @@ def draw_site(ax: Axes, site: Site) -> None:
             fontsize=8, fontweight="bold", annotation_clip=True,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8},
         )  # fmt: skip
-    plan_axes(ax)
+    ax.set_aspect("equal", adjustable="box")
+    ax.set(xlabel="East of the site origin [m]", ylabel="North of the site origin [m]")
 
 
 def draw_tower(ax: Axes, tower: Tower, **look: Any) -> None:
@@ -348,12 +349,6 @@ def _draw_crowns(ax: Axes, trees: Trees) -> None:
     ax.add_collection(crowns, autolim=False)
     ax.scatter(trees.east_m, trees.north_m, s=1.5, color="#2F5A25", linewidths=0, rasterized=True, zorder=0.45)
     ax.plot([], [], marker="o", markersize=6, color="#5E8C4F", alpha=0.6, linestyle="none", label="tree")
-
-
-def plan_axes(ax: Axes) -> None:
-    """Set labels and equal scales of a plan."""
-    ax.set_aspect("equal", adjustable="box")
-    ax.set(xlabel="East of the site origin [m]", ylabel="North of the site origin [m]")
 
 
 def frame_around(ax: Axes, east: FloatArray, north: FloatArray, *, margin: float = 0.08, shape: float = 1.0) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import shapely
 
 from ..common.units import FloatArray
 from ..site.scenes import drawn_buildings
@@ -27,17 +28,14 @@ TREES_IN_PAGE = 5000
 
 def view_limits(site: Site) -> FloatArray:
     """Return the limits (3, 2) of all objects in east, north and up, with a margin [m]."""
-    points = [tower.position_m for tower in site.towers.values()]
     areas = [(b.footprint, b.base_m + b.height_m) for b in drawn_buildings(site)]
     areas += [(forest.area, 0.0) for forest in site.forests] + [(fence.area, 0.0) for fence in site.geofences]
-    for area, top_m in areas:
-        points += list(at_height(np.asarray(area.exterior.coords)[:, :2], top_m))
-    if len(trees := site.trees):
-        points += list(np.column_stack([trees.east_m, trees.north_m, trees.ground_m + trees.height_m]))
-    if not points:
-        return np.array([[-100.0, 100.0], [-100.0, 100.0], [0.0, 50.0]])
-    cloud = np.array(points)
+    trees, towers = site.trees, np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
+    tops = np.column_stack([trees.east_m, trees.north_m, trees.ground_m + trees.height_m])
+    cloud = np.concatenate([towers, tops, *(at_height(shapely.get_coordinates(a), top_m) for a, top_m in areas)])
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    if not len(cloud):
+        return np.array([[-100.0, 100.0], [-100.0, 100.0], [0.0, 50.0]])
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     margin = 0.05 * max(high[0] - low[0], high[1] - low[1], 100.0)
     # include objects below the origin
@@ -54,8 +52,7 @@ def plan(site: Site) -> Figure:
     shape = float(np.clip(width / height, 0.45, 2.2))
     fig, ax = canvas.subplots((7.0 * min(shape, 1.0) + 2.4, 7.0 / max(shape, 1.0) + 0.6))
     canvas.draw_site(ax, site)
-    ax.set_xlim(*limits[0])
-    ax.set_ylim(*limits[1])
+    ax.set(xlim=limits[0], ylim=limits[1])
     ax.set_title(site.name, wrap=True)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))

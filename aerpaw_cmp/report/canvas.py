@@ -2,8 +2,8 @@
 
 Every figure is a separate :class:`matplotlib.figure.Figure`, drawn inside :func:`style` without pyplot and global
 state. Data sets differ not only in colour, but also in lightness, line style, marker or hatch, so that they can be
-distinguished in grey. Clouds of points are rasterised. Long lines are thinned, but retain their extremes. The SVG of a
-long flight is therefore small.
+distinguished in grey. Dots are rasterised. Long lines are thinned, but retain their extremes. The SVG of a long flight
+is therefore small.
 """
 
 from __future__ import annotations
@@ -216,9 +216,9 @@ def draw_marks(ax: Axes, marks: Sequence[Mapping[str, Any]]) -> None:
     ----------
     ax : Axes
     marks : sequence of mapping
-        Marks of :func:`mark`. The look may have ``colour``, ``dash`` (line style), ``alpha``, ``marker``, ``size`` and
-        ``hatch``. ``spans`` fill the background between ``x`` and ``ends`` up to the share ``height`` of the axes. The
-        script of a page does not draw them.
+        Marks of :func:`mark`. Their look may have ``colour``, ``dash`` (line style), ``alpha``, ``marker``, ``size``
+        and ``hatch``. A mark of kind ``spans`` fills the background between ``x`` and ``ends``, up to the share
+        ``height`` of the axes. The script of a page does not draw this kind.
     """
     for number, item in enumerate(marks):
         kind, x = item["kind"], item["x"]

@@ -1,7 +1,7 @@
 """Charts that the script of a page draws, and the confusion matrix of serving cells.
 
 A chart has marks (:func:`~aerpaw_cmp.report.canvas.mark`) over two axes. Dots may have whiskers from ``low`` to
-``high``. ``rows`` are names that replace the numbers of the ordinate. Figures (:func:`drawn`) show the same marks.
+``high``. ``rows`` are names that replace the numbers of the ordinate. :func:`chart_figure` draws the same marks.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Chart:
     content: Mapping[str, Any]
 
 
-def drawn(panels: Mapping[str, Mapping[str, Any]]) -> Figure:
+def chart_figure(panels: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Draw charts of one kind, by their titles, in one figure with at most three per row."""
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
@@ -107,7 +107,7 @@ def _errors(models: Sequence[ModelRow]) -> dict[str, Any]:
     return {"rows": names, "chosen": chosen, "x": {"label": "RMSE on held-out areas [dB]"}, "marks": [dots]}
 
 
-def flown(data: ReportData) -> list[Chart]:
+def level_charts(data: ReportData) -> list[Chart]:
     """Return charts of measured and simulated levels over time, one per channel of a flight, for the page of a map."""
     start, caption = start_of(data), "Ray tracing is drawn minus the offset of the channel."
     clock = {"label": "", "start": str(start.astype("datetime64[ms]"))}

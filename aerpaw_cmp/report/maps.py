@@ -30,7 +30,7 @@ from ..site.site import Site
 from . import canvas
 from .canvas import FigureSpec, beyond, colour_bar, draw_areas, draw_tower, mark, subplots
 from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, bold, paragraph, settings_card
-from .charts import Chart, drawn, flown
+from .charts import Chart, chart_figure, level_charts
 from .flight_data import RANKS, ReportData
 from .flight_figures import channel_specs
 from .flight_words import said_of
@@ -434,7 +434,7 @@ class Plate:
     @property
     def spec(self) -> FigureSpec:
         """The figure."""
-        return FigureSpec(self.name, partial(drawn, self.panels))
+        return FigureSpec(self.name, partial(chart_figure, self.panels))
 
     @property
     def charts(self) -> list[Chart]:
@@ -797,7 +797,7 @@ CARDS = (result_card, levels_card, flights_card, ranks_card, interpolation_card)
 def maps_page(data: MapsData, files: Sequence[str]) -> str:
     """Return the page."""
     charts = [chart for plate in plates(data) for chart in plate.charts]
-    charts += [chart for flight in data.flights for chart in flown(flight)]
+    charts += [chart for flight in data.flights for chart in level_charts(flight)]
     linked = payload(data, charts) if data.rss or data.rank or data.layers else None
     shown = Positions(view="map_explorer", data=linked) if linked else None
     columns, rows = len(data.east_m), len(data.north_m)

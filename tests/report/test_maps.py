@@ -8,7 +8,7 @@ import pytest
 from aerpaw_cmp.report import canvas
 from aerpaw_cmp.report import maps as maps_figures
 from aerpaw_cmp.report import maps as maps_html
-from aerpaw_cmp.report.charts import flown
+from aerpaw_cmp.report.charts import level_charts
 from aerpaw_cmp.report.maps import MapsData
 from aerpaw_cmp.report.texts import percent
 
@@ -164,7 +164,7 @@ def test_a_flight_on_the_map_shows_its_levels_over_time(maps_data, report_data):
     panels = [panel for panel in report_data.rss if panel.score.n]
     assert panels
     assert all(f"{report_data.flight}, {panel.name}" in page for panel in panels)
-    (chart, *_) = flown(report_data)
+    (chart, *_) = level_charts(report_data)
     measured, traced = chart.content["marks"]
     np.testing.assert_array_equal(measured["y"], panels[0].measured_db)
     np.testing.assert_array_equal(traced["y"], panels[0].simulated_dbm - panels[0].score.offset_db)

@@ -53,7 +53,6 @@ from aerpaw_cmp.compare.calibration import (
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.calibrate import (
     Calibration,
-    GroundFit,
     in_campaigns,
     learned_healths,
     learned_locks,
@@ -69,7 +68,6 @@ from aerpaw_cmp.site.learned import folder_of, remember
 
 RECIPES = Path(__file__).parents[1] / "tests" / "field" / "learned"
 TIMEZONE = "America/New_York"
-_NO_RAY = GroundFit(roughness_m=(float("inf"),), log_likelihood=(0.0,))  # drafts have none
 NAMES = ("dataset12", "lte", "afar", "nr_rank")
 
 
@@ -114,7 +112,7 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
         scores["flight_left_out"] = flight_left_out(observed, without=learned)
     calibration = Calibration(
         settings=settings, flights=tuple(flights), campaigns=campaigns, observed=tuple(observed), scores=scores,
-        controls={}, learned=learn([o.samples for o in observed]), ground=_NO_RAY, warnings=(),
+        controls={}, learned=learn([o.samples for o in observed]), warnings=(),
         words=(), locks=learned_locks(observed, learned), health=learned_healths(observed, learned),
         teaching=teaching(observed, campaigns, learned),
     )  # fmt: skip

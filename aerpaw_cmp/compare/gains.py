@@ -639,32 +639,6 @@ def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[Gai
     return model, sorted(binned, key=lambda s: groups.index(s.group))
 
 
-def column_forms(
-    series: Sequence[LinkSamples], model: GainModel, columns: Callable[[LinkSamples, float], FloatArray]
-) -> FloatArray:
-    """Return ``X' Sigma^-1 X`` (width, width), with the gains integrated out of the covariance Sigma of a model.
-
-    Parameters
-    ----------
-    series : sequence of LinkSamples
-    model : GainModel
-        Model whose priors and noise define Sigma.
-    columns : callable
-        ``columns(series, bin_s)`` returns the columns X of one series (bins, width) of :meth:`LinkSamples.binned`.
-
-    Returns
-    -------
-    (width, width)
-        A symmetric, positive semidefinite matrix [squared unit of the columns per dB^2].
-    """
-    model, rows = _binned_series(series, model)
-    names = [s.group for s in rows]
-    some = [s for s in series if len(s.binned(model.bin_s))]
-    values = np.concatenate([columns(s, model.bin_s) for s in sorted(some, key=lambda s: names.index(s.group))])
-    inside = Factor.of(_covariance_of_levels(model, rows)).whiten(values)
-    return np.asarray(inside.T @ inside)
-
-
 # Nominal shares of samples within an interval.
 SHARES = (0.5, 0.9, 0.95)
 

@@ -23,7 +23,6 @@ from ..common.errors import InputError, UsageError
 from ..common.gaussian import determining
 from ..common.stages import PlannedStage, Stages
 from ..common.text import counted
-from ..common.units import FloatArray
 from ..common.yamlfile import StrictModel, load_yaml
 from ..compare import calibration, gains
 from ..compare.calibration import Learned, Observed, Score, flights_of, groups_of, learn
@@ -35,7 +34,6 @@ from ..flight.gains import flight_of, load_with_learned
 from ..flight.replay import observed_series
 from ..flight.rows import LOCK_FLOOR_DB
 from ..flight.training import counted_once, flight_logs, marks_of
-from ..propagation.field.baselines import two_ray_dbm
 from ..report.calibration import sentences
 from ..site.learned import AIRFRAME_BAND, DirectionCovariance, LearnedHealth, LearnedLock, Source
 
@@ -203,10 +201,6 @@ def lock_words(lock: LearnedLock) -> str:
     )
 
 
-# Candidate roughness heights [m]. Infinite means that there is no ground ray.
-_ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
-
-
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
 
 
@@ -245,27 +239,6 @@ class CalibrationFile(StrictModel):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GroundFit:
-    """The log likelihood of each roughness height of the ground [m], relative to no ground ray (infinite height)."""
-
-    roughness_m: tuple[float, ...]
-    log_likelihood: tuple[float, ...]
-
-    @property
-    def likely_m(self) -> tuple[float, float]:
-        """Range of heights within 2 nat of the best log likelihood (about a 95 % interval)."""
-        # 2 nat are two standard deviations of a normal likelihood
-        least = max(self.log_likelihood) - 2.0
-        near = [r for r, v in zip(self.roughness_m, self.log_likelihood, strict=True) if v > least]
-        return min(near), max(near)
-
-    @property
-    def used_m(self) -> float | None:
-        """The most probable height, for replays. None if the data fit equally well without a ground ray."""
-        return None if math.isinf(self.likely_m[1]) else self.roughness_m[int(np.argmax(self.log_likelihood))]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
     """The result of a calibration."""
 
@@ -277,7 +250,6 @@ class Calibration:
     learned: Learned
     scores: Mapping[str, tuple[Score, ...]]
     controls: Mapping[str, tuple[Score, ...]]
-    ground: GroundFit
     locks: Mapping[str, LearnedLock]
     """Lock models by antenna, for receivers that lose their lock."""
     health: Mapping[str, LearnedHealth]
@@ -375,14 +347,12 @@ def calibrate(
     with stages("read"):
         further = [load_data(load_with_learned(path), path.parent, logs_root) for path in score]
     series = [o.samples for o in observed]
-    rest = [("fit, ground, scores", ", ".join(sorted({samples.antenna for samples in series})))]
+    rest = [("fit, scores", ", ".join(sorted({samples.antenna for samples in series})))]
     rest += [("score", counted(len(score), "flight"))] if score else []
     rest += [("rank", "of all flights")] if settings.rank else []
     stages.checked(lambda: [PlannedStage(*row) for row in rest])
     with stages("fit"):
         learned = learn(series)
-    with stages("ground"):
-        ground = _fit_ground(flights, observed, learned)
     fits: dict[str, Learned] = {}
     with stages("scores"):
         scores = _score_all(observed, stages, fits)
@@ -403,12 +373,11 @@ def calibrate(
         learned=learned,
         scores=scores,
         controls=controls,
-        ground=ground,
         locks=locks,
         health=health,
         teaching=taught,
         warnings=tuple(warnings),
-        words=(*sentences(scores, controls, ground.likely_m), *map(lock_words, locks.values())),
+        words=(*sentences(scores, controls), *map(lock_words, locks.values())),
     )
 
 
@@ -553,43 +522,6 @@ def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | Non
     if lost > 0.01:
         remarks.append(f"{name}: {100 * lost:.0f} % of the levels have no position and are ignored")
     return observed, remarks
-
-
-# --- learning ------------------------------------------------------------------------------------------------------
-
-
-def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], learned: Learned) -> GroundFit:
-    """Return the likelihood of a coherent ground ray for each roughness, with the gains integrated out."""
-    by_name = {data.settings.flight.name: data for data in flights}
-    by_series = {(o.samples.flight, o.samples.antenna): o for o in observed}
-
-    def columns(samples: gains.LinkSamples, bin_s: float) -> FloatArray:
-        data = by_name[samples.flight]
-        o = by_series[samples.flight, samples.antenna]
-        link = next(s.link for s in data.rss if f"{s.tower}.{s.channel}" == samples.antenna)
-        tower = data.site.towers[samples.tower]
-        place = tower.position_m[None, :] if o.tower_m is None else o.tower_m[:, None, :]
-        out = [samples.binned(bin_s).residual_db]
-        for sigma in _ROUGHNESS_M:
-            level = two_ray_dbm(
-                place,
-                samples.position_m,
-                link.carrier_hz,
-                link.transmit_power_dbm,
-                ground_material=data.site.ground_material,
-                ground_m=tower.ground_m,
-                roughness_m=sigma,
-            )[:, 0]
-            ripple = np.where(np.isfinite(samples.residual_db), level - o.free_space_db, np.nan)
-            out.append(dataclasses.replace(samples, residual_db=ripple).binned(bin_s).residual_db)
-        stacked = np.stack(out, axis=1)
-        return np.asarray(stacked - stacked.mean(axis=0))
-
-    series = [o.samples for o in observed]
-    form = gains.column_forms(series, learned.model, columns)
-    value = np.diag(form)[1:] - 2.0 * form[0, 1:]
-    likelihood = -0.5 * (value - value[-1])
-    return GroundFit(roughness_m=_ROUGHNESS_M, log_likelihood=tuple(map(float, likelihood)))
 
 
 # --- scores --------------------------------------------------------------------------------------------------------

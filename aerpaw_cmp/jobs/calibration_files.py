@@ -191,10 +191,8 @@ def learned_settings(
             entry["tower"] = at_tower
         else:
             entry.setdefault("towers", {})[tower] = at_tower
-    rough_m = calibration.ground.used_m
-    # without a ground ray, the gains were learned with the direct path only
-    depth = {"max_depth": 0} if rough_m is None else {"max_depth": 1, "ground_roughness_m": rough_m}
-    return {"link": {"channels": channels}, "rt": {"engine": "image", "attitude": "logged", **depth}}
+    # the gains were learned with the direct path only
+    return {"link": {"channels": channels}, "rt": {"engine": "image", "attitude": "logged", "max_depth": 0}}
 
 
 def _record_of(
@@ -216,11 +214,6 @@ def _record_of(
     CalibrationData
         Input of :func:`aerpaw_cmp.report.calibration.write_calibration`.
     """
-    heights = [f"{100 * r:g} cm" if math.isfinite(r) else "no ray" for r in calibration.ground.roughness_m]
-    ground = {
-        "rows": list(zip(heights, calibration.ground.log_likelihood, strict=True)),
-        "likely_m": calibration.ground.likely_m,
-    }
     return CalibrationData(
         name=calibration.settings.calibration,
         flights=calibration.names,
@@ -229,7 +222,6 @@ def _record_of(
         scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},
         controls={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.controls.items()},
         strengths={"model": dataclasses.asdict(calibration.learned.model)},
-        ground=ground,
         antennas=tuple(maps.values()),
         settings_text=text,
         stages_s=stages_s,
@@ -324,9 +316,8 @@ def site_entries(calibrated: Calibrated) -> dict[str, tuple[Entry, dict[str, byt
         tables: dict[str, bytes] = {}
         if calibrated.calibration is not None and maps is not None:
             series, tables = _learned_series(calibrated.calibration, name, maps)
-            ground_m = calibrated.calibration.ground.used_m
             errors = _errors(calibrated.calibration, name)
-            made = made.model_copy(update={"errors": errors, "series": series, "ground_roughness_m": ground_m})
+            made = made.model_copy(update={"errors": errors, "series": series})
         if calibrated.ranked is not None:
             file = f"{safe_name(name)}.receiver.json.gz"
             made = made.model_copy(update={"receivers": _learned_receivers(flights, calibrated.ranked, file)})

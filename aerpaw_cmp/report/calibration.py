@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from ..common.jsonable import json_object
 from ..common.units import FloatArray
 from ..compare.calibration import BASELINES, Score, mean_rmse
 from ..compare.verdict import Verdict, antenna_or_place, by_flight
-from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, write_page
+from .cards import HEAD, SHARE, TEXT, Card, Page, Positions, Table, write_page
 from .flight_words import said_of
 from .page import Made, about
 from .places import BODY, COMPASS, Places, payload
@@ -60,7 +59,6 @@ class CalibrationData(Made):
     scores: Mapping[str, Sequence[Mapping[str, Any]]]
     controls: Mapping[str, Sequence[Mapping[str, Any]]]
     strengths: Mapping[str, Any]
-    ground: Mapping[str, Any] | None
     antennas: Sequence[AntennaMap]
     rank: Mapping[str, Any] | None = None
     settings_text: str = ""
@@ -129,17 +127,13 @@ def _errors(scores: Sequence[Score], name: str = "rmse_db") -> list[tuple[str, f
     return [(score.flight, getattr(score, name)) for score in scores]
 
 
-def sentences(
-    scores: Mapping[str, Sequence[Score]], controls: Mapping[str, Sequence[Score]], ground_m: tuple[float, float] | None
-) -> tuple[str, ...]:
+def sentences(scores: Mapping[str, Sequence[Score]], controls: Mapping[str, Sequence[Score]]) -> tuple[str, ...]:
     """Return the summary for page and terminal, followed by details.
 
     Parameters
     ----------
     scores, controls : mapping of str to sequence of Score
         Scores by kind of held-out data, and scores of wrong or simpler models as controls.
-    ground_m : (float, float), optional
-        Range of the roughness height that the data allow [m]; None if no ground was fitted.
 
     Returns
     -------
@@ -160,10 +154,10 @@ def sentences(
         said_of(turned, FRAMES, near=ends[0], far=ends[1]),
         f"Next: {step}" if turned.cause != "place" else "",
     )
-    return (" ".join(text for text in first if text), *_further(scores, ground_m))
+    return (" ".join(text for text in first if text), *_further(scores))
 
 
-def _further(scores: Mapping[str, Sequence[Score]], ground_m: tuple[float, float] | None) -> Iterator[str]:
+def _further(scores: Mapping[str, Sequence[Score]]) -> Iterator[str]:
     left_out, sectors = scores["flight_left_out"], scores["sector_left_out"]
     if sectors:
         base, error = mean_rmse(sectors, "free_space_rmse_db"), mean_rmse(sectors)
@@ -174,13 +168,6 @@ def _further(scores: Mapping[str, Sequence[Score]], ground_m: tuple[float, float
             yield f"{100 * share:.0f} % of the improvement over free space remains in these directions."
     if not scores["heading_left_out"]:
         yield "No heading could be held out, because all flights have the same one."
-    if ground_m is not None and math.isinf(ground_m[0]):
-        yield "The data show no coherent ground ray."
-    elif ground_m is not None:
-        low, high = (100.0 * end for end in ground_m)
-        yield f"The data allow a roughness of the ground of {low:.1f} cm " + (
-            "or more." if math.isinf(high) else f"to {high:.1f} cm."
-        )
 
 
 SPLIT_TITLE = {
@@ -197,7 +184,7 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
     return json_object(
         calibration=data.name,
         flights=data.flights, trained_on=data.trained_on, marks=data.marks, scores=data.scores,
-        controls=data.controls, strengths=data.strengths, ground=data.ground, words=data.words,
+        controls=data.controls, strengths=data.strengths, words=data.words,
         warnings=data.warnings,
         antennas=[
             {"name": a.name, "share_of_sphere_seen": _share_seen(a), "n_bins": len(a.flown)} for a in data.antennas
@@ -282,16 +269,6 @@ def gains_card(data: CalibrationData) -> Card:
     return Card(title="Gain of the antennas", positions=shown, text=[text])
 
 
-def ground_card(data: CalibrationData) -> Card:
-    """Return the card of the likelihood of a coherent ground ray."""
-    table = Table(
-        caption="Log likelihood of a coherent ground ray against none, by height of roughness (0: smooth).",
-        columns={"roughness": RIGHT, "log likelihood": 1},
-        rows=[(str(row[0]), row[1]) for row in (data.ground or {}).get("rows", ())],
-    )  # fmt: skip
-    return Card(title="Ground", id="ground", tables=[table])
-
-
 def rank_card(data: CalibrationData) -> Card:
     """Return the card of the rank receiver's forecasts on held-out flights."""
     table = Table(
@@ -307,7 +284,7 @@ def rank_card(data: CalibrationData) -> Card:
     return Card(title="Rank", id="rank", tables=[table])
 
 
-CARDS = (scores_card, gains_card, ground_card, rank_card)
+CARDS = (scores_card, gains_card, rank_card)
 
 
 def write_calibration(data: CalibrationData, folder: Path) -> list[Path]:

@@ -264,6 +264,7 @@ class Entry(StrictModel):
     series: list[LearnedSeries] = Field(default_factory=list)
     receivers: list[LearnedReceiver] = Field(default_factory=list)
     ground_roughness_m: float | None = None
+    """Roughness of the ground that earlier versions learned [m]. It is not used."""
     tables: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
     """SHA-256 of the tables as written. No other file is replaced or removed."""
     sha256: str = ""

@@ -9,7 +9,6 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.flight.gains import path_loss, path_losses
 from aerpaw_cmp.flight.replay import replay_poses
 from aerpaw_cmp.flight.settings import RtSettings, load_flight
-from aerpaw_cmp.jobs.calibrate import GroundFit
 from aerpaw_cmp.jobs.flight_run import Model, recommended_changes
 from aerpaw_cmp.propagation.check import reference
 from aerpaw_cmp.propagation.check.audit import Expected
@@ -65,12 +64,6 @@ def test_a_ground_that_is_not_known_is_refused():
     with pytest.raises(UsageError, match="scene of triangles"):
         path_loss(scene, rt(ground_roughness_m=0.1), 3.4e9)
     assert path_loss(scene, rt(), 3.4e9) is None
-
-
-def test_a_calibration_uses_a_ray_only_where_none_is_less_likely():
-    heights = (0.0, 0.05, np.inf)
-    assert GroundFit(roughness_m=heights, log_likelihood=(-9.0, 5.0, 0.0)).used_m == 0.05
-    assert GroundFit(roughness_m=heights, log_likelihood=(-9.0, 1.5, 0.0)).used_m is None
 
 
 def test_the_ladder_writes_and_takes_away_the_roughness(tmp_path):

@@ -82,8 +82,8 @@ def calibration(_: Fixture) -> str:
     as_dicts = [{k: [dataclasses.asdict(s) for s in v] for k, v in part.items()} for part in (left, controls)]
     data = CalibrationData(
         name="lake_wheeler_july", generated="2026-11-21T00:00:00+00:00", flights=["F0", "F1", "F2", "F3"],
-        trained_on=["ab" * 32], marks=[], words=sentences(left, controls, (0.02, np.inf)), warnings=[], scores=as_dicts[0],
-        controls=as_dicts[1], strengths={}, ground=None, antennas=[],
+        trained_on=["ab" * 32], marks=[], words=sentences(left, controls), warnings=[], scores=as_dicts[0],
+        controls=as_dicts[1], strengths={}, antennas=[],
         settings_text="link: {" + ", ".join(f"setting_{i}: {i}" for i in range(200)) + "}",
     )  # fmt: skip
     return _written(calibration_html.write_calibration, data, "calibration")

@@ -104,10 +104,10 @@ def nearest(
     chosen = Neighbours(np.full((len(targets_m), m), -1, dtype=np.int64), np.full((len(targets_m), m), np.inf))
     if len(samples_m) == 0 or len(targets_m) == 0:
         return chosen
-    tree, order = cKDTree(samples_m), in_strips(targets_m, QUERY_CHUNK)
+    tree = cKDTree(samples_m)
     for start in range(0, len(targets_m), QUERY_CHUNK):
         # one more than required shows whether a tie continues; on the paper's grid up to 12 cells are equally distant
-        todo, candidates = order[start : start + QUERY_CHUNK], m + 13
+        todo, candidates = np.arange(start, min(start + QUERY_CHUNK, len(targets_m))), m + 13
         while len(todo):
             todo = _fill_nearest(tree, targets_m, todo, radius_m, skip, candidates, chosen)
             candidates *= 2
@@ -147,15 +147,6 @@ def by_rule(
 def renumbered(taken: BoolArray) -> IntArray:
     """Return the number of each sample among the samples of a mask (samples,), -1 outside the mask."""
     return np.where(taken, np.cumsum(taken) - 1, -1)
-
-
-def in_strips(places_m: FloatArray, together: int) -> IntArray:
-    """Return an order of positions in strips, in which ``together`` consecutive positions fill about a square."""
-    if not len(places_m):
-        return np.empty(0, dtype=np.int64)
-    east, north = (places_m - places_m.min(axis=0)).T[:2]
-    width = max(float(np.sqrt(east.max() * north.max() * together / len(places_m))), TIE_M)
-    return np.argsort(np.floor(north / width) * (east.max() + TIE_M) + east)
 
 
 def _fill_nearest(
@@ -432,9 +423,9 @@ class OrdinaryKriging:
         weight = np.zeros(chosen.index.shape)
         variance = np.full(len(targets), np.nan)
         regularised = np.zeros(len(targets), dtype=bool)
-        order, coordinates = in_strips(targets, CHUNK), np.ascontiguousarray(samples.T)
+        coordinates = np.ascontiguousarray(samples.T)
         for m in np.unique(count[count > 0]):
-            same = order[count[order] == m]
+            same = np.flatnonzero(count == m)
             step = min(CHUNK, max(1, FACTOR_NUMBERS // int(m) ** 2))
             for start in range(0, len(same), step):
                 rows = same[start : start + step]

@@ -198,7 +198,7 @@ def long_flight(samples: int = 50_000, channels: int = 10) -> ReportData:
         panels.append(
             rss_result(tower.name, channel_name, time, place, levels, unit="dBm", geometry={"distance_m": distance})
         )
-    track = Track(time=time, east_m=east, north_m=north, up_m=up)
+    track = Track(time=time, position_m=np.column_stack([east, north, up]))
     return ReportData(
         title="A flight that was never flown", flight="long", site=site, generated="2026-11-21T00:00:00+00:00",
         rss=tuple(panels), verdict=flight_verdict(panels), track=track, synthetic=True,

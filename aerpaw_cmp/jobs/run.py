@@ -281,7 +281,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
 def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[str, ...]:
     """Return the formats of the exports. Raise UsageError for options that exclude each other."""
     from ..report.exports import chosen_formats
-    from ..report.flight import FIGURES
+    from ..report.page import FIGURES
 
     if chosen.figures not in FIGURES:
         raise UsageError(f"--figures {chosen.figures}", expected=f"one of {', '.join(FIGURES)}")

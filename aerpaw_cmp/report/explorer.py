@@ -151,10 +151,9 @@ def _track(data: ReportData, start: np.datetime64, arrays: PackedArrays) -> dict
     track = data.track
     if track is None or not len(track.time):
         return None
-    places = np.stack([track.east_m, track.north_m, track.up_m])
-    known = np.flatnonzero(np.isfinite(places).all(axis=0))
+    known = np.flatnonzero(np.isfinite(track.position_m).all(axis=1))
     pick = known[spread_out(len(known), TRACK_POINTS)]
-    position = {axis: arrays.add(place) for axis, place in zip(AXES, places[:, pick], strict=True)}
+    position = {axis: arrays.add(place) for axis, place in zip(AXES, track.position_m[pick].T, strict=True)}
     return {"time": arrays.add(seconds_since(track.time, start)[pick], "f8"), **position}
 
 

@@ -306,12 +306,13 @@ def _flown(export: Export) -> str:
     """Return the track as KML, with times if they are known. Empty if there are fewer than two positions."""
     if (line := export.data.track) is None:
         return ""
-    known = np.flatnonzero(np.isfinite(line.east_m) & np.isfinite(line.north_m) & ~np.isnat(line.time))
+    known = np.flatnonzero(np.isfinite(line.position_m[:, :2]).all(axis=1) & ~np.isnat(line.time))
     if len(known) < 2:
         return ""
-    pick = known[keep_extremes([line.up_m[known]], TRACK_POINTS)]
-    latitude, longitude = latitude_longitude(export.data.site.frame, line.east_m[pick], line.north_m[pick])
-    at = kml.coordinates(longitude, latitude, line.up_m[pick])
+    pick = known[keep_extremes([line.position_m[known, 2]], TRACK_POINTS)]
+    east, north, up = line.position_m[pick].T
+    latitude, longitude = latitude_longitude(export.data.site.frame, east, north)
+    at = kml.coordinates(longitude, latitude, up)
     if export.clock:
         times = "".join(f"<when>{time}</when>" for time in iso_time(line.time[pick]))
         places = "".join(f"<gx:coord>{item.replace(',', ' ')}</gx:coord>" for item in at)

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,23 +23,19 @@ from ..compare.level import PART_DB, ErrorSpan, FieldAudit
 from ..compare.result import APPLIED, GIVEN, AuditResult, ClockResult, EngineResult, RankResult, RssResult
 from ..compare.statistics import Interval
 from ..logs.records import has_wall_clock
-from . import flight_figures as figures
 from . import flight_words as words
-from .canvas import FORMATS
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, paragraph, settings_card
 from .charts import charts_of, shown_confusion
 from .columns import RANK, RSS, csv_text, described
 from .explorer import payload
 from .exports import FOLDER
 from .flight_data import RANKS, InputFile, ReportData, start_of
+from .flight_figures import figure_specs
 from .page import about, json_text, merge, rendered, write_figures, write_file
 from .texts import clock, cut, duration, interval, k_key, minute, number, percent
 
 # Largest number of rejected lines that are shown per file.
 _REJECTED_SHOWN = 20
-
-# Formats in which figures are written as files.
-FIGURES = ("none", "svg", "png", "pdf", "all")
 
 # --- metrics.json ---------------------------------------------------------------------------------------------------
 
@@ -565,7 +562,7 @@ def write_report(
     folder : path
         An empty folder, such as that of :meth:`aerpaw_cmp.common.outputs.OutputFolder.filling`.
     drawn : str
-        One of :data:`FIGURES`.
+        One of :data:`~aerpaw_cmp.report.page.FIGURES`.
     exports : sequence of str
         Formats of :data:`aerpaw_cmp.report.exports.FORMATS` for the samples, in addition to CSV.
     stages : Stages, optional
@@ -584,12 +581,10 @@ def write_report(
     folder, stages = Path(folder), stages or Stages(seconds=dict(data.stages_s))
     written: list[Path] = []
     with stages("report"):
-        specs = [] if drawn == "none" else figures.figure_specs(data)
-        formats = FORMATS if drawn == "all" else (drawn,)
         for name, text in (("rss.csv", csv_text(RSS, data.rss)), ("rank.csv", csv_text(RANK, data.rank))):
             # also write a table without rows, so that every report has the same files
             written.append(write_file(folder / name, text))
-        pictures = write_figures(specs, folder / "figures", formats, stages.progress)
+        pictures = write_figures(partial(figure_specs, data), folder / "figures", drawn, stages.progress)
     written += pictures
     if exports:
         from .exports import of_report, write_exports

@@ -67,12 +67,10 @@ class InputFile:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """The track of the UAV: ``time`` (n,), and positions (n,) in the site frame [m]."""
+    """The track of the UAV: ``time`` (n,), and positions (n, 3) east, north and up in the site frame [m]."""
 
     time: AnyArray
-    east_m: FloatArray
-    north_m: FloatArray
-    up_m: FloatArray
+    position_m: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -354,7 +352,7 @@ def track_of(data: FlightData) -> Track | None:
         if placed is None or placed.position_m is None:
             return None
         time, position = placed.time, placed.position_m
-    return Track(time=time, east_m=position[:, 0], north_m=position[:, 1], up_m=position[:, 2])
+    return Track(time=time, position_m=position)
 
 
 def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
@@ -364,7 +362,7 @@ def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
     track = track_of(data)
     if track is None:
         return ()
-    out, start, line_m = [], 0, np.column_stack([track.east_m, track.north_m, track.up_m])
+    out, start, line_m = [], 0, track.position_m
     for point in points:
         if not point.label:
             continue

@@ -15,7 +15,6 @@ from ..common.kml import CLASS_COLOURS
 from ..common.text import counted
 from ..common.units import BoolArray, FloatArray, spread_out
 from ..compare.result import PairResult, RankResult, RssResult
-from ..site.site import Site
 from . import canvas
 from .canvas import FigureSpec, mark
 from .flight_data import RANKS, ReportData, Track, start_of, used_towers
@@ -23,7 +22,6 @@ from .flight_words import count, instants, pretty, signed
 from .texts import k_key, number, safe_name
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -87,10 +85,10 @@ def trajectory(data: ReportData, track: Track) -> Figure:
         look = {"color": canvas.TOWER, "linewidth": 1.2, "linestyle": (0, (4, 2)), "zorder": 4.5}
         ax.plot(*way[spread_out(len(way), canvas.POINTS_PER_LINE)].T, label=f"track of {name}", **look)
     points = ax.scatter(
-        track.east_m, track.north_m, c=track.up_m, cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,
+        *track.position_m.T[:2], c=track.position_m[:, 2], cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,
         label="flight (colour: height)",
     )  # fmt: skip
-    flown = np.column_stack([track.east_m, track.north_m])
+    flown = track.position_m[:, :2]
     extent, centre = np.nanmax([*np.ptp(flown, axis=0), 100.0]), np.nanmean(flown, axis=0)
     places = (data.site.towers[name].position_m[None, :2] for name in used_towers(data))
     # omit distant towers, because the flight would be a dot next to them
@@ -108,7 +106,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
 
 def altitude(data: ReportData, track: Track) -> Figure:
     """Draw height over time."""
-    height = mark("line", "height of the UAV", canvas.seconds_since(track.time, start_of(data)), track.up_m)
+    height = mark("line", "height of the UAV", canvas.seconds_since(track.time, start_of(data)), track.position_m[:, 2])
     return over_time(data, [({"label": "Height above ground [m]"}, [height])], [2.2])
 
 
@@ -242,36 +240,8 @@ def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssR
 # --- rank ---------------------------------------------------------------------------------------
 
 
-def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: FloatArray, title: str) -> None:
-    """Draw ranks at their positions, with a colour and a marker for each. NaN is not drawn.
-
-    Parameters
-    ----------
-    ax : Axes
-    site : Site
-    east, north : (n,)
-        Positions [m].
-    rank : (n,)
-        Ranks 1 to 4; 0 if there is no path, NaN if unknown.
-    title : str
-    """
-    canvas.draw_site(ax, site)
-    entries = []
-    for value, at in ((value, rank == value) for value in (0, *RANKS) if (rank == value).any()):
-        style: dict[str, Any] = {"color": "black", "linewidths": 0.8}
-        if value:
-            style = {"facecolor": CLASS_COLOURS[value], "edgecolors": "#222222", "linewidths": 0.25}
-        entries.append(ax.scatter(
-            east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **style,
-            label=f"{f'rank {value}' if value else 'no path'} ({count(int(at.sum()))})",
-            zorder=3.0 + 1.0 / at.sum(),  # rare ranks on top, so that they are visible
-        ))  # fmt: skip
-    ax.set_title(title)
-    ax.legend(handles=entries, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, markerscale=1.6)
-
-
 def rank_maps(data: ReportData, panel: RankResult) -> Figure:
-    """Draw the measured rank and the rank of every K along the flight."""
+    """Draw the measured rank and the rank of every K along the flight. Each rank has a colour and a marker."""
     maps = [("Measured (reported RI)", panel.measured)]
     maps += [(f"Ray tracing, K = {k_key(k)}", rank.astype(float)) for k, rank in panel.rank.items()]
     columns = 2 if len(maps) > 1 else 1
@@ -281,7 +251,19 @@ def rank_maps(data: ReportData, panel: RankResult) -> Figure:
     # 1.6 inches are for title, axis label and a legend of two lines
     fig, axes = canvas.subplots((9.2, rows * (3.9 / shape + 1.6)), rows, columns, squeeze=False)
     for ax, (title, rank) in zip(axes.ravel(), maps, strict=False):
-        _rank_map(ax, data.site, east, north, rank, title)
+        canvas.draw_site(ax, data.site)
+        entries = []
+        for value in (value for value in (0, *RANKS) if (rank == value).any()):
+            at, look = rank == value, {"color": "black", "linewidths": 0.8}
+            if value:
+                look = {"facecolor": CLASS_COLOURS[value], "edgecolors": "#222222", "linewidths": 0.25}
+            entries.append(ax.scatter(
+                east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **look,
+                label=f"{f'rank {value}' if value else 'no path'} ({count(int(at.sum()))})",
+                zorder=3.0 + 1.0 / at.sum(),  # rare ranks on top, so that they are visible
+            ))  # fmt: skip
+        ax.set_title(title)
+        ax.legend(handles=entries, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, markerscale=1.6)
         canvas.frame_around(ax, east, north, shape=shape)
     for ax in axes.ravel()[len(maps) :]:
         ax.set_visible(False)

@@ -27,7 +27,6 @@ from ..maps.evaluate import TREATMENTS
 from ..maps.grid import JOINT, PAPER_SPACING_M, RANK_CLASSES, Layer
 from ..maps.variogram import BiExponential, BinnedCorrelation
 from ..site.site import Site
-from . import canvas
 from .canvas import FigureSpec, beyond, colour_bar, draw_areas, draw_tower, mark, subplots
 from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, bold, paragraph, settings_card
 from .charts import Chart, chart_figure, level_charts
@@ -825,8 +824,6 @@ def write_maps(data: MapsData, folder: str | Path, drawn: str = "none") -> list[
     """Write ``map.html``, ``metrics.json`` and figures in the formats ``drawn``, and return the files, page first."""
     folder = Path(folder)
     written = [write_file(folder / "metrics.json", json_text(maps_metrics(data)))]
-    specs = [] if drawn == "none" else figure_specs(data)
-    formats = canvas.FORMATS if drawn == "all" else (drawn,)
-    files = write_figures(specs, folder / "figures", formats)
+    files = write_figures(partial(figure_specs, data), folder / "figures", drawn)
     page = write_file(folder / "map.html", maps_page(data, ["metrics.json"]))
     return [page, *written, *files]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
@@ -21,8 +21,11 @@ from markupsafe import Markup
 from ..common.stages import Progress, logged
 from ..common.text import counted
 from ..common.versions import commit, utc_now, versions
-from .canvas import FigureSpec, render
+from .canvas import FORMATS, FigureSpec, render
 from .texts import coded
+
+# Choices for figures as files: no figures, one format, or all formats.
+FIGURES = ("none", *FORMATS, "all")
 
 
 def links_of(by_tower: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], Any]:
@@ -132,20 +135,18 @@ def embedded(content: Mapping[str, Any] | None) -> Markup:
 
 
 def write_figures(
-    specs: Sequence[FigureSpec],
-    folder: Path,
-    formats: Sequence[str] = ("png",),
-    progress: Progress = logged,
+    specs_of: Callable[[], Sequence[FigureSpec]], folder: Path, drawn: str, progress: Progress = logged
 ) -> list[Path]:
-    """Draw figures, write each in all formats, and return the files.
+    """Draw figures, write each in one or all formats, and return the files.
 
     Parameters
     ----------
-    specs : sequence of FigureSpec
+    specs_of : callable
+        Returns the figures.
     folder : Path
         Created if it does not exist.
-    formats : sequence of str
-        Formats of matplotlib, such as ``"svg"``, ``"png"``, ``"pdf"``.
+    drawn : str
+        One of :data:`FIGURES`.
     progress : Progress
         Called with the share of figures that have been drawn.
 
@@ -153,11 +154,10 @@ def write_figures(
     -------
     list of Path
     """
+    specs = () if drawn == "none" else specs_of()
     written: list[Path] = []
-    for number, spec in enumerate(specs):
-        progress("figures", number / len(specs))
-        pictures = render(spec, formats)
+    for number, spec in enumerate(specs, 1):
+        pictures = render(spec, FORMATS if drawn == "all" else (drawn,))
         written += [write_file(folder / f"{spec.name}.{form}", content) for form, content in pictures.items()]
-    if specs:
-        progress("figures", 1.0)
+        progress("figures", number / len(specs))
     return written

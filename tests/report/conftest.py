@@ -58,38 +58,38 @@ def make_track(n: int = 6000) -> Track:
     north = -80 + 360 * s
     up = 40.0 * np.clip(np.minimum(s / 0.08, (1 - s) / 0.08), 0.0125, 1)
     time = np.datetime64("2024-07-15T17:02:11", "ns") + (s * 950e9).astype("timedelta64[ns]")
-    return Track(time=time, east_m=east, north_m=north, up_m=up)
+    return Track(time=time, position_m=np.column_stack([east, north, up]))
 
 
 def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> RssResult:
     rng = np.random.default_rng(seed)
-    position = np.stack([track.east_m, track.north_m, track.up_m], axis=1)
+    position, (east, north, up) = track.position_m, track.position_m.T
     t = site.towers[tower].position_m
     d = np.linalg.norm(position - t, axis=1)
     mirrored = np.linalg.norm(position - t * [1, 1, -1], axis=1)
     free = 40 + 20 * np.log10(WAVELENGTH / (4 * np.pi * d))
     waves = (np.exp(-2j * np.pi * way / WAVELENGTH) / way for way in (d, mirrored))
     two_ray = 40 + 20 * np.log10(WAVELENGTH / (4 * np.pi) * np.abs(next(waves) - 0.6 * next(waves)))
-    azimuth = np.degrees(np.arctan2(track.north_m - t[1], track.east_m - t[0]))
+    azimuth = np.degrees(np.arctan2(north - t[1], east - t[0]))
     simulated = two_ray - 3.0 * np.cos(np.radians(azimuth - 40)) ** 2
     truth = (
         simulated + np.convolve(rng.normal(0, 9.0, len(d)), np.ones(25) / 25, mode="same") + rng.normal(0, 2.0, len(d))
     )
     measured = np.round(truth - 42.13, 1)
-    blocked = (track.up_m < 12) & (d > 300) if tower != "LW1" else np.zeros(len(d), dtype=bool)
+    blocked = (up < 12) & (d > 300) if tower != "LW1" else np.zeros(len(d), dtype=bool)
     simulated = np.where(blocked, np.nan, simulated)
     silent = (np.arange(len(d)) > 5900) & (tower == "LW4")
     measured = np.where(silent, np.nan, measured)
     levels = {"measured": measured, "simulated": simulated, "free_space": free, "two_ray": two_ray}
     return rss_result(
         tower, channel, track.time, position, levels, line_of_sight=np.where(blocked, 0.0, 1.0),
-        geometry={"distance_m": d, "azimuth_deg": azimuth, "elevation_deg": np.degrees(np.arcsin((track.up_m - t[2]) / d)), "altitude_m": track.up_m},
+        geometry={"distance_m": d, "azimuth_deg": azimuth, "elevation_deg": np.degrees(np.arcsin((up - t[2]) / d)), "altitude_m": up},
     )  # fmt: skip
 
 
 def make_rank(site: Site, track: Track) -> RankResult:
     pick = slice(0, None, 6)
-    east, north, up, time = track.east_m[pick], track.north_m[pick], track.up_m[pick], track.time[pick]
+    (east, north, up), time = track.position_m[pick].T, track.time[pick]
     rng = np.random.default_rng(11)
     d = np.hypot(east, north) + 20
     slow = np.convolve(rng.normal(0, 6, len(d)), np.ones(12) / 12, mode="same")
@@ -105,7 +105,7 @@ def make_rank(site: Site, track: Track) -> RankResult:
 def make_report() -> ReportData:
     site, track = make_site(), make_track()
     waypoints = tuple(
-        Waypoint(label=c, time=track.time[i], **{k: float(getattr(track, k)[i]) for k in ("east_m", "north_m")})
+        Waypoint(label=c, time=track.time[i], east_m=track.position_m[i, 0], north_m=track.position_m[i, 1])
         for c, i in zip("ABCDEF", (480, 1700, 2560, 3420, 4280, 5500), strict=True)
     )
     rss = tuple(

@@ -119,12 +119,7 @@ def few_thresholds(panel: RankResult, most: int) -> RankResult:
 
 
 def still(track: Track) -> Track:
-    return dataclasses.replace(
-        track,
-        east_m=np.full(len(track.time), 5.0),
-        north_m=np.full(len(track.time), 5.0),
-        up_m=np.full(len(track.time), 0.5),
-    )
+    return dataclasses.replace(track, position_m=np.tile([5.0, 5.0, 0.5], (len(track.time), 1)))
 
 
 @pytest.fixture(scope="module")
@@ -143,8 +138,8 @@ def drawn_before():
         lambda d: {"rss": (), "rank": (few_thresholds(d.rank[0], 0),)},
         lambda d: {"rss": (), "rank": (few_thresholds(d.rank[0], 1),)},
         lambda d: {"rss": (), "rank": (), "track": still(d.track)},
-        lambda d: {"rss": (), "rank": (), "track": Track(time=d.track.time[:1], east_m=d.track.east_m[:1], north_m=d.track.north_m[:1], up_m=d.track.up_m[:1])},
-        lambda d: {"rss": (), "rank": (), "track": dataclasses.replace(d.track, up_m=np.full(len(d.track.time), np.nan))},
+        lambda d: {"rss": (), "rank": (), "track": Track(time=d.track.time[:1], position_m=d.track.position_m[:1])},
+        lambda d: {"rss": (), "rank": (), "track": dataclasses.replace(d.track, position_m=d.track.position_m * [1.0, 1.0, np.nan])},
         lambda d: {"rss": (), "rank": (), "site": dataclasses.replace(d.site, towers={}, buildings=(), forests=(), geofences=(), trees=type(d.site.trees).none())},
     ],
     ids=["one sample", "all out of coverage", "edge", "no CSI at all", "rank without simulation", "one K", "hovering", "one pose", "no height", "bare site"],

@@ -406,10 +406,8 @@ class GainFit:
         UsageError
             If no flight of the fit has this tower and channel.
         """
-        terms, about = (
-            [t for t in self.model.terms if frames is None or t.frame in frames],
-            self._rows_of(samples.antenna),
-        )
+        terms = [t for t in self.model.terms if frames is None or t.frame in frames]
+        about = self._rows_of(samples.antenna)
         gain, sd = _in_parts(self._like_fitted(samples), lambda part: np.stack(self._moments(terms, part, about)), 2)
         return gain, sd
 

@@ -1,4 +1,4 @@
-"""Questions about logs: contradictions with file names, neighbouring files, clocks or ground heights, and assumptions.
+"""Questions about logs: contradictions with file names, clocks or ground heights, and assumptions.
 
 The module also assigns the logs of several flights to their flights, by time and position.
 """
@@ -6,19 +6,18 @@ The module also assigns the logs of several flights to their flights, by time an
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, tzinfo
 from datetime import timezone as zones
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from zoneinfo import ZoneInfo
 
 import numpy as np
 
 from ..common.errors import InputError
 from ..common.units import AnyArray
-from ..logs import files
-from ..logs.ingest import IngestedFile, read_bytes
+from ..logs.ingest import IngestedFile
 from ..logs.limits import PLACE, jumps_of
 from ..logs.records import Stream, has_wall_clock
 from ..site.site import Site
@@ -214,7 +213,6 @@ def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
 _IN_NAME = re.compile(
     r"(?<!\d)(20\d\d)[-_]?([01]\d)[-_]?([0-3]\d)(?:[T_ -]([0-2]\d)[-_:]?([0-5]\d)(?:[-_:]?([0-5]\d))?)?(?!\d)"
 )
-_NEMO_START = re.compile(r"^Measurement start;(\d{4} \w{3} \d\d \d\d:\d\d)", re.MULTILINE)
 
 # A date in a name may be local or UTC, and that of the start or of the end.
 _OF_THE_DAY = timedelta(hours=36)
@@ -240,13 +238,9 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
     start = _start(streams)
     if start is not None:
         zone = ZoneInfo(timezone) if timezone else None
-        starts = _name_starts(file.path)
-        # a log inside a flight file has a path of another machine, so its folder cannot be searched for a summary
-        if not file.holder:
-            starts += _summary_starts(Path(file.path))
         texts += [
-            f"{where} has {time:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is correct?"
-            for where, time, form, slack in starts
+            f"the file's name has {time:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is correct?"
+            for time, form, slack in _name_starts(file.path)
             if _apart(time, start, zone, exact=slack == _OF_THE_MINUTE) > slack
         ]
         if any(s.attributes.get("clock_from") == "assumed" for s in streams):
@@ -408,8 +402,8 @@ def _start(streams: Sequence[Stream]) -> datetime | None:
     return start
 
 
-def _name_starts(path: str) -> list[tuple[str, datetime, str, timedelta]]:
-    """Return dates, with or without a time, in the name of a file."""
+def _name_starts(path: str) -> list[tuple[datetime, str, timedelta]]:
+    """Return the dates in the name of a file, with the form of each and the largest usual difference from the log."""
     starts = []
     for match in _IN_NAME.finditer(Path(path).name):
         parts = [int(part) for part in match.groups() if part is not None]
@@ -418,37 +412,8 @@ def _name_starts(path: str) -> list[tuple[str, datetime, str, timedelta]]:
         except ValueError:
             continue
         form, slack = ("%Y-%m-%d %H:%M", _OF_THE_MINUTE) if len(parts) > 3 else ("%Y-%m-%d", _OF_THE_DAY)
-        starts.append(("the file's name", time, form, slack))
+        starts.append((time, form, slack))
     return starts
-
-
-def _summary_starts(path: Path) -> list[tuple[str, datetime, str, timedelta]]:
-    """Return the start of the measurement from a Nemo summary in the folder of a log."""
-    starts = []
-    stem = path.name.split(".")[0]
-    for name, head in _tables_beside(path):
-        # a folder may contain summaries of several measurements
-        if name.startswith(stem) and (match := _NEMO_START.search(head)) is not None:
-            time = datetime.strptime(match[1], "%Y %b %d %H:%M").replace(tzinfo=zones.utc)
-            starts.append((f"Measurement start in {name}", time, "%Y-%m-%d %H:%M", _OF_THE_MINUTE))
-    return starts
-
-
-def _tables_beside(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield the name and first bytes of every other CSV file in the folder of a log, on disk or inside an archive."""
-    if path.parent.is_dir():
-        for table in (table for table in sorted(path.parent.glob("*.csv")) if table != path and table.is_file()):
-            with table.open("rb") as stream:
-                yield table.name, stream.read(_HEAD_BYTES).decode("utf-8", "replace")
-        return
-    if (part := files.path_in_archive(path)) is not None:
-        place, inner = part
-        for name, member in files.archive_members(read_bytes(place)[0], place).items():
-            if name != inner and name.endswith(".csv") and PurePosixPath(name).parent == PurePosixPath(inner).parent:
-                yield PurePosixPath(name).name, member.read(_HEAD_BYTES).decode("utf-8", "replace")
-
-
-_HEAD_BYTES = 2000
 
 
 def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:

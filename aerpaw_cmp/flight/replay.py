@@ -39,10 +39,10 @@ from .training import learned_here
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
-    """The radio clock of one series: the estimate, and ``applied_s`` (n,), which is subtracted from radio times."""
+    """The radio clock of one series: the estimate, and ``applied_s``, which is subtracted from radio times [s]."""
 
     result: ClockResult
-    applied_s: FloatArray
+    applied_s: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,7 +194,7 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
     """Return radio times, corrected to the clock of the telemetry."""
     if clock is None:
         return time
-    return np.asarray(time - np.round(clock.applied_s * 1e9).astype("timedelta64[ns]"))
+    return np.asarray(time - np.timedelta64(round(clock.applied_s * 1e9), "ns"))
 
 
 def estimate_clocks(data: FlightData, progress: Progress = logged) -> list[Clock | None]:
@@ -207,7 +207,7 @@ def estimate_clocks(data: FlightData, progress: Progress = logged) -> list[Clock
     if lag == "off" or data.track is None:
         return [None] * len(data.rss)
     if isinstance(lag, float):
-        return [_given_clock(series.tower, lag, len(series.time)) for series in data.rss]
+        return [_given_clock(series.tower, lag) for series in data.rss]
     estimated = dict[int, ClockEstimate]()
     for members in same_computer(data):
         progress(f"clock {', '.join(dict.fromkeys(data.rss[i].tower for i in members))}")
@@ -229,18 +229,13 @@ def same_computer(data: FlightData) -> list[list[int]]:
     return [members for _, members in groups]
 
 
-def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) -> Clock:
+def _given_clock(receiver: str, lag_s: float) -> Clock:
     """Return the clock of a lag that the flight file specifies."""
-    lag_s = radio_minus_telemetry_s
     result = ClockResult(
-        receiver=receiver,
-        radio_minus_telemetry_s=lag_s,
-        ci95_s=(lag_s, lag_s),
-        verdict="given",
-        reason="",
+        receiver=receiver, radio_minus_telemetry_s=lag_s, ci95_s=(lag_s, lag_s), verdict="given", reason="",
         applied=GIVEN,
-    )
-    return Clock(result=result, applied_s=np.full(samples, lag_s))
+    )  # fmt: skip
+    return Clock(result=result, applied_s=lag_s)
 
 
 # Number of times that are replayed together, which limits the memory on flights over half an hour.
@@ -356,8 +351,7 @@ def _clock_levels(data: FlightData, series: RssSeries) -> FloatArray:
 def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
     """Return the clock of a receiver for one of its series."""
     result = fit.result(series.tower, apply=apply)
-    used = result.applied == APPLIED
-    return Clock(result=result, applied_s=np.full(len(series.time), fit.correction_s if used else 0.0))
+    return Clock(result=result, applied_s=fit.correction_s if result.applied == APPLIED else 0.0)
 
 
 def part_of(replayed: Replay, start: int, stop: int) -> Replay:

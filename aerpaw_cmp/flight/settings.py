@@ -676,22 +676,18 @@ def _set(plain: dict[str, Any], key: str, value: Any) -> None:
         if not isinstance(level, dict):
             raise UsageError(f"the override {key!r} goes below {'.'.join(parts[:depth])!r}, which has no keys")
         if part not in level:
-            _add(plain, level, parts[:depth], part, key)
+            level[part] = _new_entry(plain, holder, level, parts[: depth + 1], key)
         holder, level = level, level[part]
     holder[parts[-1]] = value
 
 
-def _add(plain: dict[str, Any], level: dict[str, Any], above: list[str], part: str, key: str) -> None:
-    """Create an entry in a mapping whose keys are free names, or refuse an unknown key."""
+def _new_entry(plain: dict[str, Any], holder: dict[str, Any], level: dict[str, Any], parts: list[str], key: str) -> Any:
+    """Return the first content of an entry of a mapping whose keys are free names, or refuse an unknown key."""
+    *above, part = parts
     if above == ["link", "channels"]:
-        level[part] = deepcopy(plain["link"]["rss"])
-        return
-    if above[-1:] == ["towers"] and above[0] == "link":
-        parent: Any = plain
-        for name in above[:-1]:
-            parent = parent[name]
-        level[part] = deepcopy(parent["tower"])
-        return
+        return deepcopy(plain["link"]["rss"])
+    if above[:1] == ["link"] and above[-1] == "towers":
+        return deepcopy(holder["tower"])
     near = nearest(part, level)
     raise UsageError(
         f"the override {key!r}: there is no key {part!r}" + (f" below {'.'.join(above)!r}" if above else ""),

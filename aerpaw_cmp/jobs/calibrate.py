@@ -8,9 +8,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any
@@ -544,23 +543,20 @@ def _score_all(observed: Sequence[Observed], stages: Stages, fits: dict[str, Lea
     scores: dict[str, tuple[Score, ...]] = dict.fromkeys(calibration.SPLITS, ())
     if len(calibration.flights_of(observed)) < 2:
         return scores
-    splits: dict[str, Callable[[], tuple[Score, ...]]] = {
-        "flight_left_out": lambda: calibration.flight_left_out(observed, without=fits),
-        **{
-            f"{name}_left_out": partial(calibration.parts_left_out, observed, fits, parts)
-            for name, parts in (
-                ("altitude", calibration.altitude_parts),
-                ("heading", calibration.heading_parts),
-                ("sector", calibration.sector_parts),
-            )
-        },
-        "campaign_left_out": lambda: calibration.campaign_left_out(observed),
-    }
-    for done, (split, score) in enumerate(splits.items()):
-        # the controls take about as long as two splits
-        stages.progress("scores", done / (len(splits) + 2))
-        scores[split] = score()
-    stages.progress("scores", len(splits) / (len(splits) + 2))
+    # the controls take about as long as two splits
+    shares = (done / (len(scores) + 2) for done in range(len(scores) + 1))
+    stages.progress("scores", next(shares))
+    scores["flight_left_out"] = calibration.flight_left_out(observed, without=fits)
+    for name, parts in (
+        ("altitude", calibration.altitude_parts),
+        ("heading", calibration.heading_parts),
+        ("sector", calibration.sector_parts),
+    ):
+        stages.progress("scores", next(shares))
+        scores[f"{name}_left_out"] = calibration.parts_left_out(observed, fits, parts)
+    stages.progress("scores", next(shares))
+    scores["campaign_left_out"] = calibration.campaign_left_out(observed)
+    stages.progress("scores", next(shares))
     return scores
 
 

@@ -215,8 +215,8 @@ def _pose(
             clocks = estimate_clocks(dataclasses.replace(data, rss=receiver), progress)
             clock = clocks[[s is series for s in receiver].index(True)]
             time = telemetry_time(time, clock)
-            if clock is not None and clock.applied_s[at]:
-                notes.append(f"{clock.applied_s[at]:.3f} s are subtracted from the radio's clock")
+            if clock is not None and clock.applied_s:
+                notes.append(f"{clock.applied_s:.3f} s are subtracted from the radio's clock")
         track = data.poses_at(time[at : at + 1])
         _check_pose(track.valid, series, at)
         return data.link_of(series), valid_poses(track, rt.attitude), notes, time[at : at + 1]

@@ -14,8 +14,8 @@ import copy
 import csv
 import gzip
 import hashlib
-import io
 import json
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ from ..common.gaussian import Factor, gaussian_kernel
 from ..common.geodesy import azimuth_rad, elevation_rad
 from ..common.outputs import explained_os_errors, file_digest
 from ..common.text import counted, guarded_comment
-from ..common.units import BoolArray, FloatArray, db_from_power, power_from_db
+from ..common.units import FloatArray, db_from_power, power_from_db
 from ..common.yamlfile import StrictModel, dump_yaml, load_yaml
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power
 
@@ -865,7 +865,7 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
             path=path,
             line=numbered[0][0] if numbered else None,
         )
-    values = _values(numbered[1:], len(header), path)
+    values = np.array([_row(line, number, len(header), path) for number, line in numbered[1:]]).reshape(-1, len(header))
     azimuth, elevation = np.unique(np.round(values[:, 0] % 360.0, 6)), np.unique(np.round(values[:, 1], 6))[::-1]
     _check_grid(azimuth, elevation, len(values), path)
     row = np.argmin(np.abs(elevation[None, :] - values[:, 1:2]), axis=1)
@@ -884,30 +884,15 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
     return pattern
 
 
-def _values(numbered: Sequence[tuple[int, str]], width: int, path: Path) -> FloatArray:
-    """Return the cells of numbered lines (lines, width). Lines are read one by one only to find an error."""
-    with suppress(ValueError):
-        if numbered:
-            # read all lines at once, which is fast and works for valid files
-            values = np.loadtxt([line for _, line in numbered], delimiter=",", comments=None, ndmin=2)
-            if values.shape == (len(numbered), width) and not _refused(values).any():
-                return values
-    return np.array([_row(line, number, width, path) for number, line in numbered]).reshape(-1, width)
-
-
-def _refused(values: FloatArray) -> BoolArray:
-    """Check rows (n,) of cells (n, width) that are not gains in a direction."""
-    loud, negative = values[:, 2] > HIGHEST_DBI, (values[:, 3:4] < 0).any(axis=1)
-    return np.asarray(~np.isfinite(values).all(axis=1) | loud | negative)
-
-
 def _row(line: str, number: int, width: int, path: Path) -> list[float]:
-    cells = next(csv.reader(io.StringIO(line)))
+    """Return the numbers of a line. Raise InputError if they are not a gain in a direction."""
+    cells = next(csv.reader([line]))
     try:
         row = [float(cell) for cell in cells]
     except ValueError:
         row = []
-    if len(row) != width or _refused(np.array([row]))[0]:
+    complete = len(row) == width and all(map(math.isfinite, row))
+    if not complete or row[2] > HIGHEST_DBI or min(row[3:4], default=0.0) < 0.0:
         raise InputError(
             f"'{line[:60]}'",
             expected=f"{width} numbers: angles in degrees, gain in dBi (at most {HIGHEST_DBI:g}), standard deviation",

@@ -1,6 +1,5 @@
 """A contradiction of a log becomes a question with both values. Agreement leads to no question."""
 
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -54,34 +53,6 @@ def test_the_name_of_a_file_is_compared_with_its_start(name: str, start: str, as
     if asked:
         assert start.replace("T", " ")[:16] in remarks[0]
         assert "the file's name has 20" in remarks[0]
-
-
-@pytest.mark.parametrize(("start", "asked"), [("2024-02-09T22:20:56", False), ("2009-02-24T22:20:56", True)])
-def test_a_nemo_summary_beside_a_log_is_compared_with_its_start(tmp_path: Path, start: str, asked: bool) -> None:
-    (tmp_path / "24Feb09_172055.1.csv").write_text("guid\nDevice ID;1\nMeasurement start;2024 Feb 09 17:20\n")
-    (tmp_path / "other.csv").write_text("Measurement start;2001 Jan 01 17:20\n")
-    (tmp_path / "24Feb09_172055.2.csv").mkdir()  # a folder holds no words
-    remarks = _asked(_log(tmp_path / "24Feb09_172055.1.gpx", start))
-    assert bool(remarks) is asked
-    if asked:
-        assert "Measurement start in 24Feb09_172055.1.csv has 2024-02-09 17:20" in remarks[0]
-
-
-def test_nothing_is_read_beside_a_path_that_a_flight_file_names(tmp_path: Path) -> None:
-    (tmp_path / "a.1.csv").write_text("Measurement start;2024 Jun 24 14:13\n")
-    log = _log(tmp_path / "a.1.gpx", "2025-06-24T16:13:00")
-    assert any("a.1.csv has" in text for text in _asked(log))
-    assert not any("a.1.csv has" in text for text in _asked(replace(log, holder=str(tmp_path / "flight.h5"))))
-
-
-def test_a_nemo_summary_in_the_zip_that_holds_the_log(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:
-        archive.writestr("day/24Feb09_172055.1.csv", "guid\nDevice ID;1\nMeasurement start;2024 Feb 09 17:20\n")
-        archive.writestr("other/24Feb09_172055.1.csv", "guid\nDevice ID;1\nMeasurement start;2001 Jan 01 17:20\n")
-    inside = tmp_path / "set.zip" / "day" / "24Feb09_172055.1.gpx"
-    assert _asked(_log(inside, "2024-02-09T22:20:56")) == []
-    (asked,) = _asked(_log(inside, "2009-02-24T22:20:56"))
-    assert "Measurement start in 24Feb09_172055.1.csv has 2024-02-09 17:20" in asked
 
 
 @pytest.mark.parametrize(("low_m", "asked"), [(0.4, False), (-2.0, False), (24.3, True), (110.0, True), (-40.0, True)])

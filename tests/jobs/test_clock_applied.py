@@ -44,7 +44,7 @@ def test_an_estimate_that_is_told_from_zero_is_applied(verdict: str, apply: bool
 def test_an_interval_that_holds_zero_is_not_applied() -> None:
     clock = _clock_of(SERIES, estimate("ok", ci95_s=(-0.1, 2.7)), apply=True)
     assert clock.result.applied == ESTIMATED
-    assert not clock.applied_s.any()
+    assert clock.applied_s == 0.0
 
 
 def test_a_correction_that_was_asked_for_and_not_made_is_said() -> None:

@@ -52,7 +52,7 @@ FAULTS = (
     Fault("pitch, yaw, roll read as roll, pitch, yaw", "parsers/aerpaw_parsers/vehicle_out.py", "(b\"pitch\", b\"yaw\", b\"roll\"), _TRIPLE", "(b\"roll\", b\"pitch\", b\"yaw\"), _TRIPLE", "tests/parsers/test_formats.py"),
     Fault("longitude and latitude exchanged in the frame", "aerpaw_cmp/common/geodesy.py", "in_shape(self._projection, longitude, latitude)", "in_shape(self._projection, latitude, longitude)", "tests/common/test_geodesy.py"),
     Fault("local time read as UTC", "aerpaw_cmp/logs/text.py", "return local_to_utc(wall_ns, options.timezone, needed_by=needed_by)", "return local_to_utc(wall_ns, 'UTC', needed_by=needed_by)", "tests/parsers/test_time.py"),
-    Fault("radio clock added in place of taken off", "aerpaw_cmp/flight/replay.py", "time - np.round(clock.applied_s * 1e9)", "time + np.round(clock.applied_s * 1e9)", RAW),
+    Fault("radio clock added in place of taken off", "aerpaw_cmp/flight/replay.py", "time - np.timedelta64(round(clock", "time + np.timedelta64(round(clock", RAW),
     Fault("estimated clock with the wrong sign", "aerpaw_cmp/flight/clock.py", "<= 0.0 <= high else self.radio_minus_telemetry_s", "<= 0.0 <= high else -self.radio_minus_telemetry_s", "tests/flight/test_clock.py tests/jobs/test_clock_applied.py", "this flight's clock is given"),
     Fault("patterns of tower and UAV exchanged", "aerpaw_cmp/flight/settings.py", "arrays = {name: self.towers.get(name, self.tower).build(", "self = self.model_copy(update={\"tower\": self.uav, \"uav\": self.tower})\n        arrays = {name: self.towers.get(name, self.tower).build(", RAW),
     Fault("roll of an array missed", "aerpaw_cmp/flight/settings.py", "np.radians(self.roll_deg)", "0.0 * np.radians(self.roll_deg)", "tests/jobs/test_audit_flight.py"),

@@ -42,13 +42,13 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
             text = "positions on a grid or in one text are not read: add columns of latitude and longitude"
             rows.warnings.append(f"column {sheet.names[grid]!r}: {text}")
         return None
-    known = [(i, what.quantity) for i, what in enumerate(sheet.meanings) if what and what.quantity.name == PLACE[0]]
-    surest = min(dictionary.rank_of(quantity, sheet.plain[i]) for i, quantity in known)
-    alike = [sheet.names[i] for i, quantity in known if dictionary.rank_of(quantity, sheet.plain[i]) == surest]
-    if len(alike) > 1:
-        rows.warnings.append(
-            f"several columns of positions ({', '.join(alike)}): {alike[0]!r} was used, which is a guess"
-        )
+    pairs = [*zip(*(_alike(sheet, name) for name in PLACE[:2]), strict=False)]
+    if len(pairs) > 1:
+        moving = [pair for pair in pairs if any(_moves(sheet.numbers(i)) for i in pair)]
+        latitude, longitude = moving[0] if len(moving) == 1 else (latitude, longitude)
+        how = "the only one that moves" if len(moving) == 1 else "which is a guess"
+        names = ", ".join(sheet.names[i] for i, _ in pairs)
+        rows.warnings.append(f"several columns of positions ({names}): {sheet.names[latitude]!r} was used, {how}")
     sheet.used |= {i for i in (latitude, longitude, sheet.find("altitude_m")) if i is not None}
     values: dict[str, AnyArray] = {key: sheet.numbers(i) for key, i in zip(PLACE, (latitude, longitude), strict=False)}
     written, unfixed = np.isfinite(values[PLACE[0]]) & np.isfinite(values[PLACE[1]]), without_fix(sheet)
@@ -75,6 +75,24 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
             values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
     where = None if lost.all() else written  # a row at 0, 0 is a reading without a fix
     return rows.stream("telemetry", name, values, where=where, source=source, about=about)
+
+
+# A receiver at rest seems to move by less than this, about 20 m.
+_AT_REST_DEG = 2e-4
+
+
+def _alike(sheet: _sheet.Sheet, name: str) -> list[int]:
+    """Return the filled columns of a quantity whose names are equally good."""
+    ranks = {
+        i: dictionary.rank_of(what.quantity, sheet.plain[i])
+        for i, what in enumerate(sheet.meanings)
+        if what and what.quantity.name == name and np.isfinite(sheet.numbers(i)).any()
+    }
+    return [i for i, rank in ranks.items() if rank == min(ranks.values())]
+
+
+def _moves(angle_deg: FloatArray) -> bool:
+    return bool(np.nanmax(angle_deg) - np.nanmin(angle_deg) > _AT_REST_DEG)
 
 
 def without_fix(sheet: _sheet.Sheet) -> BoolArray:

@@ -336,7 +336,7 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
         assert transfer["total_variation"] < 0.05
     page = (folder / "ranks_out" / "campaign.html").read_text(encoding="utf-8")
     assert "Mean RMSE over towers" not in page
-    assert "with the K of the other flights" in page
+    assert "with a K that was selected on the other flights" in page
 
 
 def test_the_campaigns_to_copy_from_load_and_name_flights_that_are_there() -> None:

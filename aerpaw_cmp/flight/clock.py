@@ -773,24 +773,17 @@ def _median_distances(
     shifts: FloatArray, time_s: FloatArray, log_m: FloatArray, track_s: FloatArray, track_m: FloatArray
 ) -> FloatArray:
     """Return the median distance for each shift. NaN if less than half of the log is within the track."""
-    parts = [np.zeros(0)]
-    for some in np.array_split(shifts, -(-len(shifts) // _SHIFTS_AT_ONCE) or 1):
-        time = time_s + some[:, None]
+    medians = np.full(len(shifts), np.nan)
+    for rows in np.array_split(np.arange(len(shifts)), -(-len(shifts) // _SHIFTS_AT_ONCE) or 1):
+        time = time_s + shifts[rows][:, None]
         inside = (time >= track_s[0]) & (time <= track_s[-1])
+        enough = 2 * inside.sum(axis=1) >= len(time_s)
+        time, inside = time[enough], inside[enough]
         apart = log_m - interpolated(time.ravel(), track_s, track_m).reshape(*time.shape, 3)
-        apart[..., 2] -= _medians(apart[..., 2], inside)[:, None]  # the logs may have different zeros of height
-        median = _medians(np.linalg.norm(apart, axis=2), inside)
-        parts.append(np.where(2 * inside.sum(axis=1) < len(time_s), np.nan, median))
-    return np.concatenate(parts)
+        apart[~inside] = np.nan
+        apart[..., 2] -= np.nanmedian(apart[..., 2], axis=1)[:, None]  # the logs may have different zeros of height
+        medians[rows[enough]] = np.nanmedian(np.linalg.norm(apart, axis=2), axis=1)
+    return medians
 
 
 _SHIFTS_AT_ONCE = 500
-
-
-def _medians(values: FloatArray, counts: BoolArray) -> FloatArray:
-    """Return the median of each row (n, m) over the values that ``counts`` marks, NaN if it marks none."""
-    ordered = np.sort(np.where(counts, values, np.inf), axis=1)
-    number, row = counts.sum(axis=1), np.arange(len(values))
-    low, high = np.maximum(number - 1, 0) // 2, np.minimum(number // 2, values.shape[1] - 1)
-    with np.errstate(invalid="ignore"):
-        return np.where(number > 0, 0.5 * (ordered[row, low] + ordered[row, high]), np.nan)

@@ -10,7 +10,7 @@ import dataclasses
 import itertools
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
@@ -58,10 +58,7 @@ def idle_log_keys(log: LogSettings, file: IngestedFile) -> list[str]:
         keys[f"the log counts from {' and '.join(bases)}" if bases else "it has no ranks"] = ["ri_base"]
     if log.time_origin is not None and not _starts_near(log.time_origin, file):
         keys["its times are absolute"] = ["time_origin"]
-    return [
-        f"{', '.join(stated)} {'has' if len(stated) == 1 else 'have'} no effect: {why}"
-        for why, names in keys.items() if (stated := [name for name in names if _differs(log, name)])
-    ]  # fmt: skip
+    return _without_effect(log, keys.items())
 
 
 def _starts_near(origin: str, file: IngestedFile) -> bool:
@@ -80,12 +77,15 @@ def idle_settings(settings: FlightFile, kinds: Collection[str]) -> list[str]:
     kinds : collection of {"rss", "rank"}
         Kinds of measurements in the logs.
     """
-    texts = []
-    for why, keys in _reasons(settings, kinds):
-        stated = [key for key in keys.split() if _differs(settings, key)]
-        if stated:
-            texts.append(f"{', '.join(stated)} {'has' if len(stated) == 1 else 'have'} no effect: {why}")
-    return texts
+    return _without_effect(settings, ((why, keys.split()) for why, keys in _reasons(settings, kinds)))
+
+
+def _without_effect(model: BaseModel, reasons: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+    """Return a sentence per reason about the dotted keys that the user changed."""
+    changed = ((why, [key for key in keys if _differs(model, key)]) for why, keys in reasons)
+    return [
+        f"{', '.join(keys)} {'has' if len(keys) == 1 else 'have'} no effect: {why}" for why, keys in changed if keys
+    ]
 
 
 def _reasons(settings: FlightFile, kinds: Collection[str]) -> Iterator[tuple[str, str]]:

@@ -285,12 +285,9 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
 
 def _along(data: FlightData, different: Sequence[RssSeries], instants: Times, step_s: float) -> list[Along]:
     """Return predictors of the levels of series with one tower and carrier, replayed with at most one reflection."""
-    links = [data.link_of(series) for series in different]
-    blocks = np.array_split(instants, max(1, -(-len(instants) // BLOCK)))  # about equal in size
-    parts = [_levels_along(data, links, different[0].tower, part) for part in blocks]
-    out = []
-    for series, link, *mine in zip(different, links, *parts, strict=True):
-        columns = {name: np.concatenate([part[name] for part in mine]) for name in mine[0]}
+    links, out = [data.link_of(series) for series in different], []
+    levels = _levels_along(data, links, different[0].tower, instants)
+    for series, link, columns in zip(different, links, levels, strict=True):
         distance, directions = columns.pop("distance_m"), columns.pop("directions")
         if learned_here(data, series, link):  # antennas learned from this log would reproduce its lag
             columns = {"free space": columns["free space"]}

@@ -728,7 +728,7 @@ def _line(file: IngestedFile, context: _Context, earlier: Sequence[_Line]) -> _L
     # a report needs the mapping of columns to read the file
     entry |= context.options.mapping if file.result.reader == "generic_csv" else {}
     entry |= {"skip": sorted(refused)} if refused else {}
-    keys, asked = _heights_and_floor(compared, path, context.track, commented=bool(comment))
+    keys, asked = _heights_and_floor(compared, path, context.track)
     entry |= keys
     asked += [context.which] if context.which and context.leads(file) else []
     asked += [context.unsure[file.path]] if file.path in context.unsure else []
@@ -744,9 +744,7 @@ def _line(file: IngestedFile, context: _Context, earlier: Sequence[_Line]) -> _L
     )
 
 
-def _heights_and_floor(
-    compared: Sequence[Stream], path: str, track: Stream | None, *, commented: bool
-) -> tuple[dict[str, Any], list[str]]:
+def _heights_and_floor(compared: Sequence[Stream], path: str, track: Stream | None) -> tuple[dict[str, Any], list[str]]:
     """Return the keys for a missing height and for the floor of the receiver, and the questions about them."""
     keys: dict[str, Any] = {}
     asked = []
@@ -761,9 +759,7 @@ def _heights_and_floor(
     if (floor := receiver_floor_db(levels)) is not None:
         # a hundredth above, because levels at or below floor_db are out of coverage
         keys["floor_db"] = round(floor + 0.01, 2)
-        asked.append(
-            f"floor of the receiver at {floor:.1f} dB?" if commented or asked else f"receiver floor {floor:.1f} dB?"
-        )
+        asked.append(f"floor of the receiver at {floor:.1f} dB?")
     if any(is_ratio(s) for s in compared):
         asked.append("use a signal-to-noise ratio as a level?")
     return keys, asked

@@ -104,21 +104,20 @@ def _several(lines: Lines, first: int) -> tuple[Any, int]:
     return (value, first + text.count("\n", 0, length)) if whole else (None, first)
 
 
+# The beginning of a file of objects, or of an array of objects.
+BEGIN = re.compile(rb"(?:\xef\xbb\xbf)?[\s\[]*\{")
+
+
 def first(head: bytes) -> dict[str, Any] | None:
-    """Return the first object of a file for sniffers, or None if its line is longer than the sniffed bytes."""
-    for line in head.split(b"\n", 3)[:3]:
-        text = line.strip().lstrip(b"\xef\xbb\xbf").lstrip(b"[").rstrip(b",")
-        if not text:
-            continue
-        value, _ = _loaded(text)
-        if value is None:  # the line may begin an object over several lines
-            place = head.find(b"{")
-            try:
-                value, _ = json.JSONDecoder().raw_decode(head[max(place, 0) :].decode("utf-8", "replace"))
-            except (ValueError, RecursionError):
-                return None
-        return value if isinstance(value, dict) else None
-    return None
+    """Return the first object of a file for sniffers, or None if it is longer than the sniffed bytes."""
+    begin = BEGIN.match(head)
+    if begin is None:
+        return None
+    try:
+        value, _ = json.JSONDecoder().raw_decode(head[begin.end() - 1 :].decode("utf-8", "replace"))
+    except (ValueError, RecursionError):
+        return None
+    return value if isinstance(value, dict) else None
 
 
 # Names of objects that only group values and do not describe them.

@@ -70,7 +70,7 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
 
 def starts(head: bytes, is_header: _IsHeader) -> bool:
     """Check whether a file begins with a header of this kind, perhaps below title lines, and with rows of its width."""
-    if _OBJECT.match(head):  # JSON lines: the names of the values in the first object are the header
+    if _json.BEGIN.match(head):  # JSON lines: the names of the values in the first object are the header
         entry = None if _OF_PROGRAMS.search(head) else _json.first(head)
         return entry is not None and is_header([*_json.flat(entry)])
     lines = [line.rstrip(b"\r") for line in head.split(b"\n")[: 2 * TITLES]]
@@ -84,7 +84,6 @@ def starts(head: bytes, is_header: _IsHeader) -> bool:
     return 2 * sum(len(names) < 2 * width and width <= len(names) + 1 for width in widths) >= len(widths)
 
 
-_OBJECT = re.compile(rb"(?:\xef\xbb\xbf)?[\s\[]*\{")
 # Keys of JSON that has its own reader: the tap's, PawPrints' and srsRAN's.
 _OF_PROGRAMS = re.compile(rb'"(schema|log_type|connected_bssid|abs_time|ue_list)"\s*:')
 
@@ -449,7 +448,7 @@ def _are_thousands(texts: Sequence[str]) -> bool:
 
 def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
     """Return the table of a file, or None if none of its first lines is a header."""
-    if _OBJECT.match(data):
+    if _json.BEGIN.match(data):
         lines = _text.split(data)
         parsed = _json.objects(lines)
         readings = [(int(i), _json.flat(entry)) for i, entry in zip(parsed.row, parsed.values, strict=True)]

@@ -27,14 +27,23 @@ import pandas as pd
 
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.files import SCHEMA, decode_record
-from aerpaw_cmp.readers import AnyArray, Attribute, InputError, Reader, ReadOptions, ReadResult, RejectedLine, Stream
+from aerpaw_cmp.readers import (
+    AnyArray,
+    Attribute,
+    InputError,
+    Kind,
+    Reader,
+    ReadOptions,
+    ReadResult,
+    RejectedLine,
+    Stream,
+)
 
 from . import _json
 
 # RSRP and SINR older than this are not added to a rank.
 _COMPANION_S = 2.0
 
-Columns = dict[str, AnyArray]
 # Line of the log, its record, the decoded values, and flags.
 Answer = tuple[int, dict[str, Any], dict[str, Any], list[str]]
 
@@ -77,7 +86,7 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     header = log.header or {}
     about = {"clock": "utc", "node": options.node, "frequency_hz": options.frequency_hz}
     common: dict[str, Attribute] = {name: value for name, value in about.items() if value is not None}
-    frames = {name: _joined(name, pieces) for name, pieces in log.series.items()}
+    frames = {name: pd.concat(pieces, ignore_index=True) if pieces else None for name, pieces in log.series.items()}
     streams = []
     for name in ("nr5g", "lte"):
         frame = frames[name]
@@ -114,7 +123,7 @@ class _Log:
 
     def __init__(self) -> None:
         self.header: dict[str, Any] | None = None
-        self.series: dict[str, list[Columns]] = {name: [] for name in _SERIES}
+        self.series: dict[str, list[pd.DataFrame]] = {name: [] for name in _SERIES}
         self.lines = self.exchanges = self.blank = 0
         self.rejected: list[RejectedLine] = []
         self.events: list[str] = []
@@ -131,7 +140,8 @@ class _Log:
         self.exchanges += len(exchanges)
         self.blank += blank + len(records) - len(exchanges)
         for name, (query, leg, keys) in _SERIES.items():
-            self.series[name].append(_columns([*_answered(exchanges, query, leg)], keys))
+            if answers := [*_answered(exchanges, query, leg)]:
+                self.series[name].append(_frame("rss" if leg else "rank", answers, keys))
         for _, record in records:
             self._note(record)
 
@@ -173,16 +183,6 @@ class _Log:
         return tuple(texts)
 
 
-def _joined(name: str, pieces: list[Columns]) -> pd.DataFrame | None:
-    """Return all records of a series as a frame, or None if there are no records."""
-    some = [piece for piece in pieces if len(piece["time"])]
-    if not some:
-        return None
-    values = {name: np.concatenate([piece[name] for piece in some]) for name in some[0]}
-    time, line, flag = (values.pop(name) for name in ("time", "line", "flag"))
-    return _text.frame("rss" if _SERIES[name][1] else "rank", time, line, flag, values, own=True)
-
-
 def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]], list[RejectedLine], int]:
     """Return the intact records with their line numbers, rejected lines, and the number of blank lines."""
     lines = data.split(b"\n")
@@ -218,20 +218,17 @@ def _flags(record: dict[str, Any]) -> list[str]:
     return [str(flag) for flag in flags] if isinstance(flags, list) else []
 
 
-def _columns(answers: list[Answer], names: Mapping[str, str]) -> Columns:
-    """Return columns of some answers. ``names`` maps each column to the key of its decoded value."""
-    spans = [(int(record["sent_utc_ns"]), int(record["last_utc_ns"])) for _, record, _, _ in answers]
-    columns: Columns = {
-        "time": np.array([(sent + last) // 2 for sent, last in spans], dtype=np.int64).astype("datetime64[ns]"),
-        "line": np.array([number for number, *_ in answers], dtype=np.int64),
-        "flag": np.array([";".join(flags) for *_, flags in answers], dtype=object),
-        "uncertainty_s": np.array([(last - sent) / 2e9 for sent, last in spans], dtype=np.float64),
-    }
+def _frame(kind: Kind, answers: list[Answer], names: Mapping[str, str]) -> pd.DataFrame:
+    """Return the frame of some answers. ``names`` maps each column to the key of its decoded value."""
+    sent, last = (np.array([int(record[key]) for _, record, _, _ in answers]) for key in ("sent_utc_ns", "last_utc_ns"))
+    values: dict[str, AnyArray] = {"uncertainty_s": (last - sent) / 2e9}
     for name, key in names.items():
-        cells: list[Any] = [values.get(key) for _, _, values, _ in answers]
+        cells: list[Any] = [decoded.get(key) for _, _, decoded, _ in answers]
         sound = [cell if type(cell) in (int, float) and abs(cell) < 1e9 else np.nan for cell in cells]
-        columns[name] = np.array(sound, dtype=np.float64)
-    return columns
+        values[name] = np.array(sound, dtype=np.float64)
+    flag = np.array([";".join(flags) for *_, flags in answers], dtype=object)
+    line = np.array([number for number, *_ in answers])
+    return _text.frame(kind, (sent + last) // 2, line, flag, values, own=True)
 
 
 def _answered(exchanges: list[tuple[int, dict[str, Any]]], query: str, leg: str) -> Iterator[Answer]:
@@ -246,14 +243,12 @@ def _answered(exchanges: list[tuple[int, dict[str, Any]]], query: str, leg: str)
 
 def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOptions) -> Iterator[Stream]:
     """Yield the levels of each serving cell, whose identity is in the name if there are several."""
-    identity = rsrp[list(_IDENTITY)]
-    cells = identity.drop_duplicates()
-    for values in cells.to_numpy().tolist():
-        mine = ((identity == values) | (identity.isna() & np.isnan(values))).all(axis=1)
+    cells = rsrp.groupby(list(_IDENTITY), dropna=False, sort=False)
+    for values, of_cell in cells:
         about = {key: int(value) for key, value in zip(_IDENTITY, values, strict=True) if np.isfinite(value)}
-        words = [f"{key}{about[key]}" for key in ("pci", "arfcn") if key in about] if len(cells) > 1 else []
+        words = [f"{key}{about[key]}" for key in ("pci", "arfcn") if key in about] if cells.ngroups > 1 else []
         name = "_".join(["nr5g_rsrp" if common["rat"] == "nr" else "lte_rsrp", *words])
-        frame = rsrp[mine].drop(columns=list(_IDENTITY)).reset_index(drop=True)
+        frame = of_cell.drop(columns=list(_IDENTITY)).reset_index(drop=True)
         yield Stream("rss", name, frame, {**common, **about, "channel": options.channel or name})
 
 

@@ -184,7 +184,7 @@ def tap(tmp_path, request):
             "folder": tmp_path / "log",
         } | settings  # fmt: skip
         watch = {} if feed is None else {"watch": lambda item: feed.put(0, item)}
-        session = Session(TapSettings(port=str(port), **values), **watch, **(options or {}))
+        session = Session(TapSettings(port=None if port is None else str(port), **values), **watch, **(options or {}))
         running.append(session)
         return session
 

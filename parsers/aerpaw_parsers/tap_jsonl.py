@@ -20,7 +20,7 @@ of a rank are those of the last ``servingcell`` within 2 s.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -244,7 +244,8 @@ def _answered(exchanges: list[tuple[int, dict[str, Any]]], query: str, leg: str)
 def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOptions) -> Iterator[Stream]:
     """Yield the levels of each serving cell, whose identity is in the name if there are several."""
     cells = rsrp.groupby(list(_IDENTITY), dropna=False, sort=False)
-    for values, of_cell in cells:
+    for key_of_cell, of_cell in cells:
+        values = cast("tuple[float, ...]", key_of_cell)
         about = {key: int(value) for key, value in zip(_IDENTITY, values, strict=True) if np.isfinite(value)}
         words = [f"{key}{about[key]}" for key in ("pci", "arfcn") if key in about] if cells.ngroups > 1 else []
         name = "_".join(["nr5g_rsrp" if common["rat"] == "nr" else "lte_rsrp", *words])

@@ -36,14 +36,13 @@ from scipy.spatial.distance import cdist
 from scipy.special import log_softmax, softmax
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
-from aerpaw_cmp.compare.calibration import BIN_S, OFF, Correction, Observed, choose, learn, score
+from aerpaw_cmp.compare.calibration import BIN_S, OFF, Correction, Observed, choose, score
 from aerpaw_cmp.compare.field_gp import FieldFit, FieldModel, Rows, fit_field
 from aerpaw_cmp.compare.gains import LinkSamples, fading_of
 from aerpaw_cmp.compare.level import crps_normal
 from aerpaw_cmp.compare.statistics import mean_interval
-from aerpaw_cmp.flight.gains import mean_gain_db, sphere_angles
-from aerpaw_cmp.flight.settings import AntennaSettings, load_pattern
-from aerpaw_cmp.jobs.calibrate import observe
+from aerpaw_cmp.flight.settings import AntennaSettings
+from aerpaw_cmp.jobs.calibrate import gain_of, learned_antennas, observe
 from aerpaw_cmp.jobs.calibrate_rank import FittedReceiver, RankSamples, Tried, rank_samples
 from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 
@@ -118,7 +117,7 @@ def learned(
     train: Sequence[LinkSamples], titles: Sequence[str] = (), antennas: Sequence[LinkSamples] = ()
 ) -> Correction:
     """Antennas learned from samples and from those of ``antennas``, with the residual field chosen, or one of some."""
-    return choose(train, {"learned": lambda some: learn([*some, *antennas]).predict}, titles)
+    return choose(train, {"learned": lambda some: learned_antennas([*some, *antennas]).predict}, titles)
 
 
 def errors(correction: Correction, asked: LinkSamples, known: Sequence[LinkSamples]) -> Part:
@@ -161,7 +160,7 @@ def flights(bench: Bench, *, quick: bool) -> None:
     every, rows = samples_of(bench, DATASET12), []
     for name in DATASET12[: 1 if quick else None]:
         train, asked = ([o for o in every if (o.samples.flight == name) == mine] for mine in (False, True))
-        model = learn([o.samples for o in train])
+        model = learned_antennas([o.samples for o in train])
         scores = [result for o in asked if (result := score(o, model.mean(o.samples)))]
         title, alone, chosen = both([o.samples for o in train], [o.samples for o in asked])
         rows.append([*(np.mean([getattr(s, key) for s in scores]) for key in ("rmse_db", "rmse_4s_db")),
@@ -217,17 +216,15 @@ def at_height(bench: Bench, name: str) -> Observed:
 
 def lte_height(bench: Bench, name: str, other: str, *, repeats: int) -> dict[str, tuple[float, ...]]:
     """Numbers of :func:`protocol` of one height, by model."""
-    known = {end: load_pattern(AntennaSettings(model="file", file=f"{file}_F3500.txt"), bench.folder / "antennas")
+    known = {end: gain_of(AntennaSettings(model="file", file=f"{file}_F3500.txt"), bench.folder / "antennas")
              for end, file in (("uav", "SA-1400-5900"), ("tower", "RM-WB1-DN-BLK_right_side_up"))}  # fmt: skip
     asked, (train,) = at_height(bench, name), bench.observed(other)
     tower = bench.flight(name).site.towers[asked.samples.tower]
-    model = learn([train.samples])
+    model = learned_antennas([train.samples])
 
     def two_ray(o: Observed) -> FloatArray:
         level = two_ray_dbm(tower.position_m[None, :], o.samples.position_m, 3.51e9, ground_m=tower.ground_m)[:, 0]
-        ends = {"uav": o.samples.at_uav, "tower": o.samples.at_tower}
-        gain_db = sum(mean_gain_db([known[end]], *sphere_angles(direction)) for end, direction in ends.items())
-        return level - o.free_space_db + gain_db
+        return level - o.free_space_db + known["uav"](o.samples.at_uav) + known["tower"](o.samples.at_tower)
 
     bases: dict[str, Callable[[Observed], FloatArray]] = {
         "free space": lambda o: np.zeros(len(o.samples)), "two-ray + patterns": two_ray,
@@ -284,7 +281,7 @@ def whole_flight(asked: Observed, train: Observed, quick: bool) -> FloatArray:
     for start in np.arange(0.0, samples.time_s[-1], 30.0)[:: 30 if quick else 1]:
         away = np.abs(samples.time_s - start - 15.0)
         own = samples.part(away > 15.0 + GUARD_S)
-        model = learn([train.samples, own])
+        model = learned_antennas([train.samples, own])
         target = samples.part(away <= 15.0)
         out.append(target.residual_db - model.mean(target) - model.mean_error(own))
     return np.concatenate(out)

@@ -59,6 +59,7 @@ from aerpaw_cmp.jobs.calibrate import (
     load_calibration,
     observe,
     read_flights,
+    recipe_of,
     teaching,
 )
 from aerpaw_cmp.jobs.calibrate_rank import fit_rank, samples_by_tower
@@ -106,14 +107,15 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
     flights, _, campaigns = read_flights(settings, path.parent, field)
     ranked = fit_rank(samples_by_tower(flights)) if settings.rank else None
     observed = in_campaigns(settings, observe(flights)[0], flights, campaigns)
+    chosen = recipe_of(settings, observed, field)
     scores: dict[str, tuple[Score, ...]] = dict.fromkeys(SPLITS, ())
     learned: dict[str, Learned] = {}
     if len(flights_of(observed)) > 1:  # the errors to expect; the other splits and the controls are not read
-        scores["flight_left_out"] = flight_left_out(observed, without=learned)
+        scores["flight_left_out"] = flight_left_out(observed, chosen, learned)
     calibration = Calibration(
         settings=settings, flights=tuple(flights), campaigns=campaigns, observed=tuple(observed), scores=scores,
-        controls={}, learned=learn([o.samples for o in observed]), warnings=(),
-        words=(), locks=learned_locks(observed, learned), health=learned_healths(observed, learned),
+        controls={}, learned=learn([o.samples for o in observed], chosen), warnings=(),
+        words=(), locks=learned_locks(observed, chosen, learned), health=learned_healths(observed, learned),
         teaching=teaching(observed, campaigns, learned),
     )  # fmt: skip
     calibrated = Calibrated(settings, tuple(flights), (), calibration, ranked, "left out", campaigns)
@@ -233,13 +235,13 @@ def joint(field: Path, folder: Path) -> None:
         settings = load_calibration(path)
         flights, _, campaigns = read_flights(settings, path.parent, field)
         observed = in_campaigns(settings, observe(flights)[0], flights, campaigns)
-        fits: dict[str, Learned] = {}
-        splits = {"flight": flight_left_out(observed, without=fits)}
+        recipe, fits = recipe_of(settings, observed, field), dict[str, Learned]()
+        splits = {"flight": flight_left_out(observed, recipe, fits)}
         for split, parts in (("altitude", altitude_parts), ("sector", sector_parts), ("heading", heading_parts)):
-            splits[split] = parts_left_out(observed, fits, parts)
+            splits[split] = parts_left_out(observed, recipe, fits, parts)
         print(f"learned from {', '.join(settings.campaigns)}")
-        turned = [campaign_left_out(observed, turn) for turn in (90.0, 180.0, 270.0)]
-        splits["campaign"] = campaign_left_out(observed)
+        turned = [campaign_left_out(observed, recipe, turn) for turn in (90.0, 180.0, 270.0)]
+        splits["campaign"] = campaign_left_out(observed, recipe)
         for split, scores in splits.items():
             for name in settings.campaigns:
                 mine = [s for s in scores if campaigns[s.flight] == name]

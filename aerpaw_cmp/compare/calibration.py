@@ -23,14 +23,18 @@ from .field_gp import NEW_FLIGHT, PARTS, FieldFit, FieldModel, Part, Rows, fit_f
 from .gains import (
     GainFit,
     GainModel,
+    GainOf,
     LinkSamples,
+    MountFit,
     Spread,
     StatedSpread,
     chosen_fit,
     fading_of,
     fit_gain,
+    fit_mounts,
     inside_shares,
     rotated,
+    turned,
 )
 from .ladder import log_distance_level_db
 from .level import crps_normal, floored_fit, local_mean_db
@@ -80,7 +84,46 @@ class Observed:
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
+class Recipe:
+    """A specification of what to learn.
+
+    Parameters
+    ----------
+    model : GainModel
+        Terms, and initial values of their strengths.
+    patterns : mapping of str to callable
+        Gain of measured patterns in the device frame, for ``uav`` and antennas (``tower.channel``). It can be empty.
+    """
+
+    model: GainModel
+    patterns: Mapping[str, GainOf] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Mounted:
+    """The measured patterns by name, and the fitted mounts of the patterns that a flight used."""
+
+    patterns: Mapping[str, GainOf]
+    mounts: Mapping[str, MountFit]
+
+    def pattern_db(self, name: str, direction: FloatArray) -> FloatArray:
+        """Return the gain (n,) of a mounted pattern towards directions (n, 3) in the frame of body or mast.
+
+        The gain is 0 for an antenna without a pattern.
+        """
+        pattern = self.patterns.get(name)
+        if pattern is None:
+            return np.zeros(len(direction))
+        mount = self.mounts.get(name)
+        return pattern(direction if mount is None else direction @ turned(mount.azimuth_deg))
+
+    def patterns_db(self, samples: LinkSamples) -> FloatArray:
+        """Return the gain (n,) of the measured patterns of both ends."""
+        return self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
+
+
+@dataclass(frozen=True, slots=True)
+class Learned(Mounted):
     """The result of :func:`learn`."""
 
     fit: GainFit
@@ -108,7 +151,8 @@ class Learned:
 
     def predict(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
         """Return the gain of both ends and its standard deviation (n,) [dB], up to a constant."""
-        return self.fit.predict(samples)
+        gain, sd = self.fit.predict(samples)
+        return self.patterns_db(samples) + gain, sd
 
     def mean_error(self, samples: LinkSamples) -> float:
         """Return the mean of measured level minus :meth:`mean` [dB], NaN if no sample has both."""
@@ -117,7 +161,7 @@ class Learned:
 
     def mean(self, samples: LinkSamples) -> FloatArray:
         """Return the gain of :meth:`predict` without its standard deviation, along a flight in time order."""
-        return _mean_along(self.fit, samples)
+        return self.patterns_db(samples) + _mean_along(self.fit, samples)
 
 
 # Averaging time within which a UAV hardly turns [s].
@@ -134,32 +178,38 @@ def _mean_along(fit: GainFit, samples: LinkSamples) -> FloatArray:
     return np.where(np.isfinite(samples.at_uav).all(axis=1), gain, np.nan)
 
 
-def learn(series: Sequence[LinkSamples], start: GainModel | None = None, model: GainModel | None = None) -> Learned:
-    """Learn the gain over direction of the antennas at both ends.
+def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None = None) -> Learned:
+    """Fit the mounts of the patterns, then the gain over direction that remains.
 
     Parameters
     ----------
     series : sequence of LinkSamples
         Residuals of the training flights relative to free space.
-    start : GainModel, optional
-        Terms, and initial values of their strengths.
+    recipe : Recipe
     model : GainModel, optional
         Model whose strengths were already fitted to the same flights. By default they are fitted here.
     """
-    fit = chosen_fit(series, start) if model is None else fit_gain(series, model)
+    names = ["uav", *dict.fromkeys(s.antenna for s in series)]
+    patterns = {name: recipe.patterns[name] for name in names if name in recipe.patterns}
+    mounted = Mounted(recipe.patterns, fit_mounts(series, patterns) if patterns else {})
+    residuals = [dataclasses.replace(s, residual_db=s.residual_db - mounted.patterns_db(s)) for s in series]
+    fit = chosen_fit(residuals, recipe.model) if model is None else fit_gain(residuals, model)
     if any(s.floor_db is not None for s in series):  # a third fit would not change held-out errors
-        fit = fit_gain([_at_floor(s, fit) for s in series], fit.model)
+        fit = fit_gain([_at_floor(s, mounted.patterns_db(s), fit) for s in series], fit.model)
     antennas = dict.fromkeys(s.antenna for s in series)
     fading = {name: fading_of([s for s in series if s.antenna == name], fit.model.bin_s) for name in antennas}
-    return Learned(fit, fading)
+    return Learned(recipe.patterns, mounted.mounts, fit, fading)
 
 
-def _at_floor(samples: LinkSamples, fit: GainFit) -> LinkSamples:
-    """Replace the residual of samples below the floor by the value that the fit predicts, limited to the floor."""
-    residual, floor = samples.residual_db, samples.floor_db
-    if floor is None:
-        return samples
-    gain = _mean_along(fit, samples)
+def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkSamples:
+    """Subtract ``known_db`` from the residual, and replace samples below the floor.
+
+    Samples below the floor get the value that the fit predicts, limited to the floor.
+    """
+    residual = samples.residual_db - known_db
+    if samples.floor_db is None:
+        return dataclasses.replace(samples, residual_db=residual)
+    floor, gain = samples.floor_db - known_db, _mean_along(fit, samples)
     offset_db = floored_fit(residual - floor, gain - floor, 0.0).offset_db
     unseen = np.minimum(gain - offset_db, floor)
     return dataclasses.replace(samples, residual_db=np.where(residual < floor, unseen, residual))
@@ -285,7 +335,7 @@ def groups_of(flights: Sequence[str]) -> list[list[str]]:
 
 
 def flight_left_out(
-    observed: Sequence[Observed], start: GainModel | None = None, without: dict[str, Learned] | None = None
+    observed: Sequence[Observed], recipe: Recipe, without: dict[str, Learned] | None = None
 ) -> tuple[Score, ...]:
     """Score the prediction of each flight from other flights (:func:`groups_of`).
 
@@ -294,7 +344,7 @@ def flight_left_out(
     scores: list[Score | None] = []
     for group in groups_of(flights_of(observed)):
         train = [o.samples for o in observed if o.samples.flight not in group]
-        learned = learn(train, start)
+        learned = learn(train, recipe)
         if without is not None:
             without |= dict.fromkeys(group, learned)
         unseen = [o for o in observed if o.samples.flight in group]
@@ -306,12 +356,13 @@ def flight_left_out(
     return tuple(s for s in scores if s is not None)
 
 
-def campaign_left_out(observed: Sequence[Observed], turn_deg: float = 0.0) -> tuple[Score, ...]:
+def campaign_left_out(observed: Sequence[Observed], recipe: Recipe, turn_deg: float = 0.0) -> tuple[Score, ...]:
     """Score the prediction of each campaign by the airframe of the other campaigns only. Empty for a single campaign.
 
     Parameters
     ----------
     observed : sequence of Observed
+    recipe : Recipe
     turn_deg : float
         Angle by which directions at the UAV are rotated anticlockwise, as a control.
     """
@@ -320,7 +371,7 @@ def campaign_left_out(observed: Sequence[Observed], turn_deg: float = 0.0) -> tu
         train = [o.samples for o in observed if o.samples.campaign != name]
         pupils = [o for o in observed if o.samples.campaign == name]
         if any(s.airframe == pupils[0].samples.airframe for s in train):
-            fit = learn(train).fit
+            fit = learn(train, recipe).fit
             for o in pupils:
                 at_uav = rotated(o.samples.at_uav, turn_deg)
                 scores.append(score(o, fit.airframe_mean(dataclasses.replace(o.samples, at_uav=at_uav))))
@@ -380,7 +431,7 @@ Parts = Callable[[Observed, Observed], list[tuple[BoolArray, BoolArray]]]
 
 
 def parts_left_out(
-    observed: Sequence[Observed], without: Mapping[str, Learned], parts: Parts, start: GainModel | None = None
+    observed: Sequence[Observed], recipe: Recipe, without: Mapping[str, Learned], parts: Parts
 ) -> tuple[Score, ...]:
     """Score predictions of each part of a flight from other flights, without their samples that resemble the part.
 
@@ -390,12 +441,11 @@ def parts_left_out(
     ----------
     observed : sequence of Observed
         Samples of all flights.
+    recipe : Recipe
     without : mapping of str to Learned
         Gains learned without each flight. Their strengths are used again.
     parts : callable
         :func:`altitude_parts`, :func:`heading_parts` or :func:`sector_parts`.
-    start : GainModel, optional
-        Terms, and initial values of their strengths.
 
     Returns
     -------
@@ -415,7 +465,7 @@ def parts_left_out(
             if not train or not any(parts(o, o)[k][0].any() for o in mine):
                 continue
             try:
-                learned = learn(train, start, without[flight].model)
+                learned = learn(train, recipe, without[flight].model)
             except InputError:
                 continue
             known = {s.antenna for s in train}

@@ -1,4 +1,4 @@
-"""The ``calibrate`` job, which learns antennas from several flights and scores them on held-out flights.
+"""The ``calibrate`` job, which learns mounted antennas from several flights and scores them on held-out flights.
 
 It also learns when a receiver is in lock, from levels that are predicted from other flights.
 """
@@ -24,32 +24,30 @@ from ..common.stages import PlannedStage, Stages
 from ..common.text import counted
 from ..common.yamlfile import StrictModel, load_yaml
 from ..compare import calibration, gains
-from ..compare.calibration import Learned, Observed, Score, flights_of, groups_of, learn
-from ..compare.gains import FlightEvidence, GainProcess
+from ..compare.calibration import BIN_S, Learned, Observed, Recipe, Score, flights_of, groups_of, learn
+from ..compare.gains import FlightEvidence, GainOf, GainProcess
 from ..compare.health import HeldOut, learned_health
 from ..compare.level import DetectionScore, learn_detection, score_detection
 from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
-from ..flight.gains import flight_of, load_with_learned
+from ..flight.gains import flight_of, load_with_learned, mean_gain_db, sphere_angles
 from ..flight.replay import observed_series
 from ..flight.rows import LOCK_FLOOR_DB
+from ..flight.settings import AntennaSettings, load_pattern
 from ..flight.training import counted_once, flight_logs, marks_of
 from ..report.calibration import sentences
 from ..site.learned import AIRFRAME_BAND, DirectionCovariance, LearnedHealth, LearnedLock, Source
 
 
-def learned_locks(
-    observed: Sequence[Observed], fits: Mapping[str, Learned], start: gains.GainModel | None = None
-) -> dict[str, LearnedLock]:
+def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[str, Learned]) -> dict[str, LearnedLock]:
     """Return a model of P(lock) by antenna, learned from levels predicted from other flights, with held-out scores.
 
     Parameters
     ----------
     observed : sequence of Observed
         Samples of all flights.
+    recipe : Recipe
     fits : mapping of str to Learned
         Gains learned without each flight.
-    start : GainModel, optional
-        Terms of the gains without two flights, and initial values of their strengths.
 
     Returns
     -------
@@ -60,7 +58,7 @@ def learned_locks(
     able = [o for o in observed if o.locked is not None and np.isfinite(o.locked).any()]
     if len(flights_of(able)) < 3:
         return {}
-    pairs = _without_pairs(observed, start)
+    pairs = _without_pairs(observed, recipe)
     out = {}
     for antenna in dict.fromkeys(o.samples.antenna for o in able):
         lock = _learned([o for o in able if o.samples.antenna == antenna], fits, pairs)
@@ -105,7 +103,7 @@ def learned_healths(observed: Sequence[Observed], fits: Mapping[str, Learned]) -
     return out
 
 
-def _without_pairs(observed: Sequence[Observed], start: gains.GainModel | None) -> dict[tuple[str, str], Learned]:
+def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[str, str], Learned]:
     """Return gains learned without each pair of flights, by pair.
 
     P(lock) of one flight is predicted by a fit to the other flights. The levels of each of these are predicted without
@@ -113,7 +111,7 @@ def _without_pairs(observed: Sequence[Observed], start: gains.GainModel | None) 
     """
     out: dict[tuple[str, str], Learned] = {}
     for one, other in combinations(groups_of(flights_of(observed)), 2):
-        learned = learn([o.samples for o in observed if o.samples.flight not in (*one, *other)], start)
+        learned = learn([o.samples for o in observed if o.samples.flight not in (*one, *other)], recipe)
         out |= {pair: learned for a in one for b in other for pair in ((a, b), (b, a))}
     return out
 
@@ -200,6 +198,15 @@ def lock_words(lock: LearnedLock) -> str:
     )
 
 
+class PatternsSettings(StrictModel):
+    """The measured patterns to which the learned gain is added. They are isotropic by default."""
+
+    uav: AntennaSettings | None = None
+    tower: AntennaSettings | None = None
+    towers: dict[str, AntennaSettings] = Field(default_factory=dict)
+    """Patterns by ``tower.channel``, for towers with a different pattern."""
+
+
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
 
 
@@ -218,6 +225,7 @@ class CalibrationFile(StrictModel):
     """All flights, including those of ``campaigns``."""
     campaigns: dict[_Name, CampaignSettings] = Field(default_factory=dict)
     """Campaigns by name, if antennas are learned from several campaigns together. Each becomes an entry of the site."""
+    patterns: PatternsSettings = PatternsSettings()
     source: Source = Source()
     """Title, DOI and licence of the data, and the airframe. They are stored with the learned models of a site."""
     rank: bool = False
@@ -305,6 +313,7 @@ def load_calibration(path: Path, further: Sequence[Path] = ()) -> CalibrationFil
 def calibrate(
     settings: CalibrationFile,
     flights: Sequence[FlightData],
+    folder: Path,
     logs_root: Path | None = None,
     *,
     campaigns: Mapping[str, str] | None = None,
@@ -318,8 +327,9 @@ def calibrate(
     settings : CalibrationFile
     flights : sequence of FlightData
         Flights, as returned by :func:`read_flights`.
-    logs_root : Path, optional
-        Folder of the logs of ``score``. By default it is that of their flight file.
+    folder, logs_root : Path
+        Folder for relative paths of patterns, and folder of the logs of ``score`` (by default, that of their flight
+        file).
     campaigns : mapping of str to str, optional
         Campaign of each flight, from :func:`read_flights`. By default, all flights are one campaign.
     stages : Stages, optional
@@ -343,6 +353,7 @@ def calibrate(
     observed, warnings = observe(flights)
     warnings += _unscored(observed)
     observed = in_campaigns(settings, observed, flights, campaigns)
+    recipe = recipe_of(settings, observed, logs_root or folder)
     with stages("read"):
         further = [load_data(load_with_learned(path), path.parent, logs_root) for path in score]
     series = [o.samples for o in observed]
@@ -351,15 +362,15 @@ def calibrate(
     rest += [("rank", "of all flights")] if settings.rank else []
     stages.checked(lambda: [PlannedStage(*row) for row in rest])
     with stages("fit"):
-        learned = learn(series)
+        learned = calibration.learn(series, recipe)
     fits: dict[str, Learned] = {}
     with stages("scores"):
-        scores = _score_all(observed, stages, fits)
-        controls = _controls_of(observed)
+        scores = _score_all(observed, recipe, stages, fits)
+        controls = _controls_of(observed, recipe, scores["flight_left_out"])
         stages.progress("scores", 1.0)
-        locks, health = learned_locks(observed, fits), learned_healths(observed, fits)
+        locks, health = learned_locks(observed, recipe, fits), learned_healths(observed, fits)
         taught = teaching(observed, campaigns, fits)
-    warnings += _contradictions(scores["campaign_left_out"], controls, campaigns)
+    warnings += [*_mount_warnings(learned), *_contradictions(scores["campaign_left_out"], controls, campaigns)]
     if further:
         with stages("score"):
             further_scores, remarks = _score_further(further, flights, learned, observed)
@@ -496,7 +507,7 @@ def _unscored(observed: Sequence[Observed]) -> list[str]:
     """Return a remark about channels of towers that cannot be scored, because only one flight has them."""
     flights = calibration.flights_of(observed)
     if len(flights) < 2:
-        return ["only one flight: no flight can be held out, so nothing is scored"]
+        return ["only one flight: no flight can be held out, so nothing is scored, and mounts are unstable"]
     heard = {(o.samples.antenna, o.samples.flight) for o in observed}
     count = Counter(antenna for antenna, _ in heard)
     lonely = [antenna for antenna in dict.fromkeys(o.samples.antenna for o in observed) if count[antenna] == 1]
@@ -523,15 +534,50 @@ def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | Non
     return observed, remarks
 
 
+# --- learning ------------------------------------------------------------------------------------------------------
+
+
+def learned_antennas(train: Sequence[gains.LinkSamples]) -> Learned:
+    """Learn the antennas of both ends, starting from the default strengths of the model."""
+    return calibration.learn(train, Recipe(gains.GainModel(bin_s=BIN_S)))
+
+
+def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
+    """Return the terms and patterns that a calibration.yaml specifies."""
+    patterns: dict[str, GainOf] = {}
+    if settings.patterns.uav is not None:
+        patterns["uav"] = gain_of(settings.patterns.uav, folder)
+    antennas = list(dict.fromkeys(o.samples.antenna for o in observed))
+    if unknown := sorted(settings.patterns.towers.keys() - set(antennas)):
+        raise UsageError(
+            f"patterns.towers.{unknown[0]}: the flights have no such tower and channel",
+            expected="one of " + ", ".join(antennas),
+        )
+    for antenna in antennas:
+        chosen = settings.patterns.towers.get(antenna, settings.patterns.tower)
+        if chosen is not None:
+            patterns[antenna] = gain_of(chosen, folder)
+    return Recipe(gains.GainModel(), patterns)
+
+
+def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
+    """Return a function for the gain [dBi] of a pattern towards unit vectors (n, 3) in its device frame."""
+    pattern = load_pattern(settings, folder)
+    return lambda direction: mean_gain_db([pattern], *sphere_angles(direction))
+
+
 # --- scores --------------------------------------------------------------------------------------------------------
 
 
-def _score_all(observed: Sequence[Observed], stages: Stages, fits: dict[str, Learned]) -> dict[str, tuple[Score, ...]]:
+def _score_all(
+    observed: Sequence[Observed], recipe: Recipe, stages: Stages, fits: dict[str, Learned]
+) -> dict[str, tuple[Score, ...]]:
     """Score every split (flight, height, heading, sector) on samples that were not fitted. Splits share fits.
 
     Parameters
     ----------
     observed : sequence of Observed
+    recipe : Recipe
     stages : Stages
     fits : dict of str to Learned
         Receives the gains learned without each flight.
@@ -546,32 +592,36 @@ def _score_all(observed: Sequence[Observed], stages: Stages, fits: dict[str, Lea
     # the controls take about as long as two splits
     shares = (done / (len(scores) + 2) for done in range(len(scores) + 1))
     stages.progress("scores", next(shares))
-    scores["flight_left_out"] = calibration.flight_left_out(observed, without=fits)
+    scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, fits)
     for name, parts in (
         ("altitude", calibration.altitude_parts),
         ("heading", calibration.heading_parts),
         ("sector", calibration.sector_parts),
     ):
         stages.progress("scores", next(shares))
-        scores[f"{name}_left_out"] = calibration.parts_left_out(observed, fits, parts)
+        scores[f"{name}_left_out"] = calibration.parts_left_out(observed, recipe, fits, parts)
     stages.progress("scores", next(shares))
-    scores["campaign_left_out"] = calibration.campaign_left_out(observed)
+    scores["campaign_left_out"] = calibration.campaign_left_out(observed, recipe)
     stages.progress("scores", next(shares))
     return scores
 
 
-def _controls_of(observed: Sequence[Observed]) -> dict[str, tuple[Score, ...]]:
-    """Score the UAV's gain in wrong frames on held-out flights, as controls."""
+def _controls_of(
+    observed: Sequence[Observed], recipe: Recipe, scores: tuple[Score, ...]
+) -> dict[str, tuple[Score, ...]]:
+    """Score the UAV's gain in wrong frames on held-out flights, as controls. ``scores`` are those of the body frame."""
     if len(calibration.flights_of(observed)) < 2:
         return {}
+    left_out, bare = calibration.flight_left_out, dataclasses.replace(recipe, patterns={})
     turns = (90.0, 180.0, 270.0) if len({o.samples.campaign for o in observed}) > 1 else ()
     turned = {
-        f"another campaign's airframe, rotated by {turn:.0f} deg": calibration.campaign_left_out(observed, turn)
+        f"another campaign's airframe, rotated by {turn:.0f} deg": calibration.campaign_left_out(observed, bare, turn)
         for turn in turns
     }
     return turned | {
-        "world frame at the UAV": calibration.flight_left_out(calibration.world_frame(observed)),
-        "heading turned the wrong way": calibration.flight_left_out(calibration.wrong_way(observed)),
+        "world frame at the UAV": left_out(calibration.world_frame(observed), bare),
+        "heading turned the wrong way": left_out(calibration.wrong_way(observed), bare),
+        "body frame, no patterns": left_out(observed, bare) if recipe.patterns else scores,
     }
 
 
@@ -634,3 +684,13 @@ def _airframe(learned: Learned, antenna: str) -> GainProcess:
         directions=known.directions,
         covariance_db2=known.covariance_db2,
     )
+
+
+def _mount_warnings(learned: Learned) -> list[str]:
+    """Return one sentence per mount that the data do not determine."""
+    return [
+        f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is most likely, with an SD of "
+        f"{mount.azimuth_sd_deg:.0f} deg"
+        for name, mount in learned.mounts.items()
+        if not mount.identified
+    ]

@@ -59,17 +59,18 @@ def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]
     flat, shape = vectors.reshape(-1, 3), vectors.shape[:2]
     fit, out = calibration.fit, {}
     for antenna in fit.antennas:
-        ends: tuple[tuple[str, Frame], ...] = (("uav", "body"), ("tower", "mast"))
-        for end, frame in ends:
-            gain, sd = (values.reshape(shape) for values in fit.gain(frame, antenna, flat))
-            gain_dbi = unit_mean_gain(gain)
+        ends: tuple[tuple[str, Frame, str], ...] = (("uav", "body", "uav"), ("tower", "mast", antenna))
+        for end, frame, name in ends:
+            gain, sd = fit.gain(frame, antenna, flat)
+            raw = (gain + calibration.learned.pattern_db(name, flat)).reshape(shape)
+            gain_dbi = unit_mean_gain(raw)
             out[antenna, end] = AntennaMap(
                 name=f"{antenna} {end}",
                 theta_deg=theta,
                 azimuth_deg=azimuth,
                 gain_dbi=gain_dbi,
-                sd_db=sd,
-                level_db=float((gain - gain_dbi).flat[0]),
+                sd_db=sd.reshape(shape),
+                level_db=float((raw - gain_dbi).flat[0]),
                 flown=fit.seen(frame, antenna),
             )
     return out
@@ -214,6 +215,11 @@ def _record_of(
     CalibrationData
         Input of :func:`aerpaw_cmp.report.calibration.write_calibration`.
     """
+    mounts = {
+        name: {k: v for k, v in dataclasses.asdict(m).items() if k not in ("grid_deg", "probability")}
+        | {"probability": dict(zip([f"{g:g}" for g in m.grid_deg], map(float, m.probability), strict=True))}
+        for name, m in calibration.learned.mounts.items()
+    }
     return CalibrationData(
         name=calibration.settings.calibration,
         flights=calibration.names,
@@ -221,6 +227,7 @@ def _record_of(
         warnings=calibration.warnings,
         scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},
         controls={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.controls.items()},
+        mounts=mounts,
         strengths={"model": dataclasses.asdict(calibration.learned.model)},
         antennas=tuple(maps.values()),
         settings_text=text,

@@ -18,7 +18,7 @@ from ..common.outputs import OutputFolder
 from ..common.stages import PlannedStage, Stages
 from ..common.text import counted
 from ..common.units import FloatArray
-from ..compare.calibration import choose, learn
+from ..compare.calibration import choose
 from ..compare.field_gp import FlownFlights, rms_db
 from ..compare.gains import GainModel, LinkSamples
 from ..flight.routes import (
@@ -39,7 +39,7 @@ from ..report.plan import PlanPage, plan_metrics, write_plan
 from ..report.texts import safe_name
 from ..site.mapfiles import MAX_CROSSINGS, is_tangled
 from ..site.site import Site
-from .calibrate import observe
+from .calibrate import learned_antennas, observe
 from .options import DEFAULT, JobOutcome, RunOptions
 from .predict import site_of
 from .sources import (
@@ -396,8 +396,8 @@ def _flown_flights(series: Sequence[LinkSamples]) -> FlownFlights:
     """Return strengths and spatial correction learned from earlier flights, else the defaults of the model."""
     model, residual_field = GainModel(), None
     if series:
-        model = learn(series).model
-        correction = choose(series, {"learned": lambda train: learn(train).predict})
+        model = learned_antennas(series).model
+        correction = choose(series, {"learned": lambda train: learned_antennas(train).predict})
         residual_field = correction.model if correction.on else None
     return FlownFlights(series=series, model=model, field=residual_field)
 

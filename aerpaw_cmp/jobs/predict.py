@@ -22,7 +22,7 @@ from ..common.outputs import OutputFolder
 from ..common.stages import PlannedStage, Progress, Stages
 from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
-from ..compare.calibration import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base, learn
+from ..compare.calibration import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base
 from ..compare.gains import BAND, LinkSamples
 from ..flight.data import FlightData, site_place, unread
 from ..flight.drafting.proposals import latest_learned_links
@@ -51,7 +51,7 @@ from ..site.learned import BAND as CARRIER_BAND
 from ..site.learned import folder_of, read_learned
 from ..site.site import Site
 from ..site.siteyaml import load_site, site_model
-from .calibrate import observe
+from .calibrate import learned_antennas, observe
 from .calibrate_rank import FittedReceiver, RankSamples, read_receiver
 from .options import DEFAULT, RANKS, JobOutcome, RunOptions
 from .sources import (
@@ -385,7 +385,7 @@ def _bases(
         return fixed_base(lambda s: gain(sources[s.antenna], s))
 
     bases: dict[str, Base] = {
-        "learned": lambda train: by_degree(learn(train).predict),
+        "learned": lambda train: by_degree(learned_antennas(train).predict),
         "free space": each(lambda _, s: np.zeros(len(s))),
         "none": each(lambda source, s: -source.free_space_db(s.position_m)),
     }

@@ -613,7 +613,7 @@ def run_calibrate(
         ranked, calibration = None, None
         if not settings.rank or any(data.rss for data in flights):
             calibration = calibrate(
-                settings, flights, options.logs_root, campaigns=campaigns, stages=stages, score=score
+                settings, flights, path.parent, options.logs_root, campaigns=campaigns, stages=stages, score=score
             )
         stages.checked(lambda: [PlannedStage("rank", counted(len(reports), "receiver"))])
         if settings.rank:

@@ -14,11 +14,11 @@ from ..common.jsonable import json_object
 from ..common.units import FloatArray
 from ..compare.calibration import BASELINES, Score, mean_rmse
 from ..compare.verdict import Verdict, antenna_or_place, by_flight
-from .cards import HEAD, SHARE, TEXT, Card, Page, Positions, Table, write_page
+from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, write_page
 from .flight_words import said_of
 from .page import Made, about
 from .places import BODY, COMPASS, Places, payload
-from .texts import minute, percent
+from .texts import minute, number, percent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +58,7 @@ class CalibrationData(Made):
     warnings: Sequence[str]
     scores: Mapping[str, Sequence[Mapping[str, Any]]]
     controls: Mapping[str, Sequence[Mapping[str, Any]]]
+    mounts: Mapping[str, Mapping[str, Any]]
     strengths: Mapping[str, Any]
     antennas: Sequence[AntennaMap]
     rank: Mapping[str, Any] | None = None
@@ -115,9 +116,9 @@ def helps(scores: Sequence[Score]) -> Verdict:
     return by_flight(_errors(scores), _errors(scores, name), name)
 
 
-def frame(scores: Sequence[Score], controls: Mapping[str, Sequence[Score]]) -> Verdict:
-    """Test whether an antenna or the position explains the learned gain."""
-    body = _errors(scores)
+def frame(controls: Mapping[str, Sequence[Score]]) -> Verdict:
+    """Test whether an antenna or the position explains the learned gain, without measured patterns."""
+    body = _errors(controls.get("body frame, no patterns", ()))
     return antenna_or_place(
         [by_flight(body, _errors(controls.get(name, ())), where) for name, where in WRONG_FRAMES.items()]
     )
@@ -142,7 +143,7 @@ def sentences(scores: Mapping[str, Sequence[Score]], controls: Mapping[str, Sequ
     left_out = scores["flight_left_out"]
     if not left_out:
         return (ONE_FLIGHT,)
-    verdict, turned = helps(left_out), frame(left_out, controls)
+    verdict, turned = helps(left_out), frame(controls)
     worst = max(left_out, key=lambda score: score.rmse_db)
     ends = sorted(map(abs, turned.interval))
     helped, _, step = said_of(verdict, HELPS).partition(" Next: ")
@@ -184,7 +185,7 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
     return json_object(
         calibration=data.name,
         flights=data.flights, trained_on=data.trained_on, marks=data.marks, scores=data.scores,
-        controls=data.controls, strengths=data.strengths, words=data.words,
+        controls=data.controls, mounts=data.mounts, strengths=data.strengths, words=data.words,
         warnings=data.warnings,
         antennas=[
             {"name": a.name, "share_of_sphere_seen": _share_seen(a), "n_bins": len(a.flown)} for a in data.antennas
@@ -255,6 +256,18 @@ def _rows(splits: Mapping[str, Sequence[Mapping[str, Any]]] | None, keys: Sequen
     return [(SPLIT_TITLE.get(split, split), *(row[key] for key in keys)) for split, of in known for row in of]
 
 
+def mounts_card(data: CalibrationData) -> Card:
+    """Return the card of the mounts of antennas with a measured pattern."""
+    table = Table(
+        caption="Mounts of antennas with a measured pattern; azimuth counter-clockwise from east (tower) or from the "
+        "nose (UAV).",
+        columns={"Antenna": HEAD, "azimuth": RIGHT, "sd": RIGHT, "identified": TEXT},
+        rows=[(name, number(m["azimuth_deg"], 0, "deg"), number(m["azimuth_sd_deg"], 0, "deg"),
+               "yes" if m["identified"] else "no") for name, m in data.mounts.items()],
+    )  # fmt: skip
+    return Card(title="Antennas", id="antennas", tables=[table])
+
+
 def gains_card(data: CalibrationData) -> Card:
     """Return the card with the gain of each antenna over the sphere."""
     if not data.antennas:
@@ -284,7 +297,7 @@ def rank_card(data: CalibrationData) -> Card:
     return Card(title="Rank", id="rank", tables=[table])
 
 
-CARDS = (scores_card, gains_card, rank_card)
+CARDS = (scores_card, mounts_card, gains_card, rank_card)
 
 
 def write_calibration(data: CalibrationData, folder: Path) -> list[Path]:

@@ -9,6 +9,7 @@ from aerpaw_cmp.compare import calibration
 from aerpaw_cmp.compare.calibration import (
     Observed,
     Parts,
+    Recipe,
     flight_left_out,
     flights_of,
     groups_of,
@@ -17,8 +18,10 @@ from aerpaw_cmp.compare.calibration import (
 from aerpaw_cmp.compare.gains import GainModel, LinkSamples, StatedSpread, Term, fading_of, inside_shares
 from aerpaw_cmp.compare.ladder import log_distance_level_db
 from aerpaw_cmp.compare.level import floored_fit, local_mean_db
+from aerpaw_cmp.propagation.geometry import rotation_from_yaw_pitch_roll
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
+RECIPE = Recipe(MODEL)
 
 
 def observed(flight: str, offset_db: float = 0.0, seed: int = 0) -> Observed:
@@ -38,19 +41,21 @@ def observed(flight: str, offset_db: float = 0.0, seed: int = 0) -> Observed:
 def test_an_offset_of_one_flight_shows_only_where_offsets_are_shared() -> None:
     flights = [observed("a", seed=1), observed("b", seed=2), observed("c", offset_db=6.0, seed=3)]
     learned: dict[str, calibration.Learned] = {}
-    scores = {s.flight: s for s in flight_left_out(flights, MODEL, learned)}
+    scores = {s.flight: s for s in flight_left_out(flights, RECIPE, learned)}
     assert all(s.rmse_db < 1.0 < 2.0 < s.free_space_rmse_db for s in scores.values())
     assert scores["c"].rmse_shared_offset_db == pytest.approx(np.hypot(scores["c"].rmse_db, 6.0), abs=0.3)
     assert scores["a"].rmse_shared_offset_db == pytest.approx(np.hypot(scores["a"].rmse_db, 3.0), abs=0.3)
     assert all(s.constant_rmse_db == pytest.approx(s.free_space_rmse_db) for s in scores.values())  # one distance
     assert all(np.isfinite([s.inside_50, s.inside_95]).all() for s in scores.values())
     unasked = ("inside_50", "inside_95", "rmse_shared_offset_db")  # values that are not needed are not computed
-    assert all(np.isnan([getattr(s, name) for name in unasked]).all() for s in flight_left_out(flights, MODEL))
+    assert all(np.isnan([getattr(s, name) for name in unasked]).all() for s in flight_left_out(flights, RECIPE))
     series = [o.samples for o in flights]
-    assert calibration.learn(series, MODEL, MODEL).model == MODEL  # strengths that are given are not scaled to the data
-    assert calibration.learn(series, MODEL).model != MODEL
+    assert (
+        calibration.learn(series, RECIPE, MODEL).model == MODEL
+    )  # strengths that are given are not scaled to the data
+    assert calibration.learn(series, RECIPE).model != MODEL
     level = [dataclasses.replace(o, samples=dataclasses.replace(o.samples)) for o in flights[:2]]
-    assert all(s.rmse_shared_offset_db < s.rmse_db + 0.1 for s in flight_left_out(level, MODEL, {}))
+    assert all(s.rmse_shared_offset_db < s.rmse_db + 0.1 for s in flight_left_out(level, RECIPE, {}))
 
 
 def test_many_flights_are_left_out_in_groups_and_none_is_learned_from_itself(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,7 +69,7 @@ def test_many_flights_are_left_out_in_groups_and_none_is_learned_from_itself(mon
 
     monkeypatch.setattr(calibration, "learn", spied)
     by_flight: dict[str, calibration.Learned] = {}
-    scores = flight_left_out(flights, MODEL, by_flight)
+    scores = flight_left_out(flights, RECIPE, by_flight)
     assert {s.flight for s in scores} == set(by_flight) == set(flights_of(flights))
     assert len(learned_from) == 6
     groups = groups_of(flights_of(flights))
@@ -84,7 +89,7 @@ def test_few_flights_are_left_out_one_by_one_and_many_are_sampled_over_the_seaso
 
 def test_the_mean_alone_is_that_of_the_prediction() -> None:
     arc = np.arange(70)  # the mean over it is not that over the circle
-    learned = calibration.learn([observed(name, seed=1).samples.part(arc) for name in "ab"], MODEL)
+    learned = calibration.learn([observed(name, seed=1).samples.part(arc) for name in "ab"], RECIPE)
     other = observed("c", seed=3).samples
     lost = dataclasses.replace(other, at_uav=np.where(np.arange(len(other))[:, None] < 5, np.nan, other.at_uav))
     np.testing.assert_allclose(learned.mean(lost), learned.predict(lost)[0], rtol=0, atol=1e-9)
@@ -105,9 +110,31 @@ def test_levels_below_the_floor_of_a_receiver_teach_no_gain() -> None:
     flights = [observed("a", seed=1), observed("b", seed=2)]
     error = {}
     for floor_db in (None, -1.0):
-        learned = calibration.learn([lost(o, floor_db).samples for o in flights], MODEL)
+        learned = calibration.learn([lost(o, floor_db).samples for o in flights], RECIPE)
         error[floor_db] = floored_fit(truth.residual_db, learned.mean(truth), -1.0).rmse_db
     assert error[-1.0] < 0.8 * error[None]
+
+
+@pytest.mark.parametrize("floor_db", [None, -90.0])
+def test_pattern_and_learned_gain_together_are_the_planted_gain(floor_db: float | None) -> None:
+    """The gain is added to the mounted pattern, even if the pattern explains only a part of the levels."""
+
+    def pattern(direction: np.ndarray) -> np.ndarray:
+        return 6.0 * direction[:, 0] ** 2 + 2.0 * direction[:, 1]
+
+    def flown(flight: str, seed: int) -> LinkSamples:
+        s = observed(flight, seed=seed).samples
+        floor = None if floor_db is None else np.full(len(s), floor_db)
+        level = s.residual_db + pattern(s.at_tower @ rotation_from_yaw_pitch_roll(np.radians(70.0), 0.0, 0.0))
+        return dataclasses.replace(s, residual_db=level, floor_db=floor)
+
+    recipe = Recipe(MODEL, {"LW1.USRP1": pattern})
+    learned = calibration.learn([flown("a", 1), flown("b", 2)], recipe)
+    assert set(learned.mounts) == {"LW1.USRP1"}
+    other = flown("c", 3)
+    error = other.residual_db - learned.mean(other)
+    assert error.std() < 0.8 < 2.0 < other.residual_db.std()
+    assert learned.mean_error(other) == pytest.approx(error.mean(), abs=1e-9)
 
 
 def test_part_and_bins_keep_or_drop_what_belongs_to_samples() -> None:
@@ -126,8 +153,8 @@ def test_part_and_bins_keep_or_drop_what_belongs_to_samples() -> None:
 def leaving(parts: Parts, flights: list[Observed]) -> tuple[calibration.Score, ...]:
     """Scores of a split by parts, each flight predicted from the other."""
     learned: dict[str, calibration.Learned] = {}
-    flight_left_out(flights, MODEL, learned)
-    return calibration.parts_left_out(flights, learned, parts, MODEL)
+    flight_left_out(flights, RECIPE, learned)
+    return calibration.parts_left_out(flights, RECIPE, learned, parts)
 
 
 def planted(o: Observed, part: np.ndarray, fault_db: float) -> Observed:
@@ -154,8 +181,8 @@ def test_an_antenna_that_no_other_flight_has_is_not_scored() -> None:
     alone = dataclasses.replace(flights[0], samples=dataclasses.replace(flights[0].samples, channel="USRP2"))
     split = calibration.heading_parts
     assert [(s.flight, s.channel) for s in leaving(split, [*flights, alone])] == [("a", "USRP1"), ("b", "USRP1")]
-    learned = {"a": calibration.learn([flights[1].samples], MODEL)}
-    assert calibration.parts_left_out(flights[:1], learned, split, MODEL) == ()
+    learned = {"a": calibration.learn([flights[1].samples], RECIPE)}
+    assert calibration.parts_left_out(flights[:1], RECIPE, learned, split) == ()
 
 
 @pytest.mark.parametrize("split", ["altitude", "heading", "sector"])
@@ -297,26 +324,27 @@ def test_parts_of_a_circle_and_of_the_heights_are_those_by_hand() -> None:
 
 
 def test_below_its_floor_a_receiver_has_what_the_fit_says_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Levels 3 dB above the gain, and a floor of -5 dB, computed by hand."""
-    gain = np.linspace(-20.0, 20.0, 200)
-    level_db = gain + 3.0
+    """Levels 3 dB above the gain, and a floor of -5 dB with a pattern of 2 dB, computed by hand."""
+    gain, pattern_db = np.linspace(-20.0, 20.0, 200), np.full(200, 2.0)
+    level_db = gain + 3.0 + pattern_db
     base = observed("a").samples
     samples = dataclasses.replace(
         base, residual_db=np.where(level_db < -5.0, -21.0, level_db), floor_db=np.full(200, -5.0)
     )
     monkeypatch.setattr(calibration, "_mean_along", lambda *_: gain)
-    fit = calibration.learn([observed("a").samples, observed("b").samples], MODEL).fit
-    residual_db = calibration._at_floor(samples, fit).residual_db
+    fit = calibration.learn([observed("a").samples, observed("b").samples], RECIPE).fit
+    assert fit is not None
+    residual_db = calibration._at_floor(samples, pattern_db, fit).residual_db
     np.testing.assert_allclose(
-        residual_db, np.where(level_db < -5.0, np.minimum(gain + 3.0, -5.0), gain + 3.0), atol=1e-9
+        residual_db, np.where(level_db < -5.0, np.minimum(gain + 3.0, -7.0), gain + 3.0), atol=1e-9
     )
-    plain = dataclasses.replace(samples, floor_db=None)
-    assert calibration._at_floor(plain, fit) is plain
+    plain = calibration._at_floor(dataclasses.replace(samples, floor_db=None), pattern_db, fit).residual_db
+    np.testing.assert_allclose(plain, samples.residual_db - 2.0)
 
 
 def test_an_offset_of_others_adds_to_the_error_and_stated_spreads_are_asked() -> None:
     o = observed("a", offset_db=5.0, seed=1)
-    learned = calibration.learn([observed("b", seed=2).samples, observed("c", seed=3).samples], MODEL)
+    learned = calibration.learn([observed("b", seed=2).samples, observed("c", seed=3).samples], RECIPE)
     offsets = calibration._offsets([observed(name, seed=k).samples for k, name in enumerate("bc", 2)], learned)
     (score,) = calibration.score_with(learned, [o], [observed("b", seed=2), observed("c", seed=3)])
     own_offset = learned.mean_error(o.samples)

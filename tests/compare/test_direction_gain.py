@@ -1,4 +1,4 @@
-"""Gain over direction: the dense solution written out, planted patterns learned again, strengths, refusals."""
+"""Gain over direction: the dense solution written out, planted patterns learned again, strengths, mounts, refusals."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.compare import gains as direction_gain
-from aerpaw_cmp.compare.gains import GainModel, LinkSamples, Term, chosen_fit, fit_gain
+from aerpaw_cmp.compare.gains import GainModel, LinkSamples, Term, chosen_fit, fit_gain, fit_mounts
 from aerpaw_cmp.propagation.geometry import rotation_from_aircraft, rotation_from_yaw_pitch_roll
 
 RNG = np.random.default_rng(5)
@@ -177,6 +177,61 @@ def test_many_flights_are_learned_over_longer_means(monkeypatch):
     assert fit.model.bin_s == 8.0
     for test in TEST:
         assert rmse(test.residual_db - fit.mean(test)) < 0.75 * rmse(test.residual_db)
+
+
+def test_mounts_are_found_together():
+    """A dipole-like figure of eight at each end, turned by known angles."""
+    pattern = lambda d: 6.0 * d[:, 0] + 3.0 * (d[:, 0] ** 2 - d[:, 1] ** 2)  # noqa: E731
+
+    truth = {"uav": 250.0, "A": 40.0, "B": 130.0}
+    gains = {k: (lambda d, a=a: pattern(d @ turn(a, 0.0, 0.0))) for k, a in truth.items()}
+    flights = [s for k in range(2) for s in planted(f"f{k}", 50 + k, gains)]
+    mounts = fit_mounts(flights, {"uav": pattern, "LW1.A": pattern, "LW1.B": pattern})
+    assert set(mounts) == {"uav", "LW1.A", "LW1.B"}
+    for name, fit in mounts.items():
+        true = truth[name.removeprefix("LW1.")]
+        assert abs((fit.azimuth_deg - true + 180) % 360 - 180) <= 10
+        assert fit.identified
+        assert fit.azimuth_sd_deg < 30
+        assert fit.probability.sum() == pytest.approx(1.0)
+
+
+def test_probabilities_of_mounts_by_trying_all_pairs():
+    """Compute a least-squares fit of 4 s levels about the patterns (10 dB each), for a mast weighted over azimuths."""
+    pattern = lambda d: 9.0 * d[:, 0] + 4.0 * d[:, 1] ** 2  # noqa: E731
+
+    (flight,) = planted("f", 57, {"uav": pattern, "A": pattern}, n=60, channels=("A",))
+    mounts = fit_mounts([flight], {"uav": pattern, "LW1.A": pattern})
+    bins = flight.binned(4.0)
+    centred = lambda x: x - x.mean()  # noqa: E731
+    ends = [
+        np.array([centred(pattern(at @ turn(a, 0, 0))) for a in range(0, 360, 10)])
+        for at in (bins.at_uav, bins.at_tower)
+    ]
+    left = centred(bins.residual_db) - ends[0][:, None] - ends[1]
+    log = -0.5 * (left**2).sum(axis=2) / 10.0**2
+    uav = np.exp(log.max(axis=1) - log.max())
+    mast = np.exp(log - log.max(axis=1, keepdims=True))
+    uav /= uav.sum()
+    assert 0.05 < uav.max() < 0.95
+    np.testing.assert_allclose(mounts["uav"].probability, uav, atol=1e-9)
+    np.testing.assert_allclose(mounts["LW1.A"].probability, uav @ (mast / mast.sum(axis=1, keepdims=True)), atol=1e-9)
+    assert (mounts["uav"].azimuth_deg / 10, mounts["LW1.A"].azimuth_deg / 10) == np.unravel_index(
+        log.argmax(), log.shape
+    )
+    for fit in mounts.values():  # the circular standard deviation, and what is left beyond 45 degrees
+        off = np.radians(fit.grid_deg - fit.azimuth_deg)
+        length = np.hypot(fit.probability @ np.cos(off), fit.probability @ np.sin(off))
+        assert fit.azimuth_sd_deg == pytest.approx(max(np.degrees(np.sqrt(-2 * np.log(length))), 10 / np.sqrt(12)))
+        assert fit.identified == (fit.probability[np.cos(off) < np.cos(np.radians(45.0)) - 1e-9].sum() < 0.05)
+
+
+def test_a_pattern_without_azimuth_leaves_its_mount_open():
+    flat = lambda d: 5.0 * d[:, 2]  # noqa: E731
+
+    mount = fit_mounts(TRAIN, {"uav": flat})["uav"]
+    assert not mount.identified
+    assert np.allclose(mount.probability, 1 / len(mount.grid_deg), atol=1e-6)
 
 
 def test_unknown_antenna_and_empty_flights_are_told(learned):

@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.calibration import Observed, campaign_left_out, learn
+from aerpaw_cmp.compare.calibration import Observed, Recipe, campaign_left_out, learn
 from aerpaw_cmp.compare.gains import (
     FlightEvidence,
+    GainModel,
     GainProcess,
     LinkSamples,
     Term,
@@ -43,7 +44,7 @@ def observed(series):
 
 def process(series) -> GainProcess:
     """The airframe that flights taught."""
-    fit, antenna = learn(series).fit, series[0].antenna
+    fit, antenna = learn(series, Recipe(GainModel())).fit, series[0].antenna
     at = fit.seen("body", antenna)[::3]
     return GainProcess(
         gain_db=lambda d: fit.gain("body", antenna, d)[0],
@@ -57,7 +58,7 @@ TAUGHT = process(QUIET)
 
 
 def test_each_campaign_has_the_noise_of_its_own_levels() -> None:
-    model = learn([*QUIET, *LOUD]).model
+    model = learn([*QUIET, *LOUD], Recipe(GainModel())).model
     assert model.scales_db("loud")[1] > 1.5 * model.scales_db("quiet")[1]
 
 
@@ -71,14 +72,14 @@ def test_campaigns_share_the_airframe_and_nothing_across_airframes_or_bands() ->
 
 def test_a_campaign_is_predicted_by_the_airframe_of_another() -> None:
     every = observed([*QUIET, *campaign("next", "C", range(40, 42))])
-    right = [s for s in campaign_left_out(every) if s.flight.startswith("next")]
-    turned = [s for s in campaign_left_out(every, 180.0) if s.flight.startswith("next")]
+    right = [s for s in campaign_left_out(every, Recipe(GainModel())) if s.flight.startswith("next")]
+    turned = [s for s in campaign_left_out(every, Recipe(GainModel()), 180.0) if s.flight.startswith("next")]
     assert len(right) == len(turned) == 2
     for a, b in zip(right, turned, strict=True):
         assert a.rmse_db < a.free_space_rmse_db - 0.3
         assert b.rmse_db > a.rmse_db + 0.5
     alone = observed([*QUIET, *campaign("next", "C", range(40, 42), airframe="other")])
-    assert campaign_left_out(alone) == ()
+    assert campaign_left_out(alone, Recipe(GainModel())) == ()
 
 
 @pytest.mark.parametrize("turn", [0.0, 90.0, 180.0, 270.0])

@@ -40,4 +40,4 @@ def calibrated(path: Path) -> tuple[Calibration, list[str]]:
     """Return what was learned, and the warnings about copied logs."""
     settings = load_calibration(path)
     flights, said, _ = read_flights(settings, path.parent, None)
-    return calibrate(settings, flights), said
+    return calibrate(settings, flights, path.parent), said

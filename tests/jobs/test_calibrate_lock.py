@@ -10,7 +10,7 @@ import pytest
 from scipy.special import expit
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
-from aerpaw_cmp.compare.calibration import Learned, Observed, flight_left_out, learn
+from aerpaw_cmp.compare.calibration import Learned, Observed, Recipe, flight_left_out, learn
 from aerpaw_cmp.compare.gains import GainModel, LinkSamples, Term
 from aerpaw_cmp.compare.level import DetectionForecast, learn_detection
 from aerpaw_cmp.flight.data import RssSeries
@@ -23,6 +23,7 @@ from aerpaw_cmp.site.learned import LearnedLock, read_learned, remember
 from tests.learned_entries import learned_entry, learned_series, learned_tables
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
+RECIPE = Recipe(MODEL)
 HALF_DB, PER_DB, SENT_DBM, REFERENCE_DB = -95.0, 0.4, 40.0, 80.0
 
 
@@ -48,8 +49,8 @@ def flight(name: str, seed: int, losing: bool = True) -> Observed:
 
 def locks_of(observed: list[Observed]) -> dict[str, LearnedLock]:
     fits: dict[str, Learned] = {}
-    flight_left_out(observed, MODEL, fits)
-    return learned_locks(observed, fits, MODEL)
+    flight_left_out(observed, RECIPE, fits)
+    return learned_locks(observed, RECIPE, fits)
 
 
 def test_the_planted_lock_is_recovered_and_beats_the_share_on_flights_left_out() -> None:
@@ -74,8 +75,9 @@ def test_a_forecast_that_is_scored_knows_nothing_of_the_flight(monkeypatch: pyte
     taught: list[set[str]] = []
     calls: list[list[float]] = []
 
-    def learn_from(series: Sequence[LinkSamples], start: GainModel) -> Learned:
-        return replace(learn(series, start), fading={s.flight: (0.0, 0.0) for s in series})
+    def learn_from(series: Sequence[LinkSamples], recipe: Recipe) -> Learned:
+        learned = learn(series, recipe)
+        return replace(learned, mounts={s.flight: None for s in series})  # type: ignore[misc]
 
     def levels(flights: Sequence[tuple[FloatArray, BoolArray]]) -> DetectionForecast | None:
         calls.append([float(level.mean()) for level, _ in flights])
@@ -84,8 +86,8 @@ def test_a_forecast_that_is_scored_knows_nothing_of_the_flight(monkeypatch: pyte
     monkeypatch.setattr(calibrate, "learn", learn_from)
     monkeypatch.setattr(calibrate, "learn_detection", levels)
     observed = [flight(name, seed) for seed, name in enumerate("abc")]
-    for pair, learned in calibrate._without_pairs(observed, MODEL).items():
-        assert set(learned.fading) == set("abc") - set(pair)
+    for pair, learned in calibrate._without_pairs(observed, RECIPE).items():
+        assert set(learned.mounts) == set("abc") - set(pair)
         taught.append(set(pair))
     assert len(taught) == 6
     locks_of(observed)
@@ -94,8 +96,8 @@ def test_a_forecast_that_is_scored_knows_nothing_of_the_flight(monkeypatch: pyte
 
 
 def test_one_flight_or_a_receiver_that_keeps_its_lock_teaches_nothing() -> None:
-    assert learned_locks([flight("a", 1)], {}, MODEL) == {}
-    assert learned_locks([flight("a", 1), flight("b", 2)], {}, MODEL) == {}  # nothing is left for a score
+    assert learned_locks([flight("a", 1)], RECIPE, {}) == {}
+    assert learned_locks([flight("a", 1), flight("b", 2)], RECIPE, {}) == {}  # nothing is left for a score
     assert locks_of([flight(name, 1, losing=False) for name in "abc"]) == {}
 
 

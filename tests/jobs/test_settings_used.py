@@ -200,6 +200,7 @@ def test_a_quiet_draft_shows_the_lines_to_check_and_takes_the_bandwidth_from_nam
         (["campaign", "{zoned}"], "'timezone' without 'soundings'"),
         (["predict", "{route}", "--site", "lake_wheeler", "--spacing", "10"], "--spacing along a route"),
         (["channel", "{flight}", "--subcarriers", "8"], "--subcarriers without a band"),
+        (["calibrate", "{calibration}"], "patterns.towers.LW9.A: the flights have no such tower and channel"),
         (["tap", "--telemetry", "vehicle.txt"], "--telemetry without --flight"),
     ],
 )
@@ -211,6 +212,7 @@ def test_an_option_that_cannot_act_is_refused(
     texts = {
         "campaign": "campaign: c\nflights: [flight.yaml]\n",
         "zoned": "campaign: c\nflights: [flight.yaml]\ntimezone: UTC\n",
+        "calibration": "calibration: c\nflights: [flight.yaml]\npatterns: {towers: {LW9.A: {model: dipole}}}\n",
     }
     for name, text in texts.items():
         (tmp_path / f"{name}.yaml").write_text(text)

@@ -76,6 +76,7 @@ def calibration(_: Fixture) -> str:
 
     left = {"flight_left_out": scores(3.5, 6.0, 0), "sector_left_out": scores(4.2, 6.3, 1), "heading_left_out": []}
     controls = {
+        "body frame, no patterns": scores(3.6, 6.0, 0),
         "world frame at the UAV": scores(5.1, 6.0, 2),
         "heading turned the wrong way": scores(5.6, 6.0, 3),
     }
@@ -83,7 +84,7 @@ def calibration(_: Fixture) -> str:
     data = CalibrationData(
         name="lake_wheeler_july", generated="2026-11-21T00:00:00+00:00", flights=["F0", "F1", "F2", "F3"],
         trained_on=["ab" * 32], marks=[], words=sentences(left, controls), warnings=[], scores=as_dicts[0],
-        controls=as_dicts[1], strengths={}, antennas=[],
+        controls=as_dicts[1], mounts={}, strengths={}, antennas=[],
         settings_text="link: {" + ", ".join(f"setting_{i}: {i}" for i in range(200)) + "}",
     )  # fmt: skip
     return _written(calibration_html.write_calibration, data, "calibration")

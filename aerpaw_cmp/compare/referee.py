@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray, IntArray
-from .gains import BAND
-from .level import crps_normal, local_mean_db
+from .gains import BAND, NO_SPREAD, LostLock, StatedSpread
+from .level import local_mean_db
 from .offset import grid_offset
 
 # Averaging window of the second error [s].
@@ -86,6 +86,8 @@ class PredictedLevel:
         Standard deviation of one sample.
     low_db, high_db : (n,), optional
         Ends of the 90 % interval. By default, they follow from a normal distribution with ``sd_db``.
+    lock : LostLock, optional
+        The two parts of the distribution for a receiver that can lose its lock. By default, the error is normal.
     """
 
     level_db: FloatArray
@@ -93,6 +95,7 @@ class PredictedLevel:
     sd_db: FloatArray | None = None
     low_db: FloatArray | None = None
     high_db: FloatArray | None = None
+    lock: LostLock | None = None
 
 
 def level_card(
@@ -137,7 +140,7 @@ def level_card(
     spread, varied = float(np.std(expected)), float(np.std(measured))
     covariance = float(np.mean((expected - expected.mean()) * (measured - measured.mean())))
     absolute = predicted.absolute
-    crps, inside = _distribution(error, predicted, both) if absolute else (None, None)
+    crps, inside = _distribution(measured_db, predicted, both) if absolute else (None, None)
     # an outage counts as below any threshold
     theirs = np.where(reached, level - (0.0 if absolute else fit.offset_db), -np.inf)[scored]
     ours = np.where(heard, measured_db, -np.inf)[scored]
@@ -162,18 +165,18 @@ def level_card(
 
 
 def _distribution(
-    error_db: FloatArray, predicted: PredictedLevel, both: BoolArray
+    measured_db: FloatArray, predicted: PredictedLevel, both: BoolArray
 ) -> tuple[float | None, float | None]:
     """Return CRPS and coverage of the predicted 90 % band. None if the prediction does not state them."""
-    from scipy.special import ndtri
-
-    level_db, low_db, high_db, crps = predicted.level_db[both], predicted.low_db, predicted.high_db, None
-    ends = None if low_db is None or high_db is None else (low_db[both] - level_db, high_db[both] - level_db)
+    level_db, low_db, high_db, crps = predicted.level_db, predicted.low_db, predicted.high_db, None
     if predicted.sd_db is not None and np.isfinite(predicted.sd_db[both]).all():
-        sd_db = predicted.sd_db[both]
-        half_db = float(ndtri(0.5 + 0.5 * BAND)) * sd_db
-        crps, ends = float(np.mean(crps_normal(error_db, sd_db))), ends or (-half_db, half_db)
-    return crps, None if ends is None else float(np.mean((error_db >= ends[0]) & (error_db <= ends[1])))
+        stated = StatedSpread(gain_sd_db=predicted.sd_db, spread=NO_SPREAD, lock=predicted.lock)
+        crps = stated.crps_db(np.where(both, measured_db - level_db, np.nan))
+        if low_db is None or high_db is None:
+            low_db, high_db = (level_db + end for end in stated.band_db(BAND))
+    if low_db is None or high_db is None:
+        return crps, None
+    return crps, float(np.mean(((measured_db >= low_db) & (measured_db <= high_db))[both]))
 
 
 # Largest difference between the headings of a predicted point and a sample [deg].

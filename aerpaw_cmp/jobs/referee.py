@@ -12,7 +12,7 @@ import io
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from ..common.outputs import file_digest
 from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, FloatArray
 from ..common.yamlfile import parse_yaml
+from ..compare.gains import LostLock
 from ..compare.level import nearest_in_time
 from ..compare.rank import agreement, cohen_kappa, histogram, total_variation
 from ..compare.receiver import score_forecast
@@ -57,7 +58,8 @@ from .options import AGAINST_DISTANCE_M, RANKS
 QUANTITIES = ("level_dbm", "level_db", "path_loss_db")
 _PLACE = ("east_m", "north_m", "height_m")
 _GEOGRAPHIC = ("latitude_deg", "longitude_deg", "height_m")
-_OPTIONAL = ("sd_db", "q05_db", "q95_db", "rank", "yaw_deg", "time_s", *RANKS)
+_LOCK = ("p_lock", "locked_db", "lost_db", "locked_sd_db", "lost_sd_db")
+_OPTIONAL = ("sd_db", "q05_db", "q95_db", "rank", "yaw_deg", "time_s", *RANKS, *_LOCK)
 
 _EXPECTED = (
     "time_utc, or east_m, north_m, height_m, or latitude_deg, longitude_deg, height_m; tower; level_dbm, level_db or "
@@ -73,7 +75,7 @@ _FAR_M = 50_000.0
 # A sample is scored by the nearest predicted time within this [s], or within half of the prediction's step.
 _NEAR_S = 0.5
 
-OURS = "ray tracing (this report)"
+OURS, EMULATED = "ray tracing (this report)", "emulated flight"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,7 +97,8 @@ class ForeignPrediction:
         - ``east_m north_m height_m``: position in the site frame, NaN if unknown.
         - ``tower``, and ``channel`` (empty: every channel of the tower).
         - ``level`` [dB or dBm].
-        - Those of ``sd_db q05_db q95_db rank yaw_deg time_s p_rank1..4`` that the file has.
+        - Those of ``sd_db q05_db q95_db rank yaw_deg time_s p_rank1..4`` that the file has, and the parts ``p_lock
+          locked_db lost_db locked_sd_db lost_sd_db`` of a receiver that can lose its lock.
     sha256 : str
         Digest of the file. It is empty for a folder of logs.
     remarks : tuple of str
@@ -241,22 +244,16 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
             place = [size if dim in dims else 1 for dim, size in shape.items()]
             array = array.transpose([dims.index(dim) for dim in shape if dim in dims]).reshape(place)
             columns[name] = np.broadcast_to(array, tuple(shape.values())).ravel()
-    unit = str(notes["units"].get("time", ""))
     if "time" in columns and columns["time"].dtype.kind in "fiu":
         columns["time_s"] = columns.pop("time")
-        if " since " in unit:
-            columns["time"] = _since(columns["time_s"], unit, path)
+        size, since, start = str(notes["units"].get("time", "")).partition(" since ")
+        if since:
+            with parsing(path, "a time unit such as 'seconds since 2025-06-10T14:00:00Z'"):
+                after = pd.to_timedelta(columns["time_s"], unit=size.strip().lower())  # type: ignore[call-overload]
+                columns["time"] = np.asarray(pd.to_datetime(start, utc=True) + after)
     frame: pd.DataFrame = pd.DataFrame(columns)
     frame.attrs = {"program": str(notes["attributes"].get("source", "NetCDF")), "remarks": remarks}
     return frame
-
-
-def _since(elapsed: AnyArray, unit: str, path: Path) -> AnyArray:
-    """Return times of a CF unit such as ``seconds since 2025-06-10T14:00:00Z``."""
-    size, _, start = unit.partition(" since ")
-    with parsing(path, "a time unit such as 'seconds since 2025-06-10T14:00:00Z'"):
-        after = pd.to_timedelta(np.asarray(elapsed, dtype=np.float64), unit=size.strip().lower())  # type: ignore[call-overload]
-        return np.asarray(pd.to_datetime(start, utc=True) + after)
 
 
 def _radio_map(content: bytes, path: Path) -> pd.DataFrame:
@@ -313,7 +310,7 @@ def _emulated(folder: Path, data: FlightData) -> pd.DataFrame:
             f"Its levels are in {', '.join(units)}, those of the flight in {', '.join(ours)}, so no bias is stated."
         )
     unit = units[0] if len(units) == 1 else "several units"
-    frame.attrs = {"program": "emulated flight", "remarks": tuple(remarks), "unit": unit}
+    frame.attrs = {"program": EMULATED, "remarks": tuple(remarks), "unit": unit}
     return frame
 
 
@@ -535,47 +532,56 @@ def judge(
     levels: dict[str, dict[str, SeriesVerdict]] = {}
     for entry in series:
         levels.setdefault(entry.tower, {})[entry.channel] = entry
-    means = _means(series)
-    heads = "series", "model", "n", *_HEADS.values(), "prediction minus model dB", "95 % low", "95 % high"
+    predicted = set(given.table["tower"])
+    few = [i.name for i in result.rss if i.tower in predicted and i.channel not in levels.get(i.tower, ())]
+    if series and few:
+        remarks += (f"{name}: fewer than {FEWEST} samples of {', '.join(few)} have a predicted level; not scored.",)
+    if trained := [i.name for i in result.rss if i.training and i.channel in levels.get(i.tower, ())]:
+        remarks += (f"Ray tracing has no score on {', '.join(trained)}: its antennas were learned from this flight.",)
+    table = _table(series)
+    errors = table.groupby("model", sort=False)[list(_HEADS)]
+    channels = errors.size()
+    # a number that a channel does not have has no mean
+    means = errors.mean().where(errors.count().eq(channels, axis=0)).assign(channels=channels).reset_index()
     score: dict[str, Any] = json_safe({
         "prediction": name,
         "sha256": given.sha256,
         "program": given.program,
         "fitted_on_this_flight": ["the offset of each model and channel"],
-        "sentence": _sentence(name, series, means[0]) if series else f"{name}: ranks only.",
+        "sentence": _sentence(name, series, means.iloc[0]) if series else f"{name}: ranks only.",
         "remarks": remarks,
-        "means": means,
+        "means": means[["model", "channels", *_HEADS]].to_dict("records"),
         "levels": levels,
+        "nodes": [
+            {"series": f"{s.tower} {s.channel}", "offset_db": s.cards[name].offset_db, "slope": s.cards[name].slope,
+             "floor_db": s.floor_db} for s in series if given.program == EMULATED
+        ],
         "rank": ranks,
-        "table": {"columns": heads, "rows": list(_rows(series))},
+        "table": {
+            "columns": [_HEADS.get(key, key) for key in map(str, table)],
+            "rows": table.to_numpy(dtype=object).tolist(),
+        },
     })  # fmt: skip
     return score
 
 
-def _means(series: Sequence[SeriesVerdict]) -> list[dict[str, Any]]:
-    """Return the means over channels of each model. A number that is missing for a channel is None."""
+def _table(series: Sequence[SeriesVerdict]) -> pd.DataFrame:
+    """Return one row per series and model, with NaN for numbers that a model does not have."""
     rows = []
-    for model in dict.fromkeys(name for entry in series for name in entry.cards):
-        cards = [entry.cards[model] for entry in series if model in entry.cards]
-        values = {key: [getattr(card, key) for card in cards] for key in _HEADS}
-        means = {key: None if None in of else float(np.mean(of)) for key, of in values.items()}
-        rows.append({"model": model, "channels": len(cards), **means})
-    return rows
-
-
-def _rows(series: Sequence[SeriesVerdict]) -> Iterator[tuple[Any, ...]]:
-    """Yield one row per series and model for page and card.json."""
     for entry in series:
-        for name, card in entry.cards.items():
-            pair = entry.differences.get(name)
-            apart = (None,) * 3 if pair is None else (pair.difference_db, *pair.difference_ci95_db)
+        for model, card in entry.cards.items():
+            pair = entry.differences.get(model)
+            difference = (None, None, None) if pair is None else (pair.difference_db, *pair.difference_ci95_db)
             link = f"{entry.tower} {entry.channel}"
-            yield link, name, card.n, *(getattr(card, key) for key in _HEADS), *apart
+            rows.append((link, model, card.n, *(getattr(card, key) for key in _HEADS), *difference))
+    heads = ["series", "model", "n", *_HEADS, "prediction minus model dB", "95 % low", "95 % high"]
+    table: pd.DataFrame = pd.DataFrame(rows, columns=heads).astype(dict.fromkeys(heads[3:], np.float64))
+    return table
 
 
 def _sentence(name: str, series: Sequence[SeriesVerdict], mean: Mapping[str, Any]) -> str:
     """Return both errors, whether the difference is significant, and the errors as predicted (``mean``)."""
-    text = f"{name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel. Ray tracing has no level there."
+    text = f"{name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel. Ray tracing has no score there."
     if both := [entry for entry in series if OURS in entry.differences]:
         theirs, mine = (np.mean([entry.cards[model].rmse_offset_db for entry in both]) for model in (name, OURS))
         verdicts = Counter(entry.differences[OURS].verdict for entry in both)
@@ -585,10 +591,10 @@ def _sentence(name: str, series: Sequence[SeriesVerdict], mean: Mapping[str, Any
             f"({counted(len(both), 'channel')}). It is "
             f"{' and '.join(decided) or 'on no channel significantly different from ray tracing'} (95 %)."
         )
-    if mean["rmse_db"] is not None:
-        band = mean["coverage_90"]
-        inside = "" if band is None else f"; the 90 % band contains {100 * band:.0f} % of the samples"
-        text += f" As predicted, without an offset: RMSE {mean['rmse_db']:.1f} dB{inside}."
+    if np.isfinite(mean["rmse_db"]):
+        inside = f"; the 90 % band contains {100 * mean['coverage_90']:.0f} % of the samples"
+        text += f" As predicted, without an offset: RMSE {mean['rmse_db']:.1f} dB"
+        text += f"{inside if np.isfinite(mean['coverage_90']) else ''}."
     matched, lost = sum(s.matched for s in series), sum(s.unmatched for s in series)
     if lost:
         return f"{text} {counted(matched, 'sample')} have a prediction, {counted(lost, 'sample')} have none."
@@ -611,9 +617,10 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
     # if prediction and log have no common reference, a missing level is not a predicted outage
     rows = near if absolute else scored
     same = rows & (np.isfinite(level) | ~heard)
-    name, band = given.path.name, [predicted.get(column) for column in ("sd_db", "q05_db", "q95_db")]
-    models = {name: (PredictedLevel(level, absolute, *band), rows),
-              OURS: (PredictedLevel(item.simulated_dbm, item.unit == "dBm"), same)}  # fmt: skip
+    name, (sd_db, low_db, high_db) = given.path.name, map(predicted.get, ("sd_db", "q05_db", "q95_db"))
+    models = {name: (PredictedLevel(level, absolute, sd_db, low_db, high_db, _lock(predicted)), rows)}
+    if not item.training:  # its antennas know these samples
+        models[OURS] = PredictedLevel(item.simulated_dbm, item.unit == "dBm"), same
     models |= {
         BASELINE_TITLE[key]: (PredictedLevel(of.level_dbm, absolute=False), same) for key, of in item.baselines.items()
     }
@@ -633,6 +640,20 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
         cards=cards,
         differences={key: paired_difference(theirs, of, place_m=item.position_m) for key, of in errors.items()},
     )  # fmt: skip
+
+
+def _lock(predicted: Mapping[str, FloatArray]) -> LostLock | None:
+    """Return the predicted distribution of a receiver that can lose its lock, if ``predict`` wrote one."""
+    if not {*_LOCK} <= {*predicted} or np.isnan(predicted["p_lock"]).all():
+        return None
+    level = predicted["level"]
+    return LostLock(
+        probability=predicted["p_lock"],
+        locked_db=predicted["locked_db"] - level,
+        lost_db=predicted["lost_db"] - level,
+        locked_sd_db=float(np.nanmean(predicted["locked_sd_db"])),
+        lost_sd_db=float(np.nanmean(predicted["lost_sd_db"])),
+    )
 
 
 def split_by_series(table: pd.DataFrame, tower: str, channel: str) -> pd.DataFrame:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -289,6 +290,12 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
                  "In 90 %": SHARE, "Difference": 2, "95 %": 2},
         rows=[[*row[:11], None if row[11] is None else (row[11], row[12])] for row in every], look="dense",
     )  # fmt: skip
+    nodes = Table(
+        caption="The emulator at each node: offset (added to the measurement), slope of measured over emulated level "
+        "(1 if both change equally), and detection floor (the lowest emulated level, if it repeats).",
+        columns={"Tower, channel": HEAD, "Offset [dB]": 1, "Slope": 2, "Detection floor [dB]": 1},
+        rows=[list(node.values()) for node in verdict["nodes"]],
+    )
     name, ours = verdict["prediction"], "ray tracing (this report)"
     above = Table(
         caption="Share of samples at or above a threshold. Levels without a common reference with the log are "
@@ -296,11 +303,10 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
         columns={"Tower, channel": HEAD, "Threshold [dB]": 1, "Measured": SHARE, "Prediction": SHARE,
                  "Ray tracing": SHARE},
         rows=[
-            (f"{tower} {channel}".strip(), x["threshold_db"], x["measured"], x["predicted"], mine["predicted"])
+            (f"{tower} {channel}".strip(), x["threshold_db"], x["measured"], x["predicted"], mine and mine["predicted"])
             for tower, channels in verdict["levels"].items()
             for channel, entry in channels.items()
-            if ours in entry["cards"]
-            for x, mine in zip(*(entry["cards"][key]["exceedance"] for key in (name, ours)), strict=True)
+            for x, mine in zip_longest(*(entry["cards"].get(key, {}).get("exceedance", ()) for key in (name, ours)))
         ], look="tall",
     )  # fmt: skip
     ranks = Table(
@@ -315,7 +321,7 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
     return Card(
         title=name,
         text=[paragraph(bold(verdict["sentence"])), *verdict["remarks"]],
-        tables=[means, above, ranks],
+        tables=[means, nodes, above, ranks],
         parts=[Card(title=f"{name}, channel by channel", tables=[channels], fold=True)],
     )
 

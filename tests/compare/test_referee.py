@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from aerpaw_cmp.compare.gains import LostLock
 from aerpaw_cmp.compare.referee import (
     PredictedLevel,
     detection_floor_db,
@@ -47,6 +48,29 @@ def test_crps_and_coverage_of_a_calibrated_normal_band() -> None:
     assert card.coverage_90 == pytest.approx(0.9, abs=0.015)
     band = PredictedLevel(level_db=level, low_db=level - 1.0, high_db=level + 1.0)
     assert level_card(time, measured, band, ()).coverage_90 == pytest.approx(0.383, abs=0.02)  # half a sd
+
+
+def test_a_receiver_that_loses_its_lock_is_scored_by_both_parts_of_its_distribution() -> None:
+    rng = np.random.default_rng(5)
+    heard = rng.random(N) < 0.7
+    measured = np.where(heard, rng.normal(-80.0, 2.0, N), rng.normal(-110.0, 1.0, N))
+    level, sd_db = np.full(N, -81.0), np.full(N, 14.0)
+    lock = LostLock(
+        probability=np.full(N, 0.7), locked_db=np.full(N, 1.0), lost_db=np.full(N, -29.0),
+        locked_sd_db=2.0, lost_sd_db=1.0,
+    )  # fmt: skip
+    time = np.arange(N) * 10.0
+    normal, mixed = (
+        level_card(time, measured, PredictedLevel(level_db=level, sd_db=sd_db, lock=known), ())
+        for known in (None, lock)
+    )
+    # a second route to the number: CRPS = E|X - y| - E|X - X'| / 2, with draws of the forecast
+    draws = np.where(rng.random((2, N)) < 0.7, rng.normal(-80.0, 2.0, (2, N)), rng.normal(-110.0, 1.0, (2, N)))
+    expected = np.abs(draws[0] - measured).mean() - 0.5 * np.abs(draws[0] - draws[1]).mean()
+    assert mixed.crps_db == pytest.approx(expected, rel=0.05)
+    assert normal.crps_db is not None
+    assert mixed.crps_db < normal.crps_db - 0.2
+    assert mixed.coverage_90 == pytest.approx(0.9, abs=0.02)
 
 
 def test_relative_levels_have_no_bias_and_exceed_after_the_offset() -> None:

@@ -316,6 +316,28 @@ def test_a_prediction_that_learned_from_the_flight_is_refused(said):
             read_foreign(place, data)
 
 
+def test_ray_tracing_has_no_score_where_its_antennas_were_learned_from_the_flight(said, flown):
+    data, folder, _ = said
+    result = flown[1]
+    rss = [dataclasses.replace(r, further=dataclasses.replace(r.further, trained_on=("0" * 64,))) for r in result.rss]
+    verdict = judge(read_foreign(folder, data), data, dataclasses.replace(result, rss=tuple(rss)))
+    series = verdict["levels"]["LW1"]["USRP1"]
+    assert "free space" in series["cards"]
+    assert not {"ray tracing (this report)"} & {*series["cards"], *series["differences"]}
+    assert "Ray tracing has no score there" in verdict["sentence"]
+    assert any("Ray tracing has no score on LW1 USRP1: its antennas" in text for text in verdict["remarks"])
+
+
+def test_the_parts_of_a_lost_lock_replace_the_normal_distribution(said):
+    _, folder, scored = said
+    before = scored()["levels"]["LW1"]["USRP1"]["cards"][folder.name]["crps_db"]
+    table = pd.read_csv(folder / "prediction.csv")
+    parts = {"locked_db": table["level_db"], "lost_db": table["level_db"] - 60.0}
+    table.assign(p_lock=0.5, **parts, locked_sd_db=3.0, lost_sd_db=3.0).to_csv(folder / "prediction.csv", index=False)
+    # half of the probability is 60 dB too low: the score rises by about a quarter of the distance minus half of it
+    assert scored()["levels"]["LW1"]["USRP1"]["cards"][folder.name]["crps_db"] == pytest.approx(before + 15.0, abs=2.0)
+
+
 def test_a_prediction_that_learned_from_the_flight_refuses_half_of_it(said, prediction):
     """Half of the log has another digest. Its readings match the fingerprints in the prediction."""
     data, folder, _ = said

@@ -89,14 +89,9 @@ def _print_cards(verdict: Mapping[str, Any]) -> None:
     }  # fmt: skip
     title = f"{verdict['prediction']} and other models on the same samples, means over channels (each in card.json)"
     records(verdict["means"], columns, title)
-    if verdict["program"] == "emulated flight":
-        nodes = [
-            {"series": f"{tower} {channel}", "floor_db": entry["floor_db"], **entry["cards"][verdict["prediction"]]}
-            for tower, channels in verdict["levels"].items()
-            for channel, entry in channels.items()
-        ]
-        columns = {"series": "series", "offset dB": "offset_db:.1f", "slope": "slope:.2f", "floor dB": "floor_db:.1f"}
-        records(nodes, columns, "The emulator: offset (added to the measurement), slope, detection floor")
+    columns = {"series": "series", "offset dB": "offset_db:.1f", "slope": "slope:.2f", "floor dB": "floor_db:.1f"}
+    title = "Emulator: offset (added to the measurement), slope of measured over emulated level, detection floor"
+    records(verdict["nodes"], columns, title)
     for remark in verdict["remarks"]:
         say.warn(remark)
 

@@ -104,13 +104,13 @@ def _several(lines: Lines, first: int) -> tuple[Any, int]:
     return (value, first + text.count("\n", 0, length)) if whole else (None, first)
 
 
-# The beginning of a file of objects, or of an array of objects.
-BEGIN = re.compile(rb"(?:\xef\xbb\xbf)?[\s\[]*\{")
+# An object, or an array of objects, at the beginning of a line. Programs may write messages before it.
+BEGIN = re.compile(rb"^(?:\xef\xbb\xbf)?[\s\[]*\{", re.MULTILINE)
 
 
 def first(head: bytes) -> dict[str, Any] | None:
     """Return the first object of a file for sniffers, or None if it is longer than the sniffed bytes."""
-    begin = BEGIN.match(head)
+    begin = BEGIN.search(head)
     if begin is None:
         return None
     try:

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,6 +11,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs import text as _text
+from aerpaw_cmp.logs.ingest import sniffers_of
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_parsers import _json
@@ -40,6 +42,12 @@ def test_a_mean_of_ranks_is_no_rank(
     assert [None if np.isnan(v) else v for v in stream.frame["rank"]] == ranks
     assert [None if np.isnan(v) else v for v in stream.frame["rank_mean"]] == means
     assert stream.frame["time"][0].floor("s") == pd.Timestamp("2025-03-02T15:00:00")
+
+
+def test_a_message_before_the_first_report_does_not_hide_the_format(tmp_path: Path) -> None:
+    log = tmp_path / "metrics.json"
+    log.write_bytes(b"Metrics server is listening on 127.0.0.1:8001\n" + samples.FILES["srsran_json/metrics"])
+    assert sniffers_of(log) == ["srsran_json"]
 
 
 def test_the_form_of_most_times_of_reports_is_that_of_all() -> None:

@@ -96,35 +96,16 @@ def channel_parts(
         If a tower or link is unknown, the band is wider than the model allows, the route cannot be read, or the channel
         is too large.
     """
-    stages, settings, remarks = stages or Stages(), data.settings, list[str]()
-    name, link_settings = _chosen_link(settings, chosen)
+    stages, remarks = stages or Stages(), list[str]()
+    name, link_settings = _chosen_link(data.settings, chosen)
     towers = _chosen_towers(data, chosen, remarks)
-    if chosen.subcarriers is not None and chosen.bandwidth_hz is None:
-        raise UsageError("--subcarriers without a band", expected="--bandwidth HZ as well")
-    check_band(chosen.bandwidth_hz or 0.0, link_settings.carrier_hz)
+    offsets = _offsets_hz(chosen, link_settings.carrier_hz)
     link = link_settings.build(towers, data.folder)
-    along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
-    # a speed over less than one second is mostly noise of the positions
-    spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # a long step is not a gap
-    velocity = velocities_mps(along.time_s, along.poses.position_m, *spans)
-    if np.isfinite(velocity).any():
-        other = None if along.towers_m is None else velocities_mps(along.time_s, along.towers_m, *spans)
-        along = replace(along, velocity_mps=velocity, tower_mps=other)
-    else:
-        remarks.append("No Doppler shift: no point has a neighbour in time, so the UAV has no velocity.")
-    offsets = None if chosen.bandwidth_hz is None else subcarriers_hz(chosen.bandwidth_hz, chosen.subcarriers or 1024)
+    along = _moving(data, chosen, towers, remarks)
     levels = _levels_of(data, link, name, remarks)
     along = replace(along, remarks=(*remarks, *along.remarks))
-    count, links = len(along.poses), len(along.poses) * len(towers)
-    pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
-    size = _size(pairs, _PATHS, offsets)
-    # use a power of two, like the chunks of the file: a part that ends within a chunk would compress the chunk twice
-    at_once = 1 << max(0, (_PART_BYTES * count // size).bit_length() - 1)
-    further = " of disk space"
-    if (drawn := settings.rt.engine != "image") or room is None:  # Sionna draws its rays for all poses at once
-        at_once, room, size = count, MOST_BYTES, size + _PATH_BYTES * links * _PATHS
-        further = ", or only netcdf and csv" + (" with rt.engine: image" if drawn else "")
-    _refuse(size, f"{counted(count, 'pose')}, {counted(len(towers), 'tower')}", room, further)
+    count = len(along.poses)
+    at_once, further = _poses_at_once(count, link, offsets, data.settings.rt.engine, room)
     extent_m = None if at_once >= count else extent_of(along.poses.position_m)
     progress = stages.progress if extent_m is None else lambda *_: None  # do not report progress of single parts
     names = {"": 0}  # the line of sight
@@ -132,7 +113,7 @@ def channel_parts(
         part = along.part(slice(start, start + at_once))
         run: dict[str, Any] = {"towers_m": part.towers_m, "progress": progress, "extent_m": extent_m}
         with stages("replay"):
-            replayed = replay_poses(data.site, settings.rt, link, part.poses, **run)
+            replayed = replay_poses(data.site, data.settings.rt, link, part.poses, **run)
         with stages("paths"):
             table = replayed.path_table(names)
         size = _size(replayed.h.size, table.most, offsets)
@@ -144,10 +125,49 @@ def channel_parts(
             link=name,
             replay=replayed,
             table=table,
-            summed=settings.rss.field,
+            summed=data.settings.rss.field,
             offsets_hz=offsets,
             **levels(part.poses),
         )
+
+
+def _offsets_hz(chosen: ChannelOptions, carrier_hz: float) -> FloatArray | None:
+    """Return the offsets of the subcarriers from the carrier, or None without a band."""
+    if chosen.subcarriers is not None and chosen.bandwidth_hz is None:
+        raise UsageError("--subcarriers without a band", expected="--bandwidth HZ as well")
+    check_band(chosen.bandwidth_hz or 0.0, carrier_hz)
+    return None if chosen.bandwidth_hz is None else subcarriers_hz(chosen.bandwidth_hz, chosen.subcarriers or 1024)
+
+
+def _moving(data: FlightData, chosen: ChannelOptions, towers: Sequence[str], remarks: list[str]) -> Along:
+    """Return the poses of the track or route, with the velocities of both ends if they are known."""
+    along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
+    # a speed over less than one second is mostly noise of the positions
+    spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # a long step is not a gap
+    velocity = velocities_mps(along.time_s, along.poses.position_m, *spans)
+    if not np.isfinite(velocity).any():
+        remarks.append("No Doppler shift: no point has a neighbour in time, so the UAV has no velocity.")
+        return along
+    other = None if along.towers_m is None else velocities_mps(along.time_s, along.towers_m, *spans)
+    return replace(along, velocity_mps=velocity, tower_mps=other)
+
+
+def _poses_at_once(
+    count: int, link: Link, offsets_hz: FloatArray | None, engine: str, room: int | None
+) -> tuple[int, str]:
+    """Return the number of poses of a part, and what else to do about too little room. Refuse a channel without room.
+
+    ``count`` is the number of all poses, and ``room`` [bytes] the largest size of all parts (None: a single part).
+    """
+    links = count * len(link.tower_arrays)
+    size = _size(links * len(link.uav_array) * len(next(iter(link.tower_arrays.values()))), _PATHS, offsets_hz)
+    # use a power of two, like the chunks of the file: a part that ends within a chunk would compress the chunk twice
+    at_once, further = 1 << max(0, (_PART_BYTES * count // size).bit_length() - 1), " of disk space"
+    if engine != "image" or room is None:  # Sionna draws its rays for all poses at once
+        at_once, room, size = count, MOST_BYTES, size + _PATH_BYTES * links * _PATHS
+        further = ", or only netcdf and csv" + (" with rt.engine: image" if engine != "image" else "")
+    _refuse(size, f"{counted(count, 'pose')}, {counted(len(link.tower_arrays), 'tower')}", room, further)
+    return at_once, further
 
 
 def _size(pairs: int, paths: int, offsets_hz: FloatArray | None) -> int:

@@ -617,8 +617,16 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
     # if prediction and log have no common reference, a missing level is not a predicted outage
     rows = near if absolute else scored
     same = rows & (np.isfinite(level) | ~heard)
-    name, (sd_db, low_db, high_db) = given.path.name, map(predicted.get, ("sd_db", "q05_db", "q95_db"))
-    models = {name: (PredictedLevel(level, absolute, sd_db, low_db, high_db, _lock(predicted)), rows)}
+    name = given.path.name
+    foreign = PredictedLevel(
+        level_db=level,
+        absolute=absolute,
+        sd_db=predicted.get("sd_db"),
+        low_db=predicted.get("q05_db"),
+        high_db=predicted.get("q95_db"),
+        lock=_lock(predicted),
+    )
+    models = {name: (foreign, rows)}
     if not item.training:  # its antennas know these samples
         models[OURS] = PredictedLevel(item.simulated_dbm, item.unit == "dBm"), same
     models |= {

@@ -322,7 +322,7 @@ def test_the_track_of_a_rank_log_with_positions_of_its_own_is_the_logs(tmp_path:
     bare = dataclasses.replace(data, track=None)
     assert track_of(bare) is None
     own = dataclasses.replace(bare.rank[0], position_m=np.column_stack([at, at, at]))
-    assert track_of(dataclasses.replace(bare, rank=(own,))).east_m == pytest.approx(at)
+    assert track_of(dataclasses.replace(bare, rank=(own,))).position_m[:, 0] == pytest.approx(at)
 
 
 def test_reflection_loss_weakens_reflections_only_and_ends_as_free_space(tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ FAULTS = (
     Fault("yaw counter-clockwise", "aerpaw_cmp/propagation/geometry.py", "np.pi / 2 - np.radians(yaw_deg)", "np.pi / 2 + np.radians(yaw_deg)", "tests/flight/test_track.py"),
     Fault("nose up taken for nose down", "aerpaw_cmp/propagation/geometry.py", "-np.radians(pitch_deg)", "np.radians(pitch_deg)", "tests/flight/test_track.py tests/propagation/test_attitude_chain.py"),
     Fault("attitude left in radians", "parsers/aerpaw_parsers/vehicle_out.py", "np.degrees(number[name]) for name in (\"roll\", \"pitch\", \"yaw\")", "number[name] for name in (\"roll\", \"pitch\", \"yaw\")", "tests/parsers/test_formats.py"),
-    Fault("pitch, yaw, roll read as roll, pitch, yaw", "parsers/aerpaw_parsers/vehicle_out.py", "(b\"pitch\", b\"yaw\", b\"roll\"), _TRIPLE", "(b\"roll\", b\"pitch\", b\"yaw\"), _TRIPLE", "tests/parsers/test_formats.py"),
+    Fault("pitch, yaw, roll read as roll, pitch, yaw", "parsers/aerpaw_parsers/vehicle_out.py", "_cells(b\"pitch\", b\"yaw\", b\"roll\")", "_cells(b\"roll\", b\"pitch\", b\"yaw\")", "tests/parsers/test_formats.py"),
     Fault("longitude and latitude exchanged in the frame", "aerpaw_cmp/common/geodesy.py", "in_shape(self._projection, longitude, latitude)", "in_shape(self._projection, latitude, longitude)", "tests/common/test_geodesy.py"),
     Fault("local time read as UTC", "aerpaw_cmp/logs/text.py", "return local_to_utc(wall_ns, options.timezone, needed_by=needed_by)", "return local_to_utc(wall_ns, 'UTC', needed_by=needed_by)", "tests/parsers/test_time.py"),
     Fault("radio clock added in place of taken off", "aerpaw_cmp/flight/replay.py", "time - np.timedelta64(round(clock", "time + np.timedelta64(round(clock", RAW),

@@ -104,13 +104,16 @@ def _several(lines: Lines, first: int) -> tuple[Any, int]:
     return (value, first + text.count("\n", 0, length)) if whole else (None, first)
 
 
-# An object, or an array of objects, at the beginning of a line. Programs may write messages before it.
-BEGIN = re.compile(rb"^(?:\xef\xbb\xbf)?[\s\[]*\{", re.MULTILINE)
+# The beginning of a file of objects, or of an array of objects.
+BEGIN = re.compile(rb"(?:\xef\xbb\xbf)?[\s\[]*\{")
+# An object at the beginning of a line. Programs may write messages before it. The pattern does not cross the end of a
+# line, because the search of a file of empty lines would take seconds.
+_ON_A_LINE = re.compile(rb"^(?:\xef\xbb\xbf)?[ \t\[]*\{", re.MULTILINE)
 
 
 def first(head: bytes) -> dict[str, Any] | None:
     """Return the first object of a file for sniffers, or None if it is longer than the sniffed bytes."""
-    begin = BEGIN.search(head)
+    begin = _ON_A_LINE.search(head)
     if begin is None:
         return None
     try:

@@ -48,6 +48,10 @@ def test_a_message_before_the_first_report_does_not_hide_the_format(tmp_path: Pa
     log = tmp_path / "metrics.json"
     log.write_bytes(b"Metrics server is listening on 127.0.0.1:8001\n" + samples.FILES["srsran_json/metrics"])
     assert sniffers_of(log) == ["srsran_json"]
+    # a match within one line keeps the search of a file of empty lines linear
+    found = _json._ON_A_LINE.search(b"\n\n\n [{")
+    assert found is not None
+    assert found.start() == 3
 
 
 def test_the_form_of_most_times_of_reports_is_that_of_all() -> None:

@@ -80,9 +80,11 @@ def _decimals(cells: AnyArray) -> tuple[FloatArray, BoolArray]:
     """Convert right-aligned decimals, ``(n, 16)`` uint8, to numbers, and return which of them are plain decimals."""
     texts = np.ascontiguousarray(cells).view(f"S{_VALUE}").ravel()
     plain = np.ones(len(texts), dtype=bool)
-    before_point = cells[:, :-1][cells[:, 1:] == 46]
+    digit, point = cells >= 48, cells == 46
+    # NumPy also accepts a number that begins or ends with a point, and spaces behind it
+    complete = digit[:, -1].all() and not point[:, 0].any() and digit[:, :-1][point[:, 1:]].all()
     try:
-        if _OF_DECIMALS[cells].all() and (before_point >= 48).all():
+        if complete and _OF_DECIMALS[cells].all():
             return texts.astype(np.float64), plain
     except ValueError:
         pass

@@ -77,6 +77,11 @@ def test_levels_are_the_numbers_that_python_reads() -> None:
     assert plain.tolist() == expected
     read_by_python = [float(text) if good else 0.0 for text, good in zip(texts, expected, strict=True)]
     assert values.tobytes() == np.array(read_by_python).tobytes()
+    # all texts together contain damaged ones, so also read a text alone
+    for text, good in [*zip(texts[-3000:], expected[-3000:], strict=True), (f"{5.:.1f} ".rjust(16), False),
+                       ("5.".rjust(16), False), (".123456789012345", False)]:  # fmt: skip
+        _, (alone,) = sounder_log._decimals(np.array([text], dtype="S16").view(np.uint8).reshape(1, 16))
+        assert alone == good, text
 
 
 def test_why_lines_are_rejected() -> None:

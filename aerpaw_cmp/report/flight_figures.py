@@ -113,7 +113,9 @@ def altitude(data: ReportData, track: Track) -> Figure:
 # --- over time ----------------------------------------------------------------------------------
 
 
-def over_time(data: ReportData, panels: Sequence[tuple[Mapping[str, Any], Sequence[Any]]], high_in: Any) -> Figure:
+def over_time(
+    data: ReportData, panels: Sequence[tuple[Mapping[str, Any], Sequence[Any]]], high_in: Sequence[float]
+) -> Figure:
     """Draw charts one below the other over the time of a flight, with its waypoints.
 
     Parameters

@@ -3,8 +3,8 @@
 A command is a function in a module of this package::
 
     @command("diff", examples=["aerpaw-cmp diff reports/a reports/b"])
-    def diff(first: Annotated[Path, Argument(help="...")], force: Force = False) -> int:
-        from ..jobs.diff import run_diff  # here, so that help and completion load no job
+    def diff(first: Annotated[Path, Argument(help="...")], strict: bool = False) -> int:
+        from ..jobs.diff_reports import run_diff  # here, so that help and completion load no job
 
 and a line of help in :data:`aerpaw_cmp.common.text.COMMANDS`. The function returns the exit code, or None for 0. The
 decorator adds ``-h``, ``--json``, ``--quiet`` and the examples below the options. :func:`.answered` prints the JSON

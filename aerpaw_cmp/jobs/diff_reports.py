@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -14,19 +16,92 @@ import numpy as np
 from ..common.content import KEY
 from ..common.errors import InputError, UsageError, one_line, parsing
 from ..common.files import LARGEST_TABLE, read_bounded
-from ..common.outputs import OutputFolder, changed_files
-from ..common.text import unguarded
-from ..common.units import FloatArray
-from ..compare import verdict
-from ..compare.statistics import pooled_difference
+from ..common.jsonable import fields_of, json_object
+from ..common.outputs import changed_files
+from ..common.text import counted, unguarded
+from ..common.units import FloatArray, Printed
+from ..compare.statistics import PairedDifference, pooled_difference
+from ..compare.verdict import LevelDifference, Overlap, RankDifference, level_difference, rank_difference
 from ..report.columns import RANK, RSS, header
-from ..report.diff import Entry, InputEntry, ReportDiff, ReportSide
+from ..report.flight_words import count
 from ..report.page import links_of
+from ..report.texts import cut, short
 
 _NEEDED: dict[str, type] = {
     "flight": str, "versions": dict, "inputs": list, "settings": dict, "rss": dict, "rank": dict,
 }  # fmt: skip
 _SIMULATED = "simulated_rank_k"
+# Differences up to this are ignored, because tables are rounded to four decimals, and offsets to one.
+TOLERANCE_DB = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """A named value in two reports, None if a report does not have it."""
+
+    key: str
+    first: Any
+    second: Any
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InputEntry:
+    """An input file that differs between the reports.
+
+    ``what`` is "added", "removed" or "changed".
+    """
+
+    role: str
+    path: str
+    what: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportSide:
+    """One of the two reports: its folder, when it was made, and by which version."""
+
+    folder: str
+    flight: str
+    generated: str
+    version: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportDiff:
+    """Two reports and their differences. Every difference is second minus first.
+
+    Parameters
+    ----------
+    settings, versions : tuple of Entry
+        Values that differ.
+    inputs : tuple of InputEntry
+        Input files that differ.
+    levels, ranks : tuple
+        Differences on common samples.
+    pooled : PairedDifference, optional
+        Difference in RMSE over all links.
+    links_first_only, links_second_only : tuple of str
+        Links that only the first, or only the second, report has.
+    remarks : tuple of str
+        Limits of the comparison, and numbers that look wrong.
+    """
+
+    first: ReportSide
+    second: ReportSide
+    settings: tuple[Entry, ...]
+    inputs: tuple[InputEntry, ...]
+    versions: tuple[Entry, ...]
+    levels: tuple[LevelDifference, ...]
+    ranks: tuple[RankDifference, ...]
+    pooled: PairedDifference | None
+    links_first_only: tuple[str, ...]
+    links_second_only: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    @property
+    def differences(self) -> tuple[str, ...]:
+        """Clauses about numbers that differ by more than the tolerance. Empty if there are none."""
+        return tuple(_differences(self))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,29 +109,23 @@ class ReadReport:
     """A report on the disk: metrics.json and its tables of samples."""
 
     place: Path
-    files: tuple[Path, ...]
     metrics: dict[str, Any]
     rss: Any
     rank: Any
     remarks: tuple[str, ...]
 
 
-def run_diff(first: Path, second: Path, *, out: Path | None = None, force: bool = False) -> ReportDiff:
-    """Compare two reports, and write ``diff.html`` and ``diff.json`` into ``out`` if it is given.
+def run_diff(first: Path, second: Path) -> ReportDiff:
+    """Return the differences of settings, inputs, levels and ranks between two reports.
 
     Parameters
     ----------
     first, second : Path
         Folders of reports.
-    out : Path, optional
-        Folder of the results.
-    force : bool
-        Also write into a folder with files of other programs.
 
     Returns
     -------
     ReportDiff
-        Differences of settings, inputs, levels and ranks.
 
     Raises
     ------
@@ -67,15 +136,7 @@ def run_diff(first: Path, second: Path, *, out: Path | None = None, force: bool 
     """
     first_report, second_report = _read_report(first), _read_report(second)
     _same_flight(first_report, second_report)
-    if out is None:
-        return _compare_reports(first_report, second_report)
-    from ..report.diff import write_diff
-
-    inputs = [*first_report.files, *second_report.files]
-    with OutputFolder(out, job="diff", inputs=inputs, force=force) as output, output.filling() as place:
-        diff = _compare_reports(first_report, second_report)
-        write_diff(diff, place)
-    return diff
+    return _compare_reports(first_report, second_report)
 
 
 # --- reading --------------------------------------------------------------------------------------------------------
@@ -89,30 +150,22 @@ def _read_report(place: Path) -> ReadReport:
     InputError
         If a file is missing, damaged or of another kind.
     """
-    metrics = read_metrics(place / "metrics.json")
-    files = {kind: place / f"{kind}.csv" for kind in ("rss", "rank")}
-    rss, rank = (_table(files[kind], kind, header(columns)) for kind, columns in (("rss", RSS), ("rank", RANK)))
+    metrics = _read_metrics(place)
+    rss, rank = (_table(place, kind, header(columns)) for kind, columns in (("rss", RSS), ("rank", RANK)))
     changed = [name for name in changed_files(place) if name in ("metrics.json", "rss.csv", "rank.csv")]
     remarks = [f"{place / name} was changed after the report wrote it." for name in changed]
-    return ReadReport(
-        place=place,
-        files=(place / "metrics.json", *files.values()),
-        metrics=metrics,
-        remarks=tuple(remarks),
-        rss=rss,
-        rank=rank,
-    )
+    return ReadReport(place=place, metrics=metrics, remarks=tuple(remarks), rss=rss, rank=rank)
 
 
-def read_metrics(file: Path) -> dict[str, Any]:
+def _read_metrics(place: Path) -> dict[str, Any]:
     """Read the numbers of a report from its metrics.json."""
-    place = file.parent
+    file = place / "metrics.json"
     if not file.is_file():
-        foreign = next((n for n in ("campaign.json", "diff.json") if (place / n).is_file()), None)
+        campaign = (place / "campaign.json").is_file()
         raise InputError(
             "there is no metrics.json" if place.is_dir() else "there is no such file or folder",
-            expected="the folder of a report, or its metrics.json",
-            cause=None if foreign is None else f"the folder has {foreign}: only reports of a flight can be compared",
+            expected="the folder of a report",
+            cause="the folder has campaign.json: only reports of a flight can be compared" if campaign else None,
             path=place,
         )
     with parsing(file, "metrics.json of a report", "a truncated copy"):
@@ -134,10 +187,11 @@ def read_metrics(file: Path) -> dict[str, Any]:
     return content  # type: ignore[no-any-return]
 
 
-def _table(path: Path, kind: str, columns: Sequence[str]) -> Any:
+def _table(place: Path, kind: str, columns: Sequence[str]) -> Any:
     """Read a table of samples. An error names the line of the table."""
     import pandas as pd
 
+    path = place / f"{kind}.csv"
     texts = {name: "str" for name in ("time_utc", "tower", "channel", "unit") if name in columns}
     with parsing(path, f"the table {kind}.csv in the folder of metrics.json", "a damaged or edited file"):
         content = read_bounded(path, LARGEST_TABLE, f"{kind}.csv")
@@ -256,7 +310,7 @@ def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterat
 # --- samples --------------------------------------------------------------------------------------------------------
 
 
-def _matched(mine: Any, theirs: Any) -> tuple[verdict.Overlap, Any, Any]:
+def _matched(mine: Any, theirs: Any) -> tuple[Overlap, Any, Any]:
     """Return the rows of two tables of one link at common times. Rows with the same time keep their order."""
 
     def keyed(table: Any) -> Any:
@@ -267,9 +321,9 @@ def _matched(mine: Any, theirs: Any) -> tuple[verdict.Overlap, Any, Any]:
     first, second = keyed(mine), keyed(theirs)
     # in the usual case of two reports of the same logs, avoid the join, which would take most of the time
     if first.index.equals(second.index):
-        return verdict.Overlap(first=len(first), second=len(second), common=len(first)), first, second
+        return Overlap(first=len(first), second=len(second), common=len(first)), first, second
     common = first.index.intersection(second.index, sort=False)
-    overlap = verdict.Overlap(first=len(first), second=len(second), common=len(common))
+    overlap = Overlap(first=len(first), second=len(second), common=len(common))
     return overlap, first.loc[common], second.loc[common]
 
 
@@ -291,7 +345,7 @@ def _places_m(table: Any) -> FloatArray:
     return np.column_stack([_values(table, name) for name in ("east_m", "north_m", "up_m")])
 
 
-def _levels(mine: ReadReport, theirs: ReadReport) -> Iterator[tuple[verdict.LevelDifference, Any, FloatArray]]:
+def _levels(mine: ReadReport, theirs: ReadReport) -> Iterator[tuple[LevelDifference, Any, FloatArray]]:
     """Yield the difference of each common link, with the data of its common samples.
 
     The data are the times [s], the residuals of the second and of the first report, and the positions (n, 3).
@@ -307,14 +361,14 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> Iterator[tuple[verdict.Leve
         offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, their_numbers)]
         scored = [int(table["residual_db"].notna().sum()) for table in tables]
         place_m = _places_m(a)
-        difference = verdict.level_difference(
+        difference = level_difference(
             tower, channel, overlap, first, second,
             scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]), place_m=place_m,
         )  # fmt: skip
         yield difference, (_instants(a), second[2], first[2]), place_m
 
 
-def _ranks(first: ReadReport, second: ReadReport) -> Iterator[verdict.RankDifference]:
+def _ranks(first: ReadReport, second: ReadReport) -> Iterator[RankDifference]:
     ks = [
         c.removeprefix(_SIMULATED) for c in first.rank.columns if c.startswith(_SIMULATED) and c in second.rank.columns
     ]
@@ -324,4 +378,117 @@ def _ranks(first: ReadReport, second: ReadReport) -> Iterator[verdict.RankDiffer
         overlap, a, b = _matched(*(s.rank[s.rank["tower"] == tower] for s in (first, second)))
         for k in ks:
             pairs = [(_values(t, "measured_rank"), _values(t, f"{_SIMULATED}{k}")) for t in (a, b)]
-            yield verdict.rank_difference(tower, k, overlap, pairs[0], pairs[1], _places_m(a))
+            yield rank_difference(tower, k, overlap, pairs[0], pairs[1], _places_m(a))
+
+
+# --- sentences -----------------------------------------------------------------------------------------------------
+
+
+def _differences(diff: ReportDiff) -> Iterator[str]:
+    for name, links in (("first", diff.links_first_only), ("second", diff.links_second_only)):
+        if links:
+            yield f"only the {name} report has {', '.join(links)}"
+    for level in diff.levels:
+        yield from (f"{level.tower} {level.channel}: {text}" for text in _level_clauses(level))
+    for rank in diff.ranks:
+        yield from (f"{rank.tower} K = {rank.k}: {text}" for text in _rank_clauses(rank))
+
+
+def _level_clauses(level: LevelDifference) -> Iterator[str]:
+    for what, value in (("measured", level.measured_max_db), ("replayed", level.simulated_max_db)):
+        if value > TOLERANCE_DB:
+            yield f"{what} level by up to {value:.3g} dB"
+    if abs(level.offset_db.difference) > TOLERANCE_DB:
+        yield f"offset by {Printed(level.offset_db.difference):+.3g} dB"
+    if abs(level.rmse.difference_db) > TOLERANCE_DB:
+        yield f"RMSE by {Printed(level.rmse.difference_db):+.3g} dB"
+    if level.samples.only_first or level.samples.only_second:
+        yield _alone(level.samples)
+    elif level.scored.first != level.scored.second or level.scored.common != level.scored.first:
+        yield f"{counted(level.scored.first, 'scored sample')} against {level.scored.second}"
+
+
+def _alone(samples: Overlap) -> str:
+    """Return the number of samples that only one report has, as text."""
+    sides = ((samples.only_first, "first"), (samples.only_second, "second"))
+    return ", ".join(f"{counted(n, 'sample')} only in the {name}" for n, name in sides if n)
+
+
+def _rank_clauses(rank: RankDifference) -> Iterator[str]:
+    if rank.n_changed:
+        yield f"{rank.n_changed} of {counted(rank.samples.common, 'simulated rank')}"
+    if rank.n_reported_changed:
+        yield f"{rank.n_reported_changed} of {counted(rank.samples.common, 'reported rank')}"
+    if rank.samples.only_first or rank.samples.only_second:
+        yield _alone(rank.samples)
+
+
+def diff_metrics(diff: ReportDiff) -> dict[str, Any]:
+    """Return verdict, differences and the fields of the record as plain JSON values."""
+    return json_object(
+        verdict=verdict(diff), differs=bool(diff.differences), differences=diff.differences, **fields_of(diff)
+    )
+
+
+# A SHA-256 digest or a fingerprint of a log.
+_DIGEST = re.compile(r"\b([0-9a-f]{12})[0-9a-f.]{20,}")
+
+
+def in_short(value: Any) -> str:
+    """Return the text of a value, with digests and fingerprints shortened to 12 digits. ``--json`` prints all digits.
+
+    Examples
+    --------
+    >>> in_short(["0123456789abcdef" * 4]), in_short(None), in_short(0.25)
+    ("['0123456789ab…']", 'not there', '0.25')
+    """
+    text = _DIGEST.sub(r"\1…", "not there" if value is None else short(value))
+    return cut(text, 300)
+
+
+# Sentences about two reports, by the verdict of the paired interval. Only these contain "better" and "worse".
+DIFFERENCE = {
+    "better": "The second is significantly better: {difference:+.2f} dB {interval} (95 %).",
+    "worse": "The second is significantly worse: {difference:+.2f} dB {interval} (95 %).",
+    "not significant": "The difference of {difference:+.2f} dB {interval} is not significant (95 %).",
+    "no interval": "The difference is {difference:+.2f} dB; too few independent samples for an interval.",
+}
+
+# Number of differences that the first sentence names if the RMSE are equal.
+_NAMED = 2
+
+
+def verdict(diff: ReportDiff) -> str:
+    """Return the result in one or two sentences."""
+    changed = {"setting": len(diff.settings), "input": len(diff.inputs), "version": len(diff.versions)}
+    listed = ", ".join(counted(n, name) for name, n in changed.items() if n)
+    also = f" Changed: {listed}." if listed else " Settings, inputs and versions are the same."
+    if _site_alone(diff):
+        also = " The site differs, and nothing else."
+    if not diff.differences:
+        return f"No difference: the numbers agree within {TOLERANCE_DB:g} dB.{also}"
+    return _numbers(diff) + also
+
+
+def _site_alone(diff: ReportDiff) -> bool:
+    """Check whether only the site changed: its key in the flight file, the flight file itself, and the site file."""
+    settings = [entry.key.split(".")[0] == "site" for entry in diff.settings]
+    inputs = [entry.role.startswith("site file") for entry in diff.inputs]
+    others = [entry for entry in diff.inputs if not entry.role.startswith(("site file", "flight file"))]
+    return any(settings + inputs) and all(settings) and not others and not diff.versions
+
+
+def _numbers(diff: ReportDiff) -> str:
+    """Return a sentence about the RMSE over all links, or the first differences if the RMSE are equal."""
+    scored, pooled = [level for level in diff.levels if level.rmse.n], diff.pooled
+    if pooled is None or all(abs(item.rmse.difference_db) <= TOLERANCE_DB for item in scored):
+        more = len(diff.differences) - _NAMED
+        return "; ".join(diff.differences[:_NAMED]) + (f"; and {more} more." if more > 0 else ".")
+    common, most = (count(sum(getattr(item.samples, name) for item in scored)) for name in ("common", "first"))
+    low, high = pooled.difference_ci95_db
+    interval = f"[{Printed(low):+.2f}, {Printed(high):+.2f}]" if math.isfinite(low) else ""
+    return (
+        f"RSS over {common} common samples of {most}: RMSE {pooled.other_rmse_db:.2f} dB in the first, "
+        f"{pooled.rmse_db:.2f} dB in the second. "
+        + DIFFERENCE[pooled.verdict].format(difference=Printed(pooled.difference_db), interval=interval)
+    )

@@ -47,7 +47,7 @@ CASES = {
     "report, all figures": "report {0}/sample/flight.yaml -o out --audit none --figures all --export all",
     "campaign": "campaign {0}/sample/campaign.yaml -o out --fresh --workers 2",
     "explain": "explain {0}/sample/flight.yaml --time 20 --tower LW1",
-    "diff": "diff {0}/a {0}/b -o out",
+    "diff": "diff {0}/a {0}/b",
     "calibrate": "calibrate {0}/sample/calibration.yaml -o out.yaml",
     "predict": "predict lake_wheeler --height 40 --spacing 10 -o out",
     "plan": "plan sphere --site lake_wheeler --tower LW1 --geofence {0}/fence.kml --minutes 12 -o out",

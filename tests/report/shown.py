@@ -1,4 +1,4 @@
-"""The six pages as HTML, from made-up records: for the tests of words and of first screens."""
+"""The five pages as HTML, from made-up records: for the tests of words and of first screens."""
 
 import dataclasses
 import tempfile
@@ -11,16 +11,12 @@ import pandas as pd
 
 from aerpaw_cmp.compare.calibration import Score
 from aerpaw_cmp.compare.ladder import LadderRow, ModelRow
-from aerpaw_cmp.compare.statistics import pooled_difference
-from aerpaw_cmp.compare.verdict import Overlap, level_difference
 from aerpaw_cmp.report import calibration as calibration_html
 from aerpaw_cmp.report import campaign as campaign_html
-from aerpaw_cmp.report import diff as diff_html
 from aerpaw_cmp.report import flight as html
 from aerpaw_cmp.report import maps as maps_html
 from aerpaw_cmp.report import prediction as prediction_html
 from aerpaw_cmp.report.calibration import CalibrationData, sentences
-from aerpaw_cmp.report.diff import Entry, ReportDiff, ReportSide
 from aerpaw_cmp.report.prediction import cautions, first_words
 from benchmarks import fabricated
 
@@ -90,27 +86,6 @@ def calibration(_: Fixture) -> str:
     return _written(calibration_html.write_calibration, data, "calibration")
 
 
-def diff(_: Fixture) -> str:
-    """The second report has 2 dB of further noise on its replay, and one other setting."""
-    draw = np.random.default_rng(5)
-    n = 2000
-    time, simulated, first = 0.2 * np.arange(n), draw.normal(-80.0, 5.0, n), draw.normal(0.0, 4.0, n)
-    second, overlap = first + draw.normal(0.0, 2.0, n), Overlap(first=n, second=n, common=n)
-    measured = simulated + first
-    sides = ((measured, simulated, first), (measured, measured - second, second))
-    level = level_difference("LW1", "USRP1", overlap, *sides, scored=(n, n), offsets_db=(4.0, 4.1))
-    sides_of = [ReportSide(folder=name, flight="sample", generated="2026-11-21T00:00:00+00:00", version="0.4")
-                for name in ("monday", "friday")]  # fmt: skip
-    return diff_html.diff_page(
-        ReportDiff(
-            first=sides_of[0], second=sides_of[1], settings=(Entry(key="rt.max_depth", first=2, second=1),), inputs=(),
-            versions=(), levels=(level,), ranks=(),
-            pooled=pooled_difference([(time, second, first)]),
-            links_first_only=(), links_second_only=(), remarks=(),
-        )
-    )  # fmt: skip
-
-
 def prediction(fixture: Fixture) -> str:
     """A route of 400 points under one tower, a third of them outside the flown area."""
     from tests.report.test_prediction_words import FREE, LEARNED, WITH_FIELD, correction
@@ -134,6 +109,5 @@ def prediction(fixture: Fixture) -> str:
 
 
 PAGES: dict[str, Callable[[Fixture], str]] = {
-    "report": report, "map": site_map, "campaign": campaign, "calibration": calibration, "diff": diff,
-    "prediction": prediction,
+    "report": report, "map": site_map, "campaign": campaign, "calibration": calibration, "prediction": prediction,
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Every sentence of the six pages with its condition: tests/report/sentences.md.
+"""Every sentence of the five pages with its condition: tests/report/sentences.md.
 
     python -m tests.report.test_sentences        writes that table again; read it before you commit it
 
@@ -27,7 +27,6 @@ SOURCES = {
     "map": (*SHELL, "maps.py", "charts.py", "templates/map_explorer.html.jinja"),
     "campaign": (*SHELL, "campaign.py"),
     "calibration": (*SHELL, "calibration.py"),
-    "diff": (*SHELL, "diff.py"),
     "prediction": (*SHELL, "prediction.py", "templates/places.html.jinja"),
 }  # fmt: skip
 WORD = re.compile(r"[A-Za-z][A-Za-z'-]*")

@@ -84,28 +84,23 @@ def _print_explanation(explanation: Any) -> None:
     "diff",
     examples=[
         "aerpaw-cmp diff reports/monday reports/friday",
-        "aerpaw-cmp diff reports/a reports/b -o reports/a_and_b",
-        "aerpaw-cmp diff reports/a reports/b --strict --json",
+        "aerpaw-cmp diff reports/a reports/b --strict",
+        "aerpaw-cmp diff reports/a reports/b --json > changes.json",
     ],
 )
 def diff(
     first: Annotated[Path, Argument(help="Folder of a report.")],
     second: Annotated[Path, Argument(help="The other report of the same flight.")],
-    out: Annotated[Path | None, output("Folder for diff.html and diff.json  [default: not written]")] = None,
     strict: Annotated[
         bool, Option("--strict", help="End with exit code 1 if a number differs by more than 0.01 dB.")
     ] = False,
-    force: Force = False,
 ) -> int:
     """Compare two reports of a flight: settings, inputs, versions, and numbers on common samples."""
-    from ...jobs.diff_reports import run_diff
-    from ...report.diff import diff_metrics
+    from ...jobs.diff_reports import diff_metrics, run_diff
 
-    comparison = run_diff(first, second, out=out, force=force)
+    comparison = run_diff(first, second)
     if not answered(diff_metrics(comparison)):
         _print_diff(comparison)
-        if out is not None:
-            show(f"page: {out / 'diff.html'}")
     return 1 if strict and comparison.differences else 0
 
 
@@ -114,7 +109,7 @@ _SHOWN = 20
 
 
 def _print_diff(comparison: Any) -> None:
-    from ...report.diff import in_short, verdict
+    from ...jobs.diff_reports import in_short, verdict
 
     show(verdict(comparison))
     for text in comparison.remarks:
@@ -139,7 +134,7 @@ def _print_numbers(comparison: Any) -> None:
     records(comparison.levels, levels, title)
     ranks = {
         "tower": "tower", "K": "k", "common samples": "samples", "ranks changed": "n_changed",
-        "agreement": "agreement.difference:+.3f", "95 % of it": "agreement.ci95:+.3f",
+        "agreement": "agreement.difference:+.1%", "95 % of it": "agreement.ci95:+.1%",
         "kappa": "kappa.difference:+.3f", "95 % of kappa": "kappa.ci95:+.3f",
     }  # fmt: skip
     records(comparison.ranks, ranks, "Rank on common samples, second minus first")

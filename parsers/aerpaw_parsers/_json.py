@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -167,7 +167,7 @@ def number(value: Any) -> float:
     return float("nan") if converted in dictionary.UNAVAILABLE or abs(converted) > 1e300 else converted
 
 
-def column(entries: list[dict[str, Any]], *names: str) -> FloatArray:
+def column(entries: Sequence[dict[str, Any]], *names: str) -> FloatArray:
     """Return a value of every object as numbers, under the first of ``names`` that the object has."""
     return np.array([number(next((entry[name] for name in names if name in entry), None)) for entry in entries])
 

@@ -8,6 +8,7 @@ Serialization".
 
 from __future__ import annotations
 
+import binascii
 import struct
 
 import numpy as np
@@ -33,14 +34,13 @@ _FIELDS = {
 _EARLIEST_US, _LATEST_US = 946_684_800_000_000, 9_200_000_000_000_000
 
 
+# Each byte with its bits in reverse order.
+_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+
+
 def _crc(data: bytes) -> int:
-    """Return the X.25 checksum of MAVLink."""
-    crc = 0xFFFF
-    for byte in data:
-        t = byte ^ (crc & 0xFF)
-        t = (t ^ (t << 4)) & 0xFF
-        crc = (crc >> 8) ^ (t << 8) ^ (t << 3) ^ (t >> 4)
-    return crc & 0xFFFF
+    """Return the X.25 checksum of MAVLink: the CRC-CCITT of the standard library, with reversed bits."""
+    return int(f"{binascii.crc_hqx(data.translate(_REVERSED), 0xFFFF):016b}"[::-1], 2)
 
 
 def _packet(data: bytes, at: int) -> tuple[int, int, tuple[int, int], bytes] | None:

@@ -19,7 +19,7 @@ of a rank are those of the last ``servingcell`` within 2 s.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -28,15 +28,15 @@ import pandas as pd
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.files import SCHEMA, decode_record
 from aerpaw_cmp.readers import (
-    AnyArray,
     Attribute,
     InputError,
-    Kind,
+    Lines,
     Reader,
     ReadOptions,
     ReadResult,
     RejectedLine,
     Stream,
+    split,
 )
 
 from . import _json
@@ -44,8 +44,8 @@ from . import _json
 # RSRP and SINR older than this are not added to a rank.
 _COMPANION_S = 2.0
 
-# Line of the log, its record, the decoded values, and flags.
-Answer = tuple[int, dict[str, Any], dict[str, Any], list[str]]
+# A line of the log, counted from 1, and its record.
+_Record = tuple[int, dict[str, Any]]
 
 
 def sniff(head: bytes) -> bool:
@@ -72,7 +72,7 @@ def decode_line(line: bytes) -> dict[str, Any]:
     return record
 
 
-def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
+def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Return the records of one segment.
 
     Raises
@@ -80,27 +80,31 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     InputError
         If the schema is not :data:`SCHEMA`.
     """
-    log = _Log()
-    for data in pieces:
-        log.add(data)
-    header = log.header or {}
+    lines = split(data)
+    records, rejected = _records(lines)
+    header = next((record for _, record in records if record["kind"] == "header"), {"schema": SCHEMA})
+    if header.get("schema") != SCHEMA:
+        cause = "it was written by another version"
+        raise InputError(f"the log has schema {header.get('schema')!r}", expected=SCHEMA, cause=cause)
+    exchanges = [(number, record) for number, record in records if record["kind"] == "exchange"]
     about = {"clock": "utc", "node": options.node, "frequency_hz": options.frequency_hz}
     common: dict[str, Attribute] = {name: value for name, value in about.items() if value is not None}
-    frames = {name: pd.concat(pieces, ignore_index=True) if pieces else None for name, pieces in log.series.items()}
+    frames = {name: _frame(exchanges, query, leg, keys) for name, (query, leg, keys) in _SERIES.items()}
     streams = []
     for name in ("nr5g", "lte"):
         frame = frames[name]
-        if frame is not None and (name == "nr5g" or frame["rank"].notna().any()):
+        if len(frame) and (name == "nr5g" or frame["rank"].notna().any()):
             frame = _with_serving_cell(frame, frames["nr_rsrp"]) if name == "nr5g" else frame
             of_rank = {**common, "ri_base": str(header.get("ri_base", "one")), "channel": options.channel or name}
             streams.append(Stream("rank", name, frame, of_rank))
     for leg in ("nr", "lte"):
         frame = frames[f"{leg}_rsrp"]
-        if frame is not None and (leg == "nr" or frame["rss_db"].notna().any()):
+        if leg == "nr" or frame["rss_db"].notna().any():
             streams += _cells(frame, {**common, "unit": "dBm", "rat": leg}, options)
     return ReadResult(
-        reader="tap_jsonl", streams=tuple(streams), lines=log.lines, accepted=log.exchanges, blank=log.blank,
-        rejected=tuple(log.rejected), warnings=log.warnings(),
+        reader="tap_jsonl", streams=tuple(streams), lines=len(lines), accepted=len(exchanges),
+        blank=len(lines) - len(exchanges) - len(rejected), rejected=tuple(rejected),
+        warnings=tuple(_warnings([record for _, record in records], rejected)),
     )  # fmt: skip
 
 
@@ -118,95 +122,44 @@ _SERIES: dict[str, tuple[str, str, dict[str, str]]] = {
 }  # fmt: skip
 
 
-class _Log:
-    """The state of a log while it is read."""
-
-    def __init__(self) -> None:
-        self.header: dict[str, Any] | None = None
-        self.series: dict[str, list[pd.DataFrame]] = {name: [] for name in _SERIES}
-        self.lines = self.exchanges = self.blank = 0
-        self.rejected: list[RejectedLine] = []
-        self.events: list[str] = []
-        self.open_gap: dict[str, Any] | None = None
-        self.numbers: set[int] = set()
-        self.ended = False
-
-    def add(self, data: bytes) -> None:
-        """Read the next lines."""
-        records, rejected, blank = _records(data, self.lines)
-        self.lines += len(records) + len(rejected) + blank
-        self.rejected += rejected
-        exchanges = [(number, record) for number, record in records if record["kind"] == "exchange"]
-        self.exchanges += len(exchanges)
-        self.blank += blank + len(records) - len(exchanges)
-        for name, (query, leg, keys) in _SERIES.items():
-            if answers := [*_answered(exchanges, query, leg)]:
-                self.series[name].append(_frame("rss" if leg else "rank", answers, keys))
-        for _, record in records:
-            self._note(record)
-
-    def _note(self, record: dict[str, Any]) -> None:
-        """Note the events in a record that concern the complete log: gaps, clock steps, lost records, the end."""
-        kind = record["kind"]
-        if isinstance(record.get("n"), int):
-            self.numbers.add(int(record["n"]))
-        if kind == "header" and self.header is None:
-            self.header = record
-            schema = record.get("schema")
-            if schema != SCHEMA:
-                cause = "it was written by another version"
-                raise InputError(f"the log has schema {schema!r}", expected=SCHEMA, cause=cause)
-        closed = record.get("state") == "closed"
-        if kind == "gap":
-            self.open_gap = None if closed else record
-        if kind == "gap" and closed:
-            seconds = _int(record.get("duration_ns")) / 1e9
-            self.events.append(f"gap of {seconds:.1f} s: {record.get('reason', '')}")
-        if kind == "clock":
-            self.events.append(f"the wall clock stepped by {_int(record.get('step_ns')) / 1e9:+.3f} s")
-        if kind == "disk":
-            self.events.append(f"the disk failed ({record.get('reason')}); {record.get('lost')} records were lost")
-        self.ended |= kind in ("end", "rotate")
-
-    def warnings(self) -> tuple[str, ...]:
-        """Return gaps, clock steps, lost and missing records, a truncated last line, and a missing end."""
-        texts = list(self.events)
-        if self.open_gap is not None:
-            texts.append(f"the log ends inside a gap: {self.open_gap.get('reason', '')}")
-        missing = max(self.numbers) - min(self.numbers) + 1 - len(self.numbers) if self.numbers else 0
-        if missing:
-            texts.append(f"{missing} record numbers are missing in this segment")
-        if self.rejected and self.rejected[-1].reason.startswith("torn tail"):
-            texts.append("the last line is truncated (power loss or kill while writing)")
-        if not self.ended:
-            texts.append("no end record: the session was cut off")
-        return tuple(texts)
-
-
-def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]], list[RejectedLine], int]:
-    """Return the intact records with their line numbers, rejected lines, and the number of blank lines."""
-    lines = data.split(b"\n")
-    unterminated = lines[-1] != b""
-    if not unterminated:
-        lines.pop()
-    records: list[tuple[int, dict[str, Any]]] = []
+def _records(lines: Lines) -> tuple[list[_Record], list[RejectedLine]]:
+    """Return the intact records and the rejected lines."""
+    torn = len(lines) - 1 if lines.unterminated else -1
+    records: list[_Record] = []
     rejected: list[RejectedLine] = []
-    blank = 0
-    last = before + len(lines)
-    for number, line in enumerate(lines, before + 1):
-        if not line.strip():
-            blank += 1
-            continue
-        line = line.removesuffix(b"\r")
+    for i in np.flatnonzero(~lines.blank).tolist():
         try:
-            record = decode_line(line)
-            if unterminated and number == last:  # complete by its checksum, but flagged as in other readers
-                record["flags"] = [*_flags(record), "unterminated_line"]
-            records.append((number, record))
+            record = decode_line(lines.raw(i))
         except ValueError as error:
-            reason = f"torn tail: {error}" if unterminated and number == last else str(error)
-            rejected.append(RejectedLine(number, reason, line[:2000].decode("utf-8", errors="replace")[:500]))
-    return records, rejected, blank
+            rejected.append(lines.reject(i, f"torn tail: {error}" if i == torn else str(error)))
+            continue
+        if i == torn:  # complete by its checksum, but flagged as in other readers
+            record["flags"] = [*_flags(record), "unterminated_line"]
+        records.append((i + 1, record))
+    return records, rejected
+
+
+def _warnings(records: list[dict[str, Any]], rejected: list[RejectedLine]) -> Iterator[str]:
+    """Yield gaps, clock steps, lost and missing records, a truncated last line, and a missing end."""
+    gap: dict[str, Any] | None = None
+    for record in records:
+        if record["kind"] == "gap":
+            gap = None if record.get("state") == "closed" else record
+            if gap is None:
+                yield f"gap of {_int(record.get('duration_ns')) / 1e9:.1f} s: {record.get('reason', '')}"
+        elif record["kind"] == "clock":
+            yield f"the wall clock stepped by {_int(record.get('step_ns')) / 1e9:+.3f} s"
+        elif record["kind"] == "disk":
+            yield f"the disk failed ({record.get('reason')}); {record.get('lost')} records were lost"
+    if gap is not None:
+        yield f"the log ends inside a gap: {gap.get('reason', '')}"
+    numbers = {int(record["n"]) for record in records if isinstance(record.get("n"), int)}
+    if missing := max(numbers) - min(numbers) + 1 - len(numbers) if numbers else 0:
+        yield f"{missing} record numbers are missing in this segment"
+    if rejected and rejected[-1].reason.startswith("torn tail"):
+        yield "the last line is truncated (power loss or kill while writing)"
+    if not any(record["kind"] in ("end", "rotate") for record in records):
+        yield "no end record: the session was cut off"
 
 
 def _int(value: Any) -> int:
@@ -218,27 +171,24 @@ def _flags(record: dict[str, Any]) -> list[str]:
     return [str(flag) for flag in flags] if isinstance(flags, list) else []
 
 
-def _frame(kind: Kind, answers: list[Answer], names: Mapping[str, str]) -> pd.DataFrame:
-    """Return the frame of some answers. ``names`` maps each column to the key of its decoded value."""
-    sent, last = (np.array([int(record[key]) for _, record, _, _ in answers]) for key in ("sent_utc_ns", "last_utc_ns"))
-    values: dict[str, AnyArray] = {"uncertainty_s": (last - sent) / 2e9}
-    for name, key in names.items():
-        cells: list[Any] = [decoded.get(key) for _, _, decoded, _ in answers]
-        sound = [cell if type(cell) in (int, float) and abs(cell) < 1e9 else np.nan for cell in cells]
-        values[name] = np.array(sound, dtype=np.float64)
-    flag = np.array([";".join(flags) for *_, flags in answers], dtype=object)
-    line = np.array([number for number, *_ in answers])
-    return _text.frame(kind, (sent + last) // 2, line, flag, values, own=True)
+def _frame(exchanges: list[_Record], query: str, leg: str, names: Mapping[str, str]) -> pd.DataFrame:
+    """Return the answers to a query. ``names`` maps each column to the key of its decoded value.
 
-
-def _answered(exchanges: list[tuple[int, dict[str, Any]]], query: str, leg: str) -> Iterator[Answer]:
-    """Yield the answers to a query, and failed exchanges of a rank as flagged answers without a rank."""
+    Failed exchanges of a rank are flagged answers without a rank.
+    """
+    answers = []
     for number, record in exchanges:
-        decoded = _json.inside(record, "decoded")
-        values = _json.inside(decoded, leg) if leg else decoded
+        values = _json.inside(record, "decoded")
+        values = _json.inside(values, leg) if leg else values
         if record.get("query") == query and (values or not leg):
             status = [] if leg or record.get("status") == "ok" else [f"status:{record.get('status')}"]
-            yield number, record, values, _flags(record) + status
+            flag = ";".join(_flags(record) + status)
+            answers.append((number, record["sent_utc_ns"], record["last_utc_ns"], flag, values))
+    line, sent, last, flags, decoded = zip(*answers, strict=True) if answers else [()] * 5
+    sent_ns, last_ns = np.array(sent, dtype=np.int64), np.array(last, dtype=np.int64)
+    columns = {name: _json.column(decoded, key) for name, key in names.items()}
+    values = {"uncertainty_s": (last_ns - sent_ns) / 2e9, **columns}
+    return _text.frame("rss" if leg else "rank", (sent_ns + last_ns) // 2, np.array(line), np.array(flags), values)
 
 
 def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOptions) -> Iterator[Stream]:
@@ -253,12 +203,9 @@ def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOption
         yield Stream("rss", name, frame, {**common, **about, "channel": options.channel or name})
 
 
-def _with_serving_cell(rank: pd.DataFrame, rsrp: pd.DataFrame | None) -> pd.DataFrame:
+def _with_serving_cell(rank: pd.DataFrame, rsrp: pd.DataFrame) -> pd.DataFrame:
     """Add RSRP and SINR of the last serving-cell answer as columns of the rank frame."""
     columns = {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db"}
-    if rsrp is None:
-        rank[[*columns.values()]] = np.nan
-        return rank
     cells = rsrp[["time", *columns]].sort_values("time", kind="stable").rename(columns=columns)
     asked = rank[["time"]].sort_values("time", kind="stable")
     near = pd.merge_asof(asked, cells, on="time", tolerance=pd.Timedelta(_COMPANION_S, "s"))
@@ -269,5 +216,5 @@ def _with_serving_cell(rank: pd.DataFrame, rsrp: pd.DataFrame | None) -> pd.Data
 READER = Reader(
     name="tap_jsonl", title="Log of 'aerpaw-cmp tap': rank indicator and serving cell of a Quectel modem (JSON lines)",
     kinds=("rank", "rss"), sample='{"kind":"header","schema":"aerpaw-cmp-tap/1", ...', sniff=sniff,
-    read=lambda data, options: read_pieces((data,), options), read_pieces=read_pieces,
+    read=read,
 )  # fmt: skip

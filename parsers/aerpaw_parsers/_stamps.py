@@ -104,88 +104,69 @@ def _month(word: str) -> int:
     return _MONTHS.index(word[:3].lower()) + 1 if word[:3].lower() in _MONTHS else 0
 
 
-class _Order:
-    """The order of the three numbers of a date, decided for the complete column, and warnings about assumptions."""
-
-    def __init__(self, texts: Iterable[str], name: str, *, european: bool, day_first: bool | None = None) -> None:
-        dates = [match for text in texts if (match := _match(text)) and "a" in match.re.groupindex]
-        self.day_first, self.year_first = True, False
-        self.warnings: list[str] = []
-        if not dates:
-            return
-        self._year(dates)
-        keys = ("b", "c") if self.year_first else ("a", "b")
-        firsts = [(int(match[keys[0]]), int(match[keys[1]])) for match in dates]
-        if all(match["mark"] == "." for match in dates) and not self.year_first:
-            return  # 02.03.2025: with points, the day comes first
-        if any(first > 12 for first, _ in firsts):
-            return
-        self.day_first = False
-        if any(second > 12 for _, second in firsts) or self.year_first:
-            return
-        if day_first is not None:
-            self.day_first = day_first
-            return
-        # days of a log that passes midnight follow each other in one order and are weeks apart in the other
-        distinct = {match.group("a", "b", "c"): match for match in dates}.values()
-        spans_d = [self._span_d(distinct, first) for first in (False, True)]
-        if abs(spans_d[0] - spans_d[1]) >= _WEEKS_D:
-            self.day_first = spans_d[1] < spans_d[0]
-            return
-        date = _date_in_name(name)
-        fits = [first for first in (True, False) if date and self._dated(dates[0], first) == date]
-        self.day_first = fits[0] if len(fits) == 1 else european
-        reason = "as in countries with decimal commas" if european else "a guess"
-        reason = "as in the date of the file name" if len(fits) == 1 else reason
-        word = "day" if self.day_first else "month"
-        self.warnings.append(
-            f"the dates can be read with the day or the month first: the {word} is assumed to come first, {reason}"
-        )
-
-    def _year(self, dates: list[re.Match[str]]) -> None:
-        if len(dates[0]["c"]) == 4:
-            return
-        last, first = ([int(match[key]) for match in dates] for key in ("c", "a"))
-        self.year_first = any(number > 31 for number in first) or (
-            not all(_FIRST_YEAR <= number <= _LAST_YEAR for number in last)
-            and all(_FIRST_YEAR <= number <= _LAST_YEAR for number in first)
-        )
-        word = "first" if self.year_first else "last"
-        self.warnings.append(
-            f"the years of the dates have two digits: the {word} number is assumed to be the year, which is a guess"
-        )
-
-    def _span_d(self, dates: Iterable[re.Match[str]], day_first: bool) -> float:
-        """Return roughly how many days lie between the first and the last date for one order of day and month."""
-        parts = (self.parts(match, day_first=day_first) for match in dates)
-        days = [365.25 * int(year) + 30.44 * month + day for year, month, day in parts]
-        return max(days) - min(days)
-
-    def _dated(self, match: re.Match[str], day_first: bool) -> str:
-        year, month, day = self.parts(match, day_first=day_first)
-        return f"{year}-{month:02d}-{day:02d}"
-
-    def parts(self, match: re.Match[str], *, day_first: bool | None = None) -> tuple[str, int, int]:
-        """Return year, month and day."""
-        groups = match.groupdict()
-        if groups.get("a") is None:
-            month = int(groups["month"]) if groups.get("month") else _month(groups["word"])
-            return _year(groups["year"]), month, int(groups["day"])
-        a, b, c = groups["a"], groups["b"], groups["c"]
-        if self.year_first:
-            return _year(a), int(b), int(c)
-        first = self.day_first if day_first is None else day_first
-        return _year(c), int(b if first else a), int(a if first else b)
-
-
 # Two orders of the same dates are distinguished if their spans differ by this number of days.
 _WEEKS_D = 20
-# The first and the last year of a log of this kind, as two digits.
-_FIRST_YEAR, _LAST_YEAR = 15, 40
 
 
-def _year(digits: str) -> str:
-    return digits if len(digits) == 4 else f"20{digits}"
+def _order(
+    texts: Iterable[str], name: str, *, european: bool, day_first: bool | None = None
+) -> tuple[str, list[str]]:  # fmt: skip
+    """Return the order of day, month and year in the dates of a complete column, and warnings about assumptions."""
+    dates = [match for text in texts if (match := _match(text)) and "a" in match.re.groupindex]
+    if not dates:
+        return "dmy", []
+    firsts, seconds, lasts = ([int(match[key]) for match in dates] for key in "abc")
+    warnings = []
+    if len(dates[0]["c"]) == 2:
+        year_first = max(firsts) > 31 or (not _are_years(lasts) and _are_years(firsts))
+        word = "first" if year_first else "last"
+        warnings.append(
+            f"the years of the dates have two digits: the {word} number is assumed to be the year, which is a guess"
+        )
+        if year_first:
+            return "ymd", warnings
+    # 02.03.2025: with points, the day comes first
+    if all(match["mark"] == "." for match in dates) or max(firsts) > 12:
+        return "dmy", warnings
+    if max(seconds) > 12:
+        return "mdy", warnings
+    if day_first is not None:
+        return "dmy" if day_first else "mdy", warnings
+    # days of a log that passes midnight follow each other in one order and are weeks apart in the other
+    spans_d = {}
+    for order in ("dmy", "mdy"):
+        parts = [_parts(match, order) for match in {match.group("a", "b", "c"): match for match in dates}.values()]
+        days = [365.25 * int(year) + 30.44 * month + day for year, month, day in parts]
+        spans_d[order] = max(days) - min(days)
+    if abs(spans_d["dmy"] - spans_d["mdy"]) >= _WEEKS_D:
+        return min(spans_d, key=lambda order: spans_d[order]), warnings
+    date = _date_in_name(name)
+    fits = [order for order in ("dmy", "mdy") if date == "{}-{:02d}-{:02d}".format(*_parts(dates[0], order))]
+    order = fits[0] if len(fits) == 1 else "dmy" if european else "mdy"
+    reason = "as in countries with decimal commas" if european else "a guess"
+    reason = "as in the date of the file name" if len(fits) == 1 else reason
+    word = "day" if order == "dmy" else "month"
+    warnings.append(
+        f"the dates can be read with the day or the month first: the {word} is assumed to come first, {reason}"
+    )
+    return order, warnings
+
+
+def _are_years(numbers: Iterable[int]) -> bool:
+    """Check whether two digits can all be the year of a log of this kind."""
+    return all(15 <= number <= 40 for number in numbers)
+
+
+def _parts(match: re.Match[str], order: str) -> tuple[str, int, int]:
+    """Return year, month and day."""
+    groups = match.groupdict()
+    if groups.get("a") is None:
+        year, month = groups["year"], int(groups["month"]) if groups.get("month") else _month(groups["word"])
+        day = groups["day"]
+    else:
+        numbers = dict(zip(order, match.group("a", "b", "c"), strict=True))
+        year, month, day = numbers["y"], int(numbers["m"]), numbers["d"]
+    return year if len(year) == 4 else f"20{year}", month, int(day)
 
 
 def _match(text: str) -> re.Match[str] | None:
@@ -206,17 +187,17 @@ def is_dated(text: str) -> bool:
     return re.match(r"\d{9}", text) is not None or (match is not None and match["hour"] is not None)
 
 
-def _written(text: str, order: _Order, zones: _Zones) -> bytes:
+def _written(text: str, order: str, header: str, own: str | None) -> bytes:
     """Return one time in the common form, or ``-`` for other text."""
     match = _match(text)
     if match is None:
         return b"-"
-    year, month, day = order.parts(match)
+    year, month, day = _parts(match, order)
     groups = match.groupdict()
     hour = _hour(groups)
     date = f"{year}-{month:02d}-{day:02d} {hour:02d}:{groups.get('minute') or '00'}:{groups.get('second') or '00'}"
     fraction = f".{groups['fraction'][:9]}" if groups.get("fraction") else ""
-    return (date + fraction + zones.offset(groups.get("zone"), date)).encode()
+    return (date + fraction + _offset((groups.get("zone") or header).strip(), date, own)).encode()
 
 
 def _hour(groups: dict[str, str | None]) -> int:
@@ -224,60 +205,46 @@ def _hour(groups: dict[str, str | None]) -> int:
     return hour % 12 + (12 if half[0].lower() == "p" else 0) if half else hour
 
 
-class _Zones:
-    """The offsets of the zones in the cells of a column or in its name."""
-
-    def __init__(self, options: ReadOptions, header: str) -> None:
-        self._own, self._header = options.timezone, header
-        self._known: dict[tuple[str, str], str] = {}
-
-    def offset(self, written: str | None, date: str) -> str:
-        """Return ``+hh:mm`` of a zone at a date, ``Z``, or an empty text if the zone is unknown."""
-        word = (written or self._header).strip()
-        word = word if "/" in word else word.upper()
-        if not word:
-            return ""
-        key = word, date[:10]
-        if key not in self._known:
-            self._known[key] = self._find(word, date)
-        return self._known[key]
-
-    def _find(self, word: str, date: str) -> str:
-        if (exact := _OFFSET.fullmatch(word)) is not None:
-            return f"{exact[1]}{int(exact[2]):02d}:{exact[3] or '00'}"
-        if word in _HOURS:
-            return _shown(_HOURS[word])
-        try:
-            moment = datetime.fromisoformat(date)
-        except ValueError:
-            return ""  # the date does not exist, which the caller reports
-        if self._own and (here := _at(self._own, moment)) is not None and here[1] == word:
-            return _shown(here[0])
-        if word in _WITH_SUMMER or "/" in word:
-            here = _at(_WITH_SUMMER.get(word, word), moment)
-            return "" if here is None else _shown(here[0])
-        if word not in _text.WINTER:
-            raise UsageError(
-                f"the times have an unknown zone: {word}",
-                expected="UTC, an offset such as -04:00, or an abbreviation such as EDT",
-                cause="a misspelt zone: correct it in the file",
-            )
-        candidates = _text.WINTER[word]
-        hours, zone = candidates[0]
-        here = _at(zone, moment)
-        if len(candidates) == 1 and (here is None or here[0] == hours):
-            return _shown(hours)
-        doubt, ways = (
-            "which is the zone of several countries",
-            [f"{_shown(east)} ({name})" for east, name in candidates],
+def _offset(zone: str, date: str, own: str | None) -> str:
+    """Return ``+hh:mm`` of a zone at a date, or an empty text if the zone is unknown. ``own`` is the user's zone."""
+    word = zone if "/" in zone else zone.upper()
+    if not word:
+        return ""
+    if (exact := _OFFSET.fullmatch(word)) is not None:
+        return f"{exact[1]}{int(exact[2]):02d}:{exact[3] or '00'}"
+    if word in _HOURS:
+        return _shown(_HOURS[word])
+    try:
+        moment = datetime.fromisoformat(date)
+    except ValueError:
+        return ""  # the date does not exist, which the caller reports
+    if own and (here := _at(own, moment)) is not None and here[1] == word:
+        return _shown(here[0])
+    if word in _WITH_SUMMER or "/" in word:
+        here = _at(_WITH_SUMMER.get(word, word), moment)
+        return "" if here is None else _shown(here[0])
+    if word not in _text.WINTER:
+        raise UsageError(
+            f"the times have an unknown zone: {word}",
+            expected="UTC, an offset such as -04:00, or an abbreviation such as EDT",
+            cause="a misspelt zone: correct it in the file",
         )
-        if len(candidates) == 1 and here is not None:
-            doubt = f"but on {date[:10]} the clocks of that zone show {here[1]}"
-            ways = [f"{_shown(hours)} as written", f"{_shown(here[0])} ({here[1]})"]
-        expected = f"{' or '.join(ways)}: put the offset in place of {word} in the file"
-        if len(candidates) > 1:
-            expected += ", or state the zone of the log with --timezone"
-        raise UsageError(f"the zone of the times is {word}, {doubt}", expected=expected)
+    candidates = _text.WINTER[word]
+    hours, zone = candidates[0]
+    here = _at(zone, moment)
+    if len(candidates) == 1 and (here is None or here[0] == hours):
+        return _shown(hours)
+    doubt, ways = (
+        "which is the zone of several countries",
+        [f"{_shown(east)} ({name})" for east, name in candidates],
+    )
+    if len(candidates) == 1 and here is not None:
+        doubt = f"but on {date[:10]} the clocks of that zone show {here[1]}"
+        ways = [f"{_shown(hours)} as written", f"{_shown(here[0])} ({here[1]})"]
+    expected = f"{' or '.join(ways)}: put the offset in place of {word} in the file"
+    if len(candidates) > 1:
+        expected += ", or state the zone of the log with --timezone"
+    raise UsageError(f"the zone of the times is {word}, {doubt}", expected=expected)
 
 
 def _shown(hours: float) -> str:
@@ -403,17 +370,15 @@ def read(
     if sum(_OF_DAY.fullmatch(text) is not None for text in filled) * 2 > len(filled):
         return _of_day(shown, options, zone, device)
     plain = [text for text in filled if not _COMMON.fullmatch(text)]
-    order = _Order(plain, options.file_name, european=european, day_first=day_first)
-    warnings = order.warnings
+    order, warnings = _order(plain, options.file_name, european=european, day_first=day_first)
     bare = [match for text in plain if (match := _match(text)) and match.groupdict().get("second") is None]
     if len(set(filled)) < len(filled) and 2 * len(bare) > len(filled):
         warnings.append(
             "the times have no seconds (a table saved by a spreadsheet?): all rows of a minute share one time"
         )
-    zones = _Zones(options, zone)
     cells = [
         text.encode() if _COMMON.fullmatch(text) and (not zone or text[-6] in "+-" or text[-1] == "Z")
-        else _written(text, order, zones) for text in shown
+        else _written(text, order, zone, options.timezone) for text in shown
     ]  # fmt: skip
     return "wall", _text.cells(cells), warnings
 
@@ -451,20 +416,16 @@ def refuse_spreadsheets(texts: Sequence[str]) -> None:
         If most of the texts are epochs without their last digits, so that rows of minutes would share a time, or
         minutes and seconds without the hour.
     """
-    rounded = [text for text in texts if _ROUNDED.fullmatch(text)]
-    minutes = [text for text in texts if _MINUTES.fullmatch(text)]
-    if 2 * len(rounded) > len(texts):
-        raise InputError(
-            f"the times are rounded, such as {rounded[0]}",
-            expected="all digits of the epoch",
-            cause="the table was saved by a spreadsheet, which shortens long numbers",
-        )
-    if 2 * len(minutes) > len(texts):
-        raise InputError(
-            f"the times are minutes and seconds without the hour and the date, such as {minutes[0]}",
-            expected="whole times",
-            cause="the table was saved by a spreadsheet, which shows times in this form: save the column as text",
-        )
+    kinds = (
+        (_ROUNDED, "rounded", "all digits of the epoch", "shortens long numbers"),
+        (_MINUTES, "minutes and seconds without the hour and the date", "whole times",
+         "shows times in this form: save the column as text"),
+    )  # fmt: skip
+    for form, found, expected, habit in kinds:
+        shortened = [text for text in texts if form.fullmatch(text)]
+        if 2 * len(shortened) > len(texts):
+            cause = f"the table was saved by a spreadsheet, which {habit}"
+            raise InputError(f"the times are {found}, such as {shortened[0]}", expected=expected, cause=cause)
 
 
 # The longest flight [s], the longest step between its rows [s], and, for each unit, the smallest step that numbers
@@ -656,7 +617,7 @@ def _wall_cells(day: np.datetime64, seconds: FloatArray, zone: str, options: Rea
     cells = np.datetime_as_string(stamps, unit="us").astype(np.bytes_)
     date = str(stamps[np.argmax(np.isfinite(seconds))])[:10]
     # use the offset at noon, because clocks change at night
-    offset = _Zones(options, zone).offset(None, f"{date} 12:00:00").encode()
+    offset = _offset(zone.strip(), f"{date} 12:00:00", options.timezone).encode()
     return np.where(np.isnan(seconds), b"-", np.char.add(cells, offset))
 
 

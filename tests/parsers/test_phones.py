@@ -181,6 +181,12 @@ def test_dates_that_can_be_read_two_ways_are_told() -> None:
     assert not warnings
 
 
+@pytest.mark.parametrize("zone", ["ET", "America/New_York"])
+def test_each_time_has_the_offset_of_its_own_hour(zone: str) -> None:
+    _, cells, _ = _stamps.read([f"2025/11/02 0{hour}:30:00 {zone}" for hour in (0, 3)], PLAIN)
+    assert cells.tolist() == [b"2025-11-02 00:30:00-04:00", b"2025-11-02 03:30:00-05:00"]
+
+
 def test_past_midnight() -> None:
     _, cells, _ = _stamps.read(["23:59:59.5", "00:00:00.5"], replace(PLAIN, file_name="2025-03-02_x.csv"))
     assert cells.tolist() == [b"2025-03-02T23:59:59.500000", b"2025-03-03T00:00:00.500000"]

@@ -647,7 +647,7 @@ class Correction:
         return self.over_headings([samples], flight, own_mean=own_mean)
 
     def over_headings(
-        self, each: Sequence[LinkSamples], flight: str | None = None, *, own_mean: bool = False, all_targets: int = 0
+        self, each: Sequence[LinkSamples], flight: str | None = None, *, own_mean: bool = False
     ) -> tuple[FloatArray, FloatArray]:
         """Return the mean of :meth:`predict` over several headings, for an aircraft with unknown heading.
 
@@ -657,9 +657,6 @@ class Correction:
             The same samples with each heading.
         flight : str, optional
         own_mean : bool
-        all_targets : int
-            Number of targets of the whole run, if ``each`` is a part of it, so that all parts are solved in the same
-            way.
 
         Returns
         -------
@@ -679,11 +676,10 @@ class Correction:
             targets = targets.part(np.array([np.isfinite(targets.position_m).all(axis=1).argmax()]))
         # solve once for each antenna, because maps are predicted tile by tile
         fit = self.fits.setdefault(samples.antenna, FieldFit(self.model, channel.rows, channel.left_db))
-        exact = fit.fits(max(len(targets), all_targets))
-        mean, sd = fit.predict(targets, exact=exact)
+        mean, sd = fit.predict(targets)
         if own_mean:
             # errors relative to a flight's own mean do not contain its offset
-            _, sd = fit.predict(targets, ("place", "drift"), exact=exact)
+            _, sd = fit.predict(targets, ("place", "drift"))
         variance = sd**2 + (gain_sds**2).mean(axis=0) + gains.var(axis=0) + self.model.noise_sd_db**2
         return gains.mean(axis=0) + mean, self.sd_factor * np.sqrt(variance)
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -36,18 +36,8 @@ PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
 # Prior standard deviation of the unknown mean. It is so large that it does not restrict the mean.
 MEAN_SD_DB = 100.0
 
-# Largest number of rows of the exact solution. Its matrix then takes 72 MB.
-_EXACT_ROWS = 3000
-
-# Largest product of squared rows and targets for the exact solution (about ten seconds). Larger problems use only the
-# nearest rows.
-_EXACT_WORK = 2.0e11
-
-# Number of nearest rows of a single target, and largest number of rows that several targets share.
-_NEAREST, _MOST_NEAREST = 40, 160
-
-# Side of the cells in scaled space. Targets in a cell share their rows.
-_TOGETHER = 0.25
+# Largest number of rows that are used. Their covariance then takes 72 MB.
+_MOST_ROWS = 3000
 
 # Largest number of rows per channel from which scales are fitted.
 FIT_ROWS = 700
@@ -129,7 +119,7 @@ class Rows:
         return cls(position_m=samples.position_m, direction=samples.at_uav, time_s=samples.time_s, flight=codes)
 
     def part(self, keep: Any) -> Rows:
-        """Return the selected rows. An index with two dimensions adds a dimension to every array."""
+        """Return the selected rows."""
         return Rows(**{f.name: getattr(self, f.name)[keep] for f in dataclasses.fields(self)})
 
     @classmethod
@@ -140,7 +130,7 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Apart:
-    """The distances between rows (..., n, m): horizontal, vertical, squared chord of the direction, and time.
+    """The distances between rows (n, m): horizontal, vertical, squared chord of the direction, and time.
 
     ``same`` is 1 for rows of the same flight.
     """
@@ -153,26 +143,22 @@ class _Apart:
 
     @classmethod
     def of(cls, rows: Rows, columns: Rows) -> _Apart:
-        """Return the distances of ``rows`` (..., n) from ``columns`` (..., m)."""
-        a, b = (np.moveaxis(r.position_m, -1, 0) for r in (rows, columns))
-        up = np.abs(a[2][..., :, None] - b[2][..., None, :])
-        across = np.hypot(a[0][..., :, None] - b[0][..., None, :], a[1][..., :, None] - b[1][..., None, :])
-        if rows.direction.ndim > rows.position_m.ndim:  # (headings, ..., n, m)
-            inner = np.einsum("...nhk,...mk->h...nm", rows.direction, columns.direction, optimize=True)
-        else:
-            inner = rows.direction @ np.swapaxes(columns.direction, -1, -2)
+        """Return the distances of ``rows`` (n,) from ``columns`` (m,)."""
+        between = rows.position_m[:, None] - columns.position_m
+        # (n, m), or (headings, n, m) for targets with several headings
+        inner = np.moveaxis(rows.direction, -2, 0) @ columns.direction.T
         return cls(
-            across,
-            up,
+            np.hypot(between[..., 0], between[..., 1]),
+            np.abs(between[..., 2]),
             # rounding can make the product of equal unit vectors exceed 1
             np.maximum(2.0 - 2.0 * inner, 0.0),
-            np.abs(rows.time_s[..., :, None] - columns.time_s[..., None, :]),
-            (rows.flight[..., :, None] == columns.flight[..., None, :]).astype(np.float64),
+            np.abs(rows.time_s[:, None] - columns.time_s),
+            (rows.flight[:, None] == columns.flight).astype(np.float64),
         )
 
 
 def _place(model: FieldModel, apart: _Apart) -> FloatArray:
-    """Return the covariance (..., n, m) of the field over positions.
+    """Return the covariance (n, m) of the field over positions.
 
     The covariance is averaged over several headings, which is the covariance of a level with unknown heading.
     """
@@ -188,19 +174,19 @@ def _drift(model: FieldModel, apart: _Apart) -> FloatArray:
 
 
 def covariance(model: FieldModel, rows: Rows, columns: Rows, parts: Collection[Part] = PARTS) -> FloatArray:
-    """Return the covariance (..., n, m) between rows of the selected parts of the residual, without noise [dB^2].
+    """Return the covariance (n, m) between rows of the selected parts of the residual, without noise [dB^2].
 
     Parameters
     ----------
     model : FieldModel
     rows, columns : Rows
-        Rows (..., n) and (..., m).
+        Rows (n,) and (m,).
     parts : collection of str
         Names from :data:`PARTS`.
 
     Returns
     -------
-    (..., n, m)
+    (n, m)
     """
     apart = _Apart.of(rows, columns)
     out = np.full(apart.same.shape, MEAN_SD_DB**2 if "mean" in parts else 0.0)
@@ -239,141 +225,45 @@ class FieldFit:
         if not len(self.rows):
             raise InputError("no sample to condition on", expected="flights with levels at known poses")
 
-    def predict(
-        self, targets: Rows, parts: Collection[Part] = PARTS, *, exact: bool | None = None
-    ) -> tuple[FloatArray, FloatArray]:
+    def predict(self, targets: Rows, parts: Collection[Part] = PARTS) -> tuple[FloatArray, FloatArray]:
         """Return mean and standard deviation (m,) of the selected parts at targets [dB]. NaN for targets with a NaN.
+
+        Of more than :data:`_MOST_ROWS` rows, an evenly spaced selection is used.
 
         Parameters
         ----------
         targets : Rows
         parts : collection of str
             Parts of the residual. ``("place", "drift")`` is the residual of a flight relative to its own mean.
-        exact : bool, optional
-            True to use all rows, False to use only the nearest rows of each target. By default, the exact solution is
-            used if its matrices are small enough (:data:`_EXACT_ROWS`, :data:`_EXACT_WORK`).
 
         Returns
         -------
         mean_db, sd_db : (m,)
-
-        Notes
-        -----
-        In the approximation, evenly thinned rows determine the common mean and the offset of each flight. A target is
-        predicted from its :data:`_NEAREST` rows in the scaled space (Vecchia's conditioning: Datta et al. 2016, doi
-        10.1080/01621459.2015.1044091). Targets in one cell share the rows nearest to their centre. The more targets,
-        the more rows they share (Guinness 2018, doi 10.1080/00401706.2018.1437476).
         """
         mean, sd = np.full((2, len(targets)), np.nan)
         ends = targets.direction.reshape(len(targets), -1)
-        known = np.isfinite(np.column_stack([targets.position_m, ends, targets.time_s])).all(axis=1)
-        exact = self.fits(int(known.sum())) if exact is None else exact
-        places, some = np.flatnonzero(known), targets.part(known)
+        known = np.flatnonzero(np.isfinite(np.column_stack([targets.position_m, ends, targets.time_s])).all(axis=1))
+        rows, factor, white = self._whitened
+        prior = prior_sd_db(self.model, parts) ** 2
         step = max(AT_ONCE * 3 // max(ends.shape[1], 3), 1)
-        for block, block_mean, block_sd in (self._exact if exact else self._nearest)(some, step, parts):
-            mean[places[block]], sd[places[block]] = block_mean, block_sd
+        for start in range(0, len(known), step):
+            block = known[start : start + step]
+            mean[block], explained = factor.condition(covariance(self.model, targets.part(block), rows, parts), white)
+            sd[block] = np.sqrt(np.maximum(prior - explained, 0.0))
         return mean, sd
 
-    def fits(self, targets: int) -> bool:
-        """Check whether the exact solution is used for this number of targets."""
-        return len(self.rows) <= _EXACT_ROWS and len(self.rows) ** 2 * float(targets) <= _EXACT_WORK
-
     @cached_property
-    def _whitened(self) -> tuple[Factor, FloatArray]:
-        """The factor of the covariance of the rows, and the values whitened by it."""
-        factor = Factor.of(_noisy(self.model, covariance(self.model, self.rows, self.rows)))
-        return factor, factor.whiten(np.zeros(len(self.rows)) if self.value_db is None else self.value_db)
-
-    def _exact(
-        self, targets: Rows, step: int, parts: Collection[Part]
-    ) -> Iterator[tuple[slice | IntArray, FloatArray, FloatArray]]:
-        factor, white = self._whitened
-        prior = prior_sd_db(self.model, parts) ** 2
-        for start in range(0, len(targets), step):
-            block = slice(start, start + step)
-            mean, explained = factor.condition(covariance(self.model, targets.part(block), self.rows, parts), white)
-            yield block, mean, np.sqrt(np.maximum(prior - explained, 0.0))
-
-    def _nearest(
-        self, targets: Rows, step: int, parts: Collection[Part]
-    ) -> Iterator[tuple[slice | IntArray, FloatArray, FloatArray]]:
-        from scipy.spatial import cKDTree
-
-        levels, level_sd = self._levels(targets, parts)
-        row_levels, row_sd = self._levels(self.rows, ("mean", "offset"))
-        value = np.zeros(len(self.rows)) if self.value_db is None else self.value_db - row_levels
-        near: list[Part] = ["place", "drift"]
-        near_parts = [part for part in near if part in parts]
-        # The mean and the offsets use all rows. The error of another flight's level does not affect the targets.
-        row_sd = row_sd * (np.isin(self.rows.flight, targets.flight) & bool(near_parts))
-        prior = prior_sd_db(self.model, near_parts) ** 2 if near_parts else 0.0
-        # with several headings, nearness cannot be measured by direction
-        turned = math.isfinite(self.model.turn) and targets.direction.ndim == 2
-        tree, places = cKDTree(self._scaled(self.rows, turned)), self._scaled(targets, turned)
-        for part, shared in _cells(places, step):
-            most = min(_NEAREST * len(part) ** (1 / 3), _MOST_NEAREST) if shared else _NEAREST
-            count = np.arange(1, min(round(most), len(self.rows)) + 1)
-            index = tree.query(places[part].mean(axis=0) if shared else places[part], k=count)[1]
-            rows, some, sd = self.rows.part(index), targets.part(part), row_sd[index]
-            # all residuals of a flight have the error of its level in common
-            common = sd[..., :, None] * sd[..., None, :] * (rows.flight[..., :, None] == rows.flight[..., None, :])
-            matrix = _noisy(self.model, covariance(self.model, rows, rows, near) + common)
-            own = level_sd[part][:, None] * sd * (some.flight[:, None] == rows.flight)
-            if shared:  # (targets, rows) of one set of rows
-                across = covariance(self.model, some, rows, near_parts) + own
-                weight = np.linalg.solve(matrix, across.T).T
-            else:  # a set of rows per target
-                across = covariance(self.model, some.part((slice(None), None)), rows, near_parts)[:, 0, :] + own
-                weight = np.linalg.solve(matrix, across[..., None])[..., 0]
-            variance = prior + level_sd[part] ** 2 - np.einsum("tm,tm->t", weight, across)
-            mean = levels[part] + np.einsum("tm,tm->t", weight, np.broadcast_to(value[index], weight.shape))
-            yield part, mean, np.sqrt(np.maximum(variance, 0.0))
-
-    def _scaled(self, rows: Rows, turned: bool) -> FloatArray:
-        """Return coordinates in which the correlation length of the field is 1, with or without the direction."""
-        m = self.model
-        place = rows.position_m / (m.length_m, m.length_m, m.height_m)
-        return np.column_stack([place, rows.direction / m.turn]) if turned else place
-
-    def _levels(self, targets: Rows, parts: Collection[Part]) -> tuple[FloatArray, FloatArray]:
-        """Return mean plus offset (m,) at targets from thinned rows, and its standard deviation (m,)."""
-        level_parts: list[Part] = [part for part in ("mean", "offset") if part in parts]  # type: ignore[misc]
-        out, sd = np.zeros((2, len(targets)))
-        if not level_parts:
-            return out, sd
-        thinned = spread_out(len(self.rows), _EXACT_ROWS // 2)
-        fit = FieldFit(self.model, self.rows.part(thinned), None if self.value_db is None else self.value_db[thinned])
-        _, first, member = np.unique(targets.flight, return_index=True, return_inverse=True)
-        mean_of, sd_of = fit.predict(targets.part(first), level_parts, exact=True)
-        return mean_of[member], sd_of[member]
-
-
-# Smallest number of targets in a cell that share rows. Sharing between fewer would not save time.
-FEWEST_TOGETHER = 8
-
-
-def _cells(places: FloatArray, step: int) -> Iterator[tuple[IntArray, bool]]:
-    """Yield the indices of at most ``step`` targets (n, k), and whether they share their rows.
-
-    Targets of cells with many targets come first, one cell at a time.
-    """
-    cell = np.floor(places / _TOGETHER).astype(np.int64)
-    _, member, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    member = member.ravel()
-    many = count[member] >= FEWEST_TOGETHER
-    order = np.flatnonzero(many)[np.argsort(member[many], kind="stable")]
-    for part in np.split(order, np.cumsum(count[count >= FEWEST_TOGETHER])[:-1]) if len(order) else ():
-        for start in range(0, len(part), step):
-            yield part[start : start + step], True
-    alone = np.flatnonzero(~many)
-    for start in range(0, len(alone), step):
-        yield alone[start : start + step], False
+    def _whitened(self) -> tuple[Rows, Factor, FloatArray]:
+        """The rows that are used, the factor of their covariance, and their values whitened by it."""
+        used = spread_out(len(self.rows), _MOST_ROWS)
+        rows = self.rows.part(used)
+        factor = Factor.of(_noisy(self.model, covariance(self.model, rows, rows)))
+        return rows, factor, factor.whiten(np.zeros(len(rows)) if self.value_db is None else self.value_db[used])
 
 
 def _noisy(model: FieldModel, matrix: FloatArray) -> FloatArray:
-    """Add the noise to the diagonal of a covariance (..., n, n), in place, and return it."""
-    count = matrix.shape[-1]
-    matrix[..., np.arange(count), np.arange(count)] += model.noise_sd_db**2
+    """Add the noise to the diagonal of a covariance (n, n), in place, and return it."""
+    matrix[np.diag_indices(len(matrix))] += model.noise_sd_db**2
     return matrix
 
 

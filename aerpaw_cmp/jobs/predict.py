@@ -369,8 +369,7 @@ def _best_model(
         bases.pop("none")
     correction = choose(samples, bases, STATED_FIELDS if beyond else ())
     used = learned.get(correction.base, ())
-    count = int(targets.known.sum())
-    return Flown(correction, sources, count, [item.trained_on for item in used], [item.marks for item in used])
+    return Flown(correction, sources, [item.trained_on for item in used], [item.marks for item in used])
 
 
 def _bases(

@@ -485,8 +485,6 @@ class Flown:
 
     correction: Correction
     sources: Mapping[str, Source]
-    targets: int
-    """Total number of predicted targets."""
     trained_on: Sequence[Sequence[str]] = ()
     """SHA-256 of the training data of its base, in addition to the named flights."""
     marks: Sequence[Sequence[str]] = ()
@@ -495,7 +493,7 @@ class Flown:
     def levels(self, each: Sequence[LinkSamples]) -> Levels:
         """Return levels at targets, averaged over the headings ``each``."""
         antenna = each[0].antenna
-        level, slow = self.correction.over_headings(each, all_targets=self.targets)
+        level, slow = self.correction.over_headings(each)
         guess = outside(each[0].position_m, self.sources[antenna].samples)
         # The offset of the residual field of a new flight is normally distributed. Its SD is estimated from the
         # differences between flights on all channels, because few differences determine it poorly.

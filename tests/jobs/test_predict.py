@@ -118,7 +118,7 @@ def test_the_offset_of_a_new_flight_is_students_as_in_the_memory(flights, channe
     monkeypatch.setattr(sources, "between_blocks_db", lambda _: 0.0)
     source = SimpleNamespace(samples=[s for s in samples for _ in range(2)])
     known = {"LW1.rss": source} | {f"LW{k}.rss": source for k in range(2, channels + 1)}
-    _, slow, _ = sources.Flown(field, known, 1).levels(samples[:1])
+    _, slow, _ = sources.Flown(field, known).levels(samples[:1])
     degrees = 2 + channels * (flights - 1)
     assert slow[0] * norm.ppf(0.95) == pytest.approx(student.ppf(0.95, degrees) * normal_db)
 
@@ -133,7 +133,7 @@ def test_errors_between_blocks_count_outside_the_flown_places_of_a_single_flight
         sd_factor=1.0, model=SimpleNamespace(offset_sd_db=0.0),
     )  # fmt: skip
     monkeypatch.setattr(sources, "between_blocks_db", lambda _: 3.0)
-    flown = sources.Flown(field, {"LW1.rss": SimpleNamespace(samples=samples)}, 1)
+    flown = sources.Flown(field, {"LW1.rss": SimpleNamespace(samples=samples)})
     near, far = (flown.levels([SimpleNamespace(antenna="LW1.rss", position_m=place)])[1][0] for place in (here, away))
     assert near == 2.0
     assert far == pytest.approx(np.hypot(2.0, wider_db))

@@ -101,7 +101,7 @@ COMMANDS = {
     "site import": "site import {}/map.json --base {}/site.yaml -o {}/imported.yaml",
     "site show": "site show {}/site.yaml -o {}/shown",
     "site export": "site export {}/site.yaml -o {}/exported",
-    "antenna export": "antenna export {}/=antenna.csv -o {}/antenna_out.csv",
+    "antenna export": "antenna export {}/=antenna.csv --carrier 3e9 -o {}/antenna_out.msi",
 }
 
 

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from ..common.content import marks, trained_on
-from ..common.errors import InputError, UsageError, about_file, parsed
+from ..common.errors import InputError, UsageError, parsed
 from ..common.files import LARGEST_TABLE, read_input
 from ..common.text import counted
 from ..common.units import FloatArray, power_from_db
 from .antennas import HIGHEST_DBI, NOT_GAIN, MeasuredPattern, check_power, read_pattern_text
-from .learned import BAND, SPHERE_COLUMNS, SpherePattern, planning_cuts, read_sphere_csv, sphere_csv, sphere_grid
+from .learned import BAND, SPHERE_COLUMNS, planning_cuts, read_sphere_csv, sphere_grid
 
 # Gain of a half-wave dipole over an isotropic antenna.
 _DBI_OF_DBD = 2.15
@@ -300,7 +300,7 @@ def _cut_file(path: Path, angles: tuple[str, ...]) -> FloatArray:
 
 
 def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: float | None = None) -> str:
-    """Return the text of a pattern in the format of a file ending: ``.py`` (Sionna RT), ``.msi``, ``.csv``.
+    """Return the text of a pattern in the format of a file ending: ``.py`` (Sionna RT) or ``.msi``.
 
     Comments contain the logs from which the pattern was learned.
 
@@ -329,16 +329,9 @@ def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: floa
             found = f"the pattern has {f'{frequency / 1e9:g} GHz' if frequency else 'no frequency'}"
             raise UsageError(found, expected="--carrier HZ, within 2 % of the pattern's own", path=target)
         return planning_cuts(pattern, name, frequency, lines)
-    theta, phi, _ = sphere_grid(STEP_DEG)
-    if target.suffix == ".csv":
-        with about_file(target):  # as the reader of spheres does: a sphere of two cuts may have too much power
-            check_power(pattern)
-        at = np.meshgrid(np.radians(theta), np.radians(phi), indexing="ij")
-        sd = pattern.gain_sd_db(*at) if isinstance(pattern, SpherePattern) else np.zeros(at[0].shape)
-        return sphere_csv(pattern.gain_dbi(*at), sd, lines)
     if target.suffix == ".py":
         return _sionna_module(pattern, name, target, lines)
-    raise UsageError(f"the ending {target.suffix!r}", expected=".py (Sionna RT), .msi or .csv", path=target)
+    raise UsageError(f"the ending {target.suffix!r}", expected=".py (Sionna RT) or .msi", path=target)
 
 
 def _sionna_module(pattern: MeasuredPattern, name: str, target: Path, notes: tuple[str, ...]) -> str:

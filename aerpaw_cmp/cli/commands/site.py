@@ -127,16 +127,16 @@ def site_show(
 @command(
     "export",
     of=antenna_app,
-    text="Convert a pattern to Sionna RT's custom pattern (.py), MSI Planet (.msi) or a table over the sphere (.csv).",
+    text="Convert a pattern to a custom pattern of Sionna RT (.py) or the two cuts of MSI Planet (.msi).",
     examples=[
         "aerpaw-cmp antenna export SA3300.txt -o sa3300.py",
         "aerpaw-cmp antenna export azimuth.csv --elevation elevation.csv --carrier 3.4e9 -o horn.msi",
-        "aerpaw-cmp antenna export rad_pat.mat --variable SA3300 -o sa3300.csv",
+        "aerpaw-cmp antenna export rad_pat.mat --variable SA3300 -o sa3300.py",
     ],
 )
 def antenna_export(
     file: Annotated[Path, Argument(help="Pattern: AERPAW text or .mat, MSI, a sphere .csv, an azimuth cut .csv")],
-    out: Annotated[Path, output("File to write: .py, .msi or .csv.", "FILE")],
+    out: Annotated[Path, output("File to write: .py or .msi.", "FILE")],
     elevation: Annotated[Path | None, Option(metavar="CSV", help="Elevation cut, if FILE is an azimuth cut.")] = None,
     variable: Annotated[str | None, Option(help="Name of the gain grid in a .mat file.")] = None,
     carrier: Annotated[

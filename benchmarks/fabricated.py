@@ -66,7 +66,7 @@ def season(flights: int = 200, settings: int = 20, towers: int = 5, channels: in
                 rows.append(_row((name, label, tower, channel), start, level, measured, position, with_samples))
     data = CampaignData(
         name="season", title=f"A season that was never flown: {flights} flights, {settings} settings",
-        generated="2026-11-21T00:00:00+00:00", versions={"numpy": np.__version__}, calibration="channel",
+        generated="2026-11-21T00:00:00+00:00", versions={"numpy": np.__version__},
         flights=tuple(names), settings={label: {"rt.max_depth": i % 4} for i, label in enumerate(labels)},
         rss=tuple(rows), failures=tuple(failures), site=site, synthetic=(),
     )  # fmt: skip

@@ -21,7 +21,7 @@ COMMANDS: dict[str, str] = {
     "ingest": "Read logs of any known format, account for every line, write a flight file.",
     "formats": "List the log formats that can be read, with a sample line of each.",
     "report": "Replay a flight, compare it with the measurement, and write the report.",
-    "campaign": "Compare many flights and settings: pooled offsets, held-out flights, repeatability.",
+    "campaign": "Compare many flights and settings: held-out errors, steps of offsets, repeatability.",
     "explain": "List every path of a link at one time: faces, angles, losses and total.",
     "diff": "Compare two reports of a flight: settings, inputs, numbers with intervals.",
     "calibrate": "Learn antennas from several flights and score them on held-out data.",

@@ -7,9 +7,7 @@ range is flagged, because it indicates an error and is not a result.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -175,53 +173,3 @@ def grid_offset(
     if not moments.n:
         return _NO_FIT
     return moments.fit_at(grid, nearest_offset(grid, moments.mean_db, step_db))
-
-
-Pooling = Literal["link", "tower", "channel", "flight", "all"]
-
-_GROUP: dict[str, tuple[int, ...]] = {"link": (0, 1, 2), "tower": (1,), "channel": (2,), "flight": (0,), "all": ()}
-
-
-def pooled_moments(
-    moments: Mapping[tuple[str, str, str], Moments],
-    per: Pooling = "link",
-    *,
-    span_db: tuple[float, float] = SPAN_DB,
-) -> dict[tuple[str, str, str], OffsetFit]:
-    """Fit one offset per link, tower, channel or flight, or a single one.
-
-    Parameters
-    ----------
-    moments : mapping of (flight, tower, channel) to Moments
-        Moments of all sequences.
-    per : {"link", "tower", "channel", "flight", "all"}
-        Group of sequences that share an offset.
-    span_db : (float, float)
-        Search range [dB].
-
-    Returns
-    -------
-    dict
-        By (flight, tower, channel): the shared offset, with RMSE and number of pairs of that sequence.
-
-    Notes
-    -----
-    The best shared offset is the mean difference over all pairs, rounded to the grid and limited to its range. For each
-    sequence, RMSE^2(o) = variance + (mean - o)^2.
-    """
-    axes, grid = _GROUP[per], offset_grid(span_db=span_db)
-    groups: dict[Hashable, list[tuple[str, str, str]]] = {}
-    for key in moments:
-        groups.setdefault(tuple(key[axis] for axis in axes), []).append(key)
-    fits: dict[tuple[str, str, str], OffsetFit] = {}
-    for members in groups.values():
-        filled = [moments[key] for key in members if moments[key].n]
-        if not filled:
-            fits |= dict.fromkeys(members, _NO_FIT)
-            continue
-        total = sum(item.n for item in filled)
-        # sum relative to the first mean, because sums of levels near -90 dB would be less accurate
-        mean = filled[0].mean_db + sum((item.mean_db - filled[0].mean_db) * (item.n / total) for item in filled)
-        best = nearest_offset(grid, mean)
-        fits |= {key: moments[key].fit_at(grid, best) for key in members}
-    return {key: fits[key] for key in moments}

@@ -4,8 +4,7 @@ A campaign.yaml names flight files and, optionally, settings: labels with overri
 (``rt.max_depth: 1``). Every setting runs on every flight. A flight that cannot be read is a row with its message.
 
 A task is one flight under one setting. Workers run tasks and return rows of numbers, which are stored. The rows of
-several flights determine pooled offsets, held-out errors, a ranking of settings, steps of offsets, and mean residuals
-by position.
+several flights determine held-out errors, a ranking of settings, steps of offsets, and mean residuals by position.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 from urllib.parse import quote
 
 import numpy as np
@@ -33,7 +32,6 @@ from ..common.units import FloatArray, finite_mean
 from ..common.versions import versions
 from ..common.yamlfile import StrictModel, load_yaml
 from ..compare import offset, verdict
-from ..compare.offset import Pooling, pooled_moments
 from ..compare.result import RankResult, RssResult
 from ..compare.statistics import Pass, PassPair, cell_means, pass_pairs
 from ..compare.verdict import NightOffsets, NodeOffset, node_offsets, stepped
@@ -48,7 +46,6 @@ from ..report.campaign import (
     CampaignData,
     CampaignSummary,
     Failure,
-    PooledOffset,
     RankRow,
     RankTransfer,
     Repeat,
@@ -384,7 +381,6 @@ class CampaignFile(StrictModel):
     soundings: list[str] = Field(default_factory=list)
     timezone: str | None = None  # time zone of soundings with local times
     settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
 
 
 def load_campaign(path: Path) -> CampaignFile:
@@ -431,7 +427,7 @@ def run(
     Returns
     -------
     CampaignData
-        Rows of every flight and setting, pooled offsets, repeats. ``failures`` has the flights that failed.
+        Rows of every flight and setting, and repeats. ``failures`` has the flights that failed.
 
     Raises
     ------
@@ -460,20 +456,18 @@ def run(
     rank = tuple(row for o in results for row in o.rank)
     failures += [o.failure for o in results if o.failure is not None]
     with stages("pool"):
-        rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
+        rows = [row for o in results for row in o.rss]
         repeated = repeats([r for r in rows if r.setting == next(iter(settings))])
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
     return CampaignData(
         name=campaign.campaign,
         title=campaign.title or campaign.campaign,
-        calibration=campaign.calibration,
         flights=tuple(dict.fromkeys([*files, *(f.flight for f in failures)])),
         settings=settings,
         rss=tuple(rows),
         rank=rank,
         rank_transfers=tuple(transfer_ranks(rank)),
         failures=tuple(failures),
-        pooled=tuple(pooled),
         repeats=tuple(repeated),
         site=flight_data(good[0]).site if good else None,
         synthetic=tuple(name for name, (_, f) in files.items() if f.flight.synthetic),
@@ -536,47 +530,7 @@ def _flight_files(
     return files, failures
 
 
-# --- numbers of several flights: shared offsets, repeatability, K chosen on the other flights ------------------------
-
-
-def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], list[PooledOffset]]:
-    """Return the rows with the shared offset of their setting and group, and the offsets by group."""
-    pooled_rows: list[RssRow] = []
-    groups: list[PooledOffset] = []
-    for setting in dict.fromkeys(row.setting for row in rows):
-        members, by_group = [row for row in rows if row.setting == setting], dict[str, list[RssRow]]()
-        span = (min(r.span_db[0] for r in members), max(r.span_db[1] for r in members))
-        fits = pooled_moments({row.key: row.moments for row in members}, per, span_db=span)
-        for row in members:
-            fit = fits[row.key]
-            row = dataclasses.replace(row, pooled_offset_db=fit.offset_db, pooled_rmse_db=fit.rmse_db)
-            pooled_rows.append(row)
-            by_group.setdefault(_group(row, per), []).append(row)
-        groups += [_pooled(setting, name, some, fits) for name, some in by_group.items()]
-    return pooled_rows, groups
-
-
-def _group(row: RssRow, per: Pooling) -> str:
-    joined = {"link": f"{row.flight} {row.link}", "all": "all"}
-    return joined[per] if per in joined else str(getattr(row, per))
-
-
-def _pooled(setting: str, name: str, rows: list[RssRow], fits: Mapping[Any, Any]) -> PooledOffset:
-    offsets_db = np.array([row.offset_db for row in rows])
-    offsets_db = offsets_db[np.isfinite(offsets_db)]
-    nan = float("nan")
-    return PooledOffset(
-        setting=setting,
-        group=name,
-        members=tuple(f"{row.flight} {row.link}" for row in rows),
-        offset_db=rows[0].pooled_offset_db,
-        spread_db=float(offsets_db.std(ddof=1)) if len(offsets_db) > 1 else nan,
-        range_db=(float(offsets_db.min()), float(offsets_db.max())) if len(offsets_db) else (nan, nan),
-        own_rmse_db=finite_mean([row.rmse_db for row in rows]),
-        pooled_rmse_db=finite_mean([row.pooled_rmse_db for row in rows]),
-        at_search_edge=any(fits[row.key].at_edge for row in rows),
-        units=tuple(dict.fromkeys(row.unit for row in rows)),
-    )
+# --- numbers of several flights: repeatability, K chosen on the other flights ----------------------------------------
 
 
 def repeats(rows: Sequence[RssRow]) -> list[Repeat]:
@@ -641,9 +595,6 @@ def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
     return out
 
 
-_QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
-
-
 def with_season(
     data: CampaignData, reports: Mapping[str, str] | None = None, sounded: Sequence[NodeOffset] = ()
 ) -> CampaignData:
@@ -664,15 +615,11 @@ def with_season(
     data = dataclasses.replace(data, rss=tuple(rows))
     started = _started_of(rows)
     order = sorted(data.flights, key=lambda name: (name not in started, started.get(name, 0)))
-    links, settings = list(dict.fromkeys(row.link for row in rows)), list(data.settings)
-    ranking = rank_settings(rows, settings, order, "")
-    for link in links if len(links) > 1 else ():
-        ranking += rank_settings([r for r in rows if r.link == link], settings, order, link)
     season = dataclasses.replace(
         season,
         held_out=any(np.isfinite(row.held_out_rmse_db) for row in rows),
         started={name: _iso(ns) for name, ns in started.items()},
-        ranking=tuple(ranking),
+        ranking=tuple(rank_settings(rows, list(data.settings), order)),
         nodes=season.nodes or _flown(data.reference_rows, order, started),
         places_db=_places_db(data.reference_rows, data.cell_m),
     )
@@ -715,17 +662,10 @@ def _held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
     return scored
 
 
-def _error_of(row: RssRow) -> float:
-    """Return the error by which settings are ranked [dB]: held-out, or its own RMSE if there is no other flight."""
-    return row.held_out_rmse_db if np.isfinite(row.held_out_rmse_db) else row.rmse_db
-
-
 # --- settings ---------------------------------------------------------------------------------------------------------
 
 
-def rank_settings(
-    rows: Iterable[RssRow], settings: Sequence[str], flights: Sequence[str], link: str
-) -> list[SettingRank]:
+def rank_settings(rows: Iterable[RssRow], settings: Sequence[str], flights: Sequence[str]) -> list[SettingRank]:
     """Rank settings by their mean error over flights, with their difference to the first on the same flights.
 
     Parameters
@@ -735,8 +675,6 @@ def rank_settings(
         Labels. Ties keep their order.
     flights : sequence of str
         Flights that are compared.
-    link : str
-        Link of the rows, which is stored in the result.
 
     Returns
     -------
@@ -745,8 +683,8 @@ def rank_settings(
     """
     table: dict[str, dict[str, dict[str, float]]] = {name: {} for name in settings}
     for row in rows:
-        if np.isfinite(_error_of(row)):
-            table[row.setting].setdefault(row.flight, {})[row.link] = _error_of(row)
+        if np.isfinite(row.error_db):
+            table[row.setting].setdefault(row.flight, {})[row.link] = row.error_db
     means = {name: np.array([np.mean(list(by.values())) for by in table[name].values()]) for name in settings}
     known = sorted((name for name in settings if len(means[name])), key=lambda name: float(means[name].mean()))
     choices = []
@@ -755,10 +693,9 @@ def rank_settings(
         choices.append(
             SettingRank(
                 setting=name,
-                link=link,
                 n_flights=len(means[name]),
                 mean_db=float(means[name].mean()),
-                quantiles_db=tuple(np.quantile(means[name], (0.0, *_QUANTILES, 1.0)).tolist()),
+                quantiles_db=tuple(np.quantile(means[name], (0.1, 0.5, 0.9)).tolist()),
                 difference_db=difference.mean,
                 difference_ci95_db=None if name == known[0] else (difference.low, difference.high),
                 n_paired=difference.n,

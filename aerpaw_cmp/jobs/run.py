@@ -491,7 +491,7 @@ def _compared(flight: Any, options: RunOptions, stages: Stages) -> Any:
 def run_campaign(
     path: Path, options: RunOptions = DEFAULT, *, keep: Path | None = None, fresh: bool = False
 ) -> JobOutcome:
-    """Replay and compare many flights under many settings, and write a page with pooled and held-out numbers.
+    """Replay and compare many flights under many settings, and write a page with held-out numbers.
 
     Parameters
     ----------

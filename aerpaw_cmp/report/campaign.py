@@ -18,7 +18,7 @@ from ..common.units import FloatArray
 from ..compare.level import LEARNED_HERE
 from ..compare.offset import Moments, difference_moments
 from ..compare.statistics import Interval
-from ..compare.verdict import NodeOffset, Step, Verdict, campaign_verdict, pooled_db
+from ..compare.verdict import NodeOffset, Verdict, campaign_verdict, pooled_db
 from ..site.site import Site
 from .canvas import mark
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, settings_card
@@ -26,17 +26,16 @@ from .charts import Chart
 from .flight_words import RANK_WORDS, first_sentence, pretty, ranking_sentence, said_of, signed
 from .page import Made, about, json_text, write_file
 from .places import RESIDUAL, Places, payload
-from .texts import interval, k_key, minute, more, number
+from .texts import k_key, minute, more, number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RssRow:
     """The RSS of one flight, setting, tower and channel.
 
-    ``offset_db`` and ``rmse_db`` are fitted to the samples of this row. ``pooled_offset_db`` is the common offset of
-    the row's group in ``calibration:``, and ``pooled_rmse_db`` the RMSE with this offset. ``held_out_offset_db`` is
-    fitted to the other flights with the same setting, tower and channel, and ``held_out_rmse_db`` is the RMSE with that
-    offset. Both are NaN if there is no other flight.
+    ``offset_db`` and ``rmse_db`` are fitted to the samples of this row. ``held_out_offset_db`` is fitted to the other
+    flights with the same setting, tower and channel, and ``held_out_rmse_db`` is the RMSE with that offset. Both are
+    NaN if there is no other flight.
 
     ``baselines`` contains the RMSE of each baseline with its own offset, by name [dB]. ``span_db`` is the search range
     of the offset. Arrays (n,) have one value per sample, NaN if measurement or simulation is missing. Only rows of the
@@ -70,8 +69,6 @@ class RssRow:
     start_ns: int = 0
     """First time [ns since 1970-01-01]."""
     difference: Moments | None = None
-    pooled_offset_db: float = float("nan")
-    pooled_rmse_db: float = float("nan")
     held_out_offset_db: float = float("nan")
     held_out_rmse_db: float = float("nan")
     logs: tuple[str, ...] = ()
@@ -89,6 +86,11 @@ class RssRow:
     def moments(self) -> Moments:
         """The moments of simulated minus measured level over the scored samples."""
         return self.difference or difference_moments(self.measured_db, self.simulated_dbm)
+
+    @property
+    def error_db(self) -> float:
+        """The error by which flights and settings are ordered [dB]: held out, or ``rmse_db`` without other flights."""
+        return self.held_out_rmse_db if np.isfinite(self.held_out_rmse_db) else self.rmse_db
 
     @property
     def link(self) -> str:
@@ -134,26 +136,6 @@ class Failure:
     setting: str
     message: str
     traceback: str = field(repr=False, default="")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PooledOffset:
-    """A common offset of several rows.
-
-    ``spread_db`` and ``range_db`` are standard deviation (NaN for one row) and range of the rows' own offsets.
-    ``own_rmse_db`` and ``pooled_rmse_db`` are means over the rows.
-    """
-
-    setting: str
-    group: str
-    members: tuple[str, ...]
-    offset_db: float
-    spread_db: float
-    range_db: Interval
-    own_rmse_db: float
-    pooled_rmse_db: float
-    at_search_edge: bool
-    units: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -224,15 +206,13 @@ class SettingRank:
     Parameters
     ----------
     setting : str
-    link : str
-        Tower and channel; empty for all links.
     n_flights : int
         Number of flights with an error under this setting.
     mean_db : float
         Mean over flights of the mean error over towers and channels [dB]. Errors are held out if there are several
         flights.
     quantiles_db : tuple of float
-        Quantiles of 0, 10, 25, 50, 75, 90 and 100 % over flights.
+        Quantiles of 10, 50 and 90 % over flights.
     difference_db, difference_ci95_db : float, Interval or None
         Mean over flights of the error minus that of the first setting on the same links, and its interval. The interval
         is None for the first setting.
@@ -243,7 +223,6 @@ class SettingRank:
     """
 
     setting: str
-    link: str
     n_flights: int
     mean_db: float
     quantiles_db: tuple[float, ...]
@@ -264,7 +243,7 @@ class CampaignSummary:
     started : mapping of str to str
         First time of each flight (UTC, ISO 8601); missing for logs with relative times.
     ranking : tuple of SettingRank
-        Rankings over all links and, if there are several links, for each link. The best setting is first.
+        Settings over all towers and channels, the best first.
     nodes : tuple of NodeOffset
         Offsets of nodes under the first setting, or from soundings between towers.
     places_db : mapping of (int, int) to float
@@ -281,10 +260,6 @@ class CampaignSummary:
     places_db: Mapping[tuple[int, int], float] = field(default_factory=dict)
     reports: Mapping[str, str] = field(default_factory=dict)
 
-    def over_all(self) -> tuple[SettingRank, ...]:
-        """The ranking over all towers and channels."""
-        return tuple(entry for entry in self.ranking if not entry.link)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignData(Made):
@@ -300,13 +275,11 @@ class CampaignData(Made):
 
     name: str
     title: str
-    calibration: str
     flights: tuple[str, ...]
     settings: Mapping[str, Mapping[str, Any]]
     rss: tuple[RssRow, ...] = ()
     rank: tuple[RankRow, ...] = ()
     failures: tuple[Failure, ...] = ()
-    pooled: tuple[PooledOffset, ...] = ()
     repeats: tuple[Repeat, ...] = ()
     rank_transfers: tuple[RankTransfer, ...] = ()
     site: Site | None = None
@@ -379,14 +352,6 @@ def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
 def headline(data: CampaignData) -> list[str]:
     """Return the result in a few sentences."""
     out = [*step_words(data), *_ranked_words(data)]
-    for setting in data.settings:
-        moved = [t for t in data.rank_transfers if t.setting == setting]
-        if moved:
-            out.append(
-                f"Rank, {setting}: at the K that the other flights select, the total variation is "
-                + ", ".join(f"{t.total_variation:.3f} on {t.flight} (K = {k_key(t.k)})" for t in moved)
-                + "."
-            )
     if pairs := [p for p in data.repeats if p.n > 0]:
         mean, share = np.mean([p.rmse_db for p in pairs]), 100 * np.mean([p.share for p in pairs])
         out.append(
@@ -423,7 +388,7 @@ def step_words(data: CampaignData) -> list[str]:
 
 def _ranked_words(data: CampaignData) -> list[str]:
     """Return sentences about the ranking by held-out error."""
-    ranking = data.season.over_all()
+    ranking = data.season.ranking
     if len(ranking) < 2 or not data.season.held_out:
         return []
     first = (
@@ -450,11 +415,6 @@ def warnings(data: CampaignData) -> list[str]:
         for pair in data.repeats
         if 0 < pair.share < _FEW_PAIRS
     ]
-    out += [
-        f"Pooled offset {group.group}: its members are in different units ({', '.join(group.units)})."
-        for group in data.pooled
-        if len(group.units) > 1
-    ]
     if data.synthetic:
         out.append("Simulated flights, which are not measurements: " + ", ".join(data.synthetic) + ".")
     return list(dict.fromkeys(out))
@@ -469,16 +429,12 @@ def edge_warnings(data: CampaignData) -> list[str]:
     ]
 
 
-def by_error(rows: Iterable[RssRow], name: str) -> list[tuple[str, float, str]]:
-    """Return flights by error, largest first: name, mean error over links [dB], worst link.
-
-    ``name`` is the field of the error. For rows without this error, the RMSE with their own offset is used.
-    """
+def by_error(rows: Iterable[RssRow]) -> list[tuple[str, float, str]]:
+    """Return flights by error (:attr:`RssRow.error_db`), largest first: name, mean over links [dB], worst link."""
     by: dict[str, list[tuple[float, str]]] = {}
     for row in rows:
-        error = getattr(row, name) if np.isfinite(getattr(row, name)) else row.rmse_db
-        if np.isfinite(error):
-            by.setdefault(row.flight, []).append((error, row.link))
+        if np.isfinite(row.error_db):
+            by.setdefault(row.flight, []).append((row.error_db, row.link))
     flights = [(name, float(np.mean([e for e, _ in of])), max(of)[1]) for name, of in by.items()]
     return sorted(flights, key=lambda entry: -entry[1])
 
@@ -498,7 +454,7 @@ def verdict(data: CampaignData) -> list[str]:
             f"Mean RMSE: {mean_own:.1f} dB with each flight's own offset, {np.mean(held_out):.1f} dB with the offset "
             f"of the other flights. Expect {np.mean(held_out):.1f} dB on a new flight."
         )
-    flight, error, link = by_error(rows, "rmse_db")[0]
+    flight, error, link = by_error(rows)[0]
     return [*out, said_of(cause(data), CAUSES, flight=flight, error=error, link=link)]
 
 
@@ -596,12 +552,9 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
         "mean_rmse_db": mean_rmse(data),
         "likely_cause": fields_of(cause(data)),
         "rss": _entries(data.rss, (*ARRAYS, "difference")),
-        "calibration": {"per": data.calibration, "groups": data.pooled},
         "repeatability": {
             "radius_m": data.radius_m, "heading_within_deg": data.heading_within_deg, "cell_m": data.cell_m,
-            "pairs_total": len(data.repeats),
             "links": by_link(data.repeats),
-            "pairs": telling(data.repeats),
             "table": _PAIR_TABLE if data.repeats else None,
         },
         "season": {
@@ -631,7 +584,7 @@ def _campaign_frame(data: CampaignData) -> pd.DataFrame:
 
 _CSV_COLUMNS = [
     "kind", "flight", "setting", "tower", "channel", "k", "offset_db", "offset_low_db", "offset_high_db", "rmse_db",
-    "rmse_low_db", "rmse_high_db", "free_space_rmse_db", "two_ray_rmse_db", "pooled_offset_db", "pooled_rmse_db", "n",
+    "rmse_low_db", "rmse_high_db", "free_space_rmse_db", "two_ray_rmse_db", "n",
     "n_out_of_coverage", "held_out_offset_db", "held_out_rmse_db", "correlation", "correlation_low", "correlation_high",
     "at_search_edge", "lag_s", "lag_verdict",
     "fitted", "total_variation", "total_variation_low", "total_variation_high", "agreement", "agreement_low",
@@ -643,23 +596,26 @@ _CSV_COLUMNS = [
 
 
 def result_card(data: CampaignData) -> Card:
-    """Return the card of the result: settings by error, flights with the largest error, and rank."""
-    tables = [_ranking(data), _worst(data), _mean_errors(data), _transfers(data)]
+    """Return the card of the result: settings by error, flights by error, and rank."""
+    tables = [_ranking(data), _flights(data), _transfers(data)]
     return Card(title="Result", id="result", link="Result", text=headline(data), tables=tables)
 
 
+def _offset_words(data: CampaignData) -> str:
+    return "the offset of the other flights" if data.season.held_out else "its own offset"
+
+
 def _ranking(data: CampaignData) -> Table:
-    offset = "the offset of the other flights" if data.season.held_out else "its own offset"
     return Table(
-        caption=f"Settings by their mean error over flights. Each flight is scored with {offset}.",
+        caption=f"Settings by their mean error over flights. Each flight is scored with {_offset_words(data)}.",
         columns={"Rank": 0, "Setting": HEAD, "Flights": 0, "Mean error [dB]": RIGHT, "Median [dB]": 1,
                  "10 % to 90 % [dB]": RIGHT, "Difference from the best setting [dB]": 2, "95 %": 2,
                  "Against the best": TEXT},
         rows=[
-            (place, r.setting, r.n_flights, bold(number(r.mean_db)), r.quantiles_db[3],
-             f"{number(r.quantiles_db[1])} to {number(r.quantiles_db[5])}", r.difference_db,
+            (place, r.setting, r.n_flights, bold(number(r.mean_db)), r.quantiles_db[1],
+             f"{number(r.quantiles_db[0])} to {number(r.quantiles_db[2])}", r.difference_db,
              r.difference_ci95_db or "", r.verdict)
-            for place, r in enumerate(data.season.over_all(), 1)
+            for place, r in enumerate(data.season.ranking, 1)
         ],
         notes=["The difference from the best setting is computed on the same flights, towers and channels, and its "
                "95 % interval over the flights. The best setting was selected on these flights, so expect a larger "
@@ -667,29 +623,23 @@ def _ranking(data: CampaignData) -> Table:
     )  # fmt: skip
 
 
-def _worst(data: CampaignData) -> Table:
-    season, reports, link = data.season, data.season.reports, Markup('<a href="{}">{}</a>')
-    first = next((r.setting for r in season.over_all()), "")
-    worst = by_error((row for row in data.rss if row.setting == first), "held_out_rmse_db")
-    few = f", {_FEW_FLIGHTS} of {len(worst)}" if len(worst) > _FEW_FLIGHTS else ""
+def _flights(data: CampaignData) -> Table:
+    """Return the flights by their error under the best setting, with their errors under the next settings."""
+    season, link = data.season, Markup('<a href="{}">{}</a>')
+    settings = [r.setting for r in season.ranking[:_FEW_SETTINGS]]
+    by = {name: by_error(row for row in data.rss if row.setting == name) for name in settings}
+    errors = {name: {flight: error for flight, error, _ in flights} for name, flights in by.items()}
+    worst = by[settings[0]] if settings else []
+    few = f", the {_FEW_FLIGHTS} largest of {len(worst)}" if len(worst) > _FEW_FLIGHTS else ""
     return Table(
-        caption=f"Flights with the largest error under “{first}”{few}.",
-        columns={"Flight": HEAD, "Start": "when", "Error [dB]": 1, "Worst link": TEXT},
+        caption="Flights by their error [dB], the mean over towers and channels. Each flight is scored with "
+        f"{_offset_words(data)}{few}.",
+        columns={"Flight": HEAD, "Start": "when", **dict.fromkeys(settings, 1), "Worst link": TEXT},
         rows=[
-            (link.format(reports[name], name) if name in reports else name, minute(season.started.get(name, "")),
-             error, at)
-            for name, error, at in worst[:_FEW_FLIGHTS]
+            (link.format(season.reports[flight], flight) if flight in season.reports else flight,
+             minute(season.started.get(flight, "")), *(errors[name].get(flight) for name in settings), at)
+            for flight, _, at in worst[:_FEW_FLIGHTS]
         ],
-    )  # fmt: skip
-
-
-def _mean_errors(data: CampaignData) -> Table:
-    flights = rss_flights(data)
-    shown = (data.rss or not data.rank) and 0 < len(flights) <= _FEW_FLIGHTS
-    return Table(
-        caption="Mean RMSE over towers and channels [dB], each with the offset fitted on its samples.",
-        columns={"Setting": HEAD, **dict.fromkeys(flights, 1)},
-        rows=[(setting, *(by[f] for f in flights)) for setting, by in mean_rmse(data).items()] if shown else [],
     )  # fmt: skip
 
 
@@ -707,19 +657,13 @@ def _transfers(data: CampaignData) -> Table:
 def season_card(data: CampaignData) -> Card:
     """Return the card of the campaign over time: offsets of nodes over the dates, and their steps."""
     table = Table(
-        caption="Steps of the offset of each node, with their dates and 95 % intervals.",
-        columns={"Node": HEAD, "Dates": 0, "Std. dev. [dB]": 1, "Detectable step [dB]": 1, "Steps": TEXT},
-        rows=[(n.node, len(n.night), n.sd_db, n.smallest_db, "; ".join(map(_step, n.steps)) or "none")
-              for n in data.season.nodes],
+        caption="Offsets of each node.",
+        columns={"Node": HEAD, "Dates": 0, "Std. dev. [dB]": 1, "Detectable step [dB]": 1, "Steps": 0},
+        rows=[(n.node, len(n.night), n.sd_db, n.smallest_db, len(n.steps)) for n in data.season.nodes],
         notes=["A detectable step is found on its first date with a probability of 90 %. campaign.json contains the "
                "offsets of all dates."],
     )  # fmt: skip
     return Card(title="Over the campaign", id="season", link="Over time", chart="season", parts=[Card(tables=[table])])
-
-
-def _step(step: Step) -> str:
-    back = f", back on {minute(step.back)}" if step.back else ""
-    return f"{minute(step.night)}: {signed(step.step_db)} dB ({interval(step.step_ci95_db)}){back}"
 
 
 def failures_card(data: CampaignData) -> Card:
@@ -732,30 +676,14 @@ def failures_card(data: CampaignData) -> Card:
     return Card(title="Failures", id="failures", link="Failures", tables=[table])
 
 
-def offsets_card(data: CampaignData) -> Card:
-    """Return the card of shared offsets, and of pairs of flights at the same positions."""
-    title = "Offsets and repeatability"
-    return Card(title=title, id="offsets", link="Offsets", fold=True, tables=[_pooled(data), _pairs(data)])
-
-
-def _pooled(data: CampaignData) -> Table:
-    return Table(
-        caption=f"One offset for all channels of a {data.calibration}, compared with an offset for each channel of "
-        f"each flight{more(data.pooled, ROWS_SHOWN)}.",
-        columns={"Setting": TEXT, "Group": HEAD, "Channels": 0, "Shared offset [dB]": RIGHT, "Own offsets [dB]": 1,
-                 "Std. dev. [dB]": 1, "RMSE, own offsets [dB]": 1, "RMSE, shared [dB]": 1},
-        rows=[(g.setting, g.group, len(g.members), number(g.offset_db) + (" (edge)" if g.at_search_edge else ""),
-               g.range_db, g.spread_db, g.own_rmse_db, g.pooled_rmse_db) for g in data.pooled[:ROWS_SHOWN]],
-    )  # fmt: skip
-
-
-def _pairs(data: CampaignData) -> Table:
+def repeats_card(data: CampaignData) -> Card:
+    """Return the card of pairs of flights at the same positions."""
     rmse = {row.key: row.rmse_db for row in data.reference_rows}
 
     def errors(pair: Repeat) -> str:
         return ", ".join(number(rmse.get((name, pair.tower, pair.channel))) for name in (pair.first, pair.second))
 
-    return Table(
+    pairs = Table(
         caption=f"Differences of two flights at the same positions{more(data.repeats, ROWS_SHOWN)}.",
         columns={"Link": HEAD, "Flights": TEXT, "Pairs": 0, "Share": SHARE, "Levels differ by [dB]": RIGHT, "95 %": 1,
                  "Error of one flight [dB]": 1, "Residuals differ by [dB]": 1, "RMSE of both [dB]": RIGHT,
@@ -773,6 +701,7 @@ def _pairs(data: CampaignData) -> Table:
                f"residuals in cells of {number(data.cell_m, 0, 'm')} over all heights. If their correlation is near 1, "
                "the model has the same errors on both flights."],
     )  # fmt: skip
+    return Card(title="Repeatability", id="repeats", link="Repeatability", fold=True, tables=[pairs])
 
 
 def rows_card(data: CampaignData) -> Card:
@@ -792,12 +721,12 @@ def _levels(data: CampaignData) -> Table:
         f"{few}.",
         columns={"Flight": HEAD, "Setting": TEXT, "Link": TEXT, "Offset [dB]": RIGHT, "RMSE [dB]": RIGHT, "95 %": 1,
                  "Held-out RMSE [dB]": 1, **{f"{pretty(name)} [dB]": 1 for name in models},
-                 "Against baselines (95 %)": TEXT, "RMSE, shared offset [dB]": 1, "Correlation": 2, "Samples": 0,
+                 "Against baselines (95 %)": TEXT, "Correlation": 2, "Samples": 0,
                  "Out of coverage": 0, "Clock": TEXT, "Fitted here": TEXT},
         rows=[
             (r.flight, r.setting, r.link, number(r.offset_db) + (" (edge)" if r.at_search_edge else ""),
              bold(number(r.rmse_db)), r.rmse_ci95_db or "", r.held_out_rmse_db,
-             *(r.baselines.get(name) for name in models), against_baselines(r), r.pooled_rmse_db, r.correlation, r.n,
+             *(r.baselines.get(name) for name in models), against_baselines(r), r.correlation, r.n,
              r.n_out_of_coverage, _clock(r),
              ", ".join(r.fitted))
             for r in rows
@@ -836,7 +765,7 @@ def settings_of(data: CampaignData, files: Sequence[str]) -> Card:
 
 
 # Cards in the order of the page, after its chart and map. A new card is another function here.
-CARDS = (failures_card, offsets_card, rows_card)
+CARDS = (failures_card, repeats_card, rows_card)
 
 
 def campaign_page(data: CampaignData, files: Sequence[str]) -> str:
@@ -865,8 +794,7 @@ def campaign_page(data: CampaignData, files: Sequence[str]) -> str:
 def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     """Write ``campaign.html``, ``campaign.json`` and the tables. Return the files, the page first.
 
-    ``pairs.csv`` contains all pairs of flights at the same positions. campaign.json contains only the pairs with the
-    most common samples.
+    ``pairs.csv`` contains the pairs of flights at the same positions, and campaign.json their numbers per channel.
     """
     folder = Path(folder)
     indent = 2 if len(data.rss) + len(data.rank) < _COMPACT_ROWS else None
@@ -885,17 +813,8 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
 
 # --- pairs of flights at the same positions ---------------------------------------------------------------------------
 
-# Largest number of pairs of flights in campaign.json.
-LISTED_PAIRS = 1000
-
 # File with all pairs.
 _PAIR_TABLE = "pairs.csv"
-
-
-def telling(pairs: Sequence[Repeat], most: int = LISTED_PAIRS) -> list[Repeat]:
-    """Return the ``most`` pairs of flights with the most pairs of samples, in their order."""
-    chosen = sorted(range(len(pairs)), key=lambda i: (-pairs[i].n, i))[:most]
-    return [pairs[i] for i in sorted(chosen)]
 
 
 def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:

@@ -13,15 +13,9 @@ from aerpaw_cmp.compare.offset import (
     grid_offset,
     nearest_offset,
     offset_grid,
-    pooled_moments,
 )
 
 tenths = st.integers(-2000, 2000).map(lambda k: k / 100)
-
-
-def pooled_offsets(pairs, per="link"):
-    """One offset for all sequences of a group."""
-    return pooled_moments({key: difference_moments(*levels) for key, levels in pairs.items()}, per)
 
 
 def closed_form(difference: np.ndarray) -> float:
@@ -88,52 +82,12 @@ def test_every_fit_tells_the_edge_of_its_grid(difference):
     edge = abs(difference) == 50.0
     measured, simulated = np.zeros(10), np.full(10, difference) + np.tile([-0.01, 0.01], 5)
     assert grid_offset(measured, simulated).at_edge == edge
-    (shared,) = pooled_offsets({("f", "t", "c"): (measured, simulated)}, "all").values()
-    assert (shared.at_edge, shared.offset_db) == (edge, difference)
 
 
 def test_nothing_known_is_no_number_and_no_edge():
-    for fit in (
-        grid_offset([NAN], [1.0]),
-        *pooled_offsets({("f", "t", "c"): ([NAN], [1.0])}).values(),
-    ):
-        assert np.isnan([fit.offset_db, fit.rmse_db]).all()
-        assert (fit.n, fit.at_edge) == (0, False)
-
-
-@pytest.mark.parametrize(
-    ("per", "axes"), [("link", (0, 1, 2)), ("tower", (1,)), ("channel", (2,)), ("flight", (0,)), ("all", ())]
-)
-def test_pooled_offsets_are_those_of_all_pairs_of_the_group(per, axes):
-    rng = np.random.default_rng(4)
-    pairs = {
-        (f, t, c): (rng.normal(-60, 3, n), rng.normal(-55, 3, n) + 3 * i)
-        for i, (f, t, c, n) in enumerate(
-            [("f1", "A", "x", 7), ("f1", "A", "y", 3), ("f1", "B", "x", 11), ("f2", "A", "x", 5), ("f2", "B", "y", 2)]
-        )
-    }
-    pairs = {("f0", "C", "z"): ([NAN], [0.0]), **pairs, ("f2", "B", "x"): ([NAN], [0.0])}
-    fits = pooled_offsets(pairs, per)
-    assert list(fits) == list(pairs)
-    for key, (measured, simulated) in pairs.items():
-        mates = [p for k, p in pairs.items() if [k[a] for a in axes] == [key[a] for a in axes]]
-        together = grid_offset(np.concatenate([m for m, _ in mates]), np.concatenate([s for _, s in mates]))
-        fit = fits[key]
-        if np.isnan(together.offset_db):
-            assert np.isnan(fit.offset_db)
-            continue
-        assert fit.offset_db == together.offset_db
-        assert fit.at_edge == together.at_edge
-        if np.isfinite(measured).any():
-            assert fit.rmse_db == pytest.approx(
-                float(np.sqrt(np.mean((np.asarray(measured) + fit.offset_db - simulated) ** 2)))
-            )
-            assert fit.n == len(measured)
-        else:
-            assert (fit.n, np.isnan(fit.rmse_db)) == (0, True)
-    moments = {key: difference_moments(*levels) for key, levels in pairs.items()}
-    again = pooled_moments(moments, per)
-    assert str(again) == str(fits)
+    fit = grid_offset([NAN], [1.0])
+    assert np.isnan([fit.offset_db, fit.rmse_db]).all()
+    assert (fit.n, fit.at_edge) == (0, False)
 
 
 def test_the_rmse_at_other_offsets():

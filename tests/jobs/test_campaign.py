@@ -1,4 +1,4 @@
-"""Campaigns: many flights and settings, pooled offsets, held-out fits, repeatability, failures as rows."""
+"""Campaigns: many flights and settings, held-out fits, repeatability, failures as rows."""
 
 import csv
 import dataclasses
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
@@ -17,14 +18,14 @@ from aerpaw_cmp.jobs.campaign import (
     digest_of,
     fitted_to,
     load_campaign,
-    pool_offsets,
     repeats,
     run,
     transfer_ranks,
+    with_season,
 )
 from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.jobs.tasks import OutcomeStore
-from aerpaw_cmp.report.campaign import RankRow
+from aerpaw_cmp.report.campaign import CampaignData, RankRow
 from tests.jobs.campaign_rows import rss_row
 from tests.json_page import unlisted
 from tests.simulated import planned, simulate, write_yaml
@@ -70,14 +71,14 @@ def result(folder: Path, name: str, *arguments: str, code: int = 0, **keys: Any)
 
 @pytest.fixture(scope="module")
 def summary(folder: Path) -> dict[str, Any]:
-    """One campaign with everything: two settings, shared offsets, a flight that is broken."""
+    """One campaign with everything: two settings, and a flight that is broken."""
     broken = flight_settings("first", 1, 0.0)
     broken["flight"] = {"name": "broken"}
     broken["logs"][1]["path"] = "gone/<b>USRP1.txt"
     write_yaml(folder / "broken.yaml", broken)
     return result(
         folder, "whole", flights=["first.yaml", "second.yaml", "broken.yaml", "missing.yaml"],
-        settings={"as written": {}, "right azimuth": {YAW: YAW_DEG}}, calibration="channel", code=1,
+        settings={"as written": {}, "right azimuth": {YAW: YAW_DEG}}, code=1,
     )  # fmt: skip
 
 
@@ -91,25 +92,18 @@ def test_settings_are_run_on_every_flight(summary: dict[str, Any]) -> None:
     assert len(keys) == len(summary["rss"]) == 8
 
 
-def test_offsets_are_shared_per_channel(summary: dict[str, Any]) -> None:
-    groups = {g["group"]: g for g in summary["calibration"]["groups"] if g["setting"] == "right azimuth"}
-    assert set(groups) == {"USRP1", "USRP2"}
-    mean = np.mean(list(OFFSETS_DB.values()))
-    assert groups["USRP1"]["offset_db"] == pytest.approx(mean, abs=0.3)
-    assert groups["USRP2"]["offset_db"] == pytest.approx(mean - 1.0, abs=0.3)
-    apart = OFFSETS_DB["first"] - OFFSETS_DB["second"]
-    assert groups["USRP1"]["spread_db"] == pytest.approx(apart / np.sqrt(2), abs=0.3)
-    assert groups["USRP1"]["pooled_rmse_db"] == pytest.approx(np.hypot(FADING_DB, apart / 2), abs=0.3)
-
-
-def test_one_route_flown_twice_repeats_to_the_fading_of_both(summary: dict[str, Any]) -> None:
+def test_one_route_flown_twice_repeats_to_the_fading_of_both(summary: dict[str, Any], folder: Path) -> None:
     """The model has a wrong azimuth, so both flights have the same errors at each position."""
-    pairs = summary["repeatability"]["pairs"]
-    assert [(p["first"], p["second"], p["channel"]) for p in pairs] == [
-        ("first", "second", "USRP1"),
-        ("first", "second", "USRP2"),
+    pairs = pd.read_csv(folder / "whole_out" / "pairs.csv")
+    assert pairs[["first", "second", "channel"]].to_numpy().tolist() == [
+        ["first", "second", "USRP1"],
+        ["first", "second", "USRP2"],
     ]
-    for pair in pairs:
+    assert [(link["channel"], link["meeting"]) for link in summary["repeatability"]["links"]] == [
+        ("USRP1", 1),
+        ("USRP2", 1),
+    ]
+    for _, pair in pairs.iterrows():
         assert pair["share"] > 0.9
         assert pair["rmse_db"] == pytest.approx(FADING_DB * np.sqrt(2), abs=0.35)
         assert pair["single_db"] == pytest.approx(pair["rmse_db"] / np.sqrt(2))
@@ -126,7 +120,7 @@ def test_broken_flights_are_rows_with_their_message(summary: dict[str, Any], fol
     with (folder / "whole_out" / "campaign.csv").open(encoding="utf-8", newline="") as handle:
         rows = list(csv.DictReader(handle))
     assert [r["kind"] for r in rows].count("rss") == 8
-    ranking = [entry for entry in summary["season"]["ranking"] if not entry["link"]]
+    ranking = summary["season"]["ranking"]
     best = ranking[0]["setting"]
     errors = [float(r["held_out_rmse_db"]) for r in rows if r["kind"] == "rss" and r["setting"] == best]
     assert sum(errors) / len(errors) == pytest.approx(ranking[0]["mean_db"])
@@ -183,7 +177,7 @@ def test_json_is_alone_on_standard_output(folder: Path, capsys: pytest.CaptureFi
     printed = json.loads(capsys.readouterr().out)
     assert unlisted("campaign", printed) == []
     assert printed["rss"] == written["rss"]
-    assert printed["repeatability"]["pairs"] == []
+    assert printed["repeatability"]["links"] == []
 
 
 @pytest.mark.parametrize(
@@ -195,7 +189,7 @@ def test_json_is_alone_on_standard_output(folder: Path, capsys: pytest.CaptureFi
         ({"settings": {"x": {"link.rss.towr.yaw_deg": 10}}}, "tower"),
         ({"settigns": {}}, "did you mean 'settings'"),
         ({"flights": ["first.yaml", "first.yaml"]}, "two flights are named 'first'"),
-        ({"calibratoin": "all"}, "calibration"),
+        ({"calibration": "all"}, "calibration"),
     ],
 )
 def test_mistakes_in_the_file_are_usage_errors(
@@ -216,30 +210,6 @@ def test_a_cluster_needs_distributed(
     for option in ("--cluster", "--scheduler"):
         assert main(["campaign", str(path), "-o", str(folder / "c"), "--fresh", option, "tcp://127.0.0.1:1"]) == 2
         assert "pip install 'aerpaw-cmp[cluster]'" in capsys.readouterr().err
-
-
-def test_shared_offsets_have_their_closed_form() -> None:
-    """The least squares of everything in a group is the mean difference over its samples, not over its flights."""
-    rows = [
-        rss_row("a", "USRP1", [0.0, 0.0, 0.0], [3.0, 3.0, 3.0]),
-        rss_row("b", "USRP1", [0.0, np.nan], [7.0, 100.0], unit="dB re full scale"),
-        rss_row("b", "USRP2", [1.0, 1.0], [0.0, 0.0]),
-    ]
-    done, groups = pool_offsets(rows, "channel")
-    assert [g.group for g in groups] == ["USRP1", "USRP2"]
-    assert [r.pooled_offset_db for r in done] == [4.0, 4.0, -1.0]  # (3 * 3 + 7) / 4
-    assert [r.pooled_rmse_db for r in done] == [1.0, 3.0, 0.0]
-    assert groups[0].pooled_rmse_db == 2.0
-    assert groups[0].range_db == (3.0, 7.0)
-    assert groups[0].spread_db == pytest.approx(np.sqrt(8.0))
-    assert groups[0].units == ("dBm", "dB re full scale")
-    everything, (group,) = pool_offsets(rows, "all")
-    assert group.offset_db == 2.3  # 14 / 6 on the grid of 0.1 dB
-    assert len({r.pooled_offset_db for r in everything}) == 1
-    own, single = pool_offsets(rows, "link")
-    assert [r.pooled_offset_db for r in own] == [3.0, 7.0, -1.0]
-    assert len(single) == 3
-    assert np.isnan(single[0].spread_db)
 
 
 def test_repeatability_is_the_noise_of_both_flights_after_one_constant() -> None:
@@ -306,9 +276,9 @@ def test_an_offset_at_the_end_of_its_range_is_a_failed_check(folder: Path, capsy
 
 def test_flights_without_a_sample_that_counts_give_no_number_and_end_nothing(folder: Path) -> None:
     settings = {"as written": {}, "high": {"rss.minimum_height_m": 500}}
-    campaign = result(folder, "too_low", "--strict", settings=settings, calibration="all")
+    campaign = result(folder, "too_low", "--strict", settings=settings)
     rows = [r for r in campaign["rss"] if r["setting"] == "high"]
-    assert [(r["n"], r["offset_db"], r["pooled_rmse_db"]) for r in rows] == [(0, None, None)] * 4
+    assert [(r["n"], r["offset_db"], r["rmse_db"]) for r in rows] == [(0, None, None)] * 4
     assert campaign["mean_rmse_db"]["high"] == {"first": None, "second": None}
     assert campaign["mean_rmse_db"]["as written"]["first"] > 4.0
 
@@ -386,22 +356,23 @@ def test_a_failed_task_leaves_its_traceback_in_a_file(folder: Path) -> None:
 
 
 def test_many_settings_are_held_in_the_memory_of_one() -> None:
-    """Only the first setting keeps its sample series. Shared offsets of the other settings come from moments."""
-    rng, n = np.random.default_rng(3), 5000
+    """Only the first setting keeps its sample series. Held-out errors of the other settings come from moments."""
+    rng, n, names = np.random.default_rng(3), 5000, [f"s{number}" for number in range(40)]
     every, held = [], []
-    for number in range(40):
-        simulated = np.where(np.arange(n) % 7, rng.normal(-58, 3, n), np.nan)
-        row = rss_row("f", "USRP0", rng.normal(-60, 3, n), simulated, heading_deg=rng.normal(90.0, 5.0, n))
-        every.append(dataclasses.replace(row, setting=f"s{number}"))
-        task = Task(Path("f.yaml"), "f", f"s{number}", {}, None, reference=number == 0)
-        held.append(fitted_to(task, Outcome(rss=(row,))).rss[0])
+    for flight in ("f", "g"):
+        for name in names:
+            simulated = np.where(np.arange(n) % 7, rng.normal(-58, 3, n), np.nan)
+            measured = rng.normal(-60, 3, n)
+            fit = {"rmse_db": np.nanstd(simulated - measured), "heading_deg": rng.normal(90.0, 5.0, n)}
+            row = rss_row(flight, "USRP0", measured, simulated, **fit)
+            every.append(dataclasses.replace(row, setting=name))
+            task = Task(Path("f.yaml"), flight, name, {}, None, reference=name == "s0")
+            held.append(fitted_to(task, Outcome(rss=(row,))).rss[0])
     values = [getattr(row, field.name) for row in held for field in dataclasses.fields(row)]
     arrays = {id(value): value.nbytes for value in values if isinstance(value, np.ndarray)}
-    assert sum(arrays.values()) < 16 * 8 * n  # for one setting: at most sixteen numbers per sample
-    done, groups = pool_offsets(held, "tower")
-    pooled, same = pool_offsets(every, "tower")
-    for a, b in zip(done, pooled, strict=True):
-        assert (a.pooled_offset_db, a.pooled_rmse_db) == (b.pooled_offset_db, b.pooled_rmse_db)
+    assert sum(arrays.values()) < 2 * 16 * 8 * n  # for one setting: at most sixteen numbers per sample of each flight
+    data = CampaignData(name="c", title="c", flights=("f", "g"), settings={name: {} for name in names}, rss=tuple(held))
+    for a, b in zip(with_season(data).rss, every, strict=True):
         difference = b.simulated_dbm - b.measured_db
-        assert a.pooled_rmse_db == pytest.approx(np.sqrt(np.nanmean((difference - a.pooled_offset_db) ** 2)), rel=1e-12)
-    assert repr(groups) == repr(same)
+        rmse = np.sqrt(np.nanmean((difference - a.held_out_offset_db) ** 2))
+        assert a.held_out_rmse_db == pytest.approx(rmse, rel=1e-9)

@@ -31,7 +31,7 @@ def test_held_out_errors_are_those_of_the_offset_of_the_others(data):
 
 
 def test_the_best_setting_stands_first_and_the_rest_by_flights_of_both(data):
-    ranking = data.season.over_all()
+    ranking = data.season.ranking
     assert ranking[0].setting == "setting 02"
     assert ranking[-1].setting == "setting 00"
     first = {(r.flight, r.link): r.held_out_rmse_db for r in data.rss if r.setting == "setting 02"}
@@ -44,13 +44,13 @@ def test_the_best_setting_stands_first_and_the_rest_by_flights_of_both(data):
     low, high = ranking[-1].difference_ci95_db
     assert 0 < low < ranking[-1].difference_db < high
     assert ranking[-1].verdict == "worse"
-    assert {r.link for r in data.season.ranking} == {"", "LW1 USRP1", "LW1 USRP2", "LW2 USRP1", "LW2 USRP2"}
+    assert len(ranking) == len(data.settings)
 
 
 def test_settings_that_share_no_flight_have_no_difference(data):
     early = [r for r in data.rss if r.setting == "setting 01" and r.flight < "flight_012"]
     rows = early + [r for r in data.rss if r.setting == "setting 02" and r.flight >= "flight_012"]
-    ranking = rank_settings(rows, ["setting 01", "setting 02"], data.flights, "")
+    ranking = rank_settings(rows, ["setting 01", "setting 02"], data.flights)
     assert np.isnan(ranking[1].difference_db)
     assert ranking[1].verdict == "no interval"
 
@@ -75,7 +75,7 @@ def test_one_flight_has_its_own_errors_only(data):
     )
     assert not alone.season.held_out
     assert all(np.isnan(r.held_out_rmse_db) for r in alone.rss)
-    assert alone.season.over_all()[0].mean_db > 0
+    assert alone.season.ranking[0].mean_db > 0
 
 
 def test_relative_clocks_have_no_date(data):

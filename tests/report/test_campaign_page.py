@@ -1,7 +1,6 @@
 """campaign.html for a large campaign: its content, what only the files contain, and its size."""
 
 import dataclasses
-import json
 import re
 
 import numpy as np
@@ -96,24 +95,13 @@ def many_pairs(count):
         )  # fmt: skip
 
 
-def test_campaign_json_has_the_telling_pairs_and_a_file_has_all(data, tmp_path):
+def test_campaign_json_has_the_numbers_of_pairs_by_channel_and_a_file_has_all(data):
     season = dataclasses.replace(data, repeats=tuple(many_pairs(30_000)))
     repeatability = campaign_html.campaign_metrics(season)["repeatability"]
-    assert repeatability["pairs_total"] == 30_000
-    assert len(repeatability["pairs"]) == campaign_html.LISTED_PAIRS
-    assert len(json.dumps(repeatability)) < 600_000
-    listed = {pair["first"] for pair in repeatability["pairs"]}
-    most = sorted(season.repeats, key=lambda pair: -pair.n)[: campaign_html.LISTED_PAIRS]
-    assert listed == {pair.first for pair in most}
     link = repeatability["links"][0]
     met = [pair for pair in season.repeats if pair.tower == link["tower"] and pair.n]
     assert (link["pairs"], link["meeting"], link["n"]) == (15_000, len(met), sum(pair.n for pair in met))
     assert link["rmse_quantiles_db"]["50"] == pytest.approx(np.median([pair.rmse_db for pair in met]))
-
-    few = dataclasses.replace(data, repeats=season.repeats[:40])
-    assert [p["first"] for p in campaign_html.campaign_metrics(few)["repeatability"]["pairs"]] == [
-        pair.first for pair in few.repeats
-    ]
     table = pd.DataFrame(map(campaign_html.cells, season.repeats))
     assert table["n"].tolist() == [pair.n for pair in season.repeats]
     assert table["rmse_low_db"].notna().sum() == 20_000

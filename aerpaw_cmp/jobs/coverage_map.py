@@ -58,7 +58,6 @@ from ..propagation.geometry import Link, PathSet, Poses, linear_array, single_el
 from ..propagation.options import Run, Search
 from ..propagation.replay import Replay, replay
 from ..report import maps as page
-from ..report.flight_data import ReportData
 from ..report.prediction import outside_share
 from ..site.site import Site
 from ..site.siteyaml import inputs_of_site, load_site, site_model
@@ -415,7 +414,6 @@ class MapOutcome:
     tiles: dict[str, Any] = field(default_factory=dict)
     store: TileStore | None = None
     corrected: CorrectedMaps | None = None
-    flights: tuple[ReportData, ...] = ()
 
     @property
     def shown(self) -> job.MapResult:
@@ -541,7 +539,7 @@ def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[
     work = f"{counted(math.prod(sides.values()), 'link')}: {', '.join(counted(n, name) for name, n in sides.items())}"
     stages = {
         "maps": work + (f", in tiles of {tile} x {tile} positions" if tile else ""),
-        "correct, compare": counted(len(flights), "flight") if flights else "",
+        "correct": counted(len(flights), "flight") if flights else "",
         "study": "correlation and interpolation" if settings.study and not tile else "",
         "export, page": f"layers of {counted(len(settings.foliage), 'foliage mode')}",
     }
@@ -630,7 +628,6 @@ def maps_record(
         rss=rss,
         corrected=() if flown is None else tuple(flown.rss_maps(result.grid)),
         corrected_rank=tuple(_rank_versions(outcome)),
-        flights=outcome.flights,
         flown_m=() if flown is None else tuple(line.T for line in flown.prediction.flown.values()),
         outside_flown=0.0 if flown is None else outside_share(flown.prediction.table),
         budget="" if s.budget == PAPER_BUDGET else f"{s.budget.sentence()} ",

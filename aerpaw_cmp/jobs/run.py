@@ -14,7 +14,7 @@ from typing import Any
 from ..common.errors import UsageError, noting_interrupts
 from ..common.files import cache_folder
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
-from ..common.stages import PlannedStage, Stages
+from ..common.stages import PlannedStage
 from ..common.text import counted
 from ..common.yamlfile import input_files
 from .options import AGAINST_DISTANCE_M, DEFAULT, JobOutcome, RunOptions
@@ -464,8 +464,6 @@ def run_map(
             outcome.corrected = corrected_maps(site, settings.spacing_m, heights, known, options.logs_root, stages)
         if outcome.settings.study:
             mapping.study_maps(outcome, stages)
-        # after the maps, so that their errors are reported before minutes of replay
-        outcome.flights = tuple(_compared(flight, options, stages) for flight in known)
         with output.filling() as part:
             with stages("export"):
                 files = mapping.export_maps(outcome, part, progress)
@@ -477,15 +475,6 @@ def run_map(
         if outcome.store is not None:
             outcome.store.remove()
         return JobOutcome(folder=folder, metrics=maps_metrics(record), files=output.placed([*written, *files]))
-
-
-def _compared(flight: Any, options: RunOptions, stages: Stages) -> Any:
-    """Replay and compare a flight, for the figures of a map."""
-    from ..report.flight_data import report_data
-    from .flight_run import run_flight
-
-    data = flight.load(options.logs_root)
-    return report_data(data, run_flight(data, stages, audit=False).result)
 
 
 def run_campaign(

@@ -17,7 +17,6 @@ from ..common.units import AnyArray
 from ..compare.ladder import ModelRow, distinct
 from ..compare.level import DetectionScore, ServingComparison
 from ..compare.result import RankResult
-from ..logs.records import has_wall_clock
 from .canvas import draw_marks, mark, seconds_since, subplots
 from .flight_data import RANKS, ReportData, start_of
 from .flight_words import AS_SET, learned_on
@@ -105,24 +104,6 @@ def _errors(models: Sequence[ModelRow]) -> dict[str, Any]:
     names = [f"{number}  {row.model}" for number, row in enumerate(models, 1)]
     chosen = next((i for i, row in of if row.recommended), -1)
     return {"rows": names, "chosen": chosen, "x": {"label": "RMSE on held-out areas [dB]"}, "marks": [dots]}
-
-
-def level_charts(data: ReportData) -> list[Chart]:
-    """Return charts of measured and simulated levels over time, one per channel of a flight, for the page of a map."""
-    start, caption = start_of(data), "Ray tracing is drawn minus the offset of the channel."
-    clock = {"label": "", "start": str(start.astype("datetime64[ms]"))}
-    axis = clock if has_wall_clock(start) else {"label": "Time after the first sample [s]", "start": ""}
-    return [
-        Chart(section="flights", title=f"{data.flight}, {panel.name}", caption=caption, content={
-            "x": axis, "y": {"label": f"RSS [{panel.unit}]"},
-            "marks": [
-                mark("dots", "measured", seconds_since(panel.time, start), panel.measured_db),
-                mark("line", "ray tracing", seconds_since(panel.time, start),
-                     panel.simulated_dbm - panel.score.offset_db),
-            ],
-        })
-        for panel in data.rss if panel.score.n
-    ]  # fmt: skip
 
 
 def _detection(score: DetectionScore) -> dict[str, Any]:

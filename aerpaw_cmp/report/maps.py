@@ -21,21 +21,20 @@ from ..common.geodesy import SiteFrame
 from ..common.jsonable import json_object, json_safe
 from ..common.kml import CLASS_COLOURS
 from ..common.text import counted
-from ..common.units import FloatArray, spread_out
+from ..common.units import FloatArray, finite_mean, spread_out
 from ..compare.verdict import Coverage, coverage_verdict
 from ..maps.evaluate import TREATMENTS
 from ..maps.grid import JOINT, PAPER_SPACING_M, RANK_CLASSES, Layer
 from ..maps.variogram import BiExponential, BinnedCorrelation
 from ..site.site import Site
 from .canvas import FigureSpec, beyond, colour_bar, draw_areas, draw_tower, mark, subplots
-from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, bold, paragraph, settings_card
-from .charts import Chart, chart_figure, level_charts
-from .flight_data import RANKS, ReportData
-from .flight_figures import channel_specs
+from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, paragraph, settings_card
+from .charts import Chart, chart_figure
+from .flight_data import RANKS
 from .flight_words import said_of
 from .packed import NONE, PackedArrays, ends_of_scale, listed, packed, plan_of, step_for
 from .page import Made, about, json_text, merge, write_figures, write_file
-from .texts import k_key, minute, number, percent, safe_name
+from .texts import k_key, minute, percent, safe_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -120,8 +119,6 @@ class MapsData(Made):
         Summary of the prediction with which levels were corrected.
     budget : str
         Sentence with power, noise floor and threshold, if they differ from the paper.
-    flights : tuple of ReportData
-        Flights of ``--with``, after replay and comparison.
     layers : tuple of Layer
         Layers other than RSS and rank.
     correlation : mapping of str to (BinnedCorrelation, BiExponential)
@@ -143,7 +140,6 @@ class MapsData(Made):
     outside_flown: float = 0.0
     corrected_words: str = ""
     budget: str = ""
-    flights: tuple[ReportData, ...] = ()
     rank: tuple[RankMap, ...] = ()
     rank_by_tower: tuple[RankMap, ...] = ()
     layers: tuple[Layer, ...] = ()
@@ -498,11 +494,7 @@ def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
 
 def figure_specs(data: MapsData) -> list[FigureSpec]:
     """Return every figure that the data allow, in reading order."""
-    flown = [
-        replace(spec, name=f"{spec.name}_{safe_name(flight.flight)}")
-        for flight in data.flights for spec in channel_specs(flight)
-    ]  # fmt: skip
-    return [*_rss_specs(data), *flown, *_rank_specs(data), *(plate.spec for plate in plates(data))]
+    return [*_rss_specs(data), *_rank_specs(data), *(plate.spec for plate in plates(data))]
 
 
 def _under(foliage: str) -> str:
@@ -743,60 +735,38 @@ def levels_card(data: MapsData) -> Card:
     return Card(title=title, id="rss", link="RSS", fold=True, grid=True, chart="rss" if data.rss else "")
 
 
-def flights_card(data: MapsData) -> Card:
-    """Return the card of the flights that corrected the map."""
-    title = "Measured and simulated along the flights"
-    return Card(title=title, id="flights", fold=True, chart="flights" if data.flights else "")
-
-
 def ranks_card(data: MapsData) -> Card:
     """Return the card of the rank against height."""
-    table = Table(
-        caption="Share of positions with each rank.",
-        columns={"K": HEAD, "Foliage": TEXT, "Height": RIGHT, "Out of coverage": RIGHT,
-                 **{f"Rank {rank}": RIGHT for rank in RANKS}},
-        rows=[(k_key(m.k or 0.0), m.foliage, number(m.height_m, 0, "m"), *(percent(share, 1) for share in m.share))
-              for m in data.rank],
-    )  # fmt: skip
-    parts = [Card(title="The shares as a table", fold=True, tables=[table])]
     chart = "rank" if data.rank else ""
-    title = "Channel rank against height"
-    return Card(title=title, id="rank", link="Rank", fold=True, grid=True, chart=chart, parts=parts)
+    return Card(title="Channel rank against height", id="rank", link="Rank", fold=True, grid=True, chart=chart)
 
 
 def interpolation_card(data: MapsData) -> Card:
     """Return the card of correlation and interpolation."""
     chart = "kriging" if data.correlation or data.errors else ""
-    parts = [Card(tables=error_tables(data.errors))]
-    title = "Correlation and interpolation"
-    return Card(title=title, id="kriging", link="Interpolation", fold=True, grid=True, chart=chart, parts=parts)
+    title, tables = "Correlation and interpolation", [error_table(data.errors)]
+    return Card(title=title, id="kriging", link="Interpolation", fold=True, grid=True, tables=tables, chart=chart)
 
 
-def error_tables(errors: Sequence[MapError]) -> list[Table]:
-    """Return one table per kind of evaluation, with one row per method and K, and one column per height."""
-    tables = []
-    for evaluation, members in grouped(errors, lambda e: e.evaluation).items():
-        heights = sorted({e.altitude_m for e in members})
-        rows = []
-        for (method, k), group in grouped(members, lambda e: (e.method, e.k)).items():
-            mae = {e.altitude_m: e.mae for e in group}
-            mean = bold(number(sum(mae.values()) / len(mae), 3))
-            rows.append((method, k_key(k), *(mae.get(height) for height in heights), mean))
-        tables.append(Table(
-            caption=f"Mean absolute error of the interpolated rank, {evaluation}.", rows=rows,
-            columns={"Method": HEAD, "K": TEXT, **{f"{height:g} m": 3 for height in heights}, "Mean": RIGHT},
-        ))  # fmt: skip
-    return tables
+def error_table(errors: Sequence[MapError]) -> Table:
+    """Return the table of mean errors over heights, with one row per evaluation and method, and one column per K."""
+    ks = sorted({error.k for error in errors})
+    rows = []
+    for key, members in grouped(errors, lambda e: (e.evaluation, e.method)).items():
+        rows.append((*key, *(finite_mean([e.mae for e in members if e.k == k]) for k in ks)))
+    return Table(
+        caption="Mean absolute error of the interpolated rank, mean over heights.",
+        columns={"Evaluation": TEXT, "Method": HEAD, **{f"K = {k_key(k)}": 3 for k in ks}}, rows=rows,
+    )  # fmt: skip
 
 
 # Cards in the order of the page. A new card is another function here.
-CARDS = (result_card, levels_card, flights_card, ranks_card, interpolation_card)
+CARDS = (result_card, levels_card, ranks_card, interpolation_card)
 
 
 def maps_page(data: MapsData, files: Sequence[str]) -> str:
     """Return the page."""
     charts = [chart for plate in plates(data) for chart in plate.charts]
-    charts += [chart for flight in data.flights for chart in level_charts(flight)]
     linked = payload(data, charts) if data.rss or data.rank or data.layers else None
     shown = Positions(view="map_explorer", data=linked) if linked else None
     columns, rows = len(data.east_m), len(data.north_m)

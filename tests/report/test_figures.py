@@ -14,7 +14,6 @@ from aerpaw_cmp.compare.result import RankResult, RssResult
 from aerpaw_cmp.report import canvas
 from aerpaw_cmp.report import flight as html
 from aerpaw_cmp.report import flight_figures as figures
-from aerpaw_cmp.report import maps as map_figures
 from aerpaw_cmp.report.flight_data import ReportData, Track, start_of, used_towers
 from aerpaw_cmp.site.siteyaml import load_site
 from benchmarks.fabricated import rank_result, rss_result, with_numbers
@@ -281,7 +280,7 @@ def test_a_point_between_two_gaps_of_a_line_has_a_dot():
     assert np.flatnonzero(ax.lines[0].get_markevery()).tolist() == [3]
 
 
-def test_both_channels_of_a_tower_stand_in_one_panel_of_report_and_map(report_data, maps_data):
+def test_both_channels_of_a_tower_stand_in_one_panel(report_data):
     """The second channel is moved by its offset minus that of the first.
 
     Spans in which the channels differ are shaded.
@@ -298,8 +297,6 @@ def test_both_channels_of_a_tower_stand_in_one_panel_of_report_and_map(report_da
     (shaded,) = [each for each in ax.collections if each.get_label() == "channels differ"]
     assert len(shaded.get_paths()) == len(report_data.pairs[0].score.spans) > 0
     assert ax.get_ylabel() == f"RSS [{first.unit}]"
-    with_flight = map_figures.figure_specs(dataclasses.replace(maps_data, flights=(report_data,)))
-    assert [spec.name for spec in with_flight if spec.name.startswith("rss_channels")] == [f"{spec.name}_sample"]
 
 
 def test_names_of_towers_stay_inside_the_plan() -> None:

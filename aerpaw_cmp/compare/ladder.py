@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray, IntArray
-from .statistics import NO_INTERVAL, Interval, PairedDifference, paired_difference, pooled_difference
+from .statistics import Interval, PairedDifference, paired_difference, pooled_difference
 
 # Number of areas of a flight. It is a power of two, because areas are halved.
 _BLOCKS = 8
@@ -46,16 +46,18 @@ class CandidateModel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LadderRow:
-    """The score of a model on one tower and channel.
+class ModelRow:
+    """The score of a model on one tower and channel, or over all channels of a flight.
 
     Parameters
     ----------
-    model, tower, channel : str
+    model : str
+    tower, channel : str, optional
+        None over all channels.
     rmse_heldout_db : float
         RMSE over all held-out areas [dB]; NaN if the model has too few levels.
     difference_to_best_db, difference_to_best_ci95_db : float, (low, high)
-        RMSE minus that of the best model on the same samples [dB].
+        RMSE minus that of the best model of the flight on the same samples [dB].
     n : int
         Number of samples that all compared models share.
     seconds : float
@@ -63,46 +65,15 @@ class LadderRow:
     recommended : bool
         True for the simplest model within one standard error of the best, over all series of the flight. If the errors
         on other flights are known from a calibration, the model with the lowest error there is recommended instead.
+    fastest_sufficient : bool
+        True for the fastest model whose difference to the best is not significant.
     elsewhere_db : (float, float), optional
         RMSE of the recommended model and of free space on other flights [dB], if these selected the model.
     """
 
     model: str
-    tower: str
-    channel: str
-    rmse_heldout_db: float
-    difference_to_best_db: float
-    difference_to_best_ci95_db: Interval
-    n: int
-    seconds: float
-    recommended: bool
-    elsewhere_db: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ModelRow:
-    """The score of a model over all channels of the flight.
-
-    Parameters
-    ----------
-    model : str
-    rmse_heldout_db : float
-        RMSE over all held-out areas and channels [dB]; NaN if the model has too few levels.
-    difference_to_best_db, difference_to_best_ci95_db : float, (low, high)
-        RMSE minus that of the best model on the same samples [dB].
-    n : int
-        Number of samples of all channels that all compared models share.
-    seconds : float
-        Time to compute the levels of the flight [s].
-    recommended : bool
-        The same as in :class:`LadderRow`.
-    fastest_sufficient : bool
-        True for the fastest model whose difference to the best is not significant.
-    elsewhere_db : (float, float), optional
-        The same as in :class:`LadderRow`.
-    """
-
-    model: str
+    tower: str | None = None
+    channel: str | None = None
     rmse_heldout_db: float
     difference_to_best_db: float
     difference_to_best_ci95_db: Interval
@@ -117,23 +88,23 @@ class ModelRow:
 _SAME_DB = 0.01
 
 
-def distinct(rows: Sequence[LadderRow], keep: str) -> tuple[list[LadderRow], list[str]]:
+def distinct(rows: Sequence[ModelRow], keep: str) -> tuple[list[ModelRow], list[str]]:
     """Return the rows of models that differ from every model before them, and the names of all other models.
 
     Parameters
     ----------
-    rows : sequence of LadderRow
+    rows : sequence of ModelRow
         Rows in the order of the models, with the same channels for each.
     keep : str
         Model that always has a row, such as the recommended one.
 
     Returns
     -------
-    rows : list of LadderRow
+    rows : list of ModelRow
     same : list of str
         Models whose error is within 0.01 dB of that of a model before them, on every channel.
     """
-    models: dict[str, list[LadderRow]] = {}
+    models: dict[str, list[ModelRow]] = {}
     for row in rows:
         models.setdefault(row.model, []).append(row)
     known: dict[str, FloatArray] = {}
@@ -279,80 +250,50 @@ def compare_models(
     )  # fmt: skip
 
 
-def series_rows(ladder: ModelComparison, series: int, name: tuple[str, str]) -> list[LadderRow]:
-    """Return the rows of one series, one per model.
+def model_rows(
+    ladder: ModelComparison, series: int | None = None, *, tower: str | None = None, channel: str | None = None
+) -> list[ModelRow]:
+    """Return the score of each model, simplest first. Empty if no models were compared.
 
     Parameters
     ----------
     ladder : ModelComparison
-    series : int
-        Index of the series.
-    name : (tower, channel)
-
-    Returns
-    -------
-    list of LadderRow
-    """
-    rows = []
-    for index, candidate in enumerate(ladder.candidates):
-        error = ladder.error_db[index][series]
-        against_best = None
-        if ladder.best is not None:
-            against_best = compared(error, ladder.error_db[ladder.best][series], ladder.position_m[series])
-        rows.append(
-            LadderRow(
-                model=candidate.model,
-                tower=name[0],
-                channel=name[1],
-                rmse_heldout_db=_rmse(error),
-                difference_to_best_db=float("nan") if against_best is None else against_best.difference_db,
-                difference_to_best_ci95_db=NO_INTERVAL if against_best is None else against_best.difference_ci95_db,
-                n=int(np.isfinite(error).sum()),
-                seconds=candidate.seconds,
-                recommended=index == ladder.recommended,
-                elsewhere_db=ladder.elsewhere_db if index == ladder.recommended else None,
-            )
-        )
-    return rows
-
-
-def model_rows(ladder: ModelComparison) -> list[ModelRow]:
-    """Return the score of each model over all channels, simplest first.
-
-    Parameters
-    ----------
-    ladder : ModelComparison
+    series : int, optional
+        Index of the series to score. By default, all channels are scored together.
+    tower, channel : str, optional
+        Names of this series.
 
     Returns
     -------
     list of ModelRow
-        Empty if no models were compared.
     """
     if ladder.best is None:
         return []
-    best = ladder.error_db[ladder.best]
+    of = range(len(ladder.time_s)) if series is None else [series]
+    place = [ladder.position_m[i] for i in of]
     pairs = [
-        pooled_difference(list(zip(ladder.time_s, errors, best, strict=True)), free_offset=False,
-                          place_m=ladder.position_m)
+        pooled_difference([(ladder.time_s[i], errors[i], ladder.error_db[ladder.best][i]) for i in of],
+                          free_offset=False, place_m=place)
         for errors in ladder.error_db
     ]  # fmt: skip
-    scored = [i for i, rmse in enumerate(ladder.rmse_db) if np.isfinite(rmse)]
     # sufficient: the best model, and models whose difference has a known interval that contains 0
-    sufficient = [i for i in scored if i == ladder.best or pairs[i].difference_ci95_db[0] <= 0.0]
+    sufficient = [i for i, pair in enumerate(pairs) if i == ladder.best or pair.difference_ci95_db[0] <= 0.0]
     fastest = min(sufficient, key=lambda i: ladder.candidates[i].seconds)
     return [
         ModelRow(
             model=candidate.model,
-            rmse_heldout_db=ladder.rmse_db[i],
-            difference_to_best_db=pairs[i].difference_db,
-            difference_to_best_ci95_db=pairs[i].difference_ci95_db,
-            n=sum(int(np.isfinite(error).sum()) for error in ladder.error_db[i]),
+            tower=tower,
+            channel=channel,
+            rmse_heldout_db=_rmse(np.concatenate([ladder.error_db[index][i] for i in of])),
+            difference_to_best_db=pair.difference_db,
+            difference_to_best_ci95_db=pair.difference_ci95_db,
+            n=pair.n,
             seconds=candidate.seconds,
-            recommended=i == ladder.recommended,
-            fastest_sufficient=i == fastest,
-            elsewhere_db=ladder.elsewhere_db if i == ladder.recommended else None,
+            recommended=index == ladder.recommended,
+            fastest_sufficient=index == fastest,
+            elsewhere_db=ladder.elsewhere_db if index == ladder.recommended else None,
         )
-        for i, candidate in enumerate(ladder.candidates)
+        for index, (candidate, pair) in enumerate(zip(ladder.candidates, pairs, strict=True))
     ]
 
 

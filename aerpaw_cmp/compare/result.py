@@ -18,7 +18,7 @@ import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, db_from_amplitude
 from .gains import StatedSpread
-from .ladder import LadderRow, ModelRow
+from .ladder import ModelRow
 from .level import (
     LEARNED_HERE,
     ChannelDifference,
@@ -414,7 +414,7 @@ class FlightResult:
     engine: EngineResult | None = None
     serving: ServingComparison | None = None
     models: tuple[ModelRow, ...] = ()
-    ladder: tuple[LadderRow, ...] = ()
+    ladder: tuple[ModelRow, ...] = ()
     verdict: FlightVerdict | None = None
     """The comparison with the best baseline over all channels. None if nothing could be scored."""
     likely_cause: Cause | None = None

@@ -29,7 +29,7 @@ from ..common.text import counted
 from ..common.units import FloatArray
 from ..common.yamlfile import KeyPath, edited, parse_yaml
 from ..compare.causes import OF_DIRECTION
-from ..compare.ladder import CandidateModel, ModelComparison, compare_models, model_rows, series_rows
+from ..compare.ladder import CandidateModel, ModelComparison, compare_models, model_rows
 from ..compare.result import BASELINE_TITLE, Cause, FlightResult
 from ..compare.statistics import pooled_difference
 from ..compare.verdict import is_one_place
@@ -611,12 +611,10 @@ def run_flight(
             stages.progress("model comparison")
             comparison = flight_comparison(data, replays)
             if comparison is not None:
-                rows = (series_rows(comparison.scores, index, name) for index, name in enumerate(comparison.names))
-                result = dataclasses.replace(
-                    result,
-                    models=tuple(model_rows(comparison.scores)),
-                    ladder=tuple(row for of_series in rows for row in of_series),
-                )
+                scores, names = comparison.scores, enumerate(comparison.names)
+                each = (model_rows(scores, i, tower=tower, channel=channel) for i, (tower, channel) in names)
+                ladder_rows = tuple(row for rows in each for row in rows)
+                result = dataclasses.replace(result, models=tuple(model_rows(scores)), ladder=ladder_rows)
     result = dataclasses.replace(result, likely_cause=cause_beyond_models(result.likely_cause, comparison))
     result = dataclasses.replace(result, next_step=next_step(data, result, comparison))
     return FlightRun(data=data, replays=replays, result=result, ladder=comparison)

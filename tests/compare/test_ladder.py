@@ -5,7 +5,7 @@ import pytest
 
 from aerpaw_cmp.compare.ladder import (
     CandidateModel,
-    LadderRow,
+    ModelRow,
     compare_models,
     distinct,
     held_out_error_db,
@@ -13,13 +13,14 @@ from aerpaw_cmp.compare.ladder import (
     log_distance_level_db,
     model_rows,
     places_of,
-    series_rows,
 )
 
 
 def ladder_rows(ladder, names):
     """The rows of every series."""
-    return [row for i, name in enumerate(names) for row in series_rows(ladder, i, name)]
+    return [
+        row for i, (tower, channel) in enumerate(names) for row in model_rows(ladder, i, tower=tower, channel=channel)
+    ]
 
 
 def wave(n, seed, sd=1.0):
@@ -105,7 +106,7 @@ def test_two_channels_share_one_recommendation():
 def test_nothing_measured_recommends_nothing():
     ladder = compare_models([np.full(10, np.nan)], [np.arange(10.0)], [candidate("flat", np.zeros(10))], [along(10)])
     assert ladder.recommended is None
-    assert ladder_rows(ladder, [("LW1", "A")])[0].n == 0
+    assert ladder_rows(ladder, [("LW1", "A")]) == []
 
 
 def test_a_place_that_is_visited_twice_is_left_out_as_a_whole():
@@ -213,10 +214,11 @@ def test_the_fastest_sufficient_model_is_not_significantly_worse_than_the_best()
 def test_models_that_cannot_differ_are_one_row() -> None:
     """If several models do not differ, the first is kept, with the models of the flight file and the recommendation."""
 
-    def rows(model: str, *errors_db: float, recommended: bool = False) -> list[LadderRow]:
+    def rows(model: str, *errors_db: float, recommended: bool = False) -> list[ModelRow]:
         return [
-            LadderRow(model=model, tower="LW1", channel=f"USRP{i}", rmse_heldout_db=error, difference_to_best_db=0.0,
-                      difference_to_best_ci95_db=(0.0, 0.0), n=99, seconds=1.0, recommended=recommended)
+            ModelRow(model=model, tower="LW1", channel=f"USRP{i}", rmse_heldout_db=error, difference_to_best_db=0.0,
+                      difference_to_best_ci95_db=(0.0, 0.0), n=99, seconds=1.0, recommended=recommended,
+                      fastest_sufficient=False)
             for i, error in enumerate(errors_db)
         ]  # fmt: skip
 

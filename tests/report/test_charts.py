@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.ladder import LadderRow, ModelRow
+from aerpaw_cmp.compare.ladder import ModelRow
 from aerpaw_cmp.compare.level import DetectionScore, compare_serving
 from aerpaw_cmp.report import flight as html
 from aerpaw_cmp.report.charts import charts_of, shown_confusion
@@ -55,12 +55,7 @@ def test_models_have_a_dot_for_each_score_and_whiskers_of_the_difference(report_
                  fastest_sufficient=model == "rich")
         for model, rmse, seconds in (("free space", 5.0, 0.1), ("opaque", np.nan, 0.5), ("rich", 3.0, 2.0))
     ]  # fmt: skip
-    ladder = [
-        LadderRow(model=row.model, tower="LW1", channel="A", rmse_heldout_db=row.rmse_heldout_db, n=100,
-                  difference_to_best_db=row.difference_to_best_db, seconds=row.seconds, recommended=row.recommended,
-                  difference_to_best_ci95_db=row.difference_to_best_ci95_db)
-        for row in models
-    ]  # fmt: skip
+    ladder = [dataclasses.replace(row, tower="LW1", channel="A") for row in models]
     data = dataclasses.replace(report_data, models=tuple(models), ladder=tuple(ladder))
     (chart,) = charts_of(data)
     (mark,) = chart.content["marks"]

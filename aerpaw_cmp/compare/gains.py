@@ -354,14 +354,11 @@ class GainFit:
         Means over bins, the training data.
     log_evidence : float
         Log marginal likelihood, up to a constant of the data.
-    common_scale : float
-        Factor by which all standard deviations must be multiplied to fit the data: ``s^2 = y' C^-1 y / rows``.
     """
 
     model: GainModel
     rows: tuple[LinkSamples, ...]
     log_evidence: float
-    common_scale: float
     _weights: FloatArray = field(repr=False)
     _factor: Factor = field(repr=False)
     # mean gain of each antenna over its rows
@@ -371,20 +368,6 @@ class GainFit:
     def antennas(self) -> tuple[str, ...]:
         """``tower.channel`` of the fitted antennas."""
         return tuple(dict.fromkeys(s.antenna for s in self.rows))
-
-    def scaled(self) -> GainFit:
-        """The fit with all standard deviations multiplied by :attr:`common_scale`, and unchanged gains."""
-        # a common scale does not change the means, and the new factor and evidence follow in closed form
-        s, count = self.common_scale, len(self._weights)
-        misfit = s**2 * max(count - len(self.rows), 1)
-        return dataclasses.replace(
-            self,
-            model=self.model.scaled(s),
-            log_evidence=self.log_evidence + 0.5 * misfit * (1.0 - s**-2) - count * math.log(s),
-            common_scale=1.0,
-            _weights=self._weights / s**2,
-            _factor=Factor(self._factor.lower * s),
-        )
 
     def predict(self, samples: LinkSamples, frames: Sequence[Frame] | None = None) -> tuple[FloatArray, FloatArray]:
         """Return the gain of all terms along samples, relative to its mean over the training samples.
@@ -465,25 +448,30 @@ class GainFit:
         """Return the covariance of :meth:`gain` towards directions (n, 3), shape (n, n) [dB^2]."""
         terms = [t for t in self.model.terms if t.frame == frame]
         at = self._like_fitted(directed(antenna, np.asarray(direction, dtype=np.float64)))
-        about = self._rows_of(antenna)
-        centre = gain_covariance(terms, about, [at, *self.rows]).mean(axis=0)
-        across = gain_covariance(terms, [at], self.rows) - centre[len(at) :]
-        centre = centre[: len(at)]
-        prior = gain_covariance(terms, [at], [at]) - centre[:, None] - centre
-        prior += gain_covariance(terms, about, about).mean()
-        spread = self._factor.whiten(across.T)
-        return np.asarray(prior - spread.T @ spread)
+        _, spread, centre = self._conditioned(terms, at, self._rows_of(antenna))
+        return np.asarray(gain_covariance(terms, [at], [at]) + centre[:, None] + centre - spread.T @ spread)
 
     def _moments(
         self, terms: Sequence[Term], at: LinkSamples, about: Sequence[LinkSamples]
     ) -> tuple[FloatArray, FloatArray]:
         """Return mean and SD (n,) of a sum of terms along ``at``, relative to its mean over ``about``."""
+        mean, spread, centre = self._conditioned(terms, at, about)
+        variance = sum(t.sd_db**2 for t in terms) + 2.0 * centre - (spread**2).sum(axis=0)
+        return mean, np.sqrt(np.maximum(variance, 0.0))
+
+    def _conditioned(
+        self, terms: Sequence[Term], at: LinkSamples, about: Sequence[LinkSamples]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the moments of a sum of terms along ``at`` (n,), relative to its mean over ``about``.
+
+        They are the mean (n,), the whitened covariance (rows, n) with the levels, and the part (n,) of the prior
+        covariance that comes from the mean over ``about``.
+        """
+        # ``at`` and ``about`` have one antenna, so all terms are correlated
         centre = gain_covariance(terms, about, [at, *self.rows]).mean(axis=0)
         across = gain_covariance(terms, [at], self.rows) - centre[len(at) :]
-        # ``at`` and ``about`` have one antenna, so all terms are correlated
-        prior = sum(t.sd_db**2 for t in terms) - 2.0 * centre[: len(at)] + gain_covariance(terms, about, about).mean()
-        spread = self._factor.whiten(across.T)
-        return across @ self._weights, np.sqrt(np.maximum(prior - (spread**2).sum(axis=0), 0.0))
+        mean_part = 0.5 * gain_covariance(terms, about, about).mean() - centre[: len(at)]
+        return across @ self._weights, self._factor.whiten(across.T), mean_part
 
 
 # Number of samples that are predicted together, which limits the memory.
@@ -544,22 +532,27 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     return _solved(model, rows, _covariance_of_levels(model, rows))
 
 
-def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArray) -> GainFit:
-    """Return the fit of rows with a covariance of their levels. The covariance is overwritten by its factor."""
+def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArray, *, scaled: bool = False) -> GainFit:
+    """Return the fit of rows with a covariance of their levels. The covariance is overwritten by its factor.
+
+    If ``scaled`` is set, all standard deviations are multiplied by the factor s that makes them fit the data:
+    ``s^2 = y' C^-1 y / rows``. The gains do not change.
+    """
     # in place, because a copy takes 72 MB for 3 000 rows
     factor = Factor.of(covariance)
-    target = np.concatenate([s.residual_db - s.residual_db.mean() for s in rows])
+    target = np.concatenate([_centred(s) for s in rows])
     weights = factor.solve(target)
-    misfit = float(target @ weights)
     # the part of the levels that the gains explain
     parts = np.split(weights, np.cumsum([len(s) for s in rows])[:-1])
     gain = target - np.concatenate([own_covariance(model, s) @ w for s, w in zip(rows, parts, strict=True)])
+    if scaled:
+        # the offset of each series uses one degree of freedom
+        scale = math.sqrt(max(float(target @ weights) / max(len(target) - len(rows), 1), 1e-6))
+        model, weights, factor = model.scaled(scale), weights / scale**2, Factor(factor.lower * scale)
     return GainFit(
         model=model,
         rows=tuple(rows),
         log_evidence=factor.log_likelihood(target),
-        # the offset of each series uses one degree of freedom
-        common_scale=math.sqrt(max(misfit / max(len(target) - len(rows), 1), 1e-6)),
         _weights=weights,
         _factor=factor,
         _zero={first.antenna: float(gain[part].mean()) for first, part in _groups(rows)},
@@ -567,15 +560,12 @@ def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArra
 
 
 def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) -> GainFit:
-    """Return :func:`fit_gain` with the more likely strength of the tower's gains and scaled standard deviations.
-
-    The scale makes the standard deviations fit the data (``s^2 = y' C^-1 y / rows``) and does not change the means.
-    """
+    """Return :func:`fit_gain` with the more likely strength of the tower's gains and scaled standard deviations."""
     model, rows = _binned_series(series, model or GainModel())
     model = _with_scales(model, rows)
     mast = [t for t in model.terms if t.frame == "mast"]
     if not 0 < len(mast) < len(model.terms):
-        return _solved(model, rows, _covariance_of_levels(model, rows)).scaled()
+        return _solved(model, rows, _covariance_of_levels(model, rows), scaled=True)
     others = dataclasses.replace(model, terms=tuple(t for t in model.terms if t not in mast))
     of_others, of_towers = _covariance_of_levels(others, rows), gain_covariance(mast, rows, rows)
     fits = []
@@ -583,7 +573,7 @@ def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) ->
         terms = tuple(dataclasses.replace(t, sd_db=t.sd_db * factor) if t in mast else t for t in model.terms)
         covariance = factor**2 * of_towers
         covariance += of_others
-        fits.append(_solved(dataclasses.replace(model, terms=terms), rows, covariance).scaled())
+        fits.append(_solved(dataclasses.replace(model, terms=terms), rows, covariance, scaled=True))
     return max(fits, key=lambda fit: fit.log_evidence)
 
 
@@ -597,26 +587,23 @@ def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
     names = list(dict.fromkeys(s.campaign for s in rows))
     if len(names) == 1 or model.campaigns:
         return model
-    chosen = []
-    for name in names:
-        mine = [s for s in rows if s.campaign == name]
-        # every second mean is enough to find the scales, and the factor then costs an eighth
-        mine = [s.part(np.arange(0, len(s), 2)) for s in mine]
-        gains = gain_covariance(model.terms, mine, mine)
-        levels = np.concatenate([s.residual_db - s.residual_db.mean() for s in mine])
-
-        def likelihood(
-            scales: tuple[float, float],
-            mine: list[LinkSamples] = mine,
-            gains: FloatArray = gains,
-            levels: FloatArray = levels,
-        ) -> float:
-            some = dataclasses.replace(model, own_sd_db=scales[0], noise_sd_db=scales[1])
-            covariance = _with_blocks(gains.copy(), (own_covariance(some, samples) for samples in mine))
-            return _log_likelihood(covariance, levels)
-
-        chosen.append((name, *max(_CAMPAIGN_SCALES_DB, key=likelihood)))
+    # every second mean is enough to find the scales, and the factor then costs an eighth
+    some = [s.part(np.arange(0, len(s), 2)) for s in rows]
+    chosen = ((n, *_likeliest(_CAMPAIGN_SCALES_DB, [s for s in some if s.campaign == n], model.terms)) for n in names)
     return dataclasses.replace(model, campaigns=tuple(chosen))
+
+
+def _likeliest(
+    scales_db: Iterable[tuple[float, float]], rows: Sequence[LinkSamples], terms: Sequence[Term]
+) -> tuple[float, float]:
+    """Return the pair of standard deviations of nuisance and noise [dB] with which rows are most likely."""
+    gains, levels = gain_covariance(terms, rows, rows), np.concatenate([_centred(s) for s in rows])
+
+    def likelihood(pair: tuple[float, float]) -> float:
+        model = GainModel(own_sd_db=pair[0], noise_sd_db=pair[1])
+        return _log_likelihood(_with_blocks(gains.copy(), (own_covariance(model, s) for s in rows)), levels)
+
+    return max(scales_db, key=likelihood)
 
 
 def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[GainModel, list[LinkSamples]]:
@@ -1152,15 +1139,8 @@ def _noise_covariance(rows: LinkSamples) -> FloatArray:
         return np.zeros((0, 0))
     # about 200 rows are enough to select the scales
     some = rows.part(np.arange(0, len(rows), max(1, len(rows) // 200)))
-    gains, levels = gain_covariance(ANTENNA_TERMS, [some], [some]), _centred(some)
-
-    def model(scales: tuple[float, float]) -> GainModel:
-        return GainModel(own_sd_db=scales[0], noise_sd_db=scales[1])
-
-    def likelihood(scales: tuple[float, float]) -> float:
-        return _log_likelihood(gains + own_covariance(model(scales), some), levels)
-
-    return own_covariance(model(max(product(_SCALES_DB, _SCALES_DB), key=likelihood)), rows)
+    own_sd_db, noise_sd_db = _likeliest(product(_SCALES_DB, _SCALES_DB), [some], ANTENNA_TERMS)
+    return own_covariance(GainModel(own_sd_db=own_sd_db, noise_sd_db=noise_sd_db), rows)
 
 
 def _centred(rows: LinkSamples) -> FloatArray:

@@ -132,7 +132,7 @@ def test_a_field_is_added_where_one_was_planted_and_the_nearer_base_wins() -> No
     new, own = waves.predict(asked, "b")[1], waves.predict(asked, own_mean=True)[1]
     assert (new < sd).all()
     assert (own < sd).all()
-    fit = FieldFit(waves.model, channel.rows, channel.left_db).predict(Rows.of(asked, -1), exact=True)
+    fit = FieldFit(waves.model, channel.rows, channel.left_db).predict(Rows.of(asked, -1))
     expected = waves.sd_factor * np.sqrt(fit[1] ** 2 + waves.model.noise_sd_db**2)
     np.testing.assert_allclose(sd, expected, rtol=1e-6)
     np.testing.assert_allclose(level, fit[0] + waves.predictor(asked)[0], atol=1e-6)

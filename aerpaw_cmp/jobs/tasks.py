@@ -268,14 +268,18 @@ def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: o
     return digest.hexdigest()
 
 
+# Code, and the tables that code reads: the dictionary of columns, and weights of the statistics.
+_SOURCES = ("**/*.py", "logs/*.yaml", "compare/*.json")
+
+
 @cache
 def code_digest() -> str:
-    """Return the digest of this program's source and of the versions of its numerical packages."""
+    """Return the digest of this program's source and tables, and of the versions of its numerical packages."""
     digest = hashlib.sha256()
     for name in ("aerpaw_cmp", "aerpaw_parsers"):
         with contextlib.suppress(ImportError):
             root = Path(str(import_module(name).__file__)).parent
-            for path in sorted(root.rglob("*.py")):
+            for path in sorted(path for pattern in _SOURCES for path in root.glob(pattern)):
                 digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     for name in ("numpy", "scipy", "sionna-rt"):
         with contextlib.suppress(metadata.PackageNotFoundError):

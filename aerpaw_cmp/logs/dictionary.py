@@ -2,7 +2,7 @@
 
 :func:`meaning` returns the quantity of a column by its name: unit, numbers for missing values, possible range, role
 (serving cell, n-th neighbour, uplink) and the datum of a height. ``PROGRAMS`` adds what names alone do not show: units
-and datums that a program is known to write. To add a name, add a row here. docs/formats.md shows the table.
+and datums that a program is known to write. The rows are in ``dictionary.yaml``, where names are added.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from ..common.units import BoolArray, FloatArray
 from .records import Kind
@@ -64,169 +66,26 @@ class Quantity:
         return "rss" if self.role == "rss" else "rank" if self.role == "rank" else "kpi"
 
 
-# A pattern with a word in front contains _UP[2:], which has no word boundary at its beginning.
-_UP = r"\b(alt|altitude|height|hgt|elevation|ele|hoehe|h he)"
-_ANGLE = (-360.0, 360.0)
-_SPEED = (-400.0, 400.0)
-_DBM, _DB = (-200.0, 30.0), (-60.0, 100.0)
 _FULL_SCALE = "dB re full scale"
+# Words for a height, which patterns of the file name HEIGHT.
+_HEIGHT = r"(alt|altitude|height|hgt|elevation|ele|hoehe|h he)"
+# PyYAML's C loader, which all its wheels have, needs 5 ms. Everything is text for it.
+_FILE: Mapping[str, Any] = yaml.load(
+    Path(__file__).with_name("dictionary.yaml").read_text(encoding="utf-8"),
+    Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader),
+)
 
-QUANTITIES: tuple[Quantity, ...] = (
-    # times, most reliable names first
-    Quantity("time", "time", (
-        r"^time (utc|unix|epoch)( s| ms| us| usec| ns)?$", r"^time (edt|est|cdt|cst|mdt|mst|pdt|pst|cest|cet|bst|gmt)$",
-        r"^((measured|recorded|logged|sampled|seen|received|captured|created) at|recorded|logged)$",
-        r"^(gps |utc |local |log )?(time ?stamp|date ?time|time and date|date and time)"
-        r"( utc| gps| local| ms| s| us| ns| iso| unix)?$",
-        r"^(abs|log|pc|device|event|system|utc|gps|local|unix|posix|epoch|server|host|wall|phone|sample|recording|receive)"
-        r" ?(time( stamp)?|clock)( utc| gps| local| ms| s| us| usec| ns)?$",
-        r"^(custom )?(update ?)?(local |utc )?time( ?stamp)?( utc| ms| s| us| usec| ns| local| epoch)?$",
-        r"^time ?millisecond$", r"^(rel|relative|elapsed|up) ?time( ms| s| us| ns)?$", r"^(elapsed|millis)$",
-        r"^time boot ms$", r"^time since (start|boot|take ?off|epoch)( s| ms| us)?$",
-        r"^((gpst|tai)( time)?|time (gpst|tai))$", r"^(epoch|unix|ts)( ms| s| us| ns| utc)?$", r"^utc$", r"^t( utc)?$",
-        r"^(zeit|uhrzeit|zeitstempel|hora|heure)( mesz| mez)?$",
-    )),
-    Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$", r"^(datum|fecha)$")),
-    Quantity("zone", "time", (
-        r"^((time ?)?zone|tz)( ?(name|id|offset))?( (h|hours?|min|minutes?|s|sec|seconds?))?$",
-        r"^(utc|gmt) ?offset( (h|hours?|min|minutes?|s|sec|seconds?))?$",
-    )),
-    Quantity("gps_week", "time", (r"^gps ?(week|wk)( number| no)?$", r"^gwk$", r"^(week|wn)( number| no)?$")),
-    Quantity("gps_seconds", "time", (
-        r"^(gps ?)?(tow|i ?tow|seconds? of week|week seconds?|sow|gps seconds?)( s| ms)?$", r"^gms$",
-    ), "s"),
-    # positions; those of home, of a tower or of the pilot are not the aircraft's
-    Quantity("elsewhere", "other", (
-        r"\b(home|ref|reference|origin|tower|cell|site|station|bs|base|enb|gnb|target|waypoint|wp|pilot|operator|gcs|rc"
-        r"|destination|take ?off|launch)\b.* (lat|latitude|lon|lng|long|longitude)\b",
-    )),
-    Quantity("latitude_deg", "position", (
-        r"^(osd |gps )?(lat|latitude)( deg| degrees| int| d?ddmm\w*)?( ?1?e ?[67]| [ns])?$", r" (lat|latitude)( deg)?$",
-        r"^(breite|breitengrad|latitud)( deg)?$",
-    ), "deg", can_be=(-90.0, 90.0)),
-    Quantity("longitude_deg", "position", (
-        r"^(osd |gps )?(lon|lng|long|longitude)( deg| degrees| int| d?ddmm\w*)?( ?1?e ?[67]| [ew])?$",
-        r" (lon|lng|long|longitude)( deg)?$",
-        r"^(l nge|laenge|l ngengrad|laengengrad|longitud)( deg)?$",
-    ), "deg", can_be=(-180.0, 180.0)),
-    Quantity("grid", "grid", (
-        r"\b(easting|northing|utm|ecef|ned|enu)\b", r"^(pos(ition)? )?(north|east|down)( m| meters)?$",
-        r"^(geom(etry)?|wkt|lat ?(lon|lng)|coordinates?|(gps )?(position|location))$",
-    )),
-    Quantity("accuracy", "doubt", (
-        r"(^| )[hpg]dop$", r"(^| )eph$",
-        r"^(gps |gnss |position |pos |location |horizontal |horiz )?((horizontal |horiz |h ?)?acc(uracy)?)( m)?$",
-    )),
-    # heights, by the datum in the name; heights of home and of terrain are not the aircraft's
-    Quantity("home", "other", (
-        r"\b(home|take ?off|launch|terrain|ground|geoid|undulation|delta|target|max|min)\b.*" + _UP + r"(?!.*\babove)",
-        _UP + r" (of )?(home|terrain|target)$", r"^geoid", r"accuracy|variance|\bvdop\b|precision",
-    )),
-    Quantity("altitude_m", "height", (
-        _UP + r" ?(above |over )?(the )?(take ?off|home|launch)", r"\b(rel|relative)[ ]?(home ?)?(alt|altitude|height)",
-        _UP + r" ?(rel|relative|ato)\b", r"^rel ?home ?alt$", r"^osd height", r"^ascent",
-    ), "m", can_be=(-1000.0, 20_000.0), datum="take-off"),
-    Quantity("altitude_m", "height", (
-        r"\bagl\b|altitude ?agl|^agl ?alt",
-        r"^(lidar|radar|laser|range ?finder) " + _UP[2:], _UP + r" ?(above |over )(the )?(ground|terrain)",
-        r"\babove ground\b",
-    ), "m", can_be=(-1000.0, 20_000.0), datum="ground"),
-    Quantity("altitude_m", "height", (
-        r"(\b|altitude|alt|height|h)(amsl|msl|asl)\b", r"sea ?level", r"\borthometric\b|^alt(itude)? (gps|geoid)$",
-        r"^osd alt", r"^gps " + _UP[2:],
-        r"^(ele|elev|elevation)( m| ft| feet| meters)?$",
-    ), "m", can_be=(-1000.0, 20_000.0), datum="sea level"),
-    Quantity("altitude_m", "height", (
-        r"ellips", r"\b(hae|wgs ?84)\b",
-    ), "m", can_be=(-1000.0, 20_000.0), datum="ellipsoid"),
-    Quantity("altitude_m", "height", (
-        r"^((uav|drone|vehicle|aircraft) )?(alt|altitude)( m| meters| metres| ft| feet)?$",
-        r"^(height|hgt|hoehe|h he)( m| meters| metres| ft| feet)?$", r"^(baro(metric)?|pressure) " + _UP[2:],
-        _UP + r" baro$",
-    ), "m", can_be=(-1000.0, 20_000.0), datum="unknown"),
-    # attitude; angles of a gimbal or camera are not the aircraft's
-    Quantity("gimbal", "other", (
-        r"\b(gimbal|camera|mount|payload|des|desired|target|setpoint|sp|cmd|command|ref|reference|error|err|delta|rate"
-        r"|initial|home|antenna|tower)\b",
-    )),
-    Quantity("roll_deg", "angle", (r"(^| )roll( deg| degrees| rad)?$",), "deg", can_be=_ANGLE),
-    Quantity("pitch_deg", "angle", (r"(^| )pitch( deg| degrees| rad)?$",), "deg", can_be=_ANGLE),
-    Quantity("yaw_deg", "angle", (
-        r"(^| )yaw( deg| degrees| rad)?$", r"^compass heading( degrees)?$", r"^(heading|hdg)( deg| degrees| cdeg)?$",
-    ), "deg", can_be=_ANGLE),
-    Quantity("velocity_north_mps", "velocity", (
-        r"^velocity ?(north|x)( mps)?$", r"^vn$", r"^vel n m s$", r"^(osd )?x ?speed", r"^speed ?x$", r"^vx$",
-    ), "m/s", can_be=_SPEED),
-    Quantity("velocity_east_mps", "velocity", (
-        r"^velocity ?(east|y)( mps)?$", r"^ve$", r"^vel e m s$", r"^(osd )?y ?speed", r"^speed ?y$", r"^vy$",
-    ), "m/s", can_be=_SPEED),
-    Quantity("velocity_down_mps", "velocity", (
-        r"^velocity ?(down|z)( mps)?$", r"^vd$", r"^vz$", r"^vel d m s$", r"^(osd )?z ?speed", r"^speed ?z$",
-    ), "m/s", can_be=_SPEED),
-    Quantity("fix", "count", (
-        r"^(gps )?fix( type)?$", r" fix type$", r"^gpsfix$", r"^gps lock$",
-        r"^((is|data) )?valid$",
-        r"^((has|is) )?(gps |gnss |pos(ition)? |loc(ation)? )?fix ?(type|ok|status|state|mode|quality|qual|valid)?$",
-        r"^((has|is) )?(gps|gnss|pos(ition)?|loc(ation)?) ?(fix ?type|status|state|mode|lock|valid|ok)$",
-        r"^(gps|gnss|pos(ition)?) ?qual(ity)?( ind(icator)?)?$",
-    )),
-    Quantity("satellites", "count", (
-        r"^(number of satellites?|satellites( used)?|num ?sats?|osd gpsnum|nsats?|numberofsatellites|gps count)$",
-        r"^((gps|gnss) )?(sats?|satellites?|num sats?)( (used|count|num|in use))?$", r"(^| )satellites (visible|used)$",
-    )),
-    Quantity("battery_v", "count", (r"^(battery ?)?(volts?|voltage)( v)?$",), "V"),
-    # devices and networks
-    Quantity("device", "identity", (
-        r"^(device|phone|modem|ue|vehicle|drone|uav|logger|serial|client|user|robot|rover|aircraft|tail|host"
-        r"|interface|mac|bssid|gps|gps receiver|instance)"
-        r"( ?(id|name|no|num|number|sn|serial|index|instance|port|model|address))?$",
-        r"^(imei|imsi|sys ?id|system ?id|comp ?id|component ?id)$",
-        r"^(receiver|rx)( ?(id|name|channel|port|antenna|serial number))?$",
-        r"^(transmitter|tx)( ?(id|name|channel|port|antenna))?$",
-    )),
-    Quantity("network", "identity", (
-        r"^(network )?(operator|carrier|provider|plmn|sim|slot|sub|subscription)( ?(id|name|code|slot|no|index))?$",
-        r"^network name$", r"^query$",
-        r"^mcc$", r"^mnc$", r"^mcc ?mnc$", r"^(c ?)?rnti$", r"^(ap|access point|ssid|gateway|gw)( ?(id|name|no|mac))?$",
-        r"^(receiver|rx|cent(er|re)|carrier) freq(uency)?( hz| mhz| ghz)?$",
-    )),
-    Quantity("technology", "cell", (
-        r"^(network ?(tech|mode|type)|net ?type|rat|technology|access technology|radio( type| access)?|act|cell type)$",
-    )),
-    Quantity("serving", "cell", (r"^(is ?)?(registered|serving|connected)( cell)?$",)),
-    Quantity("neighbouring", "cell", (r"^(is ?)?neighbou?r(ing)?( cell)?$",)),
-    # levels and ranks; 'PDSCH rank' before 'PDSCH throughput', 'RSSNR' before 'RSS'
-    Quantity("power", "rss", (r"^link power$", r"^(power )?lw ?[1-5]( (power|level))?( dbm?)?$"), _FULL_SCALE),
-    Quantity("quality", "rss", (r"^link quality$",), "dB"),
-    Quantity("SNR", "rss", (r"^link snr$",), "dB"),
-    # 'rank' alone may be the position in any list: described() accepts it if the table has levels. 0 means no report
-    Quantity("rank", "rank", (
-        r"\b((pdsch|dl|nr|lte|[45]g|mimo|csi) rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri|dl layer num)\b",
-    ), none=(0.0,), can_be=(0.0, 16.0)),
-    Quantity("RSRP", "rss", (
-        r"\brs ?rp\b|\bss ?rsrp\b|\brsrp\d{0,2}\b",
-    ), "dBm", none=(0.0,), can_be=_DBM),
-    Quantity("RSRQ", "kpi", (r"\brsrq\d{0,2}\b",), "dB", none=(-99.0, 0.0, 99.0, 255.0), can_be=(-60.0, 3.0)),
-    Quantity("SINR", "kpi", (r"\b(rs ?)?s(i)?nr\d{0,2}\b|\brssnr\b",), "dB", none=(-99.0, 99.0, 255.0), can_be=_DB),
-    Quantity("RSSI", "rss", (r"\brss(i\d{0,2})?\b",), "dBm", none=(0.0,), can_be=_DBM),
-    Quantity("RSCP", "rss", (r"\brscp\b",), "dBm", none=(0.0,), can_be=_DBM),
-    Quantity("RxLev", "rss", (r"\brx ?lev\b",), "dBm", none=(0.0,), can_be=_DBM),
-    Quantity("Ec/N0", "kpi", (r"\bec ?(n0|no|io)\b",), "dB", can_be=_DB),
-    Quantity("PCI", "cell", (
-        r"\b(\w{0,5}pci\d{0,2}|pcid|pcell id|physical cell (id|identity)|phys(ical)? ?cell ?id|nci pci|phy ?id)\b",
-        r"\bpsc or pci\b",
-    # NR has 1008 identities (3GPP TS 38.211, 7.4.2.1), LTE 504
-    ), none=(-1.0,), can_be=(0.0, 1007.0)),
-    Quantity("ARFCN", "cell", (
-        r"\b(nr ?|e ?|u ?)?arfcn\d{0,2}\b|\bchannel number\b|\bfreq(uency)? channel\b",
-    # the last NR-ARFCN (3GPP TS 38.104, table 5.4.2.1-1)
-    ), none=(-1.0,), can_be=(0.0, 3_279_165.0)),
-    Quantity("CQI", "kpi", (r"\bcqi\b",), none=(255.0,), can_be=(0.0, 100.0)),
-    Quantity("path loss", "kpi", (r"\bpath ?loss\b",), "dB"),
-    Quantity("throughput", "kpi", (r"\b(throughput|tput|bit ?rate|thr?put)\b",), "bit/s", open_unit=True),
-    Quantity("MCS", "kpi", (r"\bmcs\b",), can_be=(0.0, 100.0)),
-    Quantity("BLER", "kpi", (r"\bbler\b",), "%", open_unit=True),
-)  # fmt: skip
+
+def _quantity(row: Mapping[str, Any]) -> Quantity:
+    low, high = map(float, row.get("range", _ANY))
+    return Quantity(
+        name=row["name"], role=row["role"], unit=row.get("unit", ""), datum=row.get("datum", ""),
+        names=tuple(pattern.replace("HEIGHT", _HEIGHT) for pattern in row["names"]),
+        none=tuple(map(float, row.get("missing", ()))), can_be=(low, high), open_unit="open_unit" in row,
+    )  # fmt: skip
+
+
+QUANTITIES = tuple(_quantity(row) for row in _FILE["quantities"])
 
 
 @cache
@@ -623,65 +482,10 @@ class Program:
     angles: str = ""
 
 
-def _program(name: str, *signs: str, **about: Any) -> Program:
-    return Program(name, tuple(frozenset(part.split(",")) for part in signs), **about)
-
-
-_MAVLINK_UNITS = {
-    "relative alt": "mm", "alt": "mm", "vx": "cm/s", "vy": "cm/s", "vz": "cm/s", "hdg": "cdeg", "lat": "e7",
-    "lon": "e7", "voltage battery": "mv",
-}  # fmt: skip
-AERPAW_MAT = _program(
-    "AERPAW .mat", "mx,my,mz", "lat s,lon s", "lat all,lon all", datum="take-off", angles="deg",
-    words={
-        r"mx|lon s|lon all": "longitude", r"my|lat s|lat all": "latitude", r"mz|height s|h all": "altitude rel",
-        r"mroll|roll all": "roll", r"mpitch|pitch all": "pitch", r"myaw|ori s|ori all": "yaw", r"mspeedx": "vn",
-        r"mspeedy": "ve", r"mspeedz|mvz": "vd", r"mpower\d?|power all": "link power", r"mquality": "link quality"},
-    units={"ori s": "rad", "rsrp": _FULL_SCALE, "rsrp2": _FULL_SCALE, "rssi": _FULL_SCALE},
-)  # fmt: skip
-
-
-PROGRAMS: tuple[Program, ...] = (
-    _program("PX4, vehicle_gps_position", "time utc usec,timestamp", datum="sea level",
-             units={"timestamp": "us", "alt": "mm", "lat": "e7", "lon": "e7"}),
-    _program("PX4", "timestamp,timestamp sample", "timestamp,delta alt", "timestamp,alt ellipsoid", datum="sea level",
-             units={"timestamp": "us"}, angles="rad"),
-    _program("MAVLink", "time boot ms", "rollspeed", "satellites visible,eph", datum="sea level", angles="rad",
-             units=_MAVLINK_UNITS, words={r"satellites visible": "satellites", r"voltage battery": "battery voltage"}),
-    _program("ArduPilot", "timeus", "gcrs,spd", "lat,lng,q1,q2", "desroll,roll", datum="sea level", angles="deg",
-             words={r"status": "fix", r"i": "instance"}),
-    AERPAW_MAT,
-    _program("aerpawlib", "gpsfix,numberofsatellites", "gpsfix,batteryvolts", "numberofsatellites,batteryvolts",
-             "volt,number of satellite", "voltage,number of satellites", "volt,number of satellites", datum="take-off"),
-    _program("G-NetTrack Pro", "level,qual,networktech", "level,qual,networkmode", datum="sea level", words={
-        r"level": "rsrp", r"qual": "rsrq", r"psc": "pci", r"nrxlev(\d)": r"rsrp neighbour \1",
-        r"nqual(\d)": r"rsrq neighbour \1", r"ncell(\d)": r"pci neighbour \1", r"narfcn(\d)": r"arfcn neighbour \1",
-        r"lterssi": "rssi"}, units={"dl bitrate": "kbps", "ul bitrate": "kbps"}),
-    _program("G-NetTrack KML", "technology,mode,pc", "technology,pc,layer", datum="sea level", words={r"pc": "pci"}),
-    _program("G-NetTrack", "networktech", "networkmode", datum="sea level",
-             units={"dl bitrate": "kbps", "ul bitrate": "kbps"}),
-    _program("srsUE", "time,cc,earfcn,rsrp,cfo", words={r"pl": "path loss"},
-             units={"time": "ms", "dl bler": "%", "ul bler": "%"}),
-    _program("Tower Collector", "psc,short cell id,net type", datum="sea level", words={r"psc": "pci"}),
-    _program("CellMapper", "signal,psc or pci", datum="sea level", words={
-        r"signal": "rsrp", r"psc or pci": "pci", r"type": "network type"}),
-    _program("phone", "cellname", datum="sea level"),
-    _program("MAVLink, positions alone", "lat,lon,relative alt", "lat,lon,alt,hdg", units=_MAVLINK_UNITS),
-    _program("Garmin FIT", "position lat,position long", datum="sea level", units={
-        "position lat": "semicircles", "position long": "semicircles"}),
-    _program("Open DroneLog", "vps height m,height m", datum="sea level", words={
-        r"height m": "height above takeoff", r"velocity ([xyz]) ms": r"velocity \1"}),
-    # EdgeTX writes dB for dBm. 1RSS and 2RSS are received by the aircraft, TRSS by the transmitter. FrSky's RSSI is not
-    # in dBm, and Hdg is the course over ground.
-    _program("EdgeTX", "date,time,txbat v", "rqly,rsnr db", "date,time,rxbt v", words={
-        r"([12])rss( dbm?)?": r"rssi \1", r"trss( dbm?)?": "rssi telemetry", r"rsnr( db)?": "sinr 1",
-        r"tsnr( db)?": "sinr telemetry", r"rssi( db)?": "rssi count", r"ptch( rad)?": "pitch", r"hdg( .*)?": "course",
-        r"ele": "stick", r"galt( m)?": "altitude msl"},
-        units={"1rss db": "dbm", "2rss db": "dbm", "trss db": "dbm"}),
-    _program("aerpaw-cmp tap", "query,ri raw", words={r"ri raw": "raw", r"rank": "rank indicator"}),
-    _program("AERPAW monitoring", "transmitter,receiver,log type", words={
-        r"power": "link power", r"quality": "link quality", r"snr": "link snr"}),
-)  # fmt: skip
+PROGRAMS = tuple(
+    Program(**{**row, "signs": tuple(frozenset(names) for names in row["signs"])}) for row in _FILE["programs"]
+)
+AERPAW_MAT = next(known for known in PROGRAMS if known.name == "AERPAW .mat")
 
 
 # Names that a level of another program may have, and names that only look like levels, such as an altitude above sea

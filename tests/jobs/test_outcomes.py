@@ -23,7 +23,7 @@ from aerpaw_cmp.common.stages import logged
 from aerpaw_cmp.flight.settings import FlightFile, load_flight, overridden
 from aerpaw_cmp.jobs import campaign, sample
 from aerpaw_cmp.jobs.campaign import Outcome, Task, carry_out, compute, digest_of, kept_outcomes, planned_tasks
-from aerpaw_cmp.jobs.tasks import OutcomeStore, task_inputs, task_key
+from aerpaw_cmp.jobs.tasks import OutcomeStore, code_digest, task_inputs, task_key
 from aerpaw_cmp.jobs.workers import InProcess, Lost, Workers
 from aerpaw_cmp.report.campaign import Failure
 from tests.jobs.campaign_rows import rss_row
@@ -34,6 +34,15 @@ pytestmark = pytest.mark.usefixtures("few_pictures")
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return sample.write_sample(tmp_path_factory.mktemp("season") / "flight")
+
+
+@pytest.mark.parametrize("table", ["dictionary.yaml", "memory_weights.json", "dictionary.py"])
+def test_a_changed_table_of_the_code_makes_stored_outcomes_out_of_date(
+    table: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, read = code_digest.__wrapped__(), Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + (b"\n" if path.name == table else b""))
+    assert code_digest.__wrapped__() != before
 
 
 def run_tasks(tasks: list[Task], workers: Workers, keep: Path | None = None) -> list[Outcome]:

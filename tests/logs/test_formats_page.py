@@ -4,11 +4,14 @@ The example names are those of programs; each must mean what the table says.
 """
 
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from aerpaw_cmp.logs import dictionary
+from aerpaw_cmp.logs.text import COUNTS
 
 PAGE = Path(__file__).parents[2] / "docs" / "formats.md"
 BEGIN, END = "<!-- dictionary: made by tests/logs/test_formats_page.py -->\n", "<!-- end of dictionary -->\n"
@@ -89,6 +92,33 @@ def test_no_pattern_is_hidden_by_a_row_above() -> None:
     plain = [dictionary.plain(name) for names in EXAMPLES.values() for name in names]
     for row in ROWS.values():
         assert any(re.search(pattern, name) for pattern in row.names for name in plain), row.name
+
+
+def test_every_row_of_the_file_is_used() -> None:
+    """A misspelt key, role, datum or unit would be ignored, and a repeated pattern belongs to its first row."""
+    source = Path(dictionary.__file__).with_name("dictionary.yaml").read_text(encoding="utf-8")
+    rows = yaml.safe_load(source)["quantities"]
+    assert len(rows) == len(dictionary.QUANTITIES) > 40
+    keys = {"name", "role", "unit", "open_unit", "datum", "range", "missing", "names"}
+    assert not [row for row in rows if not row.keys() <= keys]
+    patterns = Counter(pattern for row in dictionary.QUANTITIES for pattern in row.names)
+    assert not [pattern for pattern, count in patterns.items() if count > 1]
+    roles = "time position grid height angle velocity count doubt identity cell rss rank kpi other"
+    datums = {"", "take-off", "ground", "sea level", "ellipsoid", "unknown"}
+    for row in dictionary.QUANTITIES:
+        assert row.role in roles.split(), row.name
+        assert row.datum in datums, row.name
+        assert bool(row.datum) == (row.role == "height"), row.name
+        assert row.can_be[0] < row.can_be[1], row.name
+
+
+def test_words_and_units_of_programs_are_known() -> None:
+    written = {"dB re full scale", "%"}
+    for program in dictionary.PROGRAMS:
+        for pattern, word in program.words.items():
+            assert re.compile(pattern).groups >= word.count("\\"), program.name
+        for unit in program.units.values():
+            assert unit in written or dictionary.is_unit(unit) or unit in COUNTS, program.name
 
 
 if __name__ == "__main__":

@@ -53,7 +53,6 @@ SMALLEST: dict[str, list[str]] = {
     "coverage_of_intervals": ["--quick"],
     "diffraction": ["sample_logs/flight.yaml"],
     "drafts": ["sample_logs"],
-    "exports": ["--samples", "20000"],
     "fabricated": [],
     "first_flight_prediction": [],
     "freeze": ["record", "{folder}/record.npz", "--quick"],

@@ -45,9 +45,6 @@ Json = Annotated[bool, Option("--json", help="Print only one JSON object on stan
 Force = Annotated[
     bool, Option("--force", help="Also replace files that this tool did not write; inputs are never replaced.")
 ]
-Export = Annotated[
-    list[str] | None, Option(help="Also write the samples as kmz, netcdf or all; repeatable, or separated by commas.")
-]
 LogsRoot = Annotated[Path | None, Option("--logs-root", help="Folder to which the paths of the logs are relative.")]
 
 

@@ -26,8 +26,7 @@ from ..flight.training import flight_logs
 from ..propagation.geometry import Link, Poses, rotation_from_aircraft
 from ..propagation.options import extent_of
 from ..propagation.replay import check_band, subcarriers_hz
-from ..report.channel import FORMATS, STREAMED, Along, Channel, write_channel
-from ..report.exports import chosen_formats
+from ..report.channel import STREAMED, Along, Channel, chosen_formats, write_channel
 from ..site.learned import BAND
 from .options import DEFAULT, JobOutcome, RunOptions
 from .sources import Source, TargetOptions, find_targets, memory_of, target_files
@@ -313,8 +312,7 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
     -------
     JobOutcome
     """
-    # the second call expands "all", so that a missing library is reported before hours of replay
-    formats = chosen_formats(chosen_formats(chosen.formats, FORMATS), FORMATS)
+    formats = chosen_formats(chosen.formats)
     settings, stages = load_with_learned(flight), Stages(options.progress)
     root, route = options.logs_root or flight.parent, chosen.route
     if route is None and settings.flight.plan and not all((root / log.path).exists() for log in settings.logs):

@@ -191,8 +191,8 @@ class ReportOptions:
         Largest distance between a sample and its predicted position, for other programs.
     figures : {"none", "svg", "png", "pdf", "all"}
         Format of figures as files: none, one format, or all formats.
-    export : sequence of str
-        Formats of the samples.
+    kmz : bool
+        Also write ``samples.kmz``.
     """
 
     audit: str | None = None
@@ -201,7 +201,7 @@ class ReportOptions:
     against: Sequence[Path] = ()
     against_distance_m: float = AGAINST_DISTANCE_M
     figures: str = "none"
-    export: Sequence[str] = ()
+    kmz: bool = False
 
 
 def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: RunOptions = DEFAULT) -> JobOutcome:
@@ -228,7 +228,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
     from .flight_run import check_recommended, recommended_text, report_stages, run_flight
     from .tasks import other_inputs
 
-    formats = _checked(flight, chosen, options)
+    _check_options(flight, chosen, options)
     settings, inputs, folder = _report_inputs(flight, chosen, options)
     stages = options.stages("report", inputs, folder)
     learned = None if chosen.learned is None else Path(chosen.learned)
@@ -270,7 +270,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             target.write(sealed(text))
             record = replace(record, extra_metrics={**record.extra_metrics, "recommended": sentence})
         with output.filling() as place:
-            written = write_report(record, place, drawn=chosen.figures, exports=formats, stages=stages)
+            written = write_report(record, place, drawn=chosen.figures, kmz=chosen.kmz, stages=stages)
             if cards:
                 text = json.dumps(cards, indent=1, ensure_ascii=False)
                 (place / "card.json").write_text(text + "\n", encoding="utf-8")
@@ -278,9 +278,8 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
     return JobOutcome(folder=folder, metrics=metrics, failed_checks=_failed_checks(metrics))
 
 
-def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[str, ...]:
-    """Return the formats of the exports. Raise UsageError for options that exclude each other."""
-    from ..report.exports import chosen_formats
+def _check_options(flight: Path, chosen: ReportOptions, options: RunOptions) -> None:
+    """Raise UsageError for options that exclude each other."""
     from ..report.page import FIGURES
 
     if chosen.figures not in FIGURES:
@@ -293,7 +292,6 @@ def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[
             expected="a name in the folder of the flight file, whose paths are relative to it; or --logs-root",
             path=chosen.recommend,
         )
-    return chosen_formats(chosen.export)
 
 
 def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[Any, list[Path], Path]:

@@ -2,7 +2,7 @@
 
 ``write_csv`` and ``write_kmz`` take :class:`MapLayers`: a grid, the frame of the site and any layers, such as a level,
 its standard deviation or classes. A position out of coverage is an empty cell of the CSV, or the class 0 ("Z"). Samples
-along a flight are written by :mod:`aerpaw_cmp.report.exports`.
+along a flight are written by :mod:`aerpaw_cmp.report.kmz`.
 
     level = Layer(name="level_db", quantity="Level", unit="dBm", values=grid.raster(level_dbm))
     maps = MapLayers(grid=grid, frame=site.frame, layers=(level,))

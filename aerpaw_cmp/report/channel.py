@@ -13,8 +13,9 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from ..common.cf import Dataset, GrowingNetcdf, file_attributes, flags
+from ..common.cf import Dataset, GrowingNetcdf, file_attributes, flags, library
 from ..common.content import KEY
+from ..common.errors import UsageError
 from ..common.stages import Stages
 from ..common.text import guarded
 from ..common.units import AnyArray, FloatArray
@@ -366,6 +367,29 @@ def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]
 # Writers of a part by format, which return the main file.
 _WRITERS = {"npz": _write_npz, "deepmimo": _write_deepmimo, "csv": _write_csv}
 FORMATS = ("netcdf", *_WRITERS)
+ALL = "all"
 
 # Formats that are written part by part. All other formats need the complete channel in memory.
 STREAMED = {"netcdf", "csv"}
+
+
+def chosen_formats(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the formats that a user chose. Names may be joined by commas, and ``all`` means every format.
+
+    Raises
+    ------
+    UsageError
+        If a name is unknown, or netCDF4 is missing, so that this is reported before hours of replay.
+
+    Examples
+    --------
+    >>> chosen_formats(["csv,npz", "csv"])
+    ('npz', 'csv')
+    """
+    chosen = {part.strip().lower() for name in names for part in name.split(",")} - {""}
+    if unknown := sorted(chosen - {*FORMATS, ALL}):
+        raise UsageError(f"format {unknown[0]!r}", expected=", ".join((*FORMATS, ALL)))
+    formats = tuple(name for name in FORMATS if name in chosen or ALL in chosen)
+    if "netcdf" in formats:
+        library("netCDF4")
+    return formats

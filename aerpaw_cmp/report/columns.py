@@ -1,7 +1,7 @@
 """The columns of rss.csv and rank.csv: name, unit, meaning, and the function that computes the values.
 
-:data:`RSS` and :data:`RANK` produce the CSV files, the NetCDF variables of the exports, the list of columns on a
-report's page and the table in docs/outputs.md. A new column is one row here.
+:data:`RSS` and :data:`RANK` produce the CSV files, the list of columns on a report's page and the table in
+docs/outputs.md. A new column is one row here.
 """
 
 from __future__ import annotations
@@ -21,9 +21,6 @@ from .texts import iso_time, k_key
 # Positions are written to 0.1 mm and levels to 1e-4 dB, which is finer than any log.
 DECIMALS = 4
 
-_RANKS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
-_NO_YES = ("no", "yes")
-
 
 @dataclass(frozen=True, slots=True)
 class Column:
@@ -38,8 +35,6 @@ class Column:
     values : callable, optional
         Function that returns the values (n,) of a series, one value for all its rows, or None if the series does not
         have the column. For a family it returns a mapping by model, K or rank. Columns of times have no function.
-    flags : tuple of str
-        Meanings of the values 0, 1, ...; empty for a number.
     optional : bool
         True if the column is missing in a file in which no series has it.
     """
@@ -48,7 +43,6 @@ class Column:
     unit: str
     meaning: str
     values: Callable[[Any], Any] | None = None
-    flags: tuple[str, ...] = ()
     optional: bool = False
 
 
@@ -94,9 +88,9 @@ RSS: tuple[Column, ...] = (
     Column("simulated_dbm", "dBm", "ray tracing; empty: no path", lambda p: p.simulated_dbm),
     Column("residual_db", "dB", "calibrated_db minus simulated_dbm", lambda p: p.residual_db),
     Column("measured_out_of_coverage", "", "1: the log has no signal here",
-           lambda p: p.measured_out_of_coverage.astype(int), _NO_YES),
+           lambda p: p.measured_out_of_coverage.astype(int)),
     Column("simulated_out_of_coverage", "", "1: the ray tracing has no path here",
-           lambda p: p.simulated_out_of_coverage.astype(int), _NO_YES),
+           lambda p: p.simulated_out_of_coverage.astype(int)),
     Column("{}_dbm", "dBm", "level of the baseline {}",
            lambda p: {name: model.level_dbm for name, model in p.baselines.items()}, optional=True),
     _stated("simulated_sd_db", "dB", "standard deviation of a sample, all parts"),
@@ -125,9 +119,9 @@ RANK: tuple[Column, ...] = (
     *_TIMES,
     Column("tower", "", "name of the tower", lambda p: p.tower),
     *_PLACES,
-    Column("measured_rank", "", "reported rank 1 to 4; empty: no CSI", lambda p: _integers(p.measured), _RANKS),
+    Column("measured_rank", "", "reported rank 1 to 4; empty: no CSI", lambda p: _integers(p.measured)),
     Column("simulated_rank_k{}", "", "rank by ray tracing, K = {}; 0: no path",
-           lambda p: {k: _integers(rank) for k, rank in p.rank.items()}, _RANKS, optional=True),
+           lambda p: {k: _integers(rank) for k, rank in p.rank.items()}, optional=True),
     Column("level_dbm", "dBm", "simulated level; empty: no path", lambda p: _finite(p.level_dbm), optional=True),
     *_TOWER_PLACES,
     Column("sigma{}_over_sigma1_db", "dB", "singular value {} over the largest; empty: no path, or zero",

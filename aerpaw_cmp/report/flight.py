@@ -29,7 +29,6 @@ from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold,
 from .charts import charts_of, shown_confusion
 from .columns import RANK, RSS, csv_text, described
 from .explorer import payload
-from .exports import FOLDER
 from .flight_data import RANKS, InputFile, ReportData, start_of
 from .flight_figures import figure_specs
 from .page import about, json_text, merge, rendered, write_figures, write_file
@@ -557,7 +556,7 @@ def write_report(
     folder: str | Path,
     *,
     drawn: str = "none",
-    exports: Sequence[str] = (),
+    kmz: bool = False,
     stages: Stages | None = None,
 ) -> WrittenReport:
     """Write the files of a report.
@@ -569,8 +568,8 @@ def write_report(
         An empty folder, such as that of :meth:`aerpaw_cmp.common.outputs.OutputFolder.filling`.
     drawn : str
         One of :data:`~aerpaw_cmp.report.page.FIGURES`.
-    exports : sequence of str
-        Formats of :data:`aerpaw_cmp.report.exports.FORMATS` for the samples, in addition to CSV.
+    kmz : bool
+        Also write ``samples.kmz``.
     stages : Stages, optional
         Receives the time of the stage "report", which is also stored in the data.
 
@@ -592,14 +591,13 @@ def write_report(
             written.append(write_file(folder / name, text))
         pictures = write_figures(partial(figure_specs, data), folder / "figures", drawn, stages.progress)
     written += pictures
-    if exports:
-        from .exports import of_report, write_exports
+    if kmz:
+        from .kmz import write_kmz
 
-        with stages("exports"):
-            written += write_exports(of_report(data), folder, exports, stages.progress)
+        with stages("kmz"):
+            written.append(write_kmz(data, folder))
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
-    offered = (folder, folder / FOLDER)
-    files = ["metrics.json", *(path.relative_to(folder).as_posix() for path in written if path.parent in offered)]
+    files = ["metrics.json", *(path.name for path in written if path.parent == folder)]
     # the page lists the folder of figures only if there are any
     files += ["figures/"] * bool(pictures)
     with stages("report"):

@@ -59,7 +59,7 @@ COMMANDS = {
     "campaign": "campaign CAMPAIGN",
 }
 WRONG = {
-    "report": "--recommend FLIGHT|--against nope|--export bananas|report LOST",
+    "report": "--recommend FLIGHT|--against nope|report LOST",
     "map": "--with nope.yaml|--with LOST",
     "predict": "--with nope.yaml|--with LOST|--site nowhere",
     "plan": "--route nope.kml|--geofence nope.kml|--minutes 1 --tower-distance 5000|--with LOST",

@@ -3,13 +3,10 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
-import xarray
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.report.exports import FORMATS
 from tests.simulated import planned, simulate, write_yaml
 
 SETTINGS = planned(
@@ -21,37 +18,23 @@ SETTINGS = planned(
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Write one report with a reflection and one without. The first also exports everything."""
+    """Write one report with a reflection and one without. The first also has samples.kmz."""
     folder = tmp_path_factory.mktemp("pair")
     path = write_yaml(folder / "flight.yaml", SETTINGS)
     simulate(path)
     out = folder / "with", folder / "without"
     words = ["--figures", "none", "--quiet"]
-    assert main(["report", str(path), "-o", str(out[0]), "--export", "all", *words]) == 0
+    assert main(["report", str(path), "-o", str(out[0]), "--kmz", *words]) == 0
     write_yaml(path, {**SETTINGS, "rt": {"max_depth": 0, "audit_links": 0}})
     assert main(["report", str(path), "-o", str(out[1]), *words]) == 0
     return out
 
 
-def test_every_export_is_part_of_the_report(pair: tuple[Path, Path]) -> None:
-    names = {path.name for path in (pair[0] / "exports").iterdir()}
-    assert names >= {"rss.nc", "rank.nc", "samples.kmz"}
-    assert len(FORMATS) == 2
-    sums = (pair[0] / "SHA256SUMS").read_text(encoding="utf-8")
-    page = (pair[0] / "report.html").read_text(encoding="utf-8")
-    for name in names:
-        assert f"exports/{name}" in sums
-        assert f"exports/{name}" in page
-    assert not (pair[1] / "exports").exists(), "nobody asked for them"
-    assert json.loads((pair[0] / "metrics.json").read_text(encoding="utf-8"))["stages"]["exports_s"] > 0
-
-
-def test_an_export_holds_the_samples_of_the_report(pair: tuple[Path, Path]) -> None:
-    table = pd.read_csv(pair[0] / "rss.csv")
-    with xarray.open_dataset(pair[0] / "exports" / "rss.nc") as samples:
-        np.testing.assert_allclose(samples["residual_db"], table["residual_db"])
-        times = pd.to_datetime(table["time_utc"]).dt.tz_localize(None)
-        assert abs(samples["time"].values - times).max() <= np.timedelta64(1, "ms")
+def test_the_kmz_is_part_of_the_report(pair: tuple[Path, Path]) -> None:
+    assert "samples.kmz" in (pair[0] / "SHA256SUMS").read_text(encoding="utf-8")
+    assert "samples.kmz" in (pair[0] / "report.html").read_text(encoding="utf-8")
+    assert not (pair[1] / "samples.kmz").exists(), "nobody asked for it"
+    assert json.loads((pair[0] / "metrics.json").read_text(encoding="utf-8"))["stages"]["kmz_s"] > 0
 
 
 def test_diff_of_two_runs_names_the_setting_and_the_levels(pair: tuple[Path, Path]) -> None:

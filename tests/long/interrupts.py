@@ -44,7 +44,7 @@ CASES = {
     "ingest --draft": "ingest {0}/sample --timezone America/New_York --draft out.yaml",
     "report": "report {0}/sample/flight.yaml -o out",
     "report, audit full": "report {0}/sample/flight.yaml -o out --audit full",
-    "report, all figures": "report {0}/sample/flight.yaml -o out --audit none --figures all --export all",
+    "report, all figures": "report {0}/sample/flight.yaml -o out --audit none --figures all --kmz",
     "campaign": "campaign {0}/sample/campaign.yaml -o out --fresh --workers 2",
     "explain": "explain {0}/sample/flight.yaml --time 20 --tower LW1",
     "diff": "diff {0}/a {0}/b",

@@ -1,4 +1,4 @@
-"""One table declares the columns of CSV, NetCDF, the page and docs/outputs.md.
+"""One table declares the columns of CSV, the page and docs/outputs.md.
 
 python -m tests.report.test_columns        writes the tables of docs/outputs.md
 """
@@ -12,7 +12,6 @@ import pytest
 from aerpaw_cmp.report import columns as report_columns
 from aerpaw_cmp.report import flight
 from aerpaw_cmp.report.columns import RANK, RSS, Column, csv_text, described, header, tables
-from aerpaw_cmp.report.exports import of_report
 from aerpaw_cmp.report.flight_data import ReportData
 
 DOCS = Path(__file__).parents[2] / "docs" / "outputs.md"
@@ -37,17 +36,14 @@ def test_the_docs_have_the_columns_of_the_code() -> None:
 
 
 def test_a_new_column_is_one_row(report_data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
-    """File, export and page have it, with unit and meaning."""
+    """File and page have it, with unit and meaning."""
     twice = Column("twice_db", "dB", "twice the residual", lambda p: 2.0 * p.residual_db)
     monkeypatch.setattr(report_columns, "RSS", (*RSS, twice))
-    for module in (flight, "aerpaw_cmp.report.exports"):
-        monkeypatch.setattr(f"{module}.RSS" if isinstance(module, str) else f"{module.__name__}.RSS", (*RSS, twice))
+    monkeypatch.setattr(flight, "RSS", (*RSS, twice))
     head, first = "".join(csv_text(report_columns.RSS, report_data.rss)).splitlines()[:2]
     assert head.split(",")[-1] == "twice_db"
     residual = float(first.split(",")[head.split(",").index("residual_db")])
     assert float(first.split(",")[-1]) == pytest.approx(2.0 * residual, abs=2e-4)
-    (exported,) = (column for column in of_report(report_data).sets[0].columns if column.name == "twice_db")
-    assert (exported.unit, exported.meaning) == ("dB", "twice the residual")
     assert "twice the residual" in flight.page(report_data, [])
 
 

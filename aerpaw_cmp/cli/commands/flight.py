@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from ...common.text import counted
 from ...jobs.options import AGAINST_DISTANCE_M, RunOptions
-from ..app import DryRun, Export, Force, LogsRoot, command, output
+from ..app import DryRun, Force, LogsRoot, command, output
 from ..shown import answered, number, print_files, records, say, show, table, warn_all
 
 
@@ -21,7 +21,7 @@ from ..shown import answered, number, print_files, records, say, show, table, wa
         "aerpaw-cmp report flight.yaml -o reports/mine --audit none",
         "aerpaw-cmp report flight.yaml --dry-run",
         "aerpaw-cmp report flight.yaml --figures all",
-        "aerpaw-cmp report flight.yaml --export kmz",
+        "aerpaw-cmp report flight.yaml --kmz",
         "aerpaw-cmp report flight.yaml --with calibrated.yaml",
         "aerpaw-cmp report flight.yaml --against prediction",
         "aerpaw-cmp report flight.yaml --against matlab.csv --against sionna_map.npz",
@@ -56,7 +56,7 @@ def report(
         Literal["none", "svg", "png", "pdf", "all"],
         Option(help="Format of figures as separate files: none, one format, or all formats."),
     ] = "none",
-    export: Export = None,
+    kmz: Annotated[bool, Option("--kmz", help="Also write samples.kmz for Google Earth and QGIS.")] = False,
     dry_run: DryRun = False,
     force: Force = False,
 ) -> int:
@@ -70,7 +70,7 @@ def report(
         against=tuple(against or ()),
         against_distance_m=against_distance,
         figures=figures,
-        export=export or (),
+        kmz=kmz,
     )
     options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
     outcome = run.run_report(flight, chosen, options)

@@ -1,24 +1,19 @@
-"""Exports are read back with the programs that others use and compared with the CSVs."""
+"""samples.kmz is read back with a reader of others and compared with the CSVs."""
 
 import dataclasses
-import sys
 import zipfile
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.compare.gains import NO_SPREAD, StatedSpread
 from aerpaw_cmp.maps.export import Scale
 from aerpaw_cmp.report import columns as export
-from aerpaw_cmp.report import exports as formats
-from aerpaw_cmp.report import exports as kmz
-from aerpaw_cmp.report import exports as points
+from aerpaw_cmp.report import kmz
 
 ODD = 'LW<4> & "ö"'
-DBM = "0.1 lg(re 1 mW)"
 
 
 def thinned(record, every, **change):
@@ -93,37 +88,6 @@ def same_times(table, times):
     assert seconds.abs().max() < 2e-3
 
 
-COLUMNS = {
-    "rss": ["measured_db", "calibrated_db", "simulated_dbm", "residual_db", "measured_out_of_coverage", "simulated_out_of_coverage", "free_space_dbm", "two_ray_dbm", "simulated_sd_db", "up_m"],
-    "rank": ["measured_rank", "simulated_rank_k10", "simulated_rank_k100", "simulated_rank_k1000", "level_dbm", "up_m"],
-}  # fmt: skip
-
-
-# --- one check per format, each against the CSVs ---------------------------------------------------------------------
-
-
-def check_netcdf(folder, frames):
-    xr = pytest.importorskip("xarray")
-    for kind, table in frames.items():
-        with xr.open_dataset(folder / f"{kind}.nc", decode_coords="all") as book:
-            assert book.attrs["featureType"] == "trajectory"
-            assert book.attrs["history"]
-            for name in COLUMNS[kind]:
-                same(table, name, book["up" if name == "up_m" else name])
-            same_times(table, book["time"].values)
-            same_places(table, book["latitude"], book["longitude"])
-            towers = np.repeat(book["tower"].values.astype(str), book["row_size"].values)
-            assert towers.tolist() == table["tower"].tolist()
-            level = book["simulated_dbm" if kind == "rss" else "level_dbm"]
-            assert level.attrs["units"] == DBM
-            assert book["latitude"].attrs["units"] == "degrees_north"
-            if kind == "rank":
-                codes = book["simulated_rank_k10"].attrs
-                assert codes["flag_meanings"].split()[0] == "out_of_coverage"
-                assert codes["flag_values"][0] == 0
-                assert np.isnan(book["measured_rank"].values).any(), "no CSI stays missing"
-
-
 def valid_kml(folder, text):
     """Against the schema of the OGC."""
     from fastkml import validator
@@ -135,14 +99,14 @@ def valid_kml(folder, text):
         return False
 
 
-def check_kmz(folder, frames, data):
+def test_an_independent_reader_finds_what_the_csvs_hold(data, frames, tmp_path):
     fastkml = pytest.importorskip("fastkml")
-    with zipfile.ZipFile(folder / "samples.kmz") as archive:
+    with zipfile.ZipFile(kmz.write_kmz(data, tmp_path)) as archive:
         assert archive.namelist()[0] == "doc.kml"
         text = archive.read("doc.kml").decode()
         legends = [name for name in archive.namelist() if name.startswith("legends/")]
     book = fastkml.KML.from_string(text.split("?>\n", 1)[1])
-    assert valid_kml(folder, text)
+    assert valid_kml(tmp_path, text)
     document = book.features[0]
     folders = {f.name: f for f in document.features if isinstance(f, fastkml.Folder)}
     towers = folders.pop("Towers")
@@ -178,23 +142,6 @@ def check_kmz(folder, frames, data):
     assert f"{ODD} USRP1, Residual" in folders
 
 
-CHECKS = {"netcdf": check_netcdf, "kmz": check_kmz}
-
-
-@pytest.mark.parametrize("name", formats.FORMATS)
-def test_an_independent_reader_finds_what_the_csvs_hold(name, data, frames, tmp_path):
-    written = formats.write_exports(points.of_report(data), tmp_path, [name])
-    assert written
-    assert all(path.is_file() and path.parent.name == "exports" for path in written)
-    CHECKS[name](tmp_path / formats.FOLDER, frames, *([data] if name == "kmz" else []))
-
-
-def test_netcdf_passes_the_checker_of_the_conventions_it_claims(data, tmp_path, cf_faults):
-    formats.write_exports(points.of_report(data), tmp_path, ["netcdf"])
-    assert cf_faults(tmp_path / "exports" / "rss.nc") == []
-    assert cf_faults(tmp_path / "exports" / "rank.nc") == []
-
-
 # --- what else may happen --------------------------------------------------------------------------------------------
 
 
@@ -208,57 +155,47 @@ def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatc
     relative = dataclasses.replace(
         data, rss=tuple(map(moved, data.rss)), rank=tuple(map(moved, data.rank)), track=moved(data.track)
     )
-    export = points.of_report(relative)
-    assert not export.clock
-    formats.write_exports(export, tmp_path, ["kmz"])
-    with zipfile.ZipFile(tmp_path / "exports" / "samples.kmz") as archive:
+    with zipfile.ZipFile(kmz.write_kmz(relative, tmp_path)) as archive:
         text = archive.read("doc.kml").decode()
     assert "TimeSpan" not in text
     assert "no origin" in text
 
 
+def lines_of(data, folder):
+    with zipfile.ZipFile(kmz.write_kmz(data, folder)) as archive:
+        text = archive.read("doc.kml").decode()
+    assert valid_kml(folder, text)
+    return {part.partition("</name>")[0]: part.count("<LineString>") for part in text.split("<Folder><name>")[1:]}
+
+
 def test_a_flight_with_rank_alone_and_one_with_nothing(data, tmp_path, monkeypatch):
+    pytest.importorskip("fastkml")
     monkeypatch.setattr(Scale, "legend", lambda *_: {})
-    alone = dataclasses.replace(data, rss=())
-    (tmp_path / "a").mkdir()
-    names = {p.name for p in formats.write_exports(points.of_report(alone), tmp_path / "a", formats.FORMATS)}
-    assert "rank.nc" in names
-    assert "rss.nc" not in names
-    nothing = dataclasses.replace(data, rss=(), rank=(), track=None)
-    (tmp_path / "b").mkdir()
-    assert formats.write_exports(points.of_report(nothing), tmp_path / "b", formats.FORMATS)
+    ranks = lines_of(dataclasses.replace(data, rss=()), tmp_path)
+    assert list(ranks) == ["Towers", "LW1, Rank reported", *(f"LW1, Rank replayed, K = {k}" for k in (10, 100, 1000))]
+    assert all(ranks[name] for name in ranks if name != "Towers")
+    assert lines_of(dataclasses.replace(data, rss=(), rank=(), track=None), tmp_path) == {"Towers": 0}
+    nan = np.full(len(data.rss[0].time), np.nan)
     silent = dataclasses.replace(
-        data.rss[0],
-        measured_db=np.full(len(data.rss[0].time), np.nan),
-        simulated_dbm=np.full(len(data.rss[0].time), np.nan),
-        position_m=np.full((len(data.rss[0].time), 3), np.nan),
+        data.rss[0], measured_db=nan, simulated_dbm=nan, position_m=np.full((len(nan), 3), np.nan)
     )
-    (tmp_path / "c").mkdir()
-    assert formats.write_exports(
-        points.of_report(dataclasses.replace(data, rss=(silent,), rank=())), tmp_path / "c", formats.FORMATS
-    )
+    levels = lines_of(dataclasses.replace(data, rss=(silent,), rank=()), tmp_path)
+    assert set(levels.values()) == {0}
+    assert len(levels) == 4
 
 
 def test_same_flight_same_kmz(data, tmp_path):
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        formats.write_exports(points.of_report(data), tmp_path / name, ["kmz"])
-    first, second = (tmp_path / name / "exports" / "samples.kmz" for name in ("a", "b"))
-    assert first.read_bytes() == second.read_bytes()
+    first, second = (kmz.write_kmz(data, tmp_path).read_bytes() for _ in range(2))
+    assert first == second
 
 
 def test_a_long_flight_is_thinned_with_its_extremes(data, tmp_path, monkeypatch):
     monkeypatch.setattr(kmz, "POINTS", 600)
-    folder = tmp_path / "exports"
-    folder.mkdir()
     panel = data.rss[0]
     level = np.array(panel.measured_db)
     level[61] += 60.0  # one sample among many
-    export = points.of_report(
-        dataclasses.replace(data, rss=(dataclasses.replace(panel, measured_db=level), data.rss[1]))
-    )
-    kmz.write_kmz(export, folder)
-    with zipfile.ZipFile(folder / "samples.kmz") as archive:
+    changed = dataclasses.replace(data, rss=(dataclasses.replace(panel, measured_db=level), data.rss[1]))
+    with zipfile.ZipFile(kmz.write_kmz(changed, tmp_path)) as archive:
         text = archive.read("doc.kml").decode()
     largest = float(np.nanmax(level + panel.score.offset_db - panel.simulated_dbm))
     assert f"{largest:.1f} dB</name>" in text
@@ -272,40 +209,3 @@ def test_every_rank_has_its_own_colour():
     numbers = kmz.RANKS.bin_of(np.array([1.0, 2.0, 3.0, 4.0, 0.0, np.nan]))
     assert [kmz.RANKS.labels[i] for i in numbers[:4]] == ["rank 1", "rank 2", "rank 3", "rank 4"]
     assert {kmz.RANKS.labels[i] for i in numbers[4:]} == {"out of coverage"}
-
-
-def test_formats_are_chosen_by_name():
-    assert formats.chosen_formats(["NetCDF, kmz", "kmz"]) == ("kmz", "netcdf")
-    assert formats.chosen_formats(["all"]) == formats.FORMATS
-    assert formats.chosen_formats([]) == ()
-    with pytest.raises(UsageError, match=r"'shapefile'.*netcdf"):
-        formats.chosen_formats(["shapefile"])
-
-
-def test_a_missing_library_is_named_with_its_extra(data, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "netCDF4", None)
-    with pytest.raises(UsageError, match=r"netCDF4.*aerpaw-cmp\[geo\]"):
-        formats.chosen_formats(["netcdf"])
-    messages = []
-    formats.write_exports(
-        points.of_report(data), tmp_path, formats.chosen_formats(["kmz", "all"]), lambda text, *_: messages.append(text)
-    )
-    assert any("netCDF4" in text and "aerpaw-cmp[geo]" in text for text in messages)
-    assert not list((tmp_path / "exports").glob("*.nc"))
-
-
-@pytest.mark.parametrize("name", formats.FORMATS)
-def test_a_limit_of_the_disk_is_an_oserror_in_every_format(name, data, tmp_path, monkeypatch):
-    """A library that writes its own files must not end the process or hide an error."""
-    resource = pytest.importorskip("resource")
-    monkeypatch.setattr(Scale, "legend", lambda *_: {})
-    export = points.of_report(data)
-    formats.write_exports(export, tmp_path, [name])  # what it loads is loaded now
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # it would be cut, and kept
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
-        with pytest.raises(OSError, match=r"(?i)large|disk"):
-            formats.write_exports(export, tmp_path, [name])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -1035,12 +1035,12 @@ class _Places:
 
 @dataclass(frozen=True, slots=True)
 class _Prepared:
-    """A pass ready to be paired: keys of the positions of levels and residuals, numbers of its cells, and means."""
+    """A pass ready to be paired: positions of its levels and residuals, numbers of its cells, and means."""
 
     number: int
     flown: Pass
-    level: bytes
-    residual: bytes
+    level: _Places
+    residual: _Places
     cells: IntArray
     means: FloatArray
     heights: FloatArray
@@ -1074,13 +1074,12 @@ def pass_pairs(
     for first, second in combinations(flights.values(), 2):
 
         @cache  # the links of a pair of flights share its searches
-        def met(mine: bytes, theirs: bytes) -> tuple[IntArray, IntArray]:
-            return places[mine].partners(places[theirs], radius_m, heading_within_deg)
+        def met(mine: _Places, theirs: _Places) -> tuple[IntArray, IntArray]:
+            return mine.partners(theirs, radius_m, heading_within_deg)
 
-        shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
         for link, own in first.items():
             for mine, theirs in product(own, second.get(link, ())):
-                yield _pair(mine, theirs, met, shared)
+                yield _pair(mine, theirs, met)
 
 
 def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Places]) -> _Prepared:
@@ -1099,17 +1098,12 @@ def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Place
     )
 
 
-def _entered(flown: Pass, good: BoolArray, places: dict[bytes, _Places]) -> bytes:
-    """Store the positions of some samples, and return a key that is equal for links that were sampled together."""
-    digest = hashlib.blake2b(good.tobytes(), digest_size=16)
-    digest.update(np.ascontiguousarray(flown.position_m).tobytes())
-    if flown.heading_deg is not None:
-        digest.update(np.ascontiguousarray(flown.heading_deg).tobytes())
-    # a key by content: links that were sampled together have equal positions in different arrays
-    key = digest.digest()
-    if key not in places:
-        places[key] = _Places(flown.position_m, flown.heading_deg, good)
-    return key
+def _entered(flown: Pass, good: BoolArray, places: dict[bytes, _Places]) -> _Places:
+    """Return the positions of some samples, the same object for links that were sampled together."""
+    columns = (good, flown.position_m, *([] if flown.heading_deg is None else [flown.heading_deg]))
+    # by content, because links that were sampled together have equal positions in different arrays
+    key = hashlib.sha256(b"".join(column.tobytes() for column in columns)).digest()
+    return places.setdefault(key, _Places(flown.position_m, flown.heading_deg, good))
 
 
 def cell_means(
@@ -1144,23 +1138,13 @@ def cell_means(
     return cell, residual, height
 
 
-def _pair(
-    mine: _Prepared,
-    theirs: _Prepared,
-    met: Callable[[bytes, bytes], tuple[IntArray, IntArray]],
-    shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]],
-) -> PassPair:
-    """Compare two passes of a link. ``met`` finds partners by the keys of positions, ``shared`` caches common cells."""
+def _pair(mine: _Prepared, theirs: _Prepared, met: Callable[[_Places, _Places], tuple[IntArray, IntArray]]) -> PassPair:
+    """Compare two passes of a link. ``met`` finds the indices of partners."""
     i, j = met(mine.level, theirs.level)
     level = theirs.flown.level_db[j] - mine.flown.level_db[i]
     i, j = met(mine.residual, theirs.residual)
     residual = theirs.flown.residual_db[j] - mine.flown.residual_db[i]
-    cells = mine.residual, theirs.residual  # equal positions have the same cells and heights
-    if cells not in shared:
-        _, i, j = np.intersect1d(mine.cells, theirs.cells, assume_unique=True, return_indices=True)
-        height = float(np.median(theirs.heights[j] - mine.heights[i])) if len(i) else float("nan")
-        shared[cells] = i, j, height
-    i, j, height = shared[cells]
+    _, i, j = np.intersect1d(mine.cells, theirs.cells, assume_unique=True, return_indices=True)
     change, nan = theirs.means[j] - mine.means[i], float("nan")
     return PassPair(
         first=mine.number,
@@ -1173,5 +1157,5 @@ def _pair(
         place_rmse_db=float(change.std()) if len(i) else nan,
         place_correlation=correlation(mine.means[i], theirs.means[j]),
         cells=len(i),
-        height_difference_m=height,
+        height_difference_m=float(np.median(theirs.heights[j] - mine.heights[i])) if len(i) else nan,
     )

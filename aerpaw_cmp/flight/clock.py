@@ -12,9 +12,9 @@ The start of a log with relative times follows from a companion log with absolut
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, product
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ import shapely
 from ..common.gaussian import Factor, determining, gaussian_kernel
 from ..common.geodesy import rough_m
 from ..common.jsonable import fields_of
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed
+from ..common.units import AnyArray, BoolArray, FloatArray, Printed
 from ..compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
 from ..compare.statistics import is_flat
 from ..logs.records import Stream, has_wall_clock
@@ -231,34 +231,31 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     alive = [channel for channel in channels if not channel.flat]  # a constant level contains no information about time
     if not alive:
         return _nothing(_FLAT_LEVEL, window_s)
-    channels = _same_models(alive)
-    models = list(channels[0].along.predicted_db)
-    groups = _at_one_time(channels)
-    places = {place: group[0].along for (place, *_), group in groups.items()}
+    models = [name for name in alive[0].along.predicted_db if all(name in c.along.predicted_db for c in alive)]
+    places = {channel.along.place: channel.along for channel in alive}
     features = {place: along.features() for place, along in places.items()}
     bins = {
-        tuple(c.name for c in group): b
-        for (place, *_), group in groups.items()
-        if (b := _Bins.of(group, features[place], window_s)) is not None
+        channel.name: b
+        for channel in alive
+        if (b := _Bins.of(channel, models, features[channel.along.place], window_s)) is not None
     }
     if not bins:
         return _nothing(_NO_OVERLAP, window_s)
     steps = int(window_s / _STEP_S + 1e-9)
     lags = np.asarray(np.arange(-steps, steps + 1) * _STEP_S, dtype=np.float64)
     # find likely lags with a guess of the correlation time, then fit the correlation time at these lags
-    first = np.sum([b.likelihood(lags, [[_START]] * len(names)).sum(axis=0) for names, b in bins.items()], axis=0)
+    first = np.sum([b.likelihood(lags, [_START]) for b in bins.values()], axis=0)
     starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # the likeliest lag of each model, and zero
-    parts = {names: b.fitted(starts) for names, b in bins.items()}
+    parts = {name: b.fitted(starts) for name, b in bins.items()}
 
     def likelihood(block: FloatArray) -> FloatArray:
-        return np.concatenate([b.likelihood(block, parts[names]) for names, b in bins.items()])
+        return np.stack([b.likelihood(block, parts[name]) for name, b in bins.items()])
 
     tried, nats = _finer(lags, likelihood, window_s)
-    names = [name for together in bins for name in together]
-    estimate = _judged(tried, nats, names, window_s)
+    estimate = _judged(tried, nats, list(bins), window_s)
     # channels of one computer have one lag, so their log likelihoods add
     total = nats.sum(axis=0).max(axis=1)  # the most likely model at each lag
-    n = sum(b.n * len(together) for together, b in bins.items())
+    n = sum(b.n for b in bins.values())
     estimate = replace(estimate, model=models[int(total.argmax())], n=n)
     explained = total.max() - sum(b.constant() for b in bins.values())
     if explained < EVIDENCE_NAT + np.log(len(lags)):  # a gain of this size occurs by chance among this number of lags
@@ -271,17 +268,15 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     return replace(estimate, verdict=verdict, reason=reason, ci95_s=(low, high))
 
 
-def _shown_without(
-    bins: Mapping[tuple[str, ...], _Bins], parts: Mapping[tuple[str, ...], list[list[_Parts]]], lag_s: float
-) -> bool:
+def _shown_without(bins: Mapping[str, _Bins], parts: Mapping[str, list[_Parts]], lag_s: float) -> bool:
     """Check whether a lag is more likely than zero without any two neighbouring parts of the flight."""
     start, end = min(b.mean_s[0] for b in bins.values()), max(b.mean_s[-1] for b in bins.values())
     lags = np.array([lag_s, 0.0, *((-_SAME_S, _SAME_S) if abs(lag_s) > _AGREE_S else ())])
     for part in range(_LEFT_OUT - 1):
         nats = []
-        for names, b in bins.items():
+        for name, b in bins.items():
             away = (b.mean_s - start) / max(end - start, 1e-9) * _LEFT_OUT - part
-            nats.append(b.likelihood(lags, parts[names], (away < 0.0) | (away >= 2.0)).sum(axis=0))
+            nats.append(b.likelihood(lags, parts[name], (away < 0.0) | (away >= 2.0)))
         shifted, *same = np.sum(nats, axis=0).max(axis=0)
         if shifted - max(same) < _WITHOUT_NAT:
             return False
@@ -292,25 +287,6 @@ _NO_OVERLAP = "too few samples at which the telemetry gives a position for every
 _FLAT_LEVEL = "the level is constant although the model predicts a change"
 _ONE_PLACE = "only one fifth of the flight supports a clock shift"
 _NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
-
-
-def _same_models(channels: Sequence[ClockChannel]) -> list[ClockChannel]:
-    """Return the channels with only the models that all of them have."""
-    common = set.intersection(*(set(channel.along.predicted_db) for channel in channels))
-    alongs = {
-        id(c.along): replace(c.along, predicted_db={k: v for k, v in c.along.predicted_db.items() if k in common})
-        for c in channels
-    }
-    return [replace(channel, along=alongs[id(channel.along)]) for channel in channels]
-
-
-def _at_one_time(channels: Sequence[ClockChannel]) -> dict[tuple[Hashable, ...], list[ClockChannel]]:
-    """Return the channels in groups with equal positions, times and missing levels."""
-    groups: dict[tuple[Hashable, ...], list[ClockChannel]] = {}
-    for channel in channels:
-        finite = [np.isfinite(v).tobytes() for v in (channel.measured_db, *channel.along.predicted_db.values())]
-        groups.setdefault((channel.along.place, np.asarray(channel.time_s).tobytes(), *finite), []).append(channel)
-    return groups
 
 
 def _finer(
@@ -378,10 +354,10 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bins:
-    """Means of levels (n, channels), the times (s,) of the predictions, and the index of the first time of each mean.
+    """Means (n,) of the levels of a channel, the times (s,) of the predictions, and the first of these of each mean.
 
-    ``features`` of directions are averaged over the same duration about each time. ``predicted`` (channels, models) is
-    the index in ``levels`` (g, k) of the prediction for a channel by a model.
+    ``features`` of directions are averaged over the same duration about each time. ``levels`` (g, models) are the
+    predictions.
     """
 
     mean_db: FloatArray
@@ -391,28 +367,22 @@ class _Bins:
     along: Along
     features: FloatArray
     levels: FloatArray
-    predicted: IntArray
 
     @property
     def n(self) -> int:
         return len(self.mean_s)
 
     @classmethod
-    def of(cls, channels: Sequence[ClockChannel], features: FloatArray, window_s: float) -> _Bins | None:
-        """Return bins of channels that differ only in their levels and have a prediction at every lag of the window.
-
-        Returns None if there are too few bins.
-        """
-        along = channels[0].along
-        models = {id(c.along): list(c.along.predicted_db.values()) for c in channels}
-        levels = np.column_stack([table for tables in models.values() for table in tables])
-        columns = dict(zip(models, np.arange(levels.shape[1]).reshape(len(models), -1), strict=True))
-        t, y = np.asarray(channels[0].time_s), np.column_stack([c.measured_db for c in channels])
+    def of(cls, channel: ClockChannel, models: Sequence[str], features: FloatArray, window_s: float) -> _Bins | None:
+        """Return the bins of a channel that have a prediction at every lag of the window, or None if they are few."""
+        along = channel.along
+        levels = np.column_stack([along.predicted_db[name] for name in models])
+        t, y = np.asarray(channel.time_s), channel.measured_db
         lost = np.asarray(~(np.isfinite(features).all(axis=1) & np.isfinite(levels).all(axis=1)))
         missing = np.concatenate([[0], np.cumsum(lost)])
         with np.errstate(invalid="ignore"):
             low, high = (np.floor((t + side - along.start_s) / along.step_s) for side in (-window_s, window_s))
-            ok: BoolArray = np.isfinite(y).all(axis=1) & (low >= 0) & (high + 1 < len(lost))
+            ok: BoolArray = np.isfinite(y) & (low >= 0) & (high + 1 < len(lost))
         begin, end = (np.where(ok, side, 0).astype(np.int64) for side in (low, high))
         # count gaps cumulatively: the prediction must exist at all times of the window
         ok[ok] = missing[end[ok] + 2] == missing[begin[ok]]
@@ -428,12 +398,15 @@ class _Bins:
         place = np.arange(len(t)) - np.repeat(first, count)
         few = place % np.repeat(-(-count // _PER_BIN), count) == 0
         starts = np.concatenate([[0], np.cumsum(few)])[first]
-        mean_db = np.stack([_calm(np.add.reduceat(v, first) / count) for v in y.T], axis=1)
         return cls(
-            mean_db=mean_db, mean_s=np.add.reduceat(t, first) / count, at_s=t[few], first=starts, along=along,
-            features=_averaged(features, width / along.step_s), levels=levels,
-            predicted=np.stack([columns[id(c.along)] for c in channels]),
-        )  # fmt: skip
+            mean_db=_calm(np.add.reduceat(y, first) / count),
+            mean_s=np.add.reduceat(t, first) / count,
+            at_s=t[few],
+            first=starts,
+            along=along,
+            features=_averaged(features, width / along.step_s),
+            levels=levels,
+        )
 
     def _between(self, at_s: FloatArray, table: FloatArray) -> FloatArray:
         place = (at_s - self.along.start_s) / self.along.step_s
@@ -445,46 +418,38 @@ class _Bins:
         return out
 
     def systems(self, lags: FloatArray) -> FloatArray:
-        """Return a table (n, lags, columns) of features (offset, slope, gains) and residuals per channel and model."""
+        """Return a table (n, lags, columns) of features (offset, slope, gains) and residuals per model."""
         count = np.diff(np.append(self.first, len(self.at_s)))[:, None]
-        features, models = self.features.shape[1], self.predicted.shape[1]
-        out = np.empty((self.n, len(lags), features + self.predicted.size))
+        features = self.features.shape[1]
+        out = np.empty((self.n, len(lags), features + self.levels.shape[1]))
         for row, lag in enumerate(lags):
             level = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
-            residual = np.repeat(self.mean_db, models, axis=1) - level[:, self.predicted.ravel()]
+            residual = self.mean_db[:, None] - level
             out[:, row, :features] = self._between(self.mean_s - lag, self.features)
             # the offset is fitted anyway, and numbers near 0 keep their digits
             out[:, row, features:] = residual - residual.mean(axis=0)
         return out
 
-    def likelihood(
-        self, lags: FloatArray, parts: Sequence[Sequence[_Parts]], kept: BoolArray | None = None
-    ) -> FloatArray:
-        """Return the log likelihood (channels, models, lags) of means ``kept`` with the best parts per channel."""
-        every = list(dict.fromkeys(chain(*parts)))
-        belongs = np.array([[part in mine for mine in parts] for part in every])[:, None, :, None]
+    def likelihood(self, lags: FloatArray, parts: Sequence[_Parts], kept: BoolArray | None = None) -> FloatArray:
+        """Return the log likelihood (models, lags) of means ``kept`` with the best parts."""
         blocks = np.array_split(lags, -(-len(lags) // _AT_ONCE))
-        tried = [np.where(belongs, self._tried(block, every, kept), -np.inf).max(axis=0) for block in blocks]
-        return np.moveaxis(np.concatenate(tried), 0, -1)
+        return np.asarray(np.concatenate([self._tried(block, parts, kept).max(axis=0) for block in blocks]).T)
 
-    def fitted(self, lags: FloatArray) -> list[list[_Parts]]:
-        """Return the most likely parts of each channel over all models and the given lags."""
+    def fitted(self, lags: FloatArray) -> list[_Parts]:
+        """Return the most likely parts for each model and each of the given lags."""
         parts = [_Parts(*each) for each in product(_MEMORY_S, _WHITE, _GAIN)]
-        best = self._tried(lags, parts).argmax(axis=0)
-        return [[parts[at] for at in set(best[:, channel].flat)] for channel in range(best.shape[1])]
+        return [parts[at] for at in np.unique(self._tried(lags, parts).argmax(axis=0))]
 
     def _tried(self, lags: FloatArray, parts: Sequence[_Parts], kept: BoolArray | None = None) -> FloatArray:
-        """Return the log likelihood of every combination (parts, lags, channels, models)."""
+        """Return the log likelihood of every combination (parts, lags, models)."""
         rows = np.ones(self.n, dtype=bool) if kept is None else kept
-        tried = _likelihood(self.systems(lags)[rows], self.mean_s[rows], self.predicted.size, parts)
-        return tried.reshape(*tried.shape[:2], *self.predicted.shape)
+        return _likelihood(self.systems(lags)[rows], self.mean_s[rows], self.levels.shape[1], parts)
 
     def constant(self) -> float:
-        """Return the largest log likelihood of levels that do not depend on position, summed over the channels."""
-        levels = self.mean_db - self.mean_db.mean(axis=0)
-        columns = np.column_stack([np.ones(self.n), np.zeros(self.n), levels])
+        """Return the largest log likelihood of a level that does not depend on position."""
+        columns = np.column_stack([np.ones(self.n), np.zeros(self.n), self.mean_db - self.mean_db.mean()])
         parts = [_Parts(*memory, 0.0) for memory in product(_MEMORY_S, _WHITE)]
-        return float(_likelihood(columns[:, None], self.mean_s, levels.shape[1], parts).max(axis=0).sum())
+        return float(_likelihood(columns[:, None], self.mean_s, 1, parts).max())
 
 
 def _calm(mean_db: FloatArray) -> FloatArray:

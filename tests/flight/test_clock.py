@@ -17,7 +17,6 @@ from aerpaw_cmp.flight.clock import (
     STAMPS_S,
     Along,
     ClockChannel,
-    _at_one_time,
     _averaged,
     _Bins,
     _finer,
@@ -151,10 +150,10 @@ def test_a_shift_that_less_than_a_fifth_of_the_flight_supports_is_not_shown(
     evidence = (mean_s >= 1000.0 * begin) & (mean_s < 1000.0 * end)
 
     def likelihood(lags: Any, _parts: Any, kept: Any) -> Any:
-        return (evidence & kept).sum() * (lags == 1.5)[None, None, :].astype(float)
+        return (evidence & kept).sum() * (lags == 1.5)[None, :].astype(float)
 
-    bins: Any = {("A",): SimpleNamespace(mean_s=mean_s, likelihood=likelihood)}
-    assert _shown_without(bins, {("A",): []}, 1.5) is shown
+    bins: Any = {"A": SimpleNamespace(mean_s=mean_s, likelihood=likelihood)}
+    assert _shown_without(bins, {"A": []}, 1.5) is shown
 
 
 def test_a_lone_dip_moves_no_estimate():
@@ -308,22 +307,6 @@ def test_the_verdict_follows_from_the_lags_that_are_left(peaks, verdict):
     assert -15.0 <= clock.ci95_s[0] <= clock.radio_minus_telemetry_s <= clock.ci95_s[1] <= 15.0
 
 
-def test_channels_of_one_place_and_time_have_the_likelihoods_of_each_alone():
-    level = ALONG.predicted_db["free space"]
-    other = along(**{"free space": level + 3.0 * np.sin(GRID / 9.0)})  # another antenna: another prediction
-    channels = [channel(0.5, 3), channel(0.5, 4, name="two", known=other), channel(0.5, 5, name="three")]
-    (together,) = _at_one_time(channels).values()
-    parts = [[_Parts(5.0, 0.3, 1.0)], [_Parts(2.0, 0.1, 0.5), _Parts(15.0, 0.9, 2.0)], [_Parts(40.0, 0.3, 0.05)]]
-    lags, both = np.arange(-9.0, 9.1, 0.5), _Bins.of(together, ALONG.features(), 15.0)
-    assert both is not None
-    for single, its, expected in zip(channels, parts, both.likelihood(lags, parts), strict=True):
-        alone = _Bins.of([single], ALONG.features(), 15.0)
-        assert alone is not None
-        np.testing.assert_allclose(alone.likelihood(lags, [its])[0], expected, rtol=1e-9)
-    missing = dataclasses.replace(channels[2], measured_db=np.where(np.arange(920) == 7, np.nan, 1.0))
-    assert [len(some) for some in _at_one_time([*channels[:2], missing]).values()] == [2, 1]
-
-
 def test_a_jittering_attitude_makes_no_sharp_optimum():
     """The likelihood of lags 0.1 s apart: an airframe that rolls by 6 degrees every tenth of a second changes little."""
     rng = np.random.default_rng(8)
@@ -332,9 +315,9 @@ def test_a_jittering_attitude_makes_no_sharp_optimum():
     shaken = dataclasses.replace(ALONG, directions=jitter)
     t = np.arange(20.0, 480.0, 1 / 30.0)
     shaken_channel = channel(0.0, 9, gain_db=12.0, memory_db=0.5, t=t, known=shaken)
-    bins = _Bins.of([shaken_channel], shaken.features(), 15.0)
+    bins = _Bins.of(shaken_channel, list(shaken.predicted_db), shaken.features(), 15.0)
     assert bins is not None
-    value = bins.likelihood(np.arange(-0.6, 0.61, 0.1), [[_Parts(5.0, 0.1, 1.0)]])[0, 0]
+    value = bins.likelihood(np.arange(-0.6, 0.61, 0.1), [_Parts(5.0, 0.1, 1.0)])[0]
     assert value.max() - value[0] > 4.0  # the lag is seen
     assert np.abs(np.diff(value, 2)).max() < 0.25 * np.ptp(value)  # and no lag stands out from its neighbours
 
@@ -412,7 +395,7 @@ def small_bins(t: np.ndarray, window_s: float = 5.0, start_s: float = 0.0, rows:
         start_s=start_s, step_s=0.1, predicted_db={"m": at}, distance_m=at + 1.0, directions=np.ones((rows, 6))
     )
     sine = ClockChannel(name="one", time_s=t, measured_db=np.sin(t), along=table)
-    return _Bins.of([sine], np.column_stack([np.ones(rows), at]), window_s)
+    return _Bins.of(sine, ["m"], np.column_stack([np.ones(rows), at]), window_s)
 
 
 def test_bins_are_seconds_or_nine_hundredths_and_eight_instants_of_each_are_asked() -> None:
@@ -432,7 +415,7 @@ def test_bins_are_seconds_or_nine_hundredths_and_eight_instants_of_each_are_aske
     features, residual = columns[:, :-1], columns[:, -1:]
     asked = dense.at_s.reshape(-1, 8).mean(axis=1) - 1.5
     np.testing.assert_allclose(features[:, 1], dense.mean_s - 1.5, atol=1e-6)
-    expected = dense.mean_db[:, 0] - asked
+    expected = dense.mean_db - asked
     np.testing.assert_allclose(residual[:, 0], expected - expected.mean(), atol=1e-9)
 
 

@@ -572,7 +572,7 @@ def run_calibrate(
     JobOutcome
         The settings file is the first of its ``files``.
     """
-    from ..site.learned import check_index, remember
+    from ..site.learned import folder_of, read_index, remember
     from ..site.siteyaml import inputs_of_site, site_model
     from .calibrate import calibrate, load_calibration, read_flights
     from .calibrate_rank import fit_rank, samples_by_tower
@@ -582,7 +582,7 @@ def run_calibrate(
     settings = load_calibration(path, further)
     if into_site is not None:
         site_model(into_site)  # report a misspelt site before the fit, so that nothing is stored under its name
-        check_index(into_site)
+        read_index(folder_of(into_site))  # report an index to which no entry can be added
     target = options.out or Path(f"{settings.calibration}.calibrated.yaml")
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError("the output is not a YAML file", expected="-o NAME.yaml", path=target)

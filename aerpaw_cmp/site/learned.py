@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from ..common.content import marks, trained_on
 from ..common.errors import InputError, UsageError, parsed, parsing
@@ -263,8 +263,6 @@ class Entry(StrictModel):
     errors: Errors | None = None
     series: list[LearnedSeries] = Field(default_factory=list)
     receivers: list[LearnedReceiver] = Field(default_factory=list)
-    ground_roughness_m: float | None = None
-    """Roughness of the ground that earlier versions learned [m]. It is not used."""
     tables: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
     """SHA-256 of the tables as written. No other file is replaced or removed."""
     sha256: str = ""
@@ -293,12 +291,6 @@ class Entry(StrictModel):
         return text + (f"; expect kappa {sum(kappas) / len(kappas):.2f} on another flight" if kappas else "")
 
 
-class _Foreign(BaseModel, extra="allow"):
-    """An entry of another version. It is not read, but is preserved when other entries are replaced."""
-
-    tables: dict[str, str] = Field(default_factory=dict)
-
-
 _Name = Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
 
 
@@ -307,13 +299,6 @@ class Learned(StrictModel):
 
     format: Literal["aerpaw-cmp learned 3"] = "aerpaw-cmp learned 3"
     entries: dict[_Name, Entry] = Field(default_factory=dict)
-
-
-class _Index(Learned):
-    """The learned models as they are written, with entries of any version."""
-
-    # a newer entry must not be lost when an older version adds another one
-    entries: dict[_Name, Entry | _Foreign] = Field(default_factory=dict)  # type: ignore[assignment]
 
 
 def folder_of(site: str | Path) -> Path:
@@ -336,7 +321,7 @@ def read_learned(site: str | Path) -> Learned:
         If the index names a file outside its folder.
     """
     folder = folder_of(site)
-    memory = _read(folder, Learned)
+    memory = read_index(folder)
     for name, entry in memory.entries.items():
         if entry.sha256 != entry.digest:
             raise UsageError(
@@ -348,20 +333,18 @@ def read_learned(site: str | Path) -> Learned:
     return memory
 
 
-def check_index(site: str | Path) -> None:
-    """Check that entries can be added for a site, which needs an index that can be read.
+def read_index(folder: Path) -> Learned:
+    """Read the index in a folder of learned models, also if values of an entry were edited.
 
     Raises
     ------
-    UsageError, InputError
-        The same as in :func:`read_learned`.
+    UsageError
+        If the index is damaged or has another version.
+    InputError
+        If the index names a file outside its folder.
     """
-    _read(folder_of(site), _Index)
-
-
-def _read(folder: Path, model: type[Learned]) -> Learned:
     index = inside(folder, _INDEX, folder / _INDEX)
-    memory = load_yaml(index, model) if index.is_file() else model()
+    memory = load_yaml(index, Learned) if index.is_file() else Learned()
     for name in {name for entry in memory.entries.values() for name in (*files_of(entry), *entry.tables)}:
         # check before a file is opened, because an index may be untrusted
         inside(folder, name, index, plain=True)
@@ -399,7 +382,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
         folder.mkdir(exist_ok=True)
         # if two calibrations of one site run at once, each must see the entry of the other
         with locked(folder):
-            memory = _read(folder, _Index)
+            memory = read_index(folder)
             # files with a digest in an entry are ours, and so are an edited table and tables of a killed calibration
             written = {item for known in memory.entries.values() for item in known.tables.items()}
             for file in packed:
@@ -458,10 +441,8 @@ def memory_lines(site: str | Path) -> list[str]:
     return lines
 
 
-def files_of(entry: Entry | _Foreign) -> set[str]:
+def files_of(entry: Entry) -> set[str]:
     """Return the names of the tables of an entry."""
-    if isinstance(entry, _Foreign):
-        return set(entry.tables)
     return {file for s in entry.series for file in s.files} | {r.file for r in entry.receivers}
 
 

@@ -48,13 +48,15 @@ from .mapfiles import (
     read_map_file,
 )
 from .site import Building, Forest, Geofence
-from .siteyaml import TALLEST_TREE_M, WIDEST_CROWN_M, SiteModel, build_site, extent_m, site_model
+from .siteyaml import TALLEST_TREE_M, WIDEST_CROWN_M, SingleTreeModel, SiteModel, build_site, extent_m, site_model
 
 # Storey height that OpenStreetMap suggests.
 _LEVEL_M = 3.0
 # Two storeys, the height of a barn or a house.
 _DEFAULT_HEIGHT_M = 6.0
 TALLEST_M = 300.0
+# Heights are rounded to centimetres, so a lower building would have no height.
+_GRID_HEIGHT_M = 0.01
 # Outlines farther than this from the origin do not belong to the site.
 FAR_M = 20_000.0
 
@@ -83,23 +85,14 @@ _EVERGREEN = {"evergreen": 1.0, "needleleaved": 1.0, "mixed": 0.5}
 # Margin of forests around the area of the site. Trees farther away do not shade any path.
 _FOREST_MARGIN_M = 1000.0
 
+# Smallest size of a tree or a wood. A smaller girth would be a trunk of 0.00 m in the file of the site.
+_SMALLEST_SIZE_M = 0.05
 # The thickest known trunk has a girth of 42 m.
 _WIDEST_GIRTH_M = 45.0
 # Distance between the trees of a row without a tagged crown diameter. At this distance default crowns touch.
 _ROW_SPACING_M = 10.0
 
 _MAXIMUM_ROW_TREES = 10_000
-
-
-@dataclass(frozen=True, slots=True)
-class SingleTree:
-    """A tree of a map file in the site frame [m]. Sizes that are not stated are None."""
-
-    east_m: float
-    north_m: float
-    height_m: float | None = None
-    crown_diameter_m: float | None = None
-    trunk_diameter_m: float | None = None
 
 
 @dataclass(slots=True)
@@ -113,7 +106,7 @@ class Footprints:
     buildings: list[Building] = field(default_factory=list)
     forests: list[Forest] = field(default_factory=list)
     geofences: list[Geofence] = field(default_factory=list)
-    trees: list[SingleTree] = field(default_factory=list)
+    trees: list[SingleTreeModel] = field(default_factory=list)
     ground: list[tuple[float, float, float]] = field(default_factory=list)
     """East, north and elevation above sea level of points of the maps [m]."""
     credits: list[str] = field(default_factory=list)
@@ -240,7 +233,7 @@ def _sort(
         actions.append(f"{name}: left out, no building or forest above the ground: {listed}{more}{hint}")
 
 
-def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[SingleTree]:
+def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[SingleTreeModel]:
     """Return a tree with its tagged sizes, or the trees of a row."""
     notes: list[str] = []
     height = _size(tree.tags, ("height", "est_height"), TALLEST_TREE_M, "a tree {:g} m high", notes)
@@ -263,13 +256,15 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
         notes.append(f"{counted(len(points), 'tree')} placed along the row, {crown or _ROW_SPACING_M:g} m apart")
     actions += [f"{tree.source}: {note}" for note in notes]
     trunk = None if girth is None else girth / math.pi
-    return [SingleTree(float(east), float(north), height, crown, trunk) for east, north in points]
+    sizes = {"height_m": height, "crown_diameter_m": crown, "trunk_diameter_m": trunk}
+    known = {name: round(size, 2) for name, size in sizes.items() if size is not None}
+    return [SingleTreeModel(at_m=(round(east, 2), round(north, 2)), **known) for east, north in points.tolist()]
 
 
 def _size(tags: Mapping[str, str], keys: tuple[str, ...], most_m: float, what: str, notes: list[str]) -> float | None:
-    """Return a size of a tree or a wood [m]. If too large, it is noted and not used."""
+    """Return a size of a tree or a wood [m]. If too small or too large, it is noted and not used."""
     size = positive_metres(tags, keys, notes)
-    if size is None or size <= most_m:
+    if size is None or _SMALLEST_SIZE_M <= size <= most_m:
         return size
     notes.append(f"{what.format(size)}; feet or centimetres? The site's default is used")
     return None
@@ -462,10 +457,10 @@ def _describe(shape: _Shape, outline: Outline, actions: list[str]) -> None:
     if (metres(lowest) or 0.0) > 0:
         notes.append("it begins above the ground (min_height, min_level), but is drawn from the ground up")
     actions += [f"{shape.source}: {note}" for note in notes]
-    if not 0 < height <= TALLEST_M:
+    if not _GRID_HEIGHT_M <= height <= TALLEST_M:
         raise InputError(
             f"{shape.source}: a building {height:g} m high",
-            expected=f"0 to {TALLEST_M:g} m",
+            expected=f"{_GRID_HEIGHT_M:g} to {TALLEST_M:g} m",
             cause="feet or centimetres in place of metres",
         )
     shape.height_m = height
@@ -792,7 +787,7 @@ def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
         "credit": "; ".join(imports.credits),
         "assumed": imports.assumed,
     }
-    content["trees"] |= {"single": [_tree_dict(tree) for tree in imports.trees]}
+    content["trees"] |= {"single": imports.trees}
     return imports.actions
 
 
@@ -805,12 +800,6 @@ def _kept_of_base(model: SiteModel, base: str | Path) -> str:
         f"{', '.join(model.towers)} with their positions and antennas, {ground} of {model.ground_material}, tree "
         "sizes. Change them in the file, or name another base with --base"
     )
-
-
-def _tree_dict(tree: SingleTree) -> dict[str, Any]:
-    sizes = {name: getattr(tree, name) for name in ("height_m", "crown_diameter_m", "trunk_diameter_m")}
-    known = {name: round(size, 2) for name, size in sizes.items() if size is not None}
-    return {"at_m": (round(tree.east_m, 2), round(tree.north_m, 2)), **known}
 
 
 def _outline_dict(name: str, area: Polygon) -> dict[str, Any]:

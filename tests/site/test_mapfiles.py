@@ -80,6 +80,7 @@ def test_trees_have_their_tagged_sizes(tmp_path: Path) -> None:
             {"circumference": "250 m", "diameter_crown": "800"},
             {"circumference": "80"},
             {"circumference": "120 cm"},
+            {"height": "0.001", "circumference": "0.01"},
         ]
     ):
         osm.node(*square(40.0 * place + 30, 50)[0], natural="tree", **tags)
@@ -87,13 +88,13 @@ def test_trees_have_their_tagged_sizes(tmp_path: Path) -> None:
     model, actions = import_site([tmp_path / "t.osm"])
     (tmp_path / "site.yaml").write_text(site_yaml(model, header=actions), encoding="utf-8")
     trees = load_site(tmp_path / "site.yaml").trees
-    np.testing.assert_allclose(trees.height_m, [12, 12.19] + 7 * [20])
-    np.testing.assert_allclose(trees.crown_diameter_m, [6] + 8 * [10])
+    np.testing.assert_allclose(trees.height_m, [12, 12.19] + 8 * [20])
+    np.testing.assert_allclose(trees.crown_diameter_m, [6] + 9 * [10])
     np.testing.assert_allclose(trees.crown_base_m, trees.height_m / 4)
-    np.testing.assert_allclose(trees.trunk_diameter_m, [0.5, 0.4, 0.4, 0.4, 0.4, 0.8, 0.4, 0.4, 0.38])
+    np.testing.assert_allclose(trees.trunk_diameter_m, [0.5, 0.4, 0.4, 0.4, 0.4, 0.8, 0.4, 0.4, 0.38, 0.4])
     assert "t.osm: node 4: the height 'tall' is not a length" in actions
     said = ("node 5: a tree 400 m high", "node 6: the circumference '250' is taken as centimetres", "node 7: a trunk 250 m",
-            "node 7: a crown 800 m", "node 8: a trunk 80 m around; feet or centimetres?")  # fmt: skip
+            "node 7: a crown 800 m", "node 8: a trunk 80 m around; feet or centimetres?", "node 10: a tree 0.001 m high")  # fmt: skip
     for words in said:
         assert any(words in action for action in actions), words
 
@@ -102,7 +103,7 @@ def test_tree_rows_become_trees_along_the_line(tmp_path: Path) -> None:
     corners = [[*square(0, 0)[0]], [*square(60, 0)[0]], [*square(60, 40)[0]]]
     row = feature({"type": "LineString", "coordinates": corners}, natural="tree_row", height="9", diameter_crown="5")
     footprints = read(tmp_path, collection(row))
-    east, north = (np.array([getattr(t, name) for t in footprints.trees]) for name in ("east_m", "north_m"))
+    east, north = np.array([tree.at_m for tree in footprints.trees]).T
     assert len(east) == 21
     assert shapely.LineString([(0, 0), (60, 0), (60, 40)]).distance(shapely.points(east, north)).max() < 0.02
     np.testing.assert_allclose(np.diff(east).sum() + np.diff(north).sum(), 100, atol=0.05)

@@ -15,7 +15,6 @@ tower, altitude and position.
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +22,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.errors import UsageError
@@ -182,10 +182,7 @@ class Border:
 
 
 def voronoi_borders(towers_m: ArrayLike, area_m: tuple[float, float, float, float]) -> tuple[Border, ...]:
-    """Return borders of the serving areas, clipped to the map.
-
-    The border of towers a and b is the part of their perpendicular bisector that is inside the area and no
-    nearer to any third tower. Along the bisector each of these conditions is linear, so the part is one segment.
+    """Return borders of the serving areas, clipped to the map: the edges of a Voronoi diagram.
 
     Parameters
     ----------
@@ -200,36 +197,18 @@ def voronoi_borders(towers_m: ArrayLike, area_m: tuple[float, float, float, floa
         Borders of the pairs of towers that have one.
     """
     towers = unmasked(towers_m)[:, :2]
-    lines = {pair: _bisector_segment(*pair, towers, area_m) for pair in itertools.combinations(range(len(towers)), 2)}
-    return tuple(Border(pair, line) for pair, line in lines.items() if line is not None)
-
-
-def _bisector_segment(
-    a: int, b: int, towers: FloatArray, area_m: tuple[float, float, float, float]
-) -> FloatArray | None:
-    """Return the part (2, 2) of the bisector of towers a and b that is their border, or None."""
-    between = towers[b] - towers[a]
-    length = float(np.hypot(*between))
-    # two towers at one position have no bisector
-    if length < 1e-6:
-        return None
-    middle = (towers[a] + towers[b]) / 2
-    along = np.array([-between[1], between[0]]) / length
-    # conditions slope * t <= bound on the point p = middle + t * along: inside the area, and |p - a|^2 <= |p - c|^2
-    others = np.delete(towers, [a, b], axis=0)
-    away = 2 * (others - towers[a])
-    slope = np.concatenate([-along, along, away @ along])
-    nearer = (others**2).sum(axis=1) - towers[a] @ towers[a] - away @ middle
-    bound = np.concatenate([middle - area_m[::2], np.array(area_m[1::2]) - middle, nearer])
-    # the bisector is completely on one side of a bound that is parallel to it
-    parallel = np.abs(slope) < 1e-12
-    at = bound / np.where(parallel, 1.0, slope)
-    low = at[(slope < 0) & ~parallel].max(initial=-np.inf)
-    high = at[(slope > 0) & ~parallel].min(initial=np.inf)
-    # three areas that meet in a point have a corner, not a border
-    if (bound[parallel] < 0).any() or high - low < 1e-9:
-        return None
-    return np.stack([middle + low * along, middle + high * along])
+    # serving_tower assigns a shared position to the first tower there
+    first = np.sort(np.unique(towers, axis=0, return_index=True)[1])
+    west, east, south, north = area_m
+    area, places = shapely.box(west, south, east, north), towers[first]
+    edges = shapely.voronoi_polygons(shapely.multipoints(places), extend_to=area, only_edges=True)
+    borders = []
+    for line in shapely.get_coordinates(shapely.get_parts(edges.intersection(area))).reshape(-1, 2, 2):
+        # both towers are equally near to each point of their border, and no other tower is nearer
+        near = np.argsort(np.hypot(*(places - line.mean(axis=0)).T))[:2]
+        a, b = np.sort(first[near]).tolist()
+        borders.append(Border((a, b), line))
+    return tuple(sorted(borders, key=lambda border: border.towers))
 
 
 # Name of the joint map, in which the nearest tower serves each position.

@@ -100,4 +100,5 @@ def test_collinear_and_coincident_towers_have_borders_or_none():
     assert [b.towers for b in lines] == [(0, 1), (1, 2)]
     assert sorted(abs(lines[0].line_m[:, 1])) == [1065.0, 1065.0]
     assert voronoi_borders([[0.0, 0.0], [0.0, 0.0]], AREA) == ()
+    assert [b.towers for b in voronoi_borders([[0.0, 0.0], [0.0, 0.0], [100.0, 0.0]], AREA)] == [(0, 2)]
     assert voronoi_borders([[0.0, 0.0]], AREA) == ()

@@ -38,7 +38,7 @@ from ..common.outputs import explained_os_errors
 from ..common.units import AnyArray, BoolArray, FloatArray, wavelength_m
 from ..propagation.geometry import corners, site_faces
 from ..propagation.scene import REACH_M
-from ..propagation.search.mirror import Mirrors
+from ..propagation.search.mirror import REACH_SLACK_M, Growth
 from ..site.site import Site, Tower
 from .export import maps_dataset
 from .grid import Grid, MapResult, serving_tower, voronoi_borders
@@ -163,7 +163,7 @@ class Reach:
         self._near = shapely.STRtree(shapely.box(*bounds.T))
         self._ends = corners(faces, 1e9)[:, :2, :2]  # ends of the lower edge of each wall, seen from above
         self._is_wall = (faces.solid >= 0) & (faces.normal[:, 2] == 0.0)
-        self._mirrors = Mirrors(faces, self.extent_m)
+        self._growth = Growth.of(faces, self.extent_m, REACH_SLACK_M, max_depth=1, budget=len(faces) + 1)
 
     def of(self, box_m: FloatArray) -> Site:
         """Return the site with the towers and buildings that reach a box (lowest and highest corner, 3)."""
@@ -186,7 +186,7 @@ class Reach:
         lines = [shapely.linestrings(np.vstack([at, tile])[None])]
         if self._depth:
             # consider only walls: seen from above, a path over ground or roof is on the line between its ends
-            lit = self._mirrors.toward(tower.position_m, box_m)
+            lit = self._growth.mirrors(tower.position_m, box_m)
             lit = lit[self._is_wall[lit]]
             walls = self._ends[lit]
             every = np.broadcast_to(tile, (len(lit), *tile.shape))

@@ -8,7 +8,7 @@ from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.geometry import Links, inside_solids, site_faces
-from aerpaw_cmp.propagation.search.mirror import Mirrors, find_paths, images_of, planes_of
+from aerpaw_cmp.propagation.search.mirror import REACH_SLACK_M, Growth, find_paths, images_of, planes_of
 from aerpaw_cmp.site.site import Building
 
 SOURCE = np.array([[0.0, 0.0, 10.0]])
@@ -47,17 +47,21 @@ def test_same_paths_as_brute_force_at_depth_3(scenes):
     assert paths.depth.max() == 3
 
 
+def one_reflection(faces, points_m):
+    return Growth.of(faces, points_m, REACH_SLACK_M, max_depth=1, budget=len(faces) + 1)
+
+
 def test_mirrors_toward_a_box_are_those_of_all_paths_into_it_and_hardly_more(scenes):
     """Return boxes next to and above buildings, and all faces of paths over one face, at random positions of a box."""
     rng = np.random.default_rng(8)
     site = scenes.site(scenes.buildings(rng, 9, spread_m=120.0))
     faces = site_faces(site)
-    mirrors, thinned = Mirrors(faces, np.array([[-200.0, -200, 0], [200, 200, 60]])), 0
+    growth, thinned = one_reflection(faces, np.array([[-200.0, -200, 0], [200, 200, 60]])), 0
     open_ = replace(faces, solid=np.full(len(faces), -1))  # nothing hides
     for _ in range(12):
         low = rng.uniform([-150, -150, 1], [120, 120, 30])
         box_m = np.array([low, low + rng.uniform(5, 30, 3)])
-        near = mirrors.toward(SOURCE[0], box_m).tolist()
+        near = growth.mirrors(SOURCE[0], box_m).tolist()
         paths = find_paths(open_, Links(SOURCE, rng.uniform(*box_m, (60, 3))), max_depth=1)
         met = set(paths.faces[paths.depth == 1, 0].tolist())
         assert met <= set(near)
@@ -65,7 +69,7 @@ def test_mirrors_toward_a_box_are_those_of_all_paths_into_it_and_hardly_more(sce
         thinned += len(faces) - len(near)
     assert thinned > 6 * len(faces)
     behind = np.array([[-1.0, -1.0, -30.0], [1.0, 1.0, -20.0]])  # under the ground nothing is lit
-    assert not len(Mirrors(site_faces(scenes.site()), behind).toward(SOURCE[0], behind))
+    assert not len(one_reflection(site_faces(scenes.site()), behind).mirrors(SOURCE[0], behind))
 
 
 def test_paths_are_sorted_and_padded(scenes):

@@ -311,7 +311,7 @@ CELLS_PER_CHUNK = 1_000_000
 # Number of targets whose heights over all faces are cached.
 TARGETS_AT_ONCE = 1024
 
-# Margin of :class:`Mirrors` [m]: it is far above the tolerance of any search.
+# Margin of a choice of mirrors before the search [m]: it is far above the tolerance of any search.
 REACH_SLACK_M = 1e-3
 
 
@@ -357,7 +357,7 @@ def find_paths(
     known = targets_m[np.isfinite(targets_m).all(axis=1)] if extent_m is None else extent_m
     tolerance_m = scene_tolerance_m(faces, sources_m, known)
     hiding = Occlusion(faces, tolerance_m)
-    growth = _Growth.of(faces, np.concatenate([known, sources_m]), tolerance_m, max_depth, budget)
+    growth = Growth.of(faces, np.concatenate([known, sources_m]), tolerance_m, max_depth, budget)
     alive = searched_links(links)
     pieces: list[PathSet] = []
     for tower, source in enumerate(sources_m):
@@ -423,7 +423,7 @@ class Sequences:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Growth:
+class Growth:
     """The growth of face sequences, face by face, for any position of the tower.
 
     Parameters
@@ -447,7 +447,7 @@ class _Growth:
     budget: int
 
     @classmethod
-    def of(cls, faces: Faces, points_m: FloatArray, tolerance_m: float, max_depth: int, budget: int) -> _Growth:
+    def of(cls, faces: Faces, points_m: FloatArray, tolerance_m: float, max_depth: int, budget: int) -> Growth:
         """Return the growth between points (n, 3) [m]."""
         # cut infinite faces at ten times the farthest point: far beyond any reflection between two points of the scene
         box = corners(faces, 10.0 * float(max(1.0, np.abs(points_m).max(initial=0.0))))
@@ -476,6 +476,12 @@ class _Growth:
         # use the box round all poses: a beam that misses the box misses every pose
         hull = (low + high)[None] / 2, np.diag(high - low)[None] / 2
         return [levels[0], *(self._reaching(level, lit, hull) for level in levels[1:])]
+
+    def mirrors(self, source_m: FloatArray, box_m: FloatArray) -> IntArray:
+        """Return the faces that may reflect from a source (3,) into a box (lowest and highest corner, 3)."""
+        points = np.array(np.meshgrid(*box_m.T)).reshape(3, -1).T
+        levels = self.sequences(source_m, np.ones(len(self.faces), np.bool_), points)
+        return levels[1].faces[:, 0] if len(levels) > 1 else np.zeros(0, np.int64)
 
     def _one_face_longer(self, level: Sequences, source: FloatArray, usable: BoolArray, left: int) -> Sequences:
         """Return the sequences that are one face longer. At most ``left`` are allowed."""
@@ -525,26 +531,6 @@ class _Growth:
             window = self.bounds.corners_m[last[part]]
             keep[part] = _beam_meets(level.images_m[part, -1], window, *hull_m, self.tolerance_m)
         return Sequences(level.faces[keep], level.images_m[keep])
-
-
-class Mirrors:
-    """The faces at which one reflection may reach a box. Create the object once for many boxes.
-
-    Parameters
-    ----------
-    faces : Faces
-    extent_m : (points, 3)
-        Points that span sources and boxes.
-    """
-
-    def __init__(self, faces: Faces, extent_m: FloatArray) -> None:
-        self._growth = _Growth.of(faces, extent_m, REACH_SLACK_M, max_depth=1, budget=len(faces) + 1)
-
-    def toward(self, source_m: FloatArray, box_m: FloatArray) -> IntArray:
-        """Return the faces that may reflect from a source (3,) into a box (lowest and highest corner, 3)."""
-        points = np.array(np.meshgrid(*box_m.T)).reshape(3, -1).T
-        levels = self._growth.sequences(source_m, np.ones(len(self._growth.faces), np.bool_), points)
-        return levels[1].faces[:, 0] if len(levels) > 1 else np.zeros(0, np.int64)
 
 
 def _facing(faces: Faces, box: _Bounds, tolerance_m: float) -> BoolArray:

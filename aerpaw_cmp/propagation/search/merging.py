@@ -9,6 +9,11 @@ conservative, because the final tests are computed on the items themselves, in f
 
 from __future__ import annotations
 
+import itertools
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 import shapely
 
@@ -273,33 +278,25 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
     # enlarge by the tolerance, so that neighbours in one plane touch
     face_tree = box_tree(low - merge_m, high + merge_m)
     plane = _shared_planes(face_tree, corners, first, (normal, offset), face_area, (low, high), merge_m)
-    normal, offset = normal[plane], offset[plane]
-    along, across = _axes(normal)
-    owner_axes = np.stack([along[face], across[face]], axis=1)
-    flat = np.einsum("tki,tai->tka", corners, owner_axes)
-    base = normal * offset[:, None]
-    window = _windows(flat, first, base, along, across)
-    flat_low = np.minimum.reduceat(flat.min(axis=1), first[:-1], axis=0)
-    flat_high = np.maximum.reduceat(flat.max(axis=1), first[:-1], axis=0)
     of_face = shape[first[:-1]]
+    # faces are numbered within their shape
+    numbers = defaultdict[int, Iterator[int]](lambda: itertools.count(1))
+    labels = tuple(f"{scene.shapes[s]} face {next(numbers[s])}" for s in of_face.tolist())
+    unbounded = Faces(normal[plane], offset[plane], tuple(scene.materials[s] for s in of_face), labels)
+    owner_axes = np.stack([unbounded.along[face], unbounded.across[face]], axis=1)
+    flat = np.einsum("tki,tai->tka", corners, owner_axes)
     return Surfaces(
-        faces=Faces(
-            normal=normal,
-            offset_m=offset,
-            material=tuple(scene.materials[s] for s in of_face),
-            label=_labels(scene.shapes, of_face),
-            along=along,
-            across=across,
-            lower=flat_low,
-            upper=flat_high,
-            polygon=(None,) * count,
+        faces=replace(
+            unbounded,
+            lower=np.minimum.reduceat(flat.min(axis=1), first[:-1], axis=0),
+            upper=np.maximum.reduceat(flat.max(axis=1), first[:-1], axis=0),
             solid=np.asarray(of_face, dtype=np.int64),
         ),
         corners_m=np.ascontiguousarray(corners),
         face=face,
         first=first,
         flat_m=np.ascontiguousarray(flat),
-        window_m=window,
+        window_m=_windows(flat, first, unbounded),
         plane=plane,
         tree=box_tree(corners.min(axis=1), corners.max(axis=1)),
         face_tree=face_tree,
@@ -308,35 +305,12 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
     )
 
 
-def _labels(shapes: tuple[str, ...], of_face: IntArray) -> tuple[str, ...]:
-    """Return labels such as ``shape face 3``, with faces counted within their shape."""
-    counts: dict[int, int] = {}
-    labels = []
-    for shape in of_face.tolist():
-        counts[shape] = counts.get(shape, 0) + 1
-        labels.append(f"{shapes[shape]} face {counts[shape]}")
-    return tuple(labels)
-
-
 def _planes(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return unit normals, offsets and areas of triangles (n, 3, 3)."""
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(across, axis=1)
     normal = across / np.where(size > 0.0, size, 1.0)[:, None]
     return normal, np.einsum("ti,ti->t", normal, corners.mean(axis=1)), 0.5 * size
-
-
-def _axes(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return in-plane unit axes. If the face has a slope, they are level and uphill."""
-    # start across the slope, which is level
-    along = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
-    size = np.linalg.norm(along, axis=1)
-    level = size < 1e-6
-    along = np.where(level[:, None], np.array([1.0, 0.0, 0.0]), along / np.where(level, 1.0, size)[:, None])
-    # subtract the normal component that the axis of a nearly level face still has
-    along -= np.einsum("fi,fi->f", along, normal)[:, None] * normal
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    return along, np.cross(normal, along)
 
 
 def _faces_of_triangles(
@@ -439,17 +413,18 @@ def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type
     return plane
 
 
-def _windows(flat: FloatArray, first: IntArray, base: FloatArray, along: FloatArray, across: FloatArray) -> FloatArray:
+def _windows(flat: FloatArray, first: IntArray, faces: Faces) -> FloatArray:
     """Return convex outlines (faces, 8, 3), counter-clockwise round the normal."""
-    owner = np.repeat(np.arange(len(base)), 3 * np.diff(first))
+    owner = np.repeat(np.arange(len(faces)), 3 * np.diff(first))
     # a corner that turns by a tenth of a micrometre is a rounding error, and would use one of the eight corners
     hull = shapely.simplify(shapely.convex_hull(shapely.multipoints(flat.reshape(-1, 2), indices=owner)), 1e-7)
     corners = shapely.get_num_coordinates(hull) - 1
     hull[corners > WINDOW] = shapely.oriented_envelope(hull[corners > WINDOW])
     point, face = shapely.get_coordinates(shapely.orient_polygons(hull), return_index=True)
-    start = np.searchsorted(face, np.arange(len(base) + 1))
+    start = np.searchsorted(face, np.arange(len(faces) + 1))
     # a ring closes with its first corner, which the window does not need; a sliver may have become a line
     last = start[1:] - np.where(shapely.get_type_id(hull) == shapely.GeometryType.POLYGON, 2, 1)
     outline = point[np.minimum(start[:-1, None] + np.arange(WINDOW), last[:, None])]
-    window = base[:, None] + outline[..., :1] * along[:, None] + outline[..., 1:] * across[:, None]
+    base = faces.normal * faces.offset_m[:, None]
+    window = base[:, None] + outline[..., :1] * faces.along[:, None] + outline[..., 1:] * faces.across[:, None]
     return np.ascontiguousarray(window)

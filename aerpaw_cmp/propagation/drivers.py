@@ -25,7 +25,7 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from .geometry import Array, Faces, Link, PathSet, Poses, RowsT, joined, rotatio
 from .options import Field, Progress, Run, Search, extent_of
 from .replay import PER_LINK, Ends, Replay, replay
 from .scene import Omission
+from .search.terrain import TERRAIN
 
 
 def replay_in_parts(
@@ -113,7 +114,8 @@ def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:
 
 def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
     """Return the faces of all parts, shared ones only once, and the path set of each part with their new numbers."""
-    common = min(_shared(parts[0].faces, part.faces) for part in parts)
+    # all parts begin with the faces of the site; planes of the terrain follow
+    common = int((parts[0].faces.solid != TERRAIN).sum())
     if all(len(part.faces) == common for part in parts):
         return parts[0].faces, [part.paths for part in parts]
     faces, out = parts[0].faces.select(np.arange(common)), []
@@ -123,17 +125,6 @@ def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
         out.append(replace(part.paths, faces=np.where(numbers >= common, numbers + shift, numbers)))
         faces = joined(faces, part.faces.select(np.arange(common, len(part.faces))))
     return faces, out
-
-
-def _shared(first: Faces, second: Faces) -> int:
-    """Return the number of leading faces that are the same in both sets."""
-    count = min(len(first), len(second))
-    same = (first.normal[:count] == second.normal[:count]).all(axis=1)
-    same &= first.offset_m[:count] == second.offset_m[:count]
-    # compare labels, too: faces of two buildings may lie in one plane
-    same &= np.array([a == b for a, b in zip(first.label, second.label, strict=False)], dtype=np.bool_)
-    # argmin of booleans returns the first face that differs
-    return count if same.all() else int(np.argmin(same))
 
 
 def added_up(omissions: Iterable[Omission]) -> list[Omission]:
@@ -304,9 +295,6 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     )
 
 
-# Ways to add the ground ray to the direct ray.
-Ground = Literal["coherent", "power_sum"]
-
 # The default ground of a site. The search fits the strength of its reflection.
 _GROUND_MATERIAL = "itu_medium_dry_ground"
 
@@ -323,7 +311,6 @@ class Geometry:
         Polarisation of each port from vertical.
     ground : float
         Amplitude factor of the ground reflection: 1 for a smooth half-space, 0 for no reflection.
-    sum : {"coherent", "power_sum"}
     """
 
     uav_yaw_deg: float
@@ -332,7 +319,6 @@ class Geometry:
     tower_slant_deg: tuple[float, ...]
     uav_slant_deg: tuple[float, ...]
     ground: float
-    sum: Ground = "power_sum"
 
     @property
     def mount_deg(self) -> tuple[float, float, float]:
@@ -344,7 +330,7 @@ class Geometry:
         slants = "/".join(f"{s:g}" for s in self.uav_slant_deg)
         tower = "/".join(f"{s:g}" for s in self.tower_slant_deg)
         turn = f"yaw {self.uav_yaw_deg:g}, pitch {self.uav_pitch_deg:g}, roll {self.uav_roll_deg:g} deg"
-        return f"{turn}; slants UAV {slants}, tower {tower}; ground x {self.ground:g} ({self.sum.replace('_', ' ')})"
+        return f"{turn}; slants UAV {slants}, tower {tower}; ground x {self.ground:g} (power sum)"
 
 
 def every_geometry(
@@ -352,7 +338,6 @@ def every_geometry(
     tower_slants_deg: Sequence[tuple[float, ...]],
     uav_slants_deg: Sequence[tuple[float, ...]],
     grounds: Sequence[float],
-    sums: Sequence[Ground] = ("power_sum",),
 ) -> tuple[Geometry, ...]:
     """Return all combinations of the values. Geometries with the same mount are adjacent.
 
@@ -364,8 +349,6 @@ def every_geometry(
         Polarisation of each port from vertical [deg].
     grounds : sequence of float
         Strength of the ground reflection relative to Fresnel's coefficient.
-    sums : sequence of {"power_sum", "coherent", ...}
-        How the two rays add up.
 
     Returns
     -------
@@ -374,11 +357,9 @@ def every_geometry(
     return tuple(
         Geometry(
             uav_yaw_deg=yaw, uav_pitch_deg=pitch, uav_roll_deg=roll, tower_slant_deg=tower, uav_slant_deg=uav,
-            ground=ground, sum=how,
+            ground=ground,
         )
-        for (yaw, pitch, roll), tower, uav, how, ground in product(
-            mounts_deg, tower_slants_deg, uav_slants_deg, sums, grounds
-        )
+        for (yaw, pitch, roll), tower, uav, ground in product(mounts_deg, tower_slants_deg, uav_slants_deg, grounds)
     )  # fmt: skip
 
 
@@ -412,24 +393,19 @@ def singular_values_of(
 
     Notes
     -----
-    The UAV receives. With the power sum the values are the roots of the eigenvalues of ``L L^H + g^2 G G^H``. This is
-    the mean of ``H H^H`` over a band in which the phase between ground ray and direct ray takes all values.
+    The UAV receives. Both rays are added as powers: the values are the roots of the eigenvalues of
+    ``L L^H + g^2 G G^H``. This is the mean of ``H H^H`` over a band in which the phase between ground ray and direct
+    ray takes all values.
     """
-    runs = [(mount, list(run)) for mount, run in groupby(geometries, lambda g: g.mount_deg)]
-    for mount, run in runs:
+    for mount, several in groupby(geometries, lambda g: g.mount_deg):
+        run = list(several)
         turned = dataclasses.replace(uav, mount=np.asarray(rotation_from_yaw_pitch_roll(*map(np.radians, mount))))
         fields = basis_fields(tower, tower_m, turned, poses, carrier_hz, any(g.ground for g in run))
         for g in run:
             los, ground = (slanted(field, g.uav_slant_deg, g.tower_slant_deg) for field in fields)
-            ground *= g.ground
-            coherent = g.sum == "coherent"
-            yield np.asarray(np.linalg.svd(los + ground, compute_uv=False)) if coherent else _of_power_sum(los, ground)
-
-
-def _of_power_sum(los: ComplexArray, ground: ComplexArray) -> FloatArray:
-    covariance = sum(field @ field.conj().swapaxes(-1, -2) for field in (los, ground))
-    # eigvalsh returns ascending eigenvalues, and rounding can make a zero eigenvalue slightly negative
-    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., ::-1], 0.0)))
+            covariance = sum(field @ field.conj().swapaxes(-1, -2) for field in (los, g.ground * ground))
+            # eigvalsh returns ascending eigenvalues, and rounding can make a zero eigenvalue slightly negative
+            yield np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., ::-1], 0.0)))
 
 
 def basis_fields(

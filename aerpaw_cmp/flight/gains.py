@@ -186,8 +186,8 @@ def _roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | Non
     """Return the loss of ground reflections by ``rt.ground_roughness_m``, or None for smooth ground.
 
     Each ground reflection is multiplied by ``exp(-2 (k sigma sin(grazing))^2)``, with the grazing angle of the array
-    centres. This is :func:`aerpaw_cmp.propagation.field.baselines.specular_factor` in decibels, which cannot underflow.
-    The scattered power is not traced.
+    centres (Ament, Proc. IRE 41 (1953), 142-146, doi:10.1109/JRPROC.1953.274171). The loss in decibels cannot
+    underflow. The scattered power is not traced.
 
     Raises
     ------

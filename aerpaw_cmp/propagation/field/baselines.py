@@ -41,7 +41,6 @@ def two_ray_dbm(
     ground_material: str = "medium_dry_ground",
     ground_m: FloatArray | float = 0.0,
     polarisation: str = "vertical",
-    roughness_m: float = 0.0,
 ) -> FloatArray:
     """Return the power of line of sight plus one reflection on a flat ground, isotropic antennas [dBm].
 
@@ -58,10 +57,6 @@ def two_ray_dbm(
     polarisation : {"vertical", "horizontal"}
         Determines the Fresnel coefficient: TM for vertical, TE for horizontal. Vertical antennas with the same gain in
         all directions have a field along theta, which stays along theta after the reflection.
-    roughness_m : float
-        Standard deviation of the ground's height: the specular ray falls by ``exp(-2 (k sigma sin(grazing))^2)``
-        (Ament, Proc. IRE 41 (1953), 142-146, doi:10.1109/JRPROC.1953.274171); with infinite roughness only free space
-        remains.
 
     Returns
     -------
@@ -79,24 +74,9 @@ def two_ray_dbm(
     eta = np.asarray(material(ground_material).relative_permittivity(carrier_hz))
     with np.errstate(divide="ignore", invalid="ignore"):
         te, tm = reflection_coefficients(np.abs(high + low) / bounced, eta, np.asarray(np.inf), wavelength)
-        sine = np.abs(high + low) / bounced
-        gamma = (tm if polarisation == "vertical" else te) * specular_factor(roughness_m, sine, wavelength)
+        gamma = tm if polarisation == "vertical" else te
         # difference of the two lengths, in a form without cancellation
         extra = 4.0 * high * low / (bounced + direct)
         field = 1.0 / direct + gamma / bounced * np.exp(-2j * np.pi * extra / wavelength)
         level = transmit_power_dbm + db_from_amplitude(wavelength / (4.0 * np.pi) * np.abs(field))
     return np.asarray(np.where(high >= 0.0, level, np.nan))
-
-
-def specular_factor(roughness_m: float, sine_grazing: FloatArray, wavelength_m: float) -> FloatArray:
-    """Return the share of the field that rough ground reflects specularly: ``exp(-2 (k sigma sin(grazing))^2)``.
-
-    Source: Ament, Proc. IRE 41 (1953), 142-146, doi:10.1109/JRPROC.1953.274171.
-
-    Examples
-    --------
-    >>> specular_factor(0.0, np.array([1.0]), 0.1).tolist(), specular_factor(np.inf, np.array([0.5]), 0.1).tolist()
-    ([1.0], [0.0])
-    """
-    phase = 2.0 * np.pi / wavelength_m * roughness_m * np.asarray(sine_grazing, dtype=np.float64)
-    return np.asarray(np.exp(-2.0 * phase**2))

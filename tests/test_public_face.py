@@ -94,7 +94,7 @@ def test_logs_are_selected_written_and_opened_again_as_a_flight(tmp_path: Path) 
     assert len(flight.rank) == records["rank"]
     assert str(flight.rss.time.dt.tz) == "UTC"
     assert flight.plot().get_xlabel() == "East [m]"
-    assert "LW1" in flight.site._repr_html_()
+    assert "LW1" in flight.site.towers
     with pytest.raises(Exception, match="an unchanged flight file"):
         flight.report(tmp_path / "report")
 

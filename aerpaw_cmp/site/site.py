@@ -13,7 +13,7 @@ import numpy as np
 from shapely.geometry import Point, Polygon
 
 from ..common.geodesy import SiteFrame
-from ..common.text import counted, html_table
+from ..common.text import counted
 from ..common.units import FloatArray
 from .mitsuba import TriangleScene
 from .relief import Dem
@@ -259,9 +259,3 @@ class Site:
             return self
         woods = tuple(replace(forest, height_m=None) if forest.trees else forest for forest in self.forests)
         return replace(self, trees=self.opaque_trees, forests=woods)
-
-    def _repr_html_(self) -> str:
-        """Return towers and their positions as HTML for notebooks."""
-        rows = [(name, *(f"{metres:.1f}" for metres in tower.position_m)) for name, tower in self.towers.items()]
-        caption = f"{self.name}: {counted(len(self.buildings), 'building')}, {counted(len(self.trees), 'tree')}"
-        return html_table(("tower", "east [m]", "north [m]", "up [m]"), rows, caption)

@@ -330,7 +330,7 @@ class Geometry:
         slants = "/".join(f"{s:g}" for s in self.uav_slant_deg)
         tower = "/".join(f"{s:g}" for s in self.tower_slant_deg)
         turn = f"yaw {self.uav_yaw_deg:g}, pitch {self.uav_pitch_deg:g}, roll {self.uav_roll_deg:g} deg"
-        return f"{turn}; slants UAV {slants}, tower {tower}; ground x {self.ground:g} (power sum)"
+        return f"{turn}; slants UAV {slants}, tower {tower}; ground x {self.ground:g} (incoherent)"
 
 
 def every_geometry(

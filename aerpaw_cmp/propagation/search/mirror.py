@@ -448,7 +448,20 @@ class Growth:
 
     @classmethod
     def of(cls, faces: Faces, points_m: FloatArray, tolerance_m: float, max_depth: int, budget: int) -> Growth:
-        """Return the growth between points (n, 3) [m]."""
+        """Return the growth between points.
+
+        Parameters
+        ----------
+        faces : Faces
+        points_m : (n, 3)
+            Points that span sources and targets [m].
+        tolerance_m, max_depth, budget
+            The same as in :class:`Growth`.
+
+        Returns
+        -------
+        Growth
+        """
         # cut infinite faces at ten times the farthest point: far beyond any reflection between two points of the scene
         box = corners(faces, 10.0 * float(max(1.0, np.abs(points_m).max(initial=0.0))))
         first, second, third, fourth = box.transpose(1, 0, 2)

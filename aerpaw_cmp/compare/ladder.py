@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray, IntArray
-from .statistics import Interval, PairedDifference, paired_difference, pooled_difference
+from .statistics import FEWEST, Interval, PairedDifference, paired_difference, pooled_difference
 
 # Number of areas of a flight. It is a power of two, because areas are halved.
 _BLOCKS = 8
@@ -197,7 +197,7 @@ def compare_models(
     candidates: Sequence[CandidateModel],
     position_m: Sequence[FloatArray],
 ) -> ModelComparison:
-    """Score models on held-out areas.
+    """Score models on held-out areas. No model is scored or recommended if they share fewer than 20 samples.
 
     Parameters
     ----------
@@ -220,6 +220,8 @@ def compare_models(
         np.asarray(np.isfinite([m, *(candidate.level_db[i] for candidate in counted)]).all(axis=0))
         for i, m in enumerate(measured_db)
     ]
+    if sum(int(keep.sum()) for keep in shared) < FEWEST:
+        shared = [np.zeros_like(keep) for keep in shared]
     places = [places_of(p[keep]) for p, keep in zip(position_m, shared, strict=True)]
     errors = tuple(
         tuple(

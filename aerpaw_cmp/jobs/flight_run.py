@@ -31,7 +31,7 @@ from ..common.yamlfile import KeyPath, edited, parse_yaml
 from ..compare.causes import OF_DIRECTION
 from ..compare.ladder import CandidateModel, ModelComparison, compare_models, model_rows
 from ..compare.result import BASELINE_TITLE, Cause, FlightResult
-from ..compare.statistics import pooled_difference
+from ..compare.statistics import FEWEST, pooled_difference
 from ..compare.verdict import is_one_place
 from ..flight.data import FlightData, RssSeries, choose_site
 from ..flight.drafting.proposals import errors_elsewhere, offered
@@ -523,7 +523,7 @@ def check_recommended(data: FlightData) -> None:
 
 _NOT_RECOMMENDED = UsageError(
     "no model can be recommended for this flight",
-    expected="RSS with known poses, replayed by the image engine (rt.engine: image)",
+    expected=f"{FEWEST} samples of RSS with known poses, replayed by the image engine (rt.engine: image)",
 )
 
 
@@ -533,7 +533,7 @@ def recommended_text(settings: FlightFile, comparison: FlightComparison | None, 
     Raises
     ------
     UsageError
-        If no models were compared: no RSS, or rays of another engine than the image method.
+        If no models were compared: too few samples of RSS, or rays of another engine than the image method.
     """
     if comparison is None or comparison.scores.recommended is None:
         raise _NOT_RECOMMENDED

@@ -22,7 +22,7 @@ from ..common.units import AnyArray, FloatArray
 from ..compare.ladder import distinct
 from ..compare.level import PART_DB, ErrorSpan, FieldAudit
 from ..compare.result import APPLIED, GIVEN, AuditResult, ClockResult, EngineResult, RankResult, RssResult
-from ..compare.statistics import Interval
+from ..compare.statistics import FEWEST, Interval
 from ..logs.records import has_wall_clock
 from . import flight_words as words
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, paragraph, settings_card
@@ -327,8 +327,10 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
 
 def models_card(data: ReportData) -> Card:
     """Return the card that compares models by their error on held-out areas, over all channels and per channel."""
+    title = "Which model does this flight need?"
     if not data.models:
-        return Card()
+        few = bool(data.rss) and sum(p.score.n for p in data.rss) < FEWEST
+        return Card(title=title, id="ladder", link="Models", text=[words.NO_MODELS] if few else [])
     kept, same = distinct(data.ladder, words.AS_SET)
     rows = {(row.model, row.tower, row.channel): row for row in kept}
     names, channels = dict.fromkeys(row.model for row in kept), dict.fromkeys((row.tower, row.channel) for row in kept)
@@ -366,7 +368,7 @@ def models_card(data: ReportData) -> Card:
         "to the best model so far."
     )
     return Card(
-        title="Which model does this flight need?", id="ladder", link="Models", text=[text], tables=[pooled],
+        title=title, id="ladder", link="Models", text=[text], tables=[pooled],
         chart="ladder", parts=[Card(title="Models, channel by channel", tables=[each], fold=True)],
     )  # fmt: skip
 

@@ -228,6 +228,7 @@ def expected_sentence(panels: Sequence[RssResult]) -> str:
 
 NO_CAUSE = "No likely cause was identified."
 FEW_SAMPLES = "No cause can be identified in fewer than {n} samples."
+NO_MODELS = f"No models are compared, because fewer than {FEWEST} samples have a measurement, a pose and a path."
 TWO_LEVELS = "No cause can be identified: the log has two levels only."
 ONE_PLACE = "No model predicts a change of 1 dB during this flight, so models cannot be distinguished."
 BEYOND_SPAN = "There is no error to report: the best offset is outside its search range."
@@ -415,7 +416,7 @@ def _ground_error(panel: RankResult, k: float) -> str:
     if sd is None:
         return ""
     return (
-        f" Errors of the known ground heights change the agreement by +-{100 * sd:.0f} percentage points "
+        f" Errors of the known ground heights change the agreement by ±{100 * sd:.0f} percentage points "
         "(one standard deviation), so smaller differences are not significant."
     )
 
@@ -654,8 +655,8 @@ def _rank_sentence(panels: Sequence[RankResult]) -> str:
             guess = f"; always guessing {commonest.rank} agrees in {agreement:.0f} %" if commonest.rank else ""
             agree = f" Per position they agree in {100 * at.agreement:.0f} % of samples{guess}."
             return (
-                f"Rank at {panel.tower} (K = {k:.10g}, best of {len(panel.score.simulated)} thresholds): predicted and "
-                f"reported shares differ by {points(at.total_variation)} in total."
+                f"Rank at {panel.tower} (K = {k:.10g}, best of {len(panel.score.simulated)} thresholds): the total "
+                f"variation of predicted and reported shares is {at.total_variation:.2f} (0: equal, 1: disjoint)."
                 + (agree if math.isfinite(at.agreement) else "")
             )
     return ""
@@ -727,21 +728,10 @@ def _rank(panel: RankResult) -> Headline | None:
         return None
     at, commonest = panel.score.simulated[k], panel.further.commonest
     low, high = at.total_variation_ci95
-    ends = f" (95 %: {100 * low:.0f} to {100 * high:.0f})" if math.isfinite(low) and math.isfinite(high) else ""
+    ends = f" (95 %: {low:.2f} to {high:.2f})" if math.isfinite(low) and math.isfinite(high) else ""
     agree = f"agreement {100 * at.agreement:.0f} %" if math.isfinite(at.agreement) else "no pose in common"
     guess = f"; always guessing {commonest.rank}: {100 * commonest.agreement:.0f} %" if commonest.rank else ""
     return Headline(
-        label=f"Rank at {panel.tower}, K = {k:.10g}", value=points(at.total_variation),
-        interval=f"between predicted and reported shares{ends}", reference=f"{agree}{guess}",
+        label=f"Rank at {panel.tower}, K = {k:.10g}", value=f"{at.total_variation:.2f}",
+        interval=f"total variation of predicted and reported shares{ends}", reference=f"{agree}{guess}",
     )  # fmt: skip
-
-
-def points(share: float) -> str:
-    """Return a difference of shares in percentage points.
-
-    Examples
-    --------
-    >>> points(0.012), points(0.18)
-    ('1 percentage point', '18 percentage points')
-    """
-    return counted(round(100 * share), "percentage point")

@@ -928,7 +928,7 @@ def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float, notes:
     over = pattern.gain_dbi(below, np.zeros(360))
     peak = max(float(level.max()), float(over.max()))
     lines = [f"NAME {name}", f"FREQUENCY {carrier_hz / 1e6:g}", f"GAIN {peak:.2f} dBi"]
-    lines += [*(f"COMMENT {note}" for note in notes), "HORIZONTAL 360"]
+    lines += [*(guarded_comment(f"COMMENT {note}") for note in notes), "HORIZONTAL 360"]
     lines += [f"{i} {peak - v:.2f}" for i, v in enumerate(level)]
     lines += ["VERTICAL 360", *(f"{i} {peak - v:.2f}" for i, v in enumerate(over))]
     return "\n".join(lines) + "\n"

@@ -103,6 +103,16 @@ def test_two_channels_share_one_recommendation():
     assert [(r.channel, r.model) for r in rows if r.recommended] == [("A", "truth"), ("B", "truth")]
 
 
+@pytest.mark.parametrize(("samples", "scored"), [(4, False), (19, False), (20, True)])
+def test_a_few_samples_score_and_recommend_no_model(samples, scored):
+    """Four samples had rows of 37.7 dB and a recommendation."""
+    truth, measured = (values[:: 2000 // samples][:samples] for values in planted())
+    models = [candidate("flat", np.full(samples, -80.0)), candidate("truth", truth)]
+    ladder = compare_models([measured], [np.arange(float(samples))], models, [along(samples)])
+    assert (ladder.recommended is not None) == scored
+    assert bool(model_rows(ladder)) == scored
+
+
 def test_nothing_measured_recommends_nothing():
     ladder = compare_models([np.full(10, np.nan)], [np.arange(10.0)], [candidate("flat", np.zeros(10))], [along(10)])
     assert ladder.recommended is None

@@ -239,3 +239,11 @@ def test_agreement_of_ranks_bears_the_error_bar_of_the_ground(small_report):
     further = dataclasses.replace(rank.further, agreement_sd_by_ground={f"{k:g}": 0.0714})
     page = render(dataclasses.replace(small_report, rank=(dataclasses.replace(rank, further=further),)))
     assert len(re.findall(r"\d\s%\s\[[^]]*\]\s±7", page.text)) == 1
+
+
+def test_a_flight_with_few_samples_says_why_no_models_are_compared(small_report):
+    first = small_report.rss[0]
+    few = with_numbers(first, n=4)
+    assert words.NO_MODELS in render(dataclasses.replace(small_report, rss=(few,), models=(), ladder=())).text
+    assert words.NO_MODELS not in render(dataclasses.replace(small_report, rss=(), models=(), ladder=())).text
+    assert words.NO_MODELS not in render(dataclasses.replace(small_report, rss=(first,), models=(), ladder=())).text

@@ -11,7 +11,7 @@ predicted strongest cell with the serving cell of a phone, and sums the results 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -250,43 +250,6 @@ def _window_means(time: FloatArray, values: FloatArray, window_s: float) -> Floa
     # ones
     ends = np.column_stack([first, last]).ravel()
     return np.asarray(np.add.reduceat(np.append(values, 0.0), ends)[::2] / (last - first))
-
-
-def averaged_fits(
-    measured_db: ArrayLike,
-    simulations: Mapping[str, ArrayLike],
-    averages: Mapping[str, Callable[[FloatArray], FloatArray]],
-    *,
-    span_db: tuple[float, float] = SPAN_DB,
-) -> dict[str, dict[str, OffsetFit]]:
-    """Return the offset fits of simulations after averaging measurement and simulation in the same way.
-
-    Parameters
-    ----------
-    measured_db : array_like, (n,)
-        [dB]
-    simulations : mapping of str to array_like (n,)
-        Levels by name, such as "coherent", "power_sum" or "local_mean".
-    averages : mapping of str to callable
-        Functions that average levels (n,), such as :func:`local_mean_db`. Their input is NaN if one side is missing.
-    span_db : (float, float)
-        Offset search.
-
-    Returns
-    -------
-    dict
-        ``result[simulation][average]``.
-    """
-    measured = _levels(measured_db)
-    result: dict[str, dict[str, OffsetFit]] = {}
-    for name, levels in simulations.items():
-        simulated = _levels(levels)
-        finite = np.isfinite(measured) & np.isfinite(simulated)
-        sides = [np.where(finite, side, np.nan) for side in (measured, simulated)]
-        result[name] = {
-            average: grid_offset(*(mean(side) for side in sides), span_db=span_db) for average, mean in averages.items()
-        }
-    return result
 
 
 # --- where the residual comes from ---------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from .level import (
     RssComparison,
     ServingComparison,
 )
+from .offset import OffsetFit
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .receiver import ForecastScore
 from .statistics import Interval, PairedDifference
@@ -111,14 +112,6 @@ class Cause:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fit:
-    """An offset, and the RMSE after this offset [dB]."""
-
-    offset_db: float
-    rmse_db: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ModelLevel:
     """Another simulation of the same samples: level (n,) [dBm] and its own best offset."""
 
@@ -164,7 +157,7 @@ class RssFurther:
     clock: ClockResult | None
     baseline_rmse_ci95_db: Mapping[str, Interval]
     compared_with: Mapping[str, PairedDifference]
-    averaged: Mapping[str, Mapping[str, Fit]]
+    averaged: Mapping[str, Mapping[str, OffsetFit]]
     detection: DetectionScore | None = None
     """Scores of the detection, for a receiver that loses its lock or has a floor."""
     snr: SnrScore | None = None

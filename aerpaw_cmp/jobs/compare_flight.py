@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +35,6 @@ from ..compare.level import (
 from ..compare.receiver import ForecastScore, score_forecast
 from ..compare.result import (
     APPLIED,
-    Fit,
     FlightResult,
     ModelLevel,
     PairResult,
@@ -421,19 +419,17 @@ def _paired(
     }
 
 
-def _averaged(case: _Case) -> dict[str, dict[str, Fit]]:
-    """Fit both sides after equal averages over time windows, per simulation."""
-    replayed, span_db = case.replayed, case.data.settings.rss.span_db
-    simulations = {
-        "coherent": replayed.spread(replayed.level_dbm("coherent")),
-        "power_sum": replayed.spread(replayed.level_dbm("power")),
-    }
-    averages = {f"{w:g} s": partial(rss.local_mean_db, case.series.time, window_s=w) for w in _AVERAGING_WINDOWS_S}
-    fits = rss.averaged_fits(case.levels.measured_db, simulations, averages, span_db=span_db)
-    return {
-        name: {average: Fit(offset_db=fit.offset_db, rmse_db=fit.rmse_db) for average, fit in each.items()}
-        for name, each in fits.items()
-    }
+def _averaged(case: _Case) -> dict[str, dict[str, offsets.OffsetFit]]:
+    """Fit the offset of each simulation after averaging power over time windows on both sides."""
+    out: dict[str, dict[str, offsets.OffsetFit]] = {"coherent": {}, "power_sum": {}}
+    for name, fits in out.items():
+        level = case.replayed.spread(case.replayed.level_dbm("coherent" if name == "coherent" else "power"))
+        measured = np.where(np.isfinite(level), case.levels.measured_db, np.nan)
+        level = np.where(np.isfinite(measured), level, np.nan)
+        for width_s in _AVERAGING_WINDOWS_S:
+            sides = (rss.local_mean_db(case.series.time, side, width_s) for side in (measured, level))
+            fits[f"{width_s:g} s"] = offsets.grid_offset(*sides, span_db=case.data.settings.rss.span_db)
+    return out
 
 
 def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:

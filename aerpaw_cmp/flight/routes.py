@@ -169,22 +169,6 @@ def lawnmower(area: Any, azimuth_deg: float, spacing_m: float) -> list[FloatArra
     return legs
 
 
-def cross(area: Any, azimuth_deg: float) -> list[FloatArray]:
-    """Return two legs (2, 2) at right angles through the middle of an area."""
-    # the centroid of a concave area may be outside it
-    middle = area.centroid if area.contains(area.centroid) else area.representative_point()
-    # longer than the area from any of its points
-    reach = 2.0 * math.hypot(area.bounds[2] - area.bounds[0], area.bounds[3] - area.bounds[1])
-    legs = []
-    for course in (azimuth_deg, azimuth_deg + 90.0):
-        step = reach * np.array([math.sin(math.radians(course)), math.cos(math.radians(course))])
-        centre = np.array([middle.x, middle.y])
-        cut = area.intersection(shapely.LineString([centre - step, centre + step]))
-        pieces = [p for p in getattr(cut, "geoms", [cut]) if p.distance(middle) < 1e-6 and p.length >= _LEAST_LEG_M]
-        legs += [np.array(p.coords)[[0, -1]] for p in pieces]
-    return legs
-
-
 def path_within(area: Any, begin: FloatArray, end: FloatArray) -> list[FloatArray]:
     """Return the corners of a path between two points of an area. It follows the border where the line is outside."""
     line = shapely.LineString([begin, end])
@@ -253,9 +237,8 @@ def with_turns(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pattern:
-    """The parameters of a route: ``shape`` (lawnmower or cross), course of legs, height, nose and slow rotations."""
+    """The parameters of a lawnmower: course of its legs, height, nose and slow rotations."""
 
-    shape: Literal["lawnmower", "cross"]
     azimuth_deg: float
     height_m: float
     nose: Nose
@@ -270,11 +253,11 @@ class Pattern:
             "four headings": "nose turned by 90 deg per leg",
         }
         turns = f", slow turn at {_TURN_POINTS} points" if self.turns else ""
-        return f"{self.shape} with legs at {self.azimuth_deg:g} deg, {self.height_m:g} m, {nose[self.nose]}{turns}"
+        return f"lawnmower with legs at {self.azimuth_deg:g} deg, {self.height_m:g} m, {nose[self.nose]}{turns}"
 
 
 def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Route:
-    """Return the densest route of a pattern within the battery time.
+    """Return the densest lawnmower of a pattern within the battery time.
 
     Parameters
     ----------
@@ -283,7 +266,7 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
         Area of :func:`allowed_area`.
     speed_mps : float
     most_s : float
-        Longest flight [s]. A cross is repeated until this time is used.
+        Longest flight [s].
 
     Returns
     -------
@@ -297,7 +280,8 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
     west, south, east, north = area.bounds
     widest = math.hypot(east - west, north - south)
 
-    def made(legs: Sequence[FloatArray]) -> Route:
+    def made(spacing_m: float) -> Route:
+        legs = lawnmower(area, pattern.azimuth_deg, spacing_m)
         if not legs:
             raise UsageError(
                 f"no route fits: no leg of {_LEAST_LEG_M:g} m is within the geofence",
@@ -306,21 +290,13 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
         points = waypoints_of(legs, area, pattern.height_m, pattern.nose)
         return flown(pattern.name, with_turns(points) if pattern.turns else points, speed_mps)
 
-    if pattern.shape == "cross":
-        legs = cross(area, pattern.azimuth_deg)
-        route, more = made(legs), list(legs)
-        # limit the repetitions, because a short cross in a long flight would take hours to compute
-        while route.duration_s < most_s and len(more) < 60:
-            more += [leg[::-1] for leg in legs] if (len(more) // max(len(legs), 1)) % 2 else list(legs)
-            route = made(more)
-        return cut(route, most_s, speed_mps)
     low, high = _CLOSEST_M, widest
     for _ in range(14):
         # geometric bisection: 14 steps suffice from hundreds of metres
         middle = math.sqrt(low * high)
-        longer = made(lawnmower(area, pattern.azimuth_deg, middle)).duration_s > most_s
+        longer = made(middle).duration_s > most_s
         low, high = (middle, high) if longer else (low, middle)
-    return cut(made(lawnmower(area, pattern.azimuth_deg, high)), most_s, speed_mps)
+    return cut(made(high), most_s, speed_mps)
 
 
 def cut(route: Route, most_s: float, speed_mps: float) -> Route:

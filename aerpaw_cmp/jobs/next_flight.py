@@ -281,12 +281,11 @@ def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
 def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     """Return the tool's patterns, without those that leave the area between legs."""
     out = []
-    shapes = [("lawnmower", 0.0, False), ("lawnmower", 90.0, False), ("lawnmower", 0.0, True), ("cross", 0.0, False)]
-    for height, (shape, azimuth, turns), nose in product(plan.heights_m, shapes, NOSES):
+    for height, (azimuth, turns), nose in product(plan.heights_m, [(0.0, False), (90.0, False), (0.0, True)], NOSES):
         # a pattern with turns on its legs has all headings, regardless of the nose setting
         if turns and nose != "along":
             continue
-        pattern = Pattern(shape=shape, azimuth_deg=azimuth, height_m=height, nose=nose, turns=turns)  # type: ignore[arg-type]
+        pattern = Pattern(azimuth_deg=azimuth, height_m=height, nose=nose, turns=turns)
         try:
             route = _raised(route_of(pattern, area, plan.speed_mps, 60.0 * plan.minutes), site)
         except UsageError:

@@ -12,7 +12,6 @@ from aerpaw_cmp.flight.routes import (
     Pattern,
     Waypoint,
     allowed_area,
-    cross,
     cut,
     flown,
     lawnmower,
@@ -33,11 +32,9 @@ AREA = allowed_area(SQUARE, [NOTCH], TOWER, 40.0)
 
 
 @pytest.mark.parametrize("nose", NOSES)
-@pytest.mark.parametrize(
-    ("shape", "azimuth", "turns"), [("lawnmower", 0.0, False), ("lawnmower", 40.0, True), ("cross", 0.0, False)]
-)
-def test_routes_stay_within_area_battery_and_away_from_towers(nose, shape, azimuth, turns):
-    route = route_of(Pattern(shape=shape, azimuth_deg=azimuth, height_m=35.0, nose=nose, turns=turns), AREA, 8.0, 300.0)
+@pytest.mark.parametrize(("azimuth", "turns"), [(0.0, False), (40.0, True)])
+def test_routes_stay_within_area_battery_and_away_from_towers(nose, azimuth, turns):
+    route = route_of(Pattern(azimuth_deg=azimuth, height_m=35.0, nose=nose, turns=turns), AREA, 8.0, 300.0)
     line = shapely.LineString(route.position_m[:, :2])
     assert shapely.box(-200, -150, 200, 150).covers(line)
     assert line.intersection(NOTCH).length < 5.0
@@ -78,13 +75,6 @@ def test_legs_of_a_rectangle_are_those_by_hand():
     assert [leg[:, 1].tolist() for leg in lawnmower(notched, 0.0, 115.0)] == [[200, 300], [300, 200]]
     split = area.difference(shapely.box(0, 100, 300, 200))
     assert [leg[:, 1].tolist() for leg in lawnmower(split, 0.0, 115.0)] == [[0, 100], [200, 300], [300, 200], [100, 0]]
-    np.testing.assert_allclose(cross(area, 0.0), [[(115, 0), (115, 300)], [(0, 150), (230, 150)]], atol=1e-9)
-    first, second = cross(shapely.box(-150, -150, 150, 150), 30.0)
-    assert np.degrees(np.arctan2(*(first[1] - first[0]))) == pytest.approx(30.0)
-    assert np.degrees(np.arctan2(*(second[1] - second[0]))) == pytest.approx(120.0)
-    assert np.linalg.norm(first[1] - first[0]) == pytest.approx(300.0 / np.cos(np.radians(30.0)))
-    assert cross(shapely.box(0, 0, 39, 300), 0.0)[0][:, 1].tolist() == [0.0, 300.0]
-    assert len(cross(shapely.box(0, 0, 39, 300), 0.0)) == 1
 
 
 def test_noses_turn_as_they_are_named_and_slow_turns_stand_at_four_points():
@@ -117,21 +107,8 @@ def test_what_may_be_flown_is_the_fence_less_what_is_avoided_and_three_metres():
     assert hole == pytest.approx(np.pi * 43.0**2, rel=0.01)
 
 
-def test_a_cross_is_flown_back_and_forth_until_the_battery_ends():
-    area = shapely.box(-150, -150, 150, 150)
-    for seconds in (20.0, 200.0):
-        route = route_of(Pattern(shape="cross", azimuth_deg=0.0, height_m=30.0, nose="along"), area, 10.0, seconds)
-        assert route.duration_s == seconds
-    # 30 s north, 21.2 s to the western end, 30 s east, then back: from the southern end of the leg it began with, reversed
-    assert route.position_m[:31, 1] == pytest.approx(np.linspace(-150.0, 150.0, 31))
-    assert route.position_m[[60, 70], 1] == pytest.approx(0.0, abs=1e-6)
-    later = [tuple(row) for row in np.round(np.diff(route.position_m[83:, :2], axis=0)).tolist()]
-    assert (0.0, -10.0) in later
-    assert (-10.0, 0.0) in later
-
-
 def test_a_longer_battery_is_a_denser_lawnmower_and_a_cut_route_ends_in_time():
-    pattern = Pattern(shape="lawnmower", azimuth_deg=0.0, height_m=35.0, nose="along")
+    pattern = Pattern(azimuth_deg=0.0, height_m=35.0, nose="along")
     lengths = [route_of(pattern, AREA, 8.0, seconds).length_m for seconds in (60.0, 240.0, 600.0)]
     assert lengths[0] < 0.5 * lengths[1] < 0.5 * lengths[2]
     route = flown("r", [Waypoint(east_m=0, north_m=0, height_m=10, yaw_deg=5, hold_s=20),
@@ -166,7 +143,7 @@ def test_an_area_without_room_is_refused():
         allowed_area(shapely.box(0, 0, 50, 50), [], np.array([[25.0, 25.0, 0.0]]), 60.0)
     with pytest.raises(UsageError, match="no leg of 40 m"):
         route_of(
-            Pattern(shape="lawnmower", azimuth_deg=0.0, height_m=30.0, nose="along"),
+            Pattern(azimuth_deg=0.0, height_m=30.0, nose="along"),
             shapely.box(0, 0, 20, 20),
             8.0,
             60.0,

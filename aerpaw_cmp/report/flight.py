@@ -166,13 +166,7 @@ def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
 
 def result_card(data: ReportData) -> Card:
     """Return the card of all errors: levels by channel, ranks by tower and K."""
-    best = words.models_verdict(data.models)
-    return Card(
-        title="Result", id="result", link="Result", chart="forecast",
-        text=[paragraph(bold(best)) if best else "", words.headline(data)],
-        tables=[_levels(data), _ranks(data)],
-        parts=[Card(title="In words, channel by channel", fold=True, text=[words.verdicts(data.rss, data.rank)])],
-    )  # fmt: skip
+    return Card(title="Result", id="result", link="Result", chart="forecast", tables=[_levels(data), _ranks(data)])
 
 
 def _levels(data: ReportData) -> Table:
@@ -218,7 +212,8 @@ def _ranks(data: ReportData) -> Table:
         notes=[words.RANK_WORDS + " p is the probability of such a total variation if both had the same distribution."
                + (f" Over all K, the agreement is largest at K = {', '.join(best)}." if best else "")
                + (" The number after ± is the standard deviation that results from the unknown shape of the ground "
-                  "between its known heights." if grounds else "")],
+                  "between its known heights." if grounds else ""),
+               *filter(None, map(words.rank_references, data.rank))],
     )  # fmt: skip
 
 

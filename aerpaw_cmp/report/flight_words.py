@@ -85,24 +85,6 @@ def _within(value: Interval, bound: str | None) -> str:
     return f" (95 % interval {low:.1f} to {high:.1f})"
 
 
-def headline(data: ReportData) -> str:
-    """Return the paragraph about the compared flight, towers and samples."""
-    parts = []
-    if data.rss:
-        towers = list(dict.fromkeys(panel.tower for panel in data.rss))
-        samples = sum(len(panel.time) for panel in data.rss)
-        panels = counted(len(data.rss), "channel")
-        parts.append(f"received signal strength at {_listed(towers)} ({panels}, {counted(samples, 'sample')})")
-    if data.rank:
-        samples = sum(len(panel.time) for panel in data.rank)
-        parts.append(f"channel rank at {_listed([panel.tower for panel in data.rank])} ({counted(samples, 'sample')})")
-    if not parts:
-        return "This flight has no radio measurement that can be compared; only its track and inputs are shown."
-    engine = "" if data.engine is None else f" by the {data.engine.engine} engine"
-    kind = "A synthetic" if data.synthetic else "The"
-    return f"{kind} flight {data.flight} was replayed{engine} at {data.site.name} and compared: {' and '.join(parts)}."
-
-
 # Explanation of the columns of a table of ranks.
 RANK_WORDS = (
     "A singular value of the channel matrix counts towards the rank if it is greater than the largest one divided by "
@@ -289,11 +271,6 @@ def _listed(names: list[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
-def verdicts(rss: Sequence[RssResult], rank: Sequence[RankResult]) -> list[str]:
-    """Return one or two sentences per series about the error of ray tracing and of baselines."""
-    return [rss_verdict(panel) for panel in rss] + [rank_verdict(panel) for panel in rank]
-
-
 def models_verdict(models: Sequence[ModelRow]) -> str:
     """Return the cross-validated errors of this replay and of the baselines, and the recommended model."""
     error = {row.model: row.rmse_heldout_db for row in models if math.isfinite(row.rmse_heldout_db)}
@@ -395,32 +372,6 @@ def _snr_words(panel: RssResult) -> str:
     )
 
 
-def rank_verdict(panel: RankResult) -> str:
-    """Return the sentence about the K whose ranks are closest to those of the modem."""
-    k = nearest_k(panel)
-    if k is None:
-        return f"{panel.tower} rank: nothing to score, because no sample has both a reported and a simulated rank."
-    best, logs = panel.score.simulated[k], panel.further.trained_on
-    learned = f" {training_sentence([panel.tower], 'the receiver')}{_learned_from(logs)}" if logs else ""
-    agree = f" and agrees per position in {100 * best.agreement:.0f} %" if math.isfinite(best.agreement) else ""
-    kappa = f" (kappa {best.kappa:.2f}; 0 is chance{_kappa_references(panel)})" if math.isfinite(best.kappa) else ""
-    return (
-        f"{panel.tower} rank: of the tested K, K = {k:.10g} is closest to the reported distribution "
-        f"(total variation {best.total_variation:.2f}){agree}{kappa}.{_ground_error(panel, k)}{learned}"
-    )
-
-
-def _ground_error(panel: RankResult, k: float) -> str:
-    """Return the sentence about the effect of a ground that is known only at some points."""
-    sd = (panel.further.agreement_sd_by_ground or {}).get(f"{k:g}")
-    if sd is None:
-        return ""
-    return (
-        f" Errors of the known ground heights change the agreement by ±{100 * sd:.0f} percentage points "
-        "(one standard deviation), so smaller differences are not significant."
-    )
-
-
 def nearest_k(panel: RankResult) -> float | None:
     """Return the K whose distribution is closest to the reported one, or None if nothing could be scored."""
     fits = panel.score.simulated
@@ -428,16 +379,15 @@ def nearest_k(panel: RankResult) -> float | None:
     return min(scored_k, key=lambda k: fits[k].total_variation, default=None)
 
 
-def _kappa_references(panel: RankResult) -> str:
-    """Return clauses about the agreement of a constant guess, and of the modem with itself."""
-    words = ""
-    commonest = panel.further.commonest
+def rank_references(panel: RankResult) -> str:
+    """Return the sentence about the agreement of a constant guess, and of the modem with itself, or an empty text."""
+    commonest, parts = panel.further.commonest, []
     if commonest.rank:
-        words += f"; always guessing {commonest.rank} agrees in {100 * commonest.agreement:.0f} %"
+        parts.append(f"always guessing {commonest.rank} agrees in {100 * commonest.agreement:.0f} %")
     repeat = panel.further.repeat.get("same_heading") or panel.further.repeat.get("any_heading")
     if repeat is not None and repeat.n and math.isfinite(repeat.kappa):
-        words += f"; repeated visits of the modem at the same positions have kappa {repeat.kappa:.2f}"
-    return words
+        parts.append(f"repeated visits of the modem at the same positions have kappa {repeat.kappa:.2f}")
+    return f"For comparison at {panel.tower}: {'; '.join(parts)}." if parts else ""
 
 
 def cautions(data: ReportData) -> list[str]:

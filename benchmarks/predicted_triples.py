@@ -27,7 +27,7 @@ from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import FlightSimulator
 from aerpaw_cmp.jobs.calibrate import observe
-from aerpaw_cmp.jobs.options import AGAINST_DISTANCE_M, RunOptions
+from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.jobs.predict import run_predict
 from aerpaw_cmp.jobs.referee import predicted_at, read_foreign, split_by_series
 from aerpaw_cmp.jobs.sources import NamedFlight, TargetOptions
@@ -113,11 +113,9 @@ def predicted(
     for flown in observe([data])[0]:
         samples = flown.samples
         part = split_by_series(given.table, samples.tower, samples.channel)
-        said, near = predicted_at(
-            given, part, samples.time_s, samples.position_m, flown.heading_deg, AGAINST_DISTANCE_M
-        )
+        said, near = predicted_at(given, part, samples.time_s, samples.position_m, flown.heading_deg)
         predicted = PredictedLevel(
-            level_db=said["level"], sd_db=said.get("sd_db"), low_db=said.get("q05_db"), high_db=said.get("q95_db")
+            level_db=said["level"], sd_db=said.get("sd_db"), q05_db=said.get("q05_db"), q95_db=said.get("q95_db")
         )
         if near.sum() >= FEWEST:
             card = level_card(samples.time_s, samples.residual_db + flown.free_space_db, predicted, ())

@@ -343,6 +343,8 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return f"'{command} --help' lists the options"
     if not _exists(place):
         return _nearest(place)
+    if str(place) in (last for option, last in pairwise(arguments) if option == "--against"):
+        return f"correct {one_line(place.name)} (docs/referee.md lists the columns) and run the same command"
     if not place.is_file():
         return f"'ls {one_line(str(place))}' shows what the folder contains"
     if words[:1] == ["ingest"]:
@@ -351,8 +353,6 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return "'aerpaw-cmp formats' lists what can be read" if unknown else ""
     if "--tower NAME=" in (error.expected or ""):
         return "the same command with --tower NAME=LATITUDE,LONGITUDE,HEIGHT"
-    if str(place) in (last for option, last in pairwise(arguments) if option == "--against"):
-        return f"correct {one_line(place.name)} (docs/referee.md lists the columns) and run the same command"
     if words[:1] in _OF_LOGS:
         return f"'aerpaw-cmp ingest {one_line(str(place))}' shows what the file contains"
     return f"the same command with another file than {one_line(place.name)}"

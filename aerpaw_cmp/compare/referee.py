@@ -84,7 +84,7 @@ class PredictedLevel:
         True if the levels have the reference of the measurement, so that no offset is needed.
     sd_db : (n,), optional
         Standard deviation of one sample.
-    low_db, high_db : (n,), optional
+    q05_db, q95_db : (n,), optional
         Ends of the 90 % interval. By default, they follow from a normal distribution with ``sd_db``.
     lock : LostLock, optional
         The two parts of the distribution for a receiver that can lose its lock. By default, the error is normal.
@@ -93,8 +93,8 @@ class PredictedLevel:
     level_db: FloatArray
     absolute: bool = True
     sd_db: FloatArray | None = None
-    low_db: FloatArray | None = None
-    high_db: FloatArray | None = None
+    q05_db: FloatArray | None = None
+    q95_db: FloatArray | None = None
     lock: LostLock | None = None
 
 
@@ -168,12 +168,14 @@ def _distribution(
     measured_db: FloatArray, predicted: PredictedLevel, both: BoolArray
 ) -> tuple[float | None, float | None]:
     """Return CRPS and coverage of the predicted 90 % band. None if the prediction does not state them."""
-    level_db, low_db, high_db, crps = predicted.level_db, predicted.low_db, predicted.high_db, None
+    low_db, high_db, crps = predicted.q05_db, predicted.q95_db, None
+    if low_db is None or high_db is None or not np.isfinite((low_db + high_db)[both]).all():
+        low_db = high_db = None
     if predicted.sd_db is not None and np.isfinite(predicted.sd_db[both]).all():
         stated = StatedSpread(gain_sd_db=predicted.sd_db, spread=NO_SPREAD, lock=predicted.lock)
-        crps = stated.crps_db(np.where(both, measured_db - level_db, np.nan))
+        crps = stated.crps_db(np.where(both, measured_db - predicted.level_db, np.nan))
         if low_db is None or high_db is None:
-            low_db, high_db = (level_db + end for end in stated.band_db(BAND))
+            low_db, high_db = (predicted.level_db + end for end in stated.band_db(BAND))
     if low_db is None or high_db is None:
         return crps, None
     return crps, float(np.mean(((measured_db >= low_db) & (measured_db <= high_db))[both]))

@@ -89,8 +89,10 @@ def run_explain(
     time : str
         Seconds after the first sample of the tower, or ISO 8601 (in the time zone of the flight if it has no offset).
     tower : str
+        A tower of the site. If the flight has no log of it, the link is explained at the times of the telemetry.
     channel : str, optional
-        Channel of the RSS logs, or "rank" for the rank log. Default: the first series of the tower.
+        Channel of the RSS logs, or "rank" for the rank log. Default: the first series of the tower. For a tower without
+        a log: a key of ``link.channels``, or by default ``link.rss``.
     engine : {"image", "sionna"}, optional
         Engine that finds the paths. Default: ``rt.engine``.
     logs_root : Path, optional
@@ -128,7 +130,7 @@ def run_explain(
     if isinstance(series, RssSeries) and settings.rss.field != "coherent":
         notes.append(f"rss.csv has rss.field: {settings.rss.field}; the level here is the coherent sum")
     notes += further_path_lines(replayed, np.asarray(source), pose, link)
-    measured = float(series.measured_db[at]) if isinstance(series, RssSeries) else None
+    measured = float(series.measured_db[at]) if isinstance(series, RssSeries) and len(series.log) else None
     return Explanation(
         flight=settings.flight.name,
         tower=tower,
@@ -153,18 +155,31 @@ def _series(data: FlightData, tower: str, channel: str | None) -> RssSeries | Ra
     every = [series for _, series in data.series]
     towers = list(dict.fromkeys(series.tower for series in every))
     mine = {series.channel: series for series in reversed(every) if series.tower == tower}
+    if not mine and tower in data.site.towers and data.track is not None:
+        return _unlogged(data, tower, channel)
     if not mine:
-        at_site = tower in data.site.towers
-        raise UsageError(
-            f"no log of tower {tower!r}",
-            expected="one of " + ", ".join(towers),
-            cause="the site has this tower, but the flight has no log of it" if at_site else "a typing error",
-        )
+        known = dict.fromkeys(towers if data.track is None else [*towers, *data.site.towers])
+        raise UsageError(f"no log of tower {tower!r}", expected="one of " + ", ".join(known), cause="a typing error")
     if channel is None:
         return mine[list(mine)[-1]]
     if channel not in mine:
         raise UsageError(f"no channel {channel!r} at {tower}", expected="one of " + ", ".join(reversed(mine)))
     return mine[channel]
+
+
+def _unlogged(data: FlightData, tower: str, channel: str | None) -> RssSeries:
+    """Return a series without levels for a tower that the flight has no log of, every second of the telemetry."""
+    assert data.track is not None
+    links = {"rss": data.settings.link.rss, **data.settings.link.channels}
+    name = channel or "rss"
+    if name not in links:
+        raise UsageError(f"no link {name!r}, and no log of {tower}", expected="one of " + ", ".join(links))
+    time = np.arange(data.track.start_ns, data.track.end_ns + 1, 1_000_000_000).astype("datetime64[ns]")
+    none = np.zeros(0, dtype=np.int64)
+    return RssSeries(
+        tower=tower, channel=name, unit="dBm", time=time, measured_db=np.full(len(time), np.nan), link=links[name],
+        settings_key=name, log=none, line=none,
+    )  # fmt: skip
 
 
 def _sample(series: RssSeries | RankSeries, time: str, zone: str | None) -> tuple[int, float]:
@@ -210,7 +225,12 @@ def _pose(
     rt, notes = data.settings.rt, []
     if isinstance(series, RssSeries):
         time = series.time
-        if data.settings.rss.lag == "apply" or isinstance(data.settings.rss.lag, float):
+        if not len(series.log):
+            notes.append(
+                f"the flight has no log of {series.tower}: times are those of the telemetry, settings those of "
+                f"link {series.channel!r}, and nothing was measured"
+            )
+        elif data.settings.rss.lag == "apply" or isinstance(data.settings.rss.lag, float):
             receiver = tuple(s for s in data.rss if s.tower == series.tower)  # each receiver has a separate clock
             clocks = estimate_clocks(dataclasses.replace(data, rss=receiver), progress)
             clock = clocks[[s is series for s in receiver].index(True)]

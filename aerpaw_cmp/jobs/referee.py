@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from ..common.content import KEY, MARKS
-from ..common.errors import InputError, UsageError, parsing
+from ..common.errors import InputError, UsageError, about_file, parsing
 from ..common.files import LARGEST_TABLE, read_bounded, read_input
 from ..common.jsonable import json_safe
 from ..common.native import read as read_native
@@ -31,7 +31,7 @@ from ..common.units import AnyArray, BoolArray, FloatArray
 from ..common.yamlfile import parse_yaml
 from ..compare.gains import LostLock
 from ..compare.level import nearest_in_time
-from ..compare.rank import agreement, cohen_kappa, histogram, total_variation
+from ..compare.rank import MAX_RANK, agreement, cohen_kappa, histogram, total_variation
 from ..compare.receiver import score_forecast
 from ..compare.referee import (
     LevelCard,
@@ -52,6 +52,7 @@ from ..logs.ingest import ingest
 from ..logs.readers import ReadOptions
 from ..propagation.field.sum import mean_pair_power, rss_dbm
 from ..site.site import Site
+from ..site.siteyaml import why_far
 from .calibrate import observe
 from .options import AGAINST_DISTANCE_M, RANKS
 
@@ -59,7 +60,9 @@ QUANTITIES = ("level_dbm", "level_db", "path_loss_db")
 _PLACE = ("east_m", "north_m", "height_m")
 _GEOGRAPHIC = ("latitude_deg", "longitude_deg", "height_m")
 _LOCK = ("p_lock", "locked_db", "lost_db", "locked_sd_db", "lost_sd_db")
-_OPTIONAL = ("sd_db", "q05_db", "q95_db", "rank", "yaw_deg", "time_s", *RANKS, *_LOCK)
+_LEVELS = ("level", "q05_db", "q95_db", "locked_db", "lost_db")
+_NUMBERS = ("sd_db", "q05_db", "q95_db", "rank", "yaw_deg", "time_s", *RANKS, *_LOCK)
+_COLUMNS = ("time", "time_utc", "tower", "channel", *_PLACE, *_GEOGRAPHIC[:2], *QUANTITIES, *_NUMBERS)
 
 _EXPECTED = (
     "time_utc, or east_m, north_m, height_m, or latitude_deg, longitude_deg, height_m; tower; level_dbm, level_db or "
@@ -71,6 +74,9 @@ _MOST_BYTES, _MOST_ROWS = 4 * LARGEST_TABLE, 5_000_000
 
 # A prediction is refused as a prediction of another area if all its positions are farther from the site's origin [m].
 _FAR_M = 50_000.0
+
+# Positions that are all closer than this to the height of the take-off ground are not a flight [m].
+_ON_GROUND_M = 3.0
 
 # A sample is scored by the nearest predicted time within this [s], or within half of the prediction's step.
 _NEAR_S = 0.5
@@ -89,22 +95,24 @@ class ForeignPrediction:
     program : str
         Program that wrote the file, if it is known.
     quantity : str
-        One of :data:`QUANTITIES`. Empty if only ranks are predicted.
+        One of :data:`QUANTITIES`, as in the file. Empty if only ranks are predicted.
     table : DataFrame
         One row per prediction.
 
         - ``time``: datetime64[ns], NaT if unknown.
         - ``east_m north_m height_m``: position in the site frame, NaN if unknown.
         - ``tower``, and ``channel`` (empty: every channel of the tower).
-        - ``level`` [dB or dBm].
-        - Those of ``sd_db q05_db q95_db rank yaw_deg time_s p_rank1..4`` that the file has, and the parts ``p_lock
-          locked_db lost_db locked_sd_db lost_sd_db`` of a receiver that can lose its lock.
+        - ``level`` [dB or dBm]. A path loss is its negative, and so are the columns of its distribution.
+        - ``sd_db q05_db q95_db rank yaw_deg time_s p_rank1..4``, and the parts ``p_lock locked_db lost_db locked_sd_db
+          lost_sd_db`` of a receiver that can lose its lock. NaN if the file does not have them.
     sha256 : str
         Digest of the file. It is empty for a folder of logs.
     remarks : tuple of str
         Sentences on how the file was read.
     unit : str
         Unit of ``level_db``. It is empty if the levels have the unit of the log.
+    near_m : float
+        Largest distance between a sample and its predicted position.
     """
 
     path: Path
@@ -114,12 +122,11 @@ class ForeignPrediction:
     sha256: str = ""
     remarks: tuple[str, ...] = ()
     unit: str = ""
+    near_m: float = AGAINST_DISTANCE_M
 
     def absolute(self, unit: str) -> bool:
         """Check whether the levels need no offset to be compared with a log in a unit."""
-        if self.quantity == "level_db":
-            return self.unit in ("", unit)
-        return (self.quantity, unit) == ("level_dbm", "dBm")
+        return self.unit in ("", unit) if self.quantity == "level_db" else unit == "dBm"
 
     @property
     def timed(self) -> bool:
@@ -127,7 +134,7 @@ class ForeignPrediction:
         return bool(self.table["time"].notna().any())
 
 
-def read_foreign(path: Path, data: FlightData) -> ForeignPrediction:
+def read_foreign(path: Path, data: FlightData, near_m: float = AGAINST_DISTANCE_M) -> ForeignPrediction:
     """Read the prediction in a file or folder.
 
     Parameters
@@ -136,6 +143,8 @@ def read_foreign(path: Path, data: FlightData) -> ForeignPrediction:
         CSV, NetCDF, .npz, the output folder of ``predict``, or a folder with the logs of an emulated flight.
     data : FlightData
         The flight that is scored: its site, time zone, towers and logs.
+    near_m : float
+        Largest distance between a sample and its predicted position.
 
     Returns
     -------
@@ -149,23 +158,20 @@ def read_foreign(path: Path, data: FlightData) -> ForeignPrediction:
         If ``predict`` learned the prediction from the logs of the flight.
     """
     file = path / "prediction.csv" if (path / "prediction.csv").is_file() else path
-    if file.is_dir():
-        digest, frame = "", _emulated(path, data)
-    else:
-        content = read_input(file, _MOST_BYTES, "a prediction: CSV, NetCDF, .npz, or a folder")
-        if content[:3] == b"CDF":
-            raise InputError("a NetCDF file of version 3", expected="NetCDF 4 ('nccopy -k nc4 IN OUT')", path=path)
-        formats = {b"\x89HDF\r\n\x1a\n": _netcdf, b"PK\x03\x04": _radio_map}
-        read = next((reader for start, reader in formats.items() if content.startswith(start)), _csv)
-        digest, frame = file_digest(file), read(content, file)
-    if file.name.startswith("prediction.") and (file.parent / "metrics.json").is_file():
-        frame.attrs["unit"] = _predicted_unit(file.parent / "metrics.json", data)
-    quantity, table = _checked(frame, path, data.site)
-    _check_names(table, data, path)
-    return ForeignPrediction(
-        path=path, program=frame.attrs["program"], quantity=quantity, table=table, sha256=digest,
-        remarks=frame.attrs.get("remarks", ()), unit=frame.attrs.get("unit", ""),
-    )  # fmt: skip
+    with about_file(path):
+        if file.is_dir():
+            digest, frame = "", _emulated(path, data)
+        else:
+            content = read_input(file, _MOST_BYTES, "a prediction: CSV, NetCDF, .npz, or a folder")
+            if content.startswith(b"CDF"):
+                raise InputError("a NetCDF file of version 3", expected="NetCDF 4 ('nccopy -k nc4 IN OUT')")
+            read = next((reader for start, reader in _READERS.items() if content.startswith(start)), _csv)
+            digest, frame = file_digest(file), read(content, file)
+        if file.name.startswith("prediction.") and (file.parent / "metrics.json").is_file():
+            frame.attrs["unit"] = _predicted_unit(file.parent / "metrics.json", data)
+        quantity, table = _checked(frame, data)
+    about = {str(name): value for name, value in frame.attrs.items()}
+    return ForeignPrediction(path=path, quantity=quantity, table=table, sha256=digest, near_m=near_m, **about)
 
 
 def _predicted_unit(path: Path, data: FlightData) -> str:
@@ -192,8 +198,8 @@ def _predicted_unit(path: Path, data: FlightData) -> str:
 
 
 # --- formats -------------------------------------------------------------------------------------------------------
-# Each function returns a table with the column names of the file, and the attributes ``program``, ``remarks`` and
-# ``unit``.
+# Each function returns a table with the column names of the file. Its attributes are the fields ``program``,
+# ``remarks`` and ``unit`` of the prediction.
 
 
 def _csv(content: bytes, path: Path) -> pd.DataFrame:
@@ -201,21 +207,17 @@ def _csv(content: bytes, path: Path) -> pd.DataFrame:
         frame = pd.read_csv(
             io.BytesIO(content), comment="#", skipinitialspace=True, low_memory=False, nrows=_MOST_ROWS + 1
         )
-    _check_rows(len(frame), path)
+    _check_rows(len(frame))
     frame.columns = [str(name).strip().lower() for name in frame.columns]
     frame.attrs = {"program": "CSV"}
     return frame
 
 
-def _check_rows(rows: int, path: Path) -> None:
+def _check_rows(rows: int) -> None:
     """Refuse a prediction with more than :data:`_MOST_ROWS` rows before its table is made."""
     if rows > _MOST_ROWS:
-        raise InputError(
-            f"the prediction has more than {_MOST_ROWS} rows",
-            expected=f"at most {_MOST_ROWS} rows (towers times positions or times)",
-            cause="a map of a larger area, or finer than needed; remove positions far from the route",
-            path=path,
-        )
+        expected = "fewer positions or times; positions far from the route are not needed"
+        raise InputError(f"the prediction has more than {_MOST_ROWS} rows", expected=expected)
 
 
 def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
@@ -234,16 +236,15 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
         remarks = (f"The levels of {path.name} are those of H, with {power_dbm:g} dBm transmitted.",)
     main = next((name for name in (*QUANTITIES, "rank", RANKS[0]) if name in known), None)
     if main is None:
-        raise InputError("no variable with a level", expected=_EXPECTED, path=path)
+        raise InputError("no variable with a level", expected=_EXPECTED)
     shape = dict(zip(known[main][0], known[main][1].shape, strict=True))
-    _check_rows(math.prod(shape.values()), path)
-    columns = {}
-    for name in ("time", "time_utc", "tower", "channel", *_PLACE, *_GEOGRAPHIC, *QUANTITIES, *_OPTIONAL):
-        dims, array = known.get(name, ((), None))
-        if array is not None and set(dims) <= set(shape):
-            place = [size if dim in dims else 1 for dim, size in shape.items()]
-            array = array.transpose([dims.index(dim) for dim in shape if dim in dims]).reshape(place)
-            columns[name] = np.broadcast_to(array, tuple(shape.values())).ravel()
+    _check_rows(math.prod(shape.values()))
+    at = dict(zip(shape, np.indices(tuple(shape.values())).reshape(len(shape), -1), strict=True))
+    columns = {
+        name: array[tuple(at[dim] for dim in dims)]
+        for name, (dims, array) in known.items()
+        if name in _COLUMNS and set(dims) <= set(at)
+    }
     if "time" in columns and columns["time"].dtype.kind in "fiu":
         columns["time_s"] = columns.pop("time")
         size, since, start = str(notes["units"].get("time", "")).partition(" since ")
@@ -261,23 +262,21 @@ def _radio_map(content: bytes, path: Path) -> pd.DataFrame:
     needed = ("path_gain", "cell_centers", "tx_names")
     with parsing(path, f"an .npz with {', '.join(needed)}"), np.load(io.BytesIO(content)) as book:
         if missing := set(needed) - set(book.files):
-            raise InputError(f"no array {', '.join(sorted(missing))}", expected=", ".join(needed), path=path)
+            raise InputError(f"no array {', '.join(sorted(missing))}", expected=", ".join(needed))
         if sum(info.file_size for info in book.zip.infolist()) > _MOST_BYTES:
-            raise InputError("the arrays are too large", expected=f"at most {_MOST_BYTES >> 20} MiB", path=path)
+            raise InputError("the arrays are too large", expected=f"at most {_MOST_BYTES >> 20} MiB")
         gain, centre, names = (np.asarray(book[name]) for name in needed)
     if gain.ndim != 3 or centre.shape != (*gain.shape[1:], 3) or names.shape != gain.shape[:1]:
         raise InputError(
             f"shapes {gain.shape}, {centre.shape}, {names.shape}",
             expected="path_gain (towers, rows, columns), cell_centers (rows, columns, 3), tx_names (towers,)",
-            path=path,
         )
-    _check_rows(gain.size, path)
+    _check_rows(gain.size)
     with np.errstate(divide="ignore", invalid="ignore"):
         loss_db = -10.0 * np.log10(gain.astype(np.float64).ravel())
     places = np.tile(centre.reshape(-1, 3), (len(names), 1)).astype(np.float64)
-    frame: pd.DataFrame = pd.DataFrame(places, columns=list(_PLACE)).assign(
-        tower=np.repeat(names.astype(str), gain[0].size), path_loss_db=np.where(np.isfinite(loss_db), loss_db, np.nan)
-    )
+    towers = np.repeat(names.astype(str), gain[0].size)
+    frame: pd.DataFrame = pd.DataFrame(places, columns=list(_PLACE)).assign(tower=towers, path_loss_db=loss_db)
     remark = "The cell centres of the radio map are taken as east, north and up of the site [m]."
     frame.attrs = {"program": "radio map (.npz)", "remarks": (remark,)}
     return frame
@@ -288,29 +287,19 @@ def _emulated(folder: Path, data: FlightData) -> pd.DataFrame:
     own = folder / "flight.yaml"
     twin = load_data(load_with_learned(own) if own.is_file() else _drafted(folder, data), folder)
     if set(flight_logs(twin)) & set(flight_logs(data)):
-        raise InputError(
-            "logs of the scored flight itself",
-            expected="logs of an emulated flight",
-            cause="the folder of the real flight was named",
-            path=folder,
-        )
-    samples = [(o.samples, o.samples.residual_db + o.free_space_db) for o in observe([twin])[0]]
+        raise InputError("logs of the scored flight itself", expected="logs of an emulated flight")
     every = pd.concat(
-        [
-            pd.DataFrame(s.position_m, columns=list(_PLACE)).assign(tower=s.tower, channel=s.channel, level_db=level)
-            for s, level in samples
-        ]
+        pd.DataFrame(o.samples.position_m, columns=list(_PLACE)).assign(
+            tower=o.samples.tower, channel=o.samples.channel, level_db=o.samples.residual_db + o.free_space_db
+        )
+        for o in observe([twin])[0]
     )
     # a hover has many levels at one position: their mean is what the emulator predicts there
-    frame: pd.DataFrame = every.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False)["level_db"].mean()
+    frame: pd.DataFrame = every.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False).mean()
     units, ours = (sorted({s.unit for s in of.rss}) for of in (twin, data))
-    remarks = [f"{folder.name} is an emulated flight: {counted(len(frame), 'level')} with a position."]
-    if units != ours:
-        remarks.append(
-            f"Its levels are in {', '.join(units)}, those of the flight in {', '.join(ours)}, so no bias is stated."
-        )
+    remark = f"Its levels are in {', '.join(units)}, those of the flight in {', '.join(ours)}, so no bias is stated."
     unit = units[0] if len(units) == 1 else "several units"
-    frame.attrs = {"program": EMULATED, "remarks": tuple(remarks), "unit": unit}
+    frame.attrs = {"program": EMULATED, "remarks": () if units == ours else (remark,), "unit": unit}
     return frame
 
 
@@ -320,105 +309,115 @@ def _drafted(folder: Path, data: FlightData) -> FlightFile:
     timezone = data.settings.timezone
     files = ingest([folder], options=ReadOptions(timezone=timezone))
     if not files:
-        raise InputError("no log", expected="power logs and telemetry of an emulated flight", path=folder)
+        raise InputError("no log", expected="power logs and telemetry of an emulated flight")
     return parse_yaml(drafts(files, folder, DraftOptions(timezone=timezone, site=site))[0].text, FlightFile)
+
+
+# Reader by the first bytes of a file. Other files are CSV.
+_READERS = {b"\x89HDF\r\n\x1a\n": _netcdf, b"PK\x03\x04": _radio_map}
 
 
 # --- checks --------------------------------------------------------------------------------------------------------
 
 
-def _checked(frame: pd.DataFrame, path: Path, site: Site) -> tuple[str, pd.DataFrame]:
+def _checked(frame: pd.DataFrame, data: FlightData) -> tuple[str, pd.DataFrame]:
     """Return the quantity, and the table with the column names of :class:`ForeignPrediction`."""
-    columns = f"(columns: {', '.join(map(str, frame))})"
-    quantities = [name for name in QUANTITIES if name in frame]
-    if len(quantities) > 1:
-        raise InputError(f"columns {', '.join(quantities)}", expected="one of them", path=path)
-    if not quantities and not {"rank", *RANKS} & set(frame):
-        near = [str(name) for name in frame if name in ("level", "rss", "rsrp", "rssi", "power", "path_gain")]
+    names = [str(name) for name in frame]
+    columns, quantities = f"(columns: {', '.join(names)})", [name for name in QUANTITIES if name in names]
+    if len(set(names)) < len(names) or len(quantities) > 1:
+        raise InputError(f"several columns of one quantity {columns}", expected="one of them")
+    if not quantities and not {"rank", *RANKS} & set(names):
+        near = [name for name in names if name in ("level", "rss", "rsrp", "rssi", "power", "path_gain")]
+        cause = f"the unit of {near[0]!r} is not in its name" if near else None
         raise InputError(
             f"no column of a level with its unit {columns}",
             expected="level_dbm, level_db (the unit of the log) or path_loss_db",
-            cause=f"the unit of {near[0]!r} is not in its name" if near else None,
-            path=path,
+            cause="a separator that is not a comma" if len(names) == 1 else cause,
         )
-    if "tower" not in frame:
-        raise InputError(f"no column tower {columns}", expected=_EXPECTED, path=path)
+    if "tower" not in names:
+        raise InputError(f"no column tower {columns}", expected=_EXPECTED)
     quantity = quantities[0] if quantities else ""
-    table = pd.DataFrame({"tower": frame["tower"].astype(str).str.strip()})
-    table["channel"] = frame["channel"].astype(str).str.strip().replace({"nan": ""}) if "channel" in frame else ""
-    table["time"] = _times(frame, path)
-    table[list(_PLACE)] = _places(frame, path, site)
+    given = frame.reindex(columns=list(_COLUMNS))
+    table: pd.DataFrame = given[list(_NUMBERS)].apply(_numbers)
+    for name in ("tower", "channel"):
+        table[name] = given[name].astype("string").fillna("").str.strip().astype(object)
+    table["level"] = _numbers(given[quantity]) if quantity else np.nan
+    if not table[["level", "rank", *RANKS]].notna().any(axis=None):
+        first = f", but {frame[quantity].iloc[0]}" if quantity and len(frame) else ""
+        raise InputError(f"no level or rank{first}", expected="numbers with a decimal point")
+    table["time"] = _times(given)
+    table[list(_PLACE)] = _places(given, data.site)
     if table["time"].isna().all() and table["east_m"].isna().all():
-        raise InputError("rows without a time and without a position", expected=_EXPECTED, path=path)
-    table["level"] = _numbers(frame[quantity]) if quantity else np.nan
-    for name in (name for name in _OPTIONAL if name in frame):
-        table[name] = _numbers(frame[name])
-    _check_levels(table["level"].to_numpy(np.float64), quantity, path)
-    _check_repeats(table, path)
+        raise InputError(f"rows without a time and without a position {columns}", expected=_EXPECTED)
+    _check_numbers(table, quantity)
+    if quantity == "path_loss_db":
+        # a large loss is a low level, so the ends of the band change places
+        table = table.rename(columns={"q05_db": "q95_db", "q95_db": "q05_db"})
+        table[list(_LEVELS)] *= -1.0
+    _check_repeats(table)
+    _check_names(table, data)
     return quantity, table
 
 
 def _numbers(column: Any) -> Any:
-    return pd.to_numeric(column, errors="coerce").astype(np.float64)
+    """Return numbers (n,). NaN for texts, and for the infinite levels that programs write for no signal."""
+    return pd.to_numeric(column, errors="coerce").astype(np.float64).replace([-np.inf, np.inf], np.nan)
 
 
-def _times(frame: pd.DataFrame, path: Path) -> Any:
+def _times(given: pd.DataFrame) -> Any:
     """Return times (n,) as naive UTC datetime64[ns]. NaT if there is no column of times."""
-    name = next((name for name in ("time_utc", "time") if name in frame), None)
-    if name is None:
-        return pd.Series(pd.NaT, index=frame.index, dtype="datetime64[ns]")
-    column = frame[name]
-    numeric, dated = pd.api.types.is_numeric_dtype(column), pd.api.types.is_datetime64_any_dtype(column)
-    if name == "time" and not numeric | dated and not column.astype(str).str.contains(r"Z$|[+-]\d\d:?\d\d$").all():
-        expected = "a column time_utc, or times that end in Z"
-        raise InputError(f"times without a zone, such as {column.iloc[0]!r}", expected=expected, path=path)
-    stamps = pd.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
-    if numeric or stamps.isna().all():
+    name = "time_utc" if given["time_utc"].notna().any() else "time"
+    column = given[name].dropna()
+    stamps = pd.to_datetime(column.astype(str), utc=True, errors="coerce", format="ISO8601")
+    if len(column) and (pd.api.types.is_numeric_dtype(column) or stamps.isna().all()):
         expected = "ISO 8601 in UTC, such as 2025-06-10T14:00:00Z"
-        raise InputError(f"no time that can be read ({column.iloc[0]!r})", expected=expected, path=path)
-    return stamps.dt.tz_localize(None).astype("datetime64[ns]")
+        raise InputError(f"no time that can be read ({column.iloc[0]})", expected=expected)
+    dated = pd.api.types.is_datetime64_any_dtype(column)
+    if name == "time" and not dated and not column.astype(str).str.contains(r"Z$|[+-]\d\d:?\d\d$").all():
+        expected = "a column time_utc, or times that end in Z"
+        raise InputError(f"times without a zone, such as {column.iloc[0]!r}", expected=expected)
+    return stamps.dt.tz_localize(None).astype("datetime64[ns]").reindex(given.index)
 
 
-def _places(frame: pd.DataFrame, path: Path, site: Site) -> AnyArray:
+def _places(given: pd.DataFrame, site: Site) -> AnyArray:
     """Return east, north, up (n, 3) in the site frame [m]. NaN if there are no columns of positions."""
-    if set(_PLACE) <= set(frame):
-        place = np.column_stack([_numbers(frame[name]) for name in _PLACE])
-        cause = "map coordinates (UTM) instead of metres from the origin"
-    elif set(_GEOGRAPHIC) <= set(frame):
-        latitude, longitude, height = (np.asarray(_numbers(frame[name])) for name in _GEOGRAPHIC)
-        place = np.column_stack([*site.frame.to_local(latitude, longitude), height + site.takeoff_ground_m])
-        swapped = np.hypot(*site.frame.to_local(np.clip(longitude, -90.0, 90.0), latitude))
-        near = np.nanmin(swapped, initial=np.inf) <= _FAR_M
-        cause = "latitude and longitude are swapped" if near else "a prediction of another area"
-    else:
-        return np.full((len(frame), 3), np.nan)
-    away_m = float(np.nanmin(np.hypot(place[:, 0], place[:, 1]), initial=np.inf))
+    place, (latitude, longitude, height) = (
+        np.stack([_numbers(given[name]) for name in names]) for names in (_PLACE, _GEOGRAPHIC)
+    )
+    cause = "map coordinates (UTM) instead of metres from the origin"
+    if np.isfinite(latitude).any():
+        place = np.stack([*site.frame.to_local(latitude, longitude), height + site.takeoff_ground_m])
+        cause = why_far(latitude[0], longitude[0], site.frame)
+    away_m = float(np.nanmin(np.hypot(place[0], place[1]), initial=np.inf))
     if _FAR_M < away_m < np.inf:
-        raise InputError(
-            f"the nearest position is {away_m / 1000:.0f} km from the site's origin",
-            expected=f"positions within {_FAR_M / 1000:.0f} km", cause=cause, path=path,
-        )  # fmt: skip
-    return place
+        found = f"the nearest position is {away_m / 1000:.0f} km from the site's origin"
+        raise InputError(found, expected=f"positions within {_FAR_M / 1000:.0f} km", cause=cause)
+    return np.asarray(np.where(np.isfinite(place).all(axis=0), place, np.nan).T)
 
 
-def _check_levels(level: FloatArray, quantity: str, path: Path) -> None:
-    """Refuse levels that cannot have the unit of their column."""
-    known = level[np.isfinite(level)]
-    if not len(known):
-        return
-    middle, cause = float(np.median(known)), None
-    if known.min() > 0.0 and known.max() < 1.0:
-        cause = "a linear gain or power in watts or milliwatts; 10 log10(gain), or 10 log10(P / 1 mW), is in decibels"
-    elif quantity == "level_dbm" and middle > 60.0:
-        cause = "a path loss (path_loss_db)"
-    elif quantity == "path_loss_db" and middle < 0.0:
-        cause = "a path gain; its negative is the loss"
-    if cause is not None:
-        what = "a loss above 0 dB" if quantity == "path_loss_db" else f"received levels as {quantity}"
-        raise InputError(f"a median {quantity} of {middle:.3g}", expected=what, cause=cause, path=path)
+def _check_numbers(table: pd.DataFrame, quantity: str) -> None:
+    """Refuse numbers that cannot have the meaning of their column."""
+    level, share = table["level"].dropna(), table[list(RANKS)].sum(axis=1, skipna=False).dropna()
+    middle = level.median()
+    median = f"a median {quantity} of {middle:.3g}"
+    linear = len(level) > 0 and level.min() > 0.0 and level.max() < 1.0
+    loss = "a loss above 0 dB" if quantity == "path_loss_db" else f"received levels as {quantity}"
+    for wrong, found, expected, cause in (
+        (linear, median, loss, "a linear gain or power in watts or milliwatts; 10 log10(gain), or 10 log10(P / 1 mW), "
+         "is in decibels"),
+        (quantity == "level_dbm" and middle > 30.0, median, loss, "a path loss (path_loss_db), or a missing sign"),
+        (quantity == "path_loss_db" and middle < 0.0, median, loss, "a path gain; its negative is the loss"),
+        ((table["sd_db"] <= 0.0).any(), "sd_db of 0 or less", "standard deviations above 0 dB", None),
+        ((table["q05_db"] > table["q95_db"]).any(), "q05_db above q95_db", "the lower end in q05_db", "swapped names"),
+        (not table["rank"].dropna().isin(range(MAX_RANK + 1)).all(), "ranks that are not 0 to 4",
+         "1 to 4, or 0 without a channel", None),
+        ((abs(share - 1.0) > 0.01).any(), "p_rank1 to p_rank4 with another sum than 1", "probabilities", None),
+    ):  # fmt: skip
+        if wrong:
+            raise InputError(found, expected=expected, cause=cause)
 
 
-def _check_repeats(table: pd.DataFrame, path: Path) -> None:
+def _check_repeats(table: pd.DataFrame) -> None:
     """Refuse rows of one tower, channel and time (else position and heading) with different levels.
 
     A route can pass a position several times: ``time_s`` after an unknown start distinguishes the passes.
@@ -427,26 +426,27 @@ def _check_repeats(table: pd.DataFrame, path: Path) -> None:
     distinct = table.dropna(subset="level").drop_duplicates(["tower", "channel", *key, "level"])
     twice = distinct[distinct.duplicated(["tower", "channel", *key], keep=False)]
     if len(twice):
-        where = ", ".join(f"{name} {twice[name].iloc[0]}" for name in ("tower", *key))
+        first = twice[["tower", *key]].iloc[0].dropna()
+        where = ", ".join(f"{name} {f'{v:.2f}' if isinstance(v, float) else v}" for name, v in first.items())
         raise InputError(
             f"{counted(len(twice), 'row')} with several levels at one position: {where}",
             expected="one row per tower, channel and time or position",
             cause="two channels or two heights without their column",
-            path=path,
         )
 
 
-def _check_names(table: pd.DataFrame, data: FlightData, path: Path) -> None:
+def _check_names(table: pd.DataFrame, data: FlightData) -> None:
     """Refuse a prediction without any tower of the flight, and use levels of an unknown channel for all channels.
 
     A program that predicts one channel per tower may have another name for it.
     """
     ours, theirs = {s.tower for _, s in data.series}, sorted(set(table["tower"]))
     if ours.isdisjoint(theirs):
-        raise InputError(
-            f"towers {', '.join(theirs[:8])}", expected=f"towers of the flight: {', '.join(sorted(ours))}",
-            cause="other names for the same towers; rename them in the file", path=path,
-        )  # fmt: skip
+        found, expected = (
+            f"towers {', '.join(theirs[:8]) or 'without names'}",
+            f"towers of the flight: {', '.join(sorted(ours))}",
+        )
+        raise InputError(found, expected=expected, cause="other names for the same towers; rename them in the file")
     channels = table[table["level"].notna()].groupby("tower")["channel"].unique()
     named = {channel for of_tower in channels for channel in of_tower}
     if channels.str.len().max() == 1 and named.isdisjoint(s.channel for s in data.rss):
@@ -484,16 +484,11 @@ class SeriesVerdict:
     differences: Mapping[str, PairedDifference]
 
 
-# Numbers of a card that the tables show, with their headings.
-_HEADS = {
-    "bias_db": "bias dB", "rmse_db": "RMSE dB", "rmse_offset_db": "RMSE after offset dB", "rmse_1s_db": "RMSE 1 s dB",
-    "correlation": "correlation", "crps_db": "CRPS dB", "coverage_90": "inside 90 %",
-}  # fmt: skip
+# Numbers of a card that are averaged over channels.
+_AVERAGED = ("bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "correlation", "crps_db", "coverage_90")
 
 
-def judge(
-    given: ForeignPrediction, data: FlightData, result: FlightResult, near_m: float = AGAINST_DISTANCE_M
-) -> dict[str, Any]:
+def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> dict[str, Any]:
     """Score a prediction on a flight.
 
     Parameters
@@ -502,8 +497,6 @@ def judge(
     data : FlightData
     result : FlightResult
         Levels and ranks by ray tracing, and baselines, at the same samples.
-    near_m : float
-        Largest distance between a sample and its predicted position.
 
     Returns
     -------
@@ -515,102 +508,95 @@ def judge(
     InputError
         If none of the predictions is near a sample.
     """
-    series = [s for item in result.rss if given.quantity and (s := _series(given, item, data, near_m))]
-    ranks = {item.tower: r for item in result.rank if (r := _ranks(given, item, data, near_m))}
+    series = [s for item in result.rss if given.quantity and (s := _series(given, item, data))]
+    ranks = {item.tower: r for item in result.rank if (r := _ranks(given, item, data))}
     if not series and not ranks:
         raise InputError(
             f"fewer than {FEWEST} samples of the flight have a prediction nearby",
-            expected="a time within the step of the prediction" if given.timed else f"positions within {near_m:g} m",
-            cause=_why_none(given, result),
+            expected="a time within the step of the prediction"
+            if given.timed
+            else f"positions within {given.near_m:g} m",
+            cause=_why_none(given, data, result),
             path=given.path,
         )
-    name, remarks = given.path.name, given.remarks
-    matched, lost = sum(s.matched for s in series), sum(s.unmatched for s in series)
-    if lost > 0.1 * (matched + lost):
-        where = "times of the prediction" if given.timed else f"predicted positions (within {near_m:g} m)"
-        remarks += (f"{name}: {counted(lost, 'sample')} lie outside the {where} and are not scored.",)
-    levels: dict[str, dict[str, SeriesVerdict]] = {}
-    for entry in series:
-        levels.setdefault(entry.tower, {})[entry.channel] = entry
-    predicted = set(given.table["tower"])
-    few = [i.name for i in result.rss if i.tower in predicted and i.channel not in levels.get(i.tower, ())]
-    if series and few:
-        remarks += (f"{name}: fewer than {FEWEST} samples of {', '.join(few)} have a predicted level; not scored.",)
-    if trained := [i.name for i in result.rss if i.training and i.channel in levels.get(i.tower, ())]:
-        remarks += (f"Ray tracing has no score on {', '.join(trained)}: its antennas were learned from this flight.",)
-    table = _table(series)
-    errors = table.groupby("model", sort=False)[list(_HEADS)]
-    channels = errors.size()
-    # a number that a channel does not have has no mean
-    means = errors.mean().where(errors.count().eq(channels, axis=0)).assign(channels=channels).reset_index()
+    name, predicted = given.path.name, set(given.table["tower"])
+    scored = {(entry.tower, entry.channel) for entry in series}
+    # means over different channels could not be compared
+    models: Mapping[str, LevelCard] = max((entry.cards for entry in series), key=len, default={})
+    common = [entry for entry in series if entry.cards.keys() >= models.keys()]
+    means = [_means(model, [entry.cards[model] for entry in common]) for model in models]
+    remarks = [*given.remarks]
+    if series and (few := [i.name for i in result.rss if i.tower in predicted and (i.tower, i.channel) not in scored]):
+        remarks.append(f"{name}: fewer than {FEWEST} samples of {', '.join(few)} have a predicted level; not scored.")
+    if trained := [i.name for i in result.rss if i.training and (i.tower, i.channel) in scored]:
+        names = ", ".join(trained)
+        remarks.append(f"Ray tracing has no score on {names}: its antennas were learned from this flight.")
+    if len(common) < len(series):
+        channels = f"{', '.join(f'{s.tower} {s.channel}' for s in common)} only"
+        remarks.append(f"The means are over {channels}: the other channels are not predicted by all models.")
     score: dict[str, Any] = json_safe({
         "prediction": name,
         "sha256": given.sha256,
         "program": given.program,
         "fitted_on_this_flight": ["the offset of each model and channel"],
-        "sentence": _sentence(name, series, means.iloc[0]) if series else f"{name}: ranks only.",
+        "sentence": _sentence(given, series, common, means) if series else f"{name}: ranks only.",
         "remarks": remarks,
-        "means": means[["model", "channels", *_HEADS]].to_dict("records"),
-        "levels": levels,
+        "means": means,
+        "levels": {s.tower: {other.channel: other for other in series if other.tower == s.tower} for s in series},
         "nodes": [
             {"series": f"{s.tower} {s.channel}", "offset_db": s.cards[name].offset_db, "slope": s.cards[name].slope,
              "floor_db": s.floor_db} for s in series if given.program == EMULATED
         ],
         "rank": ranks,
-        "table": {
-            "columns": [_HEADS.get(key, key) for key in map(str, table)],
-            "rows": table.to_numpy(dtype=object).tolist(),
-        },
     })  # fmt: skip
     return score
 
 
-def _table(series: Sequence[SeriesVerdict]) -> pd.DataFrame:
-    """Return one row per series and model, with NaN for numbers that a model does not have."""
-    rows = []
-    for entry in series:
-        for model, card in entry.cards.items():
-            pair = entry.differences.get(model)
-            difference = (None, None, None) if pair is None else (pair.difference_db, *pair.difference_ci95_db)
-            link = f"{entry.tower} {entry.channel}"
-            rows.append((link, model, card.n, *(getattr(card, key) for key in _HEADS), *difference))
-    heads = ["series", "model", "n", *_HEADS, "prediction minus model dB", "95 % low", "95 % high"]
-    table: pd.DataFrame = pd.DataFrame(rows, columns=heads).astype(dict.fromkeys(heads[3:], np.float64))
-    return table
+def _means(model: str, cards: Sequence[LevelCard]) -> dict[str, Any]:
+    """Return the mean scores of a model over channels. NaN if a channel does not have the number."""
+    values = np.array([[getattr(card, key) for key in _AVERAGED] for card in cards], dtype=np.float64)
+    return {"model": model, "channels": len(cards), **dict(zip(_AVERAGED, values.mean(axis=0), strict=True))}
 
 
-def _sentence(name: str, series: Sequence[SeriesVerdict], mean: Mapping[str, Any]) -> str:
-    """Return both errors, whether the difference is significant, and the errors as predicted (``mean``)."""
-    text = f"{name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel. Ray tracing has no score there."
-    if both := [entry for entry in series if OURS in entry.differences]:
-        theirs, mine = (np.mean([entry.cards[model].rmse_offset_db for entry in both]) for model in (name, OURS))
-        verdicts = Counter(entry.differences[OURS].verdict for entry in both)
+def _sentence(
+    given: ForeignPrediction,
+    series: Sequence[SeriesVerdict],
+    common: Sequence[SeriesVerdict],
+    means: Sequence[Mapping[str, Any]],
+) -> str:
+    """Return both errors, whether the difference is significant, the errors as predicted, and the scored samples."""
+    mean, errors = means[0], {row["model"]: row["rmse_offset_db"] for row in means}
+    text = f"{given.path.name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel"
+    if OURS in errors:
+        verdicts = Counter(entry.differences[OURS].verdict for entry in common)
         decided = [f"significantly {kind} on {verdicts[kind]}" for kind in ("better", "worse") if verdicts[kind]]
-        text = (
-            f"{name}: RMSE {theirs:.1f} dB after one offset per channel, ray tracing {mine:.1f} dB on the same samples "
-            f"({counted(len(both), 'channel')}). It is "
+        text += (
+            f", ray tracing {errors[OURS]:.1f} dB on the same samples ({counted(len(common), 'channel')}). It is "
             f"{' and '.join(decided) or 'on no channel significantly different from ray tracing'} (95 %)."
         )
+    else:
+        text += ". Ray tracing has no score there."
     if np.isfinite(mean["rmse_db"]):
         inside = f"; the 90 % band contains {100 * mean['coverage_90']:.0f} % of the samples"
         text += f" As predicted, without an offset: RMSE {mean['rmse_db']:.1f} dB"
         text += f"{inside if np.isfinite(mean['coverage_90']) else ''}."
     matched, lost = sum(s.matched for s in series), sum(s.unmatched for s in series)
-    if lost:
-        return f"{text} {counted(matched, 'sample')} have a prediction, {counted(lost, 'sample')} have none."
-    return f"{text} All {counted(matched, 'sample')} have a prediction."
+    if not lost:
+        return f"{text} All {counted(matched, 'sample')} have a prediction."
+    where = "other times" if given.timed else f"positions more than {given.near_m:g} m from it (--against-distance)"
+    return f"{text} {counted(matched, 'sample')} have a prediction; {counted(lost, 'sample')} at {where} have none."
 
 
-def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m: float) -> SeriesVerdict | None:
+def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> SeriesVerdict | None:
     """Return the cards of one tower and channel. None if too few samples have a prediction."""
     part = split_by_series(given.table, item.tower, item.channel)
     heading_deg = item.geometry.get("heading_deg")
-    predicted, near = predicted_at(given, part, item.time, item.position_m, heading_deg, near_m)
+    predicted, near = predicted_at(given, part, item.time, item.position_m, heading_deg)
     near &= item.posed
-    level, heard, absolute = predicted["level"], np.isfinite(item.measured_db), given.absolute(item.unit)
     if given.quantity == "path_loss_db":
         link = next(s.link for s in data.rss if (s.tower, s.channel) == (item.tower, item.channel))
-        level = link.transmit_power_dbm - level
+        predicted |= {key: link.transmit_power_dbm + predicted[key] for key in _LEVELS}
+    level, heard, absolute = predicted["level"], np.isfinite(item.measured_db), given.absolute(item.unit)
     scored = near & heard & np.isfinite(level)
     if scored.sum() < FEWEST:
         return None
@@ -618,14 +604,8 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
     rows = near if absolute else scored
     same = rows & (np.isfinite(level) | ~heard)
     name = given.path.name
-    foreign = PredictedLevel(
-        level_db=level,
-        absolute=absolute,
-        sd_db=predicted.get("sd_db"),
-        low_db=predicted.get("q05_db"),
-        high_db=predicted.get("q95_db"),
-        lock=_lock(predicted),
-    )
+    stated = {key: predicted[key] for key in ("sd_db", "q05_db", "q95_db")}
+    foreign = PredictedLevel(level, absolute, lock=_lock(predicted), **stated)
     models = {name: (foreign, rows)}
     if not item.training:  # its antennas know these samples
         models[OURS] = PredictedLevel(item.simulated_dbm, item.unit == "dBm"), same
@@ -652,7 +632,7 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData, near_m:
 
 def _lock(predicted: Mapping[str, FloatArray]) -> LostLock | None:
     """Return the predicted distribution of a receiver that can lose its lock, if ``predict`` wrote one."""
-    if not {*_LOCK} <= {*predicted} or np.isnan(predicted["p_lock"]).all():
+    if np.isnan(predicted["p_lock"]).all():
         return None
     level = predicted["level"]
     return LostLock(
@@ -672,7 +652,7 @@ def split_by_series(table: pd.DataFrame, tower: str, channel: str) -> pd.DataFra
 
 
 def predicted_at(
-    given: ForeignPrediction, part: pd.DataFrame, time: Any, position_m: FloatArray, heading_deg: Any, near_m: float
+    given: ForeignPrediction, part: pd.DataFrame, time: Any, position_m: FloatArray, heading_deg: Any
 ) -> tuple[dict[str, FloatArray], BoolArray]:
     """Return the numbers that are predicted for samples.
 
@@ -685,8 +665,6 @@ def predicted_at(
     position_m : (n, 3)
     heading_deg : (n,), optional
         Headings of the nose.
-    near_m : float
-        Largest distance between a sample and its predicted position.
 
     Returns
     -------
@@ -695,10 +673,9 @@ def predicted_at(
     near : (n,) bool
         True if a prediction is near.
     """
-    part = part[(part["time"] if given.timed else part["east_m"]).notna()]
+    part, names = part[(part["time"] if given.timed else part["east_m"]).notna()], ("level", *_NUMBERS)
     if part.empty:
-        near: BoolArray = np.zeros(len(time), dtype=np.bool_)
-        return {"level": np.full(len(time), np.nan)}, near
+        return {name: np.full(len(time), np.nan) for name in names}, np.zeros(len(time), dtype=np.bool_)
     if given.timed:
         known = part["time"].to_numpy("datetime64[ns]")
         index, apart = nearest_in_time(time, known)
@@ -706,30 +683,27 @@ def predicted_at(
         most_s = max(_NEAR_S, 0.51 * float(np.median(steps_s)) if len(steps_s) else 0.0)
         near = np.asarray(apart / np.timedelta64(1, "s") <= most_s)
     else:
-        yaw_deg = part["yaw_deg"].to_numpy(np.float64) if "yaw_deg" in part else None
-        points = part[list(_PLACE)].to_numpy(np.float64)
-        index, near = nearest_points(position_m, heading_deg, points, yaw_deg, near_m)
-    names = [name for name in ("level", *_OPTIONAL) if name in part]
+        points, yaw_deg = part[list(_PLACE)].to_numpy(np.float64), part["yaw_deg"].to_numpy(np.float64)
+        index, near = nearest_points(position_m, heading_deg, points, yaw_deg, given.near_m)
     return {name: np.where(near, part[name].to_numpy(np.float64)[index], np.nan) for name in names}, near
 
 
-def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData, near_m: float) -> dict[str, Any] | None:
+def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData) -> dict[str, Any] | None:
     """Return kappa, total variation and agreement of predicted ranks and of ray tracing, on the same samples.
 
     If the prediction has probabilities, ``log_score`` and ``constant_log_score`` are also returned.
     """
-    ranked = [name for name in ("rank", *RANKS) if name in given.table]
-    part = given.table[(given.table["tower"] == item.tower) & given.table[ranked].notna().any(axis=1)]
+    ranked = given.table[["rank", *RANKS]].notna().any(axis=1)
+    part = given.table[(given.table["tower"] == item.tower) & ranked]
     heading_deg = data.poses_at(item.time).heading_deg if data.track is not None else None
-    predicted, near = predicted_at(given, part, item.time, item.position_m, heading_deg, near_m)
-    p = np.column_stack([predicted.get(name, np.full(len(near), np.nan)) for name in RANKS])
-    stated = np.isfinite(p).all(axis=1)
-    rank = predicted.get("rank", np.where(stated, np.nan_to_num(p).argmax(axis=1) + 1.0, np.nan))
+    predicted, near = predicted_at(given, part, item.time, item.position_m, heading_deg)
+    p = np.column_stack([predicted[name] for name in RANKS])
+    stated, rank = np.isfinite(p).all(axis=1), predicted["rank"]
+    rank = np.where(np.isnan(rank) & stated, np.nan_to_num(p).argmax(axis=1) + 1.0, rank)
     scored = near & np.isfinite(rank) & np.isfinite(item.measured) & (item.measured > 0)
     if scored.sum() < FEWEST:
         return None
     best = max(item.rank, key=lambda k: item.score.simulated[k].agreement)
-    models = {given.path.name: rank, f"ray tracing, K = {best:g}": item.rank[best].astype(np.float64)}
     measured = item.measured[scored]
     scores = {
         key: {
@@ -737,18 +711,17 @@ def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData, near_m:
             "total_variation": total_variation(histogram(measured), histogram(ranks[scored])),
             "agreement": agreement(measured, ranks[scored]),
         }
-        for key, ranks in models.items()
+        for key, ranks in ((given.path.name, rank), (f"ray tracing, K = {best:g}", item.rank[best]))
     }
-    entry = {"tower": item.tower, "matched": int(scored.sum()), "unmatched": int((~near).sum()), "scores": scores}
     scored &= stated
-    if not scored.any():
-        return entry | {"log_score": None, "constant_log_score": None}
-    forecast = score_forecast(item.measured[scored], p[scored], rank[scored], np.nanmean(p, axis=0))
-    return entry | {"log_score": forecast.log_score, "constant_log_score": forecast.constant_log_score}
+    constant = p[stated].sum(axis=0) / max(stated.sum(), 1)
+    forecast = score_forecast(item.measured[scored], p[scored], rank[scored], constant)
+    entry = {"tower": item.tower, "matched": len(measured), "unmatched": int((~near).sum()), "scores": scores}
+    return entry | {key: getattr(forecast, key) for key in ("log_score", "constant_log_score")}
 
 
-def _why_none(given: ForeignPrediction, result: FlightResult) -> str | None:
-    """Return the likely cause if no sample is near a prediction: other channels, time zone, day, route or datum."""
+def _why_none(given: ForeignPrediction, data: FlightData, result: FlightResult) -> str | None:
+    """Return the likely cause if no sample is near a prediction: channels, time zone, day, ground, datum or route."""
     if not result.series:
         return None
     ours, theirs = ({s.channel for s in result.rss}, set(given.table["channel"]) - {""})
@@ -760,6 +733,12 @@ def _why_none(given: ForeignPrediction, result: FlightResult) -> str | None:
         place[np.isfinite(place).all(axis=1)]
         for place in (np.vstack([s.position_m for s in result.series]), given.table[list(_PLACE)].to_numpy())
     )
+    above_m = points[:, 2] - data.site.takeoff_ground_m
+    if np.abs(above_m).max() < _ON_GROUND_M:
+        return (
+            f"no predicted position is in the air (at most {above_m.max():.1f} m above the take-off ground), so an "
+            "emulated vehicle did not fly"
+        )
     index, near = nearest_points(flown * [1, 1, 0], None, points * [1, 1, 0], None, 50.0)
     apart_m = float(np.median((points[index] - flown)[near, 2])) if near.mean() > 0.5 else 0.0
     if abs(apart_m) > 10.0:
@@ -776,7 +755,8 @@ def _other_time(given: ForeignPrediction, result: FlightResult) -> str:
     flown = np.concatenate([item.time for item in result.series])
     theirs = given.table["time"].dropna().to_numpy("datetime64[ns]")
     apart_h = float((np.median(theirs.astype(np.int64)) - np.median(flown.astype(np.int64))) / 3.6e12)
-    spans = f"predicted {theirs.min()} to {theirs.max()}, flown {flown.min()} to {flown.max()} (UTC)"
+    (begin, end), (first, last) = (np.array([t.min(), t.max()], "datetime64[s]") for t in (theirs, flown))
+    spans = f"predicted {begin} to {end}, flown {first} to {last} (UTC)"
     hours = round(apart_h * 2) / 2
     zone = 0.5 <= abs(hours) <= 14.0 and abs(apart_h - hours) < 0.25
-    return f"another time zone, {hours:+g} h: {spans}" if zone else f"another flight: {spans}"
+    return f"another time zone, {hours:+g} h: {spans}" if zone else f"another flight, or too few times: {spans}"

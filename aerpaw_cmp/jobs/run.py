@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -226,6 +226,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
     from ..report.flight import write_report
     from ..report.flight_data import pose_paths, report_data
     from .flight_run import check_recommended, recommended_text, report_stages, run_flight
+    from .referee import judge, read_foreign
     from .tasks import other_inputs
 
     _check_options(flight, chosen, options)
@@ -240,11 +241,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             target = outputs.enter_context(file)
         with stages("read"):
             data = load_data(settings, flight.parent, options.logs_root)
-            given = []
-            if chosen.against:
-                from .referee import read_foreign
-
-                given = [read_foreign(path, data) for path in chosen.against]
+            given = [read_foreign(path, data, chosen.against_distance_m) for path in chosen.against]
         if chosen.recommend is not None:
             check_recommended(data)
         stages.checked(lambda: report_stages(data, chosen.figures))
@@ -258,12 +255,9 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             other_inputs=other_inputs(settings, flight, options.logs_root, learned),
             paths=pose_paths(data, replays),
         )
-        cards: list[dict[str, Any]] = []
-        if given:
-            from .referee import judge
-
-            with stages("score predictions"):
-                cards = [judge(item, data, flight_run.result, chosen.against_distance_m) for item in given]
+        with stages("score predictions") if given else nullcontext():
+            cards = [judge(item, data, flight_run.result) for item in given]
+        if cards:
             record = replace(record, extra_metrics={**record.extra_metrics, "referee": cards})
         if target is not None:
             text, sentence = recommended_text(load_flight(flight), flight_run.ladder, flight)

@@ -17,7 +17,7 @@ from ..common.geodesy import SiteFrame
 from ..common.outputs import OutputFile, OutputFolder, explained_os_errors, is_sealed, sealed
 from ..common.text import counted
 from ..site.antennas import read_gain_grid
-from ..site.footprints import site_yaml
+from ..site.footprints import name_and_value, numbers_of, site_yaml
 from ..site.materials import CONSTANT, material
 from ..site.mitsuba import Mesh, TriangleScene
 from ..site.pattern_files import exported, read_cut_files, read_pattern_file
@@ -92,7 +92,7 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
     UsageError
         If the position of the scene or of its towers is missing.
     """
-    named = dict(_pair(text, "--material", "wall=concrete") for text in facts.materials)
+    named = dict(name_and_value(text, "--material", "wall=concrete") for text in facts.materials)
     base = None if facts.base is None else site_model(facts.base)
     start = _origin(facts.origin, base)
     with OutputFile(out, own=is_sealed, inputs=[path], force=force) as output:
@@ -140,28 +140,11 @@ def _summary(scene: TriangleScene) -> str:
     return f"{counted(len(scene.shapes), 'shape')}, {counted(len(scene), 'triangle')}, {size} m, of {', '.join(used)}"
 
 
-def _pair(text: str, option: str, example: str) -> tuple[str, str]:
-    name, mark, value = text.partition("=")
-    if not (mark and name and value):
-        raise UsageError(f"{option} '{text}'", expected=f"{option} {example}")
-    return name, value
-
-
-def _numbers(text: str, counts: tuple[int, ...], what: str, expected: str) -> list[float]:
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in counts:
-        raise UsageError(f"{what} '{text}'", expected=expected)
-    return values
-
-
 def _origin(text: str | None, base: SiteModel | None) -> dict[str, Any]:
     if text == "local":
         return {"latitude_deg": 0.0, "longitude_deg": 0.0}
     if text is not None:
-        values = _numbers(text, (2, 3), "--origin", "--origin latitude,longitude[,ground height above sea level]")
+        values = numbers_of(text, (2, 3), "--origin", "--origin latitude,longitude[,ground height above sea level]")
         origin: dict[str, Any] = {"latitude_deg": values[0], "longitude_deg": values[1]}
         if not (abs(values[0]) <= 90 and abs(values[1]) <= 180):
             raise UsageError(
@@ -188,8 +171,8 @@ def _towers(towers: Sequence[str], frame: SiteFrame, low: Any, high: Any) -> dic
         )
     by_name: dict[str, Any] = {}
     for text in towers:
-        name, place = _pair(text, "--tower", "BS=10,20,25")
-        east, north, up = _numbers(place, (3,), f"--tower {name}", "--tower name=east,north,height")
+        name, place = name_and_value(text, "--tower", "BS=10,20,25")
+        east, north, up = numbers_of(place, (3,), f"--tower {name}", "--tower name=east,north,height")
         latitude, longitude = frame.to_geographic(east, north)
         by_name[name] = {
             "latitude_deg": round(float(latitude), 10),

@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -609,12 +608,11 @@ class Prior:
 
     def sources(self) -> dict[str, Source]:
         """Return one link per tower, with isotropic ends and woods that attenuate."""
-        how: dict[str, Any] = {
-            "rt": RtSettings(foliage="attenuating"),
-            "rss": RssSettings(field="power"),
-            "unit": "dBm",
-        }
-        links = (Source(tower=t, channel="level", link=self.link, site=self.site, **how) for t in self.site.towers)
+        rt, rss = RtSettings(foliage="attenuating"), RssSettings(field="power")
+        links = (
+            Source(tower=tower, channel="level", unit="dBm", link=self.link, site=self.site, rt=rt, rss=rss)
+            for tower in self.site.towers
+        )
         return {source.antenna: source for source in links}
 
     def levels(self, each: Sequence[LinkSamples]) -> Levels:

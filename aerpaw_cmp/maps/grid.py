@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..common.errors import UsageError
 from ..common.jsonable import number_key
-from ..common.units import THERMAL_NOISE_DBM_HZ, AnyArray, FloatArray, IntArray, Printed, db_from_power, unmasked
+from ..common.units import AnyArray, FloatArray, IntArray, Printed, db_from_power, noise_floor_dbm, unmasked
 from ..compare.rank import rank_from_singular_values
 
 # Horizontal interval d_rx of the UAV positions.
@@ -571,9 +571,7 @@ class LinkBudget:
     @property
     def noise_dbm(self) -> float | None:
         """The noise floor of the receiver [dBm]. None without a bandwidth."""
-        if self.bandwidth_mhz is None:
-            return None
-        return THERMAL_NOISE_DBM_HZ + 10.0 * math.log10(self.bandwidth_mhz * 1e6) + self.noise_figure_db
+        return self.bandwidth_mhz and noise_floor_dbm(1e6 * self.bandwidth_mhz, self.noise_figure_db)
 
     @property
     def level_dbm(self) -> float | None:
@@ -589,17 +587,14 @@ class LinkBudget:
 
     def sentence(self) -> str:
         """Return power, noise floor and threshold in one sentence."""
-        noise = "noise floor not known (no bandwidth)"
+        noise, threshold = "noise floor not known (no bandwidth)", "covered where any path arrives"
         if self.noise_dbm is not None:
-            noise = (
-                f"noise floor {Printed(self.noise_dbm):.1f} dBm ({self.bandwidth_mhz:g} MHz, "
-                f"noise figure {self.noise_figure_db:g} dB)"
-            )
-        threshold = "covered where any path arrives"
+            receiver = f"({self.bandwidth_mhz:g} MHz, noise figure {self.noise_figure_db:g} dB)"
+            noise = f"noise floor {Printed(self.noise_dbm):.1f} dBm {receiver}"
         if self.level_dbm is not None:
             threshold = f"covered from {Printed(self.level_dbm):.1f} dBm"
-            if self.threshold_snr_db is not None:
-                threshold += f" (SNR {self.threshold_snr_db:g} dB)"
+        if self.threshold_snr_db is not None:
+            threshold += f" (SNR {self.threshold_snr_db:g} dB)"
         return f"Transmit power {self.tx_power_dbm:g} dBm; {noise}; {threshold}."
 
 

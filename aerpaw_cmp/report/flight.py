@@ -269,20 +269,31 @@ def referee_card(data: ReportData) -> Card:
 
 def _prediction_card(verdict: Mapping[str, Any]) -> Card:
     """Return the card of one prediction: means over channels, then each channel."""
+    name = verdict["prediction"]
+    series = [
+        (f"{tower} {channel}".strip(), entry)
+        for tower, channels in verdict["levels"].items()
+        for channel, entry in channels.items()
+    ]
     errors: dict[str, str | int] = {"Bias [dB]": 1, "RMSE [dB]": 1, "after offset": 1, "over 1 s": 1}
+    scores = {**errors, "Correlation": 2, "CRPS [dB]": 2, "In 90 %": SHARE}
+    keys = ("bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "correlation", "crps_db", "coverage_90")
     means = Table(
-        caption="Mean scores over the channels. A dash means that the prediction has no common reference with the "
-        "log, or no 90 % band.",
-        columns={"Model": HEAD, "Channels": 0, **errors, "Correlation": 2, "CRPS [dB]": 2, "In 90 %": SHARE},
+        caption="Mean scores over the channels that all models have. A dash means that the prediction has no common "
+        "reference with the log, or no 90 % band.",
+        columns={"Model": HEAD, "Channels": 0, **scores},
         rows=[list(row.values()) for row in verdict["means"]],
     )
-    every = verdict["table"]["rows"]
     channels = Table(
         caption="Scores of each channel. The difference is the RMSE of the prediction minus that of the model, after "
         "offsets, with its 95 % interval [dB]. If it is negative, the prediction is better.",
-        columns={"Tower, channel": HEAD, "Model": TEXT, "Samples": 0, **errors, "Correlation": 2, "CRPS [dB]": 2,
-                 "In 90 %": SHARE, "Difference": 2, "95 %": 2},
-        rows=[[*row[:11], None if row[11] is None else (row[11], row[12])] for row in every], look="dense",
+        columns={"Tower, channel": HEAD, "Model": TEXT, "Samples": 0, **scores, "Difference": 2, "95 %": 2},
+        rows=[
+            (link, model, card["n"], *(card[key] for key in keys),
+             *((None, None) if pair is None else (pair["difference_db"], tuple(pair["difference_ci95_db"]))))
+            for link, entry in series for model, card in entry["cards"].items()
+            for pair in [entry["differences"].get(model)]
+        ], look="dense",
     )  # fmt: skip
     nodes = Table(
         caption="The emulator at each node: offset (added to the measurement), slope of measured over emulated level "
@@ -290,26 +301,26 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
         columns={"Tower, channel": HEAD, "Offset [dB]": 1, "Slope": 2, "Detection floor [dB]": 1},
         rows=[list(node.values()) for node in verdict["nodes"]],
     )
-    name, ours = verdict["prediction"], "ray tracing (this report)"
     above = Table(
         caption="Share of samples at or above a threshold. Levels without a common reference with the log are "
         "compared after the offset.",
         columns={"Tower, channel": HEAD, "Threshold [dB]": 1, "Measured": SHARE, "Prediction": SHARE,
                  "Ray tracing": SHARE},
         rows=[
-            (f"{tower} {channel}".strip(), x["threshold_db"], x["measured"], x["predicted"], mine and mine["predicted"])
-            for tower, channels in verdict["levels"].items()
-            for channel, entry in channels.items()
-            for x, mine in zip_longest(*(entry["cards"].get(key, {}).get("exceedance", ()) for key in (name, ours)))
+            (link, x["threshold_db"], x["measured"], x["predicted"], mine and mine["predicted"])
+            for link, entry in series
+            for x, mine in zip_longest(
+                *(entry["cards"].get(key, {}).get("exceedance", ()) for key in (name, "ray tracing (this report)"))
+            )
         ], look="tall",
     )  # fmt: skip
     ranks = Table(
         caption="Ranks on the same samples.",
         columns={"Tower": HEAD, "Model": TEXT, "Samples": 0, "Kappa": 2, "Total variation": 3, "Agreement": SHARE},
         rows=[
-            (tower, name, entry["matched"], score["kappa"], score["total_variation"], score["agreement"])
+            (tower, model, entry["matched"], score["kappa"], score["total_variation"], score["agreement"])
             for tower, entry in verdict["rank"].items()
-            for name, score in entry["scores"].items()
+            for model, score in entry["scores"].items()
         ],
     )
     return Card(

@@ -82,13 +82,14 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
         columns={"Time [min]": 1, "Length [km]": 1, "SD [dB]": 1},
         rows=[(p["minutes"], p["length_m"] / 1000, p["sd_db"]) for p in data.curve],
     )  # fmt: skip
+    target = data.target if data.seen_from_m is None else "all directions around the towers, at all headings"
     known = f"Known flights: {', '.join(data.flights)}."
     if not data.flights:
         known = "No flight is known: antennas are those that the model assumes."
     return Page(
-        kind="plan", title=f"Next flight, target {data.target}", verdict=data.sentence, cautions=data.warnings,
+        kind="plan", title=f"Next flight for {target}", verdict=data.sentence, cautions=data.warnings,
         about=[f"{known} Antennas: {', '.join(data.antennas)}. Made {minute(data.generated)}. "
-               f"Files: {', '.join(data.files)}."],
+               "QGroundControl opens route.plan; route.csv has the same waypoints."],
         cards=[Card(title="Target and route", positions=Positions(view="places", data=shown)),
                Card(title="Candidates", id="candidates", tables=[candidates]),
                Card(title="Flight time", id="length", tables=[curve])],
@@ -99,7 +100,7 @@ def write_plan(data: PlanPage, folder: Path) -> list[Path]:
     """Write the page and its files, and return their paths, the page first."""
     shown = payload(
         list(_groups(data)), data.site, lines=[data.track_m], rings=[data.outline_m, *data.holes_m],
-        note="Black line: the recommended route. Dashed lines: limits of the area in which it may run.",
+        note="Solid line: the recommended route. Dashed lines: limits of the area in which it may run.",
     )  # fmt: skip
     written = write_page(folder, "plan", plan_page(data, shown), plan_metrics(data))
     written += [write_file(folder / name, text) for name, text in data.files.items()]

@@ -95,10 +95,10 @@ def heading_words(yaw_deg: FloatArray) -> str:
     Examples
     --------
     >>> heading_words(np.array([90.0, 90.0])), heading_words(np.array([0.0, 90.0])), heading_words(np.array([np.nan]))
-    ('heading 90 degrees', 'headings of the route', 'heading open')
+    ('heading 90 degrees', 'headings of the route', 'any heading')
     """
     if not np.isfinite(yaw_deg).all():
-        return "heading open"
+        return "any heading"
     return "headings of the route" if np.ptp(yaw_deg) else f"heading {yaw_deg[0]:.0f} degrees"
 
 
@@ -107,7 +107,7 @@ def first_words(
     outside: float,
     expected_db: float,
     band_db: float,
-    heading: str = "heading open",
+    heading: str = "any heading",
     lock: float | None = None,
     origin: str = REMEMBERED,
 ) -> str:
@@ -303,18 +303,22 @@ def prediction_page(data: PredictionPage, numbers: Mapping[str, Any], shown: Map
     return Page(
         kind="prediction", title=data.name, verdict=data.verdict, cautions=data.warnings, about=[about],
         cards=[Card(title="Map", positions=Positions(view="places", data=shown)),
-               _levels_card(numbers, lock="p_lock" in data.table), _model_card(data)],
+               _levels_card(numbers, lock="p_lock" in data.table, flown=bool(data.flights)),
+               _model_card(data)],
     )  # fmt: skip
 
 
-def _levels_card(numbers: Mapping[str, Any], *, lock: bool) -> Card:
-    columns: dict[str, str | int] = {"Tower, channel": HEAD, "Unit": TEXT, "Points": 0, "Level": 1, "SD [dB]": 1,
-                        **({"P(lock)": 2} if lock else {}), "Outside flown area": SHARE}  # fmt: skip
-    keys = ("unit", "points", "mean_level_db", "mean_sd_db", *(["mean_p_lock"] if lock else []), "share_outside_flown")
+def _levels_card(numbers: Mapping[str, Any], *, lock: bool, flown: bool) -> Card:
+    columns: dict[str, tuple[str, str | int]] = {
+        "unit": ("Unit", TEXT), "points": ("Points", 0), "mean_level_db": ("Level", 1), "mean_sd_db": ("SD [dB]", 1),
+        **({"mean_p_lock": ("P(lock)", 2)} if lock else {}),
+        **({"share_outside_flown": ("Outside flown area", SHARE)} if flown else {}),
+    }  # fmt: skip
     levels = Table(
-        caption="Means over all points. The standard deviation is that of one sample.", columns=columns,
-        rows=[(name, *(series[key] for key in keys)) for name, series in numbers["series"].items()],
-    )  # fmt: skip
+        caption="Means over all points. SD is the standard deviation of one sample.",
+        columns={"Tower, channel": HEAD, **dict(columns.values())},
+        rows=[(name, *(series[key] for key in columns)) for name, series in numbers["series"].items()],
+    )
     ranks = Table(
         caption="Mean probability of each rank over all points, by the learned receiver.",
         columns={"Tower": HEAD, **{f"rank {rank}": 2 for rank in RANKS}},
@@ -367,7 +371,7 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
     """
     numbers = prediction_metrics(data)
     flown = [np.asarray(line).T for line in data.flown.values()]
-    note = "Black lines: the flights from which the prediction is learned." if flown else ""
+    note = "Solid lines: the flights from which the prediction is learned." if flown else ""
     shown = payload(list(_groups(data)), data.site, lines=flown, note=note)
     written = write_page(folder, "prediction", prediction_page(data, numbers, shown), numbers)
     digits = {c: 3 for c in data.table.columns if c.endswith(("_db", "_m", "_deg", "_s"))}

@@ -749,23 +749,58 @@ def _site_around(
     return model, [about, *actions]
 
 
+def name_and_value(text: str, option: str, example: str) -> tuple[str, str]:
+    """Return both sides of ``NAME=VALUE``, the text of an option. UsageError if one of them is missing."""
+    name, mark, value = text.partition("=")
+    if not (mark and name and value):
+        raise UsageError(f"{option} '{text}'", expected=f"{option} {example}")
+    return name, value
+
+
+def numbers_of(text: str, counts: tuple[int, ...], what: str, expected: str) -> list[float]:
+    """Return numbers that are separated by commas.
+
+    Parameters
+    ----------
+    text : str
+        The value of an option.
+    counts : tuple of int
+        Allowed counts of numbers.
+    what, expected : str
+        The option, and its form, for the message.
+
+    Returns
+    -------
+    list of float
+
+    Raises
+    ------
+    UsageError
+        If a part is not a number, or another count is given.
+    """
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in counts:
+        raise UsageError(f"{what} '{text}'", expected=expected)
+    return values
+
+
 def _named_towers(towers: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return towers by name from ``NAME=LATITUDE,LONGITUDE,HEIGHT``."""
-    form = "--tower NAME=LATITUDE,LONGITUDE,HEIGHT, such as --tower roof=40.009,-105.267,25 [deg, deg, m above ground]"
+    form = "NAME=LATITUDE,LONGITUDE,HEIGHT, such as --tower roof=40.009,-105.267,25 [deg, deg, m above ground]"
     by_name: dict[str, dict[str, float]] = {}
     for text in towers:
-        name, _, place = text.partition("=")
-        try:
-            latitude, longitude, height = (float(word) for word in place.split(","))
-        except ValueError:
-            raise UsageError(f"--tower '{text}'", expected=form) from None
-        if not (name and math.isfinite(height) and 0 < height <= TALLEST_M):
-            raise UsageError(f"--tower '{text}'", expected=form, cause=f"a height outside 0 to {TALLEST_M:g} m")
-        if not (abs(latitude) <= 90 and abs(longitude) <= 180):
-            swapped = abs(longitude) <= 90 and abs(latitude) <= 180
-            raise UsageError(f"--tower '{text}'", expected=form, cause="the two are swapped" if swapped else None)
-        if name in by_name:
-            raise UsageError(f"two towers named '{name}'", expected="one --tower per name")
+        name, place = name_and_value(text, "--tower", form)
+        latitude, longitude, height = numbers_of(place, (3,), f"--tower {name}", f"--tower {form}")
+        for wrong, cause in (
+            (not 0 < height <= TALLEST_M, f"a height outside 0 to {TALLEST_M:g} m"),
+            (not (abs(latitude) <= 90 and abs(longitude) <= 180), "the two are swapped, or not in degrees"),
+            (name in by_name, f"two towers named '{name}'"),
+        ):
+            if wrong:
+                raise UsageError(f"--tower '{text}'", expected=f"--tower {form}", cause=cause)
         by_name[name] = {"latitude_deg": latitude, "longitude_deg": longitude, "antenna_height_m": height}
     return by_name
 

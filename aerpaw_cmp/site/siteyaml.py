@@ -587,11 +587,11 @@ def _check_tower(tower: Tower, area: Area | None, frame: SiteFrame) -> None:
             f"tower '{tower.name}' ({tower.latitude_deg:.5f}, {tower.longitude_deg:.5f}) lies {away / 1000:.1f} km "
             f"from its site",
             expected=f"at most {_FAR_TOWER_M / 1000:g} km",
-            cause=_why_far(tower.latitude_deg, tower.longitude_deg, frame),
+            cause=why_far(tower.latitude_deg, tower.longitude_deg, frame),
         )
 
 
-def _why_far(latitude: float, longitude: float, frame: SiteFrame) -> str:
+def why_far(latitude: float, longitude: float, frame: SiteFrame) -> str:
     """Return the likely error of a position that is far from the site."""
     for cause, position in (
         ("latitude and longitude are swapped", (longitude, latitude)),
@@ -905,7 +905,7 @@ def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: 
     away = float(np.hypot(east, north).max())
     if away > _FAR_POLYGON_M:
         wraps = float(np.abs(np.diff(longitude)).max()) > 180
-        cause = "it crosses the antimeridian (180 deg)" if wraps else _why_far(*ring[0], frame)
+        cause = "it crosses the antimeridian (180 deg)" if wraps else why_far(*ring[0], frame)
         raise UsageError(f"'{name}' reaches {away / 1000:.0f} km from the site's origin", cause=cause)
     return list(zip(east.tolist(), north.tolist(), strict=True))
 

@@ -18,7 +18,6 @@ from aerpaw_cmp.common.jsonable import fields_of
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.compare.level import crps_normal, local_mean_db
 from aerpaw_cmp.compare.receiver import constant_forecast, score_forecast
-from aerpaw_cmp.jobs.options import AGAINST_DISTANCE_M
 from aerpaw_cmp.jobs.referee import predicted_at, read_foreign, split_by_series
 
 from .tasks import KEY, RANKS, SERIES, Bench
@@ -191,12 +190,11 @@ def read_foreign_entry(path: Path, bench: Bench, tasks: Sequence[str], head: Map
                 found, _ = predicted_at(
                     given, part, pd.to_datetime(rows["time"]).dt.tz_localize(None).to_numpy("datetime64[ns]"),
                     rows[["east_m", "north_m", "up_m"]].to_numpy(np.float64), rows["heading_deg"].to_numpy(np.float64),
-                    AGAINST_DISTANCE_M,
                 )  # fmt: skip
                 # a loss has the reference of a level only where levels count about their mean error
                 loss = given.quantity == "path_loss_db"
                 level = np.full(len(rows), np.nan) if loss and not spec.own_offset else found["level"]
-                values = found | {"level_db": -level if loss else level}
+                values = found | {"level_db": level}
                 parts.append(rows[KEY].assign(**{name: values[name] for name in wanted if name in values}))
                 parts[-1]["known"] = np.isfinite(values.get(wanted[0], np.full(len(rows), np.nan)))
     frame = pd.concat(parts, ignore_index=True)

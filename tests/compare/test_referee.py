@@ -46,7 +46,7 @@ def test_crps_and_coverage_of_a_calibrated_normal_band() -> None:
     card = level_card(time, measured, PredictedLevel(level_db=level, sd_db=np.full(N, 2.0)), ())
     assert card.crps_db == pytest.approx(2.0 / np.sqrt(np.pi), rel=0.03)  # expected CRPS of N(0, sd) is sd / sqrt(pi)
     assert card.coverage_90 == pytest.approx(0.9, abs=0.015)
-    band = PredictedLevel(level_db=level, low_db=level - 1.0, high_db=level + 1.0)
+    band = PredictedLevel(level_db=level, q05_db=level - 1.0, q95_db=level + 1.0)
     assert level_card(time, measured, band, ()).coverage_90 == pytest.approx(0.383, abs=0.02)  # half a sd
 
 

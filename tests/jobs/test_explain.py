@@ -9,6 +9,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.jobs.explain import run_explain
+from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import unlisted
 from tests.simulated import planned, simulate, write_yaml
 
@@ -75,6 +76,20 @@ def test_command_line_and_json(flown, capsys):
     assert "coherent sum" in text
 
 
+def test_a_tower_without_a_log_is_explained_at_the_times_of_the_telemetry(flown):
+    explained = run_explain(flown[0], time="4", tower="LW4")
+    assert explained.measured_db is None
+    assert any("the flight has no log of LW4: times are those of the telemetry" in note for note in explained.notes)
+    tower = load_site("lake_wheeler").towers["LW4"].position_m
+    direct = next(path for path in explained.paths if path.words == "line of sight")
+    assert direct.length_m == pytest.approx(np.linalg.norm(np.subtract(explained.position_m, tower)), abs=1e-6)
+    spreading = 20 * np.log10(299792458 / 3.3e9 / (4 * np.pi * direct.length_m))
+    assert direct.terms_db["spreading"] == pytest.approx(spreading, abs=1e-9)
+    # the UAV is where the log of another tower has it at that time
+    other = run_explain(flown[0], time=explained.time_utc, tower="LW1")
+    assert other.position_m == pytest.approx(explained.position_m, abs=5.0)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -82,7 +97,7 @@ def test_command_line_and_json(flown, capsys):
         ({"time": "-20"}, "before the first"),
         ({"time": "noon"}, "seconds after"),
         ({"tower": "LW9"}, "LW1, LW2"),
-        ({"tower": "LW4"}, "the flight has no log of it"),
+        ({"tower": "LW4", "channel": "USRP7"}, "no link 'USRP7', and no log of LW4; expected one of rss"),
         ({"channel": "USRP7"}, "USRP1"),
     ],
 )

@@ -71,7 +71,9 @@ def test_plan_writes_the_best_route_and_prefers_headings(place: Path) -> None:
     assert (np.abs(north) < 251).all()
     table = pd.read_csv(out / "sd_map.csv")
     assert (table["sd_after_db"] <= table["sd_before_db"] + 0.02).all()
-    assert "Candidates" in (out / "plan.html").read_text(encoding="utf-8")
+    page = (out / "plan.html").read_text(encoding="utf-8")
+    assert "Candidates" in page
+    assert "Next flight for all directions around the towers" in page
 
 
 @pytest.mark.parametrize(

@@ -21,11 +21,12 @@ from aerpaw_cmp.jobs import predict, sources
 from aerpaw_cmp.jobs.calibrate import observe
 from aerpaw_cmp.jobs.calibrate_rank import rank_samples
 from aerpaw_cmp.jobs.flight_run import run_flight
-from aerpaw_cmp.jobs.referee import judge, read_foreign
+from aerpaw_cmp.jobs.referee import EMULATED, judge, read_foreign
 from aerpaw_cmp.jobs.sources import TargetOptions, Targets, find_targets, named_flights
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.propagation.geometry import Link, rotation_from_aircraft, single_element
 from aerpaw_cmp.propagation.replay import trace
+from aerpaw_cmp.report.flight import referee_card
 from aerpaw_cmp.report.prediction import prediction_metrics, write_prediction
 from aerpaw_cmp.report.texts import coded
 from aerpaw_cmp.site.siteyaml import load_site
@@ -326,6 +327,136 @@ def test_ray_tracing_has_no_score_where_its_antennas_were_learned_from_the_fligh
     assert not {"ray tracing (this report)"} & {*series["cards"], *series["differences"]}
     assert "Ray tracing has no score there" in verdict["sentence"]
     assert any("Ray tracing has no score on LW1 USRP1: its antennas" in text for text in verdict["remarks"])
+
+
+def both_channels(folder: Path) -> pd.DataFrame:
+    """The prediction of one channel, for two channels."""
+    table = pd.read_csv(folder / "prediction.csv")
+    (folder / "metrics.json").unlink()
+    return pd.concat([table.assign(channel=channel) for channel in ("USRP1", "USRP2")])
+
+
+def test_means_are_over_the_channels_that_all_models_have(said, flown):
+    """Ray tracing learned from one of two channels, so a mean over both channels is not comparable with its score."""
+    data, folder, _ = said
+    both_channels(folder).to_csv(folder / "prediction.csv", index=False)
+    rss = [
+        dataclasses.replace(r, further=dataclasses.replace(r.further, trained_on=("0" * 64,)))
+        if (r.tower, r.channel) == ("LW1", "USRP1")
+        else r
+        for r in flown[1].rss
+    ]
+    verdict = judge(read_foreign(folder, data), data, dataclasses.replace(flown[1], rss=tuple(rss)))
+    assert set(verdict["levels"]["LW1"]) == {"USRP1", "USRP2"}
+    means, cards = verdict["means"], verdict["levels"]["LW1"]["USRP2"]["cards"]
+    assert [row["model"] for row in means] == list(cards)
+    assert {row["channels"] for row in means} == {1}
+    for row in means:
+        assert row["rmse_offset_db"] == cards[row["model"]]["rmse_offset_db"]
+    assert f"RMSE {cards[folder.name]['rmse_offset_db']:.1f} dB after one offset" in verdict["sentence"]
+    assert "(1 channel)" in verdict["sentence"]
+    assert any("The means are over LW1 USRP2 only" in text for text in verdict["remarks"])
+
+
+def in_dbm(data, result):
+    """Return the flight as if its logs were in dBm."""
+    rss = tuple(dataclasses.replace(s, unit="dBm") for s in data.rss)
+    return dataclasses.replace(data, rss=rss), dataclasses.replace(
+        result, rss=tuple(dataclasses.replace(r, unit="dBm") for r in result.rss)
+    )
+
+
+def test_the_band_of_a_path_loss_is_mirrored(said, flown):
+    """The lower end of a loss is the upper end of a level."""
+    data, result = in_dbm(*flown)
+    table = pd.read_csv(said[1] / "prediction.csv")
+    (item,) = (r for r in result.rss if (r.tower, r.channel) == ("LW1", "USRP1"))
+    loss = next(s.link for s in data.rss if s.tower == "LW1").transmit_power_dbm - table["level_db"]
+    table = table.drop(columns=["level_db", "sd_db"])
+    table.assign(path_loss_db=loss, q05_db=loss - 1.0, q95_db=loss + 9.0).to_csv(said[1] / "loss.csv", index=False)
+    verdict = judge(read_foreign(said[1] / "loss.csv", data), data, result)
+    card = verdict["levels"]["LW1"]["USRP1"]["cards"]["loss.csv"]
+    # the levels are 2 dB above the measurement, so most measured levels are 1 to 9 dB below the level of the file
+    assert card["bias_db"] == pytest.approx(-2.0, abs=0.3)
+    assert card["n"] == np.isfinite(item.measured_db[item.posed]).sum()
+    assert card["coverage_90"] > 0.9
+    assert card["crps_db"] is None
+
+
+def test_offset_slope_and_floor_of_each_node_of_an_emulator(said, flown):
+    """Compare the table of nodes with NumPy: levels of half the slope that end at a floor."""
+    data, folder, _ = said
+    (item,) = (r for r in flown[1].rss if (r.tower, r.channel) == ("LW1", "USRP1"))
+    heard = item.posed & np.isfinite(item.measured_db)
+    emulated = np.maximum(0.5 * item.simulated_dbm + 20.0, np.quantile(0.5 * item.simulated_dbm[heard] + 20.0, 0.1))
+    time = pd.to_datetime(item.time[heard]).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    pd.DataFrame({"time_utc": time, "tower": "LW1", "channel": "USRP1", "level_db": emulated[heard]}).to_csv(
+        folder / "twin.csv", index=False
+    )
+    given = read_foreign(folder / "twin.csv", data)
+    assert judge(given, data, flown[1])["nodes"] == []  # only an emulator has nodes
+    verdict = judge(dataclasses.replace(given, program=EMULATED), data, flown[1])
+    (node,) = verdict["nodes"]
+    measured, level = item.measured_db[heard], emulated[heard]
+    assert node["series"] == "LW1 USRP1"
+    assert node["offset_db"] == pytest.approx(np.mean(level - measured), abs=0.06)
+    assert node["slope"] == pytest.approx(np.polyfit(level, measured, 1)[0], abs=1e-6)
+    assert node["floor_db"] == pytest.approx(level.min(), abs=1e-9)
+    page = str(referee_card(SimpleNamespace(extra_metrics={"referee": [verdict]})))
+    assert "The emulator at each node" in page
+    assert str(node["offset_db"]) in page
+
+
+def test_a_channel_with_too_few_predictions_is_named(said, flown):
+    data, folder, _ = said
+    table = both_channels(folder)
+    few = table[(table["channel"] == "USRP1") | (np.arange(len(table)) % 40 == 0)]
+    few.assign(east_m=few["east_m"].where(few["channel"] == "USRP1", 9e3)).to_csv(folder / "few.csv", index=False)
+    verdict = judge(read_foreign(folder / "few.csv", data), data, flown[1])
+    assert list(verdict["levels"]["LW1"]) == ["USRP1"]
+    assert any("few.csv: fewer than 20 samples of LW1 USRP2 have a predicted level" in s for s in verdict["remarks"])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: f.assign(sd_db=0.0), "sd_db of 0 or less"),
+        (lambda f: f.assign(sd_db=-3.0), "sd_db of 0 or less"),
+        (lambda f: f.rename(columns={"q05_db": "q95_db", "q95_db": "q05_db"}), "q05_db above q95_db.*swapped"),
+        (lambda f: f.assign(rank=7), "ranks that are not 0 to 4"),
+        (lambda f: f.assign(p_rank1=0.9, p_rank2=0.9, p_rank3=0.0, p_rank4=0.0), "another sum than 1"),
+        (lambda f: f.assign(level_db=f["level_db"].map("{:.1f}".format).str.replace(".", ",")), "no level or rank, but"),
+        (lambda f: f.assign(level_db="n/a"), "no level or rank, but nan; expected numbers with a decimal point"),
+        (lambda f: f[:0], "no level or rank; expected"),
+        (lambda f: f.assign(tower=np.nan), "towers without names; expected towers of the flight"),
+        (lambda f: f.assign(time_utc=1748786400), "no time that can be read.*ISO 8601 in UTC"),
+        (lambda f: f.assign(Tower="LW1"), "several columns of one quantity"),
+        (lambda f: f.rename(columns={"height_m": "alt"}), "without a time and without a position .*alt"),
+        (lambda f: f.rename(columns={"level_db": "level_dbm"}).assign(level_dbm=61.0), "missing sign"),
+    ],
+)  # fmt: skip
+def test_numbers_that_cannot_be_are_refused(change, words, said):
+    data, folder, _ = said
+    change(pd.read_csv(folder / "prediction.csv")).to_csv(folder / "bad.csv", index=False)
+    with pytest.raises(InputError, match=words):
+        read_foreign(folder / "bad.csv", data)
+
+
+def test_a_table_with_semicolons_names_its_separator(said):
+    data, folder, _ = said
+    pd.read_csv(folder / "prediction.csv").to_csv(folder / "bad.csv", index=False, sep=";")
+    with pytest.raises(InputError, match="a separator that is not a comma"):
+        read_foreign(folder / "bad.csv", data)
+
+
+def test_an_emulator_that_did_not_fly_is_named(said, flown, tmp_path):
+    data, result = flown
+    shutil.copytree(Path(__file__).parents[1] / "predictions" / "emulator", tmp_path / "twin")
+    log = tmp_path / "twin" / "2026-05-22_vehicleOut.txt"
+    rows = [line.split(",", 4) for line in log.read_text().splitlines()]
+    log.write_text("".join(f"{row[0]},-78.6962747,35.7274823,-0.113,{row[4]}\n" for row in rows))
+    with pytest.raises(InputError, match=r"no predicted position is in the air .* an emulated vehicle did not fly"):
+        judge(read_foreign(tmp_path / "twin", data), data, result)
 
 
 def test_the_parts_of_a_lost_lock_replace_the_normal_distribution(said):

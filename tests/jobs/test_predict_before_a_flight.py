@@ -46,6 +46,8 @@ def test_level_is_that_of_two_paths_and_the_standard_deviation_is_stated(place: 
     assert half == pytest.approx(1.6449 * table["sd_db"].to_numpy(), rel=1e-3)
     assert "No flight is known" in str(metrics["sentence"])
     assert "2.5 GHz, 30 dBm" in str(metrics["sentence"])
+    # there is no flown area before the first flight
+    assert "Outside flown area" not in (place / "out" / "prediction.html").read_text(encoding="utf-8")
 
 
 def test_options_replace_carrier_and_power_of_the_site(place: Path) -> None:

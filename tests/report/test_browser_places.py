@@ -64,6 +64,19 @@ def test_the_map_names_its_towers_and_reads_the_point_under_the_pointer(driver, 
     assert drawn.count("A 3.5 3.5") == 2 * len(driver.execute_script("return places.drawn()"))  # circles in halves
 
 
+def test_the_map_of_a_short_route_shows_the_towers_around_it(driver, maps_data):
+    """Levels along a route do not explain themselves if the tower is outside the map. The route is 400 m long."""
+    driver.execute_script("places.choose(0)")
+    frame(driver)
+    near = {
+        name
+        for name, tower in maps_data.site.towers.items()
+        if -400 < tower.east_m < 800 and -400 < tower.north_m < 500
+    }
+    assert len(near) >= 2
+    assert near <= {label[4] for label in driver.execute_script("return places.labels()")}
+
+
 def test_a_saved_table_has_no_formula_of_a_name(driver):
     """The page saves tables like those that Python writes, and numbers stay numbers."""
     driver.execute_script("""

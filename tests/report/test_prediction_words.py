@@ -34,7 +34,7 @@ def test_a_model_that_beats_free_space_is_called_better_with_its_interval() -> N
     chosen = correction(LEARNED, errors, 3.0)
     words, listed = first_words(chosen, 0.1, 4.2, 7.5), " ".join(cautions(chosen, 0.1))
     said = re.fullmatch(
-        r"Expect an RMSE of 4\.2 dB over 4 s means at these points on a new flight \(heading open\); 90 % of the samples lie "
+        r"Expect an RMSE of 4\.2 dB over 4 s means at these points on a new flight \(any heading\); 90 % of the samples lie "
         r"within ±7\.5 dB\. On held-out flights it is (\d\.\d) dB better than free space \[(\d\.\d), (\d\.\d)\] \(95 %\)\.",
         words,
     )  # its offset and places count

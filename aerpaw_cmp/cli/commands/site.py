@@ -249,12 +249,13 @@ def map_(
 
 
 def _print_coverage(rows: list[dict[str, Any]], settings: Any) -> None:
-    """Print the share of covered positions per tower and height, for the foliage model of the paper."""
-    shown = [row for row in rows if row["antennas"] == "MIMO" and row["foliage"] == settings.shown]
-    heights = sorted({row["altitude_m"] for row in shown})
-    share = {(row["tower"], row["altitude_m"]): f"{100.0 * row['coverage']:.1f} %" for row in shown}
-    names = list(dict.fromkeys(row["tower"] for row in shown))
-    lines = [
-        ["nearest tower" if name == "joint" else name, *(share[name, height] for height in heights)] for name in names
-    ]
-    table(["tower", *(f"{height:g} m" for height in heights)], lines, f"Covered positions, foliage {settings.shown}")
+    """Print the share of covered positions per tower, antennas and height, for the foliage model of the paper."""
+    lines: dict[tuple[str, str], dict[str, str]] = {}
+    for row in (row for row in rows if row["foliage"] == settings.shown):
+        antennas = "one element" if row["antennas"] == "SISO" else f"{settings.elements} elements in phase"
+        line = lines.setdefault((row["tower"].replace("joint", "nearest tower"), antennas), {})
+        line[f"{row['altitude_m']:g} m"] = f"{100.0 * row['coverage']:.1f} %"
+    heads = ["tower", "antennas", *next(iter(lines.values()))]
+    table(
+        heads, [[*key, *line.values()] for key, line in lines.items()], f"Covered positions, foliage {settings.shown}"
+    )

@@ -25,11 +25,15 @@
   // --- the plan and the sphere ----------------------------------------------------------------------------------------
 
   let project = null, drawn = [], labels = [];
-  function limits() { // extent of the points of this group and of the lines
+  function limits() { // extent of the points of this group, of the lines, and of towers that are no farther than it is wide
     const [e, n] = group().at.map(i => arrays[i]), all = [[...e].filter(Number.isFinite), [...n].filter(Number.isFinite)];
     for (const line of [...data.lines, ...data.rings]) for (const [x, y] of line) { all[0].push(x); all[1].push(y); }
     const ends = all.flatMap(list => [list.reduce((a, b) => Math.min(a, b), Infinity), list.reduce((a, b) => Math.max(a, b), -Infinity)]);
-    const room = 0.04 * Math.max(ends[1] - ends[0], ends[3] - ends[2], 50);
+    const size = Math.max(ends[1] - ends[0], ends[3] - ends[2], 50), room = 0.04 * size, [west, east, south, north] = ends;
+    for (const { at: [x, y] } of data.site.towers) {
+      if (x < west - size || x > east + size || y < south - size || y > north + size) continue;
+      [x, x, y, y].forEach((v, i) => { ends[i] = i % 2 ? Math.max(ends[i], v) : Math.min(ends[i], v); });
+    }
     return ends.map((v, i) => v + (i % 2 ? room : -room));
   }
   function drawPlan(pen, w, h) {

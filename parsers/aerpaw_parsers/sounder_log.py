@@ -10,8 +10,7 @@ name: ``LW1:LW2:3235751:3.32G:0:2026-06-01_02_00_05:power_log.txt`` (transmitter
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,17 +27,15 @@ _VALUE = 16  # od -f: right-aligned in sixteen columns
 _WIDTHS = range(7, 13)  # octal digits of the offset; seven until 2 MiB of samples, ten from 128 MiB on
 _MOST_REPEATS = 5_000_000  # two days at 30 samples per second: a damaged offset implies more
 _HEAD = rb"^\[(" + _text.TIME + rb")\] "
-_ODD = re.compile(_HEAD + rb"+([0-7]{7,12}) +(" + _text.NUMBER + rb"|-?nan|-?inf)[ \t]*$")
-_STAR = re.compile(_HEAD + rb"+\*[ \t]*$")
-_FOOT = re.compile(_HEAD + rb"+([0-7]{7,12})[ \t]*$")
+# A sample, a '*' (no offset) or a last line (no value).
+_LINE = re.compile(_HEAD + rb"+(?:\*|([0-7]{7,12})(?: +(" + _text.NUMBER + rb"|-?nan|-?inf))?)[ \t]*$")
 
 
 def sniff(head: bytes) -> bool:
     """Check whether most of the first lines are od lines, with at least one sample."""
     lines = _text.first_lines(head)
-    samples = sum(_ODD.match(line) is not None for line in lines)
-    stars = sum(_STAR.match(line) is not None for line in lines)
-    return samples > 0 and 2 * (samples + stars) > len(lines)
+    known = [found for found in map(_LINE.match, lines) if found and (found[3] or not found[2])]
+    return any(found[3] for found in known) and 2 * len(known) > len(lines)
 
 
 @dataclass
@@ -134,39 +131,26 @@ def _piece(lines: _text.Lines, rejects: _text.Rejects) -> _Piece:
     """Read samples of od's layout at once, and the few other lines one by one."""
     fixed, wrong = _fixed_layout(lines)
     rejects.add(lines, wrong, "the offset is not an octal number: not written by od")
-    unread = np.ones(len(lines), dtype=bool)
+    unread = ~lines.blank
     unread[fixed.line] = unread[wrong] = False
-    samples: list[tuple[int, bytes, bytes, float]] = []
-    marks: list[tuple[int, bytes, bytes, float]] = []
-    blank, torn = 0, len(lines) - 1 if lines.unterminated else -1
+    odd: list[tuple[int, bytes, int, float, bool]] = []
     for i in np.flatnonzero(unread).tolist():
         line = lines.raw(i)
-        sample, star, foot = (form.match(line) for form in (_ODD, _STAR, _FOOT))
-        if sample is not None and i == torn and len(line) < _STAMP + 1 + len(sample[2]) + _VALUE:
-            rejects.add(lines, [i], "truncated last line: the value is cut short")
-        elif sample is not None:
-            samples.append((i, sample[1], sample[2], float(sample[3])))
-        if mark := star or foot:
-            marks.append((i, mark[1], b"-1" if star else mark[2], np.nan))
-        elif sample is None and line.strip():
+        found = _LINE.match(line)
+        last = lines.unterminated and i == len(lines) - 1
+        if found is None:
             rejects.add(lines, [i], _reason(line))
-        blank += not line.strip()
-    odd, wrong_dates = _collect(samples)
-    marked, wrong_marks = _collect(marks)
-    rejects.add(lines, wrong_dates + wrong_marks, "the time stamp is not a date of the calendar")
-    texts = {i: lines.text(i) for i in marked.line[:KEPT_REJECTED].tolist()}
-    return _Piece(fixed.join(odd) if len(odd.line) else fixed, marked, texts, len(lines), blank)
-
-
-def _collect(rows: list[tuple[int, bytes, bytes, float]]) -> tuple[_Samples, list[int]]:
-    """Return the rows with parsed times, and the lines with an invalid time."""
-    if not rows:
-        return _Samples.none(), []
-    line = np.array([row[0] for row in rows], dtype=np.int64)
-    wall, valid, _, _ = _text.parse_texts(np.array([row[1] for row in rows]))
-    offset = np.array([-1 if row[2] == b"-1" else int(row[2], 8) for row in rows], dtype=np.int64)
-    value = np.array([row[3] for row in rows])
-    return _Samples(line, wall, offset, value).take(valid), line[~valid].tolist()
+        elif last and found[3] and len(line) < _STAMP + 1 + len(found[2]) + _VALUE:
+            rejects.add(lines, [i], "truncated last line: the value is cut short")
+        else:
+            odd.append((i, found[1], int(found[2] or b"-1", 8), float(found[3] or "nan"), found[3] is not None))
+    line_of, times, offset, value, sampled = zip(*odd, strict=True) if odd else ((),) * 5
+    wall, valid, _, _ = _text.parse_texts(_text.cells(times))
+    rows = _Samples(np.array(line_of, np.int64), wall, np.array(offset, np.int64), np.array(value, np.float64))
+    rejects.add(lines, rows.line[~valid], "the time stamp is not a date of the calendar")
+    samples, marks = (rows.take(valid & (np.array(sampled, dtype=bool) == kind)) for kind in (True, False))
+    texts = {i: lines.text(i) for i in marks.line[:KEPT_REJECTED].tolist()}
+    return _Piece(fixed.join(samples) if len(samples.line) else fixed, marks, texts, len(lines), int(lines.blank.sum()))
 
 
 def _reason(line: bytes) -> str:
@@ -199,20 +183,20 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     ends = (samples.take(near) if len(samples.line) else samples).join(feet)
     after = np.searchsorted(ends.line, stars.line)
     before = np.searchsorted(samples.line, stars.line) - 1
-    bad: list[tuple[int, str]] = []
-    ok = (before >= 0) & (after < len(ends.line))
-    same = np.concatenate(([False], np.diff(before) == 0)) & (before >= 0)
-    bad += [(int(i), "'*' without a sample before it or an offset after it: the length of the run is unknown")
-            for i in stars.line[~ok]]  # fmt: skip
-    bad += [(int(i), "a second '*' in one run") for i in stars.line[ok & same]]
-    chosen = np.flatnonzero(ok & ~same)
-    start, end = before[chosen], after[chosen]
-    count = (ends.offset[end] - samples.offset[start]) // 4 - 1
+    bounded = (before >= 0) & (after < len(ends.line))
+    second = np.concatenate(([False], np.diff(before) == 0))
+    first, count = bounded & ~second, np.zeros(len(stars.line), dtype=np.int64)
+    count[first] = (ends.offset[after[first]] - samples.offset[before[first]]) // 4 - 1
     fits = (count >= 0) & (np.cumsum(np.maximum(count, 0)) <= _MOST_REPEATS)
-    bad += [(int(i), "'*' between offsets that do not bound a run of plausible length")
-            for i in stars.line[chosen[~fits]]]  # fmt: skip
-    chosen, start, end, count = chosen[fits], start[fits], end[fits], count[fits]
-    step = np.concatenate([np.arange(1, n + 1) for n in count.tolist()]) if len(count) else np.zeros(0, dtype=np.int64)
+    reasons = {
+        "'*' without a sample before it or an offset after it: the length of the run is unknown": ~bounded,
+        "a second '*' in one run": bounded & second,
+        "'*' between offsets that do not bound a run of plausible length": first & ~fits,
+    }
+    bad = [(i, reason) for reason, where in reasons.items() for i in stars.line[where].tolist()]
+    chosen = np.flatnonzero(first & fits)
+    start, end, count = before[chosen], after[chosen], count[chosen]
+    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + 1
     part = step / np.repeat(count + 1, count)
     span = (ends.wall[end] - samples.wall[start]).astype(np.float64)
     repeats = _Samples(
@@ -238,19 +222,19 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     UsageError
         If no time zone is given.
     """
-    rejects, tally, notes = _text.Rejects(), Counter[str](), list[str]()
+    rejects, warnings = _text.Rejects(), list[str]()
     log = _joined(pieces, rejects)
     repeats, used, bad = _expand(log.samples, log.marks)
     feet = log.marks.line[log.marks.offset >= 0].tolist()
     foot = "no value after the offset (truncated last line, or the end of od's input)"
     for i, reason in (*bad, *((i, foot) for i in feet)):
         rejects.add_line(i + 1, reason, log.texts.get(i, ""))
-    tally.update(repeated=len(repeats.line), accepted=len(log.samples.line) + len(used))
-    stream = _stream(log, repeats, options, tally, notes)
     rejected, reasons = rejects.result()
+    accepted = len(log.samples.line) + len(used)
+    streams = (_stream(log, repeats, options, warnings),) if accepted else ()
     return ReadResult(
-        reader="sounder_log", streams=() if stream is None else (stream,), lines=log.lines, accepted=tally["accepted"],
-        blank=log.blank, rejected=rejected, warnings=tuple(_warnings(tally, notes, options)), reasons=reasons,
+        reader="sounder_log", streams=streams, lines=log.lines, accepted=accepted, blank=log.blank, rejected=rejected,
+        warnings=tuple(warnings), reasons=reasons,
     )  # fmt: skip
 
 
@@ -274,27 +258,28 @@ def _joined(pieces: Iterable[bytes], rejects: _text.Rejects) -> _Piece:
     return _Piece(samples, marks, texts, before, blank, torn=before - 1 if unterminated else -1)
 
 
-def _stream(
-    log: _Piece, repeats: _Samples, options: ReadOptions, tally: Counter[str], notes: list[str]
-) -> Stream | None:
-    """Return the stream with its flags, or None if it is empty, and add warnings about its times to ``notes``."""
-    samples = log.samples
-    if not len(samples.line):
-        return None
-    repeated = np.zeros(0, dtype=bool)
+def _stream(log: _Piece, repeats: _Samples, options: ReadOptions, warnings: list[str]) -> Stream:
+    """Return the stream with its flags, and add warnings about repeated, lost and missing samples and about times."""
+    samples, repeated = log.samples, np.zeros(0, dtype=bool)
     if len(repeats.line):
         samples = samples.join(repeats)
         repeated = np.isin(samples.line, repeats.line)  # lines of '*' contain no other samples
+        restored = counted(len(repeats.line), "sample was", "samples were")
+        warnings.append(
+            f"{restored} restored: the log has '*' (of the program od) for values that repeat. Flagged 'repeated'"
+        )
     # a log may have 1 GB: free each column as soon as it is not needed
     jump = samples.offset
     jump[1:] -= jump[:-1]
     jump[0] = 0
     lost = jump > 4
-    missing = int((jump[lost] // 4 - 1).sum())
-    tally.update(lost=int(lost.sum()), missing=missing, back=int((jump < 0).sum()))
+    if lost.any():
+        missing = counted(int((jump[lost] // 4 - 1).sum()), "sample")
+        warnings.append(f"offsets jump at {counted(int(lost.sum()), 'place')}: {missing} missing")
+    if back := int((jump < 0).sum()):
+        warnings.append(f"offsets step back at {counted(back, 'place')}: several runs in one file?")
     samples.offset = jump = _NONE
     instants = _text.wall_to_utc(samples.wall, options, needed_by="sounder_log")
-    notes += instants.warnings
     samples.wall = _NONE
     flag = _text.no_flags(len(samples.line))
     instants.flag(flag)
@@ -307,40 +292,22 @@ def _stream(
         _text.add_flag(flag, samples.line == log.torn, _text.UNTERMINATED)
     samples.line += 1
     frame = _text.frame("rss", instants.time, samples.line, flag, {"rss_db": samples.value}, own=True)
-    tally["time_back"] = _text.steps_back(frame)
-    name, ratio = _name(options)
+    warnings += [*instants.warnings, *_text.back_in_time(_text.steps_back(frame))]
+    named = _NAMED.search(options.file_name.lower())
+    if named is None and options.channel is None:
+        warnings.append(
+            "power, quality and SNR logs have one layout: read as power, because the file name does not show the kind; "
+            "use the channel option for another kind"
+        )
+    name = options.channel or (named.group() if named else "power")
+    unit = "dB" if name.lower() in ("quality", "snr") else "dB re full scale"
     attributes = _text.attributes(
-        options, channel=name, unit=options.unit or ("dB" if ratio else "dB re full scale"),
-        quantity="SNR" if name.lower() == "snr" else None, repeated_samples=tally["repeated"],
+        options, channel=name, unit=options.unit or unit, quantity="SNR" if name.lower() == "snr" else None,
+        repeated_samples=len(repeats.line),
     )  # fmt: skip
     if link := _SOUNDING.match(options.file_name):
         attributes |= _identity.attributes_of({key: text for key, text in link.groupdict().items() if text != "null"})
     return Stream("rss", name, frame, attributes)
-
-
-def _name(options: ReadOptions) -> tuple[str, bool]:
-    """Return the name of the channel, and whether its levels are ratios."""
-    named = _NAMED.search(options.file_name.lower())
-    name = options.channel or (named.group() if named else "power")
-    return name, name.lower() in ("quality", "snr")
-
-
-def _warnings(tally: Counter[str], of_times: list[str], options: ReadOptions) -> Iterator[str]:
-    """Yield warnings about the numbers of repeated, lost and missing samples."""
-    if tally["repeated"]:
-        samples = counted(tally["repeated"], "sample was", "samples were")
-        yield f"{samples} restored: the log has '*' (of the program od) for values that repeat. Flagged 'repeated'"
-    if tally["lost"]:
-        yield f"offsets jump at {counted(tally['lost'], 'place')}: {counted(tally['missing'], 'sample')} missing"
-    if tally["back"]:
-        yield f"offsets step back at {counted(tally['back'], 'place')}: several runs in one file?"
-    yield from of_times
-    yield from _text.back_in_time(tally["time_back"])
-    if tally["accepted"] and options.channel is None and not _NAMED.search(options.file_name.lower()):
-        yield (
-            "power, quality and SNR logs have one layout: read as power, because the file name does not show the kind; "
-            "use the channel option for another kind"
-        )
 
 
 # Name of a file of the nightly soundings between towers.

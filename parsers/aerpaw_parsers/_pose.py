@@ -131,9 +131,7 @@ def of_readings(
 ) -> ReadResult:  # fmt: skip
     """Return the telemetry ``vehicle`` of readings with a time and a position, by :func:`._sheet.of_readings`."""
     sheet = _sheet.of_readings(lines, readings, rejected)
-    rows = _sheet.rows(sheet, options, reader=reader) if readings else None
-    if rows is None:
-        return _sheet.all_rejected(lines.data, reader, "no reading with a time and a position")
+    rows = _sheet.rows(sheet, options, reader=reader)
     track = from_sheet(rows, sheet, name="vehicle", source=reader)
     rows.warnings += sheet.remarks()
     return rows.result([track])

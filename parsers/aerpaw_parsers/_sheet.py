@@ -23,7 +23,7 @@ from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.limits import NEAR_DEG
-from aerpaw_cmp.readers import ReadOptions, ReadResult, RejectedLine, Rows, built, counted, dictionary, instants_of
+from aerpaw_cmp.readers import ReadOptions, RejectedLine, Rows, built, counted, dictionary, instants_of
 
 from . import _json, _stamps
 
@@ -446,16 +446,22 @@ def _are_thousands(texts: Sequence[str]) -> bool:
     return any("," in text for text in texts) and all(_THOUSANDS.fullmatch(text) for text in texts if "," in text)
 
 
-def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
-    """Return the table of a file, or None if none of its first lines is a header."""
+def read(data: bytes, is_header: _IsHeader) -> Sheet:
+    """Return the table of a file.
+
+    Raises
+    ------
+    InputError
+        If none of the first lines is a header.
+    """
     if _json.BEGIN.match(data):
         lines = _text.split(data)
         parsed = _json.objects(lines)
         readings = [(int(i), _json.flat(entry)) for i, entry in zip(parsed.row, parsed.values, strict=True)]
-        return of_readings(lines, readings, parsed.rejected) if readings else None
+        return of_readings(lines, readings, parsed.rejected)
     header = _header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
     if header is None:
-        return None
+        raise InputError("no header with a time and a level, ratio, rank or position", expected="names of columns")
     sheet = cut(_text.split(data), *header)
     _split_places(sheet)
     return sheet
@@ -701,13 +707,18 @@ def _without_empty_end(rows: list[tuple[int, list[str]]], names: list[str]) -> l
     return rows
 
 
-def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None = None) -> Rows | None:
-    """Return the rows of a table with their times, or None if the table has no times.
+def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None = None) -> Rows:
+    """Return the rows of a table with their times.
 
     Parameters
     ----------
     column : int, optional
         Column of the times; by default the one that the dictionary finds.
+
+    Raises
+    ------
+    InputError
+        If the table has no times, or its columns are shifted.
     """
     known = {i: m.quantity for i, m in enumerate(sheet.meanings) if m is not None and not m.indirect}
     mapped = column is not None
@@ -719,13 +730,12 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     weeks = None if mapped and column != sheet.find("gps_seconds") else _gps_weeks(sheet, column)
     times = (column, sheet.find("time") if weeks is not None else None, *map(sheet.find, _OF_CLOCK))
     sheet.used |= {i for i in times if i is not None}
-    if column is None and weeks is None:
-        return None
     if weeks is not None:
         clock, cells, warnings = "epoch_s", weeks, ["the times are GPS weeks and seconds: leap seconds were subtracted"]
-    else:
-        assert column is not None
+    elif column is not None:
         clock, cells, warnings = _times(sheet, column, options, mapped=mapped)
+    else:
+        raise InputError("no reading has a time", expected="times and values", cause="a truncated file")
     start = next((found for text in (sheet.cells or [[]])[0] if (found := _START.search(text))), None)
     if clock.startswith("relative") and start is not None:
         options = replace(options, time_origin=options.time_origin or start[1])
@@ -1044,12 +1054,3 @@ def _add_milliseconds(rows: Rows, milliseconds: FloatArray) -> None:
         rows.warnings.append("the column of milliseconds does not fit the times and is not used")
         return
     rows.time = np.where(known, zero.max() + counted, time).astype("datetime64[ns]")
-
-
-def all_rejected(data: bytes, reader: str, reason: str) -> ReadResult:
-    """Return the account of a file without such a table, with all lines rejected."""
-    lines = _text.split(data)
-    filled = np.flatnonzero(~lines.blank)
-    rejected = tuple(lines.reject_all(filled, reason))
-    blank = len(lines) - len(filled)
-    return ReadResult(reader=reader, streams=(), lines=len(lines), accepted=0, blank=blank, rejected=rejected)

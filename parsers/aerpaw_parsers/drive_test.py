@@ -300,14 +300,12 @@ def _read(data: bytes, options: ReadOptions, *, header: _IsHeader, reader: str, 
     Raises
     ------
     InputError
-        If the only positions are on a local grid.
+        If there is no header with a time, or the only positions are on a local grid.
     UsageError
         If the zone of the clock is unknown.
     """
     sheet = _sheet.read(data, header)
-    rows = None if sheet is None else _sheet.rows(sheet, options, reader=reader)
-    if sheet is None or rows is None:
-        return _sheet.all_rejected(data, reader, "no header with a time and a level, ratio, rank or position")
+    rows = _sheet.rows(sheet, options, reader=reader)
     grid = sheet.find("grid")
     if track and sheet.find("latitude_deg") is None and grid is not None:
         raise InputError(

@@ -146,7 +146,6 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     sheet.used |= {*where.values()}
     sheet.said = {where[name]: quantity for name, quantity in _QUANTITIES.items() if name in where}
     rows = _sheet.rows(sheet, options, reader="generic_csv", column=where.pop("time"))
-    assert rows is not None
     for column in (where[name] for name in _VALUE[kind]):
         if len(sheet) and not any(sheet.texts(column)):
             found = f"column {sheet.names[column]!r} is empty in every row"

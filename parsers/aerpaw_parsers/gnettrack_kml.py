@@ -37,10 +37,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     timed = [i for i, reading in enumerate(readings) if reading.get("TIME") and i not in cut]
     torn = lines.reject_all(np.setdiff1d(row[cut], row[timed]), "a placemark without its end (truncated file?)")
     sheet = _sheet.of_readings(lines, [(int(row[i]), readings[i]) for i in timed], torn)
-    rows = _sheet.rows(sheet, options, reader="gnettrack_kml") if timed else None
-    if rows is None:
-        return _sheet.all_rejected(data, "gnettrack_kml", "no placemark with a time")
-    return drive_test.of_sheet(rows, sheet)
+    return drive_test.of_sheet(_sheet.rows(sheet, options, reader="gnettrack_kml"), sheet)
 
 
 def _reading(text: bytes) -> dict[str, str]:

@@ -68,9 +68,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     row = lines.number_at(at for at, _ in points)
     readings = [(int(i), cells) for i, (_, cells) in zip(row, points, strict=True)]
     sheet = _sheet.of_readings(lines, readings, _torn(lines, data, row))
-    rows = _sheet.rows(sheet, options, reader="gpx") if readings else None
-    if rows is None:
-        return _sheet.all_rejected(data, "gpx", "a point without position or time (truncated?)")
+    rows = _sheet.rows(sheet, options, reader="gpx")
     begun = [track.start() for track in re.finditer(rb"<(?:\w{1,20}:)?trk\b", data)]
     track = np.searchsorted(begun, np.array([at for at, _ in points], dtype=np.int64))[rows.at]
     parts = {"": (rows, sheet)}

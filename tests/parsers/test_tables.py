@@ -106,7 +106,8 @@ def test_all_three_angles_must_look_like_radians(yaws: tuple[float, float], pitc
 
 
 def test_a_header_far_below_is_none() -> None:
-    assert read("pose_csv", b"a line of talk\n" * 70 + POSES + pose(0) + pose(1)).accepted == 0
+    with pytest.raises(InputError, match="no header with a time"):
+        read("pose_csv", b"a line of talk\n" * 70 + POSES + pose(0) + pose(1))
 
 
 PHONE = b"Timestamp,LTEPCI,RSRP,RSRQ,EARFCN,N1 LTE RSRP,N1 LTE PCI\n"

@@ -54,7 +54,9 @@ def parts(
         The name is empty if the table has one part.
     """
     columns = [
-        i for i, what in enumerate(sheet.meanings) if what and what.quantity.name in keys and _of_row(what.place)
+        i
+        for i, what in enumerate(sheet.meanings)
+        if what and what.quantity.name in keys and not what.place.startswith("n")
     ]
     marks = _marks(rows, sheet, keys, columns, level) if found else []
     texts = {i: _named(sheet, i) for i in (*columns, *marks)}
@@ -88,10 +90,6 @@ def parts(
         written = {sheet.plain[i]: text for i, text in zip(several, values, strict=True) if text}
         label = "_".join(_label(name, text) for name, text in written.items())
         yield label, replace(rows.part(where), about=rows.about | attributes_of(alone | written)), sheet.part(where)
-
-
-def _of_row(place: str) -> bool:
-    return not place.startswith("n")
 
 
 def _values(texts: _Texts) -> dict[int, set[str]]:

@@ -44,7 +44,8 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
         return None
     pairs = [*zip(*(_alike(sheet, name) for name in PLACE[:2]), strict=False)]
     if len(pairs) > 1:
-        moving = [pair for pair in pairs if any(_moves(sheet.numbers(i)) for i in pair)]
+        spans_deg = [max(np.nanmax(angle) - np.nanmin(angle) for angle in map(sheet.numbers, pair)) for pair in pairs]
+        moving = [pair for pair, span_deg in zip(pairs, spans_deg, strict=True) if span_deg > _AT_REST_DEG]
         latitude, longitude = moving[0] if len(moving) == 1 else (latitude, longitude)
         how = "the only one that moves" if len(moving) == 1 else "which is a guess"
         names = ", ".join(sheet.names[i] for i, _ in pairs)
@@ -89,10 +90,6 @@ def _alike(sheet: _sheet.Sheet, name: str) -> list[int]:
         if what and what.quantity.name == name and np.isfinite(sheet.numbers(i)).any()
     }
     return [i for i, rank in ranks.items() if rank == min(ranks.values())]
-
-
-def _moves(angle_deg: FloatArray) -> bool:
-    return bool(np.nanmax(angle_deg) - np.nanmin(angle_deg) > _AT_REST_DEG)
 
 
 def without_fix(sheet: _sheet.Sheet) -> BoolArray:

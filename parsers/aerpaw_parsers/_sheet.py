@@ -400,11 +400,6 @@ class Sheet:
             said.append(f"{counted(equal, 'row')} equal to another row in every cell: was one log joined twice?")
         return said
 
-    @property
-    def _has_level(self) -> bool:
-        """Check whether a column with a level was read."""
-        return any((what := self.meanings[i]) is not None and what.quantity.role == "rss" for i in self.used)
-
     def _is_of_interest(self, column: int) -> bool:
         """Check whether a column has values and looks like a level, an identity, a position or a time."""
         meaning, words = self.meanings[column], self.plain[column]
@@ -414,7 +409,8 @@ class Sheet:
         elif not like:
             like = _WHERE_OR_WHEN.search(words) is not None or self.unit_read(column) in _OF_LEVELS[1:]
             # an index of the level of an unknown radio access, where no level is read
-            like |= _ASU.search(words) is not None and not self._has_level
+            levels = (what for i in self.used if (what := self.meanings[i]) and what.quantity.role == "rss")
+            like |= _ASU.search(words) is not None and not any(levels)
             # angles in columns of other names, such as x and y
             like |= self.find("latitude_deg") is None and _is_angle(self.numbers(column))
         return like and any(text.lower() not in NO_VALUE for text in self.texts(column))

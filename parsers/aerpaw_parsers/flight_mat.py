@@ -56,11 +56,6 @@ def sniff(head: bytes) -> bool:
     return head.startswith(MAGIC) and any(name in _NAMES or _GPS.fullmatch(name) for name in names_of(head))
 
 
-def _load(data: bytes) -> dict[str, AnyArray]:
-    """Return the variables of a flight as flat arrays, in the file's order of rows."""
-    return {name: np.asarray(values).ravel() for name, values in read_arrays(data, {*_NAMES, _DECODED}).items()}
-
-
 def _numeric(values: AnyArray, name: str) -> FloatArray:
     if values.dtype.kind not in "fiu":
         raise InputError(f"the variable {name!r} is not numeric", expected="a column of numbers")
@@ -130,7 +125,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If no time zone is given.
     """
-    table = _load(data)
+    # flat arrays, in the file's order of rows
+    table = {name: np.asarray(values).ravel() for name, values in read_arrays(data, {*_NAMES, _DECODED}).items()}
     if not any(name in table for name in (*_LEVELS, *_TELEMETRY)):
         raise InputError("the MATLAB file contains no flight", expected=f"variables: {', '.join(sorted(_NAMES)[:5])}")
     count = _common_length(table)

@@ -76,7 +76,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         parts = {f"_{i}": (rows.part(track == i), sheet.part(track == i)) for i in np.unique(track).tolist()}
     streams: list[Stream | None] = []
     for suffix, (part, cells) in parts.items():
-        streams.append(_track(part, cells, f"track{suffix}"))
+        stream = _pose.from_sheet(part, cells, name=f"track{suffix}", source="GPX")
+        # GPX has one height, ele, which receivers write above sea level
+        streams.append(stream and replace(stream, attributes={**stream.attributes, "height_from": "program"}))
         streams += drive_test.of_radio(part, cells) if drive_test.has_radio(sheet.names) else []
     rows.warnings += [*_sheet.way_to_level(sheet), *sheet.remarks()]
     return rows.result(streams)
@@ -86,12 +88,6 @@ def _overlap(rows: Rows, track: IntArray) -> bool:
     """Check whether tracks of one file run at the same time, as those of two devices do."""
     spans = sorted((rows.time[track == i].min(), rows.time[track == i].max()) for i in np.unique(track))
     return any(start < end for (_, end), (start, _) in pairwise(spans))
-
-
-def _track(rows: Rows, sheet: _sheet.Sheet, name: str) -> Stream | None:
-    stream = _pose.from_sheet(rows, sheet, name=name, source="GPX")
-    # GPX has one height, ele, which receivers write above sea level
-    return stream and replace(stream, attributes={**stream.attributes, "height_from": "program"})
 
 
 def _torn(lines: Lines, data: bytes, row: object) -> list[RejectedLine]:

@@ -8,7 +8,6 @@ The level of a cell is its RSRP; 2147483647 and ``Unavailable`` mean a missing v
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -43,12 +42,6 @@ def _reading(row: int, cell: dict[str, Any], connected: float) -> _cells.Reading
     fields = {name: _json.number(value) for name, value in cell.items()}
     serving = str(cell.get("is_connected")).lower() == "true" or (rat == "lte" and fields.get("pci") == connected)
     return _cells.reading(row, fields, rat=rat, serving=serving)
-
-
-def _readings(entries: list[dict[str, Any]]) -> Iterator[_cells.Reading]:
-    for i, entry in enumerate(entries):
-        for cell in _json.listed(entry, "cells"):
-            yield _reading(i, cell, _json.number(entry.get("connected_pci")))
 
 
 def _text_cells(line: bytes) -> list[dict[str, Any]] | None:
@@ -117,13 +110,6 @@ def _nr(rows: Rows, entries: list[dict[str, Any]]) -> Stream | None:
     )  # fmt: skip
 
 
-def _track(rows: Rows, entries: list[dict[str, Any]]) -> Stream | None:
-    """Return the positions in the objects or in their ``location``."""
-    places = [{**_json.inside(item, "gps"), **_json.inside(item, "location"), **item} for item in entries]
-    names = (("latitude", "lat"), ("longitude", "lon", "lng"), ("altitude", "alt"))
-    return _placed(rows, *(_json.column(places, *keys) for keys in names))
-
-
 def _placed(rows: Rows, latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> Stream | None:
     if not np.isfinite(latitude).any():
         return None
@@ -152,8 +138,15 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     timed = [entries[i] for i in rows.at.tolist()]
     if any("companion_abs_time" not in item and "cells" in item for item in timed):
         rows.warnings.append("some lines have no companion_abs_time: the clock of the phone is used there")
-    cells = _cells.streams(rows, _readings(timed), source="PawPrints")
-    return rows.result([_track(rows, timed), *cells, _nr(rows, timed)])
+    readings = [
+        _reading(i, cell, _json.number(entry.get("connected_pci")))
+        for i, entry in enumerate(timed) for cell in _json.listed(entry, "cells")
+    ]  # fmt: skip
+    # positions are in the objects or in their 'location'
+    places = [{**_json.inside(item, "gps"), **_json.inside(item, "location"), **item} for item in timed]
+    names = (("latitude", "lat"), ("longitude", "lon", "lng"), ("altitude", "alt"))
+    track = _placed(rows, *(_json.column(places, *keys) for keys in names))
+    return rows.result([track, *_cells.streams(rows, readings, source="PawPrints"), _nr(rows, timed)])
 
 
 READER = Reader(

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress, islice
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -529,13 +530,45 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     below[: at + 1] = False
     numbers = np.flatnonzero(below).tolist()
     group = [text.strip() for text in split_row(lines.raw(at - 1), separator)] if at else []
-    table = _Table(_unique_names(names, group), [*range(at + 1)])
     written = list(_logical([(i, lines.raw(i)) for i in numbers], separator, len(names)))
-    if len(written) < len(numbers):  # the further lines of a row are comments
-        table.comments += sorted({*numbers} - {i for i, _ in written})
+    # the further lines of a row are comments
+    comments = [*range(at + 1), *sorted({*numbers} - {i for i, _ in written})]
+    header, rows, begun = _Header(_unique_names(names, group)), list[_Row](), False
     for i, fields in _without_empty_end(written, names):
-        table.add(i, fields)
-    return table.sheet(lines, numbers[-1] if numbers else at)
+        words = [text.strip() for text in fields]
+        units = not begun and header.adds_units(words)
+        if units or (not any(_VALUE.match(text) for text in words) and header.is_header(words)):
+            comments.append(i)  # units below the names, or the header of a file that was appended
+            continue
+        rows.append(_Row(i, len(fields), len(header.place), header.placed(fields)))
+        begun |= len(fields) == len(header.place)
+    kept = _whole_rows(rows, header.names, numbers[-1] if numbers else at)
+    text = "no row has as many fields as the header: the last columns were read as empty"
+    last = kept[-1].line if kept else comments[-1]
+    torn = len(lines) - 1 if lines.unterminated else -1
+    # text below the table, as in exports of Nemo, has no separator and does not begin with a number
+    alone = [row.line for row in rows if row.line > last and row.fields == 1 and row.line != torn]
+    foot = {i for i in alone if not _VALUE.match(lines.raw(i).decode("utf-8", "replace"))}
+    settled = {row.line for row in kept} | foot
+    return Sheet(
+        lines=lines, names=header.names, row=np.array([row.line for row in kept], dtype=np.int64),
+        notes={len(header.names): text} if kept and not begun else {},
+        cells=[[*row.cells, *[""] * (len(header.names) - len(row.cells))] for row in kept],
+        blank_rows=np.array([*comments, *foot], dtype=np.int64),
+        rejected=[
+            lines.reject(row.line, f"{counted(row.fields, 'field')} where the header has {row.width} (truncated line?)")
+            for row in rows if row.line not in settled
+        ],
+    )  # fmt: skip
+
+
+class _Row(NamedTuple):
+    """A row of a table: its 0-based line, its number of fields, that of its header, and its cells."""
+
+    line: int
+    fields: int
+    width: int
+    cells: list[str]
 
 
 # Largest number of lines of a cell with line breaks.
@@ -573,47 +606,26 @@ def _unique_names(names: Sequence[str], group: Sequence[str] = ()) -> list[str]:
     return unlike
 
 
-class _Table:
-    """Rows under one header or several."""
+class _Header:
+    """The columns of a table under one header or several."""
 
-    def __init__(self, names: list[str], comments: list[int]) -> None:
-        self.names, self.comments = names, comments
-        self._place = list(range(len(names)))  # column of each field under the present header
+    def __init__(self, names: list[str]) -> None:
+        self.names = names
+        self.place = list(range(len(names)))  # column of each field under the present header
         self._unit = [""] * len(names)  # unit of each field that differs from that of the first header
         self._known, self._repeated = {dictionary.without_unit(name)[0] for name in names}, False
-        self._row: list[int] = []
-        self._cells: list[list[str]] = []
-        self._short: list[tuple[int, list[str]]] = []
-        self._odd: list[tuple[int, int, int]] = []
 
-    def add(self, i: int, fields: list[str]) -> None:
-        """Add the next line that is not blank."""
-        width = len(self._place)
-        words = [text.strip() for text in fields]
-        if self._is_units(words) or (not any(_VALUE.match(text) for text in words) and self._is_header(words)):
-            self.comments.append(i)  # units below the names, or the header of a file that was appended
-        elif len(fields) == width:
-            self._row.append(i)
-            self._cells.append(self._placed(fields))
-        elif 1 < len(fields) < width:
-            self._short.append((i, self._placed([*fields, *[""] * (width - len(fields))])))
-            self._odd.append((i, len(fields), width))
-        else:
-            self._odd.append((i, len(fields), width))
-
-    def _is_units(self, texts: list[str]) -> bool:
+    def adds_units(self, texts: list[str]) -> bool:
         """Check whether the line below the names contains their units, and add the units to the names."""
-        if self._row or len(texts) != len(self.names):
-            return False
         texts = [text.strip("[]()") for text in texts]
         filled = [text for text in texts if text]
         units = sum(dictionary.is_unit(text) or text in _HARMLESS for text in filled)
-        if len(filled) < 2 or 2 * units <= len(filled):
+        if len(texts) != len(self.names) or len(filled) < 2 or 2 * units <= len(filled):
             return False
         self.names[:] = [f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, texts, strict=True)]
         return True
 
-    def _is_header(self, texts: list[str]) -> bool:
+    def is_header(self, texts: list[str]) -> bool:
         """Check whether a line is a header, perhaps with other columns, and apply it to the lines below."""
         texts = _unique_names(texts)
         bare = [dictionary.without_unit(text) for text in texts]
@@ -624,54 +636,39 @@ class _Table:
         spare: dict[str, list[int]] = {}
         for j, name in enumerate(self.names):
             spare.setdefault(dictionary.without_unit(name)[0], []).append(j)
-        self._place, self._unit, self._repeated = [], [], True
+        self.place, self._unit, self._repeated = [], [], True
         for (name, unit), text in zip(bare, texts, strict=True):
             if not spare.get(name):
                 spare[name] = [len(self.names)]
                 self.names.append(text)
                 self._known.add(name)
             column = spare[name].pop(0)
-            self._place.append(column)
+            self.place.append(column)
             changed = dictionary.is_unit(unit) and unit != dictionary.without_unit(self.names[column])[1]
             self._unit.append(unit if changed else "")
         return True
 
-    def _placed(self, fields: list[str]) -> list[str]:
-        if len(self.names) == len(self._place) and not self._repeated:
+    def placed(self, fields: list[str]) -> list[str]:
+        """Return the cells of a row in the order of the columns, with empty cells in place of missing fields."""
+        if len(fields) < len(self.place):
+            fields = [*fields, *[""] * (len(self.place) - len(fields))]
+        if len(self.names) == len(self.place) and not self._repeated:
             return fields
         cells = [""] * len(self.names)
-        for j, text, unit in zip(self._place, fields, self._unit, strict=True):
+        for j, text, unit in zip(self.place, fields, self._unit, strict=False):
             cells[j] = f"{text.strip()} {unit}" if unit and text.strip() else text
         return cells
 
-    def sheet(self, lines: _text.Lines, last_line: int) -> Sheet:
-        """Return the table, with rows shorter than their header if the program often writes such rows."""
-        # the last line may be cut short in every file
-        inner, full = [i for i, _ in self._short if i != last_line], bool(self._row)
-        # a single short row is truncated, but a program that omits last cells writes many short rows
-        if len(inner) >= max(2, len(self._row) // 20):
-            meanings = [dictionary.meaning(name) for name in self.names]
-            read = {i for i, cells in self._short if not _torn(cells, meanings)}
-            both = [*zip(self._row, self._cells, strict=True), *(item for item in self._short if item[0] in read)]
-            self._row, self._cells = [list(part) for part in zip(*sorted(both), strict=True)] if both else ([], [])
-            self._odd = [item for item in self._odd if item[0] not in read]
-        text = "no row has as many fields as the header: the last columns were read as empty"
-        notes = {len(self.names): text} if not full and self._cells else {}
-        last = self._row[-1] if self._row else self.comments[-1]
-        torn = len(lines) - 1 if lines.unterminated else -1
-        # text below the table, as in exports of Nemo, has no separator and does not begin with a number
-        alone = [i for i, count, _ in self._odd if i > last and count == 1 and i != torn]
-        foot = {i for i in alone if not _VALUE.match(lines.raw(i).decode("utf-8", "replace"))}
-        odd = (item for item in self._odd if item[0] not in foot)
-        return Sheet(
-            lines=lines, names=self.names, row=np.array(self._row, dtype=np.int64), notes=notes,
-            cells=[[*cells, *[""] * (len(self.names) - len(cells))] for cells in self._cells],
-            blank_rows=np.array([*self.comments, *foot], dtype=np.int64),
-            rejected=[
-                lines.reject(i, f"{counted(count, 'field')} where the header has {width} (truncated line?)")
-                for i, count, width in odd
-            ],
-        )  # fmt: skip
+
+def _whole_rows(rows: list[_Row], names: list[str], last_line: int) -> list[_Row]:
+    """Return the rows as wide as their header, and shorter rows if the program often writes such rows."""
+    full = [row for row in rows if row.fields == row.width]
+    short = [row for row in rows if 1 < row.fields < row.width]
+    # a single short row is truncated, and the last line may be cut short in every file
+    if sum(row.line != last_line for row in short) < max(2, len(full) // 20):
+        return full
+    meanings = [dictionary.meaning(name) for name in names]
+    return sorted([*full, *(row for row in short if not _torn(row.cells, meanings))])
 
 
 def _torn(cells: list[str], meanings: list[dictionary.Meaning | None]) -> bool:

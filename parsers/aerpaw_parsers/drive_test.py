@@ -41,7 +41,6 @@ from . import _cells, _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel
 _IsHeader = Callable[[list[str]], bool]
 # A tower of Lake Wheeler in the name of a column.
 _TOWER = re.compile(r"\blw ?([1-5])\b")
-_TECH = re.compile(r"(?i)4g|5g|lte|nr")
 # Values with which the columns "serving", "neighbouring" and "technology" mark a cell that does not serve.
 _NO, _YES = ("false", "0", "no", "", "n/a", "none", "null", "nan", "-"), ("true", "1", "yes")
 _NEIGHBOURS = ("neighbor", "neighbour", "neighboring", "neighbouring", "detected", "monitored")
@@ -475,10 +474,10 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
     assert level is not None
     assert quality is not None
     for name, older in (("RSCP", r"(?i)3g|umts|hspa|wcdma"), ("RxLev", r"(?i)2g|gsm|gprs|edge")):
-        mine = [re.search(older, text) is not None and not _TECH.search(text) for text in texts]
+        mine = [re.search(older, text) is not None and not _rat(text) for text in texts]
         if any(mine):
             sheet.add(name, [cells[level] if its else "" for cells, its in zip(sheet.cells, mine, strict=True)])
-    unlike = np.array([not _TECH.search(text) for text in texts], dtype=bool)
+    unlike = np.array([not _rat(text) for text in texts], dtype=bool)
     if unlike.any():
         sheet.silence(unlike, [level, quality])
 

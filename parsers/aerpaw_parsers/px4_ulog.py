@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -51,12 +51,15 @@ def _layout(text: str) -> np.dtype[np.void] | None:  # type: ignore[type-var]
         return None
 
 
-def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int, list[RejectedLine]]:
-    """Return the messages of the wanted topics, their numbers, the number of intact messages, and damaged segments."""
+# The messages of a topic: their numbers, and their content.
+_Topic = tuple[list[int], AnyArray]
+
+
+def _topics(data: bytes) -> tuple[dict[str, _Topic], int, list[RejectedLine]]:
+    """Return the wanted topics, the number of intact messages, and damaged segments."""
     forms: dict[str, str] = {}
     names: dict[int, tuple[str, int]] = {}
-    bodies: dict[tuple[str, int], list[bytes]] = {}
-    numbers: dict[tuple[str, int], list[int]] = {}
+    bodies: dict[tuple[str, int], list[tuple[int, bytes]]] = {}
     damaged: list[RejectedLine] = []
     count, at = 0, 16  # after the magic bytes, the version and the start time
     while at + 3 <= len(data):
@@ -73,31 +76,28 @@ def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int
             names[struct.unpack_from("<H", body, 1)[0]] = (body[3:].decode("ascii", "replace"), body[0])
         topic = names.get(struct.unpack_from("<H", body)[0]) if kind == ord("D") and size > 2 else None
         if topic is not None and topic[0] in _WANTED and (topic[1] == 0 or topic[0] in _RECEIVERS):
-            bodies.setdefault(topic, []).append(body[2:])
-            numbers.setdefault(topic, []).append(count)
+            bodies.setdefault(topic, []).append((count, body[2:]))
         count += 1
         at += 3 + size
-    tables = {topic: _table(content, forms.get(topic[0], "")) for topic, content in bodies.items()}
-    best = {name: _best([topic for topic in tables if topic[0] == name], tables) for name in _WANTED}
-    chosen = {name: _table([], "") if topic is None else tables[topic] for name, topic in best.items()}
-    of_chosen = {name: [] if topic is None else numbers[topic] for name, topic in best.items()}
-    return chosen, of_chosen, count, damaged
+    topics: dict[str, _Topic] = {}
+    for (name, _), messages in sorted(bodies.items()):
+        numbers, content = zip(*messages, strict=True)
+        table = _table(content, forms.get(name, ""))
+        # the first receiver with the most fixes
+        if name not in topics or _fixes(table) > _fixes(topics[name][1]):
+            topics[name] = [*numbers], table
+    return {name: topics.get(name, ([], _table((), ""))) for name in _WANTED}, count, damaged
 
 
-def _best(topics: list[tuple[str, int]], tables: Mapping[tuple[str, int], AnyArray]) -> tuple[str, int] | None:
-    """Return the first instance of a topic with the most fixes, or None if there is no instance."""
-
-    def fixes(topic: tuple[str, int]) -> int:
-        fix = _column(tables[topic], "fix_type")
-        return 0 if fix is None else int((fix >= _FIX_3D).sum())
-
-    return max(sorted(topics), key=fixes) if topics else None
+def _fixes(table: AnyArray) -> int:
+    fix = _column(table, "fix_type")
+    return 0 if fix is None else int((fix >= _FIX_3D).sum())
 
 
 _RECEIVERS, _FIX_2D, _FIX_3D = ("vehicle_gps_position", "sensor_gps"), 2, 3
 
 
-def _table(bodies: list[bytes], text: str) -> AnyArray:
+def _table(bodies: Sequence[bytes], text: str) -> AnyArray:
     layout = _layout(text)
     if layout is None or not bodies or "timestamp" not in (layout.names or ()):
         return np.zeros(0, dtype=[("timestamp", "<u8")])
@@ -110,8 +110,9 @@ def _column(table: AnyArray, *names: str) -> FloatArray | None:
     return next((table[name].astype(np.float64) for name in names if name in (table.dtype.names or ())), None)
 
 
-def _series(table: AnyArray, numbers: list[int], columns: Mapping[str, FloatArray | None]) -> _autopilot.Series:
-    if not len(table):
+def _series(topic: _Topic, columns: Mapping[str, FloatArray | None]) -> _autopilot.Series:
+    numbers, table = topic
+    if not len(table) or not columns:
         return _autopilot.NONE
     present = {name: values for name, values in columns.items() if values is not None}
     return _autopilot.Series(table["timestamp"].astype(np.float64) / 1e6, np.array(numbers, dtype=np.int64), present)
@@ -119,27 +120,19 @@ def _series(table: AnyArray, numbers: list[int], columns: Mapping[str, FloatArra
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Return the telemetry ``vehicle``."""
-    tables, numbers, count, damaged = _topics(data)
-    gps_name = next((name for name in ("vehicle_gps_position", "sensor_gps") if len(tables[name])), "sensor_gps")
-    gps, place_name = tables[gps_name], "vehicle_global_position"
-    position = _position(tables[place_name])
-    if position is None:
-        position, place_name = _position(gps), gps_name
-    track = _autopilot.NONE
-    if position is not None:
-        track = _series(tables[place_name], numbers[place_name], position)
-    local, attitude = tables["vehicle_local_position"], tables["vehicle_attitude"]
-    utc = _column(gps, "time_utc_usec")
-    offset = None if utc is None else _autopilot.offset_s(utc / 1e6, gps["timestamp"].astype(np.float64) / 1e6)
+    topics, count, damaged = _topics(data)
+    gps_name = "vehicle_gps_position" if len(topics["vehicle_gps_position"][1]) else "sensor_gps"
+    gps, attitude, local = topics[gps_name], topics["vehicle_attitude"], topics["vehicle_local_position"]
+    place, source = topics["vehicle_global_position"], "PX4 ULog"
+    if not (position := _position(place[1])):
+        place, source, position = gps, f"PX4 ULog, {gps_name}", _position(gps[1])
+    utc = _column(gps[1], "time_utc_usec")
+    offset = None if utc is None else _autopilot.offset_s(utc / 1e6, gps[1]["timestamp"].astype(np.float64) / 1e6)
     flight = _autopilot.Flight(
-        position=track,
-        attitude=_series(attitude, numbers["vehicle_attitude"], _angles(attitude)),
-        velocity=_series(local, numbers["vehicle_local_position"], _columns(local)),
-        fix=_series(gps, numbers[gps_name], _columns(gps)),
-        utc_minus_clock_s=offset,
-        home=_home(tables["home_position"], numbers["home_position"]),
-        source="PX4 ULog" if place_name == "vehicle_global_position" else f"PX4 ULog, {place_name}",
-    )
+        position=_series(place, position), attitude=_series(attitude, _angles(attitude[1])),
+        velocity=_series(local, _columns(local[1])), fix=_series(gps, _columns(gps[1])), utc_minus_clock_s=offset,
+        home=_series(topics["home_position"], _home(topics["home_position"][1])), source=source,
+    )  # fmt: skip
     return _autopilot.result("px4_ulog", options, [flight], count, damaged)
 
 
@@ -150,11 +143,11 @@ def _columns(table: AnyArray) -> dict[str, FloatArray]:
     return dictionary.record_columns(fields, integers=[name for name in names if table.dtype[name].kind != "f"])
 
 
-def _position(table: AnyArray) -> dict[str, FloatArray] | None:
-    """Return position and altitude of the messages of the estimator or the receiver, or None."""
+def _position(table: AnyArray) -> dict[str, FloatArray]:
+    """Return position and altitude of the messages of the estimator or the receiver, if there are any."""
     columns = _columns(table)
     if not len(table) or not {"latitude_deg", "longitude_deg"} <= set(columns):
-        return None
+        return {}
     if "fix" in columns:  # the receiver's own position; positions at 0, 0 are flagged
         columns |= {
             name: np.where(columns["fix"] < _FIX_2D, 0.0, columns[name]) for name in ("latitude_deg", "longitude_deg")
@@ -163,12 +156,12 @@ def _position(table: AnyArray) -> dict[str, FloatArray] | None:
     return {name: columns.get(name, unknown) for name in ("latitude_deg", "longitude_deg", "altitude_m")}
 
 
-def _home(table: AnyArray, numbers: list[int]) -> _autopilot.Series:
+def _home(table: AnyArray) -> dict[str, FloatArray | None]:
     """Return the altitude of home each time that it was set, NaN if the autopilot marks it as not valid."""
     altitude, valid = _column(table, "alt"), _column(table, "valid_alt")
     if altitude is not None and valid is not None:
         altitude = np.where(valid != 0, altitude, np.nan)
-    return _series(table, numbers, {"altitude_m": altitude})
+    return {"altitude_m": altitude}
 
 
 def _angles(table: AnyArray) -> dict[str, FloatArray | None]:

@@ -62,8 +62,7 @@ def parts(
     texts = {i: _named(sheet, i) for i in (*columns, *marks)}
     filled = _with_level(sheet)
     picked = np.flatnonzero(filled).tolist()
-    several = [i for i in columns if len({*texts[i]}) > 1]
-    several = [i for i in several if 1 < len({texts[i][row] for row in picked}) <= _MOST_PARTS]
+    several = [i for i in columns if 1 < len({texts[i][row] for row in picked}) <= _MOST_PARTS]
     base = ["\t".join(row) for row in zip(*(texts[i] for i in several), strict=True)]
     several += dividing_columns({i: texts[i] for i in marks}, filled, base)
     for i in several:

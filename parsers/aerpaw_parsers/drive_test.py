@@ -21,20 +21,11 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import dictionary
-from aerpaw_cmp.readers import (
-    Attribute,
-    InputError,
-    Reader,
-    ReadOptions,
-    ReadResult,
-    Rows,
-    Stream,
-    checked_ranks,
-    snr_stream,
-)
+from aerpaw_cmp.readers import Attribute, Reader, ReadOptions, ReadResult, Rows, Stream, checked_ranks, snr_stream
 
 from . import _cells, _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, rtklib_pos, vehicle_out
 

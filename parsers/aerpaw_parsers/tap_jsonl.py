@@ -25,19 +25,10 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.files import SCHEMA, decode_record
-from aerpaw_cmp.readers import (
-    Attribute,
-    InputError,
-    Lines,
-    Reader,
-    ReadOptions,
-    ReadResult,
-    RejectedLine,
-    Stream,
-    split,
-)
+from aerpaw_cmp.readers import Attribute, Lines, Reader, ReadOptions, ReadResult, RejectedLine, Stream, split
 
 from . import _json
 

@@ -114,7 +114,7 @@ _KINDS: tuple[tuple[str, str, tuple[_Test, ...]], ...] = (
      (rb"Found CELL \d{1,5}\.\d MHz, EARFCN=\d",)),
     ("flight_plan", "a planned route, not a flight: 'aerpaw-cmp predict' reads it",
      (rb'"fileType"\s*:\s*"Plan"|\A\s*QGC WPL \d+',)),
-    ("settings_yaml", "settings of aerpaw-cmp: of a flight, a site, a calibration or a campaign",
+    ("settings_yaml", "settings for 'aerpaw-cmp report', 'calibrate' or 'campaign', or a site",
      (rb"(?m)\A[^\0]{0,4096}?^(?:flight|origin|calibration|campaign):", rb"(?m)^(?:logs|towers|flights|campaign):")),
     ("own_export", "samples of a report of aerpaw-cmp: use the logs of that report (or '--map' its columns)",
      (rb"\A(?:\xef\xbb\xbf)?time_utc,time_s,tower,",)),

@@ -65,7 +65,7 @@ class Flight:
     Parameters
     ----------
     position : Series
-        Columns ``latitude_deg longitude_deg altitude_m``, or no columns.
+        Columns ``latitude_deg longitude_deg altitude_m`` and perhaps ``above_home_m``, or no columns.
     attitude : Series
         ``roll_deg pitch_deg yaw_deg``.
     velocity : Series
@@ -171,12 +171,15 @@ def _track(rows: Rows, flight: Flight, timed: BoolArray) -> Stream | None:
         return None
     time_s = flight.position.time_s[timed]
     values: dict[str, AnyArray] = {name: column[timed] for name, column in flight.position.columns.items()}
-    lost = (np.abs(values["latitude_deg"]) < 1e-6) & (np.abs(values["longitude_deg"]) < 1e-6)
-    rows.mark(lost, "no_fix")
-    for name in _pose.PLACE:
-        values[name] = np.where(lost, np.nan, values[name])
+    logged, above = values.pop("above_home_m", None), None
+    home_m = values["altitude_m"] - (0.0 if logged is None else logged)  # also before the first fix
+    lost = _pose.clean(rows, values)
+    values["altitude_m"] = np.where(lost, np.nan, values["altitude_m"])
     rows.warnings += _apart(flight, time_s, values)
-    values["altitude_m"] = _height(rows, flight, time_s, values)
+    if logged is not None:
+        height = np.where(lost, np.nan, logged)
+        above = _pose.from_logged_heights(rows, time_s, values["altitude_m"], height, home_m)
+    values["altitude_m"] = _height(rows, flight, time_s, values) if above is None else above
     heading = values.pop("yaw_deg", np.full(len(rows), np.nan))
     values |= {name: flight.attitude.near(name, time_s) for name in _pose.ANGLES}
     values["yaw_deg"] = np.where(np.isnan(values["yaw_deg"]), heading, values["yaw_deg"])
@@ -229,19 +232,3 @@ def _height(rows: Rows, flight: Flight, time_s: FloatArray, values: dict[str, An
         return altitude - float(altitude[known[0]] if rest is None else rest)
     home_m = columns["altitude_m"][home]
     return _pose.above_home(rows, time_s, altitude, flight.home.time_s[home], home_m)
-
-
-def of_both(position: Series, above_home: str) -> Series:
-    """Return the home of positions with an altitude above sea level and a height above home.
-
-    If home never moves, the height above home is used as logged: it becomes the altitude, above a home at 0. If both
-    are the same number throughout, home was never set, and the result is empty.
-    """
-    altitude, height = position.columns["altitude_m"], position.columns.pop(above_home)
-    if not _pose.home_was_set(altitude, height):
-        return NONE
-    home_m = altitude - height
-    finite = home_m[np.isfinite(home_m)]
-    if not len(finite) or np.ptp(finite) <= _pose.MOVED_M:
-        position.columns["altitude_m"], home_m = height, np.zeros(len(height))
-    return Series(position.time_s, position.number, {"altitude_m": home_m})

@@ -181,8 +181,18 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
     height = sheet.numbers(column)
     if datum != "take-off":
         return datum, height
-    height, home_is_set = _with_moved_home(rows, sheet, height)
-    return datum if home_is_set else "sea level", height
+    for i, what in enumerate(sheet.meanings):
+        own = "" if what is None else what.quantity.datum
+        if own == "sea level" or (own == "unknown" and sheet.program and sheet.program.datum == "sea level"):
+            sheet.used.add(i)
+            time_s = (rows.time - rows.time[:1]) / np.timedelta64(1, "s")
+            altitude = sheet.numbers(i)
+            above = from_logged_heights(rows, time_s, altitude, height, altitude - height)
+            if above is None:
+                return "sea level", height
+            if above is not height:
+                return datum, above
+    return datum, height
 
 
 _IMPERIAL = ("mph", "ft", "feet", "foot", "ft/s")
@@ -223,33 +233,33 @@ def above_home(
     return np.asarray(altitude - home_m[at])
 
 
-def home_was_set(altitude: FloatArray, height: FloatArray) -> bool:
-    """Check whether heights above home differ anywhere from the altitudes above sea level, or begin near zero."""
-    apart = np.abs(altitude - height)
-    return not np.isfinite(apart).any() or np.nanmax(apart) > UNSET_M or np.nanmin(np.abs(height)) < _NEAR_ZERO_M
+def from_logged_heights(
+    rows: Rows, time_s: FloatArray, altitude: FloatArray, height: FloatArray, home_m: FloatArray
+) -> FloatArray | None:  # fmt: skip
+    """Return heights above the home at take-off from logged heights above home, or None if home was never set.
 
+    Parameters
+    ----------
+    rows : Rows
+    time_s, altitude, height, home_m : float array, shape (n,)
+        Time, altitude above sea level, height above home, and altitude of home, which is the difference of the two.
 
-def _with_moved_home(rows: Rows, sheet: _sheet.Sheet, height: FloatArray) -> tuple[FloatArray, bool]:
-    """Return heights above the home at take-off, and whether home was set.
-
-    If there is a column of altitudes above sea level, it shows whether home moved in one step or was never known.
+    Returns
+    -------
+    float array, shape (n,), or None
+        Heights as logged if home never moved in one step. Home was never set if altitude and height are the same number
+        throughout and do not begin near zero.
     """
-    for i, meaning in enumerate(sheet.meanings):
-        datum = "" if meaning is None else meaning.quantity.datum
-        if datum == "sea level" or (
-            datum == "unknown" and sheet.program is not None and sheet.program.datum == "sea level"
-        ):
-            altitude = sheet.numbers(i)
-            sheet.used.add(i)
-            if not home_was_set(altitude, height):
-                return height, False
-            known = np.flatnonzero(np.isfinite(altitude) & np.isfinite(height))
-            home_m = (altitude - height)[known]
-            steady = np.abs(np.diff(home_m)) < _JITTER_M
-            if len(known) > 1 and np.ptp(home_m) > MOVED_M and steady.mean() > _STEADY:
-                time_s = (rows.time - rows.time[0]) / np.timedelta64(1, "s")
-                return above_home(rows, time_s, altitude, time_s[known], home_m), True
-    return height, True
+    known = np.flatnonzero(np.isfinite(home_m))
+    home_m = home_m[known]
+    if not len(known):
+        return height
+    if np.abs(home_m).max() <= UNSET_M and np.nanmin(np.abs(height), initial=np.inf) >= _NEAR_ZERO_M:
+        return None
+    steady = np.abs(np.diff(home_m)) < _JITTER_M
+    if np.ptp(home_m) <= MOVED_M or steady.mean() <= _STEADY:
+        return height
+    return above_home(rows, time_s, altitude, time_s[known], home_m)
 
 
 # Two heights of one estimate differ by a constant within this [m], except in the few rows in which home moves.

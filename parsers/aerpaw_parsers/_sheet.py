@@ -740,11 +740,9 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     if clock.startswith("relative") and start is not None:
         timed.clock_from = "written"
     _to_utc(timed, sheet, column)
-    if len(timed.row) < len(sheet.row):
-        inside = np.zeros(len(sheet.row), dtype=bool)
-        inside[timed.at] = True
-        kept = sheet.part(inside)
-        sheet.row, sheet.cells, sheet._numbers = kept.row, kept.cells, {}
+    if len(timed) < len(sheet):  # rows without a time are rejected
+        sheet.row, sheet.cells = sheet.row[timed.at], [sheet.cells[i] for i in timed.at.tolist()]
+        sheet._numbers.clear()
     if (counter := sheet.named("time millisecond", "millisecond", "milliseconds", "msec", "ms")) not in (None, column):
         sheet.used.add(counter)
         _add_milliseconds(timed, sheet.numbers(counter))

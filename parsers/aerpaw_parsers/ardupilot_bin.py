@@ -159,13 +159,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     names = ("Lat", "Lng", "Alt", "RelHomeAlt")  # a receiver with one antenna has no yaw
     position = _named(place, *(name for name in names if name in place.columns))
     position.columns.setdefault("altitude_m", np.full(len(place.time_s), np.nan))
-    home = _autopilot.NONE
-    if "above_home_m" in position.columns:
-        home = _autopilot.of_both(position, "above_home_m")
     filters = next((series[name] for name in ("XKF1", "NKF1", "EKF1") if len(series[name].time_s)), _autopilot.NONE)
     flight = _autopilot.Flight(
         position=position, attitude=_named(series["ATT"]), velocity=_named(filters), fix=_named(gps),
-        utc_minus_clock_s=_offset(gps), home=home, source="ArduPilot dataflash log", battery=_named(series["BAT"]),
+        utc_minus_clock_s=_offset(gps), source="ArduPilot dataflash log", battery=_named(series["BAT"]),
     )  # fmt: skip
     return _autopilot.result("ardupilot_bin", options, [flight], count, damaged, series["RAD"])
 

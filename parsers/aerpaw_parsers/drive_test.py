@@ -254,13 +254,6 @@ def _of_one_phone(readings: pd.DataFrame, time: AnyArray) -> pd.DataFrame:
     return doubted
 
 
-def _identities(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[str]:
-    """Return PCI and carrier of the serving cell in each row, as text."""
-    columns = next((cell.columns for cell in cells if cell.place == "serving"), {})
-    texts = [sheet.texts(columns[name]) for name in _IDENTITY if name in columns]
-    return ["\t".join(row) for row in zip(*texts, strict=True)] if texts else [""] * len(sheet)
-
-
 def _idle(sheet: _sheet.Sheet) -> BoolArray:
     """Return the rows whose cell does not serve, in tables with one cell per row."""
     idle = np.zeros(len(sheet), dtype=bool)
@@ -342,7 +335,10 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     of_row = (sheet.find(name) for name in ("technology", "serving", "neighbouring"))
     sheet.used |= {*others, *ranks, *(i for i in of_row if i is not None)}
     sheet.used |= {i for cell in cells for i in (*cell.columns.values(), *cell.ports, *cell.marks)}
-    more, about = _identity.cell_names(sheet, _identities(sheet, cells))
+    serving = next((cell.columns for cell in cells if cell.place == "serving"), {})
+    identities = [sheet.texts(serving[name]) for name in _IDENTITY if name in serving]
+    base = ["\t".join(row) for row in zip(*identities, strict=True)] or [""] * len(sheet)
+    more, about = _identity.cell_names(sheet, base)
     owned: dict[tuple[str, str, str], list[_Cell]] = {}
     for cell in cells:
         owner = cell.place if cell.place.startswith(_OWNERS) else ""

@@ -138,10 +138,9 @@ def _flight(messages: dict[int, list[_Message]], system: int, name: str) -> _aut
             np.array([row[2] for row in rows]), np.array([row[0] for row in rows], dtype=np.int64), columns
         )
     position = series[_POSITION]
-    home = _autopilot.of_both(position, "above_home_m")
     return _autopilot.Flight(
         position=position, attitude=series[_ATTITUDE], velocity=position, fix=series[_GPS], utc_minus_clock_s=0.0,
-        home=home, source="MAVLink telemetry log", name=name, system=system, battery=series[_STATUS],
+        source="MAVLink telemetry log", name=name, system=system, battery=series[_STATUS],
     )  # fmt: skip
 
 

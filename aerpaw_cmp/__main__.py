@@ -40,7 +40,8 @@ BLAS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _UNUSABLE = (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENOTDIR, errno.EIO, errno.ESTALE)
 LONGEST_NAME = 120
 
-# Made before Python looks for cycles among them (700 by default): a report makes a million, of which most stay.
+# Number of new objects after which Python searches for cycles (700 by default). A report creates a million objects and
+# keeps most of them.
 NEW_OBJECTS = 10_000
 
 

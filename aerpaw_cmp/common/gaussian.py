@@ -110,7 +110,7 @@ class Factor:
         return -0.5 * float(white @ white) - float(np.log(np.diag(self.lower)).sum())
 
     def inverse(self) -> FloatArray:
-        """Return ``C^-1``, in a third of the time of solving for the unit matrix."""
+        """Return ``C^-1``, in a third of the time that solving for the identity matrix takes."""
         from scipy.linalg.lapack import dpotri
 
         # LAPACK fills one triangle and does not clear the other

@@ -1,4 +1,4 @@
-"""Reading of third-party files in native formats (HDF5, GeoTIFF), in a child process that cannot open anything.
+"""Reading of third-party files in native formats (HDF5, GeoTIFF), in a child process that cannot open other files.
 
 Libraries of these formats are C code that a file can lead to other files (external storage and links, virtual data
 sets, VRT), into endless loops, and sometimes beyond the end of a buffer. The child gets the bytes of the file, loads

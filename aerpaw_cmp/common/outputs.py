@@ -576,7 +576,7 @@ class _Place:
 
 
 def _is_own(status: os.stat_result) -> bool:
-    """Check whether a file or folder belongs to this user. True on systems without users."""
+    """Check whether a file or folder belongs to this user. Always true if the system has no user numbers (Windows)."""
     return not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
 
 

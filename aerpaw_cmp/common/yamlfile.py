@@ -412,6 +412,14 @@ _KINDS = {
 }
 
 
+def expectation(item: Any) -> str:
+    """Return what a finding of pydantic expects, as words that follow "expected"."""
+    message = str(item["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
+    for kind, words in _KINDS.items():
+        message = words.format(**item.get("ctx", {})) if re.fullmatch(kind, item["type"]) else message
+    return re.sub(r"<\w+\.\w+: ('[^']*')>", r"\1", message)  # write members of an Enum as in the file
+
+
 def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | None]:
     location: Location = item["loc"]
     where = ".".join(str(part) for part in location if not _MEMBER.fullmatch(str(part)))
@@ -425,12 +433,9 @@ def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | Non
         return f"{'.'.join(map(str, location[:-1]))}: entry {location[-1] + 1} of the list is missing", None
     if item["type"] == "missing":
         return f"the key '{where}' is missing", None
-    message = str(item["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
-    for kind, words in _KINDS.items():
-        message = words.format(**item.get("ctx", {})) if re.fullmatch(kind, item["type"]) else message
+    message = expectation(item)
     if item["type"] in ("value_error", "assertion_error"):
         return (f"{where}: {message}" if where else message), None
-    message = re.sub(r"<\w+\.\w+: ('[^']*')>", r"\1", message)  # write members of an Enum as in the file
     shown = repr(item["input"])
     shown = shown if len(shown) <= 60 else shown[:57] + "..."
     return f"{where}: found {shown}; expected {message}", None

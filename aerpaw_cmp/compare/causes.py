@@ -317,7 +317,7 @@ class _Conditions:
     follows: float | None = None
     """Largest remaining error as a share of that of a constant level, which fits a log of noise best."""
     most_left: float = 2.0
-    """Largest remaining error as a multiple of the largest usual one."""
+    """Largest remaining error, as a multiple of the largest error of a held-out flight."""
 
 
 _CONDITIONS = {
@@ -345,7 +345,7 @@ def _conditions(name: str) -> _Conditions:
 
 
 def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]) -> bool:
-    """Check whether a cause reduces the RMSE of the channels that show it as much as its conditions require.
+    """Check whether a cause lowers the RMSE as much as its conditions require, on the channels that show it.
 
     ``beside`` are the other causes of the likeliest explanation.
     """
@@ -960,7 +960,7 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     rivals = [_SLOPE * e.predicted_db[:, None], elevation]
     rivals += [] if e.distance_db is None else [_SLOPE * e.distance_db[:, None]]
     others = [Trial(columns=columns) for columns in rivals]
-    # without antennas in the prediction, twice the decibels are those of a path-loss exponent of 4
+    # a prediction without antennas is free space: doubled decibels then equal a path-loss exponent of 4
     alike = e.distance_db is not None and bool((e.predicted_db - e.distance_db).std() < SHOWN_DB)
     if alike:
         # near its maximum, the log likelihood is a parabola
@@ -1046,7 +1046,7 @@ def _is_flat(e: LevelEvidence) -> bool:
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the noise that the receiver writes without lock, by the quality in the log."""
     if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
-        # the cautions count the samples, and the first sentence has the error with the floor already
+        # the report counts these samples in a caution, and its first sentence already has the error with the floor
         yield Trial(name="lock", clipped=lost, sentence="the receiver had no lock in parts of the flight")
 
 
@@ -1108,7 +1108,7 @@ def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
     inside, outside = pile[1:] & pile[:-1], ~(pile[1:] | pile[:-1])
     if inside.sum() < max(_LEAST_BINS, _LEAST_CLIPPED * len(pile)) or outside.sum() < _LEAST_BINS:
         return None
-    # the link is beyond a limit where the receiver shows it, but within it during interference of constant power
+    # at a limit of the receiver, the predicted level is beyond the limit; under constant interference it is not
     error = e.measured_db - e.predicted_db
     missing = side * float(np.median(error[pile]) - np.median(error[~pile]))
     limited = np.median(step[inside]) < _MOST_FADING * np.median(step[outside]) and missing > -_BEYOND_DB

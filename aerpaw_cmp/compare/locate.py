@@ -1,9 +1,9 @@
 """Position estimate of a transmitter at an unknown place, from the levels of one flight.
 
 In the model, the level falls with the logarithm of the distance, by an unknown slope. Both antennas add gains that
-depend on elevation, azimuth and the directions of the airframe. Shadowing is correlated over position or time. Of a
-level below the floor of the receiver, only this fact is known. Several strengths and lengths are tried and weighted by
-their evidence.
+depend on elevation, azimuth and the directions of the airframe. Shadowing is correlated over position or time. A
+level below the floor of the receiver has no value: it is only known to be below the floor. Several strengths and
+lengths are tried and weighted by their evidence.
 """
 
 from __future__ import annotations

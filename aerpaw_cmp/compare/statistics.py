@@ -348,7 +348,10 @@ def _picked(slow: FloatArray, known: WeightedCorrelations) -> tuple[IntArray, Fl
 
 
 def _stretched(drawn: FloatArray, by: float) -> FloatArray:
-    """Move draws away from their median, so that 2.5 % on each side are where the odds to the power ``by`` were."""
+    """Stretch draws about their median, separately on each side.
+
+    The new 2.5 % points are the old points whose odds are those of 2.5 % to the power ``by``.
+    """
     tail = 1.0 / (1.0 + 39.0**by)  # 39 to 1 are the odds of 2.5 %
     # interpolate directly, in half the time of np.quantile
     asked, ranks = (tail, 0.025, 0.5, 0.975, 1.0 - tail), np.linspace(0.0, 1.0, len(drawn))

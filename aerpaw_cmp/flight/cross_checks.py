@@ -284,8 +284,8 @@ def doubts(
     undated : sequence of str
         Logs with positions and relative times that the flight file dates, although the telemetry has absolute times.
     takeoff_ground_m : float
-        Height of the take-off point above the ground at the site's origin. If the heights of the log count from the
-        sea, it is minus the height of that ground above the sea.
+        Height of the take-off point above the ground at the site's origin. If the heights of the log are above
+        sea level, it is minus the height of that ground above sea level.
 
     Returns
     -------
@@ -315,10 +315,10 @@ def doubts(
     return tuple(texts)
 
 
-# If no sample is below this height [m], the heights count from the sea and not from take-off.
+# If no sample is below this height [m], the heights are above sea level and not above take-off.
 _FLOWN_M = 300.0
 
-# If the lowest height is within this [m] of the site's ground above the sea, heights probably count from the sea.
+# If the lowest height is within this [m] of the site's ground above sea level, heights are probably above sea level.
 _NEAR_GROUND_M = 50.0
 
 # A track starts with a take-off if the UAV moves by at most _REST_M in the first _REST_S, and then climbs by _CLIMB_M.
@@ -369,8 +369,8 @@ def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
         )
     if near:
         return (
-            f"the lowest height above take-off is {low_m:.0f} m, about the height of the ground above the sea "
-            f"({sea_m:.0f} m): if heights count from the sea, write 'takeoff_ground_m: {-(sea_m or 0.0):.0f}' "
+            f"the lowest height above take-off is {low_m:.0f} m, about the height of the ground above sea level "
+            f"({sea_m:.0f} m): if heights are above sea level, write 'takeoff_ground_m: {-(sea_m or 0.0):.0f}' "
             "under 'origin:' of the site file",
         )
     return ()

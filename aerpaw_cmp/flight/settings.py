@@ -21,7 +21,7 @@ from ..common.errors import UsageError
 from ..common.files import inside
 from ..common.outputs import check_seal
 from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, carrier_fault, noise_floor_dbm, wavelength_m
-from ..common.yamlfile import StrictModel, load_yaml, nearest, nearest_zone
+from ..common.yamlfile import StrictModel, expectation, load_yaml, nearest, nearest_zone
 from ..logs.readers import ReadOptions
 from ..logs.records import Kind
 from ..propagation.geometry import (
@@ -216,7 +216,7 @@ class LinksSettings(StrictModel):
     rank: LinkSettings = LinkSettings(
         carrier_hz=3.4e9,
         uav_transmits=False,
-        bandwidth_hz=20e6,  # a modem reports a rank above the noise in its channel, not in 1 Hz
+        bandwidth_hz=20e6,  # the noise in the channel of the modem limits the rank, not the noise in 1 Hz
         tower=ArraySettings(layout="tower_comparison", slant_deg=[45.0, -45.0, 45.0, -45.0], yaw_deg=45.0),
         uav=ArraySettings(layout="uav_comparison", slant_deg=[45.0, -45.0, -45.0, 45.0], yaw_deg=315.0, roll_deg=90.0),
     )
@@ -663,8 +663,9 @@ def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
         where = ".".join(str(part) for part in first["loc"])
         # name the override that the user wrote, even if the error is at a key above or below it
         key = next((k for k in overrides if k.startswith(where) or where.startswith(k)), where)
-        message = str(first["msg"]).removeprefix("Value error, ")
-        raise UsageError(f"the override {key!r}: found {first['input']!r} at {where}", expected=message) from None
+        raise UsageError(
+            f"the override {key!r}: found {first['input']!r} at {where}", expected=expectation(first)
+        ) from None
     # a campaign can change a channel that some of its flights do not have
     return other.changed({}, lent={*settings.lent, *(other.link.channels.keys() - settings.link.channels.keys())})
 

@@ -207,7 +207,7 @@ def digest_of(task: Task) -> str:
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:
     """Return a stored outcome with the flight and setting names of ``task``. Only the first setting keeps its samples.
 
-    Rows of the remaining settings contain only numbers, so that 4000 tasks need no more memory than their flights.
+    Rows of all other settings contain only numbers, because the samples of thousands of tasks would not fit in memory.
     """
     names = {"flight": task.flight, "setting": task.setting}
 

@@ -97,7 +97,7 @@ class Model:
     def name(self) -> str:
         """The parts of the model as text."""
         parts = {
-            "isotropic": [], "measured": ["antennas"], "learned": ["learned sphere"],
+            "isotropic": [], "measured": ["antennas"], "learned": ["learned antennas"],
         }[self.antennas]  # fmt: skip
         parts += {"ignored": [], "level": ["heading"], "logged": ["attitude"]}[self.attitude]
         if self.ground != "none":

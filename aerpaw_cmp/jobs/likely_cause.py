@@ -99,7 +99,7 @@ def _late_clock(evidence: Sequence[LevelEvidence], towers: Sequence[str]) -> Cau
         if clock is None or not clock.shifted:
             continue
         low, high = clock.ci95_s
-        # an interval wider than the lag shows levels that are late in a part of the flight only
+        # if the interval is wider than the lag, the levels are late in only part of the flight
         if high - low <= abs(clock.radio_minus_telemetry_s) and fall_without_lag_db(here) >= SHOWN_DB:
             late.setdefault(clock.in_words, []).append(tower)
     if not late:

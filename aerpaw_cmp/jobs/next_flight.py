@@ -222,8 +222,8 @@ def _sentence(best: Candidate, curve: Sequence[Mapping[str, float]], now_db: flo
     """Return the opening text of the page."""
     minutes = best.route.duration_s / 60.0
     text = (
-        f"Fly {best.route.name}: {best.route.length_m / 1000.0:.1f} km, {minutes:.0f} min. It lowers the standard "
-        f"deviation over the target from {now_db:.1f} to {best.sd_db:.1f} dB."
+        f"Best route: {best.route.name}; {best.route.length_m / 1000.0:.1f} km, {minutes:.0f} min. It lowers the "
+        f"standard deviation over the target from {now_db:.1f} to {best.sd_db:.1f} dB."
     )
     for enough in [p for p in curve if p["minutes"] < 0.9 * minutes][-1:]:
         text += f" A flight of {enough['minutes']:.0f} min lowers it to {enough['sd_db']:.1f} dB."

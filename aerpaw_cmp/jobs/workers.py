@@ -316,7 +316,8 @@ def _scheduler(address: str, paths: Sequence[Path], progress: Progress) -> Itera
         ) from None
     if not address.startswith("tls://"):
         raise UsageError(
-            f"--scheduler {address!r} is not protected: anyone who reaches it can run programs as you, on both sides",
+            f"--scheduler {address!r} is not protected: anyone who reaches it can run programs as you, here and on "
+            "the workers",
             expected="tls://HOST:PORT, with certificates in Dask's configuration (docs/campaign.md)",
         )
     try:

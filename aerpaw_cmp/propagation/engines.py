@@ -33,12 +33,12 @@ MANY_FACES = 400
 # PathSolver finds a wall of solid angle W with probability ``1 - exp(-N W / 4 pi)``, so the required rays depend on the
 # smallest and farthest walls. Pilot searches on a batch of poses use more rays each time, until two find the same
 # paths. A wall that both searches miss can still be lost at other poses. The audit reports such a wall.
-# Rays per tower of the first pilot.
+# Rays per tower of the first pilot search.
 FIRST = 10_000
 
 _FACTOR = 4
 
-# Largest number of rays per tower of a pilot.
+# Largest number of rays per tower of a pilot search.
 MOST = 2_560_000
 
 
@@ -62,15 +62,15 @@ class Choice:
 
 
 def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) -> Choice:
-    """Find the number of rays at which two pilots agree.
+    """Find the number of rays at which two pilot searches agree.
 
     Parameters
     ----------
     pilot : callable
-        ``pilot(samples)`` returns the paths of the pilot's poses.
+        ``pilot(samples)`` returns the paths of the poses of the pilot search.
     faces : Faces
     poses : int
-        Number of poses of the pilot, for the explanation.
+        Number of poses of the pilot search, for the explanation.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
 
 
 def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache: PathCache | None) -> Choice | None:
-    """Find the rays per tower at which two pilots on a batch of poses, spread over the flight, find the same paths.
+    """Find the rays per tower at which two pilot searches on a batch of poses find the same paths.
 
     Parameters
     ----------

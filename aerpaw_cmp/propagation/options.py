@@ -32,7 +32,7 @@ class Search:
     max_depth : int
         Largest number of reflections, 0 to 3.
     samples : int or "auto"
-        ``sionna`` only: rays per tower; "auto" raises the number until two pilots find the same paths
+        ``sionna`` only: rays per tower; "auto" raises the number until two pilot searches find the same paths
         (:func:`aerpaw_cmp.propagation.engines.enough_samples`).
     batch : int
         ``sionna`` only: poses per call.

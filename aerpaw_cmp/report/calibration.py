@@ -173,9 +173,10 @@ def _further(scores: Mapping[str, Sequence[Score]]) -> Iterator[str]:
 
 SPLIT_TITLE = {
     "flight_left_out": "each flight",
-    "altitude_left_out": "and its cruising height",
-    "heading_left_out": "and an eighth of the compass of headings",
-    "sector_left_out": "and a sector of 60 degrees at the tower",
+    "altitude_left_out": "each flight and its cruising height",
+    "heading_left_out": "each flight and an eighth of the headings",
+    "sector_left_out": "each flight and a sector of 60 degrees at the tower",
+    "campaign_left_out": "each campaign",
     "other_flights": "other flights (--score)",
 }
 
@@ -302,7 +303,9 @@ CARDS = (scores_card, mounts_card, gains_card, rank_card)
 
 def write_calibration(data: CalibrationData, folder: Path) -> list[Path]:
     """Write ``calibration.html`` and ``metrics.json``."""
-    settings = Markup("<pre>{}</pre>").format(data.settings_text)
+    settings = Markup('<pre tabindex="0" role="region" aria-label="Settings for flight.yaml">{}</pre>').format(
+        data.settings_text
+    )
     page = Page(
         kind="calibration", title=data.name, verdict=data.words[0] if data.words else "", cautions=data.warnings,
         about=[f"Flights: {', '.join(data.flights)}. Made {minute(data.generated)}"],

@@ -359,7 +359,10 @@ def headline(data: CampaignData) -> list[str]:
             f"({counted(sum(p.n for p in pairs), 'pair')}, {share:.0f} % of the samples)."
         )
     elif data.repeats:
-        out.append("No two flights visit the same positions within the radius, so repeatability is not known.")
+        out.append(
+            f"No two flights visit the same positions within {number(data.radius_m, 0, 'm')} at similar headings, so "
+            "repeatability is not known."
+        )
     return out
 
 

@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from ..compare.statistics import Interval
 from .page import json_text, rendered, write_file
-from .texts import flat, interval, number, percent, short
+from .texts import cut, flat, interval, number, percent, short
 
 # Forms of a column: text, head of a row, right-aligned text, percentage. The form of a column of numbers is its number
 # of decimals.
@@ -206,9 +206,13 @@ class Page:
         return rendered("page", scripts, page=self, cards=cards, cell=cell, numeric=_numeric)
 
 
+# Characters of a setting that the page shows. Fingerprints of logs have thousands.
+_SETTING_SHOWN = 300
+
+
 def settings_card(made: Any, *settings: Mapping[str, Any], fold: bool = False) -> Card:
     """Return the card of settings, versions and times. ``made`` has the fields of :class:`~.page.Made`."""
-    rows = [row for part in settings for row in flat(part)]
+    rows = [(key, cut(text, _SETTING_SHOWN)) for part in settings for key, text in flat(part)]
     checked = Table(caption="The checked settings.", columns={"Key": HEAD, "Value": TEXT}, rows=rows)
     software = Table(caption="Software.", columns={"Name": HEAD, "Version": TEXT}, rows=list(made.versions.items()))
     stages = list(made.stages_s.items())

@@ -197,8 +197,9 @@ def _ranks(data: ReportData) -> Table:
             agreement = estimate(at.agreement, at.agreement_ci95, SHARE)
             if (by_ground := (p.further.agreement_sd_by_ground or {}).get(f"{k:g}")) is not None:
                 agreement += Markup(' <span class="small">±{}</span>').format(number(100 * by_ground, 0))
-            rows.append(("", f"K = {k_key(k)}", *at.histogram, estimate(at.total_variation, at.total_variation_ci95),
-                         at.p_histogram, agreement, at.kappa, at.wasserstein, at.out_of_coverage))  # fmt: skip
+            rows.append((p.tower, f"K = {k_key(k)}", *at.histogram,
+                         estimate(at.total_variation, at.total_variation_ci95), at.p_histogram, agreement, at.kappa,
+                         at.wasserstein, at.out_of_coverage))  # fmt: skip
         if math.isfinite(p.score.curve.best_k):
             best.append(f"{number(p.score.curve.best_k)} {interval(p.score.curve.best_k_ci95)} at {p.tower}")
     grounds = any(p.further.agreement_sd_by_ground for p in data.rank)
@@ -215,6 +216,10 @@ def _ranks(data: ReportData) -> Table:
                   "between its known heights." if grounds else ""),
                *filter(None, map(words.rank_references, data.rank))],
     )  # fmt: skip
+
+
+# Words for the entries of ``fitted_on_scored``.
+_FITTED = {"offset_db": "offset", "lag_s": "clock lag"}
 
 
 def channels_card(data: ReportData) -> Card:
@@ -235,7 +240,7 @@ def _channel(data: ReportData, p: RssResult) -> Card:
         title=p.name, group="rss-channel", chart=f"rss/{p.tower}/{p.channel}",
         text=[paragraph(
             words.rss_verdict(p),
-            f"Fitted on the scored samples: {', '.join(score.fitted_on_scored) or 'nothing'}.",
+            f"Fitted on the scored samples: {', '.join(_FITTED.get(name, name) for name in score.fitted_on_scored)}.",
             f"Offset {number(score.offset_db)} dB {interval(score.intervals.offset_db)}.",
             counts_as if math.isfinite(independent) else "", lag if p.clock_verdict else "",
         )],
@@ -358,10 +363,10 @@ def models_card(data: ReportData) -> Card:
                *([f"Within 0.01 dB of a row above on every channel: {'; '.join(same)}."] if same else [])],
     )  # fmt: skip
     each = Table(
-        caption="RMSE in dB on held-out areas, and in brackets the 95 % interval of its difference to the best model.",
+        caption="RMSE in dB on held-out areas. \u0394: 95 % interval of its difference to the best model.",
         columns={"Tower": HEAD, "Channel": HEAD, **{f"Model {number}": RIGHT for number in range(1, len(shown) + 1)}},
         rows=[
-            (*of, *(Markup('{} <span class="small">{}</span>').format(
+            (*of, *(Markup('{} <span class="small">\u0394 {}</span>').format(
                         number(row.rmse_heldout_db), interval(row.difference_to_best_ci95_db, 2))
                     for model in names for row in [rows[model, of[0], of[1]]]))
             for of in channels

@@ -259,7 +259,7 @@ def audit_paths(audit: AuditResult) -> str:
             + (" (each passed a second test)" if tested else "")
         )
     if math.isfinite(audit.rss_max_error_db):
-        parts.append(f"RSS of the two engines within {audit.rss_max_error_db:.2g} dB")
+        parts.append(f"RSS differs by at most {max(audit.rss_max_error_db, 0.001):.2g} dB")
     return ", ".join(parts)
 
 
@@ -345,9 +345,9 @@ def _detection_words(panel: RssResult) -> str:
     floor = f"{Printed(score.floor_db):.0f}"
     return (
         f" The receiver detected the signal in {100 * score.n_detected / score.n:.0f} % of "
-        f"{counted(score.n, 'sample')}: the Brier score of the predicted level is {score.brier:.2f} "
-        f"({learned_on(score)}), and {score.constant_brier:.2f} for "
-        f"that share alone. With lower levels counted as {floor}: RMSE {score.rmse_db:.1f} dB (free space: "
+        f"{counted(score.n, 'sample')}. The Brier score of detection forecast from the predicted level is "
+        f"{score.brier:.2f} ({learned_on(score)}), and {score.constant_brier:.2f} for the constant share. "
+        f"With lower levels counted as {floor}: RMSE {score.rmse_db:.1f} dB (free space: "
         f"{score.free_space_rmse_db:.1f} dB)."
     )
 

@@ -9,7 +9,7 @@ The LTE flights have ``RSRP RSRP2 RSRQ RSSI`` and ``mX mY mZ``, with ``timestamp
 the other levels are -inf. Levels are dB re full scale (the authors subtract 98 dB for dBm).
 
 Processed files (``lat_s lon_s height_s RSRP_s ori_s``; ``lat_all lon_all h_all power_all ori_all``) have no clock: rows
-are counted at the rate of the raw flights, from 1970. The lines of the account are rows.
+are timed at the sample rate of the raw logs, from 1970. The lines of the account are rows.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _instants(
     none = np.zeros(len(wall), dtype=bool)
     if clock == _COUNTED:
         origin = _text.origin_ns(options, needed_by="flight_mat")
-        text = "the file has no clock: its rows are counted at the rate of the raw flight"
+        text = "the file has no clock: its rows are timed at the sample rate of the raw log"
         warnings.append(text if origin is not None else text + ", from 1970-01-01T00:00")
         return _text.Instants((wall + (origin or 0)).astype("datetime64[ns]"), none, none.copy()), warnings
     if clock == _UTC and options.clock not in ("local", "local_as_utc"):

@@ -122,7 +122,7 @@ def test_relative_levels_are_placed_where_the_track_that_dates_them_was(tmp_path
     head = "index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi"
     (tmp_path / "nemo.csv").write_text("\n".join([head, *lines, ""]))
     text, _ = draft([pose, *ingest(tmp_path / "nemo.csv")], tmp_path, DraftOptions())
-    assert "the levels fit LW1" in text
+    assert "no position fits the levels clearly better than LW1: is it this tower?" in text
     assert parse_yaml(text, FlightFile).rss.span_db == (40.0, 90.0)  # Friis: 62.2 dB at 100 m
 
 
@@ -292,7 +292,7 @@ def test_of_towers_that_fit_alike_the_receivers_own_is_proposed(
     placement = finder.propose(_flown(finder, gains, "LW1", slice(0, 500)), {name: [] for name in usual})
     assert placement is not None
     assert placement.node == said
-    assert f"the levels fit LW2 or LW1 as well as any other position: is it {said}?" in placement.question
+    assert f"no position fits the levels clearly better than LW2 or LW1: is it {said}?" in placement.question
 
 
 @pytest.mark.parametrize(
@@ -308,7 +308,7 @@ def test_a_tower_stands_beside_antennas_of_which_nothing_is_known(
     placement = finder.propose(_flown(finder, gains, at, part))
     assert placement is not None
     assert placement.node == said
-    assert ("as well as any other position" in placement.question) == (said != "NODE")
+    assert ("no position fits the levels clearly better" in placement.question) == (said != "NODE")
 
 
 @pytest.mark.parametrize("head", ["cell_id,rsrp", "rsrp cell 1,rsrp cell 2"])

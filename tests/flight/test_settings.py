@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight.gains import load_with_learned
-from aerpaw_cmp.flight.settings import ArraySettings, FlightFile
+from aerpaw_cmp.flight.settings import ArraySettings, FlightFile, overridden
 
 POINT = {"east_m": 0, "north_m": 0, "height_m": 5}
 PLAN = {"start": "2025-06-01T10:00:00", "waypoints": [POINT, POINT]}
@@ -128,3 +128,11 @@ def test_a_key_in_the_wrong_place_is_refused_with_the_right_one(line: str, home:
     with pytest.raises(UsageError, match="line 3: unknown key") as caught:
         parse_yaml(f"flight: f\nlogs: [{{path: a}}]\n{line}\n", FlightFile)
     assert home in str(caught.value)
+
+
+def test_an_override_of_the_wrong_kind_states_what_is_expected() -> None:
+    file = parse_yaml("flight: f\nlogs: [{path: a}]\n", FlightFile)
+    with pytest.raises(UsageError) as caught:
+        overridden(file, {"antennas": None})
+    assert "found None at antennas" in str(caught.value)
+    assert "expected keys with values" in str(caught.value)

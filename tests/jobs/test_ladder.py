@@ -115,7 +115,7 @@ def test_a_hover_recommends_no_model(tmp_path: Path, capsys: pytest.CaptureFixtu
     at = np.arange(0.0, 120.0, 0.2)
     rss_log(tmp_path, "A", at, -80.0 + 0.3 * np.random.default_rng(1).normal(size=len(at)))
     rows = {row["model"]: row for row in report(path, capsys)["ladder"]}
-    as_set, learned = rows["as set in flight.yaml"], rows["learned sphere + heading"]
+    as_set, learned = rows["as set in flight.yaml"], rows["learned antennas + heading"]
     assert as_set["rmse_heldout_db"] > learned["rmse_heldout_db"] + 0.1
     assert [as_set["recommended"], learned["recommended"]] == [True, False]
 
@@ -150,7 +150,7 @@ def test_learned_antennas_are_scored_on_other_flights_alone(tmp_path: Path) -> N
         (tmp_path / "learned.yaml").write_text(yaml.safe_dump(stated), encoding="utf-8")
         outcome = run_flight(load_data(load_flight(tmp_path / "learned.yaml"), tmp_path), audit=False, ladder=True)
         rows = {row.model: row for row in outcome.result.ladder}
-        learned = {name: row for name, row in rows.items() if "learned sphere" in name or "as set" in name}
+        learned = {name: row for name, row in rows.items() if "learned antennas" in name or "as set" in name}
         assert len(learned) >= 2
         assert all(np.isfinite(row.rmse_heldout_db) == scored for row in learned.values())
         assert all(("not scored" in name) != scored for name in learned)
@@ -200,8 +200,8 @@ def test_an_isotropic_flight_is_offered_what_its_site_remembers(
     """
     metrics = report(remembering(tmp_path, learned_db), capsys, "--recommend", str(tmp_path / "best.yaml"))
     candidates = {row["model"]: row for row in metrics["ladder"]}
-    assert {"learned sphere", "learned sphere + heading"} <= set(candidates)
-    assert candidates["learned sphere + heading"]["recommended"] == chosen
+    assert {"learned antennas", "learned antennas + heading"} <= set(candidates)
+    assert candidates["learned antennas + heading"]["recommended"] == chosen
     assert bool(load_flight(tmp_path / "best.yaml").antennas) == chosen
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert ("best on other flights (3.5 dB, free space 5.0 dB)" in page) == chosen

@@ -159,7 +159,7 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
         table("time,lat,lon,pci,rsrp", EPOCH + ",35.7,-78.7,11,{l}") + table("", EPOCH + ",11,35.7,-78.7,{l}")[1:], InputError, SHIFTED),
     "a latitude of 999": (table("time,lat,lon,pci,rsrp", EPOCH + ",999,35.7,-78.7,{l}"), InputError, SHIFTED),
     "weeks modulo 1024": (table("week,tow,pci,rsrp", "322,22401{i},11,{l}"), InputError, "modulo 1024"),
-    "a month of no language": (phone("Time", "10 foo 2025 10:00:0{i}"), InputError, "of a form that is not read"),
+    "a month of no language": (phone("Time", "10 foo 2025 10:00:0{i}"), InputError, "has an unsupported form"),
     "a scan of access points": ("WigleWifi-1.4,appRelease=2.53\nMAC,SSID,FirstSeen,RSSI\n", InputError, "of WiGLE: its cells"),
     "answers of another modem": (
         table("", '[2025-06-10 10:00:0{i}] #RFSTS: "310 26",1795,-101,-67,-15,2242'), InputError, "AT answers of a modem"),

@@ -2,12 +2,14 @@
 
 import dataclasses
 import inspect
+import re
+from types import SimpleNamespace
 
 import pytest
 from markupsafe import Markup
 
 from aerpaw_cmp.report import calibration, campaign, flight, maps
-from aerpaw_cmp.report.cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Table
+from aerpaw_cmp.report.cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Table, settings_card
 from aerpaw_cmp.report.flight_data import ReportData
 from aerpaw_cmp.report.maps import MapsData
 from aerpaw_cmp.report.page import environment
@@ -25,6 +27,14 @@ def test_cells_have_the_form_of_their_column() -> None:
     assert '<th scope="row">a&lt;b</th><td>–</td><td class="n">1.23</td>' in html.replace("\n", "")
     assert '<td class="n">50\N{NARROW NO-BREAK SPACE}%</td><td class="n"><b>x</b></td>' in html.replace("\n", "")
     assert '<td class="n">[1.00, 2.00]</td>' in html
+
+
+def test_a_long_setting_is_cut_and_a_short_one_is_complete() -> None:
+    made = SimpleNamespace(versions={"python": "3.11"}, stages_s={"read": 1.0})
+    html = shown(settings_card(made, {"marks": ["ab" * 2000], "rt": {"max_depth": 1}}))
+    assert "<td>1</td>" in html
+    (text,) = re.findall(r"<td>((?:ab)+a?…)</td>", html)
+    assert len(text) == 300
 
 
 @pytest.mark.parametrize("card", [Card(), Card(title="T", id="t", link="L", tables=[TABLE], parts=[Card(text=[[]])])])

@@ -461,6 +461,6 @@ def test_a_receiver_that_lost_its_lock_has_one_error_that_with_the_floor(report_
     assert cards[0].value == f"{expected[0]:.1f} dB"
     assert any(f"{panel.name} lost its lock in 30 % of the samples" in said for said in cautions(data))
     assert (
-        "Brier score of the predicted level is 0.14 (learned on other flights), and 0.20 for that share"
+        "Brier score of detection forecast from the predicted level is 0.14 (learned on other flights), and 0.20"
         in rss_verdict(panel)
     )

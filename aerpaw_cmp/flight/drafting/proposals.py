@@ -251,17 +251,17 @@ class NodeFinder:
             return _node(self._local(place), at_list, about, nodes)
         best = int(odds_tower.argmax())
         if odds_tower[best] >= _TOWER_ODDS:
-            how = (
-                "with its antennas learned from flights"
-                if odds_tower[best] > odds[best]
-                else "as well as any other position"
-            )
             near = [i for i in np.argsort(-odds_tower) if odds_tower[i] > odds_tower[best] - _UNDECIDED]
             alike = [towers[i].name for i in near]
             # part of a flight can fit several towers: one with learned antennas is the most likely
             name = towers[max(near, key=lambda i: (known[i], towers[i].name in antennas))].name
             asked = "is it this tower?" if len(alike) == 1 else f"is it {name}?"
-            return Placement(name, None, f"the levels fit {' or '.join(alike)} {how}: {asked}")
+            fits = (
+                f"the levels fit {' or '.join(alike)} with its antennas learned from flights"
+                if odds_tower[best] > odds[best]
+                else f"no position fits the levels clearly better than {' or '.join(alike)}"
+            )
+            return Placement(name, None, f"{fits}: {asked}")
         assert estimate is not None  # no tower fits
         latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
         apart = [float(np.hypot(*(np.asarray(t.position_m) - estimate.place_m)[:2])) for t in towers]
@@ -710,9 +710,9 @@ def _receivers(
         rivals = [nat for name, nat in together.items() if name != best]
         over = together.get(best, -math.inf) - float(np.logaddexp.reduce([0.0, *rivals]))
         if over >= LEAST_ODDS:
-            out[log] = Receiver(best, f"receiver {best} with odds {_ratio(over)} by its {words[log, best]}?")
+            out[log] = Receiver(best, f"{words[log, best]}, odds {_ratio(over)}: is it the learned receiver {best}?")
         elif chosen.fits and (log, theirs) in words:
-            out[log] = Receiver("", f"another receiver than {theirs}, by its {words[log, theirs]}?")
+            out[log] = Receiver("", f"{words[log, theirs]}: is it another receiver than {theirs}?")
     return out
 
 
@@ -738,7 +738,7 @@ def _receiver_odds(
     if lost > _LOST_SHARE:
         nat += _ITS_LOCK if lock is not None else -math.inf
     stated = f"{level.offset_db:.1f} +- {level.sd_db:.1f}"
-    return nat, f"level of {offset_db:.1f} dB above free space ({stated} when learned)"
+    return nat, f"level {offset_db:.1f} dB above free space ({stated} dB when learned)"
 
 
 def _airframe_for(
@@ -799,9 +799,9 @@ def _odds(odds: Evidence) -> str:
     Examples
     --------
     >>> _odds(Evidence(over_own=4.0, over_turned=20.0))
-    'odds 55:1 against an unknown gain, more than 1000:1 against rotated copies'
+    'odds 55:1 against an unknown gain, more than 1000:1 against the same antennas rotated'
     """
-    turned = "" if math.isinf(odds.over_turned) else f", {_ratio(odds.over_turned)} against rotated copies"
+    turned = "" if math.isinf(odds.over_turned) else f", {_ratio(odds.over_turned)} against the same antennas rotated"
     return f"odds {_ratio(odds.over_own)} against an unknown gain{turned}"
 
 

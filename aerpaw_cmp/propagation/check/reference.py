@@ -344,7 +344,7 @@ class Blocks:
             if min(a[2], b[2]) >= top or not self._near(number, a, b):
                 continue
             shape = self._shape(number, grown)
-            # an upright segment has no shadow to intersect
+            # a vertical segment is a point on the map, with which no line can intersect
             if shadow.length < 1e-9:
                 if shape.contains(Point(a[:2])):
                     return True

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ..common.cf import library
 from ..common.errors import UsageError, noting_interrupts
 from ..common.files import cache_folder
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
@@ -193,6 +194,8 @@ class ReportOptions:
         Format of figures as files: none, one format, or all formats.
     kmz : bool
         Also write ``samples.kmz``.
+    netcdf : bool
+        Also write ``rss.nc`` and ``rank.nc``.
     """
 
     audit: str | None = None
@@ -202,6 +205,7 @@ class ReportOptions:
     against_distance_m: float = AGAINST_DISTANCE_M
     figures: str = "none"
     kmz: bool = False
+    netcdf: bool = False
 
 
 def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: RunOptions = DEFAULT) -> JobOutcome:
@@ -264,7 +268,9 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             target.write(sealed(text))
             record = replace(record, extra_metrics={**record.extra_metrics, "recommended": sentence})
         with output.filling() as place:
-            written = write_report(record, place, drawn=chosen.figures, kmz=chosen.kmz, stages=stages)
+            written = write_report(
+                record, place, drawn=chosen.figures, kmz=chosen.kmz, netcdf=chosen.netcdf, stages=stages
+            )
             if cards:
                 text = json.dumps(cards, indent=1, ensure_ascii=False)
                 (place / "card.json").write_text(text + "\n", encoding="utf-8")
@@ -273,9 +279,11 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
 
 
 def _check_options(flight: Path, chosen: ReportOptions, options: RunOptions) -> None:
-    """Raise UsageError for options that exclude each other."""
+    """Raise UsageError for options that exclude each other, and for a missing library."""
     from ..report.page import FIGURES
 
+    if chosen.netcdf:
+        library("netCDF4")
     if chosen.figures not in FIGURES:
         raise UsageError(f"--figures {chosen.figures}", expected=f"one of {', '.join(FIGURES)}")
     beside, home = (chosen.recommend or flight).parent, flight.parent

@@ -1,7 +1,7 @@
 """The columns of rss.csv and rank.csv: name, unit, meaning, and the function that computes the values.
 
-:data:`RSS` and :data:`RANK` produce the CSV files, the list of columns on a report's page and the table in
-docs/outputs.md. A new column is one row here.
+:data:`RSS` and :data:`RANK` produce the CSV files, the NetCDF variables, the list of columns on a report's page and the
+table in docs/outputs.md. A new column is one row here.
 """
 
 from __future__ import annotations

@@ -570,6 +570,7 @@ def write_report(
     *,
     drawn: str = "none",
     kmz: bool = False,
+    netcdf: bool = False,
     stages: Stages | None = None,
 ) -> WrittenReport:
     """Write the files of a report.
@@ -583,6 +584,8 @@ def write_report(
         One of :data:`~aerpaw_cmp.report.page.FIGURES`.
     kmz : bool
         Also write ``samples.kmz``.
+    netcdf : bool
+        Also write ``rss.nc`` and ``rank.nc``.
     stages : Stages, optional
         Receives the time of the stage "report", which is also stored in the data.
 
@@ -609,6 +612,11 @@ def write_report(
 
         with stages("kmz"):
             written.append(write_kmz(data, folder))
+    if netcdf:
+        from .samples_netcdf import write_netcdf
+
+        with stages("netcdf"):
+            written += write_netcdf(data, folder)
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
     files = ["metrics.json", *(path.name for path in written if path.parent == folder)]
     # the page lists the folder of figures only if there are any

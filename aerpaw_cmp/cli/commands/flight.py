@@ -21,7 +21,7 @@ from ..shown import answered, number, print_files, records, say, show, table, wa
         "aerpaw-cmp report flight.yaml -o reports/mine --audit none",
         "aerpaw-cmp report flight.yaml --dry-run",
         "aerpaw-cmp report flight.yaml --figures all",
-        "aerpaw-cmp report flight.yaml --kmz",
+        "aerpaw-cmp report flight.yaml --kmz --netcdf",
         "aerpaw-cmp report flight.yaml --with calibrated.yaml",
         "aerpaw-cmp report flight.yaml --against prediction",
         "aerpaw-cmp report flight.yaml --against matlab.csv --against sionna_map.npz",
@@ -57,6 +57,7 @@ def report(
         Option(help="Format of figures as separate files: none, one format, or all formats."),
     ] = "none",
     kmz: Annotated[bool, Option("--kmz", help="Also write samples.kmz for Google Earth and QGIS.")] = False,
+    netcdf: Annotated[bool, Option("--netcdf", help="Also write rss.nc and rank.nc for xarray and MATLAB.")] = False,
     dry_run: DryRun = False,
     force: Force = False,
 ) -> int:
@@ -71,6 +72,7 @@ def report(
         against_distance_m=against_distance,
         figures=figures,
         kmz=kmz,
+        netcdf=netcdf,
     )
     options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
     outcome = run.run_report(flight, chosen, options)

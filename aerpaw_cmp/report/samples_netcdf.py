@@ -1,0 +1,112 @@
+"""The files rss.nc and rank.nc of a report: the samples of rss.csv and rank.csv with units and the names of links.
+
+The layout is the contiguous ragged array of trajectories of the CF conventions (1.11, section H.4.3): the samples of
+all links follow each other along ``obs``, and ``row_size`` is their number per link. Variables are those of
+:mod:`.columns`, and a missing number is NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.cf import DB, DBM, Dataset, file_attributes, flags, netcdf_bytes, wgs84
+from ..common.units import AnyArray, FloatArray
+from ..logs.records import has_wall_clock
+from .columns import DECIMALS, RANK, RSS, Column, tables
+from .flight_data import ReportData
+
+# Columns of text, which are the same for all samples of a link.
+_LINK = ("tower", "channel", "unit")
+_TITLES = {"rss": "Received level, measured and replayed", "rank": "Channel rank, reported and replayed"}
+_RANKS = flags(("no path", "rank 1", "rank 2", "rank 3", "rank 4"))
+
+
+def write_netcdf(data: ReportData, folder: Path) -> list[Path]:
+    """Write ``rss.nc`` if the flight has levels and ``rank.nc`` if it has ranks, and return their paths.
+
+    Raises
+    ------
+    UsageError
+        If netCDF4 is not installed.
+    """
+    files = {"rss": (RSS, data.rss), "rank": (RANK, data.rank)}
+    written = []
+    for kind, (columns, series) in files.items():
+        if series:
+            path = folder / f"{kind}.nc"
+            path.write_bytes(netcdf_bytes(_dataset(data, kind, columns, series)))
+            written.append(path)
+    return written
+
+
+def _dataset(data: ReportData, kind: str, columns: Sequence[Column], series: Sequence[Any]) -> Dataset:
+    """Return the samples of all links as variables with the dimensions ``trajectory`` (links) and ``obs`` (samples)."""
+    members, links = tables(columns, series)
+    texts = [column for column in members if column.name in _LINK]
+    variables: dict[str, Any] = {
+        column.name: ("trajectory", [str(row[column.name]) for _, row in links], {"long_name": column.meaning})
+        for column in texts
+    }
+    names = [" ".join(str(row[column.name]) for column in texts[:2]) for _, row in links]
+    variables["link"] = ("trajectory", names, {"long_name": "name of the link", "cf_role": "trajectory_id"})
+    about = {"long_name": "number of samples of this link", "sample_dimension": "obs"}
+    variables["row_size"] = ("trajectory", np.array([len(time) for time, _ in links], dtype=np.int32), about)
+    variables["time"] = ("obs", *_seconds(np.concatenate([time for time, _ in links])))
+    samples = {
+        column.name: np.concatenate([_numbers(row[column.name]) for _, row in links])
+        for column in members
+        if column.name not in _LINK
+    }
+    axes = (("latitude", "degrees_north"), ("longitude", "degrees_east"))
+    for (name, unit), values in zip(axes, _degrees(data, samples), strict=True):
+        variables[name] = ("obs", values, {"standard_name": name, "long_name": f"WGS84 {name}", "units": unit})
+    variables["crs"] = ((), np.int32(0), wgs84())
+    for column in members:
+        if column.name in samples:
+            name = column.name.replace(".", "p")
+            variables[name] = ("obs", samples[column.name], _attributes(column))
+    source = "synthetic logs, replayed by ray tracing" if data.synthetic else "field logs, replayed by ray tracing"
+    comment = "Heights (up_m) are metres above the ground at the site origin. A missing number is NaN."
+    attributes = file_attributes(title=f"{_TITLES[kind]}: {data.title}", source=source, comment=comment)
+    return Dataset(variables, {**attributes, "featureType": "trajectory"})
+
+
+def _numbers(values: Any) -> FloatArray:
+    """Return a column (n,) with the decimals of the CSV file, and NaN for missing numbers."""
+    import pandas as pd
+
+    return np.asarray(np.round(pd.array(values).to_numpy(dtype=np.float64, na_value=np.nan), DECIMALS))
+
+
+def _degrees(data: ReportData, samples: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return latitude and longitude (n,) of the samples [deg] to 1 mm, NaN for unknown positions."""
+    east, north = samples["east_m"], samples["north_m"]
+    known = np.isfinite(east) & np.isfinite(north)
+    latitude, longitude = data.site.frame.to_geographic(np.where(known, east, 0.0), np.where(known, north, 0.0))
+    return np.where(known, np.round(latitude, 8), np.nan), np.where(known, np.round(longitude, 8), np.nan)
+
+
+def _seconds(time: AnyArray) -> tuple[FloatArray, dict[str, str]]:
+    """Return seconds (n,) after the first whole second, and their attributes."""
+    known = time[~np.isnat(time)]
+    clock = bool(len(known)) and has_wall_clock(known.min())
+    start = known.min().astype("datetime64[s]") if clock else np.datetime64("1970-01-01", "s")
+    attributes = {"standard_name": "time", "long_name": "time of the sample", "axis": "T", "calendar": "standard"}
+    attributes |= {"units": f"seconds since {str(start).replace('T', ' ')} UTC", "units_metadata": "leap_seconds: none"}
+    if not clock:
+        attributes["comment"] = "the logs have relative times and no origin: the date is not real"
+    return np.where(np.isnat(time), np.nan, (time - start) / np.timedelta64(1, "s")), attributes
+
+
+def _attributes(column: Column) -> dict[str, Any]:
+    """Return the attributes of a quantity. UDUNITS has no dB, so that its definition is written."""
+    shared: dict[str, Any] = {"long_name": column.meaning}
+    if column.name.startswith(("measured_rank", "simulated_rank")):
+        shared |= {"flag_values": _RANKS["flag_values"].astype(np.float64), "flag_meanings": _RANKS["flag_meanings"]}
+    elif column.name != "measured_db":  # its unit is a text per link
+        shared["units"] = {"dBm": DBM, "dB": DB, "": "1"}.get(column.unit, column.unit)
+    return shared | {"coordinates": "time latitude longitude up_m", "grid_mapping": "crs"}

@@ -18,6 +18,9 @@ WINDOW_S = 1.0
 # A level with a smaller standard deviation [dB] counts as constant.
 _CONSTANT_DB = 1e-6
 
+# Numbers of a card that are averaged over channels.
+AVERAGED = ("bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "correlation", "crps_db", "coverage_90")
+
 # Search range of the offset [dB], wide enough to compare logs in dB re full scale with a path loss.
 _RANGE_DB = (-400.0, 400.0)
 

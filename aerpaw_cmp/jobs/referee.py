@@ -34,6 +34,7 @@ from ..compare.level import nearest_in_time
 from ..compare.rank import MAX_RANK, agreement, cohen_kappa, histogram, total_variation
 from ..compare.receiver import score_forecast
 from ..compare.referee import (
+    AVERAGED,
     LevelCard,
     PredictedLevel,
     detection_floor_db,
@@ -442,11 +443,9 @@ def _check_names(table: pd.DataFrame, data: FlightData) -> None:
     """
     ours, theirs = {s.tower for _, s in data.series}, sorted(set(table["tower"]))
     if ours.isdisjoint(theirs):
-        found, expected = (
-            f"towers {', '.join(theirs[:8]) or 'without names'}",
-            f"towers of the flight: {', '.join(sorted(ours))}",
-        )
-        raise InputError(found, expected=expected, cause="other names for the same towers; rename them in the file")
+        found = f"towers {', '.join(theirs[:8]) or 'without names'}"
+        cause = "other names for the same towers; rename them in the file"
+        raise InputError(found, expected=f"towers of the flight: {', '.join(sorted(ours))}", cause=cause)
     channels = table[table["level"].notna()].groupby("tower")["channel"].unique()
     named = {channel for of_tower in channels for channel in of_tower}
     if channels.str.len().max() == 1 and named.isdisjoint(s.channel for s in data.rss):
@@ -482,10 +481,6 @@ class SeriesVerdict:
     floor_db: float | None
     cards: Mapping[str, LevelCard]
     differences: Mapping[str, PairedDifference]
-
-
-# Numbers of a card that are averaged over channels.
-_AVERAGED = ("bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "correlation", "crps_db", "coverage_90")
 
 
 def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> dict[str, Any]:
@@ -554,8 +549,8 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
 
 def _means(model: str, cards: Sequence[LevelCard]) -> dict[str, Any]:
     """Return the mean scores of a model over channels. NaN if a channel does not have the number."""
-    values = np.array([[getattr(card, key) for key in _AVERAGED] for card in cards], dtype=np.float64)
-    return {"model": model, "channels": len(cards), **dict(zip(_AVERAGED, values.mean(axis=0), strict=True))}
+    values = np.array([[getattr(card, key) for key in AVERAGED] for card in cards], dtype=np.float64)
+    return {"model": model, "channels": len(cards), **dict(zip(AVERAGED, values.mean(axis=0), strict=True))}
 
 
 def _sentence(

@@ -21,6 +21,7 @@ from ..common.text import counted
 from ..common.units import AnyArray, FloatArray
 from ..compare.ladder import distinct
 from ..compare.level import PART_DB, ErrorSpan, FieldAudit
+from ..compare.referee import AVERAGED
 from ..compare.result import APPLIED, GIVEN, AuditResult, ClockResult, EngineResult, RankResult, RssResult
 from ..compare.statistics import FEWEST, Interval
 from ..logs.records import has_wall_clock
@@ -280,9 +281,10 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
         for tower, channels in verdict["levels"].items()
         for channel, entry in channels.items()
     ]
-    errors: dict[str, str | int] = {"Bias [dB]": 1, "RMSE [dB]": 1, "after offset": 1, "over 1 s": 1}
-    scores = {**errors, "Correlation": 2, "CRPS [dB]": 2, "In 90 %": SHARE}
-    keys = ("bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "correlation", "crps_db", "coverage_90")
+    scores: dict[str, str | int] = {
+        "Bias [dB]": 1, "RMSE [dB]": 1, "RMSE after offset": 1, "RMSE over 1 s": 1, "Correlation": 2, "CRPS [dB]": 2,
+        "In 90 %": SHARE,
+    }  # fmt: skip
     means = Table(
         caption="Mean scores over the channels that all models have. A dash means that the prediction has no common "
         "reference with the log, or no 90 % band.",
@@ -294,7 +296,7 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
         "offsets, with its 95 % interval [dB]. If it is negative, the prediction is better.",
         columns={"Tower, channel": HEAD, "Model": TEXT, "Samples": 0, **scores, "Difference": 2, "95 %": 2},
         rows=[
-            (link, model, card["n"], *(card[key] for key in keys),
+            (link, model, card["n"], *(card[key] for key in AVERAGED),
              *((None, None) if pair is None else (pair["difference_db"], tuple(pair["difference_ci95_db"]))))
             for link, entry in series for model, card in entry["cards"].items()
             for pair in [entry["differences"].get(model)]

@@ -79,3 +79,25 @@ def test_channel_of_a_route_needs_no_logs_and_a_report_does(place: Path, capsys:
     capsys.readouterr()
     assert main(["report", str(place / "flight.yaml"), "-o", str(place / "r")]) == 2
     assert "lists no log" in capsys.readouterr().err
+
+
+def test_a_map_prints_the_coverage_of_one_element_and_of_the_array(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The array's beam has nulls, so its share alone would not be that of free space."""
+    words = ["--no-study", "--spacing", "100", "--rss-altitude", "60", "--rank-altitude", "60", "--foliage", "none"]
+    command = ["map", str(place / "site.yaml"), *words, "--threshold-dbm", "-75", "-o", str(place / "map"), "-q"]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    layers = pd.read_csv(place / "map" / "layers.csv")
+    one, four = (100 * (layers[f"rss_{kind}_h060m_T1_none"] >= -75).mean() for kind in ("siso", "mimo"))
+    assert one > four + 1.0
+    (line,) = (line for line in printed.splitlines() if "T1" in line and "one element" in line)
+    assert f"{one:.1f} %" in line
+    (line,) = (line for line in printed.splitlines() if "T1" in line and "4 elements in phase" in line)
+    assert f"{four:.1f} %" in line
+    away = np.linalg.norm(layers[["east_m", "north_m"]].assign(up=40.0), axis=1)
+    free = 30.0 + 20 * np.log10(wavelength_m(2.5e9) / (4 * np.pi * away))
+    # the direct path plus or minus one ground reflection
+    assert np.abs(layers["rss_siso_h060m_T1_none"] - free).max() < 8.0
+    assert np.abs(np.median(layers["rss_siso_h060m_T1_none"] - free)) < 1.0

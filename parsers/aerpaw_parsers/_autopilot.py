@@ -173,12 +173,14 @@ def _track(rows: Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     values: dict[str, AnyArray] = {name: column[timed] for name, column in flight.position.columns.items()}
     logged, above = values.pop("above_home_m", None), None
     home_m = values["altitude_m"] - (0.0 if logged is None else logged)  # also before the first fix
-    lost = _pose.clean(rows, values)
-    values["altitude_m"] = np.where(lost, np.nan, values["altitude_m"])
+    lost = (np.abs(values["latitude_deg"]) < 1e-6) & (np.abs(values["longitude_deg"]) < 1e-6)
+    rows.mark(lost, "no_fix")
+    for name in _pose.PLACE:
+        values[name] = np.where(lost, np.nan, values[name])
     rows.warnings += _apart(flight, time_s, values)
     if logged is not None:
         height = np.where(lost, np.nan, logged)
-        above = _pose.from_logged_heights(rows, time_s, values["altitude_m"], height, home_m)
+        above = _pose.from_logged_heights(rows, time_s, values["altitude_m"], height, home_m, one_estimate=True)
     values["altitude_m"] = _height(rows, flight, time_s, values) if above is None else above
     heading = values.pop("yaw_deg", np.full(len(rows), np.nan))
     values |= {name: flight.attitude.near(name, time_s) for name in _pose.ANGLES}

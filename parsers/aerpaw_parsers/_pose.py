@@ -234,7 +234,8 @@ def above_home(
 
 
 def from_logged_heights(
-    rows: Rows, time_s: FloatArray, altitude: FloatArray, height: FloatArray, home_m: FloatArray
+    rows: Rows, time_s: FloatArray, altitude: FloatArray, height: FloatArray, home_m: FloatArray, *,
+    one_estimate: bool = False,
 ) -> FloatArray | None:  # fmt: skip
     """Return heights above the home at take-off from logged heights above home, or None if home was never set.
 
@@ -243,6 +244,8 @@ def from_logged_heights(
     rows : Rows
     time_s, altitude, height, home_m : float array, shape (n,)
         Time, altitude above sea level, height above home, and altitude of home, which is the difference of the two.
+    one_estimate : bool
+        True if both heights are known to be of one estimate.
 
     Returns
     -------
@@ -257,7 +260,7 @@ def from_logged_heights(
     if np.abs(home_m).max() <= UNSET_M and np.nanmin(np.abs(height), initial=np.inf) >= _NEAR_ZERO_M:
         return None
     steady = np.abs(np.diff(home_m)) < _JITTER_M
-    if np.ptp(home_m) <= MOVED_M or steady.mean() <= _STEADY:
+    if np.ptp(home_m) <= MOVED_M or not (one_estimate or steady.mean() > _STEADY):
         return height
     return above_home(rows, time_s, altitude, time_s[known], home_m)
 

@@ -95,7 +95,7 @@ def _reasons(settings: FlightFile, kinds: Collection[str]) -> Iterator[tuple[str
         foliage = "foliage_model leaves advanced.gamma_db_per_m advanced.maximum_loss_db"
         yield f"rt.foliage is {rt.foliage}", " ".join(f"rt.{key}" for key in foliage.split())
     if rt.max_depth == 0:
-        yield "rt.max_depth is 0, so nothing is reflected", "rt.reflection_loss_db rt.ground_roughness_m"
+        yield "rt.max_depth is 0, so nothing is reflected", "rt.reflection_loss_db"
     if rt.engine == "image" and rt.audit_links == 0:
         yield "rt.engine is image and rt.audit_links is 0, so no rays are shot", "rt.advanced.samples"
     if lag not in ("estimate", "apply"):

@@ -1,7 +1,7 @@
 """Learned gains of a link, losses of its paths, and learned antennas in flight settings.
 
 The replay uses patterns. This module adds the learned gain of both ends together and its error model, the losses of a
-path (foliage, reflections, rough ground), and notes about foliage models.
+path (foliage, reflections), and notes about foliage models.
 
 It also replaces the names of learned antennas and receivers in flight settings by files. Reading a flight.yaml does not
 do this, so a job that replays a flight or lists its inputs calls :func:`with_learned`.
@@ -174,55 +174,6 @@ def _reflection_loss(_site: Site, rt: RtSettings, _carrier_hz: float) -> Loss | 
     return lambda paths, _sources_m, _targets_m: np.asarray(rt.reflection_loss_db * paths.depth, dtype=np.float64)
 
 
-# A reflection this close to a ground plane of the site is a ground reflection.
-_ON_GROUND_M = 1e-6
-
-
-# The same limit for an elevation model. It is larger, because specular points are found by iteration.
-_NEAR_TERRAIN_M = 0.01
-
-
-def _roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
-    """Return the loss of ground reflections by ``rt.ground_roughness_m``, or None for smooth ground.
-
-    Each ground reflection is multiplied by ``exp(-2 (k sigma sin(grazing))^2)``, with the grazing angle of the array
-    centres (Ament, Proc. IRE 41 (1953), 142-146, doi:10.1109/JRPROC.1953.274171). The loss in decibels cannot
-    underflow. The scattered power is not traced.
-
-    Raises
-    ------
-    UsageError
-        If the site is a scene of triangles.
-    """
-    sigma = rt.ground_roughness_m
-    if sigma == 0.0:
-        return None
-    if site.scene is not None:
-        raise UsageError(
-            "rt.ground_roughness_m on a site that is a scene of triangles",
-            expected="a site with a ground plane, or reflection_loss_db",
-            cause="no face of the scene is known to be its ground",
-        )
-    # with 'tower_ground: offsets', towers have ground planes at other heights
-    heights = np.array(sorted({0.0, *(tower.ground_m for tower in site.towers.values())}))
-    wavelength = wavelength_m(carrier_hz)
-
-    def loss(paths: PathSet, sources_m: FloatArray, _targets_m: FloatArray) -> FloatArray:
-        total, ray_start = np.zeros(len(paths)), sources_m[paths.tower]
-        for step in range(paths.vertices_m.shape[1]):
-            corner = paths.vertices_m[:, step]
-            on = np.abs(corner[:, 2:] - heights).min(axis=1) < _ON_GROUND_M  # NaN if the path has fewer corners
-            if site.dem is not None:
-                on |= np.abs(corner[:, 2] - site.dem.ground_m(corner[:, 0], corner[:, 1])) < _NEAR_TERRAIN_M
-            ray = corner[on] - ray_start[on]
-            sine = np.abs(ray[:, 2]) / np.maximum(np.linalg.norm(ray, axis=1), _ON_GROUND_M)
-            total[on] += 40.0 * np.log10(np.e) * (2.0 * np.pi / wavelength * sigma * sine) ** 2
-            ray_start = np.where(np.isfinite(corner), corner, ray_start)
-        return total
-
-    return loss
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathLoss:
     """A loss of a path in addition to its field. Replay, explain, model comparison and audit use it.
@@ -265,12 +216,6 @@ LOSSES: tuple[PathLoss, ...] = (
         of=_reflection_loss,
         expected=lambda rt: {"reflection_db": rt.reflection_loss_db},
     ),
-    PathLoss(
-        name="rough ground",
-        off={"ground_roughness_m": 0.0},
-        of=_roughness_loss,
-        expected=lambda rt: {"ground_roughness_m": rt.ground_roughness_m},
-    ),
 )
 
 
@@ -300,11 +245,6 @@ def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
     callable or None
         ``loss(paths, sources_m (towers, 3), targets_m (poses, 3)) -> (paths,)`` [dB], infinite if a path is blocked.
         None if no path has a loss.
-
-    Raises
-    ------
-    UsageError
-        If ``rt.ground_roughness_m`` is set and the site is a scene of triangles.
     """
     losses = list(path_losses(site, rt, carrier_hz).values())
     if len(losses) < 2:

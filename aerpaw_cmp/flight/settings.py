@@ -381,8 +381,6 @@ class RtSettings(StrictModel):
     leaves: Literal["in", "out"] = "in"
     reflection_loss_db: Annotated[float, Field(ge=0)] = 0.0
     """Additional loss per reflection, for example by rough surfaces. Fit it on other flights."""
-    ground_roughness_m: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Standard deviation of the height of the ground. It reduces the specular reflection by Ament's factor."""
     audit_links: Annotated[int, Field(ge=0)] = 200
     advanced: AdvancedRt = AdvancedRt()
 

@@ -69,12 +69,12 @@ LINES = BASELINE_TITLE["constant"], BASELINE_TITLE["log_distance"]
 LEARNED_HERE = " (its antennas were learned on this flight, too: not scored)"
 
 Antennas = Literal["isotropic", "measured", "learned"]
-Ground = Literal["none", "coherent", "weakened", "rough", "power sum"]
+Ground = Literal["none", "coherent", "weakened", "power sum"]
 Trees = Literal["none", "p833", "opaque"]
 Relief = Literal["flat", "offsets", "surface"]
 
 # Names of the sums and losses of the ground reflection.
-_GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "rough": "rough", "power sum": "incoherent"}
+_GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "power sum": "incoherent"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,8 +90,6 @@ class Model:
     """True if attenuating woods are media instead of single trees."""
     relief: Relief = "flat"
     """Ground at the towers and below the paths, instead of that of the flight file."""
-    roughness_m: float = 0.0
-    """Roughness for ``ground: rough``, from the flight file."""
 
     @property
     def name(self) -> str:
@@ -116,7 +114,6 @@ class Model:
             "max_depth": depth,
             "attitude": self.attitude,
             "reflection_loss_db": _WEAK_GROUND_DB if self.ground == "weakened" else 0.0,
-            **({"ground_roughness_m": self.roughness_m} if self.ground == "rough" else {}),
             "foliage": "none" if self.trees == "none" else "opaque" if self.trees == "opaque" else "attenuating",
         }
         if self.trees == "p833":
@@ -308,9 +305,7 @@ class _ModelSearch:
 
     def _ground(self, best: Model) -> list[Model]:
         kinds: tuple[Ground, ...] = ("power sum", "weakened", "coherent")
-        models = [dataclasses.replace(best, ground=kind) for kind in kinds]
-        rough = self._data.settings.rt.ground_roughness_m
-        return [*models, *([dataclasses.replace(best, ground="rough", roughness_m=rough)] if rough else [])]
+        return [dataclasses.replace(best, ground=kind) for kind in kinds]
 
     def _buildings(self, best: Model) -> list[Model]:
         return [dataclasses.replace(best, buildings=True)] if self._data.site.buildings else []
@@ -378,7 +373,7 @@ class _ModelSearch:
         return any(learned_here(self._data, series, link) for series, link in pairs)
 
     def _candidate(self, model: Model) -> CandidateModel:
-        learned = model.antennas == "learned" or model.ground == "rough"
+        learned = model.antennas == "learned"
         if learned and self._learned_here:
             nothing = tuple(np.full(len(s.rows), np.nan) for s in self._series)
             return CandidateModel(model=model.name + LEARNED_HERE, level_db=nothing, seconds=0.0)
@@ -488,8 +483,7 @@ def recommended_changes(
     }
     rt = stated.get("rt") or {}
     # no model has diffraction: it was the best on none of 28 real series
-    unused = ("diffraction",) if model.ground == "rough" else ("diffraction", "ground_roughness_m")
-    changes |= {("rt", key): None for key in unused if key in rt}
+    changes |= {("rt", "diffraction"): None} if "diffraction" in rt else {}
     if isinstance(stated.get("site"), str):
         of_site = {key: changes.pop(("site", key)) for section, key in list(changes) if section == "site"}
         if of_site:

@@ -40,7 +40,6 @@ LIMITS: dict[str, tuple[list[Any], list[Any]]] = {
     "towers.N.longitude_deg": ([-180, 180], [-180.1, 180.1]),
     "rt.advanced.samples": (["auto", 1, 100_000_000], [0, 100_000_001]),
     "rt.max_depth": ([0, 3], [-1, 4]),
-    "rt.ground_roughness_m": ([0, 10], [-TINY, 10.1]),
     "rt.audit_links": ([0], [-1]),
     "rss.advanced.lag_window_s": ([TINY, 3600], [0.0, 3600.1]),
     "rss.span_db": ([[-1.0, 1.0], [0.0, 100_000.0]], [[1.0, 1.0], [2.0, 1.0], [0.0, 100_000.2]]),

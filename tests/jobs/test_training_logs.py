@@ -180,7 +180,7 @@ def test_an_unseen_flight_is_scored_with_the_same_antennas(folder: Path) -> None
 
 
 def test_settings_that_were_learned_count_as_antennas_do(folder: Path) -> None:
-    """Fitted numbers in a flight file (a mount, a roughness) have no file that could say where they come from."""
+    """Fitted numbers in a flight file (a mount, a reflection loss) have no file that could say where they come from."""
     own = settings("first", {"model": "iso"}, trained_on=list(trained_on((folder / "calibrated.yaml").read_text())))
     metrics, words = report(folder, write_yaml(folder / "own.yaml", own))
     assert words.startswith("Training flight")

@@ -103,8 +103,6 @@ class ExpectedLoss:
     in_leaf : bool
     reflection_db : float
         Per reflection.
-    ground_roughness_m : float
-        Standard deviation of the ground's height.
     """
 
     model: str = "none"
@@ -112,7 +110,6 @@ class ExpectedLoss:
     maximum_db: float | None = None
     in_leaf: bool = True
     reflection_db: float = 0.0
-    ground_roughness_m: float = 0.0
 
 
 def layout_positions(
@@ -563,7 +560,7 @@ class Reference:
 
     def loss_db(self, sequence: Sequence[Mirror], target: Vector) -> float | None:
         """Return the foliage and reflection loss of a path [dB]. None if it only just touches an opaque tree."""
-        total = self.loss.reflection_db * len(sequence) + self._rough_db(sequence, target)
+        total = self.loss.reflection_db * len(sequence)
         if self.loss.model == "none" or not len(self.site.trees):
             return total
         points = _bounces(sequence, self.source, target)
@@ -579,25 +576,6 @@ class Reference:
             # rounding decides whether a chord of a micrometre exists
             return None if 0 < touched < 1e-6 else (math.inf if touched else total)
         return total + foliage_db(self.loss, depth, self.link.carrier_hz)
-
-    def _rough_db(self, sequence: Sequence[Mirror], target: Vector) -> float:
-        """Return Ament's loss at the ground [dB].
-
-        The field falls by exp(-g / 2), with g = (4 pi sigma sin(grazing) / lambda)^2.
-        """
-        sigma = self.loss.ground_roughness_m
-        if not sigma or not any(map(_is_ground, sequence)):
-            return 0.0
-        points = _bounces(sequence, self.source, target)
-        if points is None:
-            return 0.0
-        total, wavelength = 0.0, C_MPS / self.link.carrier_hz
-        for mirror, (a, b) in zip(sequence, itertools.pairwise(points), strict=False):
-            if _is_ground(mirror):
-                sine = abs(b[2] - a[2]) / math.dist(a, b)
-                # the field falls by exp(-g / 2), so the power by exp(-g): 4.34 dB for each g
-                total += 10 * math.log10(math.e) * (4 * math.pi * sigma * sine / wavelength) ** 2
-        return total
 
     def matrix(
         self, paths: Sequence[tuple[Sequence[Mirror], float]], target: Vector, turn: Matrix
@@ -615,10 +593,6 @@ class Reference:
             h += amplitudes
             power += float((np.abs(amplitudes) ** 2).mean())
         return h, power
-
-
-def _is_ground(mirror: Mirror) -> bool:
-    return mirror.solid < 0 and mirror.normal == (0.0, 0.0, 1.0)
 
 
 def fresnel(cosine: float, eta: complex, thickness_m: float | None, wavelength: float) -> tuple[complex, complex]:

@@ -284,9 +284,6 @@ class Receiver:
         Coefficients per rank: a constant, then one per standardised feature.
     mean, scale : (features,)
         Mean and scale of the training features.
-    decision_weight : (ranks,)
-        The decided rank has the largest product of probability and weight. With ones, it is the most probable rank.
-        Other weights maximise kappa on held-out sectors of the training flights (:func:`decision_weights`).
     penalty : float
         Ridge penalty.
     constant : (ranks,)
@@ -298,7 +295,6 @@ class Receiver:
     coefficient: FloatArray
     mean: FloatArray
     scale: FloatArray
-    decision_weight: FloatArray
     penalty: float
     constant: FloatArray
     n: int
@@ -306,10 +302,6 @@ class Receiver:
     def probabilities(self, features: FloatArray) -> FloatArray:
         """Return the probability (n, ranks) of each rank at features (n, features), NaN if a feature is NaN."""
         return _softmax(_design((features - self.mean) / self.scale) @ self.coefficient.T)
-
-    def decide(self, probability: FloatArray) -> IntArray:
-        """Return one rank (n,) per row of probabilities, or 0 for a row of NaN."""
-        return decide(probability, self.decision_weight)
 
     @classmethod
     def from_dict(cls, numbers: Mapping[str, Any]) -> Receiver:
@@ -320,7 +312,7 @@ class Receiver:
         ValueError
             If a field is missing, or the shapes of the fields do not agree.
         """
-        names = ("coefficient", "mean", "scale", "decision_weight", "constant")
+        names = ("coefficient", "mean", "scale", "constant")
         if missing := [name for name in (*names, "penalty", "n") if name not in numbers]:
             raise ValueError(f"a receiver without {', '.join(missing)}")
         arrays = {name: np.asarray(numbers[name], dtype=np.float64) for name in names}
@@ -343,7 +335,6 @@ def _fitted(x: FloatArray, rank: IntArray, penalty: float) -> Receiver:
         coefficient=_fit_multinomial((x - mean) / scale, rank, np.ones(len(rank)), penalty),
         mean=mean,
         scale=scale,
-        decision_weight=np.ones(MAX_RANK),
         penalty=penalty,
         constant=constant_forecast(rank),
         n=len(rank),
@@ -550,7 +541,8 @@ class ReceiverMixture:
     members : tuple of Receiver
         One per geometry, best first.
     decision_weight : (ranks,)
-        Weights of the decision for the mean forecast.
+        The decided rank has the largest product of mean probability and weight. With ones, it is the most probable
+        rank. Other weights maximise kappa on held-out sectors of the training flights (:func:`decision_weights`).
     """
 
     members: tuple[Receiver, ...]
@@ -611,24 +603,15 @@ class FeatureChoice:
 
     Parameters
     ----------
-    best : int
-        Index of the candidate with the smallest log score on held-out groups.
     order : (tried,) int
         Candidates that were cross-validated, best first.
-    log_score : (tried,)
-        Log score on held-out groups [nat], in the order of ``order``.
     tied : tuple of int
         Candidates that are not significantly worse than the best: the 95 % interval of the difference of log scores on
         the same samples contains 0. The best comes first.
-    candidates : int
-        Number of candidates.
     """
 
-    best: int
     order: IntArray
-    log_score: FloatArray
     tied: tuple[int, ...]
-    candidates: int
 
 
 def choose_features(
@@ -655,7 +638,7 @@ def choose_features(
     Returns
     -------
     FeatureChoice
-        Best candidate, candidates that are not significantly worse, and finalists by log score.
+        Finalists by log score, and candidates that are not significantly worse than the best.
 
     Raises
     ------
@@ -669,12 +652,9 @@ def choose_features(
     final = np.argsort(np.round(rough, 9), kind="stable")[:finalists]
     held_out = (out_of_group(x[final[i : i + step]], y, group, _CHOICE_PENALTY) for i in range(0, len(final), step))
     losses = np.array([log_losses(probability, y) for part in held_out for probability in part])
-    score = losses.mean(axis=1)
-    rows = np.argsort(np.round(score, 9), kind="stable")
+    rows = np.argsort(np.round(losses.mean(axis=1), 9), kind="stable")
     tied = tuple(int(final[r]) for r in rows if _not_worse(losses[r] - losses[rows[0]]))
-    return FeatureChoice(
-        best=int(final[rows[0]]), order=final[rows], log_score=score[rows], tied=tied, candidates=len(features)
-    )
+    return FeatureChoice(order=final[rows], tied=tied)
 
 
 def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray) -> float:

@@ -447,7 +447,6 @@ flights: [a.yaml, b.yaml]
 settings:
   one: {}
   two: {rt.max_depth: 0, link.rss.uav.yaw_deg: 315}
-calibration: channel
 """
 
 

@@ -105,8 +105,8 @@ def test_bench_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
 
 
 def test_a_table_too_wide_for_the_terminal_is_text_without_broken_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+    from aerpaw_cmp.cli.commands.logs import ACCOUNT
     from aerpaw_cmp.cli.shown import table
-    from aerpaw_cmp.logs.ingest import ACCOUNT
 
     file = "a_rather_long_name_of_a_power_log.txt"
     row = [file, "sounder_log", "rss: power 123456", "123456", "123450", "6", "0", "30.5"]

@@ -382,34 +382,33 @@ def _milliwatts(per_unit: float) -> Callable[[FloatArray], FloatArray]:
 ACROSS_50_OHM = ("dbuv", "db\u00b5v", "db\u03bcv")
 _DBUV_OF_0_DBM = 90 + 10 * float(np.log10(50.0))
 
-# Each unit that a name or a cell may have: the unit after conversion, and the function that converts it.
+# Units that a name or a cell may have, by the unit after conversion, with their factors.
+_FACTORS: dict[str, dict[str, float]] = {
+    "m": {
+        "ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "kft": 304.8, "m": 1.0, "meter": 1.0, "meters": 1.0,
+        "metres": 1.0, "dm": 0.1, "cm": 0.01, "mm": 1e-3, "km": 1e3, "yd": 0.9144, "in": 0.0254, "inch": 0.0254,
+        "inches": 0.0254},
+    "m/s": {
+        "mph": 0.44704, "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "kts": 0.514444,
+        "kt": 0.514444, "kn": 0.514444, "knots": 0.514444, "cm/s": 0.01, "ft/s": 0.3048},
+    "deg": {
+        "deg": 1.0, "degree": 1.0, "degrees": 1.0, "\u00b0": 1.0, "rad": 180 / np.pi, "radians": 180 / np.pi,
+        "dege7": 1e-7, "deg e7": 1e-7, "semicircles": 180 / 2**31, "degrees e7": 1e-7, "e7": 1e-7, "deg*1e7": 1e-7,
+        "1e7": 1e-7, "e6": 1e-6, "microdegrees": 1e-6, "cdeg": 0.01, "centidegrees": 0.01, "mrad": 0.18 / np.pi},
+    "bit/s": {
+        "bps": 1.0, "bit/s": 1.0, "kbps": 1e3, "kbit/s": 1e3, "mbps": 1e6, "mbit/s": 1e6, "gbps": 1e9, "gbit/s": 1e9},
+    "dB": {"db": 1.0}, _FULL_SCALE: {"dbfs": 1.0}, "dBm": {"dbm": 1.0}, "dBuV/m": {"dbuv/m": 1.0}, "V": {"mv": 1e-3},
+}  # fmt: skip
+# Powers by their number of milliwatts, which become dBm.
+_POWERS = {"mw": 1.0, "w": 1e3, "uw": 1e-3, "\u00b5w": 1e-3, "nw": 1e-6, "pw": 1e-9}
+# Each unit: the unit after conversion, and the function that converts it.
 UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
-    **{word: ("m", _times(factor)) for word, factor in (
-        ("ft", 0.3048), ("feet", 0.3048), ("foot", 0.3048), ("kft", 304.8), ("m", 1.0), ("meter", 1.0),
-        ("meters", 1.0), ("metres", 1.0), ("dm", 0.1), ("cm", 0.01), ("mm", 1e-3), ("km", 1e3), ("yd", 0.9144),
-        ("in", 0.0254), ("inch", 0.0254), ("inches", 0.0254))},
-    **{word: ("m/s", _times(factor)) for word, factor in (
-        ("mph", 0.44704), ("m/s", 1.0), ("mps", 1.0), ("km/h", 1 / 3.6), ("kmh", 1 / 3.6), ("kph", 1 / 3.6),
-        ("kts", 0.514444), ("kt", 0.514444), ("kn", 0.514444), ("knots", 0.514444), ("cm/s", 0.01), ("ft/s", 0.3048))},
-    **{word: ("deg", _times(factor)) for word, factor in (
-        ("deg", 1.0), ("degree", 1.0), ("degrees", 1.0), ("\u00b0", 1.0), ("rad", 180 / np.pi),
-        ("radians", 180 / np.pi), ("dege7", 1e-7), ("deg e7", 1e-7),
-        ("semicircles", 180 / 2**31),
-        ("degrees e7", 1e-7), ("e7", 1e-7), ("deg*1e7", 1e-7), ("1e7", 1e-7), ("e6", 1e-6),
-        ("microdegrees", 1e-6), ("cdeg", 0.01), ("centidegrees", 0.01), ("mrad", 0.18 / np.pi))},
-    **{word: ("bit/s", _times(factor)) for word, factor in (
-        ("bps", 1.0), ("bit/s", 1.0), ("kbps", 1e3), ("kbit/s", 1e3), ("mbps", 1e6), ("mbit/s", 1e6), ("gbps", 1e9),
-        ("gbit/s", 1e9))},
-    "db": ("dB", _times(1.0)),
-    "dbfs": (_FULL_SCALE, _times(1.0)),
-    "linear": ("dB", _milliwatts(1.0)),
-    "mv": ("V", _times(1e-3)),
-    "dbm": ("dBm", _times(1.0)), "dbuv/m": ("dBuV/m", _times(1.0)),
+    **{word: (unit, _times(factor)) for unit, words in _FACTORS.items() for word, factor in words.items()},
+    **{word: ("dBm", _milliwatts(factor)) for word, factor in _POWERS.items()},
     **{word: ("dBm", lambda values: values - _DBUV_OF_0_DBM) for word in ACROSS_50_OHM},
     "dbw": ("dBm", lambda values: values + 30.0),
-    "mw": ("dBm", _milliwatts(1.0)), "w": ("dBm", _milliwatts(1e3)), "uw": ("dBm", _milliwatts(1e-3)),
-    "\u00b5w": ("dBm", _milliwatts(1e-3)), "nw": ("dBm", _milliwatts(1e-6)), "pw": ("dBm", _milliwatts(1e-9)),
-}  # fmt: skip
+    "linear": ("dB", _milliwatts(1.0)),
+}
 # Units of MAVLink's integers: a converter that writes decimals has already scaled them.
 OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7", "semicircles")
 _DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
@@ -431,9 +430,9 @@ def is_unit(text: str) -> bool:
 def _scale(written: str) -> tuple[float, str]:
     """Return the factor before a unit (1 if there is none) and the unit."""
     scaled = _SCALED.fullmatch(written)
-    return (
-        (1.0, written) if scaled is None else (float(scaled[1] if scaled[1][0] != "e" else f"1{scaled[1]}"), scaled[2])
-    )
+    if scaled is None:
+        return 1.0, written
+    return float(f"1{scaled[1]}" if scaled[1].startswith("e") else scaled[1]), scaled[2]
 
 
 def unit_of(written: str) -> str:

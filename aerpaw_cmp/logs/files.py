@@ -344,19 +344,12 @@ class Column:
     """A column that grows in place: joining stored pieces would need twice the memory."""
 
     def __init__(self, dtype: Any) -> None:
-        self._values: AnyArray = np.zeros(0, dtype=dtype)
-        self._count = 0
+        self._content, self._dtype = bytearray(), dtype  # a bytearray reserves an eighth more, and moves pages
 
     def extend(self, piece: AnyArray) -> None:
         """Append values."""
-        end = self._count + len(piece)
-        if end > len(self._values):
-            # reserve a sixteenth more, as a compromise between moves and unused memory
-            self._values.resize(end + end // 16, refcheck=False)  # the system moves pages, not bytes
-        self._values[self._count : end] = piece
-        self._count = end
+        self._content += piece.astype(self._dtype, copy=False).tobytes()
 
     def array(self) -> AnyArray:
-        """Return the column. Call this when all pieces have been added."""
-        self._values.resize(self._count, refcheck=False)
-        return self._values
+        """Return the column, which then cannot grow."""
+        return np.frombuffer(self._content, dtype=self._dtype)

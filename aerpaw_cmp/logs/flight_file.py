@@ -20,6 +20,7 @@ A file without the SHA-256 (truncated, or changed by another program) is checked
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -109,11 +110,15 @@ def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
 def is_flight_file(path: Path) -> bool:
     """Check whether a file is an unchanged flight file, by the SHA-256 at its end."""
     with path.open("rb") as book:
-        content = book.seek(0, os.SEEK_END) - len(_SEAL) - _DIGEST_BYTES
-        if content <= 0:
-            return False
-        book.seek(content)
-        return book.read() == _SEAL + _digest(book, content)
+        return _unchanged(book) is True
+
+
+def _unchanged(book: BinaryIO) -> bool | None:
+    """Check whether the SHA-256 at the end is that of the content. Return None if there is no SHA-256."""
+    size = book.seek(0, os.SEEK_END) - len(_SEAL) - _DIGEST_BYTES
+    book.seek(max(size, 0))
+    end = book.read()
+    return end == _SEAL + _digest(book, size) if size > 0 and end.startswith(_SEAL) else None
 
 
 def _digest(book: BinaryIO, size: int) -> bytes:
@@ -124,20 +129,6 @@ def _digest(book: BinaryIO, size: int) -> bytes:
         digest.update(block)
         size -= len(block)
     return digest.digest()
-
-
-def _refuse_changed(content: bytes, path: str | Path) -> None:
-    """Raise InputError if the file ends with a SHA-256 that is not that of its content."""
-    size = len(content) - len(_SEAL) - _DIGEST_BYTES
-    if size <= 0 or content[size:-_DIGEST_BYTES] != _SEAL:
-        return
-    if hashlib.sha256(memoryview(content)[:size]).digest() != content[-_DIGEST_BYTES:]:
-        raise InputError(
-            "the flight file is damaged (its content does not have the SHA-256 written with it)",
-            expected="the bytes that 'aerpaw-cmp ingest -o' wrote",
-            cause="a failing disk or transfer: copy it again or ingest the logs again",
-            path=path,
-        )
 
 
 def _write_file(group: Any, file: IngestedFile, sink: Sink) -> None:
@@ -190,12 +181,9 @@ def _write_column(group: Any, name: str, column: pd.Series[Any], kind: str) -> N
         return np.asarray(stamps.astype(numbers[kind]))
 
     cells = column.to_numpy()
-    if count <= _AT_ONCE:
-        group.create_dataset(name, data=converted(cells), **packing)
-    else:
-        place = group.create_dataset(name, (count,), numbers[kind], **packing)
-        for first in range(0, count, _AT_ONCE):
-            place[first : first + _AT_ONCE] = converted(cells[first : first + _AT_ONCE])
+    place = group.create_dataset(name, (count,), numbers[kind], **packing)
+    for first in range(0, count, _AT_ONCE):
+        place[first : first + _AT_ONCE] = converted(cells[first : first + _AT_ONCE])
     if kind == "text":
         _write_json(group, f"{name}.words", list(number)[1:])
 
@@ -238,7 +226,13 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
     content = Path(path).read_bytes()
     if not content.startswith(_MAGIC):
         raise InputError("not an HDF5 file", expected="a flight file of 'aerpaw-cmp ingest -o'", path=path)
-    _refuse_changed(content, path)
+    if _unchanged(io.BytesIO(content)) is False:
+        raise InputError(
+            "the flight file is damaged (its content does not have the SHA-256 written with it)",
+            expected="the bytes that 'aerpaw-cmp ingest -o' wrote",
+            cause="a failing disk or transfer: copy it again or ingest the logs again",
+            path=path,
+        )
     items, notes = native.read("hdf5", content)
     form, version = notes["attributes"].get("format"), notes["attributes"].get("version")
     if form != FORMAT:

@@ -53,7 +53,9 @@ class Logs(dict[str, pd.DataFrame]):
         for file_name, file, stream in streams:
             place = file_name if alike[file_name, stream.name] == 1 else file.path
             key = stream.name if names[stream.name] == 1 else f"{place}:{stream.name}"
-            frame = _in_utc(stream.frame)
+            frame = stream.frame.copy(deep=False)
+            # records have naive times in UTC
+            frame["time"] = pd.to_datetime(frame["time"]).dt.tz_localize("UTC")
             if stream.kind in ("rss", "rank") and (node := named_tower("/".join(Path(file.path).parts[-2:]), _TOWERS)):
                 frame.attrs["node"] = node
             frame.attrs.update(stream.attributes)
@@ -97,7 +99,10 @@ class Logs(dict[str, pd.DataFrame]):
 
     def __repr__(self) -> str:
         """Return a line per stream."""
-        lines = ("  " + _line(name, frame) for name, frame in self.items())
+        lines = (
+            f"  {name}: {frame.attrs['kind']}, {counted(len(frame), 'record')} ({frame.attrs['reader']})"
+            for name, frame in self.items()
+        )
         return "\n".join([f"Logs of {counted(len(self.files), 'file')}", *lines])
 
     def _repr_html_(self) -> str:
@@ -107,17 +112,6 @@ class Logs(dict[str, pd.DataFrame]):
             for name, frame in self.items()
         ]
         return html_table(("stream", "kind", "reader", "records", "file"), rows)
-
-
-def _line(name: str, frame: pd.DataFrame) -> str:
-    return f"{name}: {frame.attrs['kind']}, {counted(len(frame), 'record')} ({frame.attrs['reader']})"
-
-
-def _in_utc(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a frame whose ``time`` has the zone UTC, unlike the naive times of records."""
-    out: pd.DataFrame = frame.copy(deep=False)
-    out["time"] = pd.to_datetime(out["time"]).dt.tz_localize("UTC")
-    return out
 
 
 @from_python

@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.errors import AerpawCmpError, InputError, UsageError, one_line, parsing
-from ..common.stages import duration
 from ..common.text import counted
 from . import files as packed
 from .flight_file import IngestedFile, read_flight
 from .readers import DEEP_BYTES, HEAD_BYTES, Reader, ReadOptions, blaming, by_name, catalogue, claims, identify
-from .records import ReadResult, RejectedLine, RejectedReason, Stream, by_reason, has_wall_clock
+from .records import ReadResult, RejectedLine, RejectedReason, Stream, by_reason
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -76,11 +75,6 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
     """
     data = _unpacked(_raw(Path(path)), path)
     return data, hashlib.sha256(data).hexdigest()
-
-
-def read_head(place: Path) -> bytes:
-    """Return the first bytes of a log on disk, which the sniffers test."""
-    return as_utf8(_raw(place, HEAD_BYTES))
 
 
 def _unpacked(raw: bytes, path: str | Path) -> bytes:
@@ -535,25 +529,22 @@ def _later(result: ReadResult, rollovers: int) -> ReadResult:
 
     Without rollovers, dates before the first LTE networks (2009) are reported if one rollover makes them plausible.
     """
-    if not rollovers:
-        first = min((s.frame["time"].min() for s in result.streams if len(s.frame)), default=None)
-        if first is not None and first >= _FUTURE:
-            text = (
-                f"the dates begin on {first:%Y-%m-%d}, in the future: do the times count from 1904 or 1900, not 1970?"
-            )
-            return replace(result, warnings=(*result.warnings, text))
-        if first is None or not _PLAUSIBLE_FROM - timedelta(days=ROLLOVER_DAYS) < first < _PLAUSIBLE_FROM:
-            return result
+    streams, days = result.streams, rollovers * ROLLOVER_DAYS
+    first = min((s.frame["time"].min() for s in streams if len(s.frame)), default=_PLAUSIBLE_FROM)
+    if rollovers:
+        shift = timedelta(days=days)
+        streams = tuple(replace(s, frame=s.frame.assign(time=s.frame["time"] + shift)) for s in streams)
+        text = f"{counted(rollovers, 'rollover')} of the GPS week number: {days} days were added to the times"
+    elif first >= _FUTURE:
+        text = f"the dates begin on {first:%Y-%m-%d}, in the future: do the times count from 1904 or 1900, not 1970?"
+    elif _PLAUSIBLE_FROM - timedelta(days=ROLLOVER_DAYS) < first < _PLAUSIBLE_FROM:
         text = (
             f"the dates begin on {first:%Y-%m-%d}: if the week number of the GPS receiver rolled over, "
             "'gps_rollovers: 1' next to the log in flight.yaml adds 1 024 weeks"
         )
-        return replace(result, warnings=(*result.warnings, text))
-    days = rollovers * ROLLOVER_DAYS
-    shift = timedelta(days=days)
-    streams = [replace(s, frame=s.frame.assign(time=s.frame["time"] + shift)) for s in result.streams]
-    text = f"{counted(rollovers, 'rollover')} of the GPS week number: {days} days were added to the times"
-    return replace(result, streams=tuple(streams), warnings=(*result.warnings, text))
+    else:
+        return result
+    return replace(result, streams=streams, warnings=(*result.warnings, text))
 
 
 def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) -> _Found:
@@ -615,67 +606,6 @@ def _span(stream: Stream) -> dict[str, Any]:
     seconds = (end - start).total_seconds()
     rate = (stream.rows - 1) / seconds if seconds > 0 else None
     return {"start": start.isoformat() + "Z", "end": end.isoformat() + "Z", "rate_hz": rate}
-
-
-# Columns of :func:`account_rows`.
-ACCOUNT = ("file", "reader", "streams (rows)", "lines", "accepted", "rejected", "blank", "rate Hz", "start UTC", "s")
-
-MOST_NAMED = 6
-
-
-def account_rows(account: Mapping[str, Any], every_stream: bool = False) -> tuple[str, list[list[str]]]:
-    """Return the folder that all paths share, and a row of :data:`ACCOUNT` per file.
-
-    A kind with more than :data:`MOST_NAMED` streams, as in a wide table, is only counted, unless ``every_stream`` is
-    set.
-    """
-    folder = _common_folder([Path(file["path"]) for file in account["files"]])
-    return folder, [_account_row(file, folder, every_stream) for file in account["files"]]
-
-
-def _common_folder(paths: Sequence[Path]) -> str:
-    """Return the folder that all paths share, or an empty text if there is no such folder."""
-    if len(paths) < 2 or len({path.is_absolute() for path in paths}) > 1:
-        return ""
-    return os.path.commonpath([path.parent for path in paths])
-
-
-def _account_row(file: Mapping[str, Any], folder: str, every_stream: bool) -> list[str]:
-    streams = file["streams"]
-    kinds: dict[str, list[str]] = {}
-    for stream in streams:
-        kinds.setdefault(stream["kind"], []).append(f"{stream['name']} {stream['rows']}")
-    # use a set, because streams of one log mostly have the same rate
-    rates = {"-" if s["rate_hz"] is None else _rate_words(s["rate_hz"]) for s in streams}
-    start, seconds = _start_and_length([s for s in streams if s["start"]])
-    return [
-        one_line(str(Path(file["path"]).relative_to(folder) if folder else file["path"])),
-        file["reader"],
-        "; ".join(
-            f"{kind}: {', '.join(names) if every_stream or len(names) <= MOST_NAMED else f'{len(names)} (--all)'}"
-            for kind, names in kinds.items()
-        )
-        or "-",
-        *(str(file[key]) for key in ("lines", "accepted", "rejected", "blank")),
-        ", ".join(sorted(rates)) or "-",
-        start,
-        seconds,
-    ]
-
-
-def _rate_words(rate_hz: float) -> str:
-    return f"{rate_hz:.3g}" if rate_hz >= 0.1 else f"1 in {duration(1.0 / rate_hz)}"
-
-
-def _start_and_length(streams: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
-    import numpy as np
-
-    if not streams:
-        return "-", "-"
-    first = min(np.datetime64(stream["start"].rstrip("Z")) for stream in streams)
-    last = max(np.datetime64(stream["end"].rstrip("Z")) for stream in streams)
-    start = str(first.astype("datetime64[s]")).replace("T", " ")
-    return start if has_wall_clock(first) else "relative", f"{(last - first) / np.timedelta64(1, 's'):.1f}"
 
 
 def account_notes(account: Mapping[str, Any]) -> list[str]:

@@ -18,8 +18,8 @@ vehicles. Both are reported, and their values stay as they are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -255,33 +255,19 @@ def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArr
     return astray, at_rest, float((step_m / step_s)[max(at - 1, 0) : at + 1].max()), at
 
 
-@dataclass(frozen=True, slots=True)
-class Limit:
-    """Possible values of one quantity.
-
-    Parameters
-    ----------
-    columns : tuple of str
-        Components that become NaN together.
-    ranges : tuple of (low, high)
-        Smallest and largest possible value of each column, in the unit of its name.
-    flag : str
-        Flag of rows beyond it.
-    """
-
-    columns: tuple[str, ...]
-    ranges: tuple[tuple[float, float], ...]
-    flag: str
-
-
-# Quantities that mean the same in every stream. Levels (by unit) and times have their own rules below.
-LIMITS: tuple[Limit, ...] = (
-    Limit(PLACE, ((-90.0, 90.0), (-180.0, 180.0), (-1000.0, 20_000.0)), "position_out_of_range"),
-    Limit(COLUMNS["telemetry"][3:6], ((-180.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)), "attitude_out_of_range"),
-    Limit(COLUMNS["telemetry"][6:9], ((-200.0, 200.0),) * 3, "velocity_out_of_range"),
-    Limit(("rsrp_dbm",), ((-200.0, 50.0),), "rsrp_out_of_range"),
-    Limit(("sinr_db",), ((-100.0, 100.0),), "sinr_out_of_range"),
-)
+# The flag of rows beyond a limit, and the smallest and largest possible value of each column [unit of its name]. The
+# columns of a flag become NaN together. Levels (by unit) and times have their own rules below.
+LIMITS: dict[str, dict[str, tuple[float, float]]] = {
+    "position_out_of_range": {
+        "latitude_deg": (-90.0, 90.0), "longitude_deg": (-180.0, 180.0), "altitude_m": (-1000.0, 20_000.0),
+    },
+    "attitude_out_of_range": {
+        "roll_deg": (-180.0, 180.0), "pitch_deg": (-180.0, 180.0), "yaw_deg": (-360.0, 360.0),
+    },
+    "velocity_out_of_range": dict.fromkeys(COLUMNS["telemetry"][6:9], (-200.0, 200.0)),
+    "rsrp_out_of_range": {"rsrp_dbm": (-200.0, 50.0)},
+    "sinr_out_of_range": {"sinr_db": (-100.0, 100.0)},
+}  # fmt: skip
 
 # Levels by unit: thermal noise of 1 Hz is -174 dBm, no receiver in flight receives 30 dBm; a ratio to the noise is
 # wider.
@@ -321,10 +307,7 @@ def check(result: ReadResult) -> ReadResult:
     """
     checks = [_Check(stream) for stream in result.streams]
     warnings = [text for check in checks for text in check.run()]
-    streams = tuple(
-        check.stream if check.frame is check.stream.frame else replace(check.stream, frame=check.frame)
-        for check in checks
-    )
+    streams = tuple(replace(check.stream, frame=check.frame) for check in checks)
     return replace(result, streams=streams, warnings=(*result.warnings, *warnings)) if warnings else result
 
 
@@ -362,9 +345,9 @@ class _Check:
             if self._about.get("unit") == "dBm":
                 self._no_index()
             bounds = LEVEL_DB.get(str(self._about.get("unit")), _LEVEL_OTHER_DB)
-            limits = (*LIMITS, Limit(("rss_db",), (bounds,), "level_out_of_range"))
-        for limit in limits:
-            self._within(limit)
+            limits = {**LIMITS, "level_out_of_range": {"rss_db": bounds}}
+        for flag, ranges in limits.items():
+            self._within(flag, ranges)
         if kind == "rank":
             self._within_ports()
         if kind == "telemetry":
@@ -393,9 +376,8 @@ class _Check:
         self._said.append(f"{self._what}: {rows} flagged {flag}; the first: {first} in line {line}, {why}; {end}")
         self.frame = _marked(self.frame, bad, flag, void)
 
-    def _within(self, limit: Limit) -> None:
-        names = [name for name in limit.columns if name in self.frame.columns]
-        ranges = dict(zip(limit.columns, limit.ranges, strict=True))
+    def _within(self, flag: str, ranges: Mapping[str, tuple[float, float]]) -> None:
+        names = [name for name in ranges if name in self.frame.columns]
         beyond: dict[str, BoolArray] = {}
         for name in names:
             value, (low, high) = self._values(name), ranges[name]
@@ -408,15 +390,12 @@ class _Check:
             return
         name = min(beyond, key=lambda name: int(np.argmax(beyond[name])))
         bad, (low, high) = np.any([*beyond.values()], axis=0), ranges[name]
-        first = f"{name} {self._values(name)[int(np.argmax(bad))]:.6g}"
-        swap = self._exchanged(bad) if "latitude_deg" in names else ""
-        self._flag(bad, limit.flag, first, f"where {low:g} .. {high:g} can be{swap}", names)
-
-    def _exchanged(self, bad: BoolArray) -> str:
-        """Return a hint if every impossible position were possible with its angles swapped."""
-        latitude, longitude = (np.abs(self._values(name)[bad]) for name in PLACE[:2])
-        fits = (latitude > 90.0) & (latitude <= 180.0) & (longitude <= 90.0)
-        return "; are latitude and longitude swapped?" if fits.all() else ""
+        first, hint = f"{name} {self._values(name)[int(np.argmax(bad))]:.6g}", ""
+        if "latitude_deg" in names:
+            latitude, longitude = (np.abs(self._values(name)[bad]) for name in PLACE[:2])
+            if ((latitude > 90.0) & (latitude <= 180.0) & (longitude <= 90.0)).all():
+                hint = "; are latitude and longitude swapped?"
+        self._flag(bad, flag, first, f"where {low:g} .. {high:g} can be{hint}", names)
 
     def _at_a_site_if_otherwise(self) -> None:
         """Report possible positions that would lie at a site of AERPAW if they were written differently."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import islice
 from typing import NamedTuple
@@ -116,13 +116,15 @@ def _read_hdf5(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArra
     variables, notes = read("matlab", data)
     chosen = {name: values.T for name, values in variables.items() if wanted is None or name in wanted}
     text = {name for name, kind in notes["classes"].items() if kind == "char"}
-    return {name: _letters(values) if name in text and values.ndim == 2 else values for name, values in chosen.items()}
+    for name in text & chosen.keys():
+        if chosen[name].ndim == 2:
+            chosen[name] = _texts([map(chr, row) for row in chosen[name].astype(np.uint16).tolist()])
+    return chosen
 
 
-def _letters(codes: AnyArray) -> AnyArray:
-    """Return the rows of a matrix of character codes as text, without trailing blanks."""
-    rows = codes.astype(np.uint16).tolist()
-    return np.array(["".join(map(chr, row)).rstrip() for row in rows] or [""], dtype=np.str_)[: len(codes)]
+def _texts(rows: Sequence[Iterable[str]]) -> AnyArray:
+    """Return rows of characters as texts without trailing blanks."""
+    return np.array(["".join(row).rstrip("\0").rstrip() for row in rows] or [""], dtype=np.str_)[: len(rows)]
 
 
 def _elements(data: bytes, at: int, order: str, *, padded: bool, cut: bool = False) -> Iterator[_Element]:
@@ -166,12 +168,10 @@ def _inflated(element: _Element, order: str, most: int) -> _Element:
         )
     if not machine.eof:
         raise _damaged("a compressed variable is truncated")
-    if len(plain) < 8:
+    variable = next(_elements(plain, 0, order, padded=False), None)
+    if variable is None:
         raise _damaged("an empty variable")
-    kind, size = struct.unpack_from(order + "II", plain)
-    if size > len(plain) - 8:
-        raise _damaged(f"{size} bytes announced, {len(plain) - 8} left")
-    return _Element(kind, plain[8 : 8 + size])
+    return variable
 
 
 def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[str, AnyArray | None]:
@@ -238,8 +238,4 @@ def _rows(values: _Element, shape: tuple[int, ...], order: str) -> AnyArray:
     text = values.body.decode(encoding, errors="replace")
     if len(text) != math.prod(shape):
         raise _damaged(f"{len(text)} characters for {shape[0]} rows of {shape[1]}")
-    letters = np.array(list(text), dtype="<U1").reshape(shape, order="F")
-    if shape[1] == 0 or shape[0] == 0:
-        return np.zeros(shape[0], dtype="<U1")
-    joined: AnyArray = np.char.rstrip(np.ascontiguousarray(letters).view(f"<U{shape[1]}")[:, 0])
-    return joined
+    return _texts(np.array(list(text), dtype="<U1").reshape(shape, order="F").tolist())

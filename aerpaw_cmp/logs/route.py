@@ -32,7 +32,7 @@ from ..common.errors import InputError, parsing
 from ..common.kml import named, outermost, plain_tag, xml_root
 from ..common.text import counted
 from . import dictionary
-from .ingest import as_utf8, read_bytes, read_file, read_head
+from .ingest import as_utf8, read_bytes, read_file, sniffers_of
 from .readers import HEAD_BYTES, ReadOptions, claims
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFra
         place = Path(path)
         if place.is_file() and place.stat().st_size > MOST_BYTES:
             # log readers read a large file in pieces
-            if not any(reader.kinds for reader in claims(read_head(place))):
+            if not sniffers_of(place):
                 raise InputError(
                     f"the file has {place.stat().st_size} bytes",
                     expected=f"at most {MOST_POINTS} points and {MOST_BYTES} bytes",
@@ -366,6 +366,8 @@ def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
 
 # --- tables ------------------------------------------------------------------------------------------
 
+_NUMBER = re.compile(r"\s*[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?\s*")
+
 
 def _sheet(data: bytes) -> _Route:
     """Return the waypoints of a table, which without a header are latitude, longitude, height and yaw."""
@@ -387,7 +389,7 @@ def _sheet(data: bytes) -> _Route:
     }
     begin = 2
     if columns["latitude_deg"] < 0 or columns["longitude_deg"] < 0:
-        if not all(_is_number(cell) for cell in first) or not 2 <= len(first) <= 4:
+        if not all(map(_NUMBER.fullmatch, first)) or not 2 <= len(first) <= 4:
             raise InputError(f"no route: {head.rstrip()[:60]!r}", expected=_EXPECTED)
         columns = {key: index if index < len(first) else -1 for index, key in enumerate(COLUMNS[:4])}
         rows, begin = chain([first], rows), 1
@@ -414,21 +416,14 @@ def _add_row(route: _Route, row: Sequence[str], columns: Mapping[str, int], unit
     number : int
         Number of the row, for messages.
     """
-    cells = {key: row[index].strip() if 0 <= index < len(row) else "" for key, index in columns.items()}
     try:
-        values = {
-            key: float(dictionary.converted(np.array(float(cell)), units[columns[key]])) if cell else math.nan
-            for key, cell in cells.items()
-        }
+        cells = [(row[index].strip() if 0 <= index < len(row) else "", index) for index in columns.values()]
+        values = [
+            float(dictionary.converted(np.array(float(cell)), units[index])) if cell else math.nan
+            for cell, index in cells
+        ]
     except ValueError as error:
         raise InputError(
             f"row {number} has text instead of a number ({error})", expected="latitude, longitude"
         ) from error
-    route.add(*values.values())
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        return math.isfinite(float(cell))
-    except ValueError:
-        return False
+    route.add(*values)

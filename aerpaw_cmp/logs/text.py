@@ -392,7 +392,7 @@ def _offset_s(wall_s: int, where: tzinfo, fold: int) -> int:
 
 
 def _offsets_s(buckets: IntArray, where: tzinfo, fold: int) -> IntArray:
-    return np.array([_offset_s(int(bucket) * _BUCKET_S, where, fold) for bucket in buckets.tolist()], dtype=np.int64)
+    return np.array([_offset_s(bucket * _BUCKET_S, where, fold) for bucket in buckets.tolist()], dtype=np.int64)
 
 
 def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Instants:
@@ -426,19 +426,17 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
             expected=f"timezone: {turned} (with summer time) or Etc/GMT{-hours:+.0f} (without)",
         )
     length = np.diff(np.append(starts, len(wall_ns)))
-    if np.array_equal(first, second):
-        return Instants(_minus(wall_ns, first[index], length), *np.zeros((2, len(wall_ns)), dtype=bool))
     ambiguous = np.repeat((first > second)[index], length)
     nonexistent = np.repeat((first < second)[index], length)
-    utc = _minus(wall_ns, first[index], length)
-    back = _first_step_back(wall_ns) if ambiguous.any() else len(wall_ns)
-    if back < len(wall_ns):
-        behind = ambiguous.copy()
-        behind[:back] = False
-        # the second pass is later by the change of the clock
-        utc[behind] += np.repeat((first - second)[index], length)[behind].astype("timedelta64[s]")
+    utc = np.repeat(first[index] * 1_000_000_000, length)
+    np.subtract(wall_ns, utc, out=utc)  # in place, for a log of 1 GB
     warnings = []
     if ambiguous.any():
+        back = np.flatnonzero(np.diff(wall_ns // 1_000_000_000) <= -1800)
+        behind = ambiguous.copy()
+        behind[: back[0] + 1 if len(back) else None] = False
+        # the second pass is later by the change of the clock
+        utc[behind] += np.repeat((first - second)[index], length)[behind] * 1_000_000_000
         warnings.append(
             f"{counted(int(ambiguous.sum()), 'time')} in the hour that occurs twice in {name}: read as daylight time "
             f"until the log's clock steps back; flagged {_AMBIGUOUS}"
@@ -447,27 +445,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
         warnings.append(
             f"{counted(int(nonexistent.sum()), 'time')} in the hour that {name} skipped (wrong zone?): {_NONEXISTENT}"
         )
-    return Instants(utc, ambiguous, nonexistent, tuple(warnings))
-
-
-def _minus(wall_ns: IntArray, offset_s: IntArray, length: IntArray) -> AnyArray:
-    """Return UTC of wall clocks [ns] in runs of ``length`` with one offset [s], in one array."""
-    utc = np.repeat(offset_s * 1_000_000_000, length)
-    np.subtract(wall_ns, utc, out=utc)
-    return utc.view("datetime64[ns]")
-
-
-def _first_step_back(wall_ns: IntArray) -> int:
-    """Return the index after the first step back by half an hour or more, or the number of times."""
-    for first in range(0, len(wall_ns) - 1, _AT_ONCE):
-        whole_s = wall_ns[first : first + _AT_ONCE + 1] // 1_000_000_000
-        steps = np.flatnonzero(whole_s[1:] - whole_s[:-1] <= -1800)
-        if len(steps):
-            return first + int(steps[0]) + 1
-    return len(wall_ns)
-
-
-_AT_ONCE = 1 << 20
+    return Instants(utc.view("datetime64[ns]"), ambiguous, nonexistent, tuple(warnings))
 
 
 def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
@@ -601,8 +579,7 @@ def _zone_s(text: bytes) -> int | None:
     match = re.fullmatch(rb"([+-])(\d\d):?(\d\d)", text)
     if not match:
         return None
-    seconds = int(match[2]) * 3600 + int(match[3]) * 60
-    return -seconds if match[1] == b"-" else seconds
+    return int(match[1] + match[2]) * 3600 + int(match[1] + match[3]) * 60
 
 
 def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> tuple[Instants, BoolArray]:
@@ -694,14 +671,10 @@ def frame(
         "flag": pd.Series(array(flag, dtype=object), dtype=object, copy=False),
     }
     for name in COLUMNS[kind]:
-        if name in _INTEGERS:
-            content[name] = array(values[name], dtype=np.int64) if name in values else np.full(count, -1)
-        else:
-            content[name] = array(values[name], dtype=np.float64) if name in values else np.full(count, np.nan)
-    for name, column in values.items():
-        if name not in content:
-            # copy the array, because several streams may use it
-            content[name] = np.array(column)
+        dtype, missing = (np.int64, -1) if name in _INTEGERS else (np.float64, np.nan)
+        content[name] = array(values[name], dtype=dtype) if name in values else np.full(count, missing)
+    # copy the other arrays, because several streams may use them
+    content |= {name: np.array(column) for name, column in values.items() if name not in content}
     columns: pd.DataFrame = pd.DataFrame(content, copy=False)
     return columns
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.errors import UsageError
-from ..common.units import AnyArray, unmasked
+from ..common.units import unmasked
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,7 +32,7 @@ def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]
     timezone : str
         IANA zone of the simulated clock.
     digits : int
-        Number of digits of the fraction: 0, 3 or 6. Further digits are cut off, as by ``strftime``.
+        Number of digits of the fraction, 1 to 6. Further digits are cut off, as by ``strftime``.
 
     Raises
     ------
@@ -47,13 +46,12 @@ def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]
     """
     import pandas as pd
 
+    from .text import zone
+
     index = pd.DatetimeIndex(np.asarray(times, dtype="datetime64[ns]"), tz="UTC")
-    try:
-        local = index.tz_convert(timezone).tz_localize(None).to_numpy().astype("datetime64[us]")
-    except Exception as error:  # zoneinfo and pandas raise several kinds of exceptions for a wrong name
-        raise UsageError(f"unknown time zone {timezone!r}", expected="an IANA name, e.g. America/New_York") from error
-    texts = [str(text).replace("T", " ") for text in np.datetime_as_string(local, unit="us")]
-    return texts if digits == 6 else [text[: 20 + digits] if digits else text[:19] for text in texts]
+    local = index.tz_convert(zone(timezone, needed_by="the simulated logs")).tz_localize(None).to_numpy()
+    texts = np.datetime_as_string(local.astype("datetime64[us]"), unit="us")
+    return [str(text)[: 20 + digits].replace("T", " ") for text in texts]
 
 
 def format_vehicle_out(frame: pd.DataFrame, timezone: str) -> bytes:
@@ -77,22 +75,12 @@ def format_vehicle_out(frame: pd.DataFrame, timezone: str) -> bytes:
     fix = np.where(nowhere, 0, np.where(frame["fix"] < 0, 3, frame["fix"]))
     # -1 is the record's "unknown": the logger always writes a number
     satellites = np.where(frame["satellites"] < 0, 12, frame["satellites"])
+    columns = [column.tolist() for column in (longitude, latitude, altitude, angles, speed, fix, satellites)]
+    stamps = local_text(frame["time"].to_numpy(), timezone)
     lines = [
-        f'{i + 1},{_short(lon, 7)},{_short(lat, 7)},{_short(alt, 3)},"({_tuple(angle, 17)})","({_tuple(v, 2)})",'
+        f'{i},{_short(lon, 7)},{_short(lat, 7)},{_short(alt, 3)},"({_tuple(angle, 17)})","({_tuple(v, 2)})",'
         f"48,{time},{f},{s}\r\n"
-        for i, (lon, lat, alt, angle, v, time, f, s) in enumerate(
-            zip(
-                longitude.tolist(),
-                latitude.tolist(),
-                altitude.tolist(),
-                angles.tolist(),
-                speed.tolist(),
-                local_text(frame["time"].to_numpy(), timezone),
-                fix.tolist(),
-                satellites.tolist(),
-                strict=True,
-            )
-        )
+        for i, (time, lon, lat, alt, angle, v, f, s) in enumerate(zip(stamps, *columns, strict=True), start=1)
     ]
     return "".join(lines).encode("ascii")
 
@@ -146,12 +134,6 @@ def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str) -> byte
     return "".join(lines).encode("ascii")
 
 
-def _ri(values: ArrayLike) -> AnyArray:
-    """Return RI in the form of a Quectel: layers from 1, and 0 for no CSI."""
-    rank = unmasked(values)
-    return np.where(np.isnan(rank), 0, rank).astype(np.int64)
-
-
 def format_ri_csv(frame: pd.DataFrame, timezone: str) -> bytes:
     """Return rank records with positions as the published six-column table ``ID,Time and date,...,NR RI``.
 
@@ -162,10 +144,11 @@ def format_ri_csv(frame: pd.DataFrame, timezone: str) -> bytes:
     timezone : str
         Zone of the logger's clock.
     """
+    rank = unmasked(frame["rank"].to_numpy())
     columns = (
         local_text(frame["time"].to_numpy(), timezone, digits=3),
         *(frame[name].tolist() for name in ("longitude_deg", "latitude_deg", "altitude_m")),
-        _ri(frame["rank"].to_numpy()).tolist(),
+        np.where(np.isnan(rank), 0, rank).astype(np.int64).tolist(),
     )
     lines = [
         f"{i + 1},{time},{_cell(lon, 7)},{_cell(lat, 7)},{_cell(alt, 3)},{ri}\r\n"

@@ -10,10 +10,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from aerpaw_cmp.cli.commands.logs import ACCOUNT, account_rows
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.logs import ingest as room
 from aerpaw_cmp.logs.flight_file import write_flight
-from aerpaw_cmp.logs.ingest import ACCOUNT, Ingested, account_notes, account_rows, ingest, read_log, summary
+from aerpaw_cmp.logs.ingest import Ingested, account_notes, ingest, read_log, summary
 from aerpaw_cmp.logs.readers import ReadOptions
 from tests.parsers.samples import OPTIONS, SAMPLES
 

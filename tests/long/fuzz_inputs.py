@@ -295,7 +295,7 @@ def check_law(result: ReadResult, data: bytes, binary: bool) -> None:
         raise ViolationError("more lines gave records than were accepted")
 
 
-RANGES = {name: bounds for limit in limits.LIMITS for name, bounds in zip(limit.columns, limit.ranges, strict=True)}
+RANGES = {name: bounds for ranges in limits.LIMITS.values() for name, bounds in ranges.items()}
 
 
 def _check_frame(name: str, kind: str, frame: Any, lines: int) -> set[int]:

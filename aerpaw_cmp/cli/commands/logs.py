@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
 from ...common.errors import UsageError
+from ...common.stages import duration
 from ..app import Force, command, output
 from ..shown import answered, records, say, show, table
 
@@ -75,12 +77,68 @@ def ingest(
 
 
 def _show(summary: Mapping[str, Any], every_stream: bool) -> None:
-    from ...logs.ingest import ACCOUNT, account_notes, account_rows
+    from ...logs.ingest import account_notes
 
     folder, rows = account_rows(summary, every_stream)
     table(list(ACCOUNT), rows, f"Files in {folder}" if folder else None)
     for note in account_notes(summary):
         say(note)
+
+
+# Columns of :func:`account_rows`.
+ACCOUNT = ("file", "reader", "streams (rows)", "lines", "accepted", "rejected", "blank", "rate Hz", "start UTC", "s")
+# A kind with more streams than this, as in a wide table, is only counted.
+_MOST_NAMED = 6
+
+
+def account_rows(account: Mapping[str, Any], every_stream: bool = False) -> tuple[str, list[list[str]]]:
+    """Return the folder that all paths share, or an empty text, and a row of :data:`ACCOUNT` per file.
+
+    Parameters
+    ----------
+    account : mapping
+        The output of :func:`aerpaw_cmp.logs.ingest.summary`.
+    every_stream : bool
+        True to name the streams of wide tables.
+    """
+    paths = [Path(file["path"]) for file in account["files"]]
+    shared = len(paths) > 1 and len({path.is_absolute() for path in paths}) == 1
+    folder = os.path.commonpath([path.parent for path in paths]) if shared else ""
+    return folder, [_account_row(file, folder, every_stream) for file in account["files"]]
+
+
+def _account_row(file: Mapping[str, Any], folder: str, every_stream: bool) -> list[str]:
+    kinds: dict[str, list[str]] = {}
+    for stream in file["streams"]:
+        kinds.setdefault(stream["kind"], []).append(f"{stream['name']} {stream['rows']}")
+    streams = "; ".join(
+        f"{kind}: {', '.join(names) if every_stream or len(names) <= _MOST_NAMED else f'{len(names)} (--all)'}"
+        for kind, names in kinds.items()
+    )
+    # use a set, because streams of one log mostly have the same rate
+    rates = {"-" if stream["rate_hz"] is None else _rate_words(stream["rate_hz"]) for stream in file["streams"]}
+    return [
+        str(Path(file["path"]).relative_to(folder) if folder else file["path"]), file["reader"], streams or "-",
+        *(str(file[key]) for key in ("lines", "accepted", "rejected", "blank")), ", ".join(sorted(rates)) or "-",
+        *_start_and_length([stream for stream in file["streams"] if stream["start"]]),
+    ]  # fmt: skip
+
+
+def _rate_words(rate_hz: float) -> str:
+    return f"{rate_hz:.3g}" if rate_hz >= 0.1 else f"1 in {duration(1.0 / rate_hz)}"
+
+
+def _start_and_length(streams: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
+    import numpy as np
+
+    from ...logs.records import has_wall_clock
+
+    if not streams:
+        return "-", "-"
+    first = min(np.datetime64(stream["start"].rstrip("Z")) for stream in streams)
+    last = max(np.datetime64(stream["end"].rstrip("Z")) for stream in streams)
+    start = str(first.astype("datetime64[s]")).replace("T", " ")
+    return start if has_wall_clock(first) else "relative", f"{(last - first) / np.timedelta64(1, 's'):.1f}"
 
 
 @command("formats", examples=["aerpaw-cmp formats", "aerpaw-cmp formats --json"])

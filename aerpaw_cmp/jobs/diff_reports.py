@@ -463,19 +463,9 @@ def verdict(diff: ReportDiff) -> str:
     changed = {"setting": len(diff.settings), "input": len(diff.inputs), "version": len(diff.versions)}
     listed = ", ".join(counted(n, name) for name, n in changed.items() if n)
     also = f" Changed: {listed}." if listed else " Settings, inputs and versions are the same."
-    if _site_alone(diff):
-        also = " The site differs, and nothing else."
     if not diff.differences:
         return f"No difference: the numbers agree within {TOLERANCE_DB:g} dB.{also}"
     return _numbers(diff) + also
-
-
-def _site_alone(diff: ReportDiff) -> bool:
-    """Check whether only the site changed: its key in the flight file, the flight file itself, and the site file."""
-    settings = [entry.key.split(".")[0] == "site" for entry in diff.settings]
-    inputs = [entry.role.startswith("site file") for entry in diff.inputs]
-    others = [entry for entry in diff.inputs if not entry.role.startswith(("site file", "flight file"))]
-    return any(settings + inputs) and all(settings) and not others and not diff.versions
 
 
 def _numbers(diff: ReportDiff) -> str:

@@ -557,7 +557,6 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
         "rss": _entries(data.rss, (*ARRAYS, "difference")),
         "repeatability": {
             "radius_m": data.radius_m, "heading_within_deg": data.heading_within_deg, "cell_m": data.cell_m,
-            "links": by_link(data.repeats),
             "table": _PAIR_TABLE if data.repeats else None,
         },
         "season": {
@@ -797,7 +796,7 @@ def campaign_page(data: CampaignData, files: Sequence[str]) -> str:
 def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     """Write ``campaign.html``, ``campaign.json`` and the tables. Return the files, the page first.
 
-    ``pairs.csv`` contains the pairs of flights at the same positions, and campaign.json their numbers per channel.
+    ``pairs.csv`` contains the pairs of flights at the same positions, which campaign.json does not have.
     """
     folder = Path(folder)
     indent = 2 if len(data.rss) + len(data.rank) < _COMPACT_ROWS else None
@@ -818,23 +817,6 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
 
 # File with all pairs.
 _PAIR_TABLE = "pairs.csv"
-
-
-def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
-    """Return the numbers of pairs per tower and channel, and their differences [dB]."""
-    groups: dict[tuple[str, str], list[Repeat]] = {}
-    for pair in pairs:
-        groups.setdefault((pair.tower, pair.channel), []).append(pair)
-    rows = []
-    for (tower, channel), members in groups.items():
-        meeting = [pair for pair in members if pair.n]
-        rmse = pd.Series([pair.rmse_db for pair in meeting], dtype=np.float64).dropna()
-        quantiles = {f"{100 * share:.0f}": rmse.quantile(share) for share in (0.1, 0.5, 0.9)}
-        rows.append({
-            "tower": tower, "channel": channel, "pairs": len(members), "meeting": len(meeting),
-            "n": sum(pair.n for pair in meeting), "rmse_mean_db": rmse.mean(), "rmse_quantiles_db": quantiles,
-        })  # fmt: skip
-    return rows
 
 
 def cells(record: Any) -> dict[str, Any]:

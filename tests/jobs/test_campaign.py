@@ -99,10 +99,7 @@ def test_one_route_flown_twice_repeats_to_the_fading_of_both(summary: dict[str, 
         ["first", "second", "USRP1"],
         ["first", "second", "USRP2"],
     ]
-    assert [(link["channel"], link["meeting"]) for link in summary["repeatability"]["links"]] == [
-        ("USRP1", 1),
-        ("USRP2", 1),
-    ]
+    assert summary["repeatability"]["table"] == "pairs.csv"
     for _, pair in pairs.iterrows():
         assert pair["share"] > 0.9
         assert pair["rmse_db"] == pytest.approx(FADING_DB * np.sqrt(2), abs=0.35)
@@ -177,7 +174,7 @@ def test_json_is_alone_on_standard_output(folder: Path, capsys: pytest.CaptureFi
     printed = json.loads(capsys.readouterr().out)
     assert unlisted("campaign", printed) == []
     assert printed["rss"] == written["rss"]
-    assert printed["repeatability"]["links"] == []
+    assert printed["repeatability"]["table"] is None
 
 
 @pytest.mark.parametrize(

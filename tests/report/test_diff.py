@@ -164,21 +164,6 @@ def test_the_other_way_round_has_the_other_sign(noisy):
     assert "significantly better: −" in verdict(reverse)
 
 
-def test_the_site_is_named_where_nothing_else_differs(noisy):
-    """Another site is a key of the flight file, that file, and the site's own."""
-
-    def other_site(metrics):
-        metrics["settings"]["site"] = {"file": "farm.yaml"}
-        for role, path in (("flight file", "flight.yaml"), ("site file", "farm.yaml")):
-            metrics["inputs"].append({"role": role, "path": path, "sha256": "e" * 64})
-
-    (first, second), _ = noisy
-    change_metrics(second, other_site)
-    assert "The site differs, and nothing else." in verdict(run_diff(first, second))
-    change_metrics(second, lambda m: m["settings"]["rt"].update(max_depth=1))
-    assert "The site differs" not in verdict(run_diff(first, second))
-
-
 def test_a_replay_that_moved_without_harm_is_said_to_have_moved(pair):
     """Measurement and replay of a link shifted together: the residual is the same."""
     change_table(

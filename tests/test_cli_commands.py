@@ -2,11 +2,13 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.cli.commands.reports import _print_campaign_summary
 from aerpaw_cmp.jobs import bench
 from aerpaw_cmp.propagation import llvm
 from tests.geojson import collection, feature, polygon
@@ -117,3 +119,12 @@ def test_a_table_too_wide_for_the_terminal_is_text_without_broken_numbers(capsys
         assert max(map(len, shown.splitlines())) <= width
         assert all(shown.count(cell) == 2 for cell in (file, "sounder_log", "123450"))
         assert shown.count("2025-06-01 14:00:00") == 2
+
+
+@pytest.mark.parametrize(("error_db", "explained"), [(3.25, False), (None, True)])
+def test_a_campaign_explains_the_dash_of_a_flight_without_a_score(error_db, explained, capsys) -> None:
+    metrics = {"mean_rmse_db": {"as written": {"one": 2.5, "two": error_db}}, "rank": [], "season": {"steps": []}}
+    _print_campaign_summary(SimpleNamespace(metrics=metrics, folder=Path("reports")))
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "2.50" in printed
+    assert ("dash: not scored, the page states why" in printed) == explained

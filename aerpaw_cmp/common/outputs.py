@@ -686,7 +686,7 @@ _REMEDIES = {
     errno.ENOSPC: "the disk is full: free some space, or name another place with -o",
     errno.EDQUOT: "your quota is used up: free some space, or name another place with -o",
     errno.EFBIG: "a limit on file sizes (ulimit -f or the file system)",
-    errno.EIO: "the disk fails: name another one with -o",
+    errno.EIO: "the disk has errors: name a place on another disk with -o",
     errno.EROFS: "the disk is mounted read-only: name another place with -o",
     errno.EACCES: "no right to write here: name another place with -o",
     errno.EPERM: "no right to write here: name another place with -o",

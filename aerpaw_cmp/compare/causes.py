@@ -928,7 +928,7 @@ def _pattern(e: LevelEvidence) -> Iterator[Trial]:
     axes = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     terms = [term for degree in (1, 2, 3) for term in combinations_with_replacement(axes, degree)]
     columns = [_GAIN_DB * np.prod(term, axis=0) for term in terms]
-    if e.turned_db:  # a column that removes the known pattern, by the mean over all headings
+    if e.turned_db:  # this column can remove the known pattern: it adds the mean of the level over all headings
         columns.append(np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1))
     sentence, step = _PATTERN[e.antenna]
     yield Trial(name=_CATCH_ALL, sentence=sentence, next_step=step, columns=np.column_stack(columns))

@@ -908,7 +908,7 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
                     "two cells or devices: name the tower's own by 'cells: {STREAM: TOWER}', 'ingest --all' lists them"
                 )
             raise UsageError(
-                f"{where} at the same time or in another form: {path!r} and {later_path!r}",
+                f"{where} at the same time or with different properties: {path!r} and {later_path!r}",
                 expected="one record of each channel and of each tower's rank",
                 cause=f"{cause}; another radio: give it its own 'channel'",
             )

@@ -356,7 +356,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
         If a key of ``antennas`` is neither ``uav`` nor ``TOWER.CHANNEL``.
     """
     ends = _Ends(settings.link.rss, dict(settings.link.channels))
-    # the airframe last, because it applies to every channel, including those that antennas of towers add
+    # the airframe last, because it applies to every channel, and an antenna of a tower can add a channel
     for key, name in sorted(settings.antennas.items(), key=lambda item: item[0] == "uav"):
         tower, _, channel = key.partition(".")
         if key != "uav" and not (tower and channel):

@@ -61,7 +61,7 @@ class Rows:
     at : int array, shape (n,)
         Index of each row among the rows passed to :func:`built`.
     data : bytes
-        The complete text, for lines between the rows.
+        The complete text, from which readers take lines between the rows, such as comments.
     """
 
     reader: str

@@ -216,7 +216,7 @@ def _missing_library(text: str) -> str:
 def _failure(child: subprocess.CompletedProcess[str]) -> str:
     """Return in one line why a child failed: the signal that ended it and its last message."""
     if missing := _missing_library(child.stderr):
-        return f"Dr.Jit cannot be loaded, the system has no {missing}"
+        return f"Dr.Jit cannot be loaded, because the system has no {missing}"
     lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
     message = next((line for line in lines if "LLVM ERROR" in line), lines[-1] if lines else "no message")
     # a negative code is the signal's number: LLVM aborts

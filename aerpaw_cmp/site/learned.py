@@ -277,7 +277,7 @@ class Entry(StrictModel):
     def about(self, errors: Errors | None = None, kind: str = "on another flight") -> str:
         """Return a sentence about the training flights and the expected error (default: held-out flights)."""
         errors = errors or self.errors
-        days = f" of {', '.join(self.flown)}" if self.flown else ""  # there are no days for logs with relative times
+        days = f" of {', '.join(self.flown)}" if self.flown else ""  # logs with relative times have no date
         text = f"learned on {counted(len(self.flights), 'flight')}{days}"
         text += f", the UAV also on {', '.join(self.joined)}" if self.joined else ""
         if errors is not None:

@@ -144,7 +144,7 @@ def test_what_drjit_itself_lacks_is_named_and_installed(tmp_path: Path, monkeypa
     trial = llvm.try_library(llvm.Library(tmp_path / "libLLVM.so.19", (19,)), program=program)
     assert not trial.blames_library
     assert trial.missing == "libatomic.so.1"
-    assert trial.reason == "Dr.Jit cannot be loaded, the system has no libatomic.so.1"
+    assert trial.reason == "Dr.Jit cannot be loaded, because the system has no libatomic.so.1"
     fake_tool(tmp_path, "apt-get", f'[ "$1" = install ] && touch "{tmp_path}/installed"; exit 0')
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     as_root_on_debian(monkeypatch, tmp_path)

@@ -185,7 +185,9 @@ def _print_campaign_summary(outcome: Any) -> None:
     names = list(next(iter(m["mean_rmse_db"].values()), {}))
     rows = [[s, *[number(by[f], "{:.2f}") for f in names]] for s, by in m["mean_rmse_db"].items()]
     if names:
-        table(["setting", *names], rows, "Mean RMSE over towers and channels (dB), each with its own offset")
+        title = "Mean RMSE over towers and channels (dB), each with its own offset"
+        unscored = any(cell == "-" for row in rows for cell in row[1:])
+        table(["setting", *names], rows, title + ("; dash: not scored, the page states why" if unscored else ""))
     heads = {"setting": "setting", "flight": "flight", "tower": "tower", "K": "k:g"}
     numbers = {"total variation": "total_variation:.3f", "agreement": "agreement:.0%", "kappa": "kappa:.2f"}
     records(m["rank"], heads | numbers, "Rank")

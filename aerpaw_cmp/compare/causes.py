@@ -312,30 +312,31 @@ class _Conditions:
     """True if the cause changes the levels of all channels."""
     of_tower: bool = False
     """True if the cause changes the levels of all channels of a tower."""
-    restores: bool = False
-    """True if the cause must bring the error back to that of held-out flights, for flights with learned antennas."""
     follows: float | None = None
     """Largest remaining error as a share of that of a constant level, which fits a log of noise best."""
     most_left: float = 2.0
-    """Largest remaining error, as a multiple of the largest error of a held-out flight."""
+    """Largest remaining error, as a multiple of the largest error of a held-out flight.
+
+    With 1, a cause that restores the usual error does not need the smallest reduction.
+    """
 
 
 _CONDITIONS = {
     "attitude": _Conditions(of_uav=True),
     # a high limit, because slow fading looks like a weak shadow
     "blocked": _Conditions(share=0.2),
-    "channels": _Conditions(part=0.5, restores=True),
-    "clock": _Conditions(part=0.5, restores=True),
+    "channels": _Conditions(part=0.5, most_left=1.0),
+    "clock": _Conditions(part=0.5, most_left=1.0),
     "decibels": _Conditions(most_left=math.inf),
     "exponent or decibels": _Conditions(part=0.5, of_uav=True, follows=0.9, most_left=math.inf),
     "gain step": _Conditions(lead=2.5, part=0.75),
-    "heading": _Conditions(learned_share=0.25, part=0.5, of_uav=True, restores=True, follows=0.9),
-    "height": _Conditions(part=0.5, of_uav=True, restores=True, follows=0.9),
-    "pattern": _Conditions(lead=3.0, learned_share=0.25, part=0.5, restores=True, follows=1.0),
+    "heading": _Conditions(learned_share=0.25, part=0.5, of_uav=True, most_left=1.0, follows=0.9),
+    "height": _Conditions(part=0.5, of_uav=True, most_left=1.0, follows=0.9),
+    "pattern": _Conditions(lead=3.0, learned_share=0.25, part=0.5, most_left=1.0, follows=1.0),
     # high limits, because the best of many positions explains a part of many errors
-    "place": _Conditions(lead=2.5, share=0.3, part=0.75, of_tower=True, restores=True, follows=0.9),
-    "saturation": _Conditions(part=0.5, restores=True),
-    "telemetry": _Conditions(part=0.5, of_uav=True, restores=True, follows=0.9),
+    "place": _Conditions(lead=2.5, share=0.3, part=0.75, of_tower=True, most_left=1.0, follows=0.9),
+    "saturation": _Conditions(part=0.5, most_left=1.0),
+    "telemetry": _Conditions(part=0.5, of_uav=True, most_left=1.0, follows=0.9),
     "tower": _Conditions(part=0.75, follows=1.0, most_left=math.inf),
 }
 
@@ -376,10 +377,10 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
         restored = False
     else:
         # the error is larger than on any held-out flight, and usual after correcting the cause
-        restored = need.restores and name != _CATCH_ALL and known_db > usual[1] >= alone_db
+        restored = need.most_left == 1.0 and name != _CATCH_ALL and known_db > usual[1] >= alone_db
         # do not name such a cause for an error that held-out flights also have
         least_db = usual[1] if name in OF_DIRECTION else usual[0] if name == "saturation" and not certain else 0.0
-        enough = known_db > least_db and alone_db <= (1.0 if need.restores else need.most_left) * usual[1]
+        enough = known_db > least_db and alone_db <= need.most_left * usual[1]
     return enough and (share <= 1.0 - least_share or certain or restored)
 
 
@@ -831,8 +832,7 @@ def _growing(e: LevelEvidence) -> FloatArray:
     table = np.stack([e.raised_db.get(rise, np.zeros(len(e.time_s))) for rise in rises.tolist()])
     share = (e.time_s - e.time_s[0]) / max(float(np.ptp(e.time_s)), 1e-9)
     at = np.interp(np.outer(_DRIFTS_M, share), rises, np.arange(len(rises)))
-    low, sample = np.minimum(at.astype(np.int64), len(rises) - 2), np.arange(len(share))
-    return np.asarray(table[low, sample] + (at - low) * (table[low + 1, sample] - table[low, sample]))
+    return _interpolated(table, at)
 
 
 def _misread(e: LevelEvidence) -> Iterator[Trial]:
@@ -871,7 +871,9 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     coarse, cost = _likeliest(e, e.predicted_db + table.reshape(len(weight), -1), weight=weight)
     i, j = np.unravel_index(coarse, table.shape[:2])
     fine = [(i + r, j + a) for r in _FINER for a in _FINER if 0 <= i + r <= len(radii) - 1]
-    changes = np.array([_between(table, at, around) for at, around in fine])
+    indices = np.array(fine)[:, :, None]
+    # the first azimuth follows the last
+    changes = _interpolated(np.hstack([table, table[:, :1]]), indices[:, 0], indices[:, 1] % len(azimuths))
     best, _ = _likeliest(e, e.predicted_db + changes)
     at, around = fine[best]
     radius = float(np.exp(np.interp(at, np.arange(len(radii)), np.log(radii))))
@@ -884,13 +886,12 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     )  # fmt: skip
 
 
-def _between(table: FloatArray, at: float, around: float) -> FloatArray:
-    """Return a change (n,) between rows and columns of a table (radii, azimuths, n) by bilinear interpolation."""
-    row, column = min(int(at), len(table) - 2), math.floor(around)
-    up, on = at - row, around - column
-    left, right = column % table.shape[1], (column + 1) % table.shape[1]
-    rows = [(1.0 - on) * table[row + k, left] + on * table[row + k, right] for k in (0, 1)]
-    return np.asarray((1.0 - up) * rows[0] + up * rows[1])
+def _interpolated(table: FloatArray, *at: FloatArray) -> FloatArray:
+    """Return levels (m, n) of a table (..., n), linear between its entries at fractional indices (m, n) or (m, 1)."""
+    from scipy.ndimage import map_coordinates
+
+    indices = np.broadcast_arrays(*at, np.arange(table.shape[-1]))
+    return np.asarray(map_coordinates(table, indices, order=1, mode="nearest"))
 
 
 # Places further away than this become unlikely [m], and steps between the computed places.
@@ -1025,24 +1026,6 @@ def _slope(e: LevelEvidence, factor: float, step: float, at: NoiseParameters) ->
 # --- faults of the receiver ----------------------------------------------------------------------------------------
 
 
-def _flat(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a constant level: a dead input, or a flight below the floor or above the ceiling."""
-    if _is_flat(e):
-        yield Trial(
-            name="flat", cost=_RARE, next_step="check the receiver's input and gain", change_db=-e.predicted_db,
-            sentence=f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} all along",
-        )  # fmt: skip
-
-
-# A level is flat if its central 80 % span less than this share of that of the predicted levels.
-_FLAT = 0.2
-
-
-def _is_flat(e: LevelEvidence) -> bool:
-    measured, predicted = (np.ptp(np.percentile(level, (10, 90))) for level in (e.measured_db, e.predicted_db))
-    return bool(measured < _FLAT * predicted)
-
-
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the noise that the receiver writes without lock, by the quality in the log."""
     if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
@@ -1063,20 +1046,25 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
         )  # fmt: skip
 
 
-def _floor(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a receiver that shows no level below its floor."""
+def _limits(e: LevelEvidence) -> Iterator[Trial]:
+    """Yield a floor and a ceiling, or a constant level: a dead input, or a flight beyond one of them."""
+    measured, predicted = (np.ptp(np.percentile(level, (10, 90))) for level in (e.measured_db, e.predicted_db))
+    if measured < _FLAT * predicted:
+        yield Trial(
+            name="flat", cost=_RARE, next_step="check the receiver's input and gain", change_db=-e.predicted_db,
+            sentence=f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} all along",
+        )  # fmt: skip
+        return
     # a frequent least level already shows where nothing was detected
-    if e.least is None and not e.limits_known and not _is_flat(e):
+    if e.least is None and not e.limits_known:
         yield from _clipping(e, 1.0)
-
-
-def _saturation(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a receiver that shows no level above its ceiling."""
-    drowned = e.unit == "dB" and bool(np.median(e.measured_db) < 0.0)  # such signals do not overload a receiver
-    if not drowned and not _is_flat(e):
+    # signals below the noise do not overload a receiver
+    if e.unit != "dB" or np.median(e.measured_db) >= 0.0:
         yield from _clipping(e, -1.0)
 
 
+# A level is flat if its central 80 % span less than this share of that of the predicted levels.
+_FLAT = 0.2
 # A limit allows a small share of samples beyond it, and the prediction must exceed it in a larger share [dB].
 _BEYOND_DB, _MOST_BEYOND = 2.0, 0.02
 _FAR_DB, _LEAST_FAR = 3.0, 0.1
@@ -1228,5 +1216,5 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
 
 CANDIDATES: tuple[Callable[[LevelEvidence], Iterator[Trial]], ...] = (
     _clock, _heading, _attitude, _misread, _height, _tower, _place, _channels, _pattern, _cell, _decibels,
-    _lock, _no_detection, _flat, _floor, _saturation, _blocked, _gain_step,
+    _lock, _no_detection, _limits, _blocked, _gain_step,
 )  # fmt: skip

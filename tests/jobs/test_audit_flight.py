@@ -17,6 +17,7 @@ from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings, LinksSetting
 from aerpaw_cmp.jobs import audit_flight
 from aerpaw_cmp.propagation.geometry import Poses
 from aerpaw_cmp.propagation.llvm import INSTALL_AGAIN
+from aerpaw_cmp.propagation.search import sionna
 from tests.jobs.test_audit_raw import write_flight
 
 FRAME = SiteFrame(35.7275, -78.696)
@@ -71,8 +72,15 @@ def test_flight_is_replayed_where_sionna_rt_cannot_be_loaded(tmp_path, monkeypat
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     engine = audit_flight.audit_replays(data, replayed)
     assert engine.audit is None
-    assert engine.not_audited.endswith(f"Repair it with: {INSTALL_AGAIN}")
+    assert engine.not_audited.startswith("Sionna RT is not installed")
+    assert engine.not_audited.endswith("Install it with: pip install sionna-rt")
     assert "mitsuba" in engine.not_audited
+
+
+def test_an_installed_sionna_rt_that_fails_is_to_be_repaired() -> None:
+    message = str(sionna._missing(ImportError("libdrjit-core.so: undefined symbol")))
+    assert message.startswith("Sionna RT cannot be loaded (libdrjit-core.so: undefined symbol)")
+    assert message.endswith(f"Repair it with: {INSTALL_AGAIN}")
 
 
 ARRAYS = {

@@ -86,6 +86,8 @@ def load_variant(prefer: str | None = None) -> str:
 
 
 def _missing(error: ImportError) -> SionnaMissingError:
+    if isinstance(error, ModuleNotFoundError):
+        return SionnaMissingError(f"Sionna RT is not installed ({error}). Install it with: pip install sionna-rt")
     return SionnaMissingError(f"Sionna RT cannot be loaded ({error}). Repair it with: {INSTALL_AGAIN}")
 
 

@@ -17,8 +17,7 @@ import pickle
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from functools import lru_cache
 from hashlib import sha256
 from importlib import import_module
@@ -128,19 +127,6 @@ def thread_count() -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # this function does not exist on macOS and Windows
         return os.cpu_count() or 1
-
-
-def in_threads(call: Callable[[Any], Any], parts: Iterable[Any], threads: int) -> list[Any]:
-    """Return ``call(part)`` for each part, in order. Kernels release the interpreter's lock.
-
-    No thread remains afterwards, so a process that is forked later has no threads.
-    """
-    parts = list(parts)
-    count = min(threads, len(parts))
-    if count < 2:
-        return [call(part) for part in parts]
-    with ThreadPoolExecutor(count) as pool:
-        return list(pool.map(call, parts))
 
 
 def kernel(function: Callable[..., Any], **options: Any) -> Any:

@@ -15,6 +15,7 @@ segment runs through the middle of a wall or roof. Nearly all remaining candidat
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -127,8 +128,10 @@ def grow_paths(
         each = max(16, min(1024, len(first) // (8 * threads) + 1))
         chunks = [first[at : at + each] for at in range(0, len(first), each)]
         for at in range(0, len(chunks), 4 * threads):
-            some = chunks[at : at + 4 * threads]
-            levels += compiled.in_threads(partial(_follow, mirrors, hiding, receivers, source, rules), some, threads)
+            # kernels release the interpreter's lock; no thread remains, so a process that is forked later has none
+            with ThreadPoolExecutor(threads) as pool:
+                follow = partial(_follow, mirrors, hiding, receivers, source, rules)
+                levels += pool.map(follow, chunks[at : at + 4 * threads])
             if run.progress:
                 run.progress((tower + min(1.0, (at + 4 * threads) / len(chunks))) / towers)
         pieces += [PathSet.from_tower(tower, poses[pose], met, at, max_depth) for pose, met, at in levels]

@@ -177,9 +177,8 @@ def _from_cuts(
         if cut not in cuts:
             raise InputError(f"no cut {cut}", expected="a horizontal and a vertical cut")
     horizontal, vertical = cuts["HORIZONTAL"], cuts["VERTICAL"]
-    theta, phi = _grid()
-    below = np.degrees(theta) - 90.0
-    around = np.degrees(phi)
+    theta, around, _ = sphere_grid(STEP_DEG)
+    below = theta - 90.0
     # share of the back, by which the front of the vertical cut is weighted against its back
     share = np.minimum(around, 360.0 - around) / 180.0  # 0 in front, 1 behind
     # planning tools count clockwise, and azimuth is counter-clockwise here
@@ -201,10 +200,6 @@ def _from_cuts(
 
 def _at(cut: FloatArray, degrees: FloatArray) -> FloatArray:
     return np.asarray(np.interp(degrees, np.arange(360.0), cut, period=360.0))
-
-
-def _grid() -> tuple[FloatArray, FloatArray]:
-    return np.radians(np.arange(0.0, 180.5, STEP_DEG)), np.radians(np.arange(0.0, 360.0, STEP_DEG))
 
 
 def _pattern(
@@ -235,10 +230,10 @@ def _great_circle(text: str, name: str, carrier_hz: float | None) -> MeasuredPat
     angle, gain = cut[once, 1], cut[once, 2]
     if len(angle) < 8 or angle[0] > -3.1 or angle[-1] < 3.1 or np.diff(angle).max() > 0.3:
         raise InputError(f"{len(angle)} angles at {frequency / 1e6:g} MHz", expected="theta from -pi to pi")
-    theta, phi = _grid()
-    share = np.minimum(np.degrees(phi), 360.0 - np.degrees(phi)) / 180.0
+    theta, phi, _ = sphere_grid(STEP_DEG)
+    share = np.minimum(phi, 360.0 - phi) / 180.0
     # blend the two halves of the circle around the axis, because there are no values between them
-    front, back = np.interp(theta, angle, gain), np.interp(-theta, angle, gain)
+    front, back = (np.interp(side * np.radians(theta), angle, gain) for side in (1.0, -1.0))
     level = (1.0 - share) * front[:, None] + share * back[:, None]
     # one circle leaves more of the sphere to the interpolation than two cuts
     return _pattern(level, name, frequency, _MOST_OF_LEARNED_CUTS_DB)

@@ -34,7 +34,7 @@ RAIN = {
         "    rain_db_per_km: float = 0.0\n",
     ),
     "aerpaw_cmp/propagation/check/reference.py: Reference.loss_db": (
-        "        total = self.loss.reflection_db * len(sequence) + self._rough_db(sequence, target)\n",
+        "        total = self.loss.reflection_db * len(sequence)\n",
         "        total += 1e-3 * self.loss.rain_db_per_km * math.dist(self.source, target)\n",
     ),
 }

@@ -92,7 +92,7 @@ def _reasons(settings: FlightFile, kinds: Collection[str]) -> Iterator[tuple[str
     """Yield each reason with the dotted keys that have no effect because of it."""
     rt, lag = settings.rt, settings.rss.lag
     if rt.foliage != "attenuating":
-        foliage = "foliage_model leaves advanced.gamma_db_per_m advanced.maximum_loss_db"
+        foliage = "leaves advanced.gamma_db_per_m advanced.maximum_loss_db"
         yield f"rt.foliage is {rt.foliage}", " ".join(f"rt.{key}" for key in foliage.split())
     if rt.max_depth == 0:
         yield "rt.max_depth is 0, so nothing is reflected", "rt.reflection_loss_db"

@@ -148,7 +148,7 @@ def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
     site = site.under(rt.foliage)
     model, evergreen = (
         foliage_model(
-            rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
+            rt.foliage,
             carrier_hz,
             in_leaf=in_leaf,
             gamma_db_per_m=rt.advanced.gamma_db_per_m,
@@ -204,7 +204,7 @@ LOSSES: tuple[PathLoss, ...] = (
         off={"foliage": "none"},
         of=_foliage_loss,
         expected=lambda rt: {
-            "model": rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
+            "model": rt.foliage,
             "gamma_db_per_m": rt.advanced.gamma_db_per_m,
             "maximum_db": rt.advanced.maximum_loss_db,
             "in_leaf": rt.leaves == "in",
@@ -438,12 +438,11 @@ def foliage_notes(wooded: bool, rt: RtSettings, carriers_hz: Collection[float]) 
     if not wooded or rt.foliage != "attenuating":
         return ()
     notes = []
-    if rt.foliage_model == "p833" and (rt.advanced.gamma_db_per_m is None or rt.advanced.maximum_loss_db is None):
+    if rt.advanced.gamma_db_per_m is None or rt.advanced.maximum_loss_db is None:
         notes += [note for carrier in sorted(carriers_hz) if (note := p833_note(carrier))]
     if rt.leaves == "out":
-        what = "gamma" if rt.foliage_model == "p833" else "the loss"
         notes.append(
-            f"Trees out of leaf: {what} in leaf divided by {1 / LEAFLESS_FACTOR:g}. That is an assumption of this "
+            f"Trees out of leaf: gamma in leaf divided by {1 / LEAFLESS_FACTOR:g}. That is an assumption of this "
             "tool: ITU-R P.833 states about 20 % near 1 GHz, and no value at this carrier."
         )
     return tuple(notes)

@@ -377,7 +377,6 @@ class RtSettings(StrictModel):
     attitude: Literal["logged", "level", "ignored"] = "ignored"
     """``logged``: the UAV array rotates with the aircraft. ``level``: with the heading only. ``ignored``: never."""
     foliage: Literal["none", "attenuating", "opaque"] = "none"
-    foliage_model: Literal["p833", "weissberger"] = "p833"
     leaves: Literal["in", "out"] = "in"
     reflection_loss_db: Annotated[float, Field(ge=0)] = 0.0
     """Additional loss per reflection, for example by rough surfaces. Fit it on other flights."""

@@ -116,8 +116,6 @@ class Model:
             "reflection_loss_db": _WEAK_GROUND_DB if self.ground == "weakened" else 0.0,
             "foliage": "none" if self.trees == "none" else "opaque" if self.trees == "opaque" else "attenuating",
         }
-        if self.trees == "p833":
-            rt["foliage_model"] = self.trees
         return {
             "rt": rt,
             "rss": {"field": "power" if self.ground == "power sum" else "coherent"},
@@ -313,7 +311,6 @@ class _ModelSearch:
     def _trees(self, best: Model) -> list[Model]:
         if not self._data.site.wooded:
             return []
-        # Weissberger is not tried, because it is within 0.11 dB of P.833 on every real flight
         kinds: tuple[Trees, ...] = ("p833", "opaque")
         media = any(forest.height_m is not None for forest in self._data.site.forests)
         return [dataclasses.replace(best, trees=kind, media=media and kind != "opaque") for kind in kinds]
@@ -373,8 +370,7 @@ class _ModelSearch:
         return any(learned_here(self._data, series, link) for series, link in pairs)
 
     def _candidate(self, model: Model) -> CandidateModel:
-        learned = model.antennas == "learned"
-        if learned and self._learned_here:
+        if model.antennas == "learned" and self._learned_here:
             nothing = tuple(np.full(len(s.rows), np.nan) for s in self._series)
             return CandidateModel(model=model.name + LEARNED_HERE, level_db=nothing, seconds=0.0)
         levels = [self._level(i, model) for i in range(len(self._series))]

@@ -66,7 +66,7 @@ VALUES: dict[str, Any] = {
     "link.rank.noise_figure_db": 90.0, "link.rank.uav": {"layout": "linear"}, "link.rank.tower": {"layout": "linear"},
     "link.rank.towers": {"LW1": {"layout": "linear"}},
     "rt.max_depth": 0, "rt.diffraction": "edges", "rt.attitude": "logged", "rt.foliage": "attenuating",
-    "rt.foliage_model": "weissberger", "rt.leaves": "out", "rt.reflection_loss_db": 3.0,
+    "rt.leaves": "out", "rt.reflection_loss_db": 3.0,
     "rt.advanced.samples": 100, "rt.advanced.gamma_db_per_m": 0.1, "rt.advanced.maximum_loss_db": 3.0,
     "rt.advanced.maximum_gap_s": 0.5,
     "rss.span_db": [-10.0, 10.0], "rss.lag": 1.0, "rss.field": "power", "rss.minimum_height_m": 20.0,

@@ -116,7 +116,7 @@ def test_the_level_has_no_step_where_a_ray_leaves_the_canopy(tilt_m: float, widt
     """
     site = wood(box(100.0, -900.0, 100.0 + width_m, 900.0))
     heights = np.arange(12.0, 28.0, 0.01)
-    for model in (foliage_model("p833", 3.4e9), WALL):
+    for model in (foliage_model("attenuating", 3.4e9), WALL):
         start = np.column_stack([0.0 * heights, 0.0 * heights, heights])
         loss_db = loss(site, start, start + np.array([400.0, 0.0, tilt_m]), model)
         assert np.abs(np.diff(loss_db)).max() < 0.1
@@ -143,11 +143,11 @@ def test_laws() -> None:
     random = np.random.default_rng(8)
     ends = random.uniform([-80, -60, 0.5], [300, 190, 40], (2, 60, 3))
     site = wood(box(0.0, 0.0, 150.0, 90.0))
-    model = foliage_model("p833", 3.4e9)
+    model = foliage_model("attenuating", 3.4e9)
     there, back = loss(site, *ends, model), loss(site, *ends[::-1], model)
     assert there == pytest.approx(back, abs=1e-9)
     assert (there > 1).sum() > 15
-    bare = loss(site, *ends, foliage_model("p833", 3.4e9, in_leaf=False))
+    bare = loss(site, *ends, foliage_model("attenuating", 3.4e9, in_leaf=False))
     assert (bare <= there + 1e-9).all()
     assert (bare < there - 0.1).any()
     assert (there <= model.loss_db(np.linalg.norm(ends[1] - ends[0], axis=1)) + 1e-9).all()

@@ -97,7 +97,7 @@ class ExpectedLoss:
 
     Parameters
     ----------
-    model : {"none", "p833", "weissberger", "opaque"}
+    model : {"none", "attenuating", "opaque"}
     gamma_db_per_m, maximum_db : float or None
         Values used instead of those of P.833.
     in_leaf : bool
@@ -673,14 +673,7 @@ def _bounces(sequence: Sequence[Mirror], source: Vector, target: Vector) -> list
 
 
 def foliage_db(loss: ExpectedLoss, depth_m: float, carrier_hz: float) -> float:
-    """Return the loss in foliage [dB] by ITU-R P.833 woodland or Weissberger.
-
-    The loss of leafless trees is divided by 1.2.
-    """
-    if loss.model == "weissberger":
-        # Weissberger's model is for trees in leaf
-        f = (carrier_hz / 1e9) ** 0.284 / (1.0 if loss.in_leaf else 1.2)
-        return float(f * (0.45 * depth_m if depth_m <= 14 else 1.33 * depth_m**0.588))
+    """Return the loss in foliage [dB] by ITU-R P.833 woodland. For leafless trees gamma is divided by 1.2."""
     gamma, largest = _p833(carrier_hz / 1e6)
     gamma = gamma / (1.0 if loss.in_leaf else 1.2) if loss.gamma_db_per_m is None else loss.gamma_db_per_m
     largest = largest if loss.maximum_db is None else loss.maximum_db

@@ -141,29 +141,6 @@ class P833:
         return np.asarray(-self.maximum_db * np.expm1(-self.gamma_db_per_m * depth / self.maximum_db))
 
 
-@dataclass(frozen=True, slots=True)
-class Weissberger:
-    """Modified exponential decay of Weissberger (1982), 0.23 to 95 GHz, depths to 400 m.
-
-    The loss is ``0.45 f^0.284 d`` up to 14 m and ``1.33 f^0.284 d^0.588`` beyond (f in GHz). At 14 m the two differ by
-    0.3 %. Deeper than 400 m the second form is extrapolated. The loss of leafless trees is multiplied by
-    ``LEAFLESS_FACTOR``, because the model only covers trees in leaf.
-    """
-
-    frequency_hz: float = 3.4e9
-    in_leaf: bool = True
-
-    def __post_init__(self) -> None:
-        if not 0.23e9 <= self.frequency_hz <= 95e9:
-            raise UsageError(f"Weissberger at {self.frequency_hz / 1e9:g} GHz", expected="0.23 to 95 GHz")
-
-    def loss_db(self, depth_m: FloatArray) -> FloatArray:
-        """Return the loss [dB] of a depth in foliage [m]."""
-        depth = np.asarray(depth_m, dtype=np.float64)
-        scale = (self.frequency_hz / 1e9) ** 0.284 * (1.0 if self.in_leaf else LEAFLESS_FACTOR)
-        return np.asarray(scale * np.where(depth <= 14.0, 0.45 * depth, 1.33 * np.abs(depth) ** 0.588))
-
-
 def foliage_model(
     name: str,
     frequency_hz: float,
@@ -172,7 +149,7 @@ def foliage_model(
     gamma_db_per_m: float | None = None,
     maximum_db: float | None = None,
 ) -> FoliageModel:
-    """Return a model by its name in flight.yaml: ``none``, ``opaque``, ``attenuating`` (= ``p833``) or ``weissberger``.
+    """Return a model by its name in flight.yaml: ``none``, ``opaque`` or ``attenuating``.
 
     ``gamma_db_per_m`` and ``maximum_db`` replace the table's values in P.833.
 
@@ -194,7 +171,7 @@ def foliage_model(
     UsageError
         If the name is unknown, or gamma or A_m is set for a model without it.
     """
-    if name in ("attenuating", "p833"):
+    if name == "attenuating":
         table = P833.at(frequency_hz, in_leaf=in_leaf)
         return P833(
             table.gamma_db_per_m if gamma_db_per_m is None else gamma_db_per_m,
@@ -202,13 +179,11 @@ def foliage_model(
         )
     if gamma_db_per_m is not None or maximum_db is not None:
         raise UsageError(f"the foliage model '{name}' has neither gamma nor A_m", expected="the model 'attenuating'")
-    if name == "weissberger":
-        return Weissberger(frequency_hz, in_leaf)
     if name == "opaque":
         return Opaque()
     if name == "none":
         return NoFoliage()
-    raise UsageError(f"unknown foliage model '{name}'", expected="none, opaque, attenuating (p833) or weissberger")
+    raise UsageError(f"unknown foliage model '{name}'", expected="none, opaque or attenuating")
 
 
 # ---------------------------------------------------------------- paths through trees

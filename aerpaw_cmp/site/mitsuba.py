@@ -6,9 +6,7 @@ Supported are shapes of type ``ply`` in the coordinates of the scene, as in all 
 materials ``itu-radio-material``, ``radio-material``, ``absorber-radio-material`` or any other whose id begins with
 ``itu_`` or ``mat-itu_``. A scene may name only files in its own folder.
 
-Triangles come from PLY files in three formats (ASCII, and binary of both byte orders).
-
-Polygons become fans of triangles. Polygons that are not flat are counted, because the fan then changes their shape.
+Meshes are binary PLY files of triangles, as in all scenes of Sionna RT.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -38,213 +36,109 @@ _LARGEST_HEADER = 65_536
 # Largest size of a mesh file in bytes.
 _LARGEST_FILE = 2**30
 
-# A polygon is not flat if a corner is farther than this from the plane of its first three corners [m].
-_FLAT_M = 1e-3
-
+# NumPy types of little endian
 _TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
+    "char": "<i1", "int8": "<i1", "uchar": "<u1", "uint8": "<u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
+    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
+    "double": "<f8", "float64": "<f8",
 }  # fmt: skip
 
+
+# Meshes that can be read, as Sionna RT, Blender's exporter for Mitsuba and this program write them.
+_MESH = "a binary PLY of triangles (little endian), as Mitsuba writes it"
 
 # Vertices (n, 3) [m] and triangles (m, 3).
 Mesh = tuple[FloatArray, IntArray]
 
 
-@dataclass(frozen=True, slots=True)
-class RawMesh:
-    """The contents of a mesh file: vertices (n, 3), triangles (m, 3) int, and the number of bent polygons."""
-
-    vertices: FloatArray
-    triangles: IntArray
-    bent: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class _Element:
-    name: str
-    count: int
-    properties: tuple[tuple[str, str, str], ...]
-    """Name and type. For lists, the type of the length follows, otherwise an empty text."""
-
-
-def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
+def read_mesh(path: Path) -> tuple[Mesh, bytes]:
     """Return the mesh of a PLY file, and the bytes of the file (for a digest).
 
     Raises
     ------
     InputError
-        If there is no such file, or it is too large or damaged.
+        If it is not a mesh, is cut off, or a face names no vertex.
     """
     data = read_input(path, _LARGEST_FILE, "a mesh")
     with parsing(path, "a mesh"):
-        return check(read_ply(data)), data
+        return read_ply(data), data
 
 
-def check(mesh: RawMesh) -> RawMesh:
-    """Return the mesh if every index names a vertex and every used vertex is finite."""
-    if len(mesh.triangles):
-        low, high = int(mesh.triangles.min()), int(mesh.triangles.max())
-        if low < 0 or high >= len(mesh.vertices):
+def read_ply(data: bytes) -> Mesh:
+    """Return vertices (n, 3) and triangles (m, 3) of a PLY file."""
+    elements, place = _header(data)
+    vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    for name, count, fields in elements:
+        record = np.dtype(fields)
+        # compare before an array is made, because a damaged header may promise more than fits into memory
+        if count < 0 or place + count * record.itemsize > len(data):
             raise InputError(
-                f"a face names vertex {low if low < 0 else high}",
-                expected=f"0 to {len(mesh.vertices) - 1}",
-                cause="the file is damaged",
+                f"the file ends before the {count} entries of '{name}' that its header promises",
+                cause="it was cut off, its faces are not triangles, or the header is damaged",
             )
-        if not np.isfinite(mesh.vertices[mesh.triangles.ravel()]).all():
-            raise InputError("a vertex is not a finite number", expected="coordinates in metres")
-    return mesh
+        rows = np.frombuffer(data, record, count, place)
+        place += count * record.itemsize
+        if name == "vertex":
+            if any(axis not in (record.names or ()) or rows[axis].ndim > 1 for axis in "xyz"):
+                raise InputError("its vertices have no x, y and z", expected="a PLY mesh")
+            vertices = np.column_stack([rows[axis].astype(np.float64) for axis in "xyz"])
+        elif name == "face":
+            triangles = _triangles(rows)
+    return _checked(vertices, triangles)
 
 
-def read_ply(data: bytes) -> RawMesh:
-    """Read a PLY file."""
-    kind, elements, start = _header(data)
-    body = _Body(data, ">" if kind == "binary_big_endian" else "<", start)
-    if kind == "ascii":  # convert words to numbers of one type, so that the rest is the same as for a binary file
-        body = _Body(_numbers(data[start:].split()).tobytes(), "=", 0)
-        elements = [replace(e, properties=tuple((n, "f8", k and "f8") for n, _, k in e.properties)) for e in elements]
-    vertices: FloatArray = np.zeros((0, 3))
-    triangles, bent = np.zeros((0, 3), dtype=np.int64), 0
-    for element in elements:
-        columns = body.read(element)
-        if element.name == "vertex":
-            vertices = _vertices(element, columns)
-        elif element.name == "face":
-            triangles, bent = _fans(_polygons(element, columns), vertices)
-    return RawMesh(vertices, triangles, bent)
+def _triangles(rows: AnyArray) -> IntArray:
+    named = next((name for name in ("vertex_indices", "vertex_index") if name in (rows.dtype.names or ())), "")
+    if not named or rows[named].ndim < 2 or rows.dtype[named].base.kind == "f":
+        raise InputError("its faces list no vertices", expected="'vertex_indices' or 'vertex_index'")
+    if (rows[f"length of {named}"] != 3).any():
+        raise InputError("a face is not a triangle", expected=_MESH)
+    return np.asarray(rows[named].astype(np.int64))
 
 
-def _header(data: bytes) -> tuple[str, list[_Element], int]:
+def _checked(vertices: FloatArray, triangles: IntArray) -> Mesh:
+    """Return the mesh if every index names a vertex and every used vertex is finite."""
+    wrong = triangles[(triangles < 0) | (triangles >= len(vertices))]
+    if wrong.size:
+        raise InputError(
+            f"a face names vertex {wrong[0]}", expected=f"0 to {len(vertices) - 1}", cause="the file is damaged"
+        )
+    if not np.isfinite(vertices[triangles]).all():
+        raise InputError("a vertex is not a finite number", expected="coordinates in metres")
+    return vertices, triangles
+
+
+# Name, number of entries and fields of an element. A list has three items, after its length.
+_Element = tuple[str, int, list[Any]]
+
+
+def _header(data: bytes) -> tuple[list[_Element], int]:
+    """Return the elements of a PLY file, and where the first of them begins."""
     if not data.startswith(b"ply"):
         raise InputError("it does not begin with 'ply'", expected="a PLY mesh")
     end = data.find(b"end_header", 0, _LARGEST_HEADER)
     if end < 0:
         found = f"no 'end_header' in its first {_LARGEST_HEADER} bytes"
         raise InputError(found, expected="a PLY mesh", cause="a damaged file")
-    start = data.find(b"\n", end) + 1
     kind = ""
     elements: list[_Element] = []
     for number, line in enumerate(data[:end].decode("latin-1").splitlines(), 1):
         words = line.split()
         try:
-            kind = words[1] if words[:1] == ["format"] else kind
-            _declare(words, elements)
+            match words:
+                case ["format", kind, *_]:
+                    pass
+                case ["element", name, count]:
+                    elements.append((name, int(count), []))
+                case ["property", "list", length, item, name]:
+                    elements[-1][2].extend([(f"length of {name}", _TYPES[length]), (name, _TYPES[item], (3,))])
+                case ["property", item, name]:
+                    elements[-1][2].append((name, _TYPES[item]))
         except (IndexError, KeyError, ValueError):
             raise InputError(f"the header says '{line.strip()[:60]}'", expected="a PLY header", line=number) from None
-    # a negative count would read backwards
-    if kind not in ("ascii", "binary_little_endian", "binary_big_endian") or any(e.count < 0 for e in elements):
-        raise InputError(f"a PLY of format '{kind}'", expected="ascii or binary")
-    return kind, elements, start
-
-
-def _declare(words: list[str], elements: list[_Element]) -> None:
-    """Read an element of the header, or a property of its last element. Other lines raise an error."""
-    if words[:1] == ["element"]:
-        elements.append(_Element(words[1], int(words[2]), ()))
-    elif words[:1] == ["property"]:
-        last = elements[-1]
-        listed = words[1] == "list"
-        item = (words[4], _TYPES[words[3]], _TYPES[words[2]]) if listed else (words[2], _TYPES[words[1]], "")
-        elements[-1] = _Element(last.name, last.count, (*last.properties, item))
-
-
-def _numbers(words: list[bytes]) -> FloatArray:
-    try:
-        return np.array(words, dtype=np.bytes_).astype(np.float64) if words else np.zeros(0)
-    except ValueError as error:
-        raise InputError(f"not a number: {error}") from None
-
-
-@dataclass(slots=True)
-class _Body:
-    """The bytes after the header, which are read from ``place``."""
-
-    data: bytes
-    order: str
-    place: int
-
-    def take(self, kind: Any, count: int, element: _Element) -> AnyArray:
-        """Return the next ``count`` items of a type."""
-        # NumPy's default is the byte order of this machine
-        what = np.dtype(kind).newbyteorder(self.order)
-        if count < 0 or self.place + count * what.itemsize > len(self.data):
-            raise InputError(
-                f"the file ends before the {element.count} entries of '{element.name}' that its header promises",
-                cause="it was cut off, or the header is damaged",
-            )
-        values = np.frombuffer(self.data, what, count, self.place)
-        self.place += count * what.itemsize
-        return values
-
-    def read(self, element: _Element) -> dict[str, Any]:
-        """Return the values of each property by row: an array, or a list of arrays if lists differ in length."""
-        least = sum(np.dtype(length or kind).itemsize for _, kind, length in element.properties)
-        begun = self.place
-        if not element.count or not least:
-            return {name: np.zeros((0, 1)) for name, *_ in element.properties}
-        # a header that promises more than the file contains fails here, before memory is requested
-        self.take(("V", least), element.count, element)
-        self.place = begun
-        # most meshes have only triangles: if all lists are as long as the first list, read them as one table
-        first, fields = self._row(element), list[Any]()
-        for i, ((_, kind, length), values) in enumerate(zip(element.properties, first, strict=True)):
-            fields += [(f"length {i}", length)] if length else []
-            fields.append((f"{i}", kind, (len(values),)))
-        self.place, record = begun, np.dtype(fields)
-        if begun + element.count * record.itemsize <= len(self.data):
-            rows = self.take(record, element.count, element)
-            if all((rows[f"length {i}"] == len(first[i])).all() for i, p in enumerate(element.properties) if p[2]):
-                return {name: rows[f"{i}"] for i, (name, *_) in enumerate(element.properties)}
-            self.place = begun
-        several = [self._row(element) for _ in range(element.count)]
-        return {name: [row[i] for row in several] for i, (name, *_) in enumerate(element.properties)}
-
-    def _row(self, element: _Element) -> list[AnyArray]:
-        """Return the values of the properties of the next entry."""
-        return [
-            self.take(kind, int(self.take(length, 1, element)[0]) if length else 1, element)
-            for _, kind, length in element.properties
-        ]
-
-
-def _vertices(element: _Element, columns: dict[str, Any]) -> FloatArray:
-    if not {"x", "y", "z"} <= set(columns) or any(length for *_, length in element.properties):
-        raise InputError("its vertices have no x, y and z", expected="a PLY mesh")
-    return np.column_stack([columns[axis][:, 0].astype(np.float64) for axis in "xyz"])
-
-
-def _polygons(element: _Element, columns: dict[str, Any]) -> list[IntArray]:
-    """Return the corners of the polygons, grouped by size."""
-    lists = [name for name, _, length in element.properties if length]
-    which = next((name for name in lists if name in ("vertex_indices", "vertex_index")), None)
-    if which is None:
-        raise InputError("its faces list no vertices", expected="'vertex_indices' or 'vertex_index'")
-    corners, by_size = columns[which], dict[int, list[AnyArray]]()
-    for row in [corners] if isinstance(corners, np.ndarray) else corners:
-        by_size.setdefault(row.shape[-1], []).append(row.reshape(-1, row.shape[-1]))
-    # replace a value that is not a number by an index that no vertex has
-    polygons = {size: np.concatenate(rows) for size, rows in by_size.items() if size >= 3}
-    return [np.where(np.abs(rows) < 2**53, rows, -1).astype(np.int64) for rows in polygons.values()]
-
-
-def _fans(polygons: list[IntArray], vertices: FloatArray) -> tuple[IntArray, int]:
-    """Return the triangles of polygons (n, 3), and the number of polygons that are not flat."""
-    triangles: list[IntArray] = []
-    bent = 0
-    for group in polygons:
-        corners = group.shape[1]
-        if corners > 3:
-            check(RawMesh(vertices, group))
-            points = vertices[group]
-            normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-            size = np.linalg.norm(normal, axis=1, keepdims=True)
-            height = np.einsum("pki,pi->pk", points - points[:, :1], normal / np.where(size > 0.0, size, 1.0))
-            bent += int((np.abs(height).max(axis=1) > _FLAT_M).sum())
-        for k in range(1, corners - 1):
-            # a fan around the first corner
-            triangles.append(group[:, [0, k, k + 1]])
-    return (np.concatenate(triangles) if triangles else np.zeros((0, 3), dtype=np.int64)), bent
+    if kind != "binary_little_endian":
+        raise InputError(f"a PLY of format '{kind[:40]}'", expected=_MESH)
+    return elements, data.find(b"\n", end) + 1
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh:
@@ -339,7 +233,7 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
         # combine digests, so that moving bytes from one file to the next changes the result
         digest.update(hashlib.sha256(content).digest())
         parts.append(_Part(name, _of_shape(shape, name, radio, unknown), mesh))
-        if sum(len(part.mesh.triangles) for part in parts) > _MOST_TRIANGLES:
+        if sum(len(part.mesh[1]) for part in parts) > _MOST_TRIANGLES:
             raise InputError(
                 f"more than {_MOST_TRIANGLES} triangles",
                 expected="a scene that fits into memory",
@@ -347,17 +241,14 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
             )
     if not parts:
         raise InputError("the scene has no triangle", expected="shapes of type ply")
-    meshes = [part.mesh for part in parts]
-    vertices, triangles = joined([(mesh.vertices, mesh.triangles) for mesh in meshes])
-    if bent := sum(mesh.bent for mesh in meshes):
-        notes.append(f"{bent} polygons are not flat: they were cut into triangles from their first corner")
+    vertices, triangles = joined([part.mesh for part in parts])
     notes += [
         f"warning: {counted(n, 'shape')} of type '{kind}' left out: only ply is read" for kind, n in skipped.items()
     ]
     return TriangleScene(
         vertices_m=vertices,
         triangles=triangles,
-        shape=np.repeat(np.arange(len(parts)), [len(mesh.triangles) for mesh in meshes]),
+        shape=np.repeat(np.arange(len(parts)), [len(part.mesh[1]) for part in parts]),
         shapes=tuple(part.name for part in parts),
         materials=tuple(part.material for part in parts),
         notes=tuple(notes),
@@ -370,7 +261,7 @@ class _Part(NamedTuple):
 
     name: str
     material: str
-    mesh: RawMesh
+    mesh: Mesh
 
 
 def _root(path: Path) -> tuple[ElementTree.Element, bytes]:

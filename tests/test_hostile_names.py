@@ -88,7 +88,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # Every command that writes files, in an order in which later ones may read what earlier ones wrote; {} is the place.
 COMMANDS = {
     "ingest": "ingest {}/f1 --timezone America/New_York -o {}/flight.h5 --draft {}/draft.yaml --site {}/site.yaml",
-    "report": "report {}/f1/flight.yaml --audit none --kmz -o {}/report",
+    "report": "report {}/f1/flight.yaml --audit none --kmz --netcdf -o {}/report",
     "campaign": "campaign {}/campaign.yaml -o {}/campaign",
     "calibrate": "calibrate {}/f1/flight.yaml {}/f2/flight.yaml -o {}/calibrated.yaml --into-site {}/site.yaml",
     "predict": "predict {}/site.yaml --with {}/f1/flight.yaml --spacing 200 -o {}/predicted",

@@ -21,6 +21,7 @@ from ..common.units import FloatArray
 from ..compare.calibration import choose
 from ..compare.field_gp import FlownFlights, rms_db
 from ..compare.gains import GainModel, LinkSamples
+from ..flight.route_files import read_areas
 from ..flight.routes import (
     NOSES,
     Pattern,
@@ -34,7 +35,6 @@ from ..flight.routes import (
     waypoints_csv,
 )
 from ..flight.training import counted_once
-from ..logs.route import read_areas
 from ..report.plan import PlanPage, plan_metrics, write_plan
 from ..report.texts import safe_name
 from ..site.mapfiles import MAX_CROSSINGS, is_tangled

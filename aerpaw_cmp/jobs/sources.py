@@ -26,11 +26,11 @@ from ..flight.data import FAR_M, FlightData, load_data, nearest_m
 from ..flight.drafting.proposals import LearnedLink, latest_learned_links
 from ..flight.gains import flight_of, load_with_learned, pair_db
 from ..flight.replay import attitude_rotation, replay_poses
+from ..flight.route_files import MOST_POINTS, read_route, too_many_points
 from ..flight.settings import FlightFile, LinkSettings, RssSettings, RtSettings
 from ..flight.simulate import LEAN_DEG_PER_MPS, planned_poses
 from ..flight.track import interpolated, raised
 from ..logs.readers import HEAD_BYTES
-from ..logs.route import MOST_POINTS, read_route, too_many_points
 from ..maps.grid import Grid
 from ..propagation.field.baselines import free_space_dbm
 from ..propagation.geometry import Poses, rotation_from_aircraft, rotation_from_axes

@@ -57,7 +57,7 @@ def line_of(module: str) -> Callable[..., int]:
 def test_a_fault_of_our_own_is_not_blamed_on_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for module in ("aerpaw_cmp.logs.route", "aerpaw_parsers.nemo"):
+    for module in ("aerpaw_cmp.flight.route_files", "aerpaw_parsers.nemo"):
         with pytest.raises(TypeError), parsing("a.log"):
             line_of(module)("text")
         with pytest.raises(InputError, match="TypeError"), parsing("a.log", any_shape=True):
@@ -65,9 +65,9 @@ def test_a_fault_of_our_own_is_not_blamed_on_the_file(
     with pytest.raises(InputError, match="TypeError"), parsing("a.log"):
         line_of("scipy.io")("text")
     with pytest.raises(InputError, match="KeyError"), parsing("a.log"):
-        line_of("aerpaw_cmp.logs.route")({}["x"])
+        line_of("aerpaw_cmp.flight.route_files")({}["x"])
     (tmp_path / "route.csv").write_bytes(SMALL_FILES["route:csv"][0])
-    monkeypatch.setattr("aerpaw_cmp.logs.route._table", line_of("aerpaw_cmp.logs.route"))
+    monkeypatch.setattr("aerpaw_cmp.flight.route_files._table", line_of("aerpaw_cmp.flight.route_files"))
     words = ["predict", str(tmp_path / "route.csv"), "--site", "lake_wheeler", "-o", str(tmp_path / "p"), "-q"]
     assert main(words) == 70
     assert "This is a fault of the program, not of your input" in capsys.readouterr().err
@@ -129,6 +129,7 @@ OWN = {
     "jobs/bench.py": "lines that it wrote itself",
     "compare/statistics.py": "a packaged table",
     "flight/training.py": "text that is compared, never parsed; any file is asked for its head; what cannot be read names no log",
+    "logs/dictionary.py": "a packaged table",
     "logs/files.py": "inside ingest and map files; its own list of what archives raise; inside ingest",
     "logs/text.py": "inside ingest",
     "logs/matfile.py": "inside ingest",

@@ -7,6 +7,7 @@ import pytest
 import shapely
 
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.flight.route_files import read_areas, read_route
 from aerpaw_cmp.flight.routes import (
     NOSES,
     Pattern,
@@ -22,7 +23,6 @@ from aerpaw_cmp.flight.routes import (
     waypoints_of,
     with_turns,
 )
-from aerpaw_cmp.logs.route import read_areas, read_route
 from aerpaw_cmp.site.siteyaml import load_site
 
 TOWER = np.array([[10.0, 20.0, 10.0]])

@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.flight.route_files import read_route
 from aerpaw_cmp.jobs import next_flight
-from aerpaw_cmp.logs.route import read_route
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import unlisted
 

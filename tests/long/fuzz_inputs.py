@@ -653,13 +653,13 @@ REPORT = json.dumps({
     "inputs": [{"path": "a.txt", "sha256": "0" * 64, "reader": "sounder_log"}], "rt": {}, "versions": {},
 }).encode()  # fmt: skip
 WAYPOINT = b"%d\t0\t%d\t16\t0\t0\t0\t0\t35.7275\t-78.696\t100\t1\n"
-_ROUTE = _loader("logs.route", "read_route", height_m=40.0)
+_ROUTE = _loader("flight.route_files", "read_route", height_m=40.0)
 # Files of one seed each: inputs other than logs and maps that may come from a third party.
 SMALL_FILES: dict[str, tuple[bytes, Callable[[Path], Any]]] = {
     "route:csv": (b"latitude,longitude,altitude\n35.7275,-78.696,40\n35.7285,-78.697,40\n", _ROUTE),
     "route:plan": (PLAN, _ROUTE),
     "route:wpl": (b"QGC WPL 110\n" + WAYPOINT % (0, 0) + WAYPOINT % (1, 3), _ROUTE),
-    "fence:kml": (FENCE, _loader("logs.route", "read_areas")),
+    "fence:kml": (FENCE, _loader("flight.route_files", "read_areas")),
     "mesh:ply": (PLY, _loader("site.mitsuba", "read_mesh")),
     "scene:xml": (SCENE, _scene),
     "sphere:csv": (SPHERE, _loader("site.learned", "read_sphere_csv")),

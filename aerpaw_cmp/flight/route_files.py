@@ -31,9 +31,9 @@ from ..common import kml
 from ..common.errors import InputError, parsing
 from ..common.kml import named, outermost, plain_tag, xml_root
 from ..common.text import counted
-from . import dictionary
-from .ingest import as_utf8, read_bytes, read_file, sniffers_of
-from .readers import HEAD_BYTES, ReadOptions, claims
+from ..logs import dictionary
+from ..logs.ingest import as_utf8, read_bytes, read_file, sniffers_of
+from ..logs.readers import HEAD_BYTES, ReadOptions, claims
 
 if TYPE_CHECKING:
     import pandas as pd

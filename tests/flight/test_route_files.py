@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs import route
-from aerpaw_cmp.logs.route import COLUMNS, read_route
+from aerpaw_cmp.flight import route_files as route
+from aerpaw_cmp.flight.route_files import COLUMNS, read_route
 from tests.parsers import samples
 
 HOME = (35.7275, -78.6962, 90.0)

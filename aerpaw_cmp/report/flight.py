@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
@@ -308,19 +308,6 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
         columns={"Tower, channel": HEAD, "Offset [dB]": 1, "Slope": 2, "Detection floor [dB]": 1},
         rows=[list(node.values()) for node in verdict["nodes"]],
     )
-    above = Table(
-        caption="Share of samples at or above a threshold. Levels without a common reference with the log are "
-        "compared after the offset.",
-        columns={"Tower, channel": HEAD, "Threshold [dB]": 1, "Measured": SHARE, "Prediction": SHARE,
-                 "Ray tracing": SHARE},
-        rows=[
-            (link, x["threshold_db"], x["measured"], x["predicted"], mine and mine["predicted"])
-            for link, entry in series
-            for x, mine in zip_longest(
-                *(entry["cards"].get(key, {}).get("exceedance", ()) for key in (name, "ray tracing (this report)"))
-            )
-        ], look="tall",
-    )  # fmt: skip
     ranks = Table(
         caption="Ranks on the same samples.",
         columns={"Tower": HEAD, "Model": TEXT, "Samples": 0, "Kappa": 2, "Total variation": 3, "Agreement": SHARE},
@@ -333,9 +320,26 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
     return Card(
         title=name,
         text=[paragraph(bold(verdict["sentence"])), *verdict["remarks"]],
-        tables=[means, nodes, above, ranks],
+        tables=[means, nodes, _exceedance_table(name, series), ranks],
         parts=[Card(title=f"{name}, channel by channel", tables=[channels], fold=True)],
     )
+
+
+def _exceedance_table(name: str, series: Iterable[tuple[str, Mapping[str, Any]]]) -> Table:
+    """Return the shares of samples above thresholds: measured, by a prediction, and by ray tracing."""
+    return Table(
+        caption="Share of samples at or above a threshold. Levels without a common reference with the log are "
+        "compared after the offset.",
+        columns={"Tower, channel": HEAD, "Threshold [dB]": 1, "Measured": SHARE, "Prediction": SHARE,
+                 "Ray tracing": SHARE},
+        rows=[
+            (link, x["threshold_db"], x["measured"], x["predicted"], mine and mine["predicted"])
+            for link, entry in series
+            for x, mine in zip_longest(
+                *(entry["cards"].get(key, {}).get("exceedance", ()) for key in (name, "ray tracing (this report)"))
+            )
+        ], look="tall",
+    )  # fmt: skip
 
 
 def models_card(data: ReportData) -> Card:

@@ -42,7 +42,8 @@ _SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
 # Largest number of words in the sentence and the next step of a cause, because the first paragraph has at most sixty.
 MOST_CAUSE_WORDS = 28
 # A cause must reduce the RMSE by this share. Half of it suffices if the log odds per channel reach the second number,
-# because a floor leaves the error of all levels above it.
+# because a floor leaves the error of all levels above it. An unnamed cause with such odds shows that none of the
+# explanations is right.
 _LEAST_SHARE, _CERTAIN = 0.1, 30.0
 # The sentence states the RMSE without and with the cause. As printed, the two numbers must differ by this [dB].
 SHOWN_DB = 0.1
@@ -206,6 +207,9 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             _explains(other, shown, _lead(either, odds) / len(shown), (best & certain) - either) for other in either
         ):
             named[either] = shown
+    # an almost certain cause that may not be named shows that no explanation fits
+    if any(_lead({other}, odds) >= _CERTAIN for other in certain - frozenset().union(*named)):
+        named = {either: shown for either, shown in named.items() if _CATCH_ALL not in either}
     if not named:
         return _by_health(None, tables)
     # a gain over directions comes last, because it can look like many faults
@@ -301,13 +305,16 @@ class _Conditions:
     """The conditions that a cause must meet before it is named."""
 
     lead: float = -math.inf
-    """Log odds per channel against all explanations without it, unless the cause halves the RMSE."""
+    """Log odds per channel against all explanations without it."""
     share: float = 0.1
     """Smallest reduction of the RMSE, as a share."""
     learned_share: float = 0.0
     """The same with learned antennas, whose error is a few decibels on every flight."""
     part: float = 0.0
-    """Smallest share of the reduction that all candidates together achieve, for flights without learned antennas."""
+    """Smallest share of what all candidates together remove of the error that the other causes leave.
+
+    It applies to flights without learned antennas.
+    """
     of_uav: bool = False
     """True if the cause changes the levels of all channels."""
     of_tower: bool = False
@@ -329,7 +336,7 @@ _CONDITIONS = {
     "clock": _Conditions(part=0.5, most_left=1.0),
     "decibels": _Conditions(most_left=math.inf),
     "exponent or decibels": _Conditions(part=0.5, of_uav=True, follows=0.9, most_left=math.inf),
-    "gain step": _Conditions(lead=2.5, part=0.75),
+    "gain step": _Conditions(lead=2.5, part=0.7),
     "heading": _Conditions(learned_share=0.25, part=0.5, of_uav=True, most_left=1.0, follows=0.9),
     "height": _Conditions(part=0.5, of_uav=True, most_left=1.0, follows=0.9),
     "pattern": _Conditions(lead=3.0, learned_share=0.25, part=0.5, most_left=1.0, follows=1.0),
@@ -337,7 +344,7 @@ _CONDITIONS = {
     "place": _Conditions(lead=2.5, share=0.3, part=0.75, of_tower=True, most_left=1.0, follows=0.9),
     "saturation": _Conditions(part=0.5, most_left=1.0),
     "telemetry": _Conditions(part=0.5, of_uav=True, most_left=1.0, follows=0.9),
-    "tower": _Conditions(part=0.75, follows=1.0, most_left=math.inf),
+    "tower": _Conditions(part=0.65, follows=1.0, most_left=math.inf),
 }
 
 
@@ -360,7 +367,7 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     known_db, alone_db = _rmse_db(sound), _rmse_db(alone)
     before_db, after_db = (_rmse_db([_best(table, of) for table in shown]) for of in (beside, {*beside, name}))
     share = max(alone_db / known_db, after_db / before_db) if known_db and before_db else 1.0
-    if lead < need.lead and (need.of_tower or share > _HALF):
+    if lead < need.lead:
         return False
     least_share = max(need.share, need.learned_share * (sound[0].evidence.antenna == "learned"))
     certain = lead >= _CERTAIN and least_share <= _LEAST_SHARE and share <= 1.0 - 0.5 * _LEAST_SHARE
@@ -373,7 +380,7 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
         return False
     usual = _usual_db(shown)
     if usual is None:
-        enough = not need.part or alone_db <= known_db - need.part * (known_db - _together_db(shown))
+        enough = not need.part or after_db <= before_db - need.part * (before_db - _together_db(shown))
         restored = False
     else:
         # the error is larger than on any held-out flight, and usual after correcting the cause
@@ -396,8 +403,6 @@ def _holds_in_halves(models: Sequence[_Model]) -> bool:
 # the gain. Halves may show different directions, so a pattern with the next log odds per channel is not tested. Learned
 # antennas leave an error of 3 dB and more, so a pattern is not the cause of an error below the last number [dB].
 _CORRELATED_BINS, _MOST_IN_HALVES, _SURE_GAIN, _LEAST_DB = 10.0, 0.85, 20.0, 2.5
-# A cause that reduces the RMSE to this share needs no further log odds.
-_HALF = 0.5
 
 
 def _usual_db(shown: Sequence[_Models]) -> tuple[float, float] | None:

@@ -35,8 +35,9 @@ from aerpaw_cmp.propagation.geometry import (
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.search.merging import _labels
+from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.propagation.search.sionna import Coefficients
+from aerpaw_cmp.site.mitsuba import TriangleScene
 from aerpaw_cmp.site.siteyaml import load_site
 
 SITE = load_site("lake_wheeler")
@@ -313,5 +314,12 @@ def test_ranks_differ_where_no_singular_value_lies_at_the_limit(ours, expected, 
 
 
 def test_faces_are_counted_within_their_shape() -> None:
-    labels = _labels(("hall", "shed"), np.array([0, 0, 1, 0, 1]))
-    assert labels == ("hall face 1", "hall face 2", "shed face 1", "hall face 3", "shed face 2")
+    shapes = np.array([0, 0, 1, 0, 1])
+    apart = np.array([[[0.0, 0, 10 * i], [1, 0, 10 * i], [0, 1, 10 * i]] for i in range(len(shapes))])
+    scene = TriangleScene(
+        apart.reshape(-1, 3), np.arange(15).reshape(-1, 3), shapes, ("hall", "shed"), ("wood", "metal")
+    )
+    faces = merged(scene).faces
+    expected = {0: ("hall face 1", "wood"), 10: ("hall face 2", "wood"), 20: ("shed face 1", "metal")}
+    expected |= {30: ("hall face 3", "wood"), 40: ("shed face 2", "metal")}
+    assert dict(zip(faces.offset_m, zip(faces.label, faces.material, strict=True), strict=True)) == expected

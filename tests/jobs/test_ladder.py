@@ -76,7 +76,7 @@ def test_free_space_is_found_said_and_written(tmp_path: Path, capsys: pytest.Cap
     assert as_set["rmse_heldout_db"] == pytest.approx(rows["coherent ground reflection"]["rmse_heldout_db"], abs=1e-6)
     assert as_set["difference_to_best_db"] > 0.2
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "free space 1.0 dB" in page[page.index('id="result"') :][:400]  # the first sentence of the verdict
+    assert "free space 1.0 dB" in page[page.index('id="ladder"') :][:400]  # the first sentence of the verdict
     assert "Models from the simplest to the most complex" in page
 
     seal, *lines = better.read_text().splitlines()
@@ -134,7 +134,8 @@ def test_a_replay_that_loses_to_a_line_says_so_first(tmp_path: Path, capsys: pyt
     assert rows["log-distance line"]["difference_to_best_db"] == 0.0
     assert "line" not in next(name for name, row in rows.items() if row["recommended"])
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "log-distance line" in page[page.index('id="result"') :][:400]
+    assert "worse than a log-distance line" in page[: page.index('id="result"')]
+    assert "log-distance line" in page[page.index('id="ladder"') :][:400]
 
 
 def test_learned_antennas_are_scored_on_other_flights_alone(tmp_path: Path) -> None:

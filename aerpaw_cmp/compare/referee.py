@@ -18,6 +18,9 @@ WINDOW_S = 1.0
 # A level with a smaller standard deviation [dB] counts as constant.
 _CONSTANT_DB = 1e-6
 
+# Name of the model of the scored report in the cards.
+OURS = "ray tracing (this report)"
+
 # Numbers of a card that are averaged over channels.
 AVERAGED = ("bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "correlation", "crps_db", "coverage_90")
 

@@ -5,8 +5,7 @@ of the error of a flight are in :mod:`.causes`. A cause is named only if its int
 causes are tested, a false one is named in at most :data:`_FALSE_ALARMS` of the cases.
 
 The module also compares ray tracing with the best baseline over all channels of a flight. It computes offsets from the
-other flights of a campaign, and finds the nights on which the offset of a node
-changes suddenly.
+other flights of a campaign, and finds the nights on which the offset of a node changes suddenly.
 
 Two reports of one flight are compared sample by sample, because they have the same measurement and mostly the same
 model. Differences are second minus first report, so a negative difference of an error means that the second is better.

@@ -35,6 +35,7 @@ from ..compare.rank import MAX_RANK, agreement, cohen_kappa, histogram, total_va
 from ..compare.receiver import score_forecast
 from ..compare.referee import (
     AVERAGED,
+    OURS,
     LevelCard,
     PredictedLevel,
     detection_floor_db,
@@ -82,7 +83,7 @@ _ON_GROUND_M = 3.0
 # A sample is scored by the nearest predicted time within this [s], or within half of the prediction's step.
 _NEAR_S = 0.5
 
-OURS, EMULATED = "ray tracing (this report)", "emulated flight"
+EMULATED = "emulated flight"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

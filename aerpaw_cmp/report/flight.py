@@ -21,7 +21,7 @@ from ..common.text import counted
 from ..common.units import AnyArray, FloatArray
 from ..compare.ladder import distinct
 from ..compare.level import PART_DB, ErrorSpan, FieldAudit
-from ..compare.referee import AVERAGED
+from ..compare.referee import AVERAGED, OURS
 from ..compare.result import APPLIED, GIVEN, AuditResult, ClockResult, EngineResult, RankResult, RssResult
 from ..compare.statistics import FEWEST, Interval
 from ..logs.records import has_wall_clock
@@ -336,7 +336,7 @@ def _exceedance_table(name: str, series: Iterable[tuple[str, Mapping[str, Any]]]
             (link, x["threshold_db"], x["measured"], x["predicted"], mine and mine["predicted"])
             for link, entry in series
             for x, mine in zip_longest(
-                *(entry["cards"].get(key, {}).get("exceedance", ()) for key in (name, "ray tracing (this report)"))
+                *(entry["cards"].get(key, {}).get("exceedance", ()) for key in (name, OURS))
             )
         ], look="tall",
     )  # fmt: skip

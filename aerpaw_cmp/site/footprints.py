@@ -56,7 +56,7 @@ _LEVEL_M = 3.0
 _DEFAULT_HEIGHT_M = 6.0
 TALLEST_M = 300.0
 # Heights are rounded to centimetres, so a lower building would have no height.
-_GRID_HEIGHT_M = 0.01
+_LOWEST_M = 0.01
 # Outlines farther than this from the origin do not belong to the site.
 FAR_M = 20_000.0
 
@@ -457,10 +457,10 @@ def _describe(shape: _Shape, outline: Outline, actions: list[str]) -> None:
     if (metres(lowest) or 0.0) > 0:
         notes.append("it begins above the ground (min_height, min_level), but is drawn from the ground up")
     actions += [f"{shape.source}: {note}" for note in notes]
-    if not _GRID_HEIGHT_M <= height <= TALLEST_M:
+    if not _LOWEST_M <= height <= TALLEST_M:
         raise InputError(
             f"{shape.source}: a building {height:g} m high",
-            expected=f"{_GRID_HEIGHT_M:g} to {TALLEST_M:g} m",
+            expected=f"{_LOWEST_M:g} to {TALLEST_M:g} m",
             cause="feet or centimetres in place of metres",
         )
     shape.height_m = height

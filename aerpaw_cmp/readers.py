@@ -17,6 +17,8 @@ from .logs.rows import (
     BOM,
     NO_TIME,
     RELATIVE,
+    LineFormat,
+    OtherLines,
     Rows,
     built,
     checked_ranks,
@@ -25,8 +27,8 @@ from .logs.rows import (
     mean_rank,
     of_ues,
     snr_stream,
+    text_reader,
 )
-from .logs.rows import reader as text_reader
 from .logs.text import NUMBER, TIME, ZONE, Lines, add_flag, first_lines, match, mostly, no_flags, split
 
 __all__ = [
@@ -46,7 +48,9 @@ __all__ = [
     "InputError",
     "IntArray",
     "Kind",
+    "LineFormat",
     "Lines",
+    "OtherLines",
     "ReadOptions",
     "ReadResult",
     "Reader",

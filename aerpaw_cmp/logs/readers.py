@@ -84,6 +84,9 @@ class ReadOptions:
     neighbour: Callable[[str], bytes | None] | None = None
 
 
+ASSUMED_CLOCK, ASSUMED_HEIGHT = "assumed: local wall time", "assumed: above take-off"
+
+
 @dataclass(frozen=True, slots=True)
 class Reader:
     """One log format.
@@ -122,8 +125,8 @@ class Reader:
     read: Callable[[bytes, ReadOptions], ReadResult]
     pieces: bool = False
     read_pieces: _ReadPieces | None = None
-    clock_from: str = "assumed: local wall time"
-    height_from: str = "assumed: above take-off"
+    clock_from: str = ASSUMED_CLOCK
+    height_from: str = ASSUMED_HEIGHT
     plugin: str = ""
 
 

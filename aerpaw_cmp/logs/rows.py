@@ -4,8 +4,8 @@
 same for readers that find their rows in another way. ``Rows.number`` and ``Rows.text`` return columns,
 ``Rows.stream`` returns a stream of columns, and ``Rows.result`` completes the account.
 
-:func:`reader` makes a reader from the regular expression of its rows, its mark, and the streams of its columns. It adds
-sniffing, the account of all lines, times, and truncated last lines.
+:func:`text_reader` makes a reader from a :class:`LineFormat`, which contains the regular expression of the rows, and
+the streams of the columns. It adds sniffing, the account of all lines, times, and truncated last lines.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from . import text as _text
-from .readers import Reader, ReadOptions
+from .readers import ASSUMED_CLOCK, ASSUMED_HEIGHT, Reader, ReadOptions
 from .records import Attribute, Kind, ReadResult, RejectedLine, Stream
 
 _NO_DATE = "the time stamp is not a date of the calendar"
@@ -227,13 +227,35 @@ def matched(
     rows, groups = _text.match(lines, pattern)
     texts = _text.columns(groups, pattern.groups)
     column = {name: texts[i - 1] for name, i in pattern.groupindex.items()}
-    return built(lines, rows, column, options, reader=reader, reason=reason, skip=skip, clock=clock)
+    return built(lines, rows, column, options, reader=reader, others=OtherLines(reason), skip=skip, clock=clock)
+
+
+@dataclass(frozen=True)
+class OtherLines:
+    """The lines of a file that are not rows, as far as its reader knows them.
+
+    Parameters
+    ----------
+    reason : callable
+        Return why a line is rejected, or None for a header, a comment or other console output. As default, no line is
+        rejected.
+    rejected : iterable of RejectedLine
+        Lines that were rejected before.
+    comments : int array, optional
+        0-based lines known to be comments.
+    closed : bool
+        True if records have their own end mark, so that a missing line end does not matter.
+    """
+
+    reason: Reason = field(default=lambda _line: None)
+    rejected: Iterable[RejectedLine] = ()
+    comments: IntArray | None = None
+    closed: bool = False
 
 
 def built(
     lines: _text.Lines, rows: IntArray, column: dict[str, AnyArray], options: ReadOptions, *, reader: str,
-    reason: Reason, skip: Callable[[IntArray], BoolArray] | None = None, clock: str = "wall",
-    extra: Iterable[RejectedLine] = (), markup: IntArray | None = None, closed: bool = False,
+    others: OtherLines = OtherLines(), skip: Callable[[IntArray], BoolArray] | None = None, clock: str = "wall",
 ) -> Rows:  # fmt: skip
     """Return rows from line numbers and text columns, one of which is ``time``, like :func:`matched`.
 
@@ -244,24 +266,19 @@ def built(
         0-based lines of the rows.
     column : mapping of str to array, shape (n,)
         Their cells as bytes or floats.
-    options, reader, reason, skip, clock
+    options, reader, skip, clock
         The same as in :func:`matched`.
-    extra : iterable of RejectedLine
-        Lines that were rejected before.
-    markup : int array, optional
-        0-based lines known to be comments.
-    closed : bool
-        True if records have their own end mark, so that a missing line end does not matter.
+    others : OtherLines, optional
 
     Returns
     -------
     Rows
     """
     comment = np.zeros(len(rows), dtype=bool) if skip is None else skip(rows)
-    before = list(extra)
+    before = list(others.rejected)
     # lines that were rejected earlier are already counted
     known = np.concatenate((rows, np.array([line.number - 1 for line in before], dtype=np.int64))).astype(np.int64)
-    blank, rejected = _text.remainder(lines, known, reason, blank=markup)
+    blank, rejected = _text.remainder(lines, known, others.reason, blank=others.comments)
     rejected += before
     blank += int(comment.sum())
     if comment.any():
@@ -271,7 +288,7 @@ def built(
     rejected += _untimed(lines, rows, column_time, valid, clock)
     flag = _text.no_flags(len(rows))
     instants.flag(flag)
-    if lines.unterminated and not closed:
+    if lines.unterminated and not others.closed:
         _text.add_flag(flag, rows == len(lines) - 1, _text.UNTERMINATED)
     warnings = list(instants.warnings)
     if relative and len(rows):
@@ -501,23 +518,15 @@ Pattern = re.Pattern[bytes]
 BOM = rb"(?:\xef\xbb\xbf)?"
 
 
-def reader(
-    name: str, title: str, *, kinds: tuple[Kind, ...], sample: str, row: Pattern | Callable[[bytes], Pattern],
-    streams: Callable[[Rows], Iterable[Stream | None]], header: Pattern | None = None, mark: Pattern | None = None,
-    torn: Pattern | None = None, otherwise: str = "does not have the form of the format's rows (truncated line?)",
-    fields: int = 0, clock: str = "wall", skip: Callable[[bytes, IntArray], BoolArray] | None = None,
-) -> Reader:  # fmt: skip
-    r"""Return a reader of lines that a pattern describes.
+@dataclass(frozen=True)
+class LineFormat:
+    r"""The lines of a text format: its rows, the line by which a file is recognised, and the lines that are errors.
 
     Parameters
     ----------
-    name, title, kinds, sample
-        The same as in :class:`aerpaw_cmp.logs.readers.Reader`.
     row : re.Pattern or callable
         See :func:`aerpaw_cmp.logs.rows.matched`. A callable returns the pattern for a file, for instance from its
         header.
-    streams : callable
-        ``streams(rows)`` returns the streams of the rows.
     header : re.Pattern, optional
         The complete line above a table, which is a comment at any position. A file is recognised by this line or by
         ``mark``, if there is one, else by most of its first lines being rows.
@@ -534,38 +543,69 @@ def reader(
         See :func:`aerpaw_cmp.logs.rows.instants_of`.
     skip : callable, optional
         ``skip(data, lines)`` returns which of the matching lines (0-based) are comments.
+    """
+
+    row: Pattern | Callable[[bytes], Pattern]
+    header: Pattern | None = None
+    mark: Pattern | None = None
+    torn: Pattern | None = None
+    otherwise: str = "does not have the form of the format's rows (truncated line?)"
+    fields: int = 0
+    clock: str = "wall"
+    skip: Callable[[bytes, IntArray], BoolArray] | None = None
+
+    def rows(self, data: bytes, options: ReadOptions, *, reader: str) -> Rows:
+        """Return the rows of a file and the account of its other lines, for the reader of this name."""
+        pattern, skip = self.row if isinstance(self.row, re.Pattern) else self.row(data), self.skip
+        comments = None if skip is None else lambda lines: skip(data, lines)
+        return matched(data, pattern, options, reader=reader, reason=self._reason, clock=self.clock, skip=comments)
+
+    def sniff(self, head: bytes) -> bool:
+        """Check whether the beginning of a file has this format."""
+        if self.mark is not None:
+            # an expression that is anchored to line starts takes 5 ms per MiB, and sniffers see 4 MiB of a KML
+            return not head.startswith(_text.MARKUP) and self.mark.search(head) is not None
+        if self.header is not None:
+            return self.header.fullmatch(head[:4000].split(b"\n", 1)[0]) is not None
+        return _text.mostly(head, self.row) if isinstance(self.row, re.Pattern) else False
+
+    def _reason(self, line: bytes) -> str | None:
+        """Return why a line that is not a row is rejected, or None for a comment."""
+        if self.header is not None and self.header.fullmatch(line):
+            return None
+        if self.torn is not None:
+            return "an incomplete row (truncated line?)" if self.torn.match(line) else None
+        count = line.count(b",") + 1
+        if self.fields in (0, count):
+            return self.otherwise
+        return f"{counted(count, 'field')}, expected {self.fields} (truncated line?)"
+
+
+def text_reader(
+    name: str, title: str, *, kinds: tuple[Kind, ...], sample: str, lines: LineFormat,
+    streams: Callable[[Rows], Iterable[Stream | None]], clock_from: str = ASSUMED_CLOCK,
+    height_from: str = ASSUMED_HEIGHT,
+) -> Reader:  # fmt: skip
+    """Return a reader of lines that a pattern describes.
+
+    Parameters
+    ----------
+    name, title, kinds, sample, clock_from, height_from
+        The same as in :class:`aerpaw_cmp.logs.readers.Reader`.
+    lines : LineFormat
+    streams : callable
+        ``streams(rows)`` returns the streams of the rows.
 
     Returns
     -------
     Reader
     """
 
-    def reason(line: bytes) -> str | None:
-        if header is not None and header.fullmatch(line):
-            return None
-        if torn is not None:
-            return "an incomplete row (truncated line?)" if torn.match(line) else None
-        count = line.count(b",") + 1
-        return (
-            f"{counted(count, 'field')}, expected {fields} (truncated line?)" if fields not in (0, count) else otherwise
-        )
-
     def read(data: bytes, options: ReadOptions) -> ReadResult:
-        pattern = row if isinstance(row, re.Pattern) else row(data)
-        left_out = None if skip is None else lambda lines: skip(data, lines)
-        rows = matched(data, pattern, options, reader=name, reason=reason, clock=clock, skip=left_out)
+        rows = lines.rows(data, options, reader=name)
         return rows.result(streams(rows))
 
-    def known(head: bytes) -> bool:
-        if header is not None:
-            return header.fullmatch(head[:4000].split(b"\n", 1)[0]) is not None
-        return _text.mostly(head, row) if isinstance(row, re.Pattern) else False
-
-    def marked(head: bytes) -> bool:
-        # an expression that is anchored to line starts takes 5 ms per MiB, and sniffers see 4 MiB of a KML
-        return mark is not None and not head.startswith(_text.MARKUP) and mark.search(head) is not None
-
     return Reader(
-        name=name, title=title, kinds=kinds, sample=sample, sniff=known if mark is None else marked,
-        read=read,
+        name=name, title=title, kinds=kinds, sample=sample, sniff=lines.sniff, read=read, clock_from=clock_from,
+        height_from=height_from,
     )  # fmt: skip

@@ -24,7 +24,7 @@ from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.limits import NEAR_DEG
-from aerpaw_cmp.readers import ReadOptions, RejectedLine, Rows, built, counted, dictionary, instants_of
+from aerpaw_cmp.readers import OtherLines, ReadOptions, RejectedLine, Rows, built, counted, dictionary, instants_of
 
 from . import _json, _stamps
 
@@ -733,8 +733,8 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     if clock.startswith("relative") and start is not None:
         options = replace(options, time_origin=options.time_origin or start[1])
     timed = built(
-        sheet.lines, sheet.row, {"time": cells}, options, reader=reader, reason=lambda _line: None, clock=clock,
-        extra=sheet.rejected, markup=sheet.blank_rows, closed=sheet.closed,
+        sheet.lines, sheet.row, {"time": cells}, options, reader=reader, clock=clock,
+        others=OtherLines(rejected=sheet.rejected, comments=sheet.blank_rows, closed=sheet.closed),
     )  # fmt: skip
     timed.warnings += warnings
     if clock.startswith("relative") and start is not None:

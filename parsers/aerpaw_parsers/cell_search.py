@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 
-from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, built, match, split
+from aerpaw_cmp.readers import OtherLines, Reader, ReadOptions, ReadResult, built, match, split
 
 from . import _cells, _stamps
 
@@ -38,7 +38,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     clock, time, warnings = _stamps.read(texts, options)
     rows = built(
         lines, row, {"time": time}, options, reader="cell_search", clock=clock,
-        reason=lambda line: "an incomplete cell (truncated line?)" if b"Found CELL" in line else None,
+        others=OtherLines(lambda line: "an incomplete cell (truncated line?)" if b"Found CELL" in line else None),
     )  # fmt: skip
     rows.warnings += warnings
     cells = [groups[i] for i in rows.at.tolist()]

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from aerpaw_cmp.common.units import BoolArray, IntArray
-from aerpaw_cmp.readers import NUMBER, TIME, ZONE, Rows, Stream, match, snr_stream, split, text_reader
+from aerpaw_cmp.readers import NUMBER, TIME, ZONE, LineFormat, Rows, Stream, match, snr_stream, split, text_reader
 
 _STAMP = rb"^\[(?P<time>" + TIME + ZONE + rb")\] "
 _VALUE = re.compile(_STAMP + rb"(?P<tower>\d{1,2}):(?P<snr>" + NUMBER + rb"|nan|-?inf)[ \t]*\r?$", re.MULTILINE)
@@ -35,6 +35,8 @@ def _streams(rows: Rows) -> Iterator[Stream | None]:
 READER = text_reader(
     "controller_log", "AADM controller console: SNR of each tower", kinds=("rss",),
     sample="[2025-01-01 12:00:07.000002] 1:-1.250000",
-    mark=re.compile(rb"^\[[^\n]{0,80}\[(?:Controller-->UAV|UAV-->Controller)\]", re.MULTILINE), row=_VALUE,
-    torn=re.compile(_STAMP + rb"\d{1,2}:"), skip=_no_level, streams=_streams,
+    streams=_streams, lines=LineFormat(
+        row=_VALUE, mark=re.compile(rb"^\[[^\n]{0,80}\[(?:Controller-->UAV|UAV-->Controller)\]", re.MULTILINE),
+        torn=re.compile(_STAMP + rb"\d{1,2}:"), skip=_no_level,
+    ),
 )  # fmt: skip

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from aerpaw_cmp.readers import NUMBER, FloatArray, Rows, Stream, text_reader
+from aerpaw_cmp.readers import NUMBER, FloatArray, LineFormat, Rows, Stream, text_reader
 
 from . import _cells
 
@@ -56,6 +56,6 @@ def _streams(rows: Rows) -> Iterator[Stream | None]:
 
 READER = text_reader(
     "nemo_csv", "Keysight Nemo NR rank and level, CSV with relative times", kinds=("rank", "rss", "kpi", "telemetry"),
-    sample="12,-1500.0,35.7280001,-78.6960002,30.5,2.0,-81.5,28.0,12.0", header=_HEADER,
-    row=_ROW, streams=_streams, fields=9, otherwise="a field is not a number", clock="relative_ms",
+    sample="12,-1500.0,35.7280001,-78.6960002,30.5,2.0,-81.5,28.0,12.0", streams=_streams,
+    lines=LineFormat(row=_ROW, header=_HEADER, fields=9, otherwise="a field is not a number", clock="relative_ms"),
 )  # fmt: skip

@@ -12,9 +12,10 @@ import numpy as np
 
 from aerpaw_cmp.common import kml
 from aerpaw_cmp.common.geodesy import rough_m
+from aerpaw_cmp.common.units import BoolArray, FloatArray
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.limits import FASTEST_MPS, typical_speed_mps
-from aerpaw_cmp.readers import BoolArray, FloatArray, Reader, ReadOptions, ReadResult, Rows, Stream, built, dictionary
+from aerpaw_cmp.readers import OtherLines, Reader, ReadOptions, ReadResult, Rows, Stream, built, dictionary
 
 from . import _cells, _pose
 from .nemo_csv import pdsch_rank
@@ -57,7 +58,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     column = dict(zip(names, _text.columns([item.groups(b"") for item in reports], 7), strict=True))
     in_seconds = _in_seconds(*(_text.numbers(column[name]) for name in ("time", *_POSITION[:2])))
     rows = built(
-        lines, row, column, options, reader="nemo_kml", reason=_reason,
+        lines, row, column, options, reader="nemo_kml", others=OtherLines(_reason),
         clock="relative_s" if in_seconds else "relative_ms",
     )  # fmt: skip
     if in_seconds:

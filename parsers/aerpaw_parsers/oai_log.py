@@ -74,7 +74,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Return the rank stream ``oai`` and RSRP, or raise UsageError if the zone of stamps is unknown."""
     lines = split(data)
     row, quantities, clock, time = _rows_of(lines)
-    rows = built(lines, row, {"time": time}, options, reader="oai_log", reason=lambda _line: None, clock=clock)
+    rows = built(lines, row, {"time": time}, options, reader="oai_log", clock=clock)
     timed = [quantities[i] for i in rows.at.tolist()]
     names = ("ri", "cqi", "sinr", "rsrp", "meas")
     value = {name: np.array([float(item.get(name, b"nan")) for item in timed]) for name in names}

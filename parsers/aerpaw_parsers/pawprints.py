@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, Rows, Stream, built, match, matched, split
+from aerpaw_cmp.readers import OtherLines, Reader, ReadOptions, ReadResult, Rows, Stream, built, match, matched, split
 
 from . import _cells, _json, _pose
 
@@ -68,8 +68,9 @@ def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
     sound = np.array([item is not None for item in cells], dtype=bool)
     rows = built(
         lines, row[sound], {"time": np.array([float(group[0]) for group in groups], dtype=np.float64)[sound]}, options,
-        reader="pawprints", reason=lambda _line: "not a complete 'CELL_LOG_START ... CELL_LOG_STOP' (truncated line?)",
-        clock="epoch_ms", extra=odd,
+        reader="pawprints", clock="epoch_ms", others=OtherLines(
+            lambda _line: "not a complete 'CELL_LOG_START ... CELL_LOG_STOP' (truncated line?)", odd
+        ),
     )  # fmt: skip
     blocks = [item for item in cells if item is not None]
     readings = [_reading(i, cell, np.nan) for i, at in enumerate(rows.at.tolist()) for cell in blocks[at]]
@@ -132,8 +133,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     entries = parsed.values
     time = _json.column(entries, "companion_abs_time", "abs_time")
     rows = built(
-        lines, parsed.row, {"time": time}, options, reader="pawprints", reason=_json.bracket, clock="epoch_ms",
-        extra=parsed.rejected, markup=parsed.more, closed=parsed.closed,
+        lines, parsed.row, {"time": time}, options, reader="pawprints", clock="epoch_ms",
+        others=OtherLines(_json.bracket, parsed.rejected, comments=parsed.more, closed=parsed.closed),
     )  # fmt: skip
     timed = [entries[i] for i in rows.at.tolist()]
     if any("companion_abs_time" not in item and "cells" in item for item in timed):

@@ -12,7 +12,17 @@ import re
 import numpy as np
 
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, RejectedLine, Rows, Stream, built, checked_ranks
+from aerpaw_cmp.readers import (
+    OtherLines,
+    Reader,
+    ReadOptions,
+    ReadResult,
+    RejectedLine,
+    Rows,
+    Stream,
+    built,
+    checked_ranks,
+)
 
 from . import _cells
 
@@ -69,8 +79,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     entries, rejected = _tables(lines)
     row = np.array([item[0] for item in entries], dtype=np.int64)
     time = _text.cells([item[1] for item in entries])
-    talk, column = lambda _line: None, {"time": time}
-    rows = built(lines, row, column, options, reader="quectel_console", reason=talk, extra=rejected)
+    rows = built(lines, row, {"time": time}, options, reader="quectel_console", others=OtherLines(rejected=rejected))
     timed = [entries[i] for i in rows.at.tolist()]
     readings = [
         _cells.reading(i, value, rat="lte" if title == "LTE" else "nr", serving=True)

@@ -33,7 +33,7 @@ import numpy as np
 from aerpaw_cmp.common.units import AnyArray, BoolArray, IntArray
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.rows import Rows, built, checked_ranks
-from aerpaw_cmp.readers import TIME, ZONE, Attribute, Reader, ReadOptions, ReadResult, Stream
+from aerpaw_cmp.readers import TIME, ZONE, Attribute, OtherLines, Reader, ReadOptions, ReadResult, Stream
 
 _C = rb"[^,\n]{0,80}"
 # The logger's CSV, or a console whose lines have a stamp (ts, a terminal program).
@@ -185,7 +185,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """
     lines = _text.split(data)
     row, table = _table(lines)
-    rows = built(lines, row, table, options, reader="quectel_csv", reason=_reason)
+    rows = built(lines, row, table, options, reader="quectel_csv", others=OtherLines(_reason))
     form = rows.columns["form"]
     nr = np.isin(form, (2, _NSA_FORM)) | ((form == 1) & (rows.columns["nr_rsrp"] != b""))
     levels = (*_levels(rows, "lte", form == 1), *_levels(rows, "nr", nr))

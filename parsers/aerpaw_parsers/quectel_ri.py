@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from aerpaw_cmp.readers import BOM, NUMBER, TIME, ZONE, Rows, Stream, text_reader
+from aerpaw_cmp.readers import BOM, NUMBER, TIME, ZONE, LineFormat, Rows, Stream, text_reader
 
 _CELL = rb', ?"?(?P<%s>' + NUMBER + rb'|nan|NaN|)"?'
 _ROW = re.compile(
@@ -35,11 +35,13 @@ READER = text_reader(
     "published Quectel NR rank table (six columns)",
     kinds=("rank",),
     sample="8,2025-01-01 12:00:07.250,-78.6960001,35.7280001,30.1,2",
-    header=re.compile(
-        BOM + rb'(?i:"?ID"?, ?"?Time and date"?, ?"?Longitude"?, ?"?Latitude"?, ?"?Altitude"?, ?"?NR RI"?)\s*'
+    lines=LineFormat(
+        row=_ROW,
+        header=re.compile(
+            BOM + rb'(?i:"?ID"?, ?"?Time and date"?, ?"?Longitude"?, ?"?Latitude"?, ?"?Altitude"?, ?"?NR RI"?)\s*'
+        ),
+        fields=6,
+        otherwise="the time or a number has another form",
     ),
-    row=_ROW,
     streams=_streams,
-    fields=6,
-    otherwise="the time or a number has another form",
 )

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from aerpaw_cmp.readers import TIME, ZONE, Rows, Stream, of_ues, text_reader
+from aerpaw_cmp.readers import TIME, ZONE, LineFormat, Rows, Stream, of_ues, text_reader
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _ROW = re.compile(
@@ -46,6 +46,8 @@ def _streams(rows: Rows) -> Iterator[Stream | None]:
 READER = text_reader(
     "srsenb_log", "srsENB console: rank indicator (0 = no report)", kinds=("rank",),
     sample="[2025-01-01 12:00:07.000000] lte   46   11   2    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k",
-    mark=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:rat +(?:pci +)?)?rnti +cqi +ri +mcs", re.MULTILINE), row=_ROW,
-    torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:lte|nr) +[0-9a-fA-F]{1,5} "), streams=_streams,
+    streams=_streams, lines=LineFormat(
+        row=_ROW, mark=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:rat +(?:pci +)?)?rnti +cqi +ri +mcs", re.MULTILINE),
+        torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:lte|nr) +[0-9a-fA-F]{1,5} "),
+    ),
 )  # fmt: skip

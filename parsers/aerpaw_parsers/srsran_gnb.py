@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, built, matched, mean_rank
+from aerpaw_cmp.readers import OtherLines, Reader, ReadOptions, ReadResult, built, matched, mean_rank
 
 from . import _json, _stamps
 
@@ -93,8 +93,10 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     # an object without UEs is valid, not a truncated line
     mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host
     rows = built(
-        lines, row[with_ue], {"time": time}, options, reader="srsran_json", reason=_json.bracket, clock=clock,
-        extra=reports.rejected, markup=np.concatenate((mute, reports.more)), closed=reports.closed,
+        lines, row[with_ue], {"time": time}, options, reader="srsran_json", clock=clock,
+        others=OtherLines(
+            _json.bracket, reports.rejected, comments=np.concatenate((mute, reports.more)), closed=reports.closed
+        ),
     )  # fmt: skip
     rows.warnings += warnings
     pairs = [(i, ue) for i, at in enumerate(rows.at.tolist()) for ue in _ues(entries[with_ue[at]])]

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from aerpaw_cmp.readers import TIME, ZONE, Rows, Stream, text_reader
+from aerpaw_cmp.readers import TIME, ZONE, LineFormat, Rows, Stream, text_reader
 
 from . import _cells
 
@@ -47,10 +47,12 @@ READER = text_reader(
     "srsUE console: RSRP, path loss, CFO",
     kinds=("rss", "kpi"),
     sample="[2025-01-01 12:00:07.000000]   0    1   -61   61 -4.3k |   0   25   1.0   4.5k    0%  1.6 |  23  83k  19M",
-    mark=re.compile(
-        rb"^\[[^\]\n]{19,40}\] *(?:(?:cc|rat) +pci +rsrp +pl +cfo +\||cc +rsrp +pl +cfo +mcs +snr)", re.MULTILINE
+    lines=LineFormat(
+        row=_ROW,
+        mark=re.compile(
+            rb"^\[[^\]\n]{19,40}\] *(?:(?:cc|rat) +pci +rsrp +pl +cfo +\||cc +rsrp +pl +cfo +mcs +snr)", re.MULTILINE
+        ),
+        torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:\d{1,2}|lte|nr) +\d{1,4} +[^ a-zA-Z]"),
     ),
-    row=_ROW,
-    torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:\d{1,2}|lte|nr) +\d{1,4} +[^ a-zA-Z]"),
     streams=_streams,
 )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from aerpaw_cmp.readers import NUMBER, TIME, ZONE, Rows, Stream, text_reader
+from aerpaw_cmp.readers import NUMBER, TIME, ZONE, LineFormat, Rows, Stream, text_reader
 
 _N = NUMBER
 _PLACE = rb'\{"lat": ?(?P<lat>%s), ?"lon": ?(?P<lon>%s), ?"alt": ?(?P<alt>%s)\}' % (_N, _N, _N)
@@ -34,5 +34,6 @@ def _streams(rows: Rows) -> Iterator[Stream | None]:
 READER = text_reader(
     "vehicle_log", "flight script's console: measured positions", kinds=("telemetry", "kpi"),
     sample='[2025-01-01 12:00:07.250000] Current location is {"lat": 35.7280002, "lon": -78.6960001, "alt": 30.1}',
-    mark=_ROW, row=_ROW, torn=re.compile(rb"^\[[^\]\n]{19,40}\] Filtered data \(avg\)"), streams=_streams,
+    lines=LineFormat(row=_ROW, mark=_ROW, torn=re.compile(rb"^\[[^\]\n]{19,40}\] Filtered data \(avg\)")),
+    streams=_streams,
 )  # fmt: skip

@@ -49,6 +49,7 @@ def test_a_reader_of_another_package_reads_its_sample(installed: Path) -> None:
     assert file["reader"] == "monitor"
     assert (file["lines"], file["accepted"], file["rejected"], file["blank"]) == (4, 2, 1, 1)
     assert file["streams"][0]["start"].startswith("2025-03-02T15:00:00.25")
+    assert file["streams"][0]["clock_from"] == "program: spectrum monitor"
 
 
 def test_a_reader_with_a_known_name_is_refused(installed: Path) -> None:

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -49,7 +50,12 @@ def test_a_reader_of_another_package_reads_its_sample(installed: Path) -> None:
     assert file["reader"] == "monitor"
     assert (file["lines"], file["accepted"], file["rejected"], file["blank"]) == (4, 2, 1, 1)
     assert file["streams"][0]["start"].startswith("2025-03-02T15:00:00.25")
-    assert file["streams"][0]["clock_from"] == "program: spectrum monitor"
+
+
+def test_a_reader_of_lines_states_where_its_clock_and_its_heights_come_from(installed: Path) -> None:
+    reader = runpy.run_path(str(installed / "my_monitor.py"))["READER"]
+    assert reader.clock_from == "program: spectrum monitor"
+    assert reader.height_from == "assumed: above take-off"
 
 
 def test_a_reader_with_a_known_name_is_refused(installed: Path) -> None:

@@ -12,7 +12,7 @@ REPORT := reports/sample
 
 # a PYTHONPATH from another project must not reach into our environment
 unexport PYTHONPATH PYTHONHOME PIP_USER
-# without bytecode kept, every worker and every child of a test compiles the package and rewrites the tests anew
+# without stored bytecode, every worker and every child process of a test would compile the package again
 unexport PYTHONDONTWRITEBYTECODE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
@@ -22,16 +22,16 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 help:
 	@echo "make report   replay the sample flight and write $(REPORT)/report.html"
 	@echo "make test     ruff, mypy, import-linter, pytest"
-	@echo "make setup    only the environment, developers' tools included: .venv and an LLVM for Dr.Jit"
+	@echo "make setup    only the environment .venv with the developers' tools, and an LLVM for Dr.Jit"
 	@echo "make docs     the documentation as pages, build/site/index.html"
 	@echo "make bench    speed against error on this machine"
 	@echo "make bench-all  every benchmark with its peers in one run; makes docs/performance.md"
-	@echo "make bench-check  every file of benchmarks/ at its smallest size: does it come to its end?"
+	@echo "make bench-check  every benchmark at its smallest size, to see that it ends without an error"
 	@echo "make clean    remove .venv, caches and $(REPORT)/"
 
 setup: $(READY_DEV) $(LLVM)
 
-# running needs the package alone; testing needs the developers' tools on top
+# commands need only the package; tests also need the developers' tools
 $(READY): pyproject.toml requirements/run.txt tools/setup_venv
 	@PYTHON="$(PYTHON)" tools/setup_venv .venv
 	@touch $@
@@ -48,10 +48,10 @@ report: $(READY) $(LLVM)
 	$(BIN)/aerpaw-cmp report sample_logs/flight.yaml -o $(REPORT) --figures png --force
 	@echo "The report: $(CURDIR)/$(REPORT)/report.html"
 
-# the order of files is that of tests/conftest.py: the dearest first
+# the files are in the order of tests/conftest.py: the slowest first
 WORKERS := -q -n auto --dist loadfile --no-loadscope-reorder
 
-# mypy uses one core, so it runs beside pytest; what it says comes after, and last which tests were skipped and why
+# mypy uses one core, so it runs in parallel to pytest; its output comes after, then the skipped tests with reasons
 test: setup
 	@command -v chromedriver >/dev/null || $(BIN)/python tools/setup_browser.py
 	$(BIN)/ruff check .
@@ -68,8 +68,8 @@ $(READY_DOCS): $(READY) requirements/docs.txt
 	@PYTHON="$(PYTHON)" tools/setup_venv .venv docs
 	@touch $@
 
-# strict: a dead link or anchor, a page without a place in the menu, a failing script of the gallery end it; with --quiet
-# warnings would be hidden from --strict, too
+# strict: a dead link or anchor, a page without a place in the menu, a failing script of the gallery end the build; --quiet
+# would also hide warnings from --strict
 docs: $(READY_DOCS)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "The documentation: $(CURDIR)/build/site/index.html"
@@ -80,7 +80,7 @@ bench: $(READY_DEV) $(LLVM)
 bench-all: $(READY_DEV) $(LLVM)
 	$(BIN)/python benchmarks/performance.py --measure
 
-# every benchmark at its smallest size: does it come to its end?
+# every benchmark at its smallest size, to see that it ends without an error
 bench-check: $(READY_DEV) $(LLVM)
 	$(BIN)/python benchmarks/all.py --check
 
@@ -88,7 +88,7 @@ clean:
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build dist $(REPORT)
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# what the packaged Lake Wheeler site remembers, anew from the real logs in FIELD
+# learn the models of the packaged Lake Wheeler site again from the real logs in FIELD
 learned: $(READY_DEV)
 	@mkdir -p reports/learned
 	for name in joint afar nr_rank; do \

@@ -1,4 +1,4 @@
-"""Entry point of the command line: answers ``--help`` from a table, hands everything else to :mod:`aerpaw_cmp.cli`.
+"""Entry point of the command line. It answers ``--help`` from a table; :mod:`aerpaw_cmp.cli` runs all commands.
 
 This is the one place where an exception becomes a message and an exit code:
 
@@ -9,7 +9,7 @@ This is the one place where an exception becomes a message and an exit code:
 3     an input could not be read, or an output not written
 70    a fault of the program itself (``--debug`` shows where)
 130   interrupted; 143 by SIGTERM, 129 by SIGHUP
-141   whoever read the output has gone (``aerpaw-cmp ... | head``)
+141   the reader of the output has closed it (``aerpaw-cmp ... | head``)
 ====  ==========================================================
 """
 

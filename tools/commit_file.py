@@ -1,6 +1,6 @@
-"""The commit that a wheel or an sdist was built from, so that an installed package can name it (``--version``).
+"""Build hook that stores the commit of the tree in a wheel or an sdist, so that ``--version`` can print it.
 
-Hatchling runs this while it builds; a wheel made from an sdist has the file already.
+Hatchling runs it during a build. A wheel built from an sdist already contains the file.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ _ASK = "from aerpaw_cmp.common.versions import commit; print(commit())"
 
 
 class CommitFile(BuildHookInterface):  # type: ignore[type-arg]
-    """Puts ``aerpaw_cmp/commit.txt`` into what is built."""
+    """A build hook that adds ``aerpaw_cmp/commit.txt``."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Ask the tree for its commit; an editable install asks it anew each time."""
+        """Write the commit of the tree to the file. An editable installation reads it from Git at each run instead."""
         if version == "editable" or Path(self.root, "aerpaw_cmp", "commit.txt").is_file():
             return
-        told = subprocess.run([sys.executable, "-c", _ASK], cwd=self.root, capture_output=True, text=True, check=True)
+        commit = subprocess.run([sys.executable, "-c", _ASK], cwd=self.root, capture_output=True, text=True, check=True)
         self._file = Path(tempfile.mkdtemp()) / "commit.txt"
-        self._file.write_text(told.stdout, encoding="ascii")
+        self._file.write_text(commit.stdout, encoding="ascii")
         build_data["force_include"][str(self._file)] = "aerpaw_cmp/commit.txt"

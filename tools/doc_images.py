@@ -1,8 +1,8 @@
-"""Remake pictures of ``docs/images``: the tutorial's page and the page of the tap.
+"""Make the pictures in ``docs/images`` of the tutorial's report and of the tap's page.
 
 python tools/doc_images.py [tutorial] [tap]
 
-Figures of the gallery are drawn when the documentation is built; that of docs/performance.md by ``make bench-all``.
+Figures of the gallery are drawn when the documentation is built, and ``make bench-all`` draws docs/performance.md's.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def of_the_tutorial() -> None:
 
 
 def main(names: list[str]) -> None:
-    """Remake the named pictures, or all."""
+    """Make the named pictures, or all pictures."""
     parts = {
         "tutorial": of_the_tutorial,
         "tap": lambda: run("tools/tap_picture.py", IMAGES / "tap_live.png", IMAGES / "tap_live_phone.png"),

@@ -1,6 +1,6 @@
-"""The lowest versions that pyproject.toml allows, as constraints for pip: what somebody with older packages has.
+"""The lowest versions that pyproject.toml allows, as constraints for pip, to test an environment with old packages.
 
-``python tools/lowest_versions.py > lowest.txt``, then ``pip install -c lowest.txt -e .`` in an environment of its own.
+``python tools/lowest_versions.py > lowest.txt``, then ``pip install -c lowest.txt -e .`` in a separate environment.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ else:
 
 
 def lowest(dependencies: list[str]) -> list[str]:
-    """Each requirement at its lowest version.
+    """Return each requirement at its lowest version.
 
     Examples
     --------

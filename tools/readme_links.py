@@ -1,8 +1,8 @@
-"""The README as a package index shows it: a link into this project must name its whole address there.
+"""Metadata hook that gives the README complete links, because a package index does not resolve relative links.
 
-Hatchling runs this where metadata are made. The address is that of ``Source`` under ``[project.urls]``, the links are
-those of the version's tag, ``/raw/`` for images and ``/blob/`` for pages, GitHub's way. While it names
-no owner the README stays as it is.
+Hatchling runs it when it creates the metadata. Links begin with the address ``Source`` of ``[project.urls]`` and the
+tag of the version, with ``/raw/`` for images and ``/blob/`` for pages, as on GitHub. As long as the address does not
+name an owner, the README is not changed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _LINK = re.compile(r"(?P<image>!?)(?P<text>\[[^\]\[]*\])\((?P<target>(?![a-z]+:|
 
 
 def with_addresses(text: str, source: str, version: str) -> str:
-    """A text in Markdown whose links into the project begin with the address of a version of it."""
+    """Return a Markdown text in which links into the project begin with the address of one of its versions."""
 
     def address(link: re.Match[str]) -> str:
         kind = "raw" if link["image"] else "blob"
@@ -27,10 +27,10 @@ def with_addresses(text: str, source: str, version: str) -> str:
 
 
 class ReadmeLinks(MetadataHookInterface):
-    """Sets ``readme``."""
+    """A metadata hook that sets ``readme``."""
 
     def update(self, metadata: dict[str, Any]) -> None:
-        """Set the README, with whole addresses where the project has one."""
+        """Set the README, with complete links if the project has an address."""
         text = Path(self.root, "README.md").read_text(encoding="utf-8")
         source = metadata["urls"]["Source"]
         text = text if "<owner>" in source else with_addresses(text, source, metadata["version"])

@@ -1,6 +1,6 @@
-"""Make sure that Dr.Jit has an LLVM that works: find one, else install one, else print the line that does.
+"""Find an LLVM that works for Dr.Jit, or install one, or print the command that installs one.
 
-Run by ``make setup`` with the Python that has Sionna RT. Exit code 0 when an LLVM works, 1 otherwise.
+``make setup`` runs it with the Python that has Sionna RT. The exit code is 0 if an LLVM works, else 1.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from aerpaw_cmp.propagation import llvm
 
 
 def say(text: str) -> None:
-    """To standard error, so that what make prints stays in order."""
+    """Print to standard error, so that the lines are in order with those of make."""
     print(text, file=sys.stderr)
 
 
 def root_prefix() -> list[str] | None:
-    """Prefix of a command that needs root: nothing, sudo, or None when it may not be run."""
+    """Return the prefix of a command that needs root: empty, sudo, or None if this user may not run it."""
     if hasattr(os, "geteuid") and os.geteuid() == 0:
         return []
     sudo = shutil.which("sudo")
@@ -37,7 +37,7 @@ def root_prefix() -> list[str] | None:
 
 
 def apt(say: Callable[[str], None]) -> Callable[..., bool] | None:
-    """apt-get of this machine, which tells ``say`` each command and answers whether it did it; None where it cannot."""
+    """Return a function that runs apt-get and returns success, or None without apt. ``say`` receives each command."""
     prefix = root_prefix()
     if prefix is None or not llvm.os_families() & {"debian", "ubuntu"} or shutil.which("apt-get") is None:
         return None
@@ -45,7 +45,7 @@ def apt(say: Callable[[str], None]) -> Callable[..., bool] | None:
     def apt_get(*arguments: str) -> bool:
         command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", *arguments]
         say(" ".join(command))
-        # a person may have to answer sudo; apt itself asks nothing
+        # sudo may request a password, so standard input stays connected; apt does not ask
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
         if done.returncode:
             say(done.stdout.strip()[-1000:])
@@ -62,14 +62,14 @@ def install(
     Parameters
     ----------
     say : callable
-        Told each command before it runs.
+        Receives each command before it runs.
     attempt : callable, optional
-        The trial; ``llvm.try_library`` by default.
+        Tests a library. Default: ``llvm.try_library``.
 
     Returns
     -------
     Trial or None
-        The trial of what was installed; None if nothing could be (not Debian or Ubuntu, no root, no package).
+        The test of the installed library. None if none can be installed (other system, no root, no package).
     """
     apt_get = apt(say)
     if apt_get is None:
@@ -82,7 +82,7 @@ def install(
         return trials[-1] if trials else None
 
     apt_get("update", "-qq")  # old lists name packages that the mirror no longer has
-    # an LLVM is there and only Dr.Jit's own need is missing, or else the distribution's LLVMs, newest first
+    # if there is an LLVM, first only install the library that Dr.Jit needs; then try LLVM packages, newest first
     wanted: list[tuple[str, ...]] = [(llvm.APT_RUNTIME,)] if llvm.candidates() else []
     wanted += [(package, llvm.APT_RUNTIME) for package in llvm.apt_packages(llvm.known_to_apt())]
     last: llvm.Trial | None = None
@@ -94,7 +94,7 @@ def install(
 
 
 def main() -> int:
-    """Find, try, install, explain."""
+    """Find and test an LLVM, install one if none works, and report the result."""
     try:
         trials = llvm.first_that_works(llvm.candidates())
     except AerpawCmpError as error:
@@ -105,11 +105,11 @@ def main() -> int:
     if trials and trials[-1].ok:
         return 0
     if llvm.sionna_fails(trials):
-        say(f"{llvm.explain(trials)}. Please remove .venv and run the same make command again, if need be with another")
-        say("Python: make PYTHON=python3.12 report")
+        say(f"{llvm.explain(trials)}. Please remove .venv and run the same make command again, if necessary with")
+        say("another Python: make PYTHON=python3.12 report")
         return 1
     if not trials or trials[-1].blames_library or trials[-1].missing:
-        say(f"{llvm.explain(trials)}. Installing what is missing, if this user may.")
+        say(f"{llvm.explain(trials)}. Installing the missing packages, if this user has the permission.")
         installed = install(say)
         if installed is not None and installed.ok and installed.library is not None:
             say(f"{installed.library.label}: works")

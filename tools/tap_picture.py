@@ -1,4 +1,4 @@
-"""Draw the picture of the tap's page: the commands of the README, run for some minutes, seen by headless Chromium.
+"""Take pictures of the tap's page in headless Chromium while tap and modem-sim run for some minutes.
 
 python tools/tap_picture.py docs/images/tap_live.png docs/images/tap_live_phone.png --seconds 200
 """
@@ -18,13 +18,13 @@ FLIGHT = Path(__file__).resolve().parents[1] / "sample_logs" / "flight.yaml"
 
 
 def command(*arguments: object) -> subprocess.Popen[str]:
-    """The command line, running."""
+    """Start a command of this program."""
     words = [sys.executable, "-m", "aerpaw_cmp", *map(str, arguments)]
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def pictures(url: str, wide: Path, phone: Path, seconds: float) -> None:
-    """The page in the dark theme on a laptop and in that for sunlight on a phone."""
+    """Take pictures of the page: dark theme on a laptop, theme for sunlight on a phone."""
     from selenium.webdriver import Chrome, ChromeOptions
     from selenium.webdriver.chrome.service import Service
 
@@ -51,7 +51,7 @@ def pictures(url: str, wide: Path, phone: Path, seconds: float) -> None:
 
 
 def main() -> None:
-    """Fly, tap, draw."""
+    """Start simulator and tap, and take the pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("wide", type=Path)
     parser.add_argument("phone", type=Path)

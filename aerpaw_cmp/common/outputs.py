@@ -557,7 +557,7 @@ class _Place:
     def refuse_gone(self) -> None:
         """Raise an error if the place was removed or replaced."""
         if not self._is_there(self.descriptor):
-            raise FileNotFoundError(errno.ENOENT, "removed while the run went on", str(self.part))
+            raise FileNotFoundError(errno.ENOENT, "removed during the run", str(self.part))
 
     def leave(self) -> None:
         """Remove the parts that did not take the target's name, and unlock."""

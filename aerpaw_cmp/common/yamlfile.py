@@ -199,7 +199,7 @@ def _read_text(path: Path) -> str:
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path=path) from None
     try:
-        # editors of Windows begin UTF-8 with a byte order mark
+        # Windows editors begin UTF-8 files with a byte order mark
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1

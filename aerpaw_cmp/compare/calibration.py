@@ -416,7 +416,8 @@ def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[
         yield dataclasses.replace(fitted, rmse_shared_offset_db=shared)
 
 
-# Largest number of flights that are scored part by part. Of more flights, an evenly spaced selection is scored.
+# Largest number of flights that are scored part by part. If there are more, an evenly spaced selection of them is
+# scored.
 _MOST_SCORED = 6
 
 

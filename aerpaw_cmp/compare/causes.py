@@ -275,7 +275,7 @@ def _rivalled(step: Step, known: Sequence[tuple[Judged, _Models]]) -> bool:
 
 
 def _lead(names: Set[str], odds: Mapping[frozenset[str], float]) -> float:
-    """Return the log odds of the explanations with any of some causes against all without them."""
+    """Return the log odds of explanations with at least one of some causes against explanations without them."""
     with_it, without = ([odds[some] for some in odds if bool(some & names) == side] for side in (True, False))
     return float(np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without)) if with_it else -math.inf
 
@@ -311,7 +311,7 @@ class _Conditions:
     learned_share: float = 0.0
     """The same with learned antennas, whose error is a few decibels on every flight."""
     part: float = 0.0
-    """Smallest share of what all candidates together remove of the error that the other causes leave.
+    """Smallest reduction of the error that remains after the other causes, as a share of that by all candidates.
 
     It applies to flights without learned antennas.
     """
@@ -482,7 +482,7 @@ def _models(e: LevelEvidence) -> _Models:
     models, likely = [model(search=False), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
     pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
     models += [model(first.trials[0], second.trials[0], at=first.parameters) for first, second in pairs]
-    # unnamed slopes do not compete with half or twice the decibels
+    # if half or twice the decibels is a candidate, leave out unnamed slopes, which would explain the same error
     named = any(m.gain > 0.0 and _names(m) & {"decibels", "exponent or decibels"} for m in alone)
     for first in likely:
         rest = [trial for trial in _candidates(_without(e, first)) if trial.name or not named]
@@ -886,7 +886,8 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     side = _SIDES[round(azimuth / 45.0) % 8]
     yield Trial(
         name="place", cost=cost, change_db=changes[best], estimate=(radius, math.nan, math.nan),
-        sentence=f"the tower is about {radius:.0f} m {side} of its place in the files, or the track opposite",
+        sentence=f"the tower is about {radius:.0f} m {side} of its stated position, or the track is "
+        "shifted the other way",
         next_step="check the coordinates of both",
     )  # fmt: skip
 
@@ -978,15 +979,15 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
             yield Trial(
                 name="exponent or decibels", cost=math.log(2.0), columns=rivals[0],
                 sentence=f"the path-loss exponent is {2.0 * best:.1f}{words}",
-                next_step="check the unit of the levels" if doubled else "look for obstacles that the map lacks",
+                next_step="check the unit of the levels" if doubled else "add missing obstacles to the site",
                 estimate=(2.0 * best, 2.0 * best - 3.92 * sd, 2.0 * best + 3.92 * sd),
             )  # fmt: skip
             return
     for factor, words in ((0.5, "half"), (2.0, "twice"))[: 1 if alike else 2]:
         trial = Trial(
             name="decibels", cost=2.0 * _RARE + math.log(2.0), change_db=(factor - 1.0) * e.predicted_db,
-            sentence=f"the levels change by {words} the link's decibels",
-            next_step="check: 10 lg of power, 20 lg of amplitude",
+            sentence=f"the levels change by {words} the predicted decibels",
+            next_step="check that decibels are 10 log10 of a power or 20 log10 of an amplitude",
         )  # fmt: skip
         if not _nearer(e, factor * e.predicted_db):
             continue
@@ -1052,12 +1053,12 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _limits(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a floor and a ceiling, or a constant level: a dead input, or a flight beyond one of them."""
+    """Yield a floor and a ceiling, or a constant level: an input without signal, or all levels beyond a limit."""
     measured, predicted = (np.ptp(np.percentile(level, (10, 90))) for level in (e.measured_db, e.predicted_db))
     if measured < _FLAT * predicted:
         yield Trial(
             name="flat", cost=_RARE, next_step="check the receiver's input and gain", change_db=-e.predicted_db,
-            sentence=f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} all along",
+            sentence=f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} throughout",
         )  # fmt: skip
         return
     # a frequent least level already shows where nothing was detected
@@ -1140,8 +1141,8 @@ _OVER_FLOOR_DB = 3.0
 
 
 _LIMITS = {
-    1.0: ("floor", "the receiver shows no level below {level}", "`floor_db: {typed}` in this `logs:` line"),
-    -1.0: ("saturation", "the receiver shows no level above {level}", "lower the gain; use only lower levels"),
+    1.0: ("floor", "the log has no level below {level}", "`floor_db: {typed}` in this `logs:` line"),
+    -1.0: ("saturation", "the log has no level above {level}", "lower the gain; use only lower levels"),
 }
 
 
@@ -1150,7 +1151,7 @@ _LIMITS = {
 
 _SEARCHED_PHI = (0.6, 0.93)
 _WIDTHS_DEG = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
-# Degrees over which the edge of a shadow fades: a Fresnel zone some hundred metres away.
+# Angle over which the edge of a shadow fades [deg]: that of a Fresnel zone some hundred metres away.
 _EDGE_DEG = 4.0
 # Smallest loss behind an obstacle [dB]. A smaller loss in a sector is usually caused by an antenna.
 _LEAST_LOSS_DB = 6.0

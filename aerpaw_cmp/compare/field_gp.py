@@ -228,7 +228,7 @@ class FieldFit:
     def predict(self, targets: Rows, parts: Collection[Part] = PARTS) -> tuple[FloatArray, FloatArray]:
         """Return mean and standard deviation (m,) of the selected parts at targets [dB]. NaN for targets with a NaN.
 
-        Of more than :data:`_MOST_ROWS` rows, an evenly spaced selection is used.
+        If there are more than :data:`_MOST_ROWS` rows, an evenly spaced selection of them is used.
 
         Parameters
         ----------

@@ -587,7 +587,7 @@ def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
     names = list(dict.fromkeys(s.campaign for s in rows))
     if len(names) == 1 or model.campaigns:
         return model
-    # every second mean is enough to find the scales, and the factor then costs an eighth
+    # every second mean is enough to find the scales, and the Cholesky factor then takes an eighth of the time
     some = [s.part(np.arange(0, len(s), 2)) for s in rows]
     chosen = ((n, *_likeliest(_CAMPAIGN_SCALES_DB, [s for s in some if s.campaign == n], model.terms)) for n in names)
     return dataclasses.replace(model, campaigns=tuple(chosen))

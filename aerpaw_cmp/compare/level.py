@@ -775,7 +775,7 @@ class ServingComparison:
 
     @property
     def majority_share(self) -> float:
-        """Share of the most frequent serving cell. A useful prediction must exceed it."""
+        """Share of the most frequent serving cell. A useful prediction is right more often."""
         return float(self.confusion.sum(axis=1).max() / self.n) if self.n else float("nan")
 
     def as_dict(self) -> dict[str, Any]:

@@ -733,8 +733,8 @@ class _Segment:
             return 0.0, np.inf, 1.0
         inflation = self.inflation()
         (before, weight), (after, weight_after) = self.level(), _mean(nights)
-        # The level before is also a mean of consecutive nights. One or two nights count as independent, because they do
-        # not show a correlation, and because the end of rain must be found.
+        # The level before the step is also a mean of consecutive nights. One or two nights count as independent,
+        # because they do not show a correlation, and because the end of rain must be found.
         level = (inflation if len(self.values) > 2 else 1.0) / weight
         share = (inflation if len(nights) > 1 else 1.0) / weight_after + level
         error = float(np.sqrt(max(square, 1e-12) / freedom * share))

@@ -333,7 +333,7 @@ def _tracked_node(
             cause="relative times require 'time_origin' and local times 'timezone', next to the track's path",
             path=path,
         )
-    remarks = [f"moves {reach_m:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
+    remarks = [f"moves {reach_m:.0f} m from its median position: samples are replayed with its position at their times"]
     # the attitude of a node is not used, so its warnings are omitted
     return at, track, [*remarks, *dataclasses.replace(track.account, unknown_attitude=0, heading_alone=0).warnings]
 
@@ -846,8 +846,8 @@ def _moving(path: str, series: RssSeries, track: Track, warnings: list[str]) -> 
     if not bad.any():
         return series
     warnings.append(
-        f"{path}: {counted(int(bad.sum()), 'sample')} of {series.tower} {series.channel} repeat one level to all "
-        f"digits while the UAV flies on; the first: line {int(series.line[bad][0])}; flagged {FLAG}, not scored"
+        f"{path}: {counted(int(bad.sum()), 'sample')} of {series.tower} {series.channel} repeat one level exactly "
+        f"while the UAV flies on; the first: line {int(series.line[bad][0])}; flagged {FLAG}, not scored"
     )
     per_sample = ("time", "measured_db", "log", "line", "serving", "locked")
     kept = {name: column[~bad] for name in per_sample if (column := getattr(series, name)) is not None}
@@ -955,7 +955,7 @@ def _check_overlap(data: FlightData) -> None:
         if data.track is None and not placed:
             raise UsageError(
                 f"{what} has no positions and there is no telemetry log",
-                expected="a telemetry log (vehicle_out, say) under 'logs'",
+                expected="a telemetry log, such as vehicle_out, under 'logs'",
             )
         if data.track is not None and not placed:
             _check_shared(data, what, series.time, data.track)

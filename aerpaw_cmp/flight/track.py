@@ -565,7 +565,7 @@ class Track:
             return 0.0, turns, (0.0, 0.0)
         part = (interval_s[:-1] / (interval_s[:-1] + interval_s[1:]))[:, None]
         line = (1.0 - part) * self._position[:-2] + part * self._position[2:]
-        # half, because lines between neighbours of a fix are twice as long as lines between fixes
+        # half the distance, because a line between the neighbours of a fix spans two intervals
         away_m = 0.5 * np.linalg.norm(line - self._position[1:-1], axis=1)
         if np.quantile(step_m, 0.9) > _SPARSE_APART_M:
             at_ends = np.append(np.inf, away_m), np.append(away_m, np.inf)

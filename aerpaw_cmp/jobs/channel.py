@@ -154,7 +154,7 @@ def _moving(data: FlightData, chosen: ChannelOptions, towers: Sequence[str], rem
 def _poses_at_once(
     count: int, link: Link, offsets_hz: FloatArray | None, engine: str, room: int | None
 ) -> tuple[int, str]:
-    """Return the number of poses of a part, and what else to do about too little room. Refuse a channel without room.
+    """Return the number of poses of a part, and advice for a channel that is too large, which is refused.
 
     ``count`` is the number of all poses, and ``room`` [bytes] the largest size of all parts (None: a single part).
     """

@@ -747,7 +747,7 @@ def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
         "leave one out": dict(outcome.studies["missing"].scores),
         f"leave one out, {zero}": dict(outcome.studies["zero"].scores),
         f"leave one out, {zero}, random samples": {name: chosen[name] for name in INTERPOLATORS if name in chosen},
-        f"blocks of {outcome.settings.block_m:g} m left out": outcome.blocks,
+        f"blocks of {outcome.settings.block_m:g} m held out": outcome.blocks,
     }
     fields = list(itertools.product(enumerate(heights), enumerate(outcome.shown.ks)))
     for evaluation, scores in tables.items():

@@ -69,7 +69,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
         if not estimate.placed:
             raise InputError(
                 "the levels do not determine a place: they fit a node 30 km away as well",
-                expected="levels that fall with the distance",
+                expected="levels that decrease with the distance",
                 cause="a receiver that logs one value, a hover, or a node far beyond the flight",
                 path=flight,
             )

@@ -269,7 +269,7 @@ def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
             raise InputError(
                 f"an area of {len(corners)} corners that cannot be used",
                 expected=f"at most {_MOST_CORNERS} corners and {MAX_CROSSINGS} crossings of the outline with itself",
-                cause="a track or a drawing by hand: simplify it in the map program",
+                cause="a recorded track or an outline drawn by hand: simplify it in the map program",
                 path=path,
             )
         out.append(ring.buffer(0))

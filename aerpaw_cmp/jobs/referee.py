@@ -353,7 +353,7 @@ def _checked(frame: pd.DataFrame, data: FlightData) -> tuple[str, pd.DataFrame]:
         raise InputError(f"rows without a time and without a position {columns}", expected=_EXPECTED)
     _check_numbers(table, quantity)
     if quantity == "path_loss_db":
-        # a large loss is a low level, so the ends of the band change places
+        # a large loss is a low level, so the ends of the band are swapped
         table = table.rename(columns={"q05_db": "q95_db", "q95_db": "q05_db"})
         table[list(_LEVELS)] *= -1.0
     _check_repeats(table)

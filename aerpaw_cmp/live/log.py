@@ -105,7 +105,7 @@ class TapLog:
     records, bytes_written : int
         Lines and bytes in the segments.
     fault : str
-        Reason why the disk cannot be written now. Empty if it can.
+        Reason why the disk cannot be written now. Empty if the disk can be written.
     free_bytes : int or None
         Space left on the disk for an ordinary user.
     """

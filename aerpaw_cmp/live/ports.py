@@ -412,7 +412,7 @@ class TapStatus:
     gaps, records, bytes_written : int
     disk_free_bytes : int or None
     disk_fault : str
-        Reason why the disk cannot be written now. Empty if it can.
+        Reason why the disk cannot be written now. Empty if it can be written.
     missed : int
         Poll slots that passed unused while connected.
     predicted_rank : int or None

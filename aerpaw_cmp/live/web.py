@@ -280,7 +280,7 @@ class WebServer(ThreadingHTTPServer):
             return True
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print nothing: a browser that disconnects is not an error, and the terminal belongs to the tap."""
+        """Print nothing: a browser that disconnects is not an error, and the tap prints its status on the terminal."""
 
 
 @dataclass(slots=True)
@@ -418,7 +418,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(data[start : start + _PIECE])
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Print nothing: the terminal belongs to the tap."""
+        """Print nothing, because the tap prints its status on the terminal."""
 
 
 def _is_loopback(host: str) -> bool:
@@ -458,7 +458,7 @@ def _refused(address: Address, error: OSError) -> UsageError:
     """Return the error for an address that cannot be used."""
     cause = {
         errno.EADDRINUSE: "another tap or another server has this port",
-        errno.EACCES: "ports below 1024 belong to the administrator",
+        errno.EACCES: "ports below 1024 require administrator rights",
         errno.EADDRNOTAVAIL: "this computer has no such address",
     }.get(error.errno or 0, "the name of another computer")
     taken = error.errno == errno.EADDRINUSE

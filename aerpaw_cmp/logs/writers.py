@@ -1,7 +1,7 @@
 """Conversion of records to the bytes of real AERPAW log formats, for ``simulate``: the inverse of the readers.
 
-Pure functions of arrays; nothing here opens a file. Layouts are exactly those of the tools that write the real
-logs: CR LF line ends where Python's ``csv`` wrote them, octal offsets and ``*`` runs where ``od`` did.
+All functions are pure functions of arrays and do not open files. Layouts are exactly those of the tools that write the
+real logs: CR LF line ends where Python's ``csv`` wrote them, octal offsets and ``*`` runs where ``od`` did.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Is this machine ready: LLVM, doctor."""
+"""Checks whether this machine is ready."""

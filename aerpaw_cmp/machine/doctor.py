@@ -33,14 +33,14 @@ _DISK_NEEDED_BYTES = 1024**3
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing looked at.
+    """The result of one check of this machine.
 
     Parameters
     ----------
     name : str
         Name of the check.
     status : {"ok", "warn", "fail"}
-        ``warn``: a job that needs it will be slow or refused, the others run. ``fail``: no replay on this machine.
+        ``warn``: jobs that need it are slow or refused, and all other jobs run. ``fail``: no replay is possible.
     found : str
         What was found.
     remedy : str
@@ -54,10 +54,10 @@ class Check:
 
 
 def checks() -> list[Check]:
-    """All checks, in the order in which a newcomer meets them. Takes a few seconds: LLVM is tried, not believed."""
+    """Return all checks, in the order in which a new user needs them, after some seconds for the test of LLVM."""
     gpu = _gpu_check()
     compilers = list(llvm_checks())
-    if "tried" in gpu.found and gpu.status == "ok":  # a GPU that works needs no LLVM
+    if "tested" in gpu.found and gpu.status == "ok":  # a GPU that works needs no LLVM
         compilers = [replace(check, status="warn") if check.status == "fail" else check for check in compilers]
     return [
         Check("Python", "ok", f"{platform.python_version()} ({sys.executable})"),
@@ -74,7 +74,7 @@ def checks() -> list[Check]:
 
 
 def as_dict(checks: Sequence[Check]) -> dict[str, Any]:
-    """Object that ``doctor --json`` prints: ``{"ready": bool, "checks": [{name, status, found, remedy}]}``."""
+    """Return the JSON object of ``doctor``: ``{"ready": bool, "checks": [{name, status, found, remedy}]}``."""
     return {"ready": ready(checks), "checks": [asdict(check) for check in checks]}
 
 
@@ -84,7 +84,7 @@ def ready(checks: Sequence[Check]) -> bool:
 
 
 def package_checks() -> Iterator[Check]:
-    """Sionna RT, Mitsuba and Dr.Jit are installed, in the versions that Sionna RT pins."""
+    """Check that Sionna RT, Mitsuba and Dr.Jit are installed, in the versions that Sionna RT pins."""
     pins: dict[str, str] = {}
     with suppress(metadata.PackageNotFoundError):
         # read from what is installed: another sionna-rt pins other versions of Mitsuba and Dr.Jit
@@ -103,7 +103,7 @@ def package_checks() -> Iterator[Check]:
 
 
 def llvm_checks() -> Iterator[Check]:
-    """One row per library up to the first that works, each tried in a child process."""
+    """Test libraries in child processes until one works, with one check per library."""
     try:
         trials = llvm.first_that_works(llvm.candidates())
     except AerpawCmpError as error:
@@ -115,7 +115,7 @@ def llvm_checks() -> Iterator[Check]:
     for trial in trials:
         name = trial.library.label if trial.library else "LLVM"
         if trial.ok:
-            yield Check("LLVM", "ok", f"{name}, tried: two paths traced in a child process, lengths right")
+            yield Check("LLVM", "ok", f"{name}, tested: a child process traced two paths with the right lengths")
         elif not trial.blames_library:
             remedy = llvm.install_line() if trial.missing else "make setup"
             yield Check("LLVM", "fail", f"{name} could not be tried: {trial.reason}", remedy)
@@ -125,26 +125,26 @@ def llvm_checks() -> Iterator[Check]:
 
 
 def _gpu_check() -> Check:
-    """Check which Mitsuba variant a replay would use. A GPU is tried like LLVM, in a child process."""
+    """Check which Mitsuba variant a replay would use. A GPU is tested in a child process, like LLVM."""
     # a container may have the driver without its command line tool
     if shutil.which("nvidia-smi") is None and not Path("/proc/driver/nvidia").exists():
         return Check("GPU", "ok", "none found: replays use llvm_ad_mono_polarized")
     trial = llvm.try_variant("cuda_ad_mono_polarized")
     if trial.ok:
-        return Check("GPU", "ok", "tried: replays use cuda_ad_mono_polarized")
+        return Check("GPU", "ok", "tested: replays use cuda_ad_mono_polarized")
     remedy = "update the NVIDIA driver ('nvidia-smi' must list the GPU); replays use LLVM until then"
-    return Check("GPU", "warn", f"an NVIDIA driver is there, but {trial.reason}", remedy)
+    return Check("GPU", "warn", f"an NVIDIA driver is installed, but {trial.reason}", remedy)
 
 
 def _cores_check() -> Check:
-    """Processor cores that this process may use."""
+    """Report the number of processor cores that this process may use."""
     # a container or taskset may grant fewer cores than the machine has
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return Check("CPU", "ok", f"{counted(cores, 'core')}, {platform.machine()}")
 
 
 def available_memory_bytes(root: Path = Path("/")) -> int | None:
-    """Memory that can still be had: the kernel's estimate, or the control group's limit when that is lower."""
+    """Return the available memory: the kernel's estimate, or the limit of the control group if it is lower."""
     try:
         lines = (root / "proc/meminfo").read_text().splitlines()
         # not MemFree, because the kernel frees its file cache on demand
@@ -152,8 +152,8 @@ def available_memory_bytes(root: Path = Path("/")) -> int | None:
     except (OSError, StopIteration, ValueError, IndexError):
         return None
     group = root / "sys/fs/cgroup"
-    with suppress(OSError, ValueError):  # without such a group the machine is the limit
-        # names of control groups of version 2; under version 1 the machine's memory is the limit
+    with suppress(OSError, ValueError):  # without such a group the memory of the machine is the limit
+        # names of control groups of version 2; version 1 is not read
         limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
         if limit != "max":
             available = min(available, int(limit) - int(used))
@@ -172,7 +172,7 @@ def memory_check(available: int | None = None) -> Check:
 
 
 def _disk_check(folder: Path) -> Check:
-    """Enough room where reports are written."""
+    """Check whether there is enough disk space where reports are written."""
     free = shutil.disk_usage(folder).free
     room = f"{free / 1024**3:.1f} GiB free in {folder}"
     if free < _DISK_NEEDED_BYTES:
@@ -181,9 +181,9 @@ def _disk_check(folder: Path) -> Check:
 
 
 def cache_check(folder: Path) -> Check:
-    """The folder of cached paths and kernels can be written to."""
+    """Check whether the folder of cached paths and kernels can be written to."""
     remedy = "set AERPAW_CMP_CACHE to a folder that you may write to"
-    # not made before the first run: until then its nearest parent decides
+    # before the first run the folder does not exist: check its nearest parent
     existing = next((place for place in (folder, *folder.parents) if place.exists()), folder)
     if not existing.is_dir():
         return Check("Cache", "warn", f"{existing} is not a folder", remedy)
@@ -201,7 +201,7 @@ def readers_check() -> Check:
         names = [reader.name for reader in catalogue()]
     except AerpawCmpError as error:
         return Check("Readers", "fail", str(error), "make setup")
-    except Exception as error:  # a reader of another distribution may raise anything on import
+    except Exception as error:  # a reader of another package may raise any exception on import
         return Check("Readers", "fail", f"{type(error).__name__} while loading them: {error}", "make setup")
     return Check("Readers", "ok", f"{len(names)}: {', '.join(names)}")
 

@@ -273,7 +273,7 @@ def _scene_of(
     moved_site = replace(site, towers={**{n: t for n, t in site.towers.items() if n != name}, **towers})
     several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
     some = poses[block.rows]
-    # each position has links only to its poses: other links would be searched without use
+    # search only the links between a position and its own poses, because no other links are used
     links = None if len(names) == 1 else np.arange(len(names))[:, None] == block.place[None, :]
     return moved_site, several, some, links
 

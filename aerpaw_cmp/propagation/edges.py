@@ -298,7 +298,7 @@ def over_edges(scene: Scene, poses: Poses, link: Link) -> EdgePaths:
         raise UsageError(
             "diffraction in a scene of triangles",
             expected="buildings with footprints, or diffraction: none",
-            cause="a triangle does not say which side of it is inside a building",
+            cause="a triangle does not show which of its sides is inside a building",
         )
     faces, sources, targets = scene.faces, scene.sources_m, poses.position_m
     known = np.isfinite(targets).all(axis=1)
@@ -396,12 +396,12 @@ def _of_solid(
             continue
         near, far = (_point(faces, wall, end, top) for end in (0, 1))
         if top in roofs:
-            # t lies in the wall, pointing down: t x normal points along the wall
+            # t is in the plane of the wall and points down, so t x normal points along the wall
             rows.append((far, near, (wall, roofs[top])))
         following = first.get(_corner(faces, wall, 1))
         # the wall turns left: at an inner corner the air is on the hollow side, and no wave is diffracted there
         if following is not None and np.cross(faces.along[wall], faces.along[following])[2] > np.sin(_SHARPEST):
-            # t lies in the wall, away from the corner
+            # t is in the plane of the wall and points away from the corner
             rows.append((_point(faces, wall, 1, low), _point(faces, wall, 1, top), (wall, following)))
     return rows
 

@@ -246,7 +246,7 @@ def _run_trial(library: Library | None, variant: str, program: str, timeout_s: f
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            return f"the trial gave no answer within {timeout_s:g} s", {}
+            return f"the trial did not end within {timeout_s:g} s", {}
     if child.returncode:
         return _failure(child), {}
     try:

@@ -1,1 +1,1 @@
-"""Finished numbers in, figures and files out."""
+"""Pages, figures and files, written from finished numbers."""

@@ -79,7 +79,7 @@ HELPS: dict[str, tuple[str, str]] = {
     ),
     "not significant": (
         "The difference of {effect:+.1f} dB is not significant (95 %: {low:+.1f} to {high:+.1f} dB).",
-        "add flights with other headings",
+        "add flights with different headings",
     ),
     "no interval": ("The difference is {effect:+.1f} dB; no interval from two flights.", "add a third flight"),
 }
@@ -92,9 +92,9 @@ FRAMES: dict[str, tuple[str, str]] = {
         "",
     ),
     "place": (
-        "The learned gain belongs to places: {where} the error is {size:.1f} dB smaller "
+        "The learned gain depends on the positions, not on the antenna: {where} the error is {size:.1f} dB smaller "
         "(95 %: {near:.1f} to {far:.1f} dB).",
-        "fly over the same places with other headings",
+        "fly over the same places with different headings",
     ),
     "not separable": (
         "Effects of antenna and place cannot be separated: {where} the error differs by {size:.1f} dB, not "

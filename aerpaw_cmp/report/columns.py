@@ -24,7 +24,7 @@ DECIMALS = 4
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column, or a family of columns. The name and meaning of a family have a gap ({}) for a model, K or rank.
+    """A column, or a family of columns. In the name and meaning of a family, {} is replaced by a model, K or rank.
 
     Parameters
     ----------

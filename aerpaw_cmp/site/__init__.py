@@ -1,1 +1,1 @@
-"""Model of the site: towers, ground, buildings, trees, materials, antennas. No ray tracer here."""
+"""Model of the site: towers, ground, buildings, trees, materials, antennas. This package does not trace rays."""

@@ -220,7 +220,7 @@ def _single_valued_poles(e_theta: ComplexArray, e_phi: ComplexArray) -> tuple[Co
     for row, next_row, slope in ((0, 1, 1.0), (-1, -2, -1.0)):
         x, y, _ = _pole_vectors(e_theta, e_phi, row, slope)
         near_x, near_y, _ = _pole_vectors(e_theta, e_phi, next_row, slope)
-        if (x * np.conj(near_x) + y * np.conj(near_y)).real < 0:  # the row of a pole may be written from either side
+        if (x * np.conj(near_x) + y * np.conj(near_y)).real < 0:  # files differ in the sign of the row of a pole
             x, y = -x, -y
         e_theta[row] = slope * (x * np.cos(phi) + y * np.sin(phi))
         e_phi[row] = y * np.cos(phi) - x * np.sin(phi)
@@ -426,7 +426,7 @@ def _as_grid(rows: _Rows) -> tuple[bool, FloatArray]:
         raise InputError(
             f"{len(key)} rows with {len(phi)} values of phi and {len(theta)} of theta",
             expected="a grid over the sphere: every phi with every theta",
-            cause="angles with other digits in each row, or a file that was cut off",
+            cause="angles with different digits in each row, or a file that was cut off",
         )
     seen = np.zeros((len(phi), len(theta)), dtype=np.int64)
     np.add.at(seen, (at_phi, at_theta), 1)
@@ -474,7 +474,7 @@ def _unfold(folded: ComplexArray) -> ComplexArray:
     inner = slice(1, -1)
     if _apart(far[:, 0, inner], near[:, -1, inner]) > _apart(-far[:, 0, inner], near[:, -1, inner]):
         far = -far
-    for pole, next_row in ((0, 1), (-1, -2)):  # the row of a pole may be written from either half
+    for pole, next_row in ((0, 1), (-1, -2)):  # files differ in the half circle whose sign the row of a pole has
         if _apart(near[:, :, pole], near[:, :, next_row]) > _apart(-near[:, :, pole], near[:, :, next_row]):
             near[:, :, pole] *= -1
         far[:, :, pole] = -near[:, :, pole]

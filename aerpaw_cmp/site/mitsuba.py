@@ -237,7 +237,7 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
             raise InputError(
                 f"more than {_MOST_TRIANGLES} triangles",
                 expected="a scene that fits into memory",
-                cause="a terrain or scan that is finer than a wavelength asks for: simplify it first",
+                cause="a terrain or scan with more detail than the wavelength requires: simplify it first",
             )
     if not parts:
         raise InputError("the scene has no triangle", expected="shapes of type ply")

@@ -190,7 +190,7 @@ def _from_cuts(
     if stated_dbi is not None and (above_db := level.max() - stated_dbi) > _RIPPLE_DB:
         down = " and ".join(f"{stated_dbi - cut[0]:.1f} dB ({cut_name})" for cut_name, cut in cuts.items())
         raise InputError(
-            f"the cuts make a peak of {level.max():.1f} dBi, {above_db:.1f} dB above the stated gain; at 0 deg they "
+            f"the cuts have a peak of {level.max():.1f} dBi, {above_db:.1f} dB above the stated gain; at 0 deg they "
             f"are {down} below it",
             expected="two cuts with the same value at 0 deg",
             cause="a beam turned to the side, and each cut relative to its own peak",

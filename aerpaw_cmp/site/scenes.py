@@ -265,7 +265,7 @@ def without_traps(
     if green.any():
         notes.append(
             f"vegetation is a medium, not a mirror: {counted(int((green & ~trunk).sum()), 'mesh', 'meshes')}; "
-            f"{counted(int(trunk.sum()), 'mesh', 'meshes')} of trunks left out"
+            f"{counted(int(trunk.sum()), 'mesh', 'meshes')} of trunks omitted"
         )
     remaining = ~(out | green)[scene.shape]
     return replace(scene, triangles=scene.triangles[remaining], shape=scene.shape[remaining]), tuple(woods), notes

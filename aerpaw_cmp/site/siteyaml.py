@@ -827,7 +827,7 @@ def _scatter(area: BaseGeometry, count: int, spacing_m: float, random: np.random
         return placed
     if count > _MAXIMUM_TREES:
         raise UsageError(
-            f"a forest of {area.area / 1e4:.0f} ha asks for {count} trees",
+            f"a forest of {area.area / 1e4:.0f} ha requires {count} trees",
             expected=f"at most {_MAXIMUM_TREES}",
             cause="trees_per_hectare is too high, or the outline reaches far outside the site",
         )

@@ -17,7 +17,7 @@ offsets_m = 0.5 * wavelength_m * np.arange(4)
 
 
 def matrices(number):
-    """Line-of-sight H (poses, 4, 4) of two parallel arrays, lengths held as ``number``."""
+    """Line-of-sight H (poses, 4, 4) of two parallel arrays, with lengths in ``number``."""
     apart_m = offsets_m[:, None] - offsets_m[None, :]
     length_m = np.hypot(distance_m[:, None, None], apart_m).astype(number)
     return np.exp(-2j * np.pi * (length_m / number(wavelength_m)).astype(np.float64)) / distance_m[:, None, None]

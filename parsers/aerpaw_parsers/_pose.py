@@ -83,7 +83,7 @@ _AT_REST_DEG = 2e-4
 
 
 def _alike(sheet: _sheet.Sheet, name: str) -> list[int]:
-    """Return the filled columns of a quantity whose names are equally good."""
+    """Return the columns with values whose names fit a quantity equally well."""
     ranks = {
         i: dictionary.rank_of(what.quantity, sheet.plain[i])
         for i, what in enumerate(sheet.meanings)

@@ -35,7 +35,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """
     samples = read_arrays(data, {"IQ"}).get("IQ")
     if samples is None or not samples.size:
-        raise InputError("the burst has no samples", expected="a variable IQ of channels by samples")
+        raise InputError("the burst has no samples", expected="a variable IQ, channels by samples")
     named = _NAME.search(options.file_name)
     if named is None:
         raise InputError(

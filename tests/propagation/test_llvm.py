@@ -97,7 +97,7 @@ def test_an_unnamed_version_is_refused_by_what_the_child_says() -> None:
         ('print(\'{"right": false, "found_m": [1.0]}\')', r"path lengths are wrong: \[1.0\]"),
         ("print('[1')", "answer is unreadable"),
         ("", "answer is unreadable"),
-        ("import time; time.sleep(60)", "no answer within 1 s"),
+        ("import time; time.sleep(60)", "did not end within 1 s"),
     ],
 )
 def test_a_bad_end_is_reported_and_blames_the_library(program: str, reason: str) -> None:

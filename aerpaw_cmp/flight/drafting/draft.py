@@ -131,7 +131,7 @@ LINK = (
 )
 _DOWNLINK = (
     f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: false}}"
-    "  # downlink: the UAV receives, the power is unknown and stands in the offset; which carrier?\n"
+    "  # downlink: the UAV receives, the unknown power is part of the offset; which carrier?\n"
 )
 _NO_TRACK = "  # no telemetry here: which vehicleOut log belongs to this flight?\n"
 RANK = (
@@ -704,7 +704,7 @@ def _line(file: IngestedFile, context: _Context, earlier: Sequence[_Line]) -> _L
     entry, comment, places = _with_node(file, path, streams, origin, context, earlier)
     if context.is_utc(file):
         entry["clock"] = "utc"
-        comment = _also(comment, "as local time it misses the telemetry, as UTC it overlaps it: is it UTC?")
+        comment = _also(comment, "it overlaps the telemetry as UTC but not as local time: is it UTC?")
     if label := _another_channel(streams, entry, earlier):
         entry["channel"] = label
         comment = _also(comment, "another receiver of this tower, whose name the log does not contain: which?")

@@ -518,7 +518,7 @@ class Receiver:
     name : str
         Name for ``receiver:`` of the log, or an empty text if no receiver fits.
     about : str
-        Its odds, or the question, as the end of a comment.
+        Its odds, or a question about it, for the end of a comment.
     """
 
     name: str

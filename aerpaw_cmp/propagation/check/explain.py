@@ -287,7 +287,7 @@ def _why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArra
         # first check the sides with faces of any size, then check whether the points lie in their faces
         _, _, ahead = reflection_points(surfaces, sequence[None], *ends, edge_m=1e9)
         if not ahead[0]:
-            return "the ends of a reflection lie on two sides of its face"
+            return "the ends of a reflection are on different sides of its face"
         _, vertices, good = reflection_points(surfaces, sequence[None], *ends, edge_m=EDGE_M)
         if not good[0]:
             return f"a reflection point lies outside {surfaces.faces.label[int(sequence[0])]} or a later face"

@@ -619,7 +619,7 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
                 continue
             rows = moved[some[crossing]]
             start, end = start_m[rows], end_m[rows]
-            # under the middle of each piece, since a canopy follows the ground
+            # use the ground under the middle of each piece, because a canopy follows the ground
             ground = np.full(len(piece), stands[number].base_m)
             if site.dem is not None:
                 middle = start[piece, :2] + share.mean(axis=1, keepdims=True) * (end - start)[piece, :2]
@@ -690,13 +690,13 @@ def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wa
 
 
 def _between(share: FloatArray, up: FloatArray, rise: FloatArray, low: float, high: float) -> FloatArray:
-    """Return the part of the way (pieces,) that runs between two heights."""
+    """Return the share (pieces,) of each segment that runs between two heights."""
     first, last = slab(up, rise, low, high)
     return np.asarray(np.maximum(np.minimum(share[:, 1], last) - np.maximum(share[:, 0], first), 0.0))
 
 
 def _around(stand: Forest, start: FloatArray, end: FloatArray) -> Iterator[Profile]:
-    """Yield the profiles of the ways around both sides of a stand."""
+    """Yield the profiles of the paths around both sides of a stand."""
     length = np.linalg.norm(end - start, axis=1)
     corner = shapely.get_coordinates(stand.area.convex_hull)[:, None]
     way = (end - start)[:, :2]

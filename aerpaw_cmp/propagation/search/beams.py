@@ -636,7 +636,7 @@ def try_out() -> None:
     rules = Rules(1, 1e-3)
     free = _direct(_Solids(tree, triangle, tree), np.zeros(3), np.array([[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]]), rules)
     if free.tolist() != [False, True]:
-        raise RuntimeError(f"compiled code sees {free.tolist()} where one of two points is hidden")
+        raise RuntimeError(f"compiled code returned {free.tolist()} for a hidden and a visible point")
 
 
 # The ground extends to this multiple of the largest coordinate, which is beyond all reflection points.

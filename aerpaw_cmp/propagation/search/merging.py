@@ -382,7 +382,7 @@ def _lie_in(corners, first, after, plane, merge_m):  # type: ignore[no-untyped-d
 
 @kernel
 def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type: ignore[no-untyped-def]
-    """Return the face whose plane each face gets.
+    """Return, for each face, the face whose plane it uses.
 
     This is a larger face that it touches and in whose plane it lies, or the face itself.
     """

@@ -987,7 +987,7 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
         trial = Trial(
             name="decibels", cost=2.0 * _RARE + math.log(2.0), change_db=(factor - 1.0) * e.predicted_db,
             sentence=f"the levels change by {words} the predicted decibels",
-            next_step="check that decibels are 10 log10 of a power or 20 log10 of an amplitude",
+            next_step="check: 10 log10 of power, 20 log10 of amplitude",
         )  # fmt: skip
         if not _nearer(e, factor * e.predicted_db):
             continue

@@ -40,7 +40,7 @@ class Check:
     name : str
         Name of the check.
     status : {"ok", "warn", "fail"}
-        ``warn``: jobs that need it are slow or refused, and all other jobs run. ``fail``: no replay is possible.
+        ``warn``: jobs that need it are slow or refused, and all other jobs run. ``fail``: a command cannot run.
     found : str
         What was found.
     remedy : str
@@ -56,7 +56,8 @@ class Check:
 def checks() -> list[Check]:
     """Return all checks, in the order in which a new user needs them, after some seconds for the test of LLVM."""
     gpu = _gpu_check()
-    compilers = list(llvm_checks())
+    # Dr.Jit is only installed with Sionna RT, and only Dr.Jit uses LLVM
+    compilers = list(llvm_checks()) if versions.version("drjit") != versions.NOT_INSTALLED else []
     if "tested" in gpu.found and gpu.status == "ok":  # a GPU that works needs no LLVM
         compilers = [replace(check, status="warn") if check.status == "fail" else check for check in compilers]
     return [
@@ -84,8 +85,12 @@ def ready(checks: Sequence[Check]) -> bool:
 
 
 def package_checks() -> Iterator[Check]:
-    """Check that Sionna RT, Mitsuba and Dr.Jit are installed, in the versions that Sionna RT pins."""
+    """Check that Sionna RT, Mitsuba and Dr.Jit are installed, in the versions that Sionna RT pins.
+
+    An environment without Sionna RT is a warning, because only the audit and the engine ``sionna`` need it.
+    """
     pins: dict[str, str] = {}
+    missing: Status = "warn" if versions.version("sionna-rt") == versions.NOT_INSTALLED else "fail"
     with suppress(metadata.PackageNotFoundError):
         # read from what is installed: another sionna-rt pins other versions of Mitsuba and Dr.Jit
         for requirement in metadata.requires("sionna-rt") or []:
@@ -95,7 +100,7 @@ def package_checks() -> Iterator[Check]:
     for title, name in (("Sionna RT", "sionna-rt"), ("Mitsuba", "mitsuba"), ("Dr.Jit", "drjit")):
         version, pin = versions.version(name), pins.get(name)
         if version == versions.NOT_INSTALLED:
-            yield Check(title, "fail", version, "make setup")
+            yield Check(title, missing, version, "pip install sionna-rt (only the audit and rt.engine: sionna need it)")
         elif pin and version != pin:
             yield Check(title, "fail", f"{version}, but Sionna RT needs {pin}", f"pip install '{name}=={pin}'")
         else:
@@ -125,14 +130,14 @@ def llvm_checks() -> Iterator[Check]:
 
 
 def _gpu_check() -> Check:
-    """Check which Mitsuba variant a replay would use. A GPU is tested in a child process, like LLVM."""
+    """Check which Mitsuba variant Sionna RT would use. A GPU is tested in a child process, like LLVM."""
     # a container may have the driver without its command line tool
     if shutil.which("nvidia-smi") is None and not Path("/proc/driver/nvidia").exists():
-        return Check("GPU", "ok", "none found: replays use llvm_ad_mono_polarized")
+        return Check("GPU", "ok", "none found: Sionna RT uses llvm_ad_mono_polarized")
     trial = llvm.try_variant("cuda_ad_mono_polarized")
     if trial.ok:
-        return Check("GPU", "ok", "tested: replays use cuda_ad_mono_polarized")
-    remedy = "update the NVIDIA driver ('nvidia-smi' must list the GPU); replays use LLVM until then"
+        return Check("GPU", "ok", "tested: Sionna RT uses cuda_ad_mono_polarized")
+    remedy = "update the NVIDIA driver ('nvidia-smi' must list the GPU); Sionna RT uses LLVM until then"
     return Check("GPU", "warn", f"an NVIDIA driver is installed, but {trial.reason}", remedy)
 
 

@@ -83,7 +83,18 @@ def test_versions_that_do_not_belong_together(monkeypatch: pytest.MonkeyPatch) -
     checks = {check.name: check for check in doctor.package_checks()}
     assert checks["Sionna RT"].status == "ok"
     assert checks["Mitsuba"].remedy == "pip install 'mitsuba==3.9.1'"
-    assert checks["Dr.Jit"].found == "not installed"
+    assert (checks["Dr.Jit"].found, checks["Dr.Jit"].status) == ("not installed", "fail")
+
+
+def test_an_environment_without_sionna_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
+    """docs/howto/install.md describes it: the audit and the engine sionna are missing, and nothing else."""
+    known = doctor.versions.version
+    absent = {"sionna-rt", "mitsuba", "drjit"}
+    monkeypatch.setattr(doctor.versions, "version", lambda name: "not installed" if name in absent else known(name))
+    checks = doctor.checks()
+    assert doctor.ready(checks)
+    assert [check.name for check in checks if check.status == "warn"][:3] == ["Sionna RT", "Mitsuba", "Dr.Jit"]
+    assert "LLVM" not in {check.name for check in checks}
 
 
 def test_memory_is_the_lower_of_machine_and_control_group(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@
     python benchmarks/country.py --keep FOLDER              the stores stay there; a run that was ended goes on
 
 Each map is ``aerpaw-cmp map`` at one height, 3 m, with one reflection and 4 x 4 elements, in a process of its own.
-Seconds are of the wall, imports, store and page included; MiB are the peaks of the largest worker and of the first
+Seconds are wall-clock time with imports, store and page; MiB are the peaks of the largest worker and of the first
 process.
 """
 

@@ -53,7 +53,7 @@ class World:
 
 
 WORLDS: Mapping[str, World] = {
-    "tame": World(),
+    "default": World(),
     "shadowing of 10 dB over 100 m": World(shadow_db=10.0, shadow_m=100.0),
     "free space": World(exponent=(2.0, 2.0), shadow_db=0.5, shadow_m=20.0),
     "patterns of 6 dB": World(pattern_db=6.0),

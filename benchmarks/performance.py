@@ -242,8 +242,8 @@ def country(history: list[dict[str, Any]]) -> list[str]:
     out = [
         "## A map of a country", "",
         f"Villages on 32 x 32 km: 3 towers, 3 000 buildings, one height of 3 m, one reflection, 4 x 4 elements, "
-        f"{result['workers']} workers, tiles of {result['cells']} x {result['cells']} positions ({when}). Seconds of "
-        "the wall include imports, store and page. `python benchmarks/country.py --receivers 1e7` measures it.", "",
+        f"{result['workers']} workers, tiles of {result['cells']} x {result['cells']} positions ({when}). Wall-clock "
+        "seconds include imports, store and page. `python benchmarks/country.py --receivers 1e7` measures it.", "",
         "| receivers | tiles | wall s | processor s | receivers a second | largest worker MiB | first process MiB "
         "| store MiB | files |",
         "| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
@@ -275,7 +275,7 @@ def kriging(history: list[dict[str, Any]]) -> list[str]:
     return [
         f"Kriging of one field, 20 neighbours ({when}), processor seconds, the least of five runs in alternation. "
         "Totals include the set-up of each program, and the first call of a process also its imports. The last row "
-        "includes neither:",
+        "includes neither set-up nor imports:",
         "",
         "| targets | ours | PyKrige's C back end | times faster |",
         "| ---: | ---: | ---: | ---: |",

@@ -147,7 +147,7 @@ def run_explain(
         measured_db=measured,
         unit=series.unit if isinstance(series, RssSeries) else "",
         absent=tuple(_absent(replayed, source, pose.position_m[0])),
-        notes=(*data.cautions, *notes, *(f"left out: {what}" for what in replayed.left_out)),
+        notes=(*data.cautions, *notes, *(f"not modelled: {what}" for what in replayed.left_out)),
     )
 
 

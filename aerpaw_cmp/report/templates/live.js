@@ -440,7 +440,7 @@
     drawState(); drawCards(); drawAlarms(); drawCharts(); drawPose(); drawMap();
     state.drawn++;
     const newest = last(state.modems[state.chosen]?.rows.columns.t ?? []);
-    state.delay = Date.now() - newest; // from the answer's time to the screen, on one computer's clock
+    state.delay = Date.now() - newest; // time from the modem's answer to the screen, if both are on one computer
   }
   at("window").addEventListener("change", () => later(draw));
   common.whenResized(document.body, draw);

@@ -199,7 +199,7 @@
   function summarise() {
     const s = statistics(), out = [], percent = v => number(100 * v, 1, "%"), q = quantity();
     const none = !a ? "A" : state.difference && !b ? "B" : "";
-    if (none) out.push(["Layer", `there is no layer ${none} of this choice`]);
+    if (none) out.push(["Layer", `there is no layer ${none} for these choices`]);
     else if (s.share) s.share.forEach((share, i) => out.push([q.classes[0] === "Z" ? (i ? `Rank ${q.classes[i]}` : "No path") : q.classes[i], percent(share)]));
     else {
       out.push([state.difference ? "Cells with both" : "Cells with a value", `${percent(s.covered)} of ${s.cells} cells`]);
@@ -308,7 +308,7 @@
     selects(at("axes-a"), "a"); selects(at("axes-b"), "b");
     at("steps").textContent = `This page stores values in steps of ${quantity().kind === "classes" ? "one class" : quantity().step + (quantity().unit ? " " + quantity().unit : "")}; files in the same folder contain the exact values.`
       + (data.left_out ? ` To limit its size, the page does not contain ${data.left_out}.` : "")
-      + (data.stride > 1 ? " Numbers of the layer are those of the cells in this page." : "");
+      + (data.stride > 1 ? " The numbers of the layer are computed from the cells in this page." : "");
   }
   function setDifference(on) {
     state.difference = on && Object.keys(quantity().layers).length > 1;

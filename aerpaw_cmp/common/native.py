@@ -156,7 +156,8 @@ def _hdf5(depth: int, netcdf: bool = False) -> Read:
                     cause="a file crafted to fill the memory",
                 )
             classes = {name: _text(item.attrs.get("MATLAB_class", b"")) for name, item in items.items()}
-            attributes = {name: _text(value) for name, value in book.attrs.items() if np.ndim(value) == 0}
+            # NetCDF stores the number of an attribute as an array of one element
+            attributes = {name: _text(np.ravel(value)[0]) for name, value in book.attrs.items() if np.size(value) == 1}
             notes: dict[str, Any] = {
                 "attributes": attributes,
                 "classes": {name: word for name, word in classes.items() if word},

@@ -156,7 +156,7 @@ def level_card(
         rmse_db=float(np.sqrt(np.mean(error**2))) if absolute else None,
         offset_db=fit.offset_db,
         rmse_offset_db=fit.rmse_db,
-        rmse_1s_db=float(np.sqrt(np.mean((slow + fit.offset_db) ** 2))),
+        rmse_1s_db=float(slow.std()),
         correlation=covariance / (spread * varied) if min(spread, varied) > _CONSTANT_DB else float("nan"),
         slope=covariance / spread**2 if spread > _CONSTANT_DB else float("nan"),
         crps_db=crps,

@@ -740,6 +740,10 @@ class PairedDifference:
         return f"{self.verdict} than {other_model} by {size} [{near:.{digits}f}, {far:.{digits}f}]"
 
 
+# Smaller differences [dB] between the errors of two models are rounding.
+_ROUNDING_DB = 1e-9
+
+
 def paired_difference(
     error_db: ArrayLike, other_error_db: ArrayLike, *, free_offset: bool = True, place_m: FloatArray | None = None
 ) -> PairedDifference:
@@ -776,6 +780,8 @@ def paired_difference(
     first, second = first[finite], second[finite]
     if free_offset and len(first):
         first, second = first - first.mean(), second - second.mean()
+    # a copy of a model differs by rounding, which must not decide
+    second = np.where(np.abs(first - second) < _ROUNDING_DB, first, second)
     nan = float("nan")
     square, other_square = (float(np.mean(e * e)) if len(e) else nan for e in (first, second))
     rmse, other_rmse = float(np.sqrt(square)), float(np.sqrt(other_square))

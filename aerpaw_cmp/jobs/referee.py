@@ -27,7 +27,7 @@ from ..common.jsonable import json_safe
 from ..common.native import read as read_native
 from ..common.outputs import file_digest
 from ..common.text import counted
-from ..common.units import AnyArray, BoolArray, FloatArray
+from ..common.units import FOOT_M, AnyArray, BoolArray, FloatArray
 from ..common.yamlfile import parse_yaml
 from ..compare.gains import LostLock
 from ..compare.level import nearest_in_time
@@ -231,14 +231,17 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
     known = {name.lower(): (notes["dims"][name][: array.ndim], array) for name, array in values.items()}
     if "up_m" in known:
         known.setdefault("height_m", known["up_m"])
-    if "h_real" in known and not set(known) & set(QUANTITIES):
+    if "h_real" in known:
+        # level_db of channel.nc has other units by tower, and may have been learned from this flight
+        known.pop("level_db", None)
         power_dbm = float(notes["attributes"].get("transmit_power_dbm", 0.0))
         (dims, real), (_, imaginary) = known["h_real"], known["h_imag"]
         known["level_dbm"] = dims[:-2], rss_dbm(mean_pair_power(real + 1j * imaginary), power_dbm)
         remarks = (f"The levels of {path.name} are those of H, with {power_dbm:g} dBm transmitted.",)
     main = next((name for name in (*QUANTITIES, "rank", RANKS[0]) if name in known), None)
     if main is None:
-        raise InputError("no variable with a level", expected=_EXPECTED)
+        unknown: pd.DataFrame = pd.DataFrame(columns=list(known))
+        return unknown
     shape = dict(zip(known[main][0], known[main][1].shape, strict=True))
     _check_rows(math.prod(shape.values()))
     at = dict(zip(shape, np.indices(tuple(shape.values())).reshape(len(shape), -1), strict=True))
@@ -249,7 +252,8 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
     }
     if "time" in columns and columns["time"].dtype.kind in "fiu":
         columns["time_s"] = columns.pop("time")
-        size, since, start = str(notes["units"].get("time", "")).partition(" since ")
+        units = {name.lower(): unit for name, unit in notes["units"].items()}
+        size, since, start = str(units.get("time", "")).partition(" since ")
         if since:
             with parsing(path, "a time unit such as 'seconds since 2025-06-10T14:00:00Z'"):
                 after = pd.to_timedelta(columns["time_s"], unit=size.strip().lower())  # type: ignore[call-overload]
@@ -273,6 +277,8 @@ def _radio_map(content: bytes, path: Path) -> pd.DataFrame:
             f"shapes {gain.shape}, {centre.shape}, {names.shape}",
             expected="path_gain (towers, rows, columns), cell_centers (rows, columns, 3), tx_names (towers,)",
         )
+    if (gain < 0.0).any():
+        raise InputError("a path_gain below 0", expected="a linear gain, 0 or more", cause="a gain in dB")
     _check_rows(gain.size)
     with np.errstate(divide="ignore", invalid="ignore"):
         loss_db = -10.0 * np.log10(gain.astype(np.float64).ravel())
@@ -341,6 +347,9 @@ def _checked(frame: pd.DataFrame, data: FlightData) -> tuple[str, pd.DataFrame]:
     quantity = quantities[0] if quantities else ""
     given = frame.reindex(columns=list(_COLUMNS))
     table: pd.DataFrame = given[list(_NUMBERS)].apply(_numbers)
+    # a rank whose column is missing, such as rank 3 of a pair of antennas, has the probability 0
+    ranked = table[list(RANKS)].notna().any(axis=1)
+    table.loc[ranked, list(RANKS)] = table.loc[ranked, list(RANKS)].fillna(0.0)
     for name in ("tower", "channel"):
         table[name] = given[name].astype("string").fillna("").str.strip().astype(object)
     table["level"] = _numbers(given[quantity]) if quantity else np.nan
@@ -371,9 +380,12 @@ def _times(given: pd.DataFrame) -> Any:
     name = "time_utc" if given["time_utc"].notna().any() else "time"
     column = given[name].dropna()
     stamps = pd.to_datetime(column.astype(str), utc=True, errors="coerce", format="ISO8601")
-    if len(column) and (pd.api.types.is_numeric_dtype(column) or stamps.isna().all()):
+    wrong = column if pd.api.types.is_numeric_dtype(column) else column[stamps.isna()]
+    if len(wrong):
         expected = "ISO 8601 in UTC, such as 2025-06-10T14:00:00Z"
-        raise InputError(f"no time that can be read ({column.iloc[0]})", expected=expected)
+        raise InputError(
+            f"{counted(len(wrong), 'time')} that cannot be read, such as {wrong.iloc[0]}", expected=expected
+        )
     dated = pd.api.types.is_datetime64_any_dtype(column)
     if name == "time" and not dated and not column.astype(str).str.contains(r"Z$|[+-]\d\d:?\d\d$").all():
         expected = "a column time_utc, or times that end in Z"
@@ -399,7 +411,7 @@ def _places(given: pd.DataFrame, site: Site) -> AnyArray:
 
 def _check_numbers(table: pd.DataFrame, quantity: str) -> None:
     """Refuse numbers that cannot have the meaning of their column."""
-    level, share = table["level"].dropna(), table[list(RANKS)].sum(axis=1, skipna=False).dropna()
+    level, shares = table["level"].dropna(), table[list(RANKS)].dropna()
     middle = level.median()
     median = f"a median {quantity} of {middle:.3g}"
     linear = len(level) > 0 and level.min() > 0.0 and level.max() < 1.0
@@ -410,10 +422,13 @@ def _check_numbers(table: pd.DataFrame, quantity: str) -> None:
         (quantity == "level_dbm" and middle > 30.0, median, loss, "a path loss (path_loss_db), or a missing sign"),
         (quantity == "path_loss_db" and middle < 0.0, median, loss, "a path gain; its negative is the loss"),
         ((table["sd_db"] <= 0.0).any(), "sd_db of 0 or less", "standard deviations above 0 dB", None),
+        (table["sd_db"].notna().any() and (table["sd_db"].isna() & table["level"].notna()).any(),
+         "levels with and without sd_db", "sd_db in each row that has a level, or in none", None),
         ((table["q05_db"] > table["q95_db"]).any(), "q05_db above q95_db", "the lower end in q05_db", "swapped names"),
         (not table["rank"].dropna().isin(range(MAX_RANK + 1)).all(), "ranks that are not 0 to 4",
          "1 to 4, or 0 without a channel", None),
-        ((abs(share - 1.0) > 0.01).any(), "p_rank1 to p_rank4 with another sum than 1", "probabilities", None),
+        ((shares < 0.0).any(axis=None) or (abs(shares.sum(axis=1) - 1.0) > 0.01).any(),
+         "p_rank1 to p_rank4 below 0, or with another sum than 1", "probabilities", None),
     ):  # fmt: skip
         if wrong:
             raise InputError(found, expected=expected, cause=cause)
@@ -522,6 +537,10 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     common = [entry for entry in series if entry.cards.keys() >= models.keys()]
     means = [_means(model, [entry.cards[model] for entry in common]) for model in models]
     remarks = [*given.remarks]
+    if unknown := sorted(predicted - {s.tower for _, s in data.series}):
+        remarks.append(f"{name}: the flight has no log of {', '.join(unknown)}; not scored.")
+    if sum(entry.matched - entry.unmatched for entry in series) < 0 and (cause := _wrong_heights(given, data, result)):
+        remarks.append(f"{name}: most samples have no prediction. Likely cause: {cause}.")
     if series and (few := [i.name for i in result.rss if i.tower in predicted and (i.tower, i.channel) not in scored]):
         remarks.append(f"{name}: fewer than {FEWEST} samples of {', '.join(few)} have a predicted level; not scored.")
     if trained := [i.name for i in result.rss if i.training and (i.tower, i.channel) in scored]:
@@ -725,25 +744,42 @@ def _why_none(given: ForeignPrediction, data: FlightData, result: FlightResult) 
         return f"other names for the channels: {', '.join(sorted(theirs))}; the flight has {', '.join(sorted(ours))}"
     if given.timed:
         return _other_time(given, result)
+    above_m = given.table["height_m"].max() - data.site.takeoff_ground_m
+    if above_m < _ON_GROUND_M:
+        return (
+            f"no predicted position is in the air (at most {above_m:.1f} m above the take-off ground), so an emulated "
+            "vehicle did not fly"
+        )
+    other = "a prediction of another route; --against-distance allows larger distances"
+    return _wrong_heights(given, data, result) or other
+
+
+def _wrong_heights(given: ForeignPrediction, data: FlightData, result: FlightResult) -> str | None:
+    """Return the likely error of the predicted heights, if most samples are near a prediction without it."""
+    if given.timed:
+        return None
     flown, points = (
         place[np.isfinite(place).all(axis=1)]
         for place in (np.vstack([s.position_m for s in result.series]), given.table[list(_PLACE)].to_numpy())
     )
-    above_m = points[:, 2] - data.site.takeoff_ground_m
-    if np.abs(above_m).max() < _ON_GROUND_M:
-        return (
-            f"no predicted position is in the air (at most {above_m.max():.1f} m above the take-off ground), so an "
-            "emulated vehicle did not fly"
-        )
-    index, near = nearest_points(flown * [1, 1, 0], None, points * [1, 1, 0], None, 50.0)
-    apart_m = float(np.median((points[index] - flown)[near, 2])) if near.mean() > 0.5 else 0.0
-    if abs(apart_m) > 10.0:
-        return (
-            f"another height datum: the predicted positions are {abs(apart_m):.0f} m "
-            f"{'above' if apart_m > 0 else 'below'} the flight, whose heights count from the ground at the origin "
-            "(up) or from take-off (with latitude and longitude)"
-        )
-    return "a prediction of another route; --against-distance allows larger distances"
+    index, near = nearest_points(flown * [1, 1, 0], None, points * [1, 1, 0], None, given.near_m)
+    if near.mean() < 0.5:
+        return None
+    ground_m, up_m = data.site.takeoff_ground_m, points[:, 2]
+    apart_m = float(np.median((points[index] - flown)[near, 2]))
+    feet, shifted = (
+        float(nearest_points(flown, None, np.column_stack([points[:, :2], up]), None, given.near_m)[1].mean())
+        for up in (ground_m + FOOT_M * (up_m - ground_m), up_m - apart_m)
+    )
+    if max(feet, shifted) < 0.5:
+        return None
+    if feet > shifted:
+        return f"heights in feet; in metres, {100 * feet:.0f} % of the samples would have a prediction"
+    return (
+        f"another height datum: the predicted positions are {abs(apart_m):.0f} m "
+        f"{'above' if apart_m > 0 else 'below'} the flight, whose heights count from the ground at the origin (up) or "
+        "from take-off (with latitude and longitude)"
+    )
 
 
 def _other_time(given: ForeignPrediction, result: FlightResult) -> str:

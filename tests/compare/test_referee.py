@@ -33,12 +33,21 @@ def test_card_of_a_shifted_prediction_with_a_true_band() -> None:
     assert card.rmse_db == pytest.approx(np.sqrt(np.mean(error**2)), abs=1e-9)
     assert card.offset_db == pytest.approx(-5.0, abs=0.1)
     assert card.rmse_offset_db == pytest.approx(2.0, abs=0.1)
-    assert card.rmse_1s_db == pytest.approx(card.rmse_offset_db, abs=1e-6)  # one sample per window
+    assert card.rmse_1s_db == pytest.approx(error.std(), abs=1e-9)  # one sample per window
     assert card.correlation == pytest.approx(6.0 / np.hypot(6.0, 2.0), abs=0.01)
     assert card.slope == pytest.approx(1.0, abs=0.03)
     (share,) = card.exceedance
     assert share.measured == pytest.approx(0.5, abs=0.03)
     assert share.predicted == pytest.approx(0.5 - 0.298, abs=0.03)  # 5 / 6 of a standard deviation: Phi(0.833) = 0.798
+
+
+def test_means_over_a_second_have_their_own_offset() -> None:
+    """The mean power of Rayleigh fading is 2.5 dB above its mean level: no error of the predicted means."""
+    rng = np.random.default_rng(4)
+    time, fading_db = np.arange(20_000) / 400.0, 10.0 * np.log10(rng.exponential(size=20_000))
+    card = level_card(time, -80.0 + fading_db, PredictedLevel(level_db=np.full(20_000, -80.0)), ())
+    assert card.rmse_offset_db == pytest.approx(5.57, abs=0.15)
+    assert card.rmse_1s_db < 0.4  # 400 draws: 4.34 / 20 dB
 
 
 def test_crps_and_coverage_of_a_calibrated_normal_band() -> None:
@@ -157,3 +166,5 @@ def test_a_paired_difference_in_closed_form() -> None:
     assert pair.difference_db == pytest.approx(np.sqrt(np.mean(error**2)), abs=1e-9)
     assert pair.verdict == "worse"
     assert paired_difference(error, error + 4.0).difference_db == pytest.approx(0.0, abs=1e-9)  # offsets are free
+    rounded = paired_difference(error, error * (1.0 + 1e-15))
+    assert (rounded.difference_ci95_db, rounded.verdict) == ((0.0, 0.0), "not significant")

@@ -11,6 +11,8 @@ import xarray
 import yaml
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.flight.data import FlightData, load_data
+from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.jobs import referee
 
 PREDICTIONS = Path(__file__).parents[1] / "predictions"
@@ -35,6 +37,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     table = pd.read_csv(place / "r" / "rss.csv")
     table[table["tower"].isin(["LW1", "LW3"])].to_csv(place / "rss.csv", index=False)
     return place
+
+
+def flight_data(path: Path) -> FlightData:
+    return load_data(load_with_learned(path), path.parent)
 
 
 def ours(flight: Path) -> pd.DataFrame:
@@ -141,6 +147,51 @@ def test_files_in_the_manner_of_three_programs_are_scored(flight: Path) -> None:
     assert "Share of samples at or above a threshold" in page
 
 
+def test_heights_in_feet_and_unknown_towers_are_named_beside_the_score(flight: Path) -> None:
+    """A climb passes the height of the cruise in feet, so that some samples have a prediction by chance."""
+    table = ours(flight).query("channel == 'USRP1' and tower == 'LW1'").dropna(subset=["east_m", "simulated_dbm"])
+    place = table[["east_m", "north_m"]].assign(height_m=table["up_m"], level_dbm=table["simulated_dbm"])
+    place = place.drop_duplicates(["east_m", "north_m", "height_m"])
+    in_feet = place.assign(tower="LW1", height_m=place["height_m"] / 0.3048)
+    pd.concat([in_feet, in_feet.assign(tower="LW9")]).to_csv(flight / "feet.csv", index=False)
+    above = place.assign(tower="LW1", height_m=place["height_m"] + 12.0)
+    above.to_csv(flight / "above.csv", index=False)
+    feet, above = scored(flight, flight / "feet.csv", flight / "above.csv")
+    assert feet["remarks"] == [
+        "feet.csv: the flight has no log of LW9; not scored.",
+        "feet.csv: most samples have no prediction. Likely cause: heights in feet; in metres, 100 % of the samples "
+        "would have a prediction.",
+    ]
+    (remark,) = above["remarks"]
+    assert "another height datum: the predicted positions are 12 m above the flight" in remark
+
+
+def test_the_channel_of_the_flight_scores_as_the_replay_with_its_transmit_power(flight: Path) -> None:
+    """Learned antennas of the site are not part of the channel: their level_db has another unit for each tower."""
+    words = ["--link", "USRP2", "--step", "0.5", "-q"]
+    assert main(["channel", str(flight / "s" / "flight.yaml"), "-o", str(flight / "h"), *words]) == 0
+    (card,) = scored(flight, flight / "h" / "channel.nc")
+    assert card["remarks"] == ["The levels of channel.nc are those of H, with 40 dBm transmitted."]
+    cards = card["levels"]["LW3"]["USRP2"]["cards"]
+    replayed = cards["ray tracing (this report)"]
+    for key in ("offset_db", "rmse_offset_db"):
+        assert cards["channel.nc"][key] == pytest.approx(replayed[key], abs=0.15)
+
+
+def test_a_prediction_of_two_ranks_has_no_others(flight: Path) -> None:
+    """The variables of a NetCDF file have any case, and so has their unit."""
+    data = flight_data(flight / "s" / "all.yaml")
+    times = pd.to_datetime(ours(flight)["time_utc"]).drop_duplicates().dt.tz_localize(None).to_numpy()
+    dims, chance = ("step",), np.full(len(times), 0.5)
+    variables = {"TIME": (dims, times), "TOWER": "LW1", "P_RANK1": (dims, chance), "P_RANK2": (dims, chance)}
+    xarray.Dataset(variables).to_netcdf(flight / "two.nc")
+    given = referee.read_foreign(flight / "two.nc", data)
+    assert given.timed
+    assert given.table[["p_rank1", "p_rank2", "p_rank3", "p_rank4"]].drop_duplicates().values.tolist() == [
+        [0.5, 0.5, 0.0, 0.0]
+    ]
+
+
 def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
     table = ours(flight)
     emulated = table[table["channel"] == "USRP1"].copy()
@@ -174,6 +225,15 @@ def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
         ),
         (lambda f: f.rename(columns={"level_dbm": "path_loss_db"}), "a path gain; its negative is the loss"),
         (lambda f: f.assign(level_db=10 ** (f.pop("level_dbm") / 10)), "a linear gain or power in watts"),
+        (lambda f: f.assign(sd_db=np.where(np.arange(len(f)) % 2, 6.0, np.nan)), "levels with and without sd_db"),
+        (
+            lambda f: f[["time_utc", "tower"]].assign(p_rank1=-0.2, p_rank2=1.2),
+            "p_rank1 to p_rank4 below 0, or with another sum than 1",
+        ),
+        (
+            lambda f: f.assign(time_utc=f["time_utc"].where(f.index % 2 > 0, "01-Jun-2025 14:00:00")),
+            "times that cannot be read, such as 01-Jun-2025",
+        ),
         (
             lambda f, place: f.join(place.add([0.0, 0.0, 95.0])).drop(columns="time_utc").drop_duplicates(place.columns),
             "another height datum: the predicted positions are 95 m above the flight",
@@ -200,6 +260,11 @@ def test_damaged_files_are_one_message(flight: Path, capsys: pytest.CaptureFixtu
         (flight / name).write_bytes(content)
         assert name in refused(flight, flight / name, capsys)
     assert "gone.csv" in refused(flight, flight / "gone.csv", capsys)
+    centre = np.zeros((2, 2, 3))
+    np.savez(flight / "db.npz", path_gain=np.full((1, 2, 2), -90.0), cell_centers=centre, tx_names=np.array(["LW1"]))
+    assert "a path_gain below 0; expected a linear gain, 0 or more" in refused(flight, flight / "db.npz", capsys)
+    xarray.Dataset({"rss": ("time", np.zeros(3)), "tower": "LW1"}).to_netcdf(flight / "rss.nc")
+    assert "(columns: time, rss, tower)" in refused(flight, flight / "rss.nc", capsys)
 
 
 def test_a_prediction_with_too_many_rows_is_refused_in_every_format(

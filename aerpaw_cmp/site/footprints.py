@@ -48,7 +48,15 @@ from .mapfiles import (
     read_map_file,
 )
 from .site import Building, Forest, Geofence
-from .siteyaml import TALLEST_TREE_M, WIDEST_CROWN_M, SingleTreeModel, SiteModel, build_site, extent_m, site_model
+from .siteyaml import (
+    TALLEST_TREE_M,
+    WIDEST_CROWN_M,
+    SingleTreeModel,
+    SiteModel,
+    build_site,
+    extent_m,
+    site_model,
+)
 
 # Storey height that OpenStreetMap suggests.
 _LEVEL_M = 3.0
@@ -685,68 +693,61 @@ def import_site(
     """
     if not files:
         raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files")
+    content: dict[str, Any] = {"name": Path(files[0]).stem, "trees": {}}
+    area_m = (-_AROUND_M, _AROUND_M, -_AROUND_M, _AROUND_M)
     named_towers = _named_towers(towers)
-    relief = {} if dem is None else {"dem": {"path": str(Path(dem).resolve()), "crs": dem_crs}}
     if towers and base is None:
-        return _site_around(files, named_towers, relief, options)
-    base = base or "lake_wheeler"
-    model = site_model(base)
-    frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
-    content = model.model_dump()
+        first = next(iter(named_towers.values()))
+        frame = SiteFrame(first["latitude_deg"], first["longitude_deg"])
+        content["origin"] = {"latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg}
+    else:
+        base = base or "lake_wheeler"
+        model = site_model(base)
+        frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
+        content, area_m = model.model_dump(), extent_m(model, frame)
+        if model.dem is not None:  # the new file may be in another folder
+            content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
     if towers:
         content["towers"] = named_towers
-    if model.dem is not None:  # the new file may be in another folder
-        content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
-    if relief:
-        content |= {**relief, "tower_ground": None}
-    actions = _from_maps(content, import_footprints(files, frame, area_m=extent_m(model, frame), **options))
-    imported = SiteModel.model_validate(content)
-    if relief:
-        build_site(imported)  # fails now if the elevation model is elsewhere
-    return imported, [_kept_of_base(imported, base), *actions]
+    if dem is not None:
+        content |= {"dem": {"path": str(Path(dem).resolve()), "crs": dem_crs}, "tower_ground": None}
+    imports = import_footprints(files, frame, area_m=area_m, **options)
+    about = [] if base is not None else _around_towers(content, imports, frame)
+    actions = _from_maps(content, imports)
+    model = SiteModel.model_validate(content)
+    build_site(model)  # fails now if elevations or towers are elsewhere
+    return model, [*(about or [_kept_of_base(model, str(base))]), *actions]
 
 
-def _site_around(
-    files: Sequence[str | Path], towers: dict[str, dict[str, float]], relief: dict[str, Any], options: dict[str, Any]
-) -> tuple[SiteModel, list[str]]:
-    """Return a site whose origin is the first tower, and whose area is that of the map around it."""
-    first = next(iter(towers.values()))
-    origin = {key: first[key] for key in ("latitude_deg", "longitude_deg")}
-    frame = SiteFrame(**origin)
-    positions = [frame.to_local(tower["latitude_deg"], tower["longitude_deg"]) for tower in towers.values()]
+def _around_towers(content: dict[str, Any], imports: Footprints, frame: SiteFrame) -> list[str]:
+    """Set area and ground of a site without a base, and return the sentences about them."""
+    first, *_ = towers = content["towers"]
+    positions = [Point(*frame.to_local(tower["latitude_deg"], tower["longitude_deg"])) for tower in towers.values()]
     reach = box(-_AROUND_M, -_AROUND_M, _AROUND_M, _AROUND_M)
-    imports = import_footprints(files, frame, area_m=(-_AROUND_M, _AROUND_M, -_AROUND_M, _AROUND_M), **options)
     shapes = [item.footprint for item in imports.buildings] + [item.area for item in imports.forests]
     mapped = shapely.union_all([shape.intersection(reach) for shape in shapes])
-    around = [Point(*position).buffer(_NEAR_TOWER_M) for position in positions]
+    # a tower farther away is a typing error, which build_site reports
+    around = [place.buffer(_NEAR_TOWER_M) for place in positions if place.distance(positions[0]) <= FAR_M]
     west, south, east, north = shapely.union_all([mapped, *around]).bounds
-    content: dict[str, Any] = {
-        "name": Path(files[0]).stem,
-        "origin": origin,
-        "towers": towers,
-        "area_m": [math.floor(west), math.ceil(east), math.floor(south), math.ceil(north)],
-        "trees": {},
-        **relief,
-    }
-    actions = _from_maps(content, imports)
+    area = content["area_m"] = [math.floor(west), math.ceil(east), math.floor(south), math.ceil(north)]
     known = [[round(value, 2) for value in (*point, _ELEVATION_SD_M)] for point in imports.ground if
              reach.contains(Point(point[:2]))]  # fmt: skip
     ground = "flat (the map has fewer than three elevations; --dem FILE names an elevation model)"
-    if relief:
-        ground = f"the elevation model {relief['dem']['path']}, whose heights are above sea level (dem.reference)"
+    if "dem" in content:
+        ground = f"the elevation model {content['dem']['path']}, whose heights are above sea level (dem.reference)"
     elif len(known) >= _FEWEST_ELEVATIONS:
         content |= {"ground_points": known[:: 1 + len(known) // _MOST_ELEVATIONS], "tower_ground": "surface"}
         ground = f"a smooth surface through {len(content['ground_points'])} elevations of the map (tag ele)"
-    west, east, south, north = content["area_m"]
     material = SiteModel.model_fields["ground_material"].default
     about = (
-        f"the origin is tower {next(iter(towers))}; the ground is {ground}, of {material}; the area is {east - west} m "
-        f"x {north - south} m: the map within {_AROUND_M / 1000:g} km of the origin. Change them in the file"
+        f"the origin is tower {first}; the ground is {ground}, of {material}; the area is {area[1] - area[0]} m x "
+        f"{area[3] - area[2]} m: the map within {_AROUND_M / 1000:g} km of the origin. Change them in the file"
     )
-    model = SiteModel.model_validate(content)
-    if relief or model.ground_points:
-        build_site(model)  # fails now if elevations are wrong or elsewhere
-    return model, [about, *actions]
+    if mapped.area > 0.0 or not shapes:
+        return [about]
+    away_km = min(shape.distance(positions[0]) for shape in shapes) / 1000
+    return [about, f"warning: no building or wood within {_AROUND_M / 1000:g} km of tower {first}; the nearest is "
+                   f"{away_km:.1f} km away. Is the position of the tower right?"]  # fmt: skip
 
 
 def name_and_value(text: str, option: str, example: str) -> tuple[str, str]:

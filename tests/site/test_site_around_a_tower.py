@@ -41,6 +41,15 @@ def test_first_tower_is_the_origin_and_buildings_keep_their_place(tmp_path: Path
     assert min(east, -south, north) >= 500
 
 
+def test_a_tower_away_from_the_map_or_from_the_first_tower_is_named(tmp_path: Path) -> None:
+    file = campus(tmp_path / "campus.geojson")
+    _, actions = import_site([file], towers=[f"roof={LATITUDE + 0.05},{LONGITUDE},25"])
+    assert actions[1].startswith("warning: no building or wood within 2 km of tower roof; the nearest is 5.5 km away")
+    towers = [f"roof={LATITUDE},{LONGITUDE},25", f"mast={LATITUDE + 1.0},{LONGITUDE},25"]
+    with pytest.raises(UsageError, match=r"tower 'mast' .* lies 11\d\.\d km from its site"):
+        import_site([file], towers=towers)
+
+
 def test_a_map_elsewhere_names_the_tower_option(tmp_path: Path) -> None:
     with pytest.raises(InputError) as refused:
         import_site([campus(tmp_path / "campus.geojson")])

@@ -34,6 +34,7 @@ from ..common.text import counted
 from ..logs import dictionary
 from ..logs.ingest import as_utf8, read_bytes, read_file, sniffers_of
 from ..logs.readers import HEAD_BYTES, ReadOptions, claims
+from ..site.mapfiles import main_kml
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -124,14 +125,16 @@ def _route(data: bytes, path: str | Path) -> _Route:
         return _waypoint_text(data.decode("utf-8", "replace"))
     if any(reader.kinds for reader in claims(data)):
         return _log(path)
-    if b"<kml" in head:
+    if data.startswith(b"PK\x03\x04"):
+        data = main_kml(data, path)
+    if kml.is_kml(data):
         return _kml(data)
     if b"\0" in head:
         raise InputError("binary content that is not a route", expected=_EXPECTED)
     return _sheet(data)
 
 
-_EXPECTED = "a QGroundControl .plan, QGC WPL waypoints, a KML with a line, a CSV with lat, lon, alt, or a log"
+_EXPECTED = "a QGroundControl .plan, QGC WPL waypoints, a KML or KMZ with a line, a CSV with lat, lon, alt, or a log"
 
 
 def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
@@ -151,6 +154,7 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
             place = f"{int(silent.sum())} of {counted(len(table), 'point')} without a height"
             raise InputError(place, expected="heights above take-off in the file, or one height for all points")
         table["altitude_m"] = table["altitude_m"].fillna(height_m)
+        route.remark(f"{int(silent.sum())} of {counted(len(table), 'point')} without a height: {height_m:g} m is used.")
     # some programs count headings from -180, others from 0
     table["yaw_deg"] = table["yaw_deg"] % 360.0
     table.attrs["remarks"] = list(route.remarks)

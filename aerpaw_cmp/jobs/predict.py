@@ -29,7 +29,7 @@ from ..flight.drafting.proposals import latest_learned_links
 from ..flight.gains import flight_of
 from ..flight.settings import FlightFile, LinkSettings, LinksSettings
 from ..flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
-from ..maps.grid import Grid, Layer
+from ..maps.grid import Grid, Layer, LinkBudget
 from ..propagation.geometry import Poses, rotation_from_aircraft
 from ..report import maps as page
 from ..report.prediction import (
@@ -312,8 +312,8 @@ def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions)
     link = LinksSettings().rank if flight is None else flight.link.rss
     carrier_hz = options.carrier_hz or (stated.carrier_ghz or 0.0) * 1e9 or link.carrier_hz
     powers = (options.tx_power_dbm, stated.tx_power_dbm, link.transmit_power_dbm)
-    link = LinkSettings(carrier_hz=carrier_hz, transmit_power_dbm=next(p for p in powers if p is not None))
-    return Prior(site, link)
+    budget = LinkBudget(tx_power_dbm=next(p for p in powers if p is not None))  # refuses a power in watts
+    return Prior(site, LinkSettings(carrier_hz=carrier_hz, transmit_power_dbm=budget.tx_power_dbm))
 
 
 def _nodes_of(where: Path) -> set[str]:

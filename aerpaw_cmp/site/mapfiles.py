@@ -597,7 +597,7 @@ def read_map_file(path: str | Path) -> MapFile:
     data = read_input(path, MAX_BYTES, "a map file")
     # browsers save a KMZ as .zip or .kml, so look at the content
     if data.startswith(b"PK\x03\x04"):
-        data = _unzipped(data, path)
+        data = main_kml(data, path)
     # skip a byte-order mark and blank lines
     start = data[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
     if not data.strip():
@@ -617,7 +617,7 @@ def read_map_file(path: str | Path) -> MapFile:
     raise InputError("not a map file", expected=FORMATS)
 
 
-def _unzipped(data: bytes, path: Path) -> bytes:
+def main_kml(data: bytes, path: str | Path) -> bytes:
     """Return the main KML file of a KMZ archive."""
     try:
         members = files.archive_members(data, path)

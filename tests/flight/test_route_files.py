@@ -1,7 +1,9 @@
 """Routes of plans, maps, tables and logs contain the same points."""
 
+import io
 import json
 import math
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +37,14 @@ def kml(shape: str) -> bytes:
     return f'<?xml version="1.0"?>\n<kml><Document><Placemark>{shape}</Placemark></Document></kml>\n'.encode()
 
 
+def kmz(shape: str) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("files/icon.png", b"no picture")
+        archive.writestr("doc.kml", kml(shape))
+    return file.getvalue()
+
+
 LINE = " ".join(f"{lon},{lat},{height}" for lat, lon, height in POINTS)
 ABOVE = " ".join(f"{lon},{lat},{height + 90}" for lat, lon, height in POINTS)
 TRACK = "".join(f"<gx:coord>{lon} {lat} {height}</gx:coord>" for lat, lon, height in POINTS)
@@ -59,6 +69,8 @@ FILES = {
     "signs.kml": kml("<LineString><altitudeMode>relativeToGround</altitudeMode><coordinates>"
                      + " ".join(f"{lon:+},{lat:+},{height:+}" for lat, lon, height in POINTS) + "</coordinates></LineString>"),
     "track.kml": kml(f"<gx:Track><altitudeMode>relativeToGround</altitudeMode>{TRACK}</gx:Track>"),
+    "line.kmz": kmz("<LineString><altitudeMode>relativeToGround</altitudeMode><coordinates>" + LINE
+                    + "</coordinates></LineString>"),
     "header.csv": b"Longitude,Latitude,Altitude (m)\r\n" + "".join(f"{b},{a},{c}\r\n" for a, b, c in POINTS).encode(),
     "feet.csv": b"lat;lng;alt [ft]\n" + "".join(f"{a};{b};{c / 0.3048}\n" for a, b, c in POINTS).encode(),
     "bare.csv": "".join(f"{a}, {b}, {c}\n" for a, b, c in POINTS).encode(),
@@ -157,7 +169,9 @@ def test_points_without_height_ask_for_one(tmp_path: Path) -> None:
     file.write_bytes(kml("<LineString><coordinates>-78.7,35.7,0 -78.7,35.8,0</coordinates></LineString>"))
     with pytest.raises(InputError, match="2 of 2 points without a height"):
         read_route(file)
-    assert read_route(file, height_m=30.0)["altitude_m"].tolist() == [30.0, 30.0]
+    route = read_route(file, height_m=30.0)
+    assert route["altitude_m"].tolist() == [30.0, 30.0]
+    assert route.attrs["remarks"] == ["2 of 2 points without a height: 30 m is used."]
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,12 @@ def test_options_replace_carrier_and_power_of_the_site(place: Path) -> None:
     np.testing.assert_allclose(level - changed, 10.0, atol=1e-3)
 
 
+def test_a_power_in_watts_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["predict", str(place / "points.csv"), "--site", str(place / "site.yaml"), "-o", str(place / "out")]
+    assert main([*words, "--tx-power-dbm", "2000"]) == 2
+    assert "a transmit power of 2000 dBm; expected -60 to 100 dBm" in " ".join(capsys.readouterr().err.split())
+
+
 def test_carrier_beside_flights_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sample = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
     words = [

@@ -103,7 +103,7 @@ _JOINED = re.compile(
     r"\b(?:n|nb|nbr|nc|ncell|nrx|nei|neigh|neighbou?r|neighbou?r?cell|ngbr|adj|det(?:ected)?)(\d{0,2})"
     r"(?=(?:pci|rsrp|rsrq|rssi|rscp|sinr|e?arfcn|rxlev)\d{0,2}\b)"
 )
-_NR = re.compile(r"\b(nr|5g|spcell|ss ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss|\bnrpci\b|\bnr ?arfcn\b|\bnci\b")
+_NR = re.compile(r"\b(nr|5g|spcell|(ss|csi) ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss|\bnrpci\b|\bnr ?arfcn\b|\bnci\b")
 _LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
 # A secondary carrier, which serves together with the primary one.
 _SECONDARY = re.compile(r"\bsc(?:ell|c) ?(\d{0,2})\b")
@@ -127,9 +127,10 @@ _INDIRECT = re.compile(
 # Levels in addition to the measured one: averages over time, and those of single ports.
 _MEAN = re.compile(
     r"\b(mean|avg|average|averaged|filtered|filt|smooth(ed)?|median|ema|rolling|moving|kalman|low ?pass|lpf|savgol"
-    r"|denoised|interp(olated)?|fitted)\d*\b"
+    r"|denoised|interp(olated)?|fitted|percentile|quantile|p\d)\d*\b"
 )
-_PORT = re.compile(r"\b(rx|ant(enna)?|port|branch|chain|path) ?\d\b")
+# SS-RSRP is the level of an NR cell, even next to its CSI-RSRP
+_PORT = re.compile(r"\b(rx|ant(enna)?|port|branch|chain|path) ?\d\b|\bcsi ?rsrp\b")
 
 
 @dataclass(frozen=True, slots=True)
@@ -523,6 +524,11 @@ def like_levels(names: Iterable[str]) -> list[str]:
     ]  # fmt: skip
 
 
+def can_be_level(name: str) -> bool:
+    """Check whether the unit in a name, if it is known, is that of a level, not that of a field strength or height."""
+    return UNITS.get(without_unit(name)[1], ("dBm",))[0] in ("dBm", "dB", _FULL_SCALE)
+
+
 def program(names: Collection[str]) -> Program | None:
     """Return the program that wrote a table with such plain names, or None if no program is recognised."""
     present = set(names)
@@ -553,6 +559,8 @@ def described(
         forms = (re.sub(form, word, bare) for form, word in words.items() if re.fullmatch(form, bare))
         common = next(forms, bare)
         what = meaning(name, None if common == bare else common)
+        if what is not None and what.quantity.name == "quality" and common == bare:
+            what = None  # only AERPAW's sounder has a quality in dB, other link qualities are percentages
         unit = what.unit if what else without_unit(name)[1]
         if known and (not unit or bare in known.units):
             unit = known.units.get(bare, known.angles if what and what.quantity.role == "angle" else "")

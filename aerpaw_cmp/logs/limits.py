@@ -252,7 +252,9 @@ def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArr
     at = int(np.argmax(astray))
     step_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)
     step_s = np.maximum(np.abs(np.diff(time_s)), 1e-3)
-    return astray, at_rest, float((step_m / step_s)[max(at - 1, 0) : at + 1].max()), at
+    run = int(np.searchsorted(begins, at, side="right")) - 1
+    around = [max(begins[run] - 1, 0), min(ends[run], count - 1) - 1]  # the steps into and out of the first such run
+    return astray, at_rest, float((step_m / step_s)[around].max()), at
 
 
 # The flag of rows beyond a limit, and the smallest and largest possible value of each column [unit of its name]. The

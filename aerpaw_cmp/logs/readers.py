@@ -284,10 +284,12 @@ def _way_to_map(names: list[str]) -> str:
     """Return the options that read a table of another kind, if its names allow a track or a level."""
     from . import dictionary
 
+    elsewhere = next(row.names[0] for row in dictionary.QUANTITIES if row.name == "elsewhere")
+    names = [name for name in names if not re.search(elsewhere, dictionary.plain(name))]
     fits = {
         what: [name for words in forms for name in names if re.search(words, dictionary.plain(name))]
         for what, forms in _LIKE.items()
-    } | {"rss_db": dictionary.like_levels(names)}
+    } | {"rss_db": [name for name in dictionary.like_levels(names) if dictionary.can_be_level(name)]}
     if not fits["time"] or not (fits["rss_db"] or all(fits[what] for what in _LIKE)):
         lacking = " or ".join(what for what in ("time", "rss_db") if not fits[what])
         return f"a table of another kind; no column looks like {lacking}"

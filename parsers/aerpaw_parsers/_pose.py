@@ -202,6 +202,7 @@ _OF_DATUM = re.compile(r"(vertical )?(alt|altitude|height)? ?(ref|reference|type
 MOVED_M, _OFF_M = 0.5, 2.0
 # A home this close to sea level [m] is not set: the two heights of a record are then equal, except for rounding.
 UNSET_M = 0.01
+_UNSET = "home was not set in {}: these have no height, because the altitude jumps when home is set"
 
 
 def above_home(
@@ -215,12 +216,8 @@ def above_home(
         step_m = altitude[begin - 1] - altitude[begin] if 0 < begin < len(altitude) else 0.0
         leaps = abs(step_m) > _REST_M + _CLIMB_MPS * (time_s[begin] - time_s[begin - 1]) if step_m else False
         altitude = np.where(np.arange(len(altitude)) < begin, np.nan, altitude) if leaps else altitude
-        how = (
-            "have no height, because the altitude jumps when home is set"
-            if leaps
-            else "use the home that was set later"
-        )
-        rows.warnings.append(f"home was not set in {counted(int((~known_home).sum()), 'record')}: these {how}")
+        text = _UNSET if leaps else "home was not set in {}: these use the home that was set later"
+        rows.warnings.append(text.format(counted(int((~known_home).sum()), "record")))
     known = np.flatnonzero(np.isfinite(altitude))
     climbs = altitude[known] - np.minimum.accumulate(altitude[known]) > _OFF_M
     takeoff_s = time_s[known[int(np.argmax(climbs))]] if climbs.any() else home_s[-1]
@@ -295,6 +292,8 @@ def above_takeoff(rows: Rows, values: dict[str, AnyArray], datum: str, lost: Boo
     if 2 * (rate_mps > _FASTEST_MPS).sum() > (rate_mps > 0).sum():
         text = f"most heights change by more than {_FASTEST_MPS:g} m/s, such as {rate_mps.max():.0f} m/s: another unit?"
         rows.warnings.append(text)
+    if datum == "take-off":
+        altitude = _without_unset_home(rows, altitude)
     if datum in ("take-off", "ground") or not len(known):
         return altitude, about
     altitude = _without_first_zeros(altitude, rows.time if datum == "unknown" else None)
@@ -348,6 +347,20 @@ def _without_first_zeros(altitude: FloatArray, time: AnyArray | None) -> FloatAr
         if rate[0] < _CLIMB_MPS or rate[0] < 3 * np.nanmax(rate[1:], initial=0.0):
             return altitude
     return np.where(np.arange(len(altitude)) < begun, np.nan, altitude)
+
+
+def _without_unset_home(rows: Rows, height: FloatArray) -> FloatArray:
+    """Return heights above take-off with NaN for leading altitudes above sea level, written before home was set.
+
+    Such altitudes are all far from 0, and the next height is near 0, farther below than any descent reaches.
+    """
+    fall_m, step_s = -np.diff(height), np.abs(np.diff(rows.time) / np.timedelta64(1, "s"))
+    falls = (fall_m > _NEAR_ZERO_M + _CLIMB_MPS * step_s) & (np.abs(height[1:]) < _REST_M)
+    begin = int(np.argmax(falls)) + 1 if falls.any() else 0
+    if not begin or np.nanmin(np.abs(height[:begin])) < _NEAR_ZERO_M:
+        return height
+    rows.warnings.append(_UNSET.format(counted(begin, "record")))
+    return np.where(np.arange(len(height)) < begin, np.nan, height)
 
 
 def _ground(*track: AnyArray) -> float | None:

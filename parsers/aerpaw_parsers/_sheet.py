@@ -721,6 +721,8 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in bounded.items()])
     column = _time_column(sheet, options) if column is None else column
     weeks = None if mapped and column != sheet.find("gps_seconds") else _gps_weeks(sheet, column)
+    if column is None and weeks is None and (date := sheet.find("date")) is not None and _is_dated(sheet, date):
+        column = date  # a column such as 'Date' with the date and the time of day
     times = (column, sheet.find("time") if weeks is not None else None, *map(sheet.find, _OF_CLOCK))
     sheet.used |= {i for i in times if i is not None}
     if weeks is not None:
@@ -856,8 +858,8 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     heads = " ".join(sheet.names[i].lower() for i in (day, column) if i is not None)
     first = _DAY_OR_MONTH.search(heads)
     return _stamps.read(
-        texts, options, unit=count, european=sheet.has_decimal_commas, zone=zone, gps=gps,
-        day_first=None if first is None else first[1].startswith("d"), device=_devices(sheet),
+        texts, options, unit=count, european=sheet.has_decimal_commas or _EUROPEAN.search(heads) is not None,
+        zone=zone, gps=gps, day_first=None if first is None else first[1].startswith("d"), device=_devices(sheet),
     )  # fmt: skip
 
 
@@ -896,6 +898,8 @@ _DATED = re.compile(r"\d{9,}[.,]?\d*|.*\d(?:Z|[+-]\d\d:?\d\d)")
 _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
 # A cell of a column that contains only AM or PM.
 _AM_PM = re.compile(r"[AaPp]\.?[Mm]\.?")
+# Words for times in languages of countries where the day comes first.
+_EUROPEAN = re.compile(r"zeit|datum|fecha|hora|heure|horodatage")
 # The order in a name: 'date (dd/mm/yyyy)'.
 _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 

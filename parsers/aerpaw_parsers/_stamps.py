@@ -25,7 +25,7 @@ _PLACE = re.compile(r"(Z|[+-]\d\d:\d\d)\[[\w/+-]+\]$")
 _ZONE = rf"(?: ?[(\[]?(?P<zone>(?:UTC|GMT) ?[+-]\d{{1,2}}(?::?\d\d)?|(?![AaPp][Mm]\b)(?:{_NAMED_ZONE}))[)\]]?)?"
 _CLOCK = (
     r"(?P<hour>\d{1,2})[:.h-](?P<minute>\d\d)(?:[:.m-](?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,40}))?)?"
-    r" ?(?P<half>[AaPp]\.?[Mm]\.?)?"
+    r" ?(?P<half>[AaPp]\.? ?[Mm]\.?)?"
 )
 _GAP = r"[T _,:;-]{1,3}(?:at )?"
 _DAY = r"(?:(?:[Mm]on|[Tt]ue|[Ww]ed|[Tt]hu|[Ff]ri|[Ss]at|[Ss]un)[a-z]{0,6}[., ]{1,2})?"

@@ -378,12 +378,15 @@ def _is_level(sheet: _sheet.Sheet, column: int, alone: bool) -> bool:
 
 
 def _is_statistic(sheet: _sheet.Sheet, column: int) -> bool:
-    """Check whether a column is the mean of a level that is another column of the table."""
+    """Check whether a column is the mean of a level that is another column of the table, or one of several means."""
     own = sheet.meanings[column]
     if own is None or own.part != "mean":
         return False
-    measured = (other for other in sheet.meanings if other is not None and not other.part and not other.indirect)
-    return any((m.quantity, m.rat, m.place) == (own.quantity, own.rat, own.place) for m in measured)
+    others = (what for what in sheet.meanings if what is not None and what is not own and not what.indirect)
+    return any(
+        (m.quantity, m.rat, m.place) == (own.quantity, own.rat, own.place)
+        for m in others if not m.part or m.quantity.name == "RSRP"
+    )  # fmt: skip
 
 
 def _of_a_scheduler(rows: Rows, sheet: _sheet.Sheet) -> bool:
@@ -414,6 +417,9 @@ def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: li
             for i in others
             if (m := sheet.meanings[i]) and m.part == "mean" and (m.rat, m.place) == (cell.rat, cell.place)
         ]
+        if _part(sheet, level) == "mean":
+            text = f"the level of the cell is {sheet.names[level]!r}, a mean or a percentile"
+            rows.warnings.append(f"{text}: no other column has the measured level")
         for listed, what in ((cell.ports, "separate series"), (means, "KPIs")):
             if listed:
                 shown = ", ".join(repr(sheet.names[i]) for i in listed)

@@ -150,7 +150,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         if len(sheet) and not any(sheet.texts(column)):
             found = f"column {sheet.names[column]!r} is empty in every row"
             raise InputError(found, expected="values", cause=_sheet.MISALIGNED)
-    unit = sheet.unit_read(where["rss_db"]) if kind == "rss" else ""
+    what = sheet.meanings[where["rss_db"]] if kind == "rss" else None
+    # the quantity determines the unit of an RSRP
+    of_quantity = what.quantity.unit if what is not None and np.isfinite(what.quantity.can_be[0]) else ""
+    unit = sheet.unit_read(where["rss_db"]) or of_quantity if kind == "rss" else ""
     if kind == "rss" and options.unit is None and not unit:
         rows.warnings.append("no 'unit:' is given: the levels are read as dB re full scale")
     angles = {name: sheet.numbers(where[name]) for name in _pose.ANGLES if name in where}

@@ -49,6 +49,12 @@ def test_a_flagged_position_is_missing_and_the_row_stays() -> None:
     assert "1 row is flagged position_jump; the first: 50" in checked.warnings[0]  # 505 m/s, or 495
 
 
+def test_the_speed_of_a_jump_is_that_out_of_a_place_where_the_log_begins() -> None:
+    frame = straight()
+    frame.loc[:29, "latitude_deg"] = 35.71
+    assert "30 rows are flagged position_jump; the first: 2096 m/s to the position in line 1" in jumps_of(frame)[1]
+
+
 @pytest.mark.parametrize("frame", [straight(), straight(speed_mps=40.0), straight(step_s=14.0, speed_mps=8.0)])
 def test_a_flight_is_not_flagged(frame: pd.DataFrame) -> None:
     jumps, sentence = jumps_of(frame)

@@ -189,3 +189,9 @@ def test_a_level_of_a_model_without_an_identity_is_not_a_level(name: str, tmp_pa
 )
 def test_words_of_gimbals_and_towers_do_not_hide_a_level(name: str, tmp_path: Path) -> None:
     assert levels_by_cell(tmp_path / "x.csv", f"PCI,{name}", ["11,-70"] * 30) == [[-70]]
+
+
+@pytest.mark.parametrize("names", ["rssi,link_quality,x,y", "1RSS(dB),RQly(%),RSNR(dB),ANT"])
+def test_a_share_of_packets_is_no_level_and_the_antenna_in_use_no_source(names: str, tmp_path: Path) -> None:
+    rows = [f"{-70 - 2 * (i // 5 % 2)},100,9,{i % 2}" for i in range(30)]
+    assert levels_by_cell(tmp_path / "x.csv", names, rows) == [[-72, -70]]

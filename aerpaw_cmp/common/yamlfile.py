@@ -403,7 +403,7 @@ _KINDS = {
     "float_(type|parsing)": "a number",
     "int_(type|parsing|from_float)": "a whole number",
     "bool_(type|parsing)": "true or false",
-    "string_type": "text (a number or yes/no in quotes)",
+    "string_type": "text (write a number or yes/no in quotes)",
     "(list|tuple)_type": "a list, [a, b]",
     "dict_type|model_type|model_attributes_type|mapping_type": "keys with values",
     "too_short": "at least {min_length} in the list",

@@ -100,7 +100,9 @@ def package_checks() -> Iterator[Check]:
     for title, name in (("Sionna RT", "sionna-rt"), ("Mitsuba", "mitsuba"), ("Dr.Jit", "drjit")):
         version, pin = versions.version(name), pins.get(name)
         if version == versions.NOT_INSTALLED:
-            yield Check(title, missing, version, "pip install sionna-rt (only the audit and rt.engine: sionna need it)")
+            yield Check(
+                title, missing, f"{version}; only needed for audit and rt.engine: sionna", "pip install sionna-rt"
+            )
         elif pin and version != pin:
             yield Check(title, "fail", f"{version}, but Sionna RT needs {pin}", f"pip install '{name}=={pin}'")
         else:

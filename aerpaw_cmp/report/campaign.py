@@ -445,7 +445,9 @@ def by_error(rows: Iterable[RssRow]) -> list[tuple[str, float, str]]:
 def verdict(data: CampaignData) -> list[str]:
     """Return sentences about ray tracing and the baselines under the first setting."""
     if not (rows := data.scored_rows):
-        return []
+        learned = any(LEARNED_HERE in row.fitted for row in data.reference_rows)
+        none = f"“{data.reference}” has no error to report: its antennas were learned from these flights. Next: "
+        return [f"{none}list another setting first, or learn the antennas from other flights."] if learned else []
     scored = [(row.rmse_db, row.n) for row in rows]
     known = {name: [row.baselines.get(name, np.nan) for row in rows] for row in rows for name in row.baselines}
     errors = {name: pooled_db(each, [row.n for row in rows]) for name, each in known.items() if np.isfinite(each).all()}

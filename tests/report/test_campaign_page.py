@@ -146,3 +146,12 @@ def test_a_flight_with_another_gain_is_named_with_its_interval_and_what_to_do(da
     assert (cause.cause, cause.where) == ("outlying offset", odd)
     assert cause.interval[0] < 9.0 < cause.interval[1]
     assert f"Next: check transmit power, receiver gain and cables of {odd}." in campaign_words.verdict(shown)[2]
+
+
+def test_a_campaign_of_training_flights_has_a_first_sentence(data):
+    """The page of three drafts of dataset 12 began with cautions."""
+    first = {"fitted": (campaign_html.LEARNED_HERE,), "rmse_db": np.nan}
+    rows = tuple(dataclasses.replace(row, **first) if row.setting == data.reference else row for row in data.rss)
+    (said,) = campaign_words.verdict(dataclasses.replace(data, rss=rows))
+    assert said.startswith(f"“{data.reference}” has no error to report")
+    assert "Next: " in said

@@ -254,9 +254,12 @@ def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, 
 
 def knows(data: FlightData, learned: Sequence[MeasuredPattern | FlightFile]) -> bool:
     """Check whether antennas or settings were learned from a log of a flight."""
-    known = union(*(item.marks for item in learned))
-    own = common(flight_logs(data), (item.trained_on for item in learned))
-    return bool(own) or any(among(mark, known) for mark in marks_of([data]))
+    return is_training_data(data, union(*(i.trained_on for i in learned)), union(*(i.marks for i in learned)))
+
+
+def is_training_data(data: FlightData, trained_on: Sequence[str], marks: Sequence[str]) -> bool:
+    """Check whether a log of a flight has one of the SHA-256 or of the fingerprints of training data."""
+    return bool(common(flight_logs(data), [trained_on])) or any(among(mark, marks) for mark in marks_of([data]))
 
 
 def series_mark(series: RssSeries | RankSeries) -> str:

@@ -27,11 +27,11 @@ from ..common.jsonable import json_safe
 from ..common.native import read as read_native
 from ..common.outputs import file_digest
 from ..common.text import counted
-from ..common.units import FOOT_M, AnyArray, BoolArray, FloatArray
+from ..common.units import FOOT_M, AnyArray, BoolArray, FloatArray, db_from_power
 from ..common.yamlfile import parse_yaml
 from ..compare.gains import LostLock
 from ..compare.level import nearest_in_time
-from ..compare.rank import MAX_RANK, agreement, cohen_kappa, histogram, total_variation
+from ..compare.rank import MAX_RANK, compare_ranks
 from ..compare.receiver import score_forecast
 from ..compare.referee import (
     AVERAGED,
@@ -49,7 +49,7 @@ from ..flight.data import FlightData, load_data
 from ..flight.drafting.draft import DraftOptions, drafts
 from ..flight.gains import load_with_learned
 from ..flight.settings import FlightFile
-from ..flight.training import among, common, flight_logs, marks_of
+from ..flight.training import flight_logs, is_training_data
 from ..logs.ingest import ingest
 from ..logs.readers import ReadOptions
 from ..propagation.field.sum import mean_pair_power, rss_dbm
@@ -186,13 +186,11 @@ def _predicted_unit(path: Path, data: FlightData) -> str:
     """
     with parsing(path, "metrics.json of 'aerpaw-cmp predict'", any_shape=True):
         about = json.loads(read_bounded(path, LARGEST_TABLE))
-        learned, marked = list(about[KEY]), tuple(map(str, about[MARKS]))
+        learned, marks = list(about[KEY]), list(map(str, about[MARKS]))
         units = {str(series["unit"]) for series in about["series"].values()}
-    own = common(flight_logs(data), [learned])
-    if own or any(among(mark, marked) for mark in marks_of([data])):
-        what = f"log (SHA-256 {own[0][:12]}...)" if own else "readings"
+    if is_training_data(data, learned, marks):
         raise UsageError(
-            f"the prediction learned from this flight's own {what}",
+            "the prediction learned from this flight's own logs",
             expected="a prediction made before the flight, or from other flights",
             path=path.parent,
         )
@@ -280,11 +278,11 @@ def _radio_map(content: bytes, path: Path) -> pd.DataFrame:
     if (gain < 0.0).any():
         raise InputError("a path_gain below 0", expected="a linear gain, 0 or more", cause="a gain in dB")
     _check_rows(gain.size)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        loss_db = -10.0 * np.log10(gain.astype(np.float64).ravel())
     places = np.tile(centre.reshape(-1, 3), (len(names), 1)).astype(np.float64)
     towers = np.repeat(names.astype(str), gain[0].size)
-    frame: pd.DataFrame = pd.DataFrame(places, columns=list(_PLACE)).assign(tower=towers, path_loss_db=loss_db)
+    frame: pd.DataFrame = pd.DataFrame(places, columns=list(_PLACE)).assign(
+        tower=towers, path_loss_db=-db_from_power(gain.ravel())
+    )
     remark = "The cell centres of the radio map are taken as east, north and up of the site [m]."
     frame.attrs = {"program": "radio map (.npz)", "remarks": (remark,)}
     return frame
@@ -379,17 +377,15 @@ def _times(given: pd.DataFrame) -> Any:
     """Return times (n,) as naive UTC datetime64[ns]. NaT if there is no column of times."""
     name = "time_utc" if given["time_utc"].notna().any() else "time"
     column = given[name].dropna()
-    stamps = pd.to_datetime(column.astype(str), utc=True, errors="coerce", format="ISO8601")
-    wrong = column if pd.api.types.is_numeric_dtype(column) else column[stamps.isna()]
-    if len(wrong):
-        expected = "ISO 8601 in UTC, such as 2025-06-10T14:00:00Z"
-        raise InputError(
-            f"{counted(len(wrong), 'time')} that cannot be read, such as {wrong.iloc[0]}", expected=expected
-        )
-    dated = pd.api.types.is_datetime64_any_dtype(column)
-    if name == "time" and not dated and not column.astype(str).str.contains(r"Z$|[+-]\d\d:?\d\d$").all():
-        expected = "a column time_utc, or times that end in Z"
-        raise InputError(f"times without a zone, such as {column.iloc[0]!r}", expected=expected)
+    text, numeric = column.astype(str), pd.api.types.is_numeric_dtype(column)
+    stamps = pd.to_datetime(text, utc=True, errors="coerce", format="ISO8601")
+    zoned = text.str.contains(r"Z$|[+-]\d\d:?\d\d$") | (name == "time_utc")
+    for wrong, found, expected in (
+        (text[stamps.isna() | numeric], "that cannot be read", "ISO 8601 in UTC, such as 2025-06-10T14:00:00Z"),
+        (text[~zoned], "without a zone", "a column time_utc, or times that end in Z"),
+    ):
+        if len(wrong):
+            raise InputError(f"{counted(len(wrong), 'time')} {found}, such as {wrong.iloc[0]}", expected=expected)
     return stamps.dt.tz_localize(None).astype("datetime64[ns]").reindex(given.index)
 
 
@@ -720,14 +716,8 @@ def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData) -> dict
         return None
     best = max(item.rank, key=lambda k: item.score.simulated[k].agreement)
     measured = item.measured[scored]
-    scores = {
-        key: {
-            "kappa": cohen_kappa(measured, ranks[scored]),
-            "total_variation": total_variation(histogram(measured), histogram(ranks[scored])),
-            "agreement": agreement(measured, ranks[scored]),
-        }
-        for key, ranks in ((given.path.name, rank), (f"ray tracing, K = {best:g}", item.rank[best]))
-    }
+    named = {given.path.name: rank, f"ray tracing, K = {best:g}": item.rank[best]}
+    scores = {name: compare_ranks(measured, ranks[scored]) for name, ranks in named.items()}
     scored &= stated
     constant = p[stated].sum(axis=0) / max(stated.sum(), 1)
     forecast = score_forecast(item.measured[scored], p[scored], rank[scored], constant)
@@ -758,28 +748,23 @@ def _wrong_heights(given: ForeignPrediction, data: FlightData, result: FlightRes
     """Return the likely error of the predicted heights, if most samples are near a prediction without it."""
     if given.timed:
         return None
-    flown, points = (
-        place[np.isfinite(place).all(axis=1)]
-        for place in (np.vstack([s.position_m for s in result.series]), given.table[list(_PLACE)].to_numpy())
-    )
-    index, near = nearest_points(flown * [1, 1, 0], None, points * [1, 1, 0], None, given.near_m)
-    if near.mean() < 0.5:
-        return None
-    ground_m, up_m = data.site.takeoff_ground_m, points[:, 2]
-    apart_m = float(np.median((points[index] - flown)[near, 2]))
-    feet, shifted = (
-        float(nearest_points(flown, None, np.column_stack([points[:, :2], up]), None, given.near_m)[1].mean())
-        for up in (ground_m + FOOT_M * (up_m - ground_m), up_m - apart_m)
-    )
-    if max(feet, shifted) < 0.5:
-        return None
-    if feet > shifted:
-        return f"heights in feet; in metres, {100 * feet:.0f} % of the samples would have a prediction"
-    return (
+    flown = np.vstack([s.position_m[np.isfinite(s.position_m).all(axis=1)] for s in result.series])
+    points, flat = given.table[list(_PLACE)].dropna().to_numpy(), np.array([1.0, 1.0, 0.0])
+    index, near = nearest_points(flown * flat, None, points * flat, None, given.near_m)
+    apart_m = float(np.median((points[index] - flown)[near, 2])) if near.any() else 0.0
+    datum = (
         f"another height datum: the predicted positions are {abs(apart_m):.0f} m "
         f"{'above' if apart_m > 0 else 'below'} the flight, whose heights count from the ground at the origin (up) or "
         "from take-off (with latitude and longitude)"
     )
+    ground = data.site.takeoff_ground_m * (1.0 - flat)
+    corrected = {datum: points - apart_m * (1.0 - flat), "heights in feet": ground + (points - ground) * [1, 1, FOOT_M]}
+    shares = {
+        cause: float(nearest_points(flown, None, places, None, given.near_m)[1].mean())
+        for cause, places in corrected.items()
+    }
+    cause = max(corrected, key=shares.__getitem__)
+    return cause if shares[cause] > 0.5 else None
 
 
 def _other_time(given: ForeignPrediction, result: FlightResult) -> str:

@@ -480,7 +480,7 @@ def test_a_prediction_that_learned_from_the_flight_refuses_half_of_it(said, pred
     about = json.loads((folder / "metrics.json").read_text())
     marks = prediction_metrics(prediction.page)["marks"]
     (folder / "metrics.json").write_text(json.dumps({**about, "marks": marks}))
-    with pytest.raises(UsageError, match="this flight's own readings"):
+    with pytest.raises(UsageError, match="this flight's own logs"):
         read_foreign(folder, data)
 
 

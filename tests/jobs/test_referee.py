@@ -159,8 +159,7 @@ def test_heights_in_feet_and_unknown_towers_are_named_beside_the_score(flight: P
     feet, above = scored(flight, flight / "feet.csv", flight / "above.csv")
     assert feet["remarks"] == [
         "feet.csv: the flight has no log of LW9; not scored.",
-        "feet.csv: most samples have no prediction. Likely cause: heights in feet; in metres, 100 % of the samples "
-        "would have a prediction.",
+        "feet.csv: most samples have no prediction. Likely cause: heights in feet.",
     ]
     (remark,) = above["remarks"]
     assert "another height datum: the predicted positions are 12 m above the flight" in remark

@@ -417,7 +417,7 @@ class OutputFolder:
         replaced = self.target.is_dir()
         for folder in (place.part, *(entry for entry in place.part.rglob("*") if entry.is_dir())):
             before = self.target / folder.relative_to(place.part)
-            if before.is_dir():  # keep permissions that a user removed
+            if before.is_dir():  # keep the folder private if the user made it private
                 folder.chmod(stat.S_IMODE(before.stat().st_mode))
         (place.part / _UNFINISHED).unlink(missing_ok=True)
         _sync_folder(place.part)

@@ -18,7 +18,8 @@ from .interrupts import raise_interrupt
 class Progress(Protocol):
     """A function that receives the current step and, if known, the share that is done (0 to 1).
 
-    Calls with the same text and a growing share form one progress bar. A text without a share is a line.
+    Calls with the same text and a growing share form one progress bar. A text without a share is shown as a
+    separate line.
     """
 
     def __call__(self, text: str, fraction: float | None = None, /) -> object: ...  # noqa: D102

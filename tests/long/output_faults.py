@@ -45,7 +45,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 HERE = Path(__file__).resolve().parent
 SAMPLE = HERE.parents[1] / "sample_logs"
@@ -154,12 +154,11 @@ def compute_once(jobs: dict[str, Job], folder: Path) -> None:
     from aerpaw_cmp.flight import replay
     from aerpaw_cmp.jobs import campaign, coverage_map, flight_run
     from aerpaw_cmp.maps import export
-    from aerpaw_cmp.report import campaign as campaign_figures
     from aerpaw_cmp.report import canvas
     from aerpaw_cmp.report import flight_figures as figures
     from aerpaw_cmp.report import maps as maps_figures
 
-    for room in (figures, campaign_figures, maps_figures):
+    for room in (figures, maps_figures):
         specs: Callable[..., Any] = room.figure_specs
         room.figure_specs = lambda data, _specs=specs: list(_specs(data))[:2]  # type: ignore[attr-defined]
     computed = ((replay, "replay_flight"), (flight_run, "run_flight"), (campaign, "run"), (coverage_map, "make_maps"))
@@ -453,9 +452,9 @@ def plant() -> None:
             rows = "".join(f"{_digest(p)}  {p.relative_to(self.target).as_posix()}\n" for p in sorted(names))
             (self.target / outputs.SUMS).write_text(f"# aerpaw-cmp: planted\n{rows}")
 
-    def straight(self: outputs.OutputFile, content: bytes) -> None:
-        with outputs.explained_os_errors(self.named):
-            self.target.write_bytes(content)
+    def straight(self: outputs.OutputFile, content: bytes | Callable[[BinaryIO], None]) -> None:
+        with outputs.explained_os_errors(self.named), self.target.open("w+b") as stream:
+            content(stream) if callable(content) else stream.write(content)
 
     outputs.OutputFolder.filling = in_place  # type: ignore[method-assign]
     outputs.OutputFile.write = straight  # type: ignore[method-assign]

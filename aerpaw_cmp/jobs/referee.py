@@ -302,10 +302,7 @@ def _emulated(folder: Path, data: FlightData) -> pd.DataFrame:
     )
     # a hover has many levels at one position: their mean is what the emulator predicts there
     frame: pd.DataFrame = every.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False).mean()
-    units, ours = (sorted({s.unit for s in of.rss}) for of in (twin, data))
-    remark = f"Its levels are in {', '.join(units)}, those of the flight in {', '.join(ours)}, so no bias is stated."
-    unit = units[0] if len(units) == 1 else "several units"
-    frame.attrs = {"program": EMULATED, "remarks": () if units == ours else (remark,), "unit": unit}
+    frame.attrs = {"program": EMULATED, "unit": ", ".join(sorted({s.unit for s in twin.rss}))}
     return frame
 
 
@@ -533,6 +530,9 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     common = [entry for entry in series if entry.cards.keys() >= models.keys()]
     means = [_means(model, [entry.cards[model] for entry in common]) for model in models]
     remarks = [*given.remarks]
+    if relative := sorted({s.unit for s in series if s.cards[name].bias_db is None}):
+        units = f"{name}: {given.unit or given.quantity}; log: {', '.join(relative)}"
+        remarks.append(f"No bias is stated, because levels and log have no common reference ({units}).")
     if unknown := sorted(predicted - {s.tower for _, s in data.series}):
         remarks.append(f"{name}: the flight has no log of {', '.join(unknown)}; not scored.")
     if sum(entry.matched - entry.unmatched for entry in series) < 0 and (cause := _wrong_heights(given, data, result)):
@@ -643,9 +643,9 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> Seri
 
 def _lock(predicted: Mapping[str, FloatArray]) -> LostLock | None:
     """Return the predicted distribution of a receiver that can lose its lock, if ``predict`` wrote one."""
-    if np.isnan(predicted["p_lock"]).all():
-        return None
     level = predicted["level"]
+    if not np.isfinite(np.stack([predicted[key] for key in _LOCK])[:, np.isfinite(level)]).all():
+        return None
     return LostLock(
         probability=predicted["p_lock"],
         locked_db=predicted["locked_db"] - level,

@@ -467,6 +467,9 @@ def test_the_parts_of_a_lost_lock_replace_the_normal_distribution(said):
     table.assign(p_lock=0.5, **parts, locked_sd_db=3.0, lost_sd_db=3.0).to_csv(folder / "prediction.csv", index=False)
     # half of the probability is 60 dB too low: the score rises by about a quarter of the distance minus half of it
     assert scored()["levels"]["LW1"]["USRP1"]["cards"][folder.name]["crps_db"] == pytest.approx(before + 15.0, abs=2.0)
+    # without one of its columns, the distribution is normal
+    table.assign(p_lock=0.5, **parts, locked_sd_db=3.0).to_csv(folder / "prediction.csv", index=False)
+    assert scored()["levels"]["LW1"]["USRP1"]["cards"][folder.name]["crps_db"] == pytest.approx(before)
 
 
 def test_a_prediction_that_learned_from_the_flight_refuses_half_of_it(said, prediction):

@@ -683,5 +683,5 @@ def _rank(panel: RankResult) -> Headline | None:
     guess = f"; always guessing {commonest.rank}: {100 * commonest.agreement:.0f} %" if commonest.rank else ""
     return Headline(
         label=f"Rank at {panel.tower}, K = {k:.10g}", value=f"{at.total_variation:.2f}",
-        interval=f"total variation of predicted and reported shares{ends}", reference=f"{agree}{guess}",
+        interval=f"total variation of the shares{ends}", reference=f"{agree}{guess}",
     )  # fmt: skip

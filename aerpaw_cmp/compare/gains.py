@@ -1080,28 +1080,32 @@ class FlightEvidence:
             self.rows = [s.binned(width) for s in series]
         self._noise = [_noise_covariance(rows) for rows in self.rows]
 
-    def of_link(self, number: int, known: Moments, airframe: GainProcess | None = None) -> Evidence:
+    def of_link(self, number: int, known: Moments, alternative: float = -math.inf) -> Evidence:
         """Return the evidence for the learned antennas of both ends of one series, by its number.
 
         ``known`` returns the moments of the gain of both ends, without the part that its table of pairs does not
-        explain. If ``airframe`` is given, the antennas must also be more likely than this airframe with a tower of
-        unknown gain.
+        explain. The antennas must also be more likely than ``alternative`` (a log likelihood).
         """
         rows, noise = self.rows[number], self._noise[number]
         if not len(rows):
             return Evidence(over_own=-math.inf, over_turned=-math.inf)
         left = noise + _PAIR_LEFT * gain_covariance([PAIR], [rows], [rows])
         own = _log_likelihood(noise + gain_covariance(ANTENNA_TERMS, [rows], [rows]), _centred(rows))
-        if airframe is not None:
-            mean, covariance = airframe.moments(rows.at_uav)
-            covariance += noise + gain_covariance([MAST, PAIR], [rows], [rows])
-            own = max(own, _log_likelihood(covariance, _centred(rows) - mean))
 
         def of(turn_deg: float) -> float:
             mean, covariance = known(_rotated(rows, turn_deg))
             return _log_likelihood(left + covariance, _centred(rows) - mean)
 
-        return judged(own, of)
+        return judged(max(own, alternative), of)
+
+    def with_airframe(self, number: int, known: GainProcess) -> float:
+        """Return the log likelihood of one series with a learned airframe and a tower of unknown gain."""
+        rows = self.rows[number]
+        if not len(rows):
+            return -math.inf
+        mean, covariance = known.moments(rows.at_uav)
+        covariance += self._noise[number] + gain_covariance([MAST, PAIR], [rows], [rows])
+        return _log_likelihood(covariance, _centred(rows) - mean)
 
     def of_airframe(self, known: GainProcess) -> Evidence:
         """Return the evidence for a learned airframe from all series together. The gain of each tower is unknown."""

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from aerpaw_cmp.site.learned import (
     LearnedLevel,
     SpherePattern,
     folder_of,
+    read_table,
     remember,
     sphere_csv,
     sphere_grid,
@@ -57,8 +59,11 @@ def table(gain: np.ndarray) -> bytes:
     return sphere_csv(gain, np.full(gain.shape, 0.7), (f"trained_on: {'a' * 64}",)).encode()
 
 
-def known_site(folder: Path, turn_deg: int = 0) -> Path:
-    """Write the packaged site with these antennas, and the airframe rotated by complete steps of its table."""
+def known_site(folder: Path, turn_deg: int = 0, *, general: bool = True) -> Path:
+    """Write the packaged site with these antennas, and the airframe rotated by complete steps of its table.
+
+    An airframe that is not ``general`` does not predict other flights.
+    """
     place = folder / "mine.yaml"
     place.write_bytes(folder_of("lake_wheeler").with_suffix(".yaml").read_bytes())
     _, _, v = sphere_grid(20.0)
@@ -75,7 +80,7 @@ def known_site(folder: Path, turn_deg: int = 0) -> Path:
         offset_db = 11.8 if channel == "USRP1" else 7.8
         level = LearnedLevel(offset_db=offset_db, sd_db=1.7, transmit_power_dbm=40.0, unit="dB re full scale")
         names = {"uav_file": "u.csv.gz", "known_file": "k.csv.gz", "tower_known_file": "m.csv.gz"}
-        series.append(learned_series(channel, **names, level=level))
+        series.append(learned_series(channel, **names, level=level, shares_airframe=general))
     remember(place, "past", learned_entry(*series), files)
     return place
 
@@ -149,10 +154,10 @@ def unnamed_logs(folder: Path) -> None:
         log.write_bytes(format_power_log(TIMES.to_numpy(), LEVELS[channel], ZONE))
 
 
-def level_tables(folder: Path) -> None:
+def level_tables(folder: Path, unit: str = "dBm") -> None:
     pose_table(folder)
     for name, level in zip(("b", "a"), LEVELS.values(), strict=True):
-        frame = pd.DataFrame({"timestamp": UTC, f"rss_{name} (dBm)": level})
+        frame = pd.DataFrame({"timestamp": UTC, f"rss_{name} ({unit})": level})
         frame.to_csv(folder / f"meter {name}.csv", index=False)
 
 
@@ -214,6 +219,28 @@ def test_two_logs_without_channels_are_two_channels_whose_ports_the_levels_show(
     assert content["antennas"] == ports
     assert [log.get("channel") for log in content["logs"] if "power" in log["path"]] == [None, "power_2"]
     assert "left out" not in capsys.readouterr().err
+
+
+def test_antennas_of_two_campaigns_are_compared_with_the_same_alternatives(tmp_path, capsys) -> None:
+    """The other campaign has a coarser antenna, and its airframe alone is not an alternative."""
+    site = known_site(tmp_path)
+    names = {"uav_file": "v.csv.gz", "tower_file": "c.csv.gz", "known_file": "l.csv.gz", "tower_known_file": "n.csv.gz"}
+    past = folder_of(site)
+    tables = {copy: read_table(past / name, "") for copy, name in (("v.csv.gz", "u.csv.gz"), ("l.csv.gz", "k.csv.gz"),
+                                                                  ("n.csv.gz", "m.csv.gz"))}  # fmt: skip
+    series = learned_series("third", **names, shares_airframe=False)
+    remember(site, "other", learned_entry(series), {**tables, "c.csv.gz": table(0.8 * TOWERS["USRP2"])})
+    _, content = drafted(renamed_log, tmp_path, site)
+    assert sorted(content["antennas"].values()) == ["mine/past_LW1.USRP2", "mine/past_uav"]
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(("unit", "count"), [("dB", 3), ("dBm", 0)])
+def test_levels_in_decibels_without_a_reference_are_not_those_of_another_unit(unit, count, tmp_path, capsys) -> None:
+    """Antennas whose airframe does not predict other flights are not tested on levels in another unit."""
+    _, content = drafted(partial(level_tables, unit=unit), tmp_path, known_site(tmp_path, general=False))
+    assert len(content.get("antennas", ())) == count
+    capsys.readouterr()
 
 
 @pytest.mark.parametrize("names", [("a/", "b/"), ("left_", "right_")])

@@ -585,7 +585,7 @@ def propose(
         observed, known = [observed_series(data, series)[0] for series in levels], all_learned_links(place)
         evidence = FlightEvidence([o.samples for o in observed])
         bands = (learned.BAND, learned.AIRFRAME_BAND) if carrier_known else (math.inf, math.inf)
-        chosen = _antennas_for(data, levels, known, evidence, nodes, bands[0])
+        chosen = _antennas_for(data, levels, known, evidence, nodes, bands)
         if chosen.fits:
             found = chosen.proposal(site, evidence)
         else:
@@ -629,22 +629,26 @@ def _antennas_for(
     known: Sequence[LearnedLink],
     evidence: FlightEvidence,
     nodes: Nodes,
-    band: float,
+    bands: tuple[float, float],
 ) -> _Chosen:
     """Return the antennas of both ends of the entry with the largest odds."""
     receivers = {item.receiver for item in known}
+    general = {item.series.uav_file: item for item in known if item.airframe_is_general}.values()
     tried: dict[str, list[tuple[str, LearnedLink, Evidence]]] = {}
     for number, series in enumerate(levels):
+        # the same alternatives for all antennas, because their odds are compared with each other
+        alone = (evidence.with_airframe(number, a.airframe) for a in general if _in_band(a, series, bands[1]))
+        most_alone = max(alone, default=-math.inf)
         for item in known:
-            if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, band):
+            if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, bands[0]):
                 continue
             named_odds = _named_odds(data, series, item, receivers)
             # antennas that do not predict other flights are not offered to a receiver with another unit
             if named_odds < 0.0 and not item.airframe_is_general:
                 continue
-            # antennas with a different name must also fit better than their airframe with an unknown antenna
-            airframe = item.airframe if item.airframe_is_general and named_odds <= 0.0 else None
-            odds = evidence.of_link(number, item.moments, airframe).with_prior(named_odds)
+            # antennas with a different name must also fit better than any airframe with an unknown antenna
+            alternative = most_alone if named_odds <= 0.0 else -math.inf
+            odds = evidence.of_link(number, item.moments, alternative).with_prior(named_odds)
             if odds.over_own > 0.0:
                 tried.setdefault(item.name, []).append((f"{series.tower}.{series.channel}", item, odds))
     # judge the channels of a flight together: they need antennas of one entry, with one airframe
@@ -733,7 +737,7 @@ def _receiver_odds(
     offset_db = float(np.nanmean(samples.residual_db - gain_db)) + sent_db + at_carrier_db
     sd_db = level.sd_db if its_antenna else math.hypot(level.sd_db, _UNKNOWN_GAINS_DB)
     nat = math.log(_UNKNOWN_LEVEL_DB / sd_db) - 0.5 * ((offset_db - level.offset_db) / sd_db) ** 2
-    nat += _OTHER_UNIT if level.unit != series.unit else 0.0
+    nat += _unit_odds(series, item)
     nat += _ITS_ANTENNAS if its_antenna else 0.0
     if lost > _LOST_SHARE:
         nat += _ITS_LOCK if lock is not None else -math.inf
@@ -781,8 +785,14 @@ def _named_odds(data: FlightData, series: RssSeries, item: LearnedLink, receiver
     if receiver in receivers:
         return _SAME_NAME if receiver == item.receiver else -math.inf
     same = (series.tower, series.channel) == (item.series.tower, item.series.channel)
-    other = item.series.level is not None and item.level.unit != series.unit
-    return (_SAME_NAME if same else 0.0) + (_OTHER_UNIT if other else 0.0)
+    return (_SAME_NAME if same else 0.0) + _unit_odds(series, item)
+
+
+def _unit_odds(series: RssSeries, item: LearnedLink) -> float:
+    """Return the log odds that the unit of levels gives to learned levels. A level in dB can have any reference."""
+    any_reference = series.unit == "dB" and series.channel.lower() not in RATIOS
+    same = item.series.level is None or any_reference or item.level.unit == series.unit
+    return 0.0 if same else _OTHER_UNIT
 
 
 def _in_band(item: LearnedLink, series: RssSeries, band: float) -> bool:

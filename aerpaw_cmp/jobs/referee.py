@@ -376,6 +376,7 @@ def _times(given: pd.DataFrame) -> Any:
     column = given[name].dropna()
     text, numeric = column.astype(str), pd.api.types.is_numeric_dtype(column)
     stamps = pd.to_datetime(text, utc=True, errors="coerce", format="ISO8601")
+    stamps = stamps.where(stamps.dt.year.between(1700, 2200))  # the range of nanoseconds
     zoned = text.str.contains(r"Z$|[+-]\d\d:?\d\d$") | (name == "time_utc")
     for wrong, found, expected in (
         (text[stamps.isna() | numeric], "that cannot be read", "ISO 8601 in UTC, such as 2025-06-10T14:00:00Z"),
@@ -517,9 +518,7 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     if not series and not ranks:
         raise InputError(
             f"fewer than {FEWEST} samples of the flight have a prediction nearby",
-            expected="a time within the step of the prediction"
-            if given.timed
-            else f"positions within {given.near_m:g} m",
+            expected=f"positions within {given.near_m:g} m, or times within the step of the prediction",
             cause=_why_none(given, data, result),
             path=given.path,
         )

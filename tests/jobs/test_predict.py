@@ -430,6 +430,7 @@ def test_a_channel_with_too_few_predictions_is_named(said, flown):
         (lambda f: f[:0], "no level or rank; expected"),
         (lambda f: f.assign(tower=np.nan), "towers without names; expected towers of the flight"),
         (lambda f: f.assign(time_utc=1748786400), "times that cannot be read, such as 1748786400; expected ISO 8601 in UTC"),
+        (lambda f: f.assign(time_utc="1677-01-01T00:00:00Z"), "times that cannot be read, such as 1677-01-01"),
         (lambda f: f.assign(Tower="LW1"), "several columns of one quantity"),
         (lambda f: f.rename(columns={"height_m": "alt"}), "without a time and without a position .*alt"),
         (lambda f: f.rename(columns={"level_db": "level_dbm"}).assign(level_dbm=61.0), "missing sign"),

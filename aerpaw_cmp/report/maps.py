@@ -180,7 +180,8 @@ def first_words(data: MapsData) -> str:
     best = max(heights, key=lambda height: height.covered)
     more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if best.covered > worst.covered else ""
     measured = "" if data.corrected else "The map contains no measurement. "
-    return f"{data.budget}{measured}{more}{sentence}"
+    result, _, step = sentence.partition("Next: ")
+    return f"{result}{more}{data.budget}{measured}" + (f"Next: {step}" if step else "")
 
 
 def coverage(data: MapsData) -> list[Coverage]:

@@ -15,12 +15,20 @@ from aerpaw_cmp.report.maps import MapsData, RssMap, first_words, warnings
         (
             {"opaque": 0.99},
             {},
-            "The map contains no measurement. Lowest coverage: 99.0 % of the positions at 30 m. Next: ",
+            "Lowest coverage: 99.0 % of the positions at 30 m. The map contains no measurement. Next: ",
         ),
-        ({"opaque": 0.6, "none": 0.95}, {}, "trees cause most of the gaps. Next: fly higher, or map with `--foliage"),
+        (
+            {"opaque": 0.6, "none": 0.95},
+            {},
+            "trees cause most of the gaps. The map contains no measurement. Next: fly higher, or map with `--foliage",
+        ),
         ({"opaque": 0.6, "attenuating": 0.9, "none": 0.95}, {}, "Next: fly higher, or compare the rows of attenuating"),
         ({"opaque": 0.6, "none": 0.62}, {}, "buildings and terrain cause most of the gaps"),
-        ({"none": 0.0}, {}, "There is no path to any position at 30 m. Next: check the towers"),
+        (
+            {"none": 0.0},
+            {},
+            "There is no path to any position at 30 m. The map contains no measurement. Next: check the towers",
+        ),
         ({"none": 0.99}, {"outside_flown": 0.7}, "70 % of the positions are outside the flown area"),
     ],
 )

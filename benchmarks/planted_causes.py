@@ -24,13 +24,8 @@ from numpy.typing import NDArray
 
 from aerpaw_cmp.common.units import wrap_degrees
 from aerpaw_cmp.compare import causes
-from aerpaw_cmp.compare.causes import (
-    OF_DIRECTION,
-    SHOWN_DB,
-    LevelEvidence,
-    Trial,
-    flight_cause,
-)
+from aerpaw_cmp.compare.causes import OF_DIRECTION, SHOWN_DB, Trial, flight_cause
+from aerpaw_cmp.compare.evidence import LevelEvidence, in_bins
 from aerpaw_cmp.flight.clock import Along, ClockChannel, judge_clock
 from aerpaw_cmp.jobs.likely_cause import fall_without_lag_db
 from aerpaw_cmp.site.siteyaml import load_site
@@ -167,7 +162,7 @@ def situation(troubles: tuple[str, ...], draw: np.random.Generator) -> tuple[Lev
     """
     while True:
         evidence, truth, effects = drawn(troubles, draw)
-        if all(effect >= LEAST_DB for effect in effects) and causes._binned(evidence) is not None:
+        if all(effect >= LEAST_DB for effect in effects) and in_bins(evidence) is not None:
             return evidence, truth
 
 
@@ -324,7 +319,7 @@ def oracle(flights: int, seed: int, margins: tuple[float, ...]) -> dict[float, t
     leads = []
     for number, troubles in enumerate(plans(flights, seed)):
         if troubles:
-            seen, truth = map(causes._binned, situation(troubles, np.random.default_rng([seed, number])))
+            seen, truth = map(in_bins, situation(troubles, np.random.default_rng([seed, number])))
             assert seen is not None
             assert truth is not None
             change, clipped = truth.predicted_db - seen.predicted_db, truth.locked < 0.5

@@ -18,24 +18,17 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations, combinations_with_replacement
 
 import numpy as np
 
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, wrap_degrees
-from ..site.learned import LearnedSeries
+from ..common.units import AnyArray, BoolArray, FloatArray, Printed, wrap_degrees
+from .evidence import EPOCH, LEAST_BINS, MOST_FADING, PILE_DB, LevelEvidence, in_bins
 from .health import Judged, Step, level_of, step_of
 from .noise import LEAST_VARIANCE, START, NoiseFit, NoiseParameters, fit_under_noise, shift_in_masks, squares_of_halves
-from .result import Cause, ClockResult
+from .result import Cause
 
-# Samples are averaged over this time [s]. Longer flights have longer means, so that their number is limited.
-BIN_S, _MOST_BINS = 1.0, 2000
-# Means between which the UAV moves [m] and turns [deg] by less than this are joined, because the fading of a hover is
-# one number and not many. A slow orbit at 1.5 m/s is not joined.
-_NEAR_M, _NEAR_DEG = 1.0, 5.0
-_FEWEST_BINS, _ENOUGH_BINS = 24, 100
-FEWEST_SAMPLES = 100
 # Prior and limit of the log odds: a fault occurs in one of ten flights, and is named if its odds are at least five to
 # one.
 _SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
@@ -49,87 +42,7 @@ _LEAST_SHARE, _CERTAIN = 0.1, 30.0
 SHOWN_DB = 0.1
 # Half of the 95 % point of chi-squared with one degree of freedom.
 _NEAR = 1.92
-_EPOCH = np.datetime64(0, "s")
 _UNNAMED = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LevelEvidence:
-    """The evidence for a cause: one channel of a flight.
-
-    Parameters
-    ----------
-    time_s : (n,)
-        Ascending times [s].
-    measured_db, predicted_db : (n,)
-        Levels before any offset; NaN if missing.
-    place_m : (n, 3)
-        Positions of the UAV [m].
-    uav_azimuth_deg, uav_elevation_deg : (n,)
-        Direction of the tower in the frame of the UAV's antenna.
-    tower_azimuth_deg : (n,)
-        Direction of the UAV seen from the tower, clockwise from north.
-    name, unit : str
-        Name of the channel and unit of its measured level.
-    start : datetime64
-        Time at which ``time_s`` is 0.
-    tower : str
-        Tower of the channel.
-    antenna : {"isotropic", "measured", "learned"}
-        Kind of the UAV's antenna.
-    turned_db, raised_db : mapping of float to (n,)
-        Change of the predicted level by an increase of the heading [deg], and of the height [m]. ``turned_db`` is empty
-        for antennas without a pattern.
-    attitude_db : mapping of str to (n,)
-        Change of the predicted level with other values of ``rt.attitude``.
-    misread_db, scaled_db : mapping of str to (n,)
-        Change of the predicted level if the telemetry has another meaning, or its heights have another unit, by that
-        meaning in words.
-    other_towers_db : mapping of str to (n,)
-        Predicted level of each other tower of the site.
-    locked, serving : (n,), optional
-        1 if in lock (or served by this cell), 0 if not, NaN if unknown. None if the log has no such column.
-    clock : ClockResult, optional
-        Test result of the radio clock.
-    """
-
-    time_s: FloatArray
-    measured_db: FloatArray
-    predicted_db: FloatArray
-    place_m: FloatArray
-    uav_azimuth_deg: FloatArray
-    uav_elevation_deg: FloatArray
-    tower_azimuth_deg: FloatArray
-    name: str = ""
-    unit: str = "dBm"
-    start: np.datetime64 = _EPOCH
-    tower: str = ""
-    antenna: str = "measured"
-    turned_db: Mapping[float, FloatArray] = field(default_factory=dict)
-    raised_db: Mapping[float, FloatArray] = field(default_factory=dict)
-    attitude_db: Mapping[str, FloatArray] = field(default_factory=dict)
-    misread_db: Mapping[str, FloatArray] = field(default_factory=dict)
-    scaled_db: Mapping[str, FloatArray] = field(default_factory=dict)
-    other_towers_db: Mapping[str, FloatArray] = field(default_factory=dict)
-    locked: FloatArray | None = None
-    serving: FloatArray | None = None
-    clock: ClockResult | None = None
-    floored: bool = False
-    """True if the settings remove levels at the floor, so that only upward fading of the lowest links remains."""
-    limits_known: bool = False
-    """True if both levels were already raised to the receiver's floor, as in the numbers of the page."""
-    learned: LearnedSeries | None = None
-    """Learned antenna of the tower with the errors of held-out flights, if the flight uses one."""
-    transmit_power_dbm: float = 0.0
-    """Transmit power of the predicted level."""
-    distance_db: FloatArray | None = None
-    """Part (n,) of the predicted level that depends only on the distance."""
-    displaced_db: Mapping[tuple[float, float], FloatArray] = field(default_factory=dict)
-    """Change of the predicted level with the tower elsewhere, by distance [m] and azimuth [deg]."""
-    swapped_db: FloatArray | None = None
-    """Change of the predicted level (n,) if the log belongs to the other channel of the tower."""
-    least: BoolArray | None = None
-    """Mask (n,) of samples at the lowest level of the log (exactly, or within its noise), if that level is frequent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,7 +93,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     Cause or None
         None if no cause is identified.
     """
-    tables = [_models(binned) for evidence in channels if (binned := _binned(evidence)) is not None]
+    tables = [_models(each) for evidence in channels if (each := in_bins(evidence)) is not None]
     names = sorted({name for table in tables for names in table for name in names})
     odds: dict[frozenset[str], float] = {}
     for some in (_SOUND, *({name} for name in names), *map(set, combinations(names, 2))):
@@ -229,7 +142,7 @@ def _by_health(cause: Cause | None, tables: Sequence[_Models]) -> Cause | None:
         return cause
     channels = [judged for judged, _ in known]
     if (step := step_of(channels)) is not None and not _rivalled(step, known):
-        instant = (_EPOCH + np.timedelta64(round(step.at_s), "s")).astype("datetime64[s]")
+        instant = (EPOCH + np.timedelta64(round(step.at_s), "s")).astype("datetime64[s]")
         sizes = ", ".join(f"{Printed(size):+.1f} dB at {name}" for name, size in step.sizes_db.items())
         return Cause(
             name="gain step", channels=tuple(step.sizes_db), estimate=max(step.sizes_db.values(), key=abs),
@@ -256,7 +169,7 @@ def _judged(sound: _Model) -> Judged | None:
         return None
     return Judged(
         name=e.name, time_s=e.time_s, error_db=e.measured_db - e.predicted_db, learned=e.learned, unit=e.unit,
-        transmit_power_dbm=e.transmit_power_dbm, start_s=float((e.start - _EPOCH) / np.timedelta64(1, "s")),
+        transmit_power_dbm=e.transmit_power_dbm, start_s=float((e.start - EPOCH) / np.timedelta64(1, "s")),
     )  # fmt: skip
 
 
@@ -434,7 +347,7 @@ def _together_db(shown: Sequence[_Models]) -> float:
 
 def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
     """Check whether a calibration could reduce the printed error of a channel, by a gain over directions."""
-    for evidence in filter(None, map(_binned, channels)):
+    for evidence in filter(None, map(in_bins, channels)):
         sound, (antenna,) = _fitted(evidence), _pattern(evidence)
         learned = _fitted(evidence, antenna, at=sound.parameters)
         left_db = float(learned.residual_db.std())
@@ -528,94 +441,6 @@ def _named(names: Sequence[str], shown: Sequence[_Models], gain: float) -> Cause
         f"1-s RMSE {rmse:.1f} \N{RIGHTWARDS ARROW} {rmse_with:.1f} dB.",
         next_step=trial.next_step, rmse_db=rmse, rmse_with_db=rmse_with, gain=gain,
     )  # fmt: skip
-
-
-def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
-    """Return means of the samples with both levels over :data:`BIN_S` and over hovers. None if there are too few."""
-    finite = np.isfinite(evidence.measured_db) & np.isfinite(evidence.predicted_db)
-    level = evidence.measured_db[finite]
-    # two levels or few samples do not show how the error varies
-    if len(level) < FEWEST_SAMPLES or len(np.unique(level)) == 2:
-        return None
-    time, level = evidence.time_s[finite], evidence.measured_db[finite]
-    width = max(min(BIN_S, float(np.ptp(time)) / _ENOUGH_BINS), float(np.ptp(time)) / _MOST_BINS, 1e-3)
-    _, place = np.unique(np.floor(time / width), return_inverse=True)
-    place = _standing(evidence, finite, place)[place]
-    count = np.bincount(place).astype(np.float64)
-    if len(count) < _FEWEST_BINS:
-        return None
-
-    def mean(values: FloatArray) -> FloatArray:
-        return _mean(values[finite], place, count)
-
-    def binned(name: str, value: object) -> object:
-        if isinstance(value, Mapping):
-            return {key: mean(column) for key, column in value.items()}
-        if not isinstance(value, np.ndarray):
-            return value
-        if name not in ("uav_azimuth_deg", "tower_azimuth_deg"):
-            # treat missing flags as 1: a gap in the log is not an error
-            return mean(np.nan_to_num(value, nan=1.0) if name in ("locked", "serving") else value)
-        # average directions, because the mean of 359 and 1 degrees is 0
-        turn = np.exp(1j * np.radians(value))
-        return np.degrees(np.angle(mean(turn.real) + 1j * mean(turn.imag)))
-
-    changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
-    at = level == level.min()
-    # compare with the next level: if levels are rounded, all are frequent, but the lowest is rarer than the next
-    next_often = (level == level[~at].min()).sum() if not at.all() else 0
-    often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level), next_often)
-    changed["least"] = np.bincount(place, at) > 0.5 * count if often else _undetected(mean(evidence.measured_db))
-    return LevelEvidence(**changed)  # type: ignore[arg-type]
-
-
-def _mean(values: FloatArray, place: IntArray, count: AnyArray) -> FloatArray:
-    """Return means of values (n,) or (n, k) over the ``count`` samples of each place."""
-    totals = np.apply_along_axis(lambda column: np.bincount(place, column), 0, values)
-    return np.asarray((totals.T / count).T)
-
-
-def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray:
-    """Return a number per second, which is the same while the UAV neither moves nor turns."""
-    azimuth, elevation = np.radians(e.uav_azimuth_deg[finite]), np.radians(e.uav_elevation_deg[finite])
-    flat = np.cos(elevation)
-    towards = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
-    count = np.bincount(second)
-    at, towards = _mean(e.place_m[finite], second, count), _mean(towards, second, count)
-    number, begin = np.zeros(len(at), dtype=np.int64), 0
-    for i in range(1, len(at)):
-        turned = np.linalg.norm(towards[i] - towards[begin]) > np.radians(_NEAR_DEG)
-        moved = turned or np.linalg.norm(at[i] - at[begin]) > _NEAR_M
-        begin = i if moved else begin
-        number[i] = number[i - 1] + moved
-    return number
-
-
-# Least number and share of samples at one level if a receiver clips.
-_AT_END, _SHARE_AT_END = 10, 0.01
-
-
-def _undetected(level_db: FloatArray) -> BoolArray | None:
-    """Return the samples (n,) without detection: those near and below the densest level, if links drop to it suddenly.
-
-    Return None if the level fades slowly into the densest level, as near a floor or in a hover.
-    """
-    ordered, step = np.sort(level_db), np.abs(np.diff(level_db))
-    within = np.searchsorted(ordered, ordered + 2.0 * _PILE_DB, "right") - np.arange(len(ordered))
-    low = ordered[within.argmax()]
-    under = level_db < low + 3.0 * _PILE_DB
-    dense = under & (level_db >= low)
-    inside, outside, between = dense[1:] & dense[:-1], ~(under[1:] | under[:-1]), under[1:] != under[:-1]
-    if inside.sum() < _LEAST_PILE * len(level_db) or min(outside.sum(), between.sum()) < _LEAST_BINS:
-        return None
-    fading_db = float(np.median(step[outside]))
-    at_once = np.median(step[between]) > _LOST * fading_db
-    return under if at_once and np.median(step[inside]) < _MOST_FADING * fading_db else None
-
-
-# A loss of detection exceeds the usual step of fading by this factor. A receiver with a noisy least level has 9, others
-# have 3.
-_LOST = 5.0
 
 
 def _fitted(e: LevelEvidence, *trials: Trial, at: NoiseParameters = START, search: bool = True) -> NoiseFit:
@@ -1074,7 +899,6 @@ _FLAT = 0.2
 # A limit allows a small share of samples beyond it, and the prediction must exceed it in a larger share [dB].
 _BEYOND_DB, _MOST_BEYOND = 2.0, 0.02
 _FAR_DB, _LEAST_FAR = 3.0, 0.1
-_LEAST_BINS = 5
 
 
 def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
@@ -1090,22 +914,22 @@ def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
         yield _profiled(e, trials)
 
 
-# Samples at a limit: distance from the last level [dB], least shares of the samples, and their fading as a share.
-_PILE_DB, _LEAST_PILE, _LEAST_CLIPPED, _MOST_FADING = 1.2, 0.1, 0.06, 0.35
+# Least share of the samples at a limit.
+_LEAST_CLIPPED = 0.06
 
 
 def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
     """Return the samples at the receiver's limit, or None if the samples at the end of the levels fade like others."""
     end = float(np.quantile(e.measured_db, 0.01 if side > 0 else 0.99))
-    pile = side * (e.measured_db - end) < _PILE_DB
+    pile = side * (e.measured_db - end) < PILE_DB
     step = np.abs(np.diff(e.measured_db))
     inside, outside = pile[1:] & pile[:-1], ~(pile[1:] | pile[:-1])
-    if inside.sum() < max(_LEAST_BINS, _LEAST_CLIPPED * len(pile)) or outside.sum() < _LEAST_BINS:
+    if inside.sum() < max(LEAST_BINS, _LEAST_CLIPPED * len(pile)) or outside.sum() < LEAST_BINS:
         return None
     # at a limit of the receiver, the predicted level is beyond the limit; under constant interference it is not
     error = e.measured_db - e.predicted_db
     missing = side * float(np.median(error[pile]) - np.median(error[~pile]))
-    limited = np.median(step[inside]) < _MOST_FADING * np.median(step[outside]) and missing > -_BEYOND_DB
+    limited = np.median(step[inside]) < MOST_FADING * np.median(step[outside]) and missing > -_BEYOND_DB
     return pile if limited else None
 
 
@@ -1166,7 +990,7 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
     for phi in _SEARCHED_PHI:
         shift, _, gain = shift_in_masks(residual, shadows, phi)
         inside = shadows.sum(axis=1)
-        possible = (inside >= _LEAST_BINS) & (shadows.shape[1] - inside >= _LEAST_BINS) & (shift < -_LEAST_LOSS_DB)
+        possible = (inside >= LEAST_BINS) & (shadows.shape[1] - inside >= LEAST_BINS) & (shift < -_LEAST_LOSS_DB)
         if not possible.any():
             continue
         gain = np.where(possible, gain, -np.inf)
@@ -1198,7 +1022,7 @@ _CHECK_GAIN = "check the receiver's gain; compare both parts separately"
 def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a shift of the level from some time until the end of the flight."""
     residual, n = e.measured_db - e.predicted_db, len(e.time_s)
-    starts = np.arange(_LEAST_BINS * 2, n - _LEAST_BINS * 2)
+    starts = np.arange(LEAST_BINS * 2, n - LEAST_BINS * 2)
     if not len(starts):
         return
     # neighbouring bins show the same step

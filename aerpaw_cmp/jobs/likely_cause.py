@@ -13,13 +13,8 @@ import numpy as np
 from ..common.errors import InputError, UsageError
 from ..common.units import FOOT_M, FloatArray
 from ..compare import level as rss
-from ..compare.causes import (
-    OF_DIRECTION,
-    SHOWN_DB,
-    LevelEvidence,
-    flight_cause,
-    gains_by_direction,
-)
+from ..compare.causes import OF_DIRECTION, SHOWN_DB, flight_cause, gains_by_direction
+from ..compare.evidence import LevelEvidence
 from ..compare.gains import turned
 from ..compare.result import Cause, RssResult
 from ..compare.verdict import lock_lost, pooled_db, without_copies

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..common.text import counted
 from ..common.units import AnyArray, Printed
-from ..compare.causes import FEWEST_SAMPLES
+from ..compare.evidence import FEWEST_SAMPLES
 from ..compare.ladder import ModelRow
 from ..compare.level import DetectionScore, ErrorSpan
 from ..compare.receiver import ForecastScore

@@ -10,7 +10,8 @@ from scipy.optimize import lsq_linear, minimize_scalar
 from scipy.stats import multivariate_normal
 
 from aerpaw_cmp.compare import causes, noise
-from aerpaw_cmp.compare.causes import LevelEvidence, Trial, flight_cause, gains_by_direction
+from aerpaw_cmp.compare.causes import Trial, flight_cause, gains_by_direction
+from aerpaw_cmp.compare.evidence import LevelEvidence, in_bins
 from aerpaw_cmp.compare.result import APPLIED, ESTIMATED, ClockResult
 from aerpaw_cmp.jobs import likely_cause
 from aerpaw_cmp.jobs.likely_cause import heights_meant, is_simulated
@@ -402,7 +403,7 @@ def test_a_second_is_the_mean_of_its_samples_and_directions_turn_the_short_way()
         time_s=time, measured_db=level, predicted_db=2.0 * time, place_m=np.outer(time, [9.0, 0.0, 0.0]),
         uav_azimuth_deg=(around + 180.0) % 360.0 - 180.0, uav_elevation_deg=time, tower_azimuth_deg=around, turned_db={10.0: time}, other_towers_db={"LW2": -time},
     )  # fmt: skip
-    binned = causes._binned(evidence)
+    binned = in_bins(evidence)
     assert binned is not None
     known = np.isfinite(level)
     seconds = [known & (np.floor(time) == second) for second in range(120)]
@@ -732,7 +733,7 @@ def test_an_antenna_pattern_needs_log_odds() -> None:
     sound, extra = _sound(), np.random.default_rng(8).normal(0.0, 2.0, 300)
     lobes = np.sin(np.radians(2.0 * sound.uav_azimuth_deg))
     for size_db, odds, named in ((3.0, 4.0, True), (3.0, 2.0, False), (7.0, 2.0, False)):
-        binned = causes._binned(replace(sound, measured_db=sound.measured_db + size_db * lobes + extra))
+        binned = in_bins(replace(sound, measured_db=sound.measured_db + size_db * lobes + extra))
         assert binned is not None
         assert causes._explains("pattern", [causes._models(binned)], odds, set()) == named
 

@@ -1,0 +1,192 @@
+"""Evidence for the cause of a level error: one channel of a flight, and its means over seconds and hovers."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..site.learned import LearnedSeries
+from .result import ClockResult
+
+# Samples are averaged over this time [s]. Longer flights have longer means, so that their number is limited.
+BIN_S, _MOST_BINS = 1.0, 2000
+# Means between which the UAV moves [m] and turns [deg] by less than this are joined, because the fading of a hover is
+# one number and not many. A slow orbit at 1.5 m/s is not joined.
+_NEAR_M, _NEAR_DEG = 1.0, 5.0
+_FEWEST_BINS, _ENOUGH_BINS = 24, 100
+FEWEST_SAMPLES = 100
+EPOCH = np.datetime64(0, "s")
+# Samples at a limit: distance from the last level [dB], least share and number of the samples, and their fading as a
+# share.
+PILE_DB, _LEAST_PILE, LEAST_BINS, MOST_FADING = 1.2, 0.1, 5, 0.35
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelEvidence:
+    """The evidence for a cause: one channel of a flight.
+
+    Parameters
+    ----------
+    time_s : (n,)
+        Ascending times [s].
+    measured_db, predicted_db : (n,)
+        Levels before any offset; NaN if missing.
+    place_m : (n, 3)
+        Positions of the UAV [m].
+    uav_azimuth_deg, uav_elevation_deg : (n,)
+        Direction of the tower in the frame of the UAV's antenna.
+    tower_azimuth_deg : (n,)
+        Direction of the UAV seen from the tower, clockwise from north.
+    name, unit : str
+        Name of the channel and unit of its measured level.
+    start : datetime64
+        Time at which ``time_s`` is 0.
+    tower : str
+        Tower of the channel.
+    antenna : {"isotropic", "measured", "learned"}
+        Kind of the UAV's antenna.
+    turned_db, raised_db : mapping of float to (n,)
+        Change of the predicted level by an increase of the heading [deg], and of the height [m]. ``turned_db`` is empty
+        for antennas without a pattern.
+    attitude_db : mapping of str to (n,)
+        Change of the predicted level with other values of ``rt.attitude``.
+    misread_db, scaled_db : mapping of str to (n,)
+        Change of the predicted level if the telemetry has another meaning, or its heights have another unit, by that
+        meaning in words.
+    other_towers_db : mapping of str to (n,)
+        Predicted level of each other tower of the site.
+    locked, serving : (n,), optional
+        1 if in lock (or served by this cell), 0 if not, NaN if unknown. None if the log has no such column.
+    clock : ClockResult, optional
+        Test result of the radio clock.
+    """
+
+    time_s: FloatArray
+    measured_db: FloatArray
+    predicted_db: FloatArray
+    place_m: FloatArray
+    uav_azimuth_deg: FloatArray
+    uav_elevation_deg: FloatArray
+    tower_azimuth_deg: FloatArray
+    name: str = ""
+    unit: str = "dBm"
+    start: np.datetime64 = EPOCH
+    tower: str = ""
+    antenna: str = "measured"
+    turned_db: Mapping[float, FloatArray] = field(default_factory=dict)
+    raised_db: Mapping[float, FloatArray] = field(default_factory=dict)
+    attitude_db: Mapping[str, FloatArray] = field(default_factory=dict)
+    misread_db: Mapping[str, FloatArray] = field(default_factory=dict)
+    scaled_db: Mapping[str, FloatArray] = field(default_factory=dict)
+    other_towers_db: Mapping[str, FloatArray] = field(default_factory=dict)
+    locked: FloatArray | None = None
+    serving: FloatArray | None = None
+    clock: ClockResult | None = None
+    floored: bool = False
+    """True if the settings remove levels at the floor, so that only upward fading of the lowest links remains."""
+    limits_known: bool = False
+    """True if both levels were already raised to the receiver's floor, as in the numbers of the page."""
+    learned: LearnedSeries | None = None
+    """Learned antenna of the tower with the errors of held-out flights, if the flight uses one."""
+    transmit_power_dbm: float = 0.0
+    """Transmit power of the predicted level."""
+    distance_db: FloatArray | None = None
+    """Part (n,) of the predicted level that depends only on the distance."""
+    displaced_db: Mapping[tuple[float, float], FloatArray] = field(default_factory=dict)
+    """Change of the predicted level with the tower elsewhere, by distance [m] and azimuth [deg]."""
+    swapped_db: FloatArray | None = None
+    """Change of the predicted level (n,) if the log belongs to the other channel of the tower."""
+    least: BoolArray | None = None
+    """Mask (n,) of samples at the lowest level of the log (exactly, or within its noise), if that level is frequent."""
+
+
+def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:
+    """Return means of the samples with both levels over :data:`BIN_S` and over hovers. None if there are too few."""
+    finite = np.isfinite(evidence.measured_db) & np.isfinite(evidence.predicted_db)
+    level = evidence.measured_db[finite]
+    # two levels or few samples do not show how the error varies
+    if len(level) < FEWEST_SAMPLES or len(np.unique(level)) == 2:
+        return None
+    time, level = evidence.time_s[finite], evidence.measured_db[finite]
+    width = max(min(BIN_S, float(np.ptp(time)) / _ENOUGH_BINS), float(np.ptp(time)) / _MOST_BINS, 1e-3)
+    _, place = np.unique(np.floor(time / width), return_inverse=True)
+    place = _standing(evidence, finite, place)[place]
+    count = np.bincount(place).astype(np.float64)
+    if len(count) < _FEWEST_BINS:
+        return None
+
+    def mean(values: FloatArray) -> FloatArray:
+        return _mean(values[finite], place, count)
+
+    def binned(name: str, value: object) -> object:
+        if isinstance(value, Mapping):
+            return {key: mean(column) for key, column in value.items()}
+        if not isinstance(value, np.ndarray):
+            return value
+        if name not in ("uav_azimuth_deg", "tower_azimuth_deg"):
+            # treat missing flags as 1: a gap in the log is not an error
+            return mean(np.nan_to_num(value, nan=1.0) if name in ("locked", "serving") else value)
+        # average directions, because the mean of 359 and 1 degrees is 0
+        turn = np.exp(1j * np.radians(value))
+        return np.degrees(np.angle(mean(turn.real) + 1j * mean(turn.imag)))
+
+    changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
+    at = level == level.min()
+    # compare with the next level: if levels are rounded, all are frequent, but the lowest is rarer than the next
+    next_often = (level == level[~at].min()).sum() if not at.all() else 0
+    often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level), next_often)
+    changed["least"] = np.bincount(place, at) > 0.5 * count if often else _undetected(mean(evidence.measured_db))
+    return LevelEvidence(**changed)  # type: ignore[arg-type]
+
+
+def _mean(values: FloatArray, place: IntArray, count: AnyArray) -> FloatArray:
+    """Return means of values (n,) or (n, k) over the ``count`` samples of each place."""
+    totals = np.apply_along_axis(lambda column: np.bincount(place, column), 0, values)
+    return np.asarray((totals.T / count).T)
+
+
+def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray:
+    """Return a number per second, which is the same while the UAV neither moves nor turns."""
+    azimuth, elevation = np.radians(e.uav_azimuth_deg[finite]), np.radians(e.uav_elevation_deg[finite])
+    flat = np.cos(elevation)
+    towards = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+    count = np.bincount(second)
+    at, towards = _mean(e.place_m[finite], second, count), _mean(towards, second, count)
+    number, begin = np.zeros(len(at), dtype=np.int64), 0
+    for i in range(1, len(at)):
+        turned = np.linalg.norm(towards[i] - towards[begin]) > np.radians(_NEAR_DEG)
+        moved = turned or np.linalg.norm(at[i] - at[begin]) > _NEAR_M
+        begin = i if moved else begin
+        number[i] = number[i - 1] + moved
+    return number
+
+
+# Least number and share of samples at one level if a receiver clips.
+_AT_END, _SHARE_AT_END = 10, 0.01
+
+
+def _undetected(level_db: FloatArray) -> BoolArray | None:
+    """Return the samples (n,) without detection: those near and below the densest level, if links drop to it suddenly.
+
+    Return None if the level fades slowly into the densest level, as near a floor or in a hover.
+    """
+    ordered, step = np.sort(level_db), np.abs(np.diff(level_db))
+    within = np.searchsorted(ordered, ordered + 2.0 * PILE_DB, "right") - np.arange(len(ordered))
+    low = ordered[within.argmax()]
+    under = level_db < low + 3.0 * PILE_DB
+    dense = under & (level_db >= low)
+    inside, outside, between = dense[1:] & dense[:-1], ~(under[1:] | under[:-1]), under[1:] != under[:-1]
+    if inside.sum() < _LEAST_PILE * len(level_db) or min(outside.sum(), between.sum()) < LEAST_BINS:
+        return None
+    fading_db = float(np.median(step[outside]))
+    at_once = np.median(step[between]) > _LOST * fading_db
+    return under if at_once and np.median(step[inside]) < MOST_FADING * fading_db else None
+
+
+# A loss of detection exceeds the usual step of fading by this factor. A receiver with a noisy least level has 9, others
+# have 3.
+_LOST = 5.0

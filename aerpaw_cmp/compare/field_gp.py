@@ -28,7 +28,7 @@ import numpy as np
 from ..common.errors import InputError
 from ..common.gaussian import Factor
 from ..common.units import FloatArray, IntArray, spread_out
-from .gains import GainFit, GainModel, LinkSamples, fit_gain
+from .gains import BAND, GainFit, GainModel, LinkSamples, fit_gain
 
 Part = Literal["mean", "place", "offset", "drift"]
 PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
@@ -59,7 +59,7 @@ class FieldModel:
         The field over positions: its standard deviation, horizontal and vertical length [m], and chord of the
         direction. With an infinite ``turn`` the field does not depend on direction.
     offset_sd_db : float
-        Standard deviation of the offset between flights.
+        Standard deviation of the offset between flights, as from :func:`_offset_sd_of` if it is fitted.
     drift_sd_db, drift_s : float
         Standard deviation and correlation time [s] of the drift within a flight.
     noise_sd_db : float
@@ -335,17 +335,25 @@ def _evenly(rows: Rows, value: FloatArray) -> tuple[Rows, FloatArray]:
     return rows.part(keep), value[keep]
 
 
-def _offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], otherwise_db: float) -> float:
-    """Return the standard deviation between the means of flights [dB], shrunk towards a prior guess.
+def _offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], usual_db: float) -> float:
+    """Return the standard deviation of a normal distribution with the 90 % band of the offset of a new flight [dB].
 
-    The result is the mean of an inverse-gamma posterior. The guess counts as two observations, because two flights
-    hardly determine a standard deviation.
+    The standard deviation between flights is integrated over its posterior distribution, because the differences of
+    few flights hardly determine it. The prior is log normal with the median ``usual_db`` and a factor of three. It does
+    not exclude equal offsets, which flights with the same devices can have.
     """
-    squares, count = 2.0 * otherwise_db**2, 2.0
+    from scipy.special import ndtr, ndtri
+
+    squares, count = 0.0, 0
     for rows, value in channels:
         means = np.array([value[rows.flight == code].mean() for code in np.unique(rows.flight)])
         squares, count = squares + float(((means - means.mean()) ** 2).sum()), count + len(means) - 1
-    return math.sqrt(squares / count)
+    z, share = np.linspace(-3.0, 3.0, 61), 0.5 + 0.5 * BAND
+    sd_db = usual_db * 3.0**z
+    log = -0.5 * z**2 - count * np.log(sd_db) - 0.5 * squares / sd_db**2
+    weight = np.exp(log - log.max())
+    inside = ndtr(ndtri(share) * sd_db[:, None] / sd_db) @ weight / weight.sum()
+    return float(np.interp(share, inside, sd_db))
 
 
 def _likelihood(model: FieldModel, apart: _Apart, value: FloatArray, names: Sequence[str]) -> tuple[float, FloatArray]:

@@ -20,7 +20,7 @@ from ..common.geodesy import azimuth_rad
 from ..common.text import counted
 from ..common.units import BoolArray, FloatArray
 from ..compare.calibration import BIN_S, Correction, Observed, Predictor, between_blocks_db, by_degree
-from ..compare.gains import NO_SPREAD, LinkSamples, LostLock, Spread, fading_of, link_directions, student_factor
+from ..compare.gains import NO_SPREAD, LinkSamples, LostLock, Spread, fading_of, link_directions
 from ..compare.level import DetectionForecast
 from ..flight.data import FAR_M, FlightData, load_data, nearest_m
 from ..flight.drafting.proposals import LearnedLink, latest_learned_links
@@ -493,14 +493,10 @@ class Flown:
         """Return levels at targets, averaged over the headings ``each``."""
         antenna = each[0].antenna
         level, slow = self.correction.over_headings(each)
-        guess = outside(each[0].position_m, self.sources[antenna].samples)
-        # The offset of the residual field of a new flight is normally distributed. Its SD is estimated from the
-        # differences between flights on all channels, because few differences determine it poorly.
-        count = {name: len({s.flight for s in source.samples}) for name, source in self.sources.items()}
-        flights, differences, fitted = count[antenna], sum(count.values()) - len(count), self.correction
-        wider = math.sqrt((1.0 + 1.0 / flights) * (student_factor(1 + differences) ** 2 - 1.0))
-        slow = np.hypot(slow, fitted.sd_factor * wider * fitted.model.offset_sd_db)
-        if flights == 1:  # held-out errors of several flights already contain the change between areas
+        known = self.sources[antenna].samples
+        guess = outside(each[0].position_m, known)
+        # held-out errors of several flights already contain the change between areas
+        if len({samples.flight for samples in known}) == 1:
             slow = np.where(guess, np.hypot(slow, between_blocks_db(self.correction.channels[antenna])), slow)
         return level, slow, guess
 

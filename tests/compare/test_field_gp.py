@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.compare import field_gp
@@ -212,12 +213,27 @@ def test_scales_are_sought_within_their_limits_from_the_usual_ones_on(monkeypatc
     np.testing.assert_allclose(bounds, np.log(list(limits.values())))
     assert np.exp(first) == pytest.approx([2.0, 300.0, 30.0, 0.7, 1.5, 60.0, 0.2])
     assert (model.length_m, model.noise_sd_db) == pytest.approx((300.0, 0.2))
-    assert model.offset_sd_db == pytest.approx(
-        1.5 * math.sqrt(2 / 3)
-    )  # two flights without an offset, and two as usual
     with pytest.raises(InputError, match="fewer than three"):
         fit_field([(rows.part(slice(0, 2)), np.zeros(2))])
     fit_field([(rows.part(slice(0, 3)), np.zeros(3))])
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_offset_of_a_new_flight_is_in_its_band_where_offsets_vary_little_or_much(count):
+    """The SD between flights is drawn with a median of 1.5 dB, and a factor of three for one standard deviation."""
+    random, held = np.random.default_rng(6), []
+    flat = np.zeros((count, 3))
+    rows = Rows(position_m=flat, direction=flat, time_s=np.zeros(count), flight=np.arange(count))
+    for _ in range(1500):
+        between_db = 1.5 * 3.0 ** np.clip(random.normal(), -3.0, 3.0)
+        known, other, new = random.normal(0.0, between_db, (3, count))
+        stated = field_gp._offset_sd_of([(rows, known), (rows, other)], 1.5) * np.sqrt(1.0 + 1.0 / count)
+        held.append((between_db > 1.5, abs(new[0] - known.mean()) <= norm.ppf(0.95) * stated))
+    much, inside = np.array(held).T
+    assert inside.mean() == pytest.approx(0.9, abs=0.02)
+    if count > 1:
+        assert min(inside[much].mean(), inside[~much].mean()) > 0.83
+        assert field_gp._offset_sd_of([(rows, np.zeros(count))] * 2, 1.5) < 0.5, "equal offsets"
 
 
 def test_rows_above_the_limit_are_selected_evenly(monkeypatch):

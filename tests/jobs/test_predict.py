@@ -10,8 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import norm
-from scipy.stats import t as student
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
@@ -105,23 +103,6 @@ def test_columns_are_those_of_the_contract(prediction):
     assert ((levels["q05_db"] < levels["level_db"]) & (levels["level_db"] < levels["q95_db"])).all()
     by_point = levels.groupby(["point", "channel"], observed=True)["p_serving"].sum()
     np.testing.assert_allclose(by_point, 1.0, atol=2e-3)
-
-
-@pytest.mark.parametrize(("flights", "channels"), [(1, 1), (2, 1), (9, 1), (2, 3)])
-def test_the_offset_of_a_new_flight_is_students_as_in_the_memory(flights, channels, monkeypatch):
-    """The band of an offset alone: two degrees of the guess, and one per difference of flights on any channel."""
-    normal_db = 1.5 * np.sqrt(1.0 + 1.0 / flights)
-    samples = [SimpleNamespace(flight=str(k), antenna="LW1.rss", position_m=np.zeros((1, 3))) for k in range(flights)]
-    field = SimpleNamespace(
-        over_headings=lambda *_, **__: (np.zeros(1), np.full(1, normal_db)), channels={"LW1.rss": None},
-        sd_factor=1.0, model=SimpleNamespace(offset_sd_db=1.5),
-    )  # fmt: skip
-    monkeypatch.setattr(sources, "between_blocks_db", lambda _: 0.0)
-    source = SimpleNamespace(samples=[s for s in samples for _ in range(2)])
-    known = {"LW1.rss": source} | {f"LW{k}.rss": source for k in range(2, channels + 1)}
-    _, slow, _ = sources.Flown(field, known).levels(samples[:1])
-    degrees = 2 + channels * (flights - 1)
-    assert slow[0] * norm.ppf(0.95) == pytest.approx(student.ppf(0.95, degrees) * normal_db)
 
 
 @pytest.mark.parametrize(("flights", "wider_db"), [(1, 3.0), (2, 0.0)])

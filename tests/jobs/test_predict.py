@@ -13,6 +13,7 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.compare.gains import LinkSamples
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs import predict, sources
@@ -103,6 +104,21 @@ def test_columns_are_those_of_the_contract(prediction):
     assert ((levels["q05_db"] < levels["level_db"]) & (levels["level_db"] < levels["q95_db"])).all()
     by_point = levels.groupby(["point", "channel"], observed=True)["p_serving"].sum()
     np.testing.assert_allclose(by_point, 1.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("each", [1, 2, 8, 40])
+def test_fading_and_the_noise_of_means_add_up_to_the_variance_of_samples(each):
+    """Planted: independent fading of 3 dB, with a number of samples per mean over 4 s."""
+    n = 800 * each
+    level_db, unit = 3.0 * np.random.default_rng(5).normal(size=n), np.tile([1.0, 0.0, 0.0], (n, 1))
+    known = LinkSamples(
+        flight="a", tower="LW1", channel="rss", time_s=np.arange(n) * (4.0 / each), position_m=unit, at_uav=unit,
+        at_tower=unit, residual_db=level_db,
+    )  # fmt: skip
+    means = known.binned(4.0)
+    correction = SimpleNamespace(channels={"LW1.rss": SimpleNamespace(rows=means)})
+    fading = sources.Flown(correction, {"LW1.rss": SimpleNamespace(samples=[known])}).fading("LW1.rss")
+    assert fading.total_db(means.residual_db.std()) == pytest.approx(level_db.std(), rel=0.01)
 
 
 @pytest.mark.parametrize(("flights", "wider_db"), [(1, 3.0), (2, 0.0)])

@@ -311,8 +311,6 @@ def _drafted(folder: Path, data: FlightData) -> FlightFile:
     site = str(data.site_place) if not Path(data.site_place).is_file() else str(Path(data.site_place).resolve())
     timezone = data.settings.timezone
     files = ingest([folder], options=ReadOptions(timezone=timezone))
-    if not files:
-        raise InputError("no log", expected="power logs and telemetry of an emulated flight")
     return parse_yaml(drafts(files, folder, DraftOptions(timezone=timezone, site=site))[0].text, FlightFile)
 
 
@@ -610,13 +608,11 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> Seri
     scored = near & heard & np.isfinite(level)
     if scored.sum() < FEWEST:
         return None
-    # if prediction and log have no common reference, a missing level is not a predicted outage
-    rows = near if absolute else scored
-    same = rows & (np.isfinite(level) | ~heard)
+    same = near & (np.isfinite(level) | ~heard)
     name = given.path.name
     stated = {key: predicted[key] for key in ("sd_db", "q05_db", "q95_db")}
     foreign = PredictedLevel(level, absolute, lock=_lock(predicted), **stated)
-    models = {name: (foreign, rows)}
+    models = {name: (foreign, near)}
     if not item.training:  # its antennas know these samples
         models[OURS] = PredictedLevel(item.simulated_dbm, item.unit == "dBm"), same
     models |= {

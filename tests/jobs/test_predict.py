@@ -404,6 +404,24 @@ def test_offset_slope_and_floor_of_each_node_of_an_emulator(said, flown):
     assert str(node["offset_db"]) in page
 
 
+def test_a_missing_level_is_an_outage_without_a_common_reference_too(said, flown):
+    """The log is in dB re full scale, the prediction in dBm."""
+    data, folder, _ = said
+    item = flown[1].rss[0]
+    level = np.where(np.arange(len(item.time)) % 10, item.simulated_dbm, np.nan)
+    times = pd.to_datetime(item.time).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    gaps = pd.DataFrame({"time_utc": times, "tower": item.tower, "channel": item.channel, "level_dbm": level})
+    gaps.to_csv(folder / "gaps.csv", index=False)
+    cards = judge(read_foreign(folder / "gaps.csv", data), data, flown[1])["levels"][item.tower][item.channel]["cards"]
+    heard, reached = np.isfinite(item.measured_db), np.isfinite(level)
+    assert cards["gaps.csv"]["outages_invented"] == (item.posed & heard & ~reached).sum() > 50
+    assert cards["gaps.csv"]["outages_missed"] == (item.posed & ~heard & reached).sum()
+    lowest = cards["gaps.csv"]["exceedance"][0]
+    measured = np.where(heard, item.measured_db, -np.inf)[item.posed]
+    assert lowest["measured"] == pytest.approx(np.mean(measured >= lowest["threshold_db"]))
+    assert cards["free space"]["n"] == cards["gaps.csv"]["n"]
+
+
 def test_a_channel_with_too_few_predictions_is_named(said, flown):
     data, folder, _ = said
     table = both_channels(folder)

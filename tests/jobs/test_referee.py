@@ -262,6 +262,8 @@ def test_damaged_files_are_one_message(flight: Path, capsys: pytest.CaptureFixtu
         (flight / name).write_bytes(content)
         assert name in refused(flight, flight / name, capsys)
     assert "gone.csv" in refused(flight, flight / "gone.csv", capsys)
+    (flight / "empty").mkdir()
+    assert "the folder contains no log that a reader recognises" in refused(flight, flight / "empty", capsys)
     centre = np.zeros((2, 2, 3))
     np.savez(flight / "db.npz", path_gain=np.full((1, 2, 2), -90.0), cell_centers=centre, tx_names=np.array(["LW1"]))
     assert "a path_gain below 0; expected a linear gain, 0 or more" in refused(flight, flight / "db.npz", capsys)

@@ -711,8 +711,7 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     side = _SIDES[round(azimuth / 45.0) % 8]
     yield Trial(
         name="place", cost=cost, change_db=changes[best], estimate=(radius, math.nan, math.nan),
-        sentence=f"the tower is about {radius:.0f} m {side} of its stated position, or the track is "
-        "shifted the other way",
+        sentence=f"the tower is about {radius:.0f} m {side} of its stated position, or the track is off the other way",
         next_step="check the coordinates of both",
     )  # fmt: skip
 

@@ -201,12 +201,7 @@ def covariance(model: FieldModel, rows: Rows, columns: Rows, parts: Collection[P
 
 def prior_sd_db(model: FieldModel, parts: Collection[Part]) -> float:
     """Return the prior standard deviation of the selected parts, before any sample is known [dB]."""
-    each = {
-        "mean": MEAN_SD_DB,
-        "place": model.place_sd_db,
-        "offset": model.offset_sd_db,
-        "drift": model.drift_sd_db,
-    }
+    each = {"mean": MEAN_SD_DB, "place": model.place_sd_db, "offset": model.offset_sd_db, "drift": model.drift_sd_db}
     return math.hypot(*(each[part] for part in parts))
 
 

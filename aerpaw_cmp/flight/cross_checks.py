@@ -355,8 +355,7 @@ def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
     if high or (near and _takes_off(telemetry)):
         # a UAV at rest is on the ground, regardless of the datum of its heights
         ground_m = low_m if sea_m is None or not high else sea_m
-        stated = "at the take-off [m]" if sea_m is None else f"{sea_m:g} m"
-        ground = f"the height of the ground above sea level, {stated}"
+        ground = f"the height of the ground above sea level{' [m]' if sea_m is None else f', {sea_m:g} m'}"
         line = f"'takeoff_ground_m: {site.takeoff_ground_m - ground_m:.0f}' under 'origin:' of the site file"
         raise InputError(
             f"the lowest height above take-off is {low_m:.0f} m" + ("" if high else ", at rest before a climb"),

@@ -223,17 +223,12 @@ def calibrate(
     for name, scores in [*m["scores"].items(), *((f"control: {k}", v) for k, v in m["controls"].items())]:
         means = [sum(s[key] for s in scores) / len(scores) if scores else None
                  for key in ("rmse_db", "rmse_4s_db", *BASELINES)]  # fmt: skip
-        rows.append(
-            [name.removesuffix("_left_out").replace("_", " "), *(number(v, "{:.2f}") for v in means), str(len(scores))]
-        )
+        kind = name.removesuffix("_left_out").replace("_", " ")
+        rows.append([kind, *(number(v, "{:.2f}") for v in means), str(len(scores))])
     if rows:
         heads = ["held out", "RMSE dB", "4 s means dB", *(f"{title} dB" for title in BASELINES.values()), "series"]
         table(heads, rows, "Mean scores on held-out data")
-    forecasts = [
-        {**forecast, "split": split.removesuffix("_left_out")}
-        for split, scores in m["rank"].items()
-        for forecast in scores
-    ]
+    forecasts = [f | {"split": split.removesuffix("_left_out")} for split, scores in m["rank"].items() for f in scores]
     columns = {
         "held out": "split", "flight": "flight", "tower": "tower", "kappa": "kappa:.3f", "agree": "agreement:.0%",
         "commonest": "majority_agreement:.0%", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",

@@ -108,7 +108,8 @@ def grow_paths(
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
     faces, towers, threads = surfaces.faces, len(links.sources_m), compiled.thread_count()
-    rules, hiding = Rules.of(surfaces, max_depth, solids=solids), _solids(surfaces)
+    rules = Rules.of(surfaces, max_depth, solids=solids)
+    hiding = _Solids(surfaces.face_tree, surfaces.corners_m, surfaces.tree)
     pieces: list[PathSet] = []
     alive = searched_links(links)
     # loop over towers, because they share a scene but have different usable faces
@@ -143,10 +144,6 @@ def grow_paths(
 
 # Receivers (n,), faces (n, depth), reflection points (n, depth, 3). Unused entries are face -1 with any point.
 _Level = tuple[IntArray, IntArray, FloatArray]
-
-
-def _solids(surfaces: Surfaces) -> _Solids:
-    return _Solids(surfaces.face_tree, surfaces.corners_m, surfaces.tree)
 
 
 def _mirrors(surfaces: Surfaces, usable: BoolArray | None = None) -> _Mirrors:

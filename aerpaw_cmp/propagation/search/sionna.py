@@ -646,8 +646,7 @@ def _check_gain(raw: dict[str, Any], sources_m: FloatArray, targets_m: FloatArra
     # a V/H pair at both ends sees the wave twice: |a|^2 sums to 2 (lambda / 4 pi d)^2
     ratio = raw["gain"][direct] / (np.sqrt(2.0) * expected)
     if len(ratio) and (np.abs(ratio - 1.0) > 1e-2)[distance > 1.0].any():
-        found = "Sionna's line of sight differs from Friis' formula by more than 1 %"
-        raise CheckError(found, cause="a damaged installation")
+        raise CheckError("Sionna's line of sight differs from Friis by more than 1 %", cause="a damaged installation")
     if (raw["gain"][valid] > 2.0).any():
         raise CheckError("Sionna reports a path that gains power", cause="a damaged installation")
 

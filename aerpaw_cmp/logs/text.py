@@ -273,18 +273,17 @@ def add_flag(column: AnyArray, mask: BoolArray, reason: str) -> None:
             column[mask] = reason  # one object for all rows
 
 
-def first_lines(head: bytes, count: int = 40) -> list[bytes]:
-    """Return complete, non-blank lines at the start of a file, which sniffers test."""
-    # enough for forty lines of any log
+def first_lines(head: bytes) -> list[bytes]:
+    """Return up to forty complete, non-blank lines at the start of a file, which sniffers test."""
     pieces = head[:16_384].split(b"\n")
     if len(head) > 16_384 or (len(pieces) > 1 and not head.endswith(b"\n")):
         pieces = pieces[:-1]  # a truncated line cannot confirm the format
-    return [piece.rstrip(b"\r") for piece in pieces if piece.strip()][:count]
+    return [piece.rstrip(b"\r") for piece in pieces if piece.strip()][:40]
 
 
-def mostly(head: bytes, pattern: re.Pattern[bytes], *, skip: int = 0) -> bool:
+def mostly(head: bytes, pattern: re.Pattern[bytes]) -> bool:
     """Check whether the pattern describes more than half of the first lines."""
-    lines = first_lines(head)[skip:]
+    lines = first_lines(head)
     return bool(lines) and 2 * sum(pattern.match(line) is not None for line in lines) > len(lines)
 
 

@@ -115,7 +115,7 @@ def result(
         Number of intact messages; those in ``damaged`` are not counted.
     damaged : list of RejectedLine
     radio : Series
-        ``RSSI``, ``RemRSSI``, ``Noise`` and ``RemNoise`` of the telemetry radio, in the radio's steps.
+        ``RSSI`` and ``RemRSSI`` of the telemetry radio, in the radio's steps.
     """
     zero_ns, offset = _text.origin_ns(options, needed_by=reader), flights[0].utc_minus_clock_s
     if offset is not None:
@@ -144,26 +144,24 @@ def result(
     return rows.result([*tracks, *_radio(rows.part(of == len(flights)), radio, timed[owner == len(flights)])])
 
 
-# Channel names: level and noise at this end of the telemetry link, and at the remote end.
-_ENDS = {"RSSI": "radio", "RemRSSI": "radio_remote", "Noise": "radio_noise", "RemNoise": "radio_remote_noise"}
+# Channel names: the level at this end of the telemetry link, and at the remote end.
+_ENDS = {"RSSI": "radio", "RemRSSI": "radio_remote"}
 
 
 def _radio(rows: Rows, radio: Series, timed: BoolArray) -> Iterator[Stream | None]:
-    """Yield the levels and the noise at both ends of a telemetry link [dBm].
+    """Yield the levels at both ends of a telemetry link [dBm].
 
     Notes
     -----
     SiK radios report steps of 1/1.9 dB from -127 dBm (ArduPilot wiki, "SiK Telemetry Radio"); 0 and 255 are unknown.
     """
-    about = {"unit": "dBm", "source": "MAVLink radio status, by SiK's scale"}
+    source = "MAVLink radio status, by SiK's scale"
     for name, channel in _ENDS.items():
         steps = radio.columns.get(name, np.zeros(len(timed)))[timed]
-        known, level_dbm = (steps > 0) & (steps < 255), steps / 1.9 - 127.0
-        if "Noise" in name:
-            yield rows.stream("kpi", channel, {"value": level_dbm}, where=known, about={**about, "quantity": "noise"})
-        else:
-            about_level = {**about, "channel": channel, "quantity": "telemetry radio RSSI"}
-            yield rows.stream("rss", channel, {"rss_db": level_dbm}, where=known, about=about_level)
+        yield rows.stream(
+            "rss", channel, {"rss_db": steps / 1.9 - 127.0}, where=(steps > 0) & (steps < 255), channel=channel,
+            unit="dBm", quantity="telemetry radio RSSI", source=source,
+        )  # fmt: skip
 
 
 def _track(rows: Rows, flight: Flight, timed: BoolArray) -> Stream | None:
@@ -219,18 +217,12 @@ def _apart(flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> l
 def _height(rows: Rows, flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> FloatArray:
     """Return heights above home at take-off, or above the ground at rest or the first position if home is unknown."""
     altitude: FloatArray = values["altitude_m"]
-    known = np.flatnonzero(np.isfinite(altitude))
-    if not len(known):
+    if not np.isfinite(altitude).any():
         return altitude
     columns, unknown = flight.home.columns, np.full(len(flight.home.time_s), np.nan)
     home = np.isfinite(columns.get("altitude_m", unknown))
     if not home.any():
-        astray = _pose.astray(rows, values)[known]
-        known = known[~astray] if not astray.all() else known
-        rest = _pose.at_rest(rows.time[known], *(values[name][known] for name in _pose.PLACE))
-        rows.warnings.append(
-            f"no home is known: heights are above {'the first position' if rest is None else 'the ground at rest'}"
-        )
-        return altitude - float(altitude[known[0]] if rest is None else rest)
+        rows.warnings.append("no home is known: heights count from the ground at rest or the first position")
+        return _pose.above_takeoff(rows, values, "sea level", np.isnan(values["latitude_deg"]))[0]
     home_m = columns["altitude_m"][home]
     return _pose.above_home(rows, time_s, altitude, flight.home.time_s[home], home_m)

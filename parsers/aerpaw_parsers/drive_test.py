@@ -128,8 +128,10 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
     for place, columns in fields.items():
         cells[place] = cell = _Cell(*place)
         for name, listed in columns.items():
-            alone = len(listed) == 1 or name in _IDENTITY
-            cell.columns[name], *second = listed if alone else sorted(listed, key=lambda i: _preference(sheet, i))
+            if len(listed) > 1 and name not in _IDENTITY:
+                filled = [i for i in listed if np.isfinite(sheet.numbers(i)).any()]
+                listed = sorted(filled or listed[:1], key=lambda i: _preference(sheet, i))
+            cell.columns[name], *second = listed
             if name == "rsrp_dbm":
                 cell.ports = [i for i in second if _part(sheet, i) != "mean"]
             others += [i for i in second if i not in cell.ports and name not in _IDENTITY]  # read as KPIs
@@ -157,11 +159,11 @@ def _part(sheet: _sheet.Sheet, column: int) -> str:
     return "" if meaning is None else meaning.part
 
 
-def _preference(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, bool, int]:
-    """Return a sort key that prefers filled columns, then neither means nor single ports, then many values."""
+def _preference(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, int]:
+    """Return a sort key that prefers columns that are neither means nor single ports, then many values."""
     known = sheet.numbers(column)
     count = len(np.unique(known[np.isfinite(known)]))
-    return not count, _part(sheet, column) == "mean", _part(sheet, column) == "port", -count
+    return _part(sheet, column) == "mean", _part(sheet, column) == "port", -count
 
 
 def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_Cell]:

@@ -11,9 +11,8 @@ import re
 
 import numpy as np
 
-from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.matfile import MAGIC, names_of, read_arrays
-from aerpaw_cmp.readers import Attribute, InputError, Reader, ReadOptions, ReadResult, Rows
+from aerpaw_cmp.readers import Attribute, InputError, Reader, ReadOptions, ReadResult, built, split
 
 _NAME = re.compile(r"(\d{6,12})(?:\.0)?_(\d{4,10})(?:\.0)?_(\d{4})_(\d\d)_(\d\d)_(\d\d)_(\d\d)_(\d\d)_?(\d{3,6})?")
 
@@ -45,18 +44,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         )
     year, month, day, hour, minute, second, part = named.groups()[2:]
     text = f"{year}-{month}-{day} {hour}:{minute}:{second}.{part or '0'}".encode()
-    instants, valid = _text.texts_to_utc(np.array([text]), options, needed_by="iq_burst")
-    if not valid[0]:
-        raise InputError(
-            "the date in the burst's name is not a date of the calendar", expected="YYYY_mm_dd_HH_MM_SS_mmm"
-        )
+    # the burst is the only line of its account
+    rows = built(split(b"\n"), np.zeros(1, dtype=np.int64), {"time": np.array([text])}, options, reader="iq_burst")
+    if not len(rows):
+        return rows.result([])
     with np.errstate(all="ignore"):  # damaged samples may be any number
         power = np.mean(np.abs(np.atleast_2d(samples)) ** 2, axis=1)
-    rows = Rows(
-        reader="iq_burst", options=options, lines=1, row=np.zeros(1, dtype=np.int64), time=instants.time,
-        flag=_text.no_flags(1), warnings=list(instants.warnings),
-    )  # fmt: skip
-    instants.flag(rows.flag)
     streams = []
     about: dict[str, Attribute | None] = {"frequency_hz": options.frequency_hz or float(named[1])}
     about["unit"] = options.unit or "dB re full scale"

@@ -23,8 +23,7 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.logs.rows import RELATIVE, instants_of
-from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, RejectedLine, Rows, Stream, no_flags
+from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, RejectedLine, Rows, Stream, built, split
 
 from . import _json, _pose, _stamps
 
@@ -83,14 +82,12 @@ def _times(captures: list[dict[str, Any]], own: str) -> list[str]:
 def _rows_of(texts: list[str], options: ReadOptions) -> Rows:
     """Return the values with times as rows, which are the lines of the account."""
     clock, cells, warnings = _stamps.read(texts, options)
-    relative, instants, valid = instants_of(cells, options, clock=clock, reader="sigmf")
-    keep = np.flatnonzero(valid)
-    flag = no_flags(len(texts))
-    instants.flag(flag)
-    return Rows(
-        reader="sigmf", options=options, lines=len(texts), row=keep, at=keep, time=instants.time[keep], flag=flag[keep],
-        warnings=[*warnings, *instants.warnings, *([RELATIVE] if relative else [])], relative=relative,
+    rows = built(
+        split(b"\n" * len(texts)), np.arange(len(texts)), {"time": cells}, options, reader="sigmf", clock=clock
     )  # fmt: skip
+    rows.warnings += warnings
+    rows.clock_from = None  # the catalogue names the source
+    return rows
 
 
 def _at_frequencies(rows: Rows, channel: str, values: FloatArray, frequency_hz: FloatArray) -> Iterator[Stream]:
@@ -197,9 +194,8 @@ def _powers(
     size, zero = max(1, round(_BURST_S * rate)), _integer(common.get("core:offset"))
     # 0 lies between the two middle codes: 127.5 of 0 .. 255
     middle = full_scale - 0.5 if samples.dtype.kind == "u" else 0.0
-    bursts: list[tuple[str, float, float]] = []  # stamp of the capture, seconds after it, frequency
-    powers: list[FloatArray] = []
-    means, clipped, most = [], [], 0.0
+    # stamp of the capture, seconds after it, frequency, and per channel power, mean and share of clipped values
+    bursts: list[tuple[str, float, float, FloatArray, FloatArray, FloatArray]] = []
     starts = [min(max(_integer(item.get("core:sample_start")) - zero, 0), len(samples)) for item in captures]
     for capture, start, end in zip(captures, starts, [*starts[1:], len(samples)], strict=True):
         stamp = next((capture[key] for key in _TIMES if key in capture), None)
@@ -209,22 +205,21 @@ def _powers(
         # less than half a burst at the end of a capture is not read
         for at in range(start, end - size // 2, size):
             piece = samples[at : min(at + size, end)].astype(np.float64) - middle
-            bursts.append((str(stamp), (at - start) / rate, _json.number(capture.get("core:frequency"))))
             with np.errstate(all="ignore"):  # damaged samples may be any number
-                powers.append((piece**2).sum(axis=2).mean(axis=0))
-                means.append(piece.mean(axis=0))
-                clipped.append((np.abs(piece) >= _FULL * full_scale - 1.0 * (full_scale > 1)).mean(axis=(0, 2)))
-                most = max(most, float(np.abs(piece).max()))
+                power, size_of = (piece**2).sum(axis=2).mean(axis=0), np.abs(piece)
+                # floats far above one have another scale
+                clipped = (size_of >= _FULL * full_scale - 1.0 * (full_scale > 1)) & (size_of <= 1.001 * full_scale)
+                about = power, piece.mean(axis=0), clipped.mean(axis=(0, 2))
+            bursts.append((str(stamp), (at - start) / rate, _json.number(capture.get("core:frequency")), *about))
     if not bursts:
         return
-    stamps, later_s, tuned = zip(*bursts, strict=True)
+    stamps, later_s, tuned, powers, means, shares = zip(*bursts, strict=True)
     with np.errstate(all="ignore"):
         level = 10 * np.log10(np.array(powers)) - 20 * np.log10(full_scale)
         dc = (np.mean(means, axis=0) ** 2).sum(axis=1)
         above_db = 10 * np.log10(dc / np.maximum(np.mean(powers, axis=0) - dc, 1e-12 * dc))
-    for i, (share, dc_db) in enumerate(zip(np.mean(clipped, axis=0), above_db, strict=True)):
-        # floats above one have another scale
-        if share > _CLIPPED_SHARE and most <= full_scale * 1.001:
+    for i, (share, dc_db) in enumerate(zip(np.mean(shares, axis=0), above_db, strict=True)):
+        if share > _CLIPPED_SHARE:
             warnings.append(f"USRP{i + 1}: {share:.1%} of the values are at full scale: clipped, levels are too low")
         if dc_db > _DC_DB:
             reason = "the receiver's own offset, or a carrier at the centre frequency"

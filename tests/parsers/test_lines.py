@@ -50,7 +50,6 @@ def test_sniffers_judge_by_forty_lines() -> None:
 )
 def test_most_of_the_first_lines_are_more_than_half(head: bytes, most: bool) -> None:
     assert _text.mostly(head, re.compile(rb"\d")) is most
-    assert _text.mostly(b"title\n" + head, re.compile(rb"\d"), skip=1) is most
 
 
 def test_numbers_of_cells_and_of_none() -> None:

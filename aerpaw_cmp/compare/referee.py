@@ -10,22 +10,16 @@ import numpy as np
 from ..common.units import BoolArray, FloatArray, IntArray
 from .gains import BAND, NO_SPREAD, LostLock, StatedSpread
 from .level import local_mean_db
-from .offset import grid_offset
+from .statistics import correlation
 
 # Averaging window of the second error [s].
 WINDOW_S = 1.0
-
-# A level with a smaller standard deviation [dB] counts as constant.
-_CONSTANT_DB = 1e-6
 
 # Name of the model of the scored report in the cards.
 OURS = "ray tracing (this report)"
 
 # Numbers of a card that are averaged over channels.
 AVERAGED = ("bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "correlation", "crps_db", "coverage_90")
-
-# Search range of the offset [dB], wide enough to compare logs in dB re full scale with a path loss.
-_RANGE_DB = (-400.0, 400.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,8 +42,7 @@ class LevelCard:
     bias_db, rmse_db : float, optional
         Mean of measured minus predicted and RMSE, without an offset. None if the levels have no common reference.
     offset_db, rmse_offset_db : float
-        Offset that is added to the measurement (on the 0.1 dB grid), and RMSE after this offset. It is fitted on the
-        scored samples.
+        Offset that is added to the measurement, and RMSE after this offset. It is fitted on the scored samples.
     rmse_1s_db : float
         RMSE of means over 1 s, after their own offset.
     correlation, slope : float
@@ -116,7 +109,7 @@ def level_card(
     Parameters
     ----------
     time_s : (n,)
-        Times of the samples [s], rising.
+        Times of the samples [s], rising. At least one sample has both levels.
     measured_db : (n,)
         Measured levels; NaN is an outage.
     predicted : PredictedLevel
@@ -129,36 +122,30 @@ def level_card(
     Returns
     -------
     LevelCard
-
-    Raises
-    ------
-    UsageError
-        If no sample has both levels.
     """
     level = predicted.level_db
     scored = np.isfinite(level) if scored is None else scored
     heard, reached = np.isfinite(measured_db) & scored, np.isfinite(level) & scored
     both = heard & reached
     measured, expected = measured_db[both], level[both]
-    fit = grid_offset(measured, expected, span_db=_RANGE_DB)
     error = measured - expected
     slow = local_mean_db(time_s[both], measured, WINDOW_S) - local_mean_db(time_s[both], expected, WINDOW_S)
-    spread, varied = float(np.std(expected)), float(np.std(measured))
-    covariance = float(np.mean((expected - expected.mean()) * (measured - measured.mean())))
+    # rounding would give a constant prediction a correlation
+    r = correlation(measured, np.round(expected, 6))
     absolute = predicted.absolute
     crps, inside = _distribution(measured_db, predicted, both) if absolute else (None, None)
     # an outage counts as below any threshold
-    theirs = np.where(reached, level - (0.0 if absolute else fit.offset_db), -np.inf)[scored]
+    theirs = np.where(reached, level + (0.0 if absolute else error.mean()), -np.inf)[scored]
     ours = np.where(heard, measured_db, -np.inf)[scored]
     return LevelCard(
         n=int(both.sum()),
         bias_db=float(error.mean()) if absolute else None,
         rmse_db=float(np.sqrt(np.mean(error**2))) if absolute else None,
-        offset_db=fit.offset_db,
-        rmse_offset_db=fit.rmse_db,
+        offset_db=-float(error.mean()),
+        rmse_offset_db=float(error.std()),
         rmse_1s_db=float(slow.std()),
-        correlation=covariance / (spread * varied) if min(spread, varied) > _CONSTANT_DB else float("nan"),
-        slope=covariance / spread**2 if spread > _CONSTANT_DB else float("nan"),
+        correlation=r,
+        slope=r * float(np.std(measured) / (np.std(expected) or 1.0)),
         crps_db=crps,
         coverage_90=inside,
         exceedance=tuple(

@@ -406,10 +406,13 @@ def warnings(data: CampaignData) -> list[str]:
     out = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures[:FEW]]
     if len(data.failures) > FEW:
         out = [f"{len(data.failures)} flights or settings have no numbers; see Failures."]
+    learned: dict[str, list[str]] = {}
+    for row in data.rss:
+        if LEARNED_HERE in row.fitted:
+            learned.setdefault(f"{row.flight}, {row.setting}", []).append(row.link)
     out += [
-        f"{row.flight}, {row.setting}, {row.link}: its antennas were learned from this log, so it is not scored."
-        for row in data.rss
-        if LEARNED_HERE in row.fitted
+        f"{name}: its antennas were learned from this log, so it is not scored ({', '.join(links)})."
+        for name, links in learned.items()
     ]
     out += edge_warnings(data)
     out += [

@@ -152,6 +152,10 @@ def test_a_campaign_of_training_flights_has_a_first_sentence(data):
     """The page of three drafts of dataset 12 began with cautions."""
     first = {"fitted": (campaign_html.LEARNED_HERE,), "rmse_db": np.nan}
     rows = tuple(dataclasses.replace(row, **first) if row.setting == data.reference else row for row in data.rss)
-    (said,) = campaign_words.verdict(dataclasses.replace(data, rss=rows))
+    shown = dataclasses.replace(data, rss=rows)
+    (said,) = campaign_words.verdict(shown)
     assert said.startswith(f"“{data.reference}” has no error to report")
     assert "Next: " in said
+    cautions = [text for text in campaign_words.warnings(shown) if "learned from this log" in text]
+    assert len(cautions) == len({row.flight for row in rows if row.setting == data.reference})
+    assert all("(LW1 USRP1, LW1 USRP2, " in text for text in cautions)

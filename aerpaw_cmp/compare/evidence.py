@@ -20,8 +20,8 @@ _NEAR_M, _NEAR_DEG = 1.0, 5.0
 _FEWEST_BINS, _ENOUGH_BINS = 24, 100
 FEWEST_SAMPLES = 100
 EPOCH = np.datetime64(0, "s")
-# Samples at a limit: distance from the last level [dB], least share and number of the samples, and their fading as a
-# share.
+# Samples at a limit: largest distance from the extreme level [dB], smallest share and number of the samples, and their
+# largest fading as a share.
 PILE_DB, _LEAST_PILE, LEAST_BINS, MOST_FADING = 1.2, 0.1, 5, 0.35
 
 
@@ -165,7 +165,7 @@ def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray
     return number
 
 
-# Least number and share of samples at one level if a receiver clips.
+# Smallest number and share of samples at one level if a receiver clips.
 _AT_END, _SHARE_AT_END = 10, 0.01
 
 
@@ -187,6 +187,6 @@ def _undetected(level_db: FloatArray) -> BoolArray | None:
     return under if at_once and np.median(step[inside]) < MOST_FADING * fading_db else None
 
 
-# A loss of detection exceeds the usual step of fading by this factor. A receiver with a noisy least level has 9, others
-# have 3.
+# A loss of detection exceeds the usual step of fading by this factor. For a receiver with a noisy lowest level, the
+# ratio is 9, for others 3.
 _LOST = 5.0

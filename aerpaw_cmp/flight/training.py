@@ -258,7 +258,7 @@ def knows(data: FlightData, learned: Sequence[MeasuredPattern | FlightFile]) -> 
 
 
 def is_training_data(data: FlightData, trained_on: Sequence[str], marks: Sequence[str]) -> bool:
-    """Check whether a log of a flight has one of the SHA-256 or of the fingerprints of training data."""
+    """Check whether a log of a flight has the SHA-256 or the fingerprint of one of the training logs."""
     return bool(common(flight_logs(data), [trained_on])) or any(among(mark, marks) for mark in marks_of([data]))
 
 

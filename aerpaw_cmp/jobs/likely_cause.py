@@ -146,7 +146,7 @@ def is_simulated(telemetry: Stream) -> bool:
 
 
 _RECEIVER = {"fix": 6, "satellites": 10}
-# Least numbers of rows for the test of constant columns and of voltages, and the share of rows with three voltages. The
+# Smallest numbers of rows for the tests of constant columns and of voltages, and share of rows with three voltages. The
 # simulator's battery has three voltages in 97 % of the rows of one flight. With a real battery, at most 5 % share one.
 _FEWEST_ROWS, _FEWEST_VOLTAGES, _SHARE_OF_VOLTAGES = 4, 15, 0.8
 

@@ -230,7 +230,7 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
     if "up_m" in known:
         known.setdefault("height_m", known["up_m"])
     if "h_real" in known:
-        # level_db of channel.nc has other units by tower, and may have been learned from this flight
+        # level_db of channel.nc may differ in unit between towers, and may have been learned from this flight
         known.pop("level_db", None)
         power_dbm = float(notes["attributes"].get("transmit_power_dbm", 0.0))
         (dims, real), (_, imaginary) = known["h_real"], known["h_imag"]

@@ -504,7 +504,7 @@ class Flown:
         """Return the spread of samples about their means over 4 s."""
         known = self.sources[antenna].samples
         sd_db, kurtosis = fading_of(known, BIN_S)
-        # the noise of a mean of n samples already contains an n-th of the variance of their fading
+        # the noise of a mean of n samples already contains 1/n of the variance of their fading
         count, means = sum(np.isfinite(s.residual_db).sum() for s in known), len(self.correction.channels[antenna].rows)
         sd_db *= math.sqrt(1.0 - min(means / count, 1.0))
         return dataclasses.replace(NO_SPREAD, fading_sd_db=sd_db, fading_kurtosis=kurtosis, bin_s=BIN_S)

@@ -207,7 +207,7 @@ def _powers(
             piece = samples[at : min(at + size, end)].astype(np.float64) - middle
             with np.errstate(all="ignore"):  # damaged samples may be any number
                 power, size_of = (piece**2).sum(axis=2).mean(axis=0), np.abs(piece)
-                # floats far above one have another scale
+                # floats far above full scale have an unknown scale
                 clipped = (size_of >= _FULL * full_scale - 1.0 * (full_scale > 1)) & (size_of <= 1.001 * full_scale)
                 about = power, piece.mean(axis=0), clipped.mean(axis=(0, 2))
             bursts.append((str(stamp), (at - start) / rate, _json.number(capture.get("core:frequency")), *about))

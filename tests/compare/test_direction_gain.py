@@ -51,7 +51,7 @@ def planted(name: str, seed: int, gains, *, n: int = 500, height: float = 50.0, 
 
 GAINS = {"uav": drawn(0.5, 2.5, 1), "A": drawn(0.4, 3.0, 2), "B": drawn(0.4, 3.0, 3)}
 TRAIN = [s for k in range(3) for s in planted(f"f{k}", 10 + k, GAINS, height=40.0 + 15 * k)]
-TEST = planted("kept aside", 99, GAINS, height=48.0)
+TEST = planted("held out", 99, GAINS, height=48.0)
 
 
 @pytest.fixture(scope="module")

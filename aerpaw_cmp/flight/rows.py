@@ -103,8 +103,9 @@ def may_lose_lock(stream: Stream) -> bool:
 
 
 def is_sounder_power(stream: Stream) -> bool:
-    """Check whether a stream is a level of the sounder, which may have a lock quality."""
-    return stream.kind == "rss" and stream.name == "power" and stream.attributes.get("unit") == "dB re full scale"
+    """Check whether a stream can be a level of the sounder, which may have a lock quality. Its name is any channel."""
+    levels = stream.kind == "rss" and stream.attributes.get("quantity") is None
+    return levels and stream.attributes.get("unit") == "dB re full scale"
 
 
 def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | None, str]:

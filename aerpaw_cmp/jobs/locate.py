@@ -17,9 +17,9 @@ from ..flight.data import check_place, choose_site, is_ratio, read_logs, site_pl
 from ..flight.drafting.draft import receiver_floor_db
 from ..flight.drafting.proposals import NodeFinder, searching_airframe, with_antennas
 from ..flight.gains import load_with_learned
-from ..flight.rows import LOCK_FLOOR_DB, is_sounder_power
+from ..flight.rows import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
 from ..flight.settings import FlightFile
-from ..flight.training import mark_of
+from ..flight.training import among, mark_of
 from ..logs.ingest import IngestedFile
 from ..logs.records import Stream
 from ..report.locate import write_locate
@@ -58,9 +58,9 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
     with OutputFolder(folder, job="locate", inputs=inputs, force=options.force) as output:
         with stages("read"):
             site = choose_site(settings.site, flight.parent)
-            vehicle, file, level = _streams(settings, flight, options.logs_root, channel)
+            vehicle, file, level, loses_lock = _streams(settings, flight, options.logs_root, channel)
             check_place(site, str(flight), vehicle)
-            floor = LOCK_FLOOR_DB if is_sounder_power(level) else receiver_floor_db([level])
+            floor = LOCK_FLOOR_DB if loses_lock else receiver_floor_db([level])
             track = NodeFinder(site, vehicle).levels(level, -np.inf if floor is None else floor)
         with stages("locate"):
             node, uav = _antennas(settings, flight, options.logs_root, track, (file, level))
@@ -85,8 +85,8 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
 
 def _streams(
     settings: FlightFile, flight: Path, logs_root: Path | None, channel: str | None
-) -> tuple[Stream, IngestedFile, Stream]:
-    """Return the telemetry with the most rows, the file of the chosen levels, and these levels."""
+) -> tuple[Stream, IngestedFile, Stream, bool]:
+    """Return the telemetry with the most rows, the file of the chosen levels, these levels, and if they lose lock."""
     streams = [(f, stream) for f in read_logs(settings, flight.parent, logs_root) for stream in f.result.streams]
     vehicles = [s for _, s in streams if s.kind == "telemetry"]
     levels = {s.channel: (f, s) for f, s in reversed(streams) if s.kind == "rss" and not is_ratio(s)}
@@ -95,7 +95,9 @@ def _streams(
         raise InputError(f"no log has {missing}", expected="telemetry and levels of one flight", path=flight)
     if channel is not None and channel not in levels:
         raise UsageError(f"no channel {channel!r}", expected="one of " + ", ".join(reversed(levels)))
-    return max(vehicles, key=lambda s: len(s.frame)), *levels[channel or list(levels)[-1]]
+    file, level = levels[channel or list(levels)[-1]]
+    loses_lock = is_sounder_power(level) and any(may_lose_lock(stream) for _, stream in streams)
+    return max(vehicles, key=lambda s: len(s.frame)), file, level, loses_lock
 
 
 def _antennas(
@@ -109,9 +111,9 @@ def _antennas(
     # the antennas of an unknown node are those of link.rss.tower, not those of a tower of the site
     known = settings.link.of(level.channel).build(["node"], logs_root or flight.parent)
     node, uav = (array.patterns[0] for array in (known.tower_arrays["node"], known.uav_array))
-    if isinstance(uav, MeasuredPattern) and file.sha256 not in uav.trained_on:
-        return node if isinstance(node, SpherePattern) else None, uav
     mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
+    if isinstance(uav, MeasuredPattern) and not (file.sha256 in uav.trained_on or among(mark, uav.marks)):
+        return node if isinstance(node, SpherePattern) else None, uav
     carrier_hz = settings.link.of(level.channel).carrier_hz
     place = site_place(settings.site.file, flight.parent)
     return None, searching_airframe(place, (file.sha256, mark), track, carrier_hz)

@@ -243,9 +243,8 @@ def test_levels_in_decibels_without_a_reference_are_not_those_of_another_unit(un
     capsys.readouterr()
 
 
-@pytest.mark.parametrize("names", [("a/", "b/"), ("left_", "right_")])
+@pytest.mark.parametrize("names", [("a/", "b/"), ("left_", "right_"), ("LW1/USRP1/", "LW1/USRP2/")])
 def test_each_of_two_receivers_has_the_lock_of_its_own_quality(names, tmp_path, capsys) -> None:
-    """Neither folders nor files name a tower or a channel."""
     lost = np.arange(len(TIMES)) % 900 < 300
     known = {"USRP1": np.full(len(TIMES), 72.2) + 0.1 * (np.arange(len(TIMES)) % 3)}
     known["USRP2"] = np.where(lost, 40.0, known["USRP1"])
@@ -257,7 +256,7 @@ def test_each_of_two_receivers_has_the_lock_of_its_own_quality(names, tmp_path, 
             level = np.where(known[channel] > 60.0, LEVELS[channel] + 40.0, RNG.normal(-70.0, 1.0, len(TIMES)))
             for what, values in (("power", level), ("quality", known[channel])):
                 log = folder / f"{name}2026-05-06_10_00_00_{what}_log.txt"
-                log.parent.mkdir(exist_ok=True)
+                log.parent.mkdir(parents=True, exist_ok=True)
                 log.write_bytes(format_power_log(TIMES.to_numpy(), values, ZONE))
 
     draft, content = drafted(write, tmp_path, known_site(tmp_path))

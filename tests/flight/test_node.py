@@ -56,6 +56,18 @@ def _drafted(folder: Path, node: tuple[float, float, float], level_100_m: float 
     return parse_yaml(text, FlightFile), "\n".join(remarks)
 
 
+@pytest.mark.parametrize(
+    ("place", "searched"), [(tuple(SITE.towers["LW1"].position_m), False), ((150.0, 90.0, 2.0), True)]
+)
+def test_an_airframe_is_searched_for_levels_with_any_name_if_no_tower_fits(
+    place: tuple[float, float, float], searched: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searches: list[object] = []
+    monkeypatch.setattr("aerpaw_cmp.flight.drafting.draft.searching_airframe", lambda *each: searches.append(each))
+    _drafted(tmp_path, place)
+    assert bool(searches) is searched
+
+
 @pytest.mark.parametrize(("first", "apart_m"), [(True, 400.0), (False, 400.0), (True, 3.0)])
 def test_of_two_vehicles_the_levels_name_the_one_that_carried_the_radio(
     tmp_path: Path, first: bool, apart_m: float

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.flight.training import mark_of
 from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.jobs.run import run_simulate
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import listed
 
@@ -117,11 +120,27 @@ def test_a_growing_log_is_followed_until_it_is_interrupted(flight, capsys, tmp_p
     assert (tmp_path / "out" / "locate.html").exists()
 
 
-@pytest.mark.parametrize("own", [True, False])
+def test_only_a_log_with_a_lock_quality_has_the_floor_of_a_lost_lock(flight, capsys, tmp_path):
+    """The channel of a sounder log that names none is called power."""
+    (flight.parent / "unnamed.yaml").write_text(flight.read_text().replace(", channel: A", ""))
+    assert main(["locate", str(flight.parent / "unnamed.yaml"), "-o", str(tmp_path / "out"), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert "Floor of the receiver: not known." in " ".join(printed["assumed"])
+    assert printed["region90_m"] < 200.0
+
+
+@pytest.mark.parametrize("own", ["log", "copy", ""])
 def test_antennas_that_this_very_log_taught_are_not_used(flight, own, capsys, tmp_path):
-    digest = hashlib.sha256(flight.with_name("power.txt").read_bytes()).hexdigest() if own else "ab" * 32
+    digest = hashlib.sha256(flight.with_name("power.txt").read_bytes()).hexdigest() if own == "log" else "ab" * 32
+    (log,) = ingest([flight.with_name("power.txt")], options=ReadOptions(timezone="America/New_York"))
+    frame = log.result.streams[0].frame
+    mark = mark_of(frame["time"].to_numpy(), frame["rss_db"].to_numpy())
     rows = [f"{a},{e},0,1" for a in range(0, 360, 90) for e in (90, 0, -90)]
-    head = [f"# trained_on: {digest}", "azimuth_deg,elevation_deg,gain_dbi,gain_sd_db"]
+    head = [
+        f"# trained_on: {digest}",
+        *([f"# marks: {mark}"] if own == "copy" else []),
+        "azimuth_deg,elevation_deg,gain_dbi,gain_sd_db",
+    ]
     (flight.parent / "frame.csv").write_text("\n".join([*head, *rows]) + "\n")
     link = "link: {rss: {carrier_hz: 3.3e9, uav: {antenna: {model: sphere, file: frame.csv}}}}\n"
     (flight.parent / "taught.yaml").write_text(flight.read_text() + link)

@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import ceil, floor
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,6 @@ from .proposals import (
     listed_places,
     propose,
     searching_airframe,
-    with_antennas,
 )
 
 
@@ -813,8 +813,8 @@ def _placement(
     site = site_place(context.options.site, context.folder)
     log = file.sha256, mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
     track = finder.levels(level, context.floor_db(level))
-    airframe = searching_airframe(site, log, track) if is_sounder_power(level) else None
-    return finder.propose(with_antennas(track, airframe), learned_towers(site, log, loses_lock=False), nodes)
+    antennas = learned_towers(site, log, loses_lock=False)
+    return finder.propose(track, antennas, nodes, partial(searching_airframe, site, log, track))
 
 
 def _doubt(entry: Mapping[str, Any], levels: Sequence[Stream], finder: NodeFinder, context: _Context) -> str:

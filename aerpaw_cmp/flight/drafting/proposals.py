@@ -210,6 +210,7 @@ class NodeFinder:
         track: LevelTrack,
         antennas: Mapping[str, Sequence[LearnedTower]] = MappingProxyType({}),
         nodes: Mapping[str, FloatArray] = MappingProxyType({}),
+        airframe: Callable[[], MeasuredPattern | None] = lambda: None,
     ) -> Placement | None:
         """Return the tower, listed position or estimated position that levels fit. None if there are too few levels.
 
@@ -220,6 +221,8 @@ class NodeFinder:
             Gains of towers and airframe that were learned from other flights, by tower.
         nodes : mapping of str to (3,)
             Positions of the nodes that were proposed for other logs of the flight [m].
+        airframe : callable
+            Returns the learned airframe that the levels support. It is searched if no tower fits without it.
         """
         if len(track.level_db) < FEWEST:
             return None
@@ -227,6 +230,9 @@ class NodeFinder:
         listed = [place for place in self.listed if self._near(place.latitude_deg, place.longitude_deg)]
         at = [np.asarray(tower.position_m) for tower in towers] + [self._local(place) for place in listed]
         odds = place_odds(track, np.array(at))
+        if odds[: len(towers)].max() < _TOWER_ODDS and (known_airframe := airframe()) is not None:
+            track = with_antennas(track, known_airframe)
+            odds = place_odds(track, np.array(at))
         odds_tower, odds_listed = odds[: len(towers)].copy(), odds[len(towers) :]
         # only for learned antennas, or if no tower fits, because the search is the slowest step
         estimate = locate(track) if any(antennas.values()) or odds_tower.max() < _TOWER_ODDS else None

@@ -11,6 +11,7 @@ import itertools
 import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
@@ -28,6 +29,7 @@ from ..common.yamlfile import nearest
 from ..logs.ingest import ROLLOVER_DAYS, Held, IngestedFile, ingest, named_log, read_log
 from ..logs.records import COLUMNS, Stream
 from ..propagation.geometry import Link
+from ..site.learned import read_learned
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
 from .clock import clock_trap
@@ -485,6 +487,7 @@ def gather(
             "link.rank: no bandwidth_hz: ranks count as in coverage down to the thermal noise of 1 Hz (-174 dBm)"
         )
     cautions = check_names(settings, site, [(series.tower, series.channel) for _, series in rss])
+    cautions += _unknown_receivers(settings, data.site_place)
     track = None
     if found.telemetry:
         path, telemetry = found.telemetry[0]
@@ -633,6 +636,18 @@ def _idle_channels(settings: FlightFile, channels: Sequence[str]) -> tuple[str, 
     idle = sorted((settings.link.channels.keys() & settings.lent) - {*channels})
     text = f"link.channels names {', '.join(idle)}, which no log of this flight has: these settings are not used."
     return (text,) if idle else ()
+
+
+def _unknown_receivers(settings: FlightFile, site: str | Path) -> tuple[str, ...]:
+    """Return a sentence about receivers of the flight file that the site has not learned. Empty if there are none."""
+    named = {log.receiver for log in settings.logs if log.receiver}
+    known: set[str] = set()
+    with suppress(InputError, UsageError):
+        entries = read_learned(site).entries if named else {}
+        known = {series.receiver or name for name, entry in entries.items() for series in entry.series}
+    new = ", ".join(sorted(named - known))
+    text = f"logs: receiver {new} is not a learned receiver ({', '.join(sorted(known))}), so it has no effect."
+    return (text,) if new and known else ()
 
 
 def _undated(data: FlightData, track: str) -> list[str]:

@@ -35,7 +35,7 @@ from ..propagation.geometry import (
 )
 from ..propagation.options import Diffraction
 from ..site.antennas import Isotropic
-from ..site.learned import LearnedAntenna, Written, read_pair, read_sphere_csv
+from ..site.learned import BAND, LearnedAntenna, Written, check_band, read_pair, read_sphere_csv
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -589,7 +589,7 @@ def joined(settings: FlightFile, learned: Path) -> FlightFile:
     Raises
     ------
     UsageError
-        If the file is not a calibrated.yaml, was edited, or does not fit this flight.
+        If the file is not a calibrated.yaml, was edited, does not fit this flight, or was learned in another band.
     """
     if learned.is_file():
         check_seal(learned)
@@ -602,6 +602,8 @@ def joined(settings: FlightFile, learned: Path) -> FlightFile:
     channels = dict(stated.get("link", {}).get("channels", {}))
     for name, channel in taught.items():
         before = {**rss_link, **channels.get(name, {})}
+        if {"carrier_hz"} <= before.keys() & channel.keys():
+            check_band(channel["carrier_hz"], before["carrier_hz"], BAND, f"{learned.name}: antennas of {name} ")
         # a learned 'tower' applies to every tower, but an entry of 'towers' would have priority
         towers = {} if "tower" in channel else before.get("towers", {})
         channels[name] = {**before, **channel, "towers": {**towers, **channel.get("towers", {})}}

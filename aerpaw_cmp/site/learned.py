@@ -483,10 +483,12 @@ def read_table(path: Path, expected: str, written: Written | None = None) -> byt
     InputError
         If the file is too large, damaged, or not as it was written.
     """
-    content = read_bounded(path, LARGEST_TABLE, expected)
+    missing = written is not None and not path.exists()
+    content = b"" if missing else read_bounded(path, LARGEST_TABLE, expected)
     if written is not None and hashlib.sha256(content).hexdigest() != written.sha256:
+        found = "is missing" if missing else "is not the one that was learned"
         raise InputError(
-            f"this table is not the one that was learned (SHA-256 {written.sha256[:12]}...)",
+            f"this table {found} (SHA-256 {written.sha256[:12]}...)",
             expected=f"{expected} as it was written; learn it again: {written.command}",
             cause="an edited table, or a calibration that was killed while it wrote",
             path=path,
@@ -993,7 +995,7 @@ def learned_antenna(named: Named, end: str, carrier_hz: float) -> tuple[Path, Le
     series = named.antenna(end, carrier_hz)
     if series is None:
         raise UsageError("the entry has no such antenna", expected="one that the entry has")
-    _check_band(series.carrier_hz, carrier_hz, AIRFRAME_BAND if end == "uav" else BAND)
+    check_band(series.carrier_hz, carrier_hz, AIRFRAME_BAND if end == "uav" else BAND)
     file = series.uav_file if end == "uav" else series.tower_file
     path, written = named.folder / file, named.written(file)
     check_logs(read_sphere_csv(path, written).trained_on, named, path)
@@ -1023,10 +1025,11 @@ def _airframe_spread(errors: Errors | None, spread: LearnedSpread) -> LearnedSpr
     return spread.model_copy(update={"own_sd_db": round(max(own_db2, spread.own_sd_db**2) ** 0.5, 3)})
 
 
-def _check_band(learned_hz: float, used_hz: float, band: float) -> None:
+def check_band(learned_hz: float, used_hz: float, band: float, key: str = "") -> None:
+    """Raise UsageError if antennas are used at a carrier that differs by more than a share ``band`` of theirs."""
     if abs(used_hz / learned_hz - 1.0) > band:
         raise UsageError(
-            f"learned at {learned_hz / 1e9:g} GHz, used at {used_hz / 1e9:g} GHz",
+            f"{key}learned at {learned_hz / 1e9:g} GHz, used at {used_hz / 1e9:g} GHz",
             expected=f"a carrier within {100 * band:g} %: farther bands were not compared",
         )
 
@@ -1048,7 +1051,7 @@ def receiver_file(named: Named, carrier_hz: float) -> Path:
     InputError
         If the table is damaged, or was learned from logs that its entry does not name.
     """
-    _check_band(named.entry.receivers[0].carrier_hz, carrier_hz, BAND)
+    check_band(named.entry.receivers[0].carrier_hz, carrier_hz, BAND)
     path = named.folder / named.entry.receivers[0].file
     with parsing(path, "a rank receiver"):
         content = json.loads(read_table(path, "a rank receiver", named.written(path.name)))

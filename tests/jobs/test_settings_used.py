@@ -74,6 +74,18 @@ def test_calibrated_antennas_come_before_those_of_the_flight(tmp_path: Path, cap
     same, metrics = report(path, "idle", "--with", str(learned))
     assert changed_channels(own, same) == set()
     assert "link.channels names C, which no log of this flight has" in metrics["warnings"][0]
+    learned.write_text(yaml.safe_dump({"link": {"channels": {"A": {"carrier_hz": 2.4e9, "uav": dipole}}}}))
+    assert main(["report", str(path), "--with", str(learned), "-o", str(tmp_path / "band")]) == 2
+    assert "antennas of A learned at 2.4 GHz, used at 3.3 GHz" in capsys.readouterr().err
+
+
+def test_a_receiver_that_the_site_has_not_learned_is_a_caution(tmp_path: Path) -> None:
+    path = write_flight(tmp_path)
+    content = yaml.safe_load(path.read_text())
+    content["logs"][-1]["receiver"] = "dataset13"
+    path.write_text(yaml.safe_dump(content))
+    _, metrics = report(path, "unknown")
+    assert metrics["warnings"][0].startswith("logs: receiver dataset13 is not a learned receiver (aadm, ")
 
 
 def test_an_antenna_of_another_band_is_the_first_caution(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

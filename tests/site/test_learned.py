@@ -182,7 +182,7 @@ NOT_AS_WRITTEN = "is not the one that was learned"
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(b"", NOT_AS_WRITTEN), (b"\xff\xfe\x00", NOT_AS_WRITTEN), (TURNED, NOT_AS_WRITTEN), (None, "cannot be read")],
+    [(b"", NOT_AS_WRITTEN), (b"\xff\xfe\x00", NOT_AS_WRITTEN), (TURNED, NOT_AS_WRITTEN), (None, "is missing")],
 )
 @pytest.mark.parametrize("end", ["uav", "LW1.A"])
 def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: bytes | None, said: str) -> None:
@@ -197,7 +197,8 @@ def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: b
         table.write_bytes(content)
     settings = load_with_learned(flight(folder, {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}))
     assert {caution.key for caution in settings.cautions} == {f"antennas.{end}"}
-    assert all(said in caution.text for caution in settings.cautions)
+    assert all(f"{said} (SHA-256" in caution.text for caution in settings.cautions)
+    assert all("learn it again: aerpaw-cmp calibrate" in caution.text for caution in settings.cautions)
     assert all(caution.text.endswith("an isotropic antenna is used instead") for caution in settings.cautions)
     link = settings.link.of("A").build(["LW1"], Path("/nowhere"))
     learned = {"LW1.A": link.tower_arrays["LW1"].patterns[0], "uav": link.uav_array.patterns[0]}

@@ -83,8 +83,6 @@ _ON_GROUND_M = 3.0
 # A sample is scored by the nearest predicted time within this [s], or within half of the prediction's step.
 _NEAR_S = 0.5
 
-EMULATED = "emulated flight"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForeignPrediction:
@@ -94,8 +92,6 @@ class ForeignPrediction:
     ----------
     path : Path
         The file or folder.
-    program : str
-        Program that wrote the file, if it is known.
     quantity : str
         One of :data:`QUANTITIES`, as in the file. Empty if only ranks are predicted.
     table : DataFrame
@@ -118,7 +114,6 @@ class ForeignPrediction:
     """
 
     path: Path
-    program: str
     quantity: str
     table: pd.DataFrame
     sha256: str = ""
@@ -198,8 +193,8 @@ def _predicted_unit(path: Path, data: FlightData) -> str:
 
 
 # --- formats -------------------------------------------------------------------------------------------------------
-# Each function returns a table with the column names of the file. Its attributes are the fields ``program``,
-# ``remarks`` and ``unit`` of the prediction.
+# Each function returns a table with the column names of the file. Its attributes are the fields ``remarks`` and
+# ``unit`` of the prediction.
 
 
 def _csv(content: bytes, path: Path) -> pd.DataFrame:
@@ -209,7 +204,6 @@ def _csv(content: bytes, path: Path) -> pd.DataFrame:
         )
     _check_rows(len(frame))
     frame.columns = [str(name).strip().lower() for name in frame.columns]
-    frame.attrs = {"program": "CSV"}
     return frame
 
 
@@ -257,7 +251,7 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
                 after = pd.to_timedelta(columns["time_s"], unit=size.strip().lower())  # type: ignore[call-overload]
                 columns["time"] = np.asarray(pd.to_datetime(start, utc=True) + after)
     frame: pd.DataFrame = pd.DataFrame(columns)
-    frame.attrs = {"program": str(notes["attributes"].get("source", "NetCDF")), "remarks": remarks}
+    frame.attrs = {"remarks": remarks}
     return frame
 
 
@@ -284,7 +278,7 @@ def _radio_map(content: bytes, path: Path) -> pd.DataFrame:
         tower=towers, path_loss_db=-db_from_power(gain.ravel())
     )
     remark = "The cell centres of the radio map are taken as east, north and up of the site [m]."
-    frame.attrs = {"program": "radio map (.npz)", "remarks": (remark,)}
+    frame.attrs = {"remarks": (remark,)}
     return frame
 
 
@@ -302,7 +296,7 @@ def _emulated(folder: Path, data: FlightData) -> pd.DataFrame:
     )
     # a hover has many levels at one position: their mean is what the emulator predicts there
     frame: pd.DataFrame = every.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False).mean()
-    frame.attrs = {"program": EMULATED, "unit": ", ".join(sorted({s.unit for s in twin.rss}))}
+    frame.attrs = {"unit": ", ".join(sorted({s.unit for s in twin.rss}))}
     return frame
 
 
@@ -473,7 +467,7 @@ class SeriesVerdict:
     matched, unmatched : int
         Samples of the flight with and without a prediction nearby.
     floor_db : float, optional
-        Detection floor that the predicted levels show (an emulated receiver).
+        Detection floor that the predicted levels show, such as those of an emulated receiver.
     cards : mapping of str to LevelCard
         By model, the prediction first, then ray tracing and the baselines, on the same samples. A model with too few
         levels has no card.
@@ -545,7 +539,6 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     score: dict[str, Any] = json_safe({
         "prediction": name,
         "sha256": given.sha256,
-        "program": given.program,
         "fitted_on_this_flight": ["the offset of each model and channel"],
         "sentence": _sentence(given, series, common, means) if series else f"{name}: ranks only.",
         "remarks": remarks,
@@ -553,7 +546,7 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
         "levels": {s.tower: {other.channel: other for other in series if other.tower == s.tower} for s in series},
         "nodes": [
             {"series": f"{s.tower} {s.channel}", "offset_db": s.cards[name].offset_db, "slope": s.cards[name].slope,
-             "floor_db": s.floor_db} for s in series if given.program == EMULATED
+             "floor_db": s.floor_db} for s in series
         ],
         "rank": ranks,
     })  # fmt: skip
@@ -598,12 +591,12 @@ def _sentence(
 def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> SeriesVerdict | None:
     """Return the cards of one tower and channel. None if too few samples have a prediction."""
     part = split_by_series(given.table, item.tower, item.channel)
+    if given.quantity == "path_loss_db":
+        link = next(s.link for s in data.rss if (s.tower, s.channel) == (item.tower, item.channel))
+        part = part.assign(**{key: link.transmit_power_dbm + part[key] for key in _LEVELS})
     heading_deg = item.geometry.get("heading_deg")
     predicted, near = predicted_at(given, part, item.time, item.position_m, heading_deg)
     near &= item.posed
-    if given.quantity == "path_loss_db":
-        link = next(s.link for s in data.rss if (s.tower, s.channel) == (item.tower, item.channel))
-        predicted |= {key: link.transmit_power_dbm + predicted[key] for key in _LEVELS}
     level, heard, absolute = predicted["level"], np.isfinite(item.measured_db), given.absolute(item.unit)
     scored = near & heard & np.isfinite(level)
     if scored.sum() < FEWEST:

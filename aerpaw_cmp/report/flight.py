@@ -303,8 +303,8 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
         ], look="dense",
     )  # fmt: skip
     nodes = Table(
-        caption="The emulator at each node: offset (added to the measurement), slope of measured over emulated level "
-        "(1 if both change equally), and detection floor (the lowest emulated level, if it repeats).",
+        caption="The prediction at each channel: offset (added to the measurement), slope of measured over predicted "
+        "level (1 if both change equally), and detection floor (the lowest predicted level, if it repeats).",
         columns={"Tower, channel": HEAD, "Offset [dB]": 1, "Slope": 2, "Detection floor [dB]": 1},
         rows=[list(node.values()) for node in verdict["nodes"]],
     )

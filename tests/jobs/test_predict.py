@@ -20,7 +20,7 @@ from aerpaw_cmp.jobs import predict, sources
 from aerpaw_cmp.jobs.calibrate import observe
 from aerpaw_cmp.jobs.calibrate_rank import rank_samples
 from aerpaw_cmp.jobs.flight_run import run_flight
-from aerpaw_cmp.jobs.referee import EMULATED, judge, read_foreign
+from aerpaw_cmp.jobs.referee import judge, read_foreign
 from aerpaw_cmp.jobs.sources import TargetOptions, Targets, find_targets, named_flights
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.propagation.geometry import Link, rotation_from_aircraft, single_element
@@ -391,8 +391,7 @@ def test_offset_slope_and_floor_of_each_node_of_an_emulator(said, flown):
         folder / "twin.csv", index=False
     )
     given = read_foreign(folder / "twin.csv", data)
-    assert judge(given, data, flown[1])["nodes"] == []  # only an emulator has nodes
-    verdict = judge(dataclasses.replace(given, program=EMULATED), data, flown[1])
+    verdict = judge(given, data, flown[1])
     (node,) = verdict["nodes"]
     measured, level = item.measured_db[heard], emulated[heard]
     assert node["series"] == "LW1 USRP1"
@@ -400,7 +399,11 @@ def test_offset_slope_and_floor_of_each_node_of_an_emulator(said, flown):
     assert node["slope"] == pytest.approx(np.polyfit(level, measured, 1)[0], abs=1e-6)
     assert node["floor_db"] == pytest.approx(level.min(), abs=1e-9)
     page = str(referee_card(SimpleNamespace(extra_metrics={"referee": [verdict]})))
-    assert "The emulator at each node" in page
+    assert "The prediction at each channel" in page
+    loss = pd.read_csv(folder / "twin.csv").assign(path_loss_db=data.rss[0].link.transmit_power_dbm - emulated[heard])
+    loss.drop(columns="level_db").to_csv(folder / "loss.csv", index=False)
+    (lossy,) = judge(read_foreign(folder / "loss.csv", data), data, flown[1])["nodes"]
+    assert lossy == pytest.approx(node)  # a loss has the floor of its level
     assert str(node["offset_db"]) in page
 
 

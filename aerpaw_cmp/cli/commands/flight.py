@@ -92,7 +92,7 @@ def _print_cards(verdict: Mapping[str, Any]) -> None:
     title = f"{verdict['prediction']} and other models on the same samples, means over channels (each in card.json)"
     records(verdict["means"], columns, title)
     columns = {"series": "series", "offset dB": "offset_db:.1f", "slope": "slope:.2f", "floor dB": "floor_db:.1f"}
-    title = "Emulator: offset (added to the measurement), slope of measured over emulated level, detection floor"
+    title = "Offset (added to the measurement), slope of measured over predicted level, detection floor"
     records(verdict["nodes"], columns, title)
     for remark in verdict["remarks"]:
         say.warn(remark)

@@ -77,6 +77,9 @@ _MOST_BYTES, _MOST_ROWS = 4 * LARGEST_TABLE, 5_000_000
 # A prediction is refused as a prediction of another area if all its positions are farther from the site's origin [m].
 _FAR_M = 50_000.0
 
+# A larger level or loss [dB] is a fill value: no link of radios loses 400 dB.
+_MOST_DB = 400.0
+
 # Positions that are all closer than this to the height of the take-off ground are not a flight [m].
 _ON_GROUND_M = 3.0
 
@@ -403,6 +406,8 @@ def _check_numbers(table: pd.DataFrame, quantity: str) -> None:
     linear = len(level) > 0 and level.min() > 0.0 and level.max() < 1.0
     loss = "a loss above 0 dB" if quantity == "path_loss_db" else f"received levels as {quantity}"
     for wrong, found, expected, cause in (
+        (level.abs().max() > _MOST_DB, f"a level of {level.min():g} to {level.max():g} dB",
+         "an empty cell where nothing is received", "a fill value for no signal"),
         (linear, median, loss, "a linear gain or power in watts or milliwatts; 10 log10(gain), or 10 log10(P / 1 mW), "
          "is in decibels"),
         (quantity == "level_dbm" and middle > 30.0, median, loss, "a path loss (path_loss_db), or a missing sign"),

@@ -444,6 +444,7 @@ def test_a_channel_with_too_few_predictions_is_named(said, flown):
         (lambda f: f.assign(rank=7), "ranks that are not 0 to 4"),
         (lambda f: f.assign(p_rank1=0.9, p_rank2=0.9, p_rank3=0.0, p_rank4=0.0), "another sum than 1"),
         (lambda f: f.assign(level_db=f["level_db"].map("{:.1f}".format).str.replace(".", ",")), "no level or rank, but"),
+        (lambda f: f.assign(level_db=f["level_db"].where(f.index % 9 > 0, -999.0)), "a level of -999 to .*fill value"),
         (lambda f: f.assign(level_db="n/a"), "no level or rank, but nan; expected numbers with a decimal point"),
         (lambda f: f[:0], "no level or rank; expected"),
         (lambda f: f.assign(tower=np.nan), "towers without names; expected towers of the flight"),

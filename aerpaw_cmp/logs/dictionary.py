@@ -174,7 +174,8 @@ def plain(name: str) -> str:
 
 _BRACKETS = re.compile(r"[\[(]([^\[\]()]{1,24})[\])]")
 _BRACKET = re.compile(_BRACKETS.pattern + r"\s*$")
-_CAMEL_UNIT = re.compile(r"(?<=[a-z])(Ft|Feet|Meters|Metres|Cm|Mm|Km|Rad|Deg|Degrees|Dbm|Mps|Mph)(?![a-z])")
+# The words of 'RsrpDbm', but not of 'dBm' and 'eNB'.
+_CAMEL = re.compile(r"(?<=[a-z])(?<!\b[a-z])(?<!_[a-z])(?=[A-Z])")
 _A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5\u03bc%\u00b0]{1,7}(/[a-z]{1,3})?")
 
 
@@ -202,7 +203,7 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
         return None
     if texts[0] == plain(name):
         # 'Time (+02:00)'; 'heightAboveGround'
-        texts += [bare, plain(in_brackets(name)[2]), plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name))]
+        texts += [bare, plain(in_brackets(name)[2]), plain(_CAMEL.sub(" ", name))]
     texts = [_JOINED.sub(r"neighbour \1 ", text).replace("  ", " ") for text in dict.fromkeys(texts)]
     hits = ((row, text) for text in texts for form, row in _forms() if form.search(text))
     row, text = next(hits, (None, ""))
@@ -301,7 +302,7 @@ def without_unit(name: str) -> tuple[str, str]:
     unit, _zone, rest = in_brackets(name)
     if unit:
         return plain(rest) if is_unit(unit) else plain(name), unit
-    words = plain(_CAMEL_UNIT.sub(r" \1", name))
+    words = plain(_CAMEL.sub(" ", name))
     end = re.fullmatch(r"(.+?)(?: ?1?)(e ?[67])", words)
     if end is not None:
         return end[1], end[2].replace(" ", "")
@@ -515,7 +516,7 @@ def names_a_cell(words: str, *, alone: bool = False) -> bool:
 
 def like_levels(names: Iterable[str]) -> list[str]:
     """Return the unknown names that may be levels, except electric power next to a voltage."""
-    words = {name: plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)) for name in names}
+    words = {name: plain(_CAMEL.sub(" ", name)) for name in names}
     electric = any(re.search(r"volt|batt|\bcurrent", text) for text in words.values())
     return [
         name for name, text in words.items()
@@ -558,6 +559,8 @@ def described(
     for name, bare in own:
         forms = (re.sub(form, word, bare) for form, word in words.items() if re.fullmatch(form, bare))
         common = next(forms, bare)
+        if common == bare and not meaning(bare) and meaning(name):
+            bare = common = plain(_CAMEL.sub(" ", name))  # 'RecordedAt' is 'recorded at'
         what = meaning(name, None if common == bare else common)
         if what is not None and what.quantity.name == "quality" and common == bare:
             what = None  # only AERPAW's sounder has a quality in dB, other link qualities are percentages

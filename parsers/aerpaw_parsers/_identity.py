@@ -187,32 +187,55 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
     unknown = [
         i for i, m in enumerate(sheet.meanings) if m is None and i not in marks and not _OTHERS.search(sheet.plain[i])
     ]
+    found: list[int] = []
     while (repeated := table.duplicated().mean()) >= _REPEATED:
         # add the column that leaves the fewest rows with the same time and key, then look for another column
         left = {i: table.assign(mark=sheet.texts(i)).duplicated().mean() for i in unknown if _few(sheet.texts(i))}
         best = min(left, key=lambda i: left[i], default=-1)
         if best < 0 or left[best] > repeated - _REPEATED / 2:
             break
-        marks.append(best)
+        found.append(best)
         unknown.remove(best)
         table[str(best)] = sheet.texts(best)
-    if key == "network" and unknown:
-        names = ("RSRP", "RSSI", "SNR", "SINR", "power") if level is None else ()
-        level = next((i for name in names if (i := sheet.find(name)) is not None), level)
+    names = ("RSRP", "RSSI", "SNR", "SINR", "power") if level is None else ()
+    level = next((i for name in names if (i := sheet.find(name)) is not None), level)
+    if found and not _name_sources(table, [str(i) for i in found], None if level is None else sheet.numbers(level)):
+        shown = ", ".join(repr(sheet.names[i]) for i in found)
+        rows.warnings.append(f"column {shown}: rows of one time differ in its values, but {_ASKED}")
+        found = []
+    marks += found
+    if key == "network" and unknown and level is not None:
         # compare rows of one known key, because a cell number that belongs to one PCI adds no information
         same = _of_one_key(table.drop(columns=["time", "levels"]))
         part, time = sheet.part(same), rows.time[same]
-        if level is None:
-            return marks
         for i in unknown:
             alternates, in_turns = _alternates(time, part, i, level)
             marks += [i] if in_turns else []
             if alternates and not in_turns:
-                rows.warnings.append(
-                    f"column {sheet.names[i]!r}: the level changes with its values from row to row, but not in a "
-                    "fixed order: does it name the device or cell of a row? If so, call it 'device'"
-                )
+                text = f"column {sheet.names[i]!r}: the level changes with its values from row to row"
+                rows.warnings.append(f"{text}, but {_ASKED}")
     return marks
+
+
+_ASKED = "not in a fixed order: does it name the device or cell of a row? If so, call it 'device'"
+
+
+def _name_sources(table: pd.DataFrame, found: list[str], level: FloatArray | None) -> bool:
+    """Check whether columns that distinguish rows of one time name sources, unlike a temperature or a counter.
+
+    Most sources have one row at each time, or the level of a source changes less than that between sources.
+    """
+    key = [name for name in table if name not in ("time", "levels", *found)]
+    groups = [group for _, group in table.groupby(key)] if key else [table]
+    places = sum(group["time"].nunique() * len(group[found].drop_duplicates()) for group in groups)
+    filled = (~table.duplicated()).sum() / places
+    if table.duplicated().mean() <= _MOST_DOUBLE and filled >= _REPEATED:
+        return True
+    if level is None:
+        return False
+    known = table.assign(level=level).sort_values("time", kind="stable")
+    within, between = (known.groupby(names)["level"].diff().abs().median() for names in ([*key, *found], ["time"]))
+    return bool(within < _SMALLER * between)
 
 
 def _of_one_key(table: pd.DataFrame) -> BoolArray:
@@ -224,7 +247,7 @@ def _of_one_key(table: pd.DataFrame) -> BoolArray:
 
 
 _CELL = ("PCI", "ARFCN", "technology", "device", "network")
-_REPEATED, _MOST_MARKS = 0.3, 16
+_REPEATED, _MOST_MARKS, _MOST_DOUBLE = 0.3, 16, 0.1
 
 
 def _few(texts: Iterable[str]) -> bool:

@@ -42,7 +42,9 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
             text = "positions on a grid or in one text are not read: add columns of latitude and longitude"
             rows.warnings.append(f"column {sheet.names[grid]!r}: {text}")
         return None
-    pairs = [*zip(*(_alike(sheet, name) for name in PLACE[:2]), strict=False)]
+    # 'rx lat' belongs to 'rx long', in any order of the columns
+    latitudes, longitudes = ({_PLACE.sub("", sheet.plain[i]): i for i in _alike(sheet, name)} for name in PLACE[:2])
+    pairs = [(i, longitudes[rest]) for rest, i in latitudes.items() if rest in longitudes]
     if len(pairs) > 1:
         spans_deg = [max(np.nanmax(angle) - np.nanmin(angle) for angle in map(sheet.numbers, pair)) for pair in pairs]
         moving = [pair for pair, span_deg in zip(pairs, spans_deg, strict=True) if span_deg > _AT_REST_DEG]
@@ -78,6 +80,7 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
     return rows.stream("telemetry", name, values, where=where, source=source, about=about)
 
 
+_PLACE = re.compile(r"\b(lat|latitude|lon|lng|long|longitude)\b")
 # A receiver at rest seems to move by less than this, about 20 m.
 _AT_REST_DEG = 2e-4
 

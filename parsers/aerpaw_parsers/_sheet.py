@@ -767,7 +767,8 @@ def _to_utc(timed: Rows, sheet: Sheet, column: int | None) -> None:
     """Convert times in place to UTC if the name of their column has a scale without leap seconds."""
     words = {*(() if column is None else sheet.plain[column].split())}
     scale = next((scale for scale in _stamps.SCALES_S if scale in words), None)
-    if scale is None or timed.relative or any("leap seconds" in text for text in timed.warnings):
+    zoned = column is not None and any(_ZONED.search(text) for text in sheet.texts(column)[:3])
+    if scale is None or zoned or timed.relative or any("leap seconds" in text for text in timed.warnings):
         return
     timed.time = timed.time - np.timedelta64(_stamps.SCALES_S[scale], "s")
     timed.warnings.append(f"the times are {scale.upper()}: {_stamps.SCALES_S[scale]} s were subtracted to get UTC")
@@ -893,6 +894,7 @@ def _zone_column(sheet: Sheet, column: int, zone: str, texts: list[str], options
 
 # Names of times since the start of a log, which may be written like times of the day.
 _ELAPSED = re.compile(r"^(rel|relative|elapsed|up) ?time")
+_ZONED = re.compile(r":\d\d(?:\.\d+)?(?:Z|[+-]\d\d:?\d\d)$")
 # Epochs, and times with an offset.
 _DATED = re.compile(r"\d{9,}[.,]?\d*|.*\d(?:Z|[+-]\d\d:?\d\d)")
 _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")

@@ -21,7 +21,7 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.readers import NUMBER, TIME, ZONE, Reader, ReadOptions, ReadResult, Rows, counted, matched, mostly
+from aerpaw_cmp.readers import BOM, NUMBER, TIME, ZONE, Reader, ReadOptions, ReadResult, Rows, counted, matched, mostly
 
 _NUMBERS = (
     "index", "longitude", "latitude", "altitude", "pitch", "yaw", "roll", "north", "east", "down", "volt", "fix",
@@ -59,10 +59,12 @@ _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while t
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether most of the first lines are telemetry rows."""
-    return mostly(head, _ROW) or mostly(head, _LONGER)
+    """Check whether most of the first lines are telemetry rows, and no header names other columns."""
+    return (mostly(head, _ROW) or mostly(head, _LONGER)) and (not _WORDS.match(head) or _TITLE.match(head) is not None)
 
 
+# A header: at least eight names.
+_WORDS = re.compile(BOM + rb"(?:\s*[\"']?[A-Za-z_][^,\n]*,){7}")
 _TITLE = re.compile(rb"(?i)(?:\xef\xbb\xbf)?\s*[\"']?(?:num|number|line_?num|index|id|no\.?)[\"']?\s*,.*lon.*")
 
 

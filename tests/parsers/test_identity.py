@@ -195,3 +195,14 @@ def test_words_of_gimbals_and_towers_do_not_hide_a_level(name: str, tmp_path: Pa
 def test_a_share_of_packets_is_no_level_and_the_antenna_in_use_no_source(names: str, tmp_path: Path) -> None:
     rows = [f"{-70 - 2 * (i // 5 % 2)},100,9,{i % 2}" for i in range(30)]
     assert levels_by_cell(tmp_path / "x.csv", names, rows) == [[-72, -70]]
+
+
+@pytest.mark.parametrize("level", [lambda i: -70 - i % 5, lambda i: -70 - 20 * (i * i % 11 % 2)])
+def test_a_temperature_in_rows_of_one_second_is_no_source_and_a_name_is_one(
+    level: Callable[[int], int], tmp_path: Path
+) -> None:
+    """The stamps have whole seconds. A name whose level stays while others differ names a source."""
+    lines = [f"{1749564000 + i // 10},11,{level(i)},{i * i % 11}" for i in range(200)]
+    result = read(tmp_path / "x.csv", "timestamp,pci,rsrp,spot\n" + "\n".join(lines) + "\n")
+    asked = any("'spot'" in text and "does it name the device" in text for text in result.warnings)
+    assert ([stream.rows for stream in result.streams] == [200]) is asked is (level(1) == -71)

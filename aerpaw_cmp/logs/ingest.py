@@ -411,9 +411,8 @@ def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: R
             path=path,
         )
     if reader is None and head:
-        reader = identify(
-            head, path=str(path)
-        )  # identify the file before reading the rest, because folders contain large files of other kinds
+        # identify the file before reading the rest, because folders contain large files of other kinds
+        reader = identify(head, path=str(path))
     pointer = head.startswith(b"version https://git-lfs")
     if reader is not None and head.strip() and not pointer and (file := _in_pieces(place, reader, options)) is not None:
         return file
@@ -644,9 +643,8 @@ def _join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
 
 def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
     """Join pieces into one log that contains the lines of all pieces, one after the other."""
-    pieces = sorted(
-        file.sha256 for file in group
-    )  # sorted, so that the digest does not depend on the names of the pieces
+    # sorted, so that the digest does not depend on the names of the pieces
+    pieces = sorted(file.sha256 for file in group)
     digest = hashlib.sha256("".join(pieces).encode()).hexdigest()
     before = 0
     parts: dict[tuple[str, str], list[tuple[Stream, pd.DataFrame]]] = {}

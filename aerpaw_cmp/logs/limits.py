@@ -484,14 +484,10 @@ class _Check:
         apart_db = (at_once["max"] - at_once["min"])[at_once["size"] > 1]
         if not turns and (2 * len(apart_db) < len(at_once) or apart_db.median() < _AT_ONCE_DB):
             return
-        how = (
-            f"{step:.0f} dB apart from record to record"
-            if turns
-            else f"{apart_db.median():.0f} dB apart at the same time"
-        )
+        apart, when = (step, "from record to record") if turns else (apart_db.median(), "at the same time")
         self._said.append(
-            f"{self._what}: its levels alternate, {how}: several devices, SIMs or networks in one series, without a "
-            "known column that names them"
+            f"{self._what}: its levels alternate, {apart:.0f} dB apart {when}: several devices, SIMs or networks in "
+            "one series, without a known column that names them"
         )
 
     def _near_in_time(self) -> None:

@@ -138,9 +138,8 @@ def _elements(data: bytes, at: int, order: str, *, padded: bool, cut: bool = Fal
                 raise _damaged("it ends inside a tag")
             return
         kind, size = struct.unpack_from(order + "II", data, at)
-        if (
-            padded and kind >> 16
-        ):  # in a small element, size and type share the first word, and the bytes are in the second word
+        # in a small element, size and type share the first word, and the bytes are in the second word
+        if padded and kind >> 16:
             size, kind = kind >> 16, kind & 0xFFFF
             if size > 4:
                 raise _damaged("a small element of more than 4 bytes")

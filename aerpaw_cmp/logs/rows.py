@@ -180,7 +180,7 @@ class Rows:
                 name = f"{stream.name}_again{alike}" if alike else stream.name
                 names[name] = replace(stream, name=name) if alike else stream
         present = tuple(names.values())
-        back = [text for stream in present[:1] for text in _text.back_in_time(_text.steps_back(stream.frame))]
+        back = [text for stream in present[:1] for text in _text.back_in_time(stream.frame)]
         return ReadResult(
             reader=self.reader,
             streams=present,

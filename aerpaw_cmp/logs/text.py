@@ -687,13 +687,9 @@ def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Att
     return {name: value for name, value in merged.items() if value is not None}
 
 
-def steps_back(records: pd.DataFrame) -> int:
-    """Count the places where the clock of a log runs backwards."""
+def back_in_time(records: pd.DataFrame) -> list[str]:
+    """Return a warning if the clock of a log runs backwards anywhere."""
     time = records["time"].to_numpy()
     # NaT compares as False
-    return int(np.count_nonzero(time[1:] < time[:-1]))
-
-
-def back_in_time(places: int) -> list[str]:
-    """Return a warning if there are such places."""
+    places = int(np.count_nonzero(time[1:] < time[:-1]))
     return [f"time steps back at {counted(places, 'place')}"] if places else []

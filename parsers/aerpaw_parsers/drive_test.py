@@ -177,9 +177,8 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
             continue
         levels = {key: home for key, home in cells.items() if "rsrp_dbm" in home.columns}
         homes = [home for key, home in levels.items() if key[1] == role and (not rat or key[0] in ("", rat))]
-        if (
-            "pci" in cell.columns and role == "serving" and not homes
-        ):  # the PCI may belong to a single level such as 'rsrp1' or 'RSRP[0]'
+        # the PCI may belong to a single level such as 'rsrp1' or 'RSRP[0]'
+        if "pci" in cell.columns and role == "serving" and not homes:
             near = [home for home in levels.values() if not home.place.startswith("n")]
             homes = [home for home in near if not rat or home.rat in ("", rat)]
         if len(homes) == 1:

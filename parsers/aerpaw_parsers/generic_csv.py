@@ -106,9 +106,8 @@ def _is_of(quantity: dictionary.Quantity, name: str, unit: str | None) -> bool:
         return quantity.role == "rss" or (quantity.unit == "dB" and unit != "dBm")
     if name == "ri_raw":
         return quantity.role == "rank"
-    of_axes = quantity.role == "velocity" and name.startswith(
-        "velocity"
-    )  # 'vx' is the velocity to the east if x is east
+    # 'vx' is the velocity to the east if x is east
+    of_axes = quantity.role == "velocity" and name.startswith("velocity")
     return name not in COLUMNS["telemetry"] or quantity.name in (name, *_NO_POSE) or of_axes
 
 

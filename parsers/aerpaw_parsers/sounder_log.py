@@ -292,7 +292,7 @@ def _stream(log: _Piece, repeats: _Samples, options: ReadOptions, warnings: list
         _text.add_flag(flag, samples.line == log.torn, _text.UNTERMINATED)
     samples.line += 1
     frame = _text.frame("rss", instants.time, samples.line, flag, {"rss_db": samples.value}, own=True)
-    warnings += [*instants.warnings, *_text.back_in_time(_text.steps_back(frame))]
+    warnings += [*instants.warnings, *_text.back_in_time(frame)]
     named = _NAMED.search(options.file_name.lower())
     if named is None and options.channel is None:
         warnings.append(

@@ -780,11 +780,11 @@ def nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) -
 
 def _idle_attitude(data: FlightData) -> tuple[str, ...]:
     """Return warnings if ``rt.attitude`` has no effect or only a partial one."""
-    mode = data.settings.rt.attitude
-    if mode == "ignored":
-        return ()
     messages = []
     for kind, series in data.series:
+        mode = data.settings.rt.attitude if kind == "rank" else data.settings.rss_attitude
+        if mode == "ignored":
+            continue
         tower, time = series.tower, series.time
         pose = None if data.track is None else data.track.pose_at(time)
         known = 0 if pose is None else int((pose.attitude_known if mode == "logged" else pose.valid).sum())

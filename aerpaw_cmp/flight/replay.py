@@ -151,7 +151,7 @@ def replay_rss(
         link = data.link_of(data.rss[members[0]])
         times = [telemetry_time(data.rss[i].time, shifts[i]) for i in members]
         valid, places, tracks = _towers_and_poses(data, tower, times)
-        poses = [valid_poses(track, rt.attitude) for track in tracks]
+        poses = [valid_poses(track, data.settings.rss_attitude) for track in tracks]
         joined = poses[0] if len(poses) == 1 else Poses(
             np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses])
         )  # fmt: skip
@@ -301,7 +301,7 @@ def _levels_along(
     """Yield levels of three models, distance and directions at times (n,) per link. Links differ only in antennas."""
     place, known = data.tower_at(tower, instants)
     track = data.poses_at(instants).where(known)
-    poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
+    poses, depth = valid_poses(track, data.settings.rss_attitude), min(data.settings.rt.max_depth, 1)
     field = Field(path_loss(data.site, data.settings.rt, links[0].carrier_hz))
     # directions at both ends, because gains over direction are fitted together with the lag
     line = track.position_m - place

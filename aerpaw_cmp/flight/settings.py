@@ -484,6 +484,17 @@ class FlightFile(StrictModel):
         return self._cautions
 
     @property
+    def rss_attitude(self) -> str:
+        """The attitude with which levels are replayed: ``rt.attitude``.
+
+        If the flight file does not state it and an airframe is learned, it is ``logged``, because the gain of an
+        airframe belongs to directions in its own axes.
+        """
+        links = (self.link.rss, *self.link.channels.values())
+        learned = any(link.uav.antenna.learned is not None for link in links)
+        return "logged" if learned and "attitude" not in self.rt.model_fields_set else self.rt.attitude
+
+    @property
     def lent(self) -> frozenset[str]:
         """The channels of ``link.channels`` from a calibration or an override, which this flight may not have."""
         return self._lent

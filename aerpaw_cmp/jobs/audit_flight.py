@@ -89,7 +89,7 @@ def audit_replays(
         paths=sum(len(r.replay.paths) for r in replays),
         settings={
             "max_depth": rt.max_depth,
-            "attitude": rt.attitude,
+            "attitude": data.settings.rss_attitude if data.rss else rt.attitude,
             "foliage": rt.foliage,
             "samples": max((r.replay.samples for r in replays), default=0) or rt.advanced.samples,
         },
@@ -237,7 +237,7 @@ def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> 
 
 def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudit:
     """Compare rotations of the track at telemetry times with those from the logged angles."""
-    mode = data.settings.rt.attitude
+    mode = data.settings.rss_attitude
     if mode == "ignored" or data.track is None:
         turned_anyway = any(np.abs(r.poses.rotation - np.eye(3)).max(initial=0.0) > 0 for r in replays)
         moved = mode == "ignored" and turned_anyway

@@ -97,6 +97,9 @@ def channel_parts(
     """
     stages, remarks = stages or Stages(), list[str]()
     name, link_settings = _chosen_link(data.settings, chosen)
+    if name != "rank":
+        rt = data.settings.rt.model_copy(update={"attitude": data.settings.rss_attitude})
+        data = replace(data, settings=data.settings.changed({"rt": rt}))
     towers = _chosen_towers(data, chosen, remarks)
     offsets = _offsets_hz(chosen, link_settings.carrier_hz)
     link = link_settings.build(towers, data.folder)

@@ -222,7 +222,7 @@ def _pose(
     data: FlightData, series: RssSeries | RankSeries, at: int, progress: Progress
 ) -> tuple[Link, Poses, list[str], Times]:
     """Return link and pose of a sample as in the report, notes, and the time (1,) on the clock of the telemetry."""
-    rt, notes = data.settings.rt, []
+    notes: list[str] = []
     if isinstance(series, RssSeries):
         time = series.time
         if not len(series.log):
@@ -239,7 +239,7 @@ def _pose(
                 notes.append(f"{clock.applied_s:.3f} s are subtracted from the radio's clock")
         track = data.poses_at(time[at : at + 1])
         _check_pose(track.valid, series, at)
-        return data.link_of(series), valid_poses(track, rt.attitude), notes, time[at : at + 1]
+        return data.link_of(series), valid_poses(track, data.settings.rss_attitude), notes, time[at : at + 1]
     link = data.link_of(series)
     poses, valid, _ = rank_poses(data, series)
     _check_pose(valid[at : at + 1], series, at)

@@ -278,7 +278,7 @@ def _evidence(
         tower_azimuth_deg=at_samples(directions["azimuth_deg"]),
         turned_db=changed(link.turned_db()),
         raised_db=changed(link.raised_db(), known_both_db),
-        attitude_db=changed(link.attitude_db(data.settings.rt.attitude)),
+        attitude_db=changed(link.attitude_db(data.settings.rss_attitude)),
         misread_db=changed(
             link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid][some]), known_both_db
         ),
@@ -379,7 +379,7 @@ class _Direct:
 
     def misread_db(self, data: FlightData, time: Times) -> dict[str, FloatArray]:
         """Return levels with another meaning of the telemetry, other than units, at the times of the poses (m,)."""
-        position_m, track, used = self.replayed.poses.position_m, self.replayed.track, data.settings.rt.attitude
+        position_m, track, used = self.replayed.poses.position_m, self.replayed.track, data.settings.rss_attitude
         if data.track is None or track is None:
             return {}
         begin_m = data.track.pose_at(np.array([data.track.start_ns], dtype="datetime64[ns]")).position_m[0, :2]

@@ -267,7 +267,7 @@ def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
         name=flight.flight.name,
         position_m=pose.position_m[pose.valid],
         yaw_deg=pose.heading_deg[pose.valid],
-        up=attitude_rotation(pose, data.settings.rt.attitude)[pose.valid][:, :, 2],
+        up=attitude_rotation(pose, data.settings.rss_attitude)[pose.valid][:, :, 2],
         time_s=((time - time[0]) / np.timedelta64(1, "s"))[pose.valid],
         remarks=("The flight file has no plan: its track is the route. Its levels are not used.",),
     )
@@ -460,7 +460,7 @@ def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dic
     for data, s in [(flight, series) for flight in known for series in flight.rss]:
         source = Source(
             tower=s.tower, channel=s.channel, unit=s.unit, link=s.link, site=data.site, folder=data.folder,
-            rt=data.settings.rt, rss=data.settings.rss,
+            rt=data.settings.rt.model_copy(update={"attitude": data.settings.rss_attitude}), rss=data.settings.rss,
         )  # fmt: skip
         if source.antenna in measured and s.tower not in data.nodes and s.unit != "dB":
             out.setdefault(source.antenna, replace(source, samples=tuple(measured[source.antenna])))

@@ -60,6 +60,16 @@ def test_the_airframe_changes_the_levels_of_every_channel(tmp_path: Path) -> Non
     assert metrics["antennas"] == ["Antennas: isotropic at the tower, dataset12.LW1.USRP1.uav at the UAV."]
 
 
+def test_a_learned_airframe_turns_with_the_aircraft_if_the_file_states_no_attitude(tmp_path: Path) -> None:
+    rt = {"max_depth": 0, "audit_links": 0}
+    (default, _), (logged, _), (ignored, _) = (
+        report(write_flight(tmp_path, antennas={"uav": "lake_wheeler/dataset12_uav"}, rt=rt | keys), name)
+        for name, keys in (("default", {}), ("logged", {"attitude": "logged"}), ("ignored", {"attitude": "ignored"}))
+    )
+    assert changed_channels(default, logged) == set()
+    assert changed_channels(default, ignored) == {"A", "B"}
+
+
 def test_calibrated_antennas_come_before_those_of_the_flight(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     antennas = {"LW1.A": "lake_wheeler/dataset12_LW1.USRP1", "uav": "lake_wheeler/dataset12_uav"}
     path = write_flight(tmp_path, antennas=antennas)

@@ -16,6 +16,7 @@ import gzip
 import hashlib
 import json
 import math
+import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -451,10 +452,13 @@ LEARNED = "# aerpaw-cmp calibrate: "
 
 
 def _is_table(place: Path) -> bool:
-    """Check whether a file is a table of a calibration or a rank receiver."""
-    with suppress(InputError, OSError, EOFError):
-        content = read_table(place, "a table")
-        return content.startswith(LEARNED.encode()) or (content.startswith(b"{") and b'"trained_on"' in content)
+    """Check whether a file is a table of a calibration or a rank receiver, also if it is truncated."""
+    with suppress(InputError, OSError, zlib.error):
+        content = read_bounded(place, LARGEST_TABLE, "a table")
+        if content.startswith(b"\x1f\x8b"):
+            content = zlib.decompressobj(wbits=31).decompress(content, LARGEST_TABLE)
+        written = content.startswith(LEARNED.encode()) or (content.startswith(b"{") and b'"trained_on"' in content)
+        return written or not content
     return False
 
 

@@ -13,7 +13,7 @@ from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.flight import replay as replays
 from aerpaw_cmp.flight import track
 from aerpaw_cmp.flight.data import load_data
-from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings, LinksSettings, RtSettings, load_flight
+from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings, LinksSettings, load_flight
 from aerpaw_cmp.jobs import audit_flight
 from aerpaw_cmp.propagation.geometry import Poses
 from aerpaw_cmp.propagation.llvm import INSTALL_AGAIN
@@ -34,7 +34,7 @@ def flight(attitude="logged", roll=8.0, pitch=-5.0):
     })  # fmt: skip
     stream = SimpleNamespace(kind="telemetry", frame=frame)
     files = (SimpleNamespace(result=SimpleNamespace(streams=(stream,))),)
-    settings = SimpleNamespace(rt=RtSettings(attitude=attitude))
+    settings = SimpleNamespace(rss_attitude=attitude)
     return SimpleNamespace(settings=settings, track=track.Track(frame, FRAME), files=files)
 
 

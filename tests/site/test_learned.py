@@ -323,6 +323,14 @@ def test_a_copied_memory_is_whole_or_not_there_and_holds_its_own_files_alone(
     assert carry_memory(folder / "mine.yaml", copy) == []
 
 
+@pytest.mark.parametrize("end", [0, 80, -1])
+def test_a_truncated_table_is_replaced_by_learning_again(folder: Path, end: int) -> None:
+    table = folder_of(folder / "mine.yaml") / "A.t.csv.gz"
+    table.write_bytes(table.read_bytes()[:end])
+    remember(folder / "mine.yaml", "d12", entry("A"), learned_tables())
+    assert gzip.decompress(table.read_bytes()) == learned_tables()["A.t.csv.gz"]
+
+
 @pytest.mark.parametrize("name", ["A.t.csv.gz", "B.t.csv.gz"])
 def test_a_table_that_no_calibration_wrote_is_neither_replaced_nor_removed(folder: Path, name: str) -> None:
     """Existing files: one of another channel, and one of the entry that was changed by hand."""

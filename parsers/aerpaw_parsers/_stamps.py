@@ -267,7 +267,7 @@ def header_zone(name: str, brackets: str) -> str:
 
     Examples
     --------
-    >>> header_zone("Time (EDT)", "EDT"), header_zone("utc_time", ""), header_zone("Time [local]", "local")
+    >>> header_zone("Time (EDT)", "EDT"), header_zone("TimeUtc", ""), header_zone("Time [local]", "local")
     ('EDT', 'UTC', '')
     """
     inside = brackets.strip()
@@ -277,7 +277,7 @@ def header_zone(name: str, brackets: str) -> str:
         return "" if inside.lower() in ("ms", "us", "s", "local", "iso", "date", "time", "unix", "epoch") else inside
     if (offset := re.search(r"\b(?:UTC|GMT) ?[+-]\d{1,2}(?::?\d\d)?\b", name, re.IGNORECASE)) is not None:
         return offset[0]
-    words = re.split(r"[^A-Za-z0-9+]+", name)
+    words = re.split(r"[^A-Za-z0-9+]+|(?<=[a-z])(?=[A-Z])", name)
     if {word.lower() for word in words} & {"utc", "gps", "gmt", "zulu", *SCALES_S}:
         return "UTC"
     last = words[-1].upper() if len(words[-1]) > 2 else ""  # 'time_edt'

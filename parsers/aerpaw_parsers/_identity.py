@@ -74,9 +74,10 @@ def parts(
     if unknown := [sheet.names[i] for i in several if i in marks and sheet.meanings[i] is None]:
         shown = ", ".join(map(repr, unknown))
         rows.warnings.append(f"column {shown} distinguishes the rows: each of its values is a series")
-    alone = {sheet.plain[i]: next(iter(values)) for i, values in _values(texts).items() if len(values) == 1}
-    alone = {name: text for name, text in alone.items() if not any(sheet.plain[i] == name for i in several)}
-    sheet.used |= {*several, *(i for i, values in _values(texts).items() if len(values) == 1)}
+    single = {i: next(iter(values)) for i, values in _values(texts).items() if len(values) == 1}
+    divided = {sheet.plain[i] for i in several}
+    alone = {sheet.plain[i]: text for i, text in single.items() if sheet.plain[i] not in divided}
+    sheet.used |= {*several, *single}
     if not several:
         yield "", replace(rows, about=rows.about | attributes_of(alone)), sheet
         return

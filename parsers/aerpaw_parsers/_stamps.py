@@ -229,21 +229,17 @@ def _offset(zone: str, date: str, own: str | None) -> str:
             expected="UTC, an offset such as -04:00, or an abbreviation such as EDT",
             cause="a misspelt zone: correct it in the file",
         )
-    candidates = _text.WINTER[word]
-    hours, zone = candidates[0]
-    here = _at(zone, moment)
-    if len(candidates) == 1 and (here is None or here[0] == hours):
-        return _shown(hours)
-    doubt, ways = (
-        "which is the zone of several countries",
-        [f"{_shown(east)} ({name})" for east, name in candidates],
-    )
-    if len(candidates) == 1 and here is not None:
-        doubt = f"but on {date[:10]} the clocks of that zone show {here[1]}"
+    (hours, zone), *others = _text.WINTER[word]
+    if others:
+        doubt, more = "which is the zone of several countries", ", or state the zone of the log with --timezone"
+        ways = [f"{_shown(east)} ({name})" for east, name in _text.WINTER[word]]
+    else:
+        here = _at(zone, moment)
+        if here is None or here[0] == hours:
+            return _shown(hours)
+        doubt, more = f"but on {date[:10]} the clocks of that zone show {here[1]}", ""
         ways = [f"{_shown(hours)} as written", f"{_shown(here[0])} ({here[1]})"]
-    expected = f"{' or '.join(ways)}: put the offset in place of {word} in the file"
-    if len(candidates) > 1:
-        expected += ", or state the zone of the log with --timezone"
+    expected = f"{' or '.join(ways)}: put the offset in place of {word} in the file{more}"
     raise UsageError(f"the zone of the times is {word}, {doubt}", expected=expected)
 
 

@@ -123,7 +123,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     table = {name: np.asarray(values).ravel() for name, values in read_arrays(data, {*_NAMES, _DECODED}).items()}
     if not any(name in table for name in (*_LEVELS, *_TELEMETRY)):
         raise InputError("the MATLAB file contains no flight", expected=f"variables: {', '.join(sorted(_NAMES)[:5])}")
-    count = _common_length(table)
+    sizes = sorted({len(column) for column in table.values()})
+    if len(sizes) > 1:  # the rows cannot be matched
+        names = [", ".join([name for name in table if len(table[name]) == size][:4]) for size in sizes]
+        shown = "; ".join(f"{counted(size, 'row')}: {listed}" for size, listed in zip(sizes, names, strict=True))
+        raise InputError(f"the columns differ in length ({shown})", expected="one row per sample in each")
+    (count,) = sizes
     wall, valid, clock = _wall(table)
     keep = np.flatnonzero(valid)
     timed = {name: column[keep] for name, column in table.items()}
@@ -135,19 +140,6 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     )  # fmt: skip
     instants.flag(rows.flag)
     return rows.result([_track(rows, timed, clock), *_measured(rows, timed)])
-
-
-def _common_length(table: dict[str, AnyArray]) -> int:
-    """Return the number of rows, and refuse columns of several lengths, whose rows cannot be matched."""
-    lengths: dict[int, list[str]] = {}
-    for name, column in table.items():
-        lengths.setdefault(len(column), []).append(name)
-    if len(lengths) > 1:
-        sizes = "; ".join(
-            f"{counted(count, 'row')}: {', '.join(names[:4])}" for count, names in sorted(lengths.items())
-        )
-        raise InputError(f"the columns differ in length ({sizes})", expected="one row per sample in each")
-    return next(iter(lengths))
 
 
 def _track(rows: Rows, table: dict[str, AnyArray], clock: str) -> Stream | None:

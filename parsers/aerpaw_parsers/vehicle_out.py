@@ -91,16 +91,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """
     pattern = _EITHER if mostly(data, _LONGER) and not mostly(data, _ROW) else _ROW
     rows = matched(data, pattern, options, reader="vehicle_out", reason=_reason)
-    number = {name: _numbers(rows, name) for name in _NUMBERS}
+    number = {name: rows.number(name) for name in _NUMBERS}
     jumps = int((np.diff(number["index"]) != 1).sum())
     if jumps:
         rows.warnings.append(f"the row index jumps at {counted(jumps, 'place')}: rows are missing or files were joined")
     values = _values(rows, number)
     return rows.result([rows.stream("telemetry", "vehicle", values, source="vehicleOut")])
-
-
-def _numbers(rows: Rows, name: str) -> FloatArray:
-    return rows.number(name, none=(b"None",))
 
 
 def _values(rows: Rows, number: dict[str, FloatArray]) -> dict[str, AnyArray]:

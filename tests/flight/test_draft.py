@@ -483,7 +483,7 @@ def test_what_a_phone_reports_is_drafted_as_downlink(logs: Path) -> None:
         files, logs, DraftOptions(timezone=ZONE, mapping={"columns": named, "kind": "rss", "unit": "dBm"})
     )
     assert "uav_transmits: false" in entries[0]
-    assert "the power is unknown" in entries[0]
+    assert "the unknown power is part of the offset" in entries[0]
     assert parse_yaml(entries[0], FlightFile).link.rss.uav_transmits is False
 
 

@@ -488,6 +488,7 @@ def gather(
         )
     cautions = check_names(settings, site, [(series.tower, series.channel) for _, series in rss])
     cautions += _unknown_receivers(settings, data.site_place)
+    cautions += tuple(f"{c.key}: {c.text}." for c in settings.cautions if c.key == "rt" and rank)
     track = None
     if found.telemetry:
         path, telemetry = found.telemetry[0]
@@ -588,7 +589,7 @@ def check_names(settings: FlightFile, site: Site, series: Sequence[tuple[str, st
     channels = list(dict.fromkeys(channel for _, channel in series))
     pairs = [f"{tower}.{channel}" for tower, channel in dict.fromkeys(series)]
     named = {**settings.antennas, **{c.key.removeprefix("antennas."): c for c in settings.cautions}}
-    for key in sorted(named.keys() - {"uav", "rank.receiver", *pairs}):
+    for key in sorted(named.keys() - {"uav", "rank.receiver", "rt", *pairs}):
         tower = key.partition(".")[0]
         unknown = ("channel", key) if tower in site.towers else ("tower", tower)
         _unknown(f"antennas.{key}", *unknown, ["uav", *pairs])

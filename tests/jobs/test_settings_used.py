@@ -89,6 +89,20 @@ def test_calibrated_antennas_come_before_those_of_the_flight(tmp_path: Path, cap
     assert "antennas of A learned at 2.4 GHz, used at 3.3 GHz" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("ranked", [True, False])
+def test_a_calibration_that_changes_the_replay_of_ranks_is_a_caution(tmp_path: Path, ranked: bool) -> None:
+    (tmp_path / "learned.yaml").write_text(yaml.safe_dump({"rt": {"max_depth": 0, "attitude": "ignored"}}))
+    radio = "UAV/modem_ri.csv" if ranked else "LW1/USRP1_power_log.txt"
+    paths = [
+        {"path": str(SAMPLE / "UAV/2025-06-01_10_00_00_vehicleOut.txt")},
+        {"path": str(SAMPLE / radio), "node": "LW1"},
+    ]
+    path = write_flight(tmp_path, logs=paths, rt={"max_depth": 1, "audit_links": 0})
+    _, metrics = report(path, "with", "--with", str(tmp_path / "learned.yaml"))
+    said = "rt: learned.yaml also sets max_depth: 0 (before: 1) for ranks."
+    assert (said in metrics["warnings"]) is ranked
+
+
 def test_a_receiver_that_the_site_has_not_learned_is_a_caution(tmp_path: Path) -> None:
     path = write_flight(tmp_path)
     content = yaml.safe_load(path.read_text())

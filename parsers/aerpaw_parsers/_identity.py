@@ -53,11 +53,8 @@ def parts(
     tuple of str, Rows and Sheet
         The name is empty if the table has one part.
     """
-    columns = [
-        i
-        for i, what in enumerate(sheet.meanings)
-        if what and what.quantity.name in keys and not what.place.startswith("n")
-    ]
+    known = ((i, m) for i, m in enumerate(sheet.meanings) if m and m.quantity.name in keys)
+    columns = [i for i, meaning in known if not meaning.place.startswith("n")]
     marks = _marks(rows, sheet, keys, columns, level) if found else []
     texts = {i: _named(sheet, i) for i in (*columns, *marks)}
     filled = _with_level(sheet)

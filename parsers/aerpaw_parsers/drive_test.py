@@ -412,25 +412,20 @@ def _short(sheet: _sheet.Sheet, column: int) -> str:
 def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: list[int]) -> None:
     """Report which of several columns of a cell's level was read, and how the others were read."""
     for cell in cells:
-        level = cell.columns["rsrp_dbm"]
-        means = [
-            i
-            for i in others
-            if (m := sheet.meanings[i]) and m.part == "mean" and (m.rat, m.place) == (cell.rat, cell.place)
-        ]
-        if _part(sheet, level) == "mean":
-            text = f"the level of the cell is {sheet.names[level]!r}, a mean or a percentile"
-            rows.warnings.append(f"{text}: no other column has the measured level")
+        level = sheet.names[cell.columns["rsrp_dbm"]]
+        of_cell = [i for i in others if (m := sheet.meanings[i]) and (m.rat, m.place) == (cell.rat, cell.place)]
+        means = [i for i in of_cell if _part(sheet, i) == "mean"]
+        if _part(sheet, cell.columns["rsrp_dbm"]) == "mean":
+            text = f"the level of the cell is {level!r}, a mean or a percentile: no other column has the measured level"
+            rows.warnings.append(text)
         for listed, what in ((cell.ports, "separate series"), (means, "KPIs")):
             if listed:
                 shown = ", ".join(repr(sheet.names[i]) for i in listed)
-                rows.warnings.append(f"the level of the cell is {sheet.names[level]!r}; read as {what}: {shown}")
+                rows.warnings.append(f"the level of the cell is {level!r}; read as {what}: {shown}")
         # the header has one name twice: the second of them is called "RSRP 2"
-        level_name = sheet.names[cell.columns["rsrp_dbm"]]
-        if repeated := [
-            sheet.names[i] for i in others if re.fullmatch(re.escape(level_name) + r" \d+", sheet.names[i])
-        ]:
-            shown = " and ".join(map(repr, [level_name, *repeated]))
+        repeated = [name for i in others if re.fullmatch(re.escape(level) + r" \d+", name := sheet.names[i])]
+        if repeated:
+            shown = " and ".join(map(repr, [level, *repeated]))
             rows.warnings.append(f"{shown} are separate series: nothing in the table says whose levels they are")
 
 

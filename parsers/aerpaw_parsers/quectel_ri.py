@@ -30,18 +30,10 @@ def _streams(rows: Rows) -> Iterator[Stream | None]:
     yield rows.stream("rank", name, values, channel=name, ri_base="one", source="CSI report")
 
 
+_HEADER = BOM + rb'(?i:"?ID"?, ?"?Time and date"?, ?"?Longitude"?, ?"?Latitude"?, ?"?Altitude"?, ?"?NR RI"?)\s*'
 READER = text_reader(
-    "quectel_ri",
-    "published Quectel NR rank table (six columns)",
-    kinds=("rank",),
-    sample="8,2025-01-01 12:00:07.250,-78.6960001,35.7280001,30.1,2",
-    lines=LineFormat(
-        row=_ROW,
-        header=re.compile(
-            BOM + rb'(?i:"?ID"?, ?"?Time and date"?, ?"?Longitude"?, ?"?Latitude"?, ?"?Altitude"?, ?"?NR RI"?)\s*'
-        ),
-        fields=6,
-        otherwise="the time or a number has another form",
+    "quectel_ri", "published Quectel NR rank table (six columns)", kinds=("rank",), streams=_streams,
+    sample="8,2025-01-01 12:00:07.250,-78.6960001,35.7280001,30.1,2", lines=LineFormat(
+        row=_ROW, header=re.compile(_HEADER), fields=6, otherwise="the time or a number has another form"
     ),
-    streams=_streams,
-)
+)  # fmt: skip

@@ -42,17 +42,12 @@ def _streams(rows: Rows) -> Iterator[Stream | None]:
     yield rows.stream("kpi", "cfo", {"value": cfo}, quantity="CFO", unit="Hz")
 
 
+_TITLE = rb"^\[[^\]\n]{19,40}\] *(?:(?:cc|rat) +pci +rsrp +pl +cfo +\||cc +rsrp +pl +cfo +mcs +snr)"
 READER = text_reader(
-    "srsue_log",
-    "srsUE console: RSRP, path loss, CFO",
-    kinds=("rss", "kpi"),
+    "srsue_log", "srsUE console: RSRP, path loss, CFO", kinds=("rss", "kpi"),
     sample="[2025-01-01 12:00:07.000000]   0    1   -61   61 -4.3k |   0   25   1.0   4.5k    0%  1.6 |  23  83k  19M",
-    lines=LineFormat(
-        row=_ROW,
-        mark=re.compile(
-            rb"^\[[^\]\n]{19,40}\] *(?:(?:cc|rat) +pci +rsrp +pl +cfo +\||cc +rsrp +pl +cfo +mcs +snr)", re.MULTILINE
-        ),
+    streams=_streams, lines=LineFormat(
+        row=_ROW, mark=re.compile(_TITLE, re.MULTILINE),
         torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:\d{1,2}|lte|nr) +\d{1,4} +[^ a-zA-Z]"),
     ),
-    streams=_streams,
-)
+)  # fmt: skip

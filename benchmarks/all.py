@@ -83,7 +83,7 @@ SMALLEST: dict[str, list[str]] = {
     "wheels": ["--pythons", sys.executable],
 }
 
-ON_FIELD_DATA = ("injected_causes", "learned_map", "left_out_reports", "real_ground")
+ON_FIELD_DATA = ("first_flight_prediction", "injected_causes", "learned_map", "left_out_reports", "real_ground")
 
 AXES = ("poses", "towers", "faces", "samples", "report", "flights", "workers")
 

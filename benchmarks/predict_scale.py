@@ -39,6 +39,7 @@ def flight_file(number: int) -> dict:
     corners = corners if number % 4 < 2 else [(b, a) for a, b in corners]
     plan |= {
         "start": START + timedelta(hours=number), "seed": number, "bad_lines": 0, "clock_shift_s": {},
+        "offsets_db": {"LW1": plan["offsets_db"]["LW1"]},
         "waypoints": [{"label": "", "east_m": a, "north_m": b, "height_m": height} for a, b in corners],
     }  # fmt: skip
     content["flight"]["name"] = f"simulated{number}"

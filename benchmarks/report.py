@@ -79,7 +79,7 @@ def two_channels(folder: Path) -> tuple[Path, list[str], str]:
     if field:
         return ROOT / "tests" / "field" / "dataset12_40m.yaml", ["--logs-root", field], "dataset12 40 m"
     content = yaml.safe_load((ROOT / "sample_logs" / "flight.yaml").read_text())
-    content["flight"]["plan"] |= {"rss_interval_s": 0.1, "offsets_db": {}, "bad_lines": 0}
+    content["flight"]["plan"] |= {"rss_interval_s": 0.1, "offsets_db": {}, "clock_shift_s": {}, "bad_lines": 0}
     content["logs"] = [log for log in content["logs"] if log.get("node") in (None, "LW1") and "ri" not in log["path"]]
     flight = folder / "flight.yaml"
     flight.write_text(yaml.safe_dump(content))

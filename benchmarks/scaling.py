@@ -129,7 +129,7 @@ def flight_on_laps(hours: float) -> dict[str, Any]:
     for number in range(max(1, round((hours * 3600.0 - 60.0) / lap_s))):
         points += [{**p, "label": p["label"] if number == 0 else ""} for p in laps]
     intervals = {"rss_interval_s": 0.036, "telemetry_interval_s": 0.1, "clock_shift_s": {}}
-    plan |= {**intervals, "waypoints": [*points, *last]}
+    plan |= {**intervals, "offsets_db": {"LW1": plan["offsets_db"]["LW1"]}, "waypoints": [*points, *last]}
     logs = [log for log in content["logs"] if log.get("node", "LW1") == "LW1" and "ri" not in log["path"]]
     return {**content, "logs": logs, "rt": {**content["rt"], "audit_links": 0}}
 

@@ -634,10 +634,9 @@ def joined(settings: FlightFile, learned: Path) -> FlightFile:
         ) from None
     here = {"rank.receiver"} if "receiver" in known.get("rank", {}) else set[str]()
     cautions = [u for u in settings.cautions if u.key not in here and not _replaced(u.key, taught, u.channel)]
-    rt = {key: value for key, value in known.get("rt", {}).items() if getattr(settings.rt, key) != value}
-    if rt:
-        words = ", ".join(f"{key}: {value} (before: {getattr(settings.rt, key)})" for key, value in rt.items())
-        text = f"{learned.name} also sets {words} for ranks"
+    was = settings.rt.model_dump()
+    if rt := [f"{key}: {new} (before: {was[key]})" for key, new in known.get("rt", {}).items() if new != was[key]]:
+        text = f"{learned.name} also sets {', '.join(rt)} for ranks"
         cautions.append(Caution(key="rt", channel="rank", text=text, used=True))
     return whole.changed({}, cautions=cautions, lent={*settings.lent, *(taught.keys() - settings.link.channels.keys())})
 

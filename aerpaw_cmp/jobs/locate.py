@@ -14,10 +14,10 @@ from ..common.outputs import OutputFolder
 from ..common.stages import Stages
 from ..compare.locate import LevelTrack, NodeEstimate, locate
 from ..flight.data import check_place, choose_site, is_ratio, read_logs, site_place
-from ..flight.drafting.draft import receiver_floor_db
+from ..flight.drafting.draft import floor_of
 from ..flight.drafting.proposals import NodeFinder, searching_airframe, with_antennas
 from ..flight.gains import load_with_learned
-from ..flight.rows import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
+from ..flight.rows import may_lose_lock
 from ..flight.settings import FlightFile
 from ..flight.training import among, mark_of
 from ..logs.ingest import IngestedFile
@@ -58,10 +58,9 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
     with OutputFolder(folder, job="locate", inputs=inputs, force=options.force) as output:
         with stages("read"):
             site = choose_site(settings.site, flight.parent)
-            vehicle, file, level, loses_lock = _streams(settings, flight, options.logs_root, channel)
+            vehicle, file, level, locks = _streams(settings, flight, options.logs_root, channel)
             check_place(site, str(flight), vehicle)
-            floor = LOCK_FLOOR_DB if loses_lock else receiver_floor_db([level])
-            track = NodeFinder(site, vehicle).levels(level, -np.inf if floor is None else floor)
+            track = NodeFinder(site, vehicle).levels(level, floor_of(level, locks=locks))
         with stages("locate"):
             node, uav = _antennas(settings, flight, options.logs_root, track, (file, level))
             cautions = _cautions(settings, level.channel, uav)
@@ -86,7 +85,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
 def _streams(
     settings: FlightFile, flight: Path, logs_root: Path | None, channel: str | None
 ) -> tuple[Stream, IngestedFile, Stream, bool]:
-    """Return the telemetry with the most rows, the file of the chosen levels, these levels, and if they lose lock."""
+    """Return the telemetry with the most rows, the file of the chosen levels, these levels, and if a log has a lock."""
     streams = [(f, stream) for f in read_logs(settings, flight.parent, logs_root) for stream in f.result.streams]
     vehicles = [s for _, s in streams if s.kind == "telemetry"]
     levels = {s.channel: (f, s) for f, s in reversed(streams) if s.kind == "rss" and not is_ratio(s)}
@@ -96,8 +95,8 @@ def _streams(
     if channel is not None and channel not in levels:
         raise UsageError(f"no channel {channel!r}", expected="one of " + ", ".join(reversed(levels)))
     file, level = levels[channel or list(levels)[-1]]
-    loses_lock = is_sounder_power(level) and any(may_lose_lock(stream) for _, stream in streams)
-    return max(vehicles, key=lambda s: len(s.frame)), file, level, loses_lock
+    locks = any(may_lose_lock(stream) for _, stream in streams)
+    return max(vehicles, key=lambda s: len(s.frame)), file, level, locks
 
 
 def _antennas(

@@ -129,6 +129,19 @@ def test_only_a_log_with_a_lock_quality_has_the_floor_of_a_lost_lock(flight, cap
     assert printed["region90_m"] < 200.0
 
 
+def test_whole_decibels_of_rsrp_are_not_a_floor(flight, capsys, tmp_path):
+    (log,) = ingest([flight.with_name("power.txt")], options=ReadOptions(timezone="America/New_York"))
+    frame = log.result.streams[0].frame
+    level = frame["rss_db"].round().clip(lower=frame["rss_db"].quantile(0.05).round())
+    stamps = frame["time"].dt.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    text = "".join(f"{time},{value:g},77\n" for time, value in zip(stamps, level, strict=True))
+    flight.with_name("phone.csv").write_text("time,RSRP (dBm),PCI\n" + text)
+    line = "{path: power.txt, reader: sounder_log, channel: A}"
+    (flight.parent / "phone.yaml").write_text(flight.read_text().replace(line, "{path: phone.csv, reader: drive_test}"))
+    assert main(["locate", str(flight.parent / "phone.yaml"), "-o", str(tmp_path / "out"), "--json"]) == 0
+    assert "Floor of the receiver: not known." in " ".join(json.loads(capsys.readouterr().out)["assumed"])
+
+
 @pytest.mark.parametrize("own", ["log", "copy", ""])
 def test_antennas_that_this_very_log_taught_are_not_used(flight, own, capsys, tmp_path):
     digest = hashlib.sha256(flight.with_name("power.txt").read_bytes()).hexdigest() if own == "log" else "ab" * 32

@@ -540,12 +540,24 @@ def receiver_floor_db(levels: Sequence[Stream]) -> float | None:
     A receiver at its floor repeats its lowest level: in at least 1 % of the samples, and at least ten times.
     """
     floors = []
-    for stream in levels:
+    # RSRP is reported in whole decibels, so its lowest value repeats without a floor
+    for stream in (s for s in levels if s.attributes.get("quantity") != "RSRP"):
         level = stream.frame["rss_db"].to_numpy(np.float64)
         level = level[np.isfinite(level)]
         if len(level) and np.sum(level == level.min()) >= max(10.0, _CLIPPED_SHARE * len(level)) and np.ptp(level) > 0:
             floors.append(float(level.min()))
     return max(floors) if floors else None
+
+
+def floor_of(level: Stream, *, locks: bool) -> float:
+    """Return the floor of the receiver of a level [dB], or -inf if it is unknown.
+
+    ``locks`` is True if a log of the flight contains the lock quality of a sounder.
+    """
+    if locks and is_sounder_power(level):
+        return LOCK_FLOOR_DB
+    found = receiver_floor_db([level])
+    return -np.inf if found is None else found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -621,13 +633,6 @@ class _Context:
         if origin is not None and stream.attributes.get("clock") == "relative":
             shift += origin.time - np.datetime64(0, "ns")
         return replace(stream, frame=stream.frame.assign(time=stream.frame["time"] + shift)) if shift else stream
-
-    def floor_db(self, level: Stream) -> float:
-        """Return the floor of the receiver of a level [dB], or -inf if it is unknown."""
-        if self.locks and is_sounder_power(level):
-            return LOCK_FLOOR_DB
-        floor = None if level.attributes.get("quantity") == "RSRP" else receiver_floor_db([level])
-        return -np.inf if floor is None else floor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -754,9 +759,7 @@ def _heights_and_floor(compared: Sequence[Stream], path: str, track: Stream | No
         asked.append(
             "no altitude in the log: what is height_m?" if height is None else "height_m from the file's name?"
         )
-    # RSRP is reported in whole decibels, so its lowest value repeats without a floor
-    levels = [s for s in compared if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"]
-    if (floor := receiver_floor_db(levels)) is not None:
+    if (floor := receiver_floor_db([s for s in compared if s.kind == "rss"])) is not None:
         # a hundredth above, because levels at or below floor_db are out of coverage
         keys["floor_db"] = round(floor + 0.01, 2)
         asked.append(f"floor of the receiver at {floor:.1f} dB?")
@@ -812,7 +815,7 @@ def _placement(
     """Return the tower or position that a level fits. None if the level has too few samples."""
     site = site_place(context.options.site, context.folder)
     log = file.sha256, mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
-    track = finder.levels(level, context.floor_db(level))
+    track = finder.levels(level, floor_of(level, locks=context.locks))
     antennas = learned_towers(site, log, loses_lock=False)
     return finder.propose(track, antennas, nodes, partial(searching_airframe, site, log, track))
 
@@ -821,7 +824,7 @@ def _doubt(entry: Mapping[str, Any], levels: Sequence[Stream], finder: NodeFinde
     """Return a question if a name specifies a tower that the levels contradict."""
     for level in levels:
         node = str(entry.get("node") or level.attributes.get("node"))
-        better = finder.contradiction(finder.levels(level, context.floor_db(level)), node)
+        better = finder.contradiction(finder.levels(level, floor_of(level, locks=context.locks)), node)
         if better is not None:
             return f"  # the name says {node}, the levels fit {better} far better: which tower?"
     return ""
@@ -835,7 +838,7 @@ def _offset_db(
         return None
     cell = entry.get("cells", {}).get(_cell_of(level))
     node = str(cell or entry.get("node") or level.attributes.get("node"))
-    return context.finder.offset_db(context.finder.levels(level, context.floor_db(level)), node, nodes)
+    return context.finder.offset_db(context.finder.levels(level, floor_of(level, locks=context.locks)), node, nodes)
 
 
 def _origin(streams: Sequence[Stream], flown: tuple[Stream, Span] | None) -> Origin | None:

@@ -1030,7 +1030,22 @@ def _airframe_spread(errors: Errors | None, spread: LearnedSpread) -> LearnedSpr
 
 
 def check_band(learned_hz: float, used_hz: float, band: float, key: str = "") -> None:
-    """Raise UsageError if antennas are used at a carrier that differs by more than a share ``band`` of theirs."""
+    """Refuse learned antennas in another band.
+
+    Parameters
+    ----------
+    learned_hz, used_hz : float
+        Carriers at which the antennas were learned and are used [Hz].
+    band : float
+        Largest relative difference of the carriers.
+    key : str
+        Start of the message, which names the antennas.
+
+    Raises
+    ------
+    UsageError
+        If the carriers differ by more.
+    """
     if abs(used_hz / learned_hz - 1.0) > band:
         raise UsageError(
             f"{key}learned at {learned_hz / 1e9:g} GHz, used at {used_hz / 1e9:g} GHz",

@@ -223,6 +223,10 @@ class NodeFinder:
             Positions of the nodes that were proposed for other logs of the flight [m].
         airframe : callable
             Returns the learned airframe that the levels support. It is searched if no tower fits without it.
+
+        Returns
+        -------
+        Placement or None
         """
         if len(track.level_db) < FEWEST:
             return None

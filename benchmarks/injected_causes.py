@@ -38,6 +38,7 @@ from scipy.io import loadmat, savemat
 
 from aerpaw_cmp.__main__ import main as command
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.common.units import wrap_degrees
 from aerpaw_cmp.compare.result import FlightResult
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.gains import load_with_learned
@@ -332,7 +333,7 @@ def simulated_flights(count: int, keep: Path, seed: int) -> Iterator[Flight]:
         time = 1_721_046_400.0 + plan.time_s
         frame = load_site("lake_wheeler").frame
         latitude, longitude = frame.to_geographic(place[:, 0], place[:, 1])
-        yaw, pitch, roll = np.degrees(plan.turns).T
+        yaw, pitch, roll = wrap_degrees(np.degrees(plan.turns)).T
         table = {"timestamp_power": time, "mX": longitude, "mY": latitude, "mZ": place[:, 2],
                  "mYaw": yaw, "mPitch": pitch, "mRoll": roll}  # fmt: skip
         for name in LEVELS[:2]:

@@ -259,10 +259,13 @@ def _evidence(
         levels = {key: of_all(level - known_db) + simulated_db for key, level in levels_db.items()}
         return {key: np.maximum(level, floor_db) - predicted for key, level in levels.items()}
 
-    directions = link.directions(link.place_m, replayed.poses.position_m, replayed.poses.rotation)  # angles wrap
-    patterns = replayed.link.uav_array.patterns
+    patterns, rotation = replayed.link.uav_array.patterns, replayed.poses.rotation
     kinds = {"learned": any(isinstance(p, SpherePattern) for p in patterns) or replayed.learned is not None,
              "isotropic": all(isinstance(p, Isotropic) for p in patterns), "measured": True}  # fmt: skip
+    # the setting does not change levels of isotropic antennas, and an unknown gain turns with the aircraft
+    if kinds["isotropic"] and replayed.track is not None and replayed.track.attitude_known.any():
+        rotation = replayed.track.rotation
+    directions = link.directions(link.place_m, replayed.poses.position_m, rotation)  # angles wrap
     return LevelEvidence(
         name=result.name,
         tower=series.tower,

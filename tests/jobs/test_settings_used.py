@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import yaml
@@ -277,3 +278,19 @@ def test_a_calibration_is_not_recommended_to_a_report_that_uses_one(
         steps.append(result.next_step or "")
     assert ["calibrate" in step for step in steps] == [True, False]
     assert "calibrate" not in causes._PATTERN["learned"][1]
+
+
+def test_an_unknown_gain_of_the_uav_turns_with_it_although_its_attitude_is_ignored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A calibration learns gains in the frame of the aircraft, whatever the flight file does with the attitude."""
+    seen = []
+    monkeypatch.setattr(likely_cause, "flight_cause", seen.append)
+    monkeypatch.setattr(likely_cause, "_GOOD_DB", 0.0)
+    for attitude in ("ignored", "logged"):
+        data = load_data(load_with_learned(write_flight(tmp_path, rt={"max_depth": 0, "attitude": attitude})), tmp_path)
+        compare_flight(data, replay_flight(data))
+    ignored, logged = seen
+    turned = np.ptp(logged[0].uav_azimuth_deg - logged[0].tower_azimuth_deg)
+    assert turned > 90.0
+    np.testing.assert_allclose(ignored[0].uav_azimuth_deg, logged[0].uav_azimuth_deg)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import combinations, combinations_with_replacement
@@ -64,6 +65,8 @@ class Trial:
     clipped: BoolArray | None = None
     fading: FloatArray | None = None
     estimate: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    channels: int = 1
+    """Number of channels of the tower that have the same numbers and share the cost of their search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,13 +96,15 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     Cause or None
         None if no cause is identified.
     """
-    tables = [_models(each) for evidence in channels if (each := in_bins(evidence)) is not None]
+    known = [each for evidence in channels if (each := in_bins(evidence)) is not None]
+    others = [tuple(other for other in known if other is not e and other.tower == e.tower) for e in known]
+    tables = [_models(dataclasses.replace(e, others=of)) for e, of in zip(known, others, strict=True)]
     names = sorted({name for table in tables for names in table for name in names})
     odds: dict[frozenset[str], float] = {}
     for some in (_SOUND, *({name} for name in names), *map(set, combinations(names, 2))):
         models = [_best(table, some) for table in tables]
         used = frozenset().union(*map(_names, models))
-        odds[used] = sum(model.gain for model in models) - _SELDOM * len(used)
+        odds[used] = sum(model.gain for model in models) - _SELDOM * len(used) - _unpaid(models)
     best = max(odds, key=lambda some: odds[some])
     least, named = _MARGIN + math.log(max(len(channels), 1)), dict[frozenset[str], list[_Models]]()
     alternatives = _alternatives(best, odds, least)
@@ -129,6 +134,13 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     either = min(named, key=lambda e: (_CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
     cause = _named(sorted(either, key=lambda n: n not in best), named[either], _lead(either, odds))
     return _by_health(cause, tables) if _OF_HEALTH & either else cause
+
+
+def _unpaid(models: Sequence[_Model]) -> float:
+    """Return the cost of common numbers that the channels without these numbers would share."""
+    trials = [((model.evidence.tower, trial.name), trial) for model in models for trial in model.trials]
+    users = Counter(cause for cause, _ in trials)
+    return sum(max(trial.channels / users[cause] - 1.0, 0.0) * trial.cost for cause, trial in trials)
 
 
 def _by_health(cause: Cause | None, tables: Sequence[_Models]) -> Cause | None:
@@ -243,8 +255,8 @@ class _Conditions:
 
 _CONDITIONS = {
     "attitude": _Conditions(of_uav=True),
-    # a high limit, because slow fading looks like a weak shadow
-    "blocked": _Conditions(share=0.2),
+    # a high limit, because slow fading looks like a weak shadow; an obstacle shadows all channels of the tower
+    "blocked": _Conditions(share=0.2, of_tower=True),
     "channels": _Conditions(part=0.5, most_left=1.0),
     "clock": _Conditions(part=0.5, most_left=1.0),
     "decibels": _Conditions(most_left=math.inf),
@@ -413,7 +425,7 @@ def _without(e: LevelEvidence, first: _Model) -> LevelEvidence:
     predicted = e.measured_db - first.residual_db
     moved = predicted - e.predicted_db
     others = {name: level + moved for name, level in e.other_towers_db.items()}
-    return dataclasses.replace(e, predicted_db=predicted, other_towers_db=others)
+    return dataclasses.replace(e, predicted_db=predicted, other_towers_db=others, others=())
 
 
 def _rmse_db(models: Sequence[_Model]) -> float:
@@ -658,11 +670,13 @@ _DRIFTS_M = tuple(float(sign * rise) for rise in (15, 20, 25, 30, 40, 50, 60, 80
 
 def _growing(e: LevelEvidence) -> FloatArray:
     """Return the changes of the level (m, n) by a height error that grows from 0 to each of the drifts."""
+    from scipy.ndimage import map_coordinates
+
     rises = np.array(sorted({0.0, *e.raised_db}))
     table = np.stack([e.raised_db.get(rise, np.zeros(len(e.time_s))) for rise in rises.tolist()])
     share = (e.time_s - e.time_s[0]) / max(float(np.ptp(e.time_s)), 1e-9)
     at = np.interp(np.outer(_DRIFTS_M, share), rises, np.arange(len(rises)))
-    return _interpolated(table, at)
+    return np.asarray(map_coordinates(table, np.broadcast_arrays(at, np.arange(at.shape[1])), order=1, mode="nearest"))
 
 
 def _misread(e: LevelEvidence) -> Iterator[Trial]:
@@ -700,10 +714,12 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     weight = np.repeat(radii**2 * (1.0 + (radii / _NEAR_PLACE_M) ** 2) ** -1.5, len(azimuths))
     coarse, cost = _likeliest(e, e.predicted_db + table.reshape(len(weight), -1), weight=weight)
     i, j = np.unravel_index(coarse, table.shape[:2])
-    fine = [(i + r, j + a) for r in _FINER for a in _FINER if 0 <= i + r <= len(radii) - 1]
-    indices = np.array(fine)[:, :, None]
-    # the first azimuth follows the last
-    changes = _interpolated(np.hstack([table, table[:, :1]]), indices[:, 0], indices[:, 1] % len(azimuths))
+    rows = np.array([i + r for r in _FINER if 0 <= i + r <= len(radii) - 1])
+    fine = [(row, j + a) for row in rows for a in _FINER]
+    # splines over the radii, and over the azimuths around the likeliest one (the first azimuth follows the last)
+    over = _spline(np.arange(len(radii), dtype=np.float64), rows), _spline(_AROUND.astype(np.float64), np.array(_FINER))
+    near = table[:, (j + _AROUND) % len(azimuths)]
+    changes = np.einsum("ri,aj,ijt->rat", *over, near, optimize=True).reshape(len(fine), -1)
     best, _ = _likeliest(e, e.predicted_db + changes)
     at, around = fine[best]
     radius = float(np.exp(np.interp(at, np.arange(len(radii)), np.log(radii))))
@@ -716,26 +732,26 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     )  # fmt: skip
 
 
-def _interpolated(table: FloatArray, *at: FloatArray) -> FloatArray:
-    """Return levels (m, n) of a table (..., n), linear between its entries at fractional indices (m, n) or (m, 1)."""
-    from scipy.ndimage import map_coordinates
-
-    indices = np.broadcast_arrays(*at, np.arange(table.shape[-1]))
-    return np.asarray(map_coordinates(table, indices, order=1, mode="nearest"))
-
-
 # Places further away than this become unlikely [m], and steps between the computed places.
-_NEAR_PLACE_M, _FINER = 50.0, (-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75)
+_NEAR_PLACE_M, _FINER, _AROUND = 50.0, (-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75), np.arange(-4, 5)
 _SIDES = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 
 def _channels(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the log of the other channel of the tower."""
-    if e.swapped_db is not None and e.swapped_db.std() > SHOWN_DB:
+    if len(e.others) != 1 or e.others[0].unit != e.unit:
+        return
+    change_db = np.interp(e.time_s, _seconds(e.others[0], e), e.others[0].predicted_db) - e.predicted_db
+    if change_db.std() > SHOWN_DB:
         yield Trial(
-            name="channels", sentence="the channels of the tower are swapped", change_db=e.swapped_db,
+            name="channels", sentence="the channels of the tower are swapped", change_db=change_db,
             next_step="check the cables, or swap the channels in the flight file",
         )  # fmt: skip
+
+
+def _seconds(other: LevelEvidence, e: LevelEvidence) -> FloatArray:
+    """Return the times (n,) of another channel since the start of a channel."""
+    return np.asarray(other.time_s + (other.start - e.start) / np.timedelta64(1, "s"))
 
 
 _CATCH_ALL = "pattern"
@@ -1020,24 +1036,27 @@ _CHECK_GAIN = "check the receiver's gain; compare both parts separately"
 
 def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a shift of the level from some time until the end of the flight."""
-    residual, n = e.measured_db - e.predicted_db, len(e.time_s)
+    n = len(e.time_s)
     starts = np.arange(LEAST_BINS * 2, n - LEAST_BINS * 2)
     if not len(starts):
         return
     # neighbouring bins show the same step
     starts = starts[:: 1 + len(starts) // _MOSTSTARTS]
-    masks = (np.arange(n)[None, :] >= starts[:, None]).astype(np.float64)
     # a gain that drifts is an alternative to a step
     creep = _STEP_DB * (np.arange(n) / n)[:, None]
     yield Trial(columns=creep)
+    # the channels of a tower step at the same time
+    channels = (e, *e.others)
+    masks = [(_seconds(c, e)[None, :] >= e.time_s[starts][:, None]).astype(np.float64) for c in channels]
     for phi in _SEARCHED_PHI:
-        shift, error, gain = shift_in_masks(residual, masks, phi)
+        steps = [shift_in_masks(c.measured_db - c.predicted_db, m, phi) for c, m in zip(channels, masks, strict=True)]
+        (shift, error, _), gain = steps[0], np.sum([of for _, _, of in steps], axis=0)
         at = int(np.argmax(gain))
         instant = (e.start + np.timedelta64(round(float(e.time_s[starts[at]])), "s")).astype("datetime64[s]")
         step, reach = float(shift[at]), 1.96 * float(error[at])
         yield Trial(
-            name="gain step", cost=_concentration(gain, np.ones(len(gain))), columns=_STEP_DB * masks[at][:, None],
-            estimate=(step, step - reach, step + reach),
+            name="gain step", cost=_concentration(gain, np.ones(len(gain))) / len(channels), channels=len(channels),
+            columns=_STEP_DB * masks[0][at][:, None], estimate=(step, step - reach, step + reach),
             sentence=f"the level steps by {Printed(step):+.1f} dB at {str(instant)[-8:]} UTC",
             next_step=_CHECK_GAIN,
         )  # fmt: skip

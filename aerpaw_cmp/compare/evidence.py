@@ -98,10 +98,10 @@ class LevelEvidence:
     """Part (n,) of the predicted level that depends only on the distance."""
     displaced_db: Mapping[tuple[float, float], FloatArray] = field(default_factory=dict)
     """Change of the predicted level with the tower elsewhere, by distance [m] and azimuth [deg]."""
-    swapped_db: FloatArray | None = None
-    """Change of the predicted level (n,) if the log belongs to the other channel of the tower."""
     least: BoolArray | None = None
     """Mask (n,) of samples at the lowest level of the log (exactly, or within its noise), if that level is frequent."""
+    others: tuple[LevelEvidence, ...] = ()
+    """The other channels of the tower, which step at the same time if a cable or a gain changes, or can be swapped."""
 
 
 def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:

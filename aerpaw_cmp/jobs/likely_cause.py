@@ -69,7 +69,6 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
         return None, None
     rotations: dict[tuple[str, bytes], FloatArray] = {}
     evidence = [_evidence(data, *each, rotations=rotations, scaled=not meant) for each in compared]
-    evidence = [_with_other(e, each, compared, evidence) for e, each in zip(evidence, compared, strict=True)]
     cause = flight_cause(evidence)
     late = _late_clock(evidence, [series.tower for series, _, _ in compared])
     by_direction = cause is None or any(name in OF_DIRECTION for name in cause.name.split(" or "))
@@ -189,20 +188,6 @@ _SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")
 
 # Below this RMSE no cause is searched, because receivers and positions are not more accurate.
 _GOOD_DB = 1.0
-_Compared = tuple[RssSeries, Replayed, RssResult]
-
-
-def _with_other(
-    e: LevelEvidence, own: _Compared, compared: Sequence[_Compared], evidence: Sequence[LevelEvidence]
-) -> LevelEvidence:
-    """Return the evidence with the change of the level if the log belongs to the other channel of its tower."""
-    pairs = zip(compared, evidence, strict=True)
-    others = [o for (series, _, _), o in pairs if series.tower == own[0].tower and o is not e and o.unit == e.unit]
-    if len(others) != 1 or len(others[0].time_s) < 2:
-        return e
-    start_s = (e.start - others[0].start) / np.timedelta64(1, "s")
-    other_db = np.interp(e.time_s + start_s, others[0].time_s, others[0].predicted_db)
-    return dataclasses.replace(e, swapped_db=other_db - e.predicted_db)
 
 
 def _learned_series(data: FlightData, series: RssSeries) -> LearnedSeries | None:

@@ -458,7 +458,9 @@ def test_a_clock_that_drifts_is_no_constant_lag() -> None:
 def test_channels_that_are_swapped_are_named() -> None:
     sound = _sound()
     change = 5.0 * np.cos(np.radians(3.0 * sound.uav_azimuth_deg))
-    assert _named(replace(sound, measured_db=sound.measured_db + change, swapped_db=change)) == "channels"
+    other = replace(sound, predicted_db=sound.predicted_db + change)
+    swapped = replace(sound, measured_db=sound.measured_db + change), replace(other, measured_db=sound.measured_db)
+    assert _named(*swapped) == "channels"
 
 
 def test_an_exponent_of_the_distance_or_a_gain_over_elevation_is_no_unit() -> None:
@@ -743,3 +745,34 @@ def test_a_lag_with_an_interval_wider_than_itself_is_not_named(monkeypatch: pyte
     sure, vague = _clock(3.0, "shifted"), replace(_clock(3.0, "shifted"), ci95_s=(1.0, 4.5))
     assert likely_cause._late_clock([replace(_sound(), clock=sure)], ["LW1"]) is not None
     assert likely_cause._late_clock([replace(_sound(), clock=vague)], ["LW1"]) is None
+
+
+def test_channels_of_a_tower_share_the_instant_of_a_step() -> None:
+    """The instant is searched once for both, so that they need not show the step for certain each."""
+
+    def channel(seed: int, step_db: float, start_s: int) -> LevelEvidence:
+        sound, draw = _sound(seed), np.random.default_rng(seed + 50)
+        fading = draw.normal(0.0, 1.5 * np.sqrt(1.0 - 0.93**2), 300)
+        for i in range(1, 300):
+            fading[i] += 0.93 * fading[i - 1]
+        level = sound.measured_db + fading + step_db * (sound.time_s > 120.0)
+        return replace(
+            sound, name=f"LW1 {seed}", tower="LW1", turned_db={}, other_towers_db={}, measured_db=level,
+            time_s=sound.time_s - start_s, start=causes.EPOCH + np.timedelta64(start_s, "s"),
+        )  # fmt: skip
+
+    channels = channel(3, 3.25, 0), channel(4, 3.25, 40)
+    cause = flight_cause(channels)
+    assert cause is not None
+    assert cause.name == "gain step"
+    assert "00:02:01 UTC" in cause.sentence
+    assert _named(channel(3, 0.0, 0), channel(4, 0.0, 40)) == NONE
+
+
+def test_an_obstacle_shadows_all_channels_of_a_tower() -> None:
+    """A loss on one of two channels is a fault of its receiver or cable."""
+    one, other = (replace(_sound(seed), name=f"LW1 {seed}", tower="LW1") for seed in (3, 4))
+    loss_db = 12.0 * (np.abs(one.tower_azimuth_deg - 40.0) < 12.0)
+    shadowed = [replace(e, measured_db=e.measured_db - loss_db) for e in (one, other)]
+    assert _named(*shadowed) == "blocked"
+    assert _named(shadowed[0], other) != "blocked"

@@ -39,7 +39,6 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
     There is no question if the clock was corrected or if it changes nothing.
     """
     monkeypatch.setattr(likely_cause, "gains_by_direction", lambda *_: None)
-    monkeypatch.setattr(likely_cause, "_with_other", lambda e, *_: e)
     for shifted, other, fall_db, first in (
         (True, None, 0.4, True),
         (True, None, 0.02, False),

@@ -77,7 +77,7 @@ def test_the_papers_tree_is_the_default() -> None:
 
 
 def test_impossible_wishes() -> None:
-    with pytest.raises(UsageError, match="asks for 100000000 trees"):
+    with pytest.raises(UsageError, match="requires 100000000 trees"):
         place_trees(Forest("w", box(0, 0, 1e5, 1e5), 100, 4))
     with pytest.raises(ValueError, match="crown_base_fraction"):
         TreeSizes(crown_base_fraction=1.0)

@@ -93,7 +93,9 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
 _COUNTED = "row number"
 
 
-def _instants(wall: AnyArray, clock: str, options: ReadOptions) -> tuple[_text.Instants, list[str]]:
+def _instants(
+    table: dict[str, AnyArray], wall: AnyArray, clock: str, options: ReadOptions
+) -> tuple[_text.Instants, list[str]]:
     """Return UTC of each row: text and epoch are both local wall clock unless ``clock: utc`` is set."""
     warnings: list[str] = []
     none = np.zeros(len(wall), dtype=bool)
@@ -106,6 +108,10 @@ def _instants(wall: AnyArray, clock: str, options: ReadOptions) -> tuple[_text.I
         return _text.Instants(wall.astype("datetime64[ns]"), none, none.copy()), warnings
     if clock == _EPOCHS[0] and options.clock is None:
         warnings.append("timestamp_power is read as local wall clock stored as UTC, as AERPAW's authors write it")
+    elif clock == _TEXTS[0] and _EPOCHS[0] in table:
+        shift_s = np.round(_numeric(table[_EPOCHS[0]], _EPOCHS[0]) - wall / 1e9)
+        if len(shift_s) and np.abs(shift_s).max() > 1:
+            warnings.append(f"timestamp_power and its text differ by {shift_s[0]:.0f} s (true UTC?): the text was used")
     return _text.wall_to_utc(wall, options, needed_by="flight_mat"), warnings
 
 
@@ -132,7 +138,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     wall, valid, clock = _wall(table)
     keep = np.flatnonzero(valid)
     timed = {name: column[keep] for name, column in table.items()}
-    instants, warnings = _instants(wall[keep], clock, options)
+    instants, warnings = _instants(timed, wall[keep], clock, options)
     rows = Rows(
         reader="flight_mat", options=options, lines=count, row=keep, time=instants.time, flag=_text.no_flags(len(keep)),
         rejected=[RejectedLine(int(i) + 1, "the row has no time", "") for i in np.flatnonzero(~valid)],

@@ -178,6 +178,15 @@ def test_mat_epoch_of_local_time() -> None:
     assert true_utc.streams[0].frame["time"].iloc[0] == utc("2025-03-02 10:00:00.25")
 
 
+@pytest.mark.parametrize(("later_s", "warns"), [(0.0, False), (18_000.0, True)])
+def test_mat_epoch_that_differs_from_its_text_is_reported(later_s: float, warns: bool) -> None:
+    start = np.datetime64("2025-03-02T10:00:00.250").astype(np.int64) / 1e3
+    epoch = start + later_s + 0.26 * np.arange(5)
+    result = read("flight_mat", samples.mat_flight(timestamp_power=epoch[:, None]))
+    assert result.streams[0].frame["time"].iloc[0] == utc("2025-03-02 15:00:00.25")
+    assert any("differ by 18000 s" in text for text in result.warnings) == warns
+
+
 def test_mat_row_without_a_time_is_rejected() -> None:
     times = np.array(["2025-03-02 10:00:00.250", "nonsense", "2025-03-02 10:00:00.750", "NaT", "2025-02-30 10:00:00.0"])
     result = read("flight_mat", samples.mat_flight(timestamp_power_for_csv=times))

@@ -48,15 +48,7 @@ from .mapfiles import (
     read_map_file,
 )
 from .site import Building, Forest, Geofence
-from .siteyaml import (
-    TALLEST_TREE_M,
-    WIDEST_CROWN_M,
-    SingleTreeModel,
-    SiteModel,
-    build_site,
-    extent_m,
-    site_model,
-)
+from .siteyaml import TALLEST_TREE_M, WIDEST_CROWN_M, SingleTreeModel, SiteModel, build_site, extent_m, site_model
 
 # Storey height that OpenStreetMap suggests.
 _LEVEL_M = 3.0

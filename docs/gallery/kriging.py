@@ -8,10 +8,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import aerpaw_cmp as ac
-from aerpaw_cmp.propagation.geometry import single_element
 
 site = ac.load_site("lake_wheeler")
-link = ac.Link(3.4e9, {"LW1": single_element()}, single_element())
+link = ac.Link(3.4e9, {"LW1": ac.single_element()}, ac.single_element())
 axis_m = np.linspace(-400.0, 400.0, 41)
 plan_m = np.column_stack([axis.ravel() for axis in np.meshgrid(axis_m, axis_m)])
 level = ac.trace(site, link, np.column_stack([plan_m, np.full(len(plan_m), 60.0)])).rss_power_dbm[:, 0]

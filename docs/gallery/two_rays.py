@@ -10,7 +10,6 @@ import numpy as np
 
 import aerpaw_cmp as ac
 from aerpaw_cmp.propagation.field.baselines import free_space_dbm, two_ray_dbm
-from aerpaw_cmp.propagation.geometry import single_element
 
 carrier_hz = 3.4e9
 site = ac.load_site("lake_wheeler")
@@ -18,7 +17,7 @@ tower_m = site.towers["LW1"].position_m
 distance_m = np.geomspace(20.0, 2000.0, 1200)
 poses_m = tower_m + np.column_stack([0 * distance_m, -distance_m, 0 * distance_m + 30.0 - tower_m[2]])
 
-link = ac.Link(carrier_hz, {"LW1": single_element()}, single_element(), transmit_power_dbm=0.0)
+link = ac.Link(carrier_hz, {"LW1": ac.single_element()}, ac.single_element(), transmit_power_dbm=0.0)
 replay = ac.trace(site, link, poses_m, max_depth=1)
 
 figure, axes = plt.subplots(figsize=(7, 3.6))

@@ -488,7 +488,6 @@ def gather(
         )
     cautions = check_names(settings, site, [(series.tower, series.channel) for _, series in rss])
     cautions += _unknown_receivers(settings, data.site_place)
-    cautions += tuple(f"{c.key}: {c.text}." for c in settings.cautions if c.key == "rt" and rank)
     track = None
     if found.telemetry:
         path, telemetry = found.telemetry[0]
@@ -589,7 +588,7 @@ def check_names(settings: FlightFile, site: Site, series: Sequence[tuple[str, st
     channels = list(dict.fromkeys(channel for _, channel in series))
     pairs = [f"{tower}.{channel}" for tower, channel in dict.fromkeys(series)]
     named = {**settings.antennas, **{c.key.removeprefix("antennas."): c for c in settings.cautions}}
-    for key in sorted(named.keys() - {"uav", "rank.receiver", "rt", *pairs}):
+    for key in sorted(named.keys() - {"uav", "rank.receiver", *pairs}):
         tower = key.partition(".")[0]
         unknown = ("channel", key) if tower in site.towers else ("tower", tower)
         _unknown(f"antennas.{key}", *unknown, ["uav", *pairs])
@@ -783,7 +782,7 @@ def _idle_attitude(data: FlightData) -> tuple[str, ...]:
     """Return warnings if ``rt.attitude`` has no effect or only a partial one."""
     messages = []
     for kind, series in data.series:
-        mode = data.settings.rt.attitude if kind == "rank" else data.settings.rss_attitude
+        mode = data.settings.rank_rt.attitude if kind == "rank" else data.settings.rss_attitude
         if mode == "ignored":
             continue
         tower, time = series.tower, series.time

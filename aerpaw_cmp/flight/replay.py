@@ -383,7 +383,7 @@ def replay_rank(data: FlightData, progress: Progress = logged) -> list[Replayed]
         towers_m = data.tower_at(series.tower, series.time)[0][valid] if series.tower in data.nodes else None
         progress(f"replay rank {series.tower}: {counted(len(poses), 'pose')}")
         # H contains reflections only, so no other paths are searched
-        replayed = replay_poses(data.site, data.settings.rt, link, poses, towers_m=towers_m, progress=progress)
+        replayed = replay_poses(data.site, data.settings.rank_rt, link, poses, towers_m=towers_m, progress=progress)
         out.append(Replayed(link=link, poses=poses, valid=valid, replay=replayed, track=track, tower_m=towers_m))
     return out
 
@@ -400,7 +400,7 @@ def rank_poses(data: FlightData, series: RankSeries) -> tuple[Poses, BoolArray, 
     # without an attitude the array keeps its orientation in the site
     rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
     if track is not None:
-        rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
+        rotation[track.valid] = attitude_rotation(track, data.settings.rank_rt.attitude)[track.valid]
     return Poses(position[valid], rotation), valid, track
 
 

@@ -477,6 +477,7 @@ class FlightFile(StrictModel):
     report: ReportSettings = ReportSettings()
     _cautions: tuple[Caution, ...] = PrivateAttr(())
     _lent: frozenset[str] = PrivateAttr(frozenset())
+    _rank_rt: RtSettings | None = PrivateAttr(None)
 
     @property
     def cautions(self) -> tuple[Caution, ...]:
@@ -493,6 +494,14 @@ class FlightFile(StrictModel):
         links = (self.link.rss, *self.link.channels.values())
         learned = any(link.uav.antenna.learned is not None for link in links)
         return "logged" if learned and "attitude" not in self.rt.model_fields_set else self.rt.attitude
+
+    @property
+    def rank_rt(self) -> RtSettings:
+        """The settings with which ranks are replayed: ``rt`` as the flight file states it.
+
+        A calibration changes ``rt`` only for levels.
+        """
+        return self._rank_rt or self.rt
 
     @property
     def lent(self) -> frozenset[str]:
@@ -634,10 +643,7 @@ def joined(settings: FlightFile, learned: Path) -> FlightFile:
         ) from None
     here = {"rank.receiver"} if "receiver" in known.get("rank", {}) else set[str]()
     cautions = [u for u in settings.cautions if u.key not in here and not _replaced(u.key, taught, u.channel)]
-    was = settings.rt.model_dump()
-    if rt := [f"{key}: {new} (before: {was[key]})" for key, new in known.get("rt", {}).items() if new != was[key]]:
-        text = f"{learned.name} also sets {', '.join(rt)} for ranks"
-        cautions.append(Caution(key="rt", channel="rank", text=text, used=True))
+    whole._rank_rt = settings.rt
     return whole.changed({}, cautions=cautions, lent={*settings.lent, *(taught.keys() - settings.link.channels.keys())})
 
 

@@ -25,7 +25,7 @@ from ..compare.result import AuditResult, EngineResult
 from ..flight.data import FlightData
 from ..flight.gains import LOSSES, path_loss
 from ..flight.replay import Replayed, attitude_rotation, part_of
-from ..flight.settings import ArraySettings, LinkSettings, load_pattern
+from ..flight.settings import ArraySettings, LinkSettings, RtSettings, load_pattern
 from ..logs.ingest import IngestedFile
 from ..propagation.check import reference
 from ..propagation.check.audit import REFERENCE_LINKS, Audit, Expected, Second, audit, scalar_pattern
@@ -117,7 +117,7 @@ _SETTINGS = {"rt", "link", "rank", "antennas", "towers"}
 
 def _content_of(data: FlightData, replays: Sequence[Replayed]) -> str:
     """Return the SHA-256 of all inputs of an audit: libraries, code, site, logs, settings and replays."""
-    settings = data.settings.model_dump(mode="json", include=_SETTINGS)
+    settings = data.settings.model_dump(mode="json", include=_SETTINGS), data.settings.rank_rt.model_dump(mode="json")
     seen = [
         (r.poses, r.tower_m, *(getattr(r.replay, name) for name in ("towers", "faces", "contributions", *PER_LINK)))
         for r in replays
@@ -128,19 +128,19 @@ def _content_of(data: FlightData, replays: Sequence[Replayed]) -> str:
 
 def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> AuditResult | None:
     """Audit all series, with links in proportion to their poses."""
-    ks, rt = data.settings.rank.k, data.settings.rt
-    search = Search(max_depth=rt.max_depth, samples=rt.advanced.samples)
+    ks, audit_links = data.settings.rank.k, data.settings.rt.audit_links
     total = sum(len(r.poses) for r in replays)
     few = int(np.clip(_REFERENCE_LINKS_AT_MOST // max(len(replays), 1), 3, REFERENCE_LINKS))
     parts: list[Audit] = []
     known: dict[str, Any] = {}
-    for site, replayed, expected in standing(data, replays):
+    for site, replayed, expected, rt in standing(data, replays):
         count = len(replayed.poses)
-        links = min(count, max(math.ceil(rt.audit_links * count / max(total, 1)), 1))
+        links = min(count, max(math.ceil(audit_links * count / max(total, 1)), 1))
         if links:
             progress(f"audit {replayed.replay.towers[0]}: {counted(links, 'link')}")
             second = Second(links=links, expected=expected, ks=ks, reference_links=few, known=known)
             field = Field(loss=path_loss(site, rt, replayed.link.carrier_hz))
+            search = Search(max_depth=rt.max_depth, samples=rt.advanced.samples)
             parts.append(audit(site, replayed.link, replayed.poses, replayed.replay, search, field, second=second))
     if not parts:
         return None
@@ -166,12 +166,12 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
 _MOMENTS = 6
 
 
-def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected]]:
-    """Yield replays with fixed towers and their expected inputs. A moving tower is fixed at several times."""
-    site = data.site.under(data.settings.rt.foliage)
-    for replayed, expected in zip(replays, expectations(data, replays), strict=True):
+def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected, RtSettings]]:
+    """Yield replays with fixed towers, and their expected inputs and settings. A moving tower is fixed at times."""
+    for replayed, expected, rt in zip(replays, expectations(data, replays), _settings_of(data), strict=False):
+        site = data.site.under(rt.foliage)
         if replayed.tower_m is None:
-            yield site, replayed, expected
+            yield site, replayed, expected, rt
             continue
         (tower,) = replayed.link.tower_arrays
         count = len(replayed.poses)
@@ -185,7 +185,7 @@ def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Si
                 track=None,
                 tower_m=None,
             )
-            yield site_with_tower_at(site, tower, replayed.tower_m[at]), moment, expected
+            yield site_with_tower_at(site, tower, replayed.tower_m[at]), moment, expected, rt
 
 
 # --- expected inputs -----------------------------------------------------------------------------------------------
@@ -194,14 +194,21 @@ def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Si
 def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected]:
     """Return the link and losses of each replay, from the settings."""
     settings = [*(s.link for s in data.rss), *[data.settings.link.rank] * len(data.rank)]
-    rt = data.settings.rt
-    loss = reference.ExpectedLoss(**{key: value for each in LOSSES for key, value in each.expected(rt).items()})
+    losses = [
+        reference.ExpectedLoss(**{key: value for each in LOSSES for key, value in each.expected(rt).items()})
+        for rt in _settings_of(data)
+    ]
     if len(settings) != len(replays):  # only a part of the flight was replayed: use the links of the replays
-        return [Expected.of(r.link, loss) for r in replays]
+        return [Expected.of(r.link, losses[0]) for r in replays]
     return [
         Expected(expected_link(link, list(r.link.tower_arrays), data.folder), loss)
-        for link, r in zip(settings, replays, strict=True)
+        for link, r, loss in zip(settings, replays, losses, strict=True)
     ]
+
+
+def _settings_of(data: FlightData) -> list[RtSettings]:
+    """Return the settings of each replay: those of levels, then those of ranks."""
+    return [data.settings.rt] * len(data.rss) + [data.settings.rank_rt] * len(data.rank)
 
 
 def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -> reference.ExpectedLink:

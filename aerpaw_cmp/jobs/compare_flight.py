@@ -708,7 +708,7 @@ def _agreement_by_ground(
     agreed = []
     # fixed seeds, so that two reports of a flight state the same number
     for ground in ground_surface(model, data.site.frame).dems(map(np.random.default_rng, range(_DRAWS))):
-        h = replay_poses(_on(data.site, ground), data.settings.rt, replayed.link, some).h[:, 0]
+        h = replay_poses(_on(data.site, ground), data.settings.rank_rt, replayed.link, some).h[:, 0]
         agreed.append([float((ranks.channel_rank(h, k) == measured[known]).mean()) for k in ks])
     return {f"{k:g}": float(sd) for k, sd in zip(ks, np.std(agreed, axis=0, ddof=1), strict=True)}
 

@@ -117,7 +117,7 @@ def test_the_audit_takes_moments_at_which_the_rover_stands_where_it_was(case):
     _, data, (replayed,), _ = case
     moments = list(standing(data, [replayed]))
     assert len(moments) == 6
-    for site, moment, _expected in moments:
+    for site, moment, _expected, _rt in moments:
         at = int(np.argmin(np.linalg.norm(replayed.poses.position_m - moment.poses.position_m, axis=1)))
         np.testing.assert_allclose(site.towers["ROVER"].position_m, replayed.tower_m[at], atol=1e-9)
         again = replay(site, moment.link, moment.poses, Search(max_depth=1))

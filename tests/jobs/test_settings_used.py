@@ -90,18 +90,21 @@ def test_calibrated_antennas_come_before_those_of_the_flight(tmp_path: Path, cap
     assert "antennas of A learned at 2.4 GHz, used at 3.3 GHz" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("ranked", [True, False])
-def test_a_calibration_that_changes_the_replay_of_ranks_is_a_caution(tmp_path: Path, ranked: bool) -> None:
-    (tmp_path / "learned.yaml").write_text(yaml.safe_dump({"rt": {"max_depth": 0, "attitude": "ignored"}}))
-    radio = "UAV/modem_ri.csv" if ranked else "LW1/USRP1_power_log.txt"
-    paths = [
-        {"path": str(SAMPLE / "UAV/2025-06-01_10_00_00_vehicleOut.txt")},
-        {"path": str(SAMPLE / radio), "node": "LW1"},
-    ]
-    path = write_flight(tmp_path, logs=paths, rt={"max_depth": 1, "audit_links": 0})
-    _, metrics = report(path, "with", "--with", str(tmp_path / "learned.yaml"))
-    said = "rt: learned.yaml also sets max_depth: 0 (before: 1) for ranks."
-    assert (said in metrics["warnings"]) is ranked
+def test_a_calibration_changes_the_replay_of_levels_and_not_of_ranks(tmp_path: Path) -> None:
+    """Antennas are learned with the direct path. The image engine and the audit take the depth of each series."""
+    (tmp_path / "learned.yaml").write_text(yaml.safe_dump({"rt": {"max_depth": 0, "attitude": "logged"}}))
+    paths = [{"path": str(SAMPLE / "UAV/2025-06-01_10_00_00_vehicleOut.txt")}]
+    paths += [{"path": str(SAMPLE / log), "node": "LW1"} for log in ("UAV/modem_ri.csv", "LW1/USRP1_power_log.txt")]
+    path = write_flight(tmp_path, logs=paths, rt={"max_depth": 1, "audit_links": 5, "attitude": "level"})
+    levels, ranks = [], []
+    for name, words in (("own", ()), ("with", ("--with", str(tmp_path / "learned.yaml")))):
+        table, metrics = report(path, name, *words)
+        levels.append(table)
+        ranks.append((path.parent / name / "rank.csv").read_text())
+        audit = metrics["rt"]["audit"]
+        assert (audit["missing_paths"], audit["extra_paths"]) == (0, 0)
+    assert changed_channels(*levels) != set()
+    assert ranks[0] == ranks[1]
 
 
 def test_a_receiver_that_the_site_has_not_learned_is_a_caution(tmp_path: Path) -> None:

@@ -67,6 +67,9 @@ class ModelRow:
         on other flights are known from a calibration, the model with the lowest error there is recommended instead.
     fastest_sufficient : bool
         True for the fastest model whose difference to the best is not significant.
+    distinct : bool
+        False if the error is within 0.01 dB of that of an earlier model on every channel. The recommended model and
+        that of the flight file are always distinct.
     elsewhere_db : (float, float), optional
         RMSE of the recommended model and of free space on other flights [dB], if these selected the model.
     """
@@ -81,42 +84,12 @@ class ModelRow:
     seconds: float
     recommended: bool
     fastest_sufficient: bool
+    distinct: bool
     elsewhere_db: tuple[float, float] | None = None
 
 
 # Models that differ by less than this on every channel [dB] are shown as one row, because tables show hundredths.
 _SAME_DB = 0.01
-
-
-def distinct(rows: Sequence[ModelRow], keep: str) -> tuple[list[ModelRow], list[str]]:
-    """Return the rows of models that differ from every model before them, and the names of all other models.
-
-    Parameters
-    ----------
-    rows : sequence of ModelRow
-        Rows in the order of the models, with the same channels for each.
-    keep : str
-        Model that always has a row, such as the recommended one.
-
-    Returns
-    -------
-    rows : list of ModelRow
-    same : list of str
-        Models whose error is within 0.01 dB of that of a model before them, on every channel.
-    """
-    models: dict[str, list[ModelRow]] = {}
-    for row in rows:
-        models.setdefault(row.model, []).append(row)
-    known: dict[str, FloatArray] = {}
-    same = []
-    for name, own in models.items():
-        error = np.array([row.rmse_heldout_db for row in own])
-        alike = any(np.allclose(error, other, rtol=0.0, atol=_SAME_DB, equal_nan=True) for other in known.values())
-        if alike and np.isfinite(error).any() and name != keep and not any(row.recommended for row in own):
-            same.append(name)
-        else:
-            known[name] = error
-    return [row for name in known for row in models[name]], same
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -281,6 +254,7 @@ def model_rows(
     # sufficient: the best model, and models whose difference has a known interval that contains 0
     sufficient = [i for i, pair in enumerate(pairs) if i == ladder.best or pair.difference_ci95_db[0] <= 0.0]
     fastest = min(sufficient, key=lambda i: ladder.candidates[i].seconds)
+    distinct = _distinct(ladder)
     return [
         ModelRow(
             model=candidate.model,
@@ -293,10 +267,22 @@ def model_rows(
             seconds=candidate.seconds,
             recommended=index == ladder.recommended,
             fastest_sufficient=index == fastest,
+            distinct=index in distinct,
             elsewhere_db=ladder.elsewhere_db if index == ladder.recommended else None,
         )
         for index, (candidate, pair) in enumerate(zip(ladder.candidates, pairs, strict=True))
     ]
+
+
+def _distinct(ladder: ModelComparison) -> set[int]:
+    """Return the indices of models with another error than every model before them, of the last and the recommended."""
+    known: dict[int, FloatArray] = {}
+    for index, errors in enumerate(ladder.error_db):
+        own = np.array([_rmse(error) for error in errors])
+        alike = any(np.allclose(own, other, rtol=0.0, atol=_SAME_DB, equal_nan=True) for other in known.values())
+        if not alike or not np.isfinite(own).any() or index in (ladder.recommended, len(ladder.error_db) - 1):
+            known[index] = own
+    return set(known)
 
 
 def held_out_error_db(

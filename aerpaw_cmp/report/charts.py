@@ -14,12 +14,12 @@ import numpy as np
 
 from ..common.kml import CLASS_COLOURS
 from ..common.units import AnyArray
-from ..compare.ladder import ModelRow, distinct
+from ..compare.ladder import ModelRow
 from ..compare.level import DetectionScore, ServingComparison
 from ..compare.result import RankResult
 from .canvas import draw_marks, mark, seconds_since, subplots
 from .flight_data import RANKS, ReportData, start_of
-from .flight_words import AS_SET, learned_on
+from .flight_words import learned_on
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -76,8 +76,7 @@ def charts_of(data: ReportData) -> list[Chart]:
             ))  # fmt: skip
     scored = [row for row in data.models if np.isfinite(row.rmse_heldout_db)]
     if scored:
-        names = {row.model for row in distinct(data.ladder, AS_SET)[0]}
-        shown = [row for row in data.models if row.model in names]
+        shown = [row for row in data.models if row.distinct]
         charts.append(Chart(
             section="ladder", title="Models from the simplest to the most complex",
             caption="RMSE on held-out areas, over all channels. Whiskers: 95 % interval of the difference to the best "

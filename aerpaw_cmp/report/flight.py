@@ -19,11 +19,10 @@ from ..common.jsonable import fields_of, json_safe
 from ..common.stages import Stages
 from ..common.text import counted
 from ..common.units import AnyArray, FloatArray
-from ..compare.ladder import distinct
 from ..compare.level import PART_DB, ErrorSpan, FieldAudit
 from ..compare.referee import AVERAGED, OURS
 from ..compare.result import APPLIED, GIVEN, AuditResult, ClockResult, EngineResult, RankResult, RssResult
-from ..compare.statistics import FEWEST, Interval
+from ..compare.statistics import Interval
 from ..logs.records import has_wall_clock
 from . import flight_words as words
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, paragraph, settings_card
@@ -346,12 +345,11 @@ def models_card(data: ReportData) -> Card:
     """Return the card that compares models by their error on held-out areas, over all channels and per channel."""
     title = "Which model does this flight need?"
     if not data.models:
-        few = bool(data.rss) and sum(p.score.n for p in data.rss) < FEWEST
+        few = bool(data.rss) and data.engine is not None and data.engine.engine == "image"
         return Card(title=title, id="ladder", link="Models", text=[words.NO_MODELS] if few else [])
-    kept, same = distinct(data.ladder, words.AS_SET)
-    rows = {(row.model, row.tower, row.channel): row for row in kept}
-    names, channels = dict.fromkeys(row.model for row in kept), dict.fromkeys((row.tower, row.channel) for row in kept)
-    shown = [row for row in data.models if row.model in names]
+    rows = {(row.model, row.tower, row.channel): row for row in data.ladder}
+    channels = dict.fromkeys((row.tower, row.channel) for row in data.ladder)
+    shown, same = [row for row in data.models if row.distinct], [row.model for row in data.models if not row.distinct]
     notes = {row.model: ", ".join(["recommended"] * row.recommended + ["fastest sufficient"] * row.fastest_sufficient)
              for row in shown}  # fmt: skip
     pooled = Table(
@@ -374,7 +372,7 @@ def models_card(data: ReportData) -> Card:
         rows=[
             (*of, *(Markup('{} <span class="small">\u0394 {}</span>').format(
                         number(row.rmse_heldout_db), interval(row.difference_to_best_ci95_db, 2))
-                    for model in names for row in [rows[model, of[0], of[1]]]))
+                    for model in shown for row in [rows[(model.model, *of)]]))
             for of in channels
         ],
         look="dense",

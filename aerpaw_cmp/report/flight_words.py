@@ -210,7 +210,7 @@ def expected_sentence(panels: Sequence[RssResult]) -> str:
 
 NO_CAUSE = "No likely cause was identified."
 FEW_SAMPLES = "No cause can be identified in fewer than {n} samples."
-NO_MODELS = f"No models are compared, because fewer than {FEWEST} samples have a measurement, a pose and a path."
+NO_MODELS = f"No models are compared: fewer than {FEWEST} samples have a measurement, a pose and a path in every model."
 TWO_LEVELS = "No cause can be identified: the log has two levels only."
 ONE_PLACE = "No model predicts a change of 1 dB during this flight, so models cannot be distinguished."
 BEYOND_SPAN = "There is no error to report: the best offset is outside its search range."

@@ -1,13 +1,13 @@
 """Model comparison on simulated truths."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.ladder import (
     CandidateModel,
-    ModelRow,
     compare_models,
-    distinct,
     held_out_error_db,
     held_out_lines,
     log_distance_level_db,
@@ -223,20 +223,18 @@ def test_the_fastest_sufficient_model_is_not_significantly_worse_than_the_best()
 
 def test_models_that_cannot_differ_are_one_row() -> None:
     """If several models do not differ, the first is kept, with the models of the flight file and the recommendation."""
-
-    def rows(model: str, *errors_db: float, recommended: bool = False) -> list[ModelRow]:
-        return [
-            ModelRow(model=model, tower="LW1", channel=f"USRP{i}", rmse_heldout_db=error, difference_to_best_db=0.0,
-                      difference_to_best_ci95_db=(0.0, 0.0), n=99, seconds=1.0, recommended=recommended,
-                      fastest_sufficient=False)
-            for i, error in enumerate(errors_db)
-        ]  # fmt: skip
-
-    ladder = [
-        *rows("ground", 3.0, 4.0), *rows("woods", 3.001, 3.999), *rows("half", 3.0, np.nan), *rows("edges", 3.0, 4.02),
-        *rows("opaque", np.nan, np.nan), *rows("none", np.nan, np.nan),
-        *rows("relief", 3.0, 4.0, recommended=True), *rows("as set", 3.0, 4.0),
-    ]  # fmt: skip
-    kept, same = distinct(ladder, "as set")
-    assert same == ["woods"]
-    assert [row.model for row in kept[::2]] == ["ground", "half", "edges", "opaque", "none", "relief", "as set"]
+    rng, n, nan = np.random.default_rng(5), 200, np.full(200, np.nan)
+    unit = rng.choice([-1.0, 1.0], n)
+    errors = {
+        "ground": (3.0, 4.0), "woods": (3.001, 3.999), "half": (3.0, None), "edges": (3.0, 4.02),
+        "opaque": (None, None), "none": (None, None), "relief": (3.0, 4.0), "as set": (3.0, 4.0),
+    }  # fmt: skip
+    flat = CandidateModel(model="flat", level_db=(unit, unit), seconds=1.0)
+    of_two = compare_models([unit] * 2, [np.arange(n)] * 2, [flat, flat], [along(n)] * 2)
+    ladder = dataclasses.replace(
+        of_two, recommended=list(errors).index("relief"), best=0,
+        candidates=tuple(CandidateModel(model=name, level_db=(nan, nan), seconds=1.0) for name in errors),
+        error_db=tuple(tuple(nan if x is None else x * unit for x in pair) for pair in errors.values()),
+    )  # fmt: skip
+    for rows in (model_rows(ladder), model_rows(ladder, 1, tower="LW1", channel="USRP2")):
+        assert [row.model for row in rows if not row.distinct] == ["woods"]

@@ -40,7 +40,7 @@ def report(fixture: Fixture) -> str:
     """Return the page of a flight with ten channels, whose table of models by channel is wider than a page."""
     models = (
         ModelRow(model="free space", rmse_heldout_db=9.5, difference_to_best_db=0.0,
-                 difference_to_best_ci95_db=(0.0, 0.0), n=1000, seconds=1.0, recommended=True, fastest_sufficient=True),
+                 difference_to_best_ci95_db=(0.0, 0.0), n=1000, seconds=1.0, recommended=True, fastest_sufficient=True, distinct=True),
     )  # fmt: skip
     ladder = tuple(
         dataclasses.replace(models[0], tower=f"LW{i // 2 + 1}", channel=f"USRP{i % 2 + 1}", rmse_heldout_db=5.0 + i)

@@ -52,7 +52,7 @@ def test_models_have_a_dot_for_each_score_and_whiskers_of_the_difference(report_
     models = [
         ModelRow(model=model, rmse_heldout_db=rmse, difference_to_best_db=rmse - 3.0, n=100, seconds=seconds,
                  difference_to_best_ci95_db=(rmse - 3.5, rmse - 2.75), recommended=model == "rich",
-                 fastest_sufficient=model == "rich")
+                 fastest_sufficient=model == "rich", distinct=True)
         for model, rmse, seconds in (("free space", 5.0, 0.1), ("opaque", np.nan, 0.5), ("rich", 3.0, 2.0))
     ]  # fmt: skip
     ladder = [dataclasses.replace(row, tower="LW1", channel="A") for row in models]

@@ -386,7 +386,7 @@ def test_a_line_is_no_model_that_is_as_good_and_faster(fast, named):
     """A straight line traces no rays, so it is not named as a fast replay."""
     rows = [ModelRow(model=model, seconds=cost, rmse_heldout_db=11.0 + apart, difference_to_best_db=apart,
                      difference_to_best_ci95_db=(-0.5, 3.0), recommended=apart == 0.0, n=100,
-                     fastest_sufficient=cost == 0.0)
+                     fastest_sufficient=cost == 0.0, distinct=True)
             for model, cost, apart in ((fast, 0.0, 1.6), (AS_SET, 0.1, 0.0))]  # fmt: skip
     assert ("fastest" in models_verdict(rows)) == named
 

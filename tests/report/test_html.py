@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.compare.rank import CommonestRank, RankRepeat
-from aerpaw_cmp.compare.result import ESTIMATED, ClockResult
+from aerpaw_cmp.compare.result import ESTIMATED, ClockResult, EngineResult
 from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report import flight as html
@@ -241,4 +241,10 @@ def test_a_flight_with_few_samples_says_why_no_models_are_compared(small_report)
     few = with_numbers(first, n=4)
     assert words.NO_MODELS in render(dataclasses.replace(small_report, rss=(few,), models=(), ladder=())).text
     assert words.NO_MODELS not in render(dataclasses.replace(small_report, rss=(), models=(), ladder=())).text
-    assert words.NO_MODELS not in render(dataclasses.replace(small_report, rss=(first,), models=(), ladder=())).text
+    # 20 samples can be scored and fewer can have a level in every model
+    assert words.NO_MODELS in render(dataclasses.replace(small_report, rss=(first,), models=(), ladder=())).text
+    # rays of another engine are not compared with simpler models
+    other = dataclasses.replace(
+        small_report, models=(), ladder=(), engine=EngineResult(engine="sionna", links=1, seconds=1.0)
+    )
+    assert words.NO_MODELS not in render(other).text

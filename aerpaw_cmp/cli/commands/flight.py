@@ -120,14 +120,16 @@ def _verdict(outcome: Any, strict: bool) -> int:
 
 
 def _print_models(models: Sequence[Mapping[str, Any]]) -> None:
-    """Print one line per model over all channels. The page lists each channel separately."""
+    """Print one line per distinct model, over all channels. The page lists each channel separately."""
     notes = {"recommended": "recommended", "fastest_sufficient": "fastest sufficient"}
-    rows = [{**row, "note": ", ".join(notes[key] for key in notes if row[key])} for row in models]
+    rows = [{**row, "note": ", ".join(notes[key] for key in notes if row[key])} for row in models if row["distinct"]]
     columns = {
         "model": "model", "RMSE dB": "rmse_heldout_db:.1f", "minus best": "difference_to_best_db:.2f",
         "95 %": "difference_to_best_ci95_db:.2f", "s": "seconds:.1f", "": "note",
     }  # fmt: skip
-    records(rows, columns, "Models, cross-validated over all channels")
+    same = len(models) - len(rows)
+    more = f" ({same} more within 0.01 dB of a row above on every channel)" if same else ""
+    records(rows, columns, f"Models, cross-validated over all channels{more}")
 
 
 def _print_forecasts(rank: Mapping[str, Any]) -> None:

@@ -372,7 +372,7 @@ def models_card(data: ReportData) -> Card:
         rows=[
             (*of, *(Markup('{} <span class="small">\u0394 {}</span>').format(
                         number(row.rmse_heldout_db), interval(row.difference_to_best_ci95_db, 2))
-                    for model in shown for row in [rows[(model.model, *of)]]))
+                    for model in shown for row in [rows[model.model, of[0], of[1]]]))
             for of in channels
         ],
         look="dense",

@@ -324,6 +324,8 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     if "there is no telemetry log" in error.found:
         named = "--map COLUMN=latitude_deg --map COLUMN=longitude_deg names positions in the log"
         return f"'aerpaw-cmp ingest LOG TELEMETRY --draft flight.yaml' drafts it with telemetry; {named}"
+    if again := re.search(r"learn it again: (.+)", error.expected or ""):
+        return f"'{again[1]}'"
     if isinstance(error, CheckError):
         return "read the page, or run without the check"
     if isinstance(error, OutputError) or re.search(r"after -o\b|a new name", error.expected or ""):

@@ -574,17 +574,17 @@ def run_calibrate(
     JobOutcome
         The settings file is the first of its ``files``.
     """
-    from ..site.learned import folder_of, read_index, remember
+    from ..site.learned import folder_of, mend_remark, remember
     from ..site.siteyaml import inputs_of_site, site_model
     from .calibrate import calibrate, load_calibration, read_flights
     from .calibrate_rank import fit_rank, samples_by_tower
     from .calibration_files import Calibrated, site_entries, write_files
     from .tasks import inputs_of_flights
 
-    settings = load_calibration(path, further)
+    settings, mended = load_calibration(path, further), list[str]()
     if into_site is not None:
         site_model(into_site)  # report a misspelt site before the fit, so that nothing is stored under its name
-        read_index(folder_of(into_site))  # report an index to which no entry can be added
+        mended = mend_remark(folder_of(into_site), settings.by_campaign())  # refuse an index of another version
     target = options.out or Path(f"{settings.calibration}.calibrated.yaml")
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError("the output is not a YAML file", expected="-o NAME.yaml", path=target)
@@ -598,6 +598,7 @@ def run_calibrate(
     ):
         with stages("read"):
             flights, remarks, campaigns = read_flights(settings, path.parent, options.logs_root)
+            remarks += mended
             reports = samples_by_tower(flights) if settings.rank else {}
         ranked, calibration = None, None
         if not settings.rank or any(data.rss for data in flights):

@@ -16,17 +16,18 @@ import gzip
 import hashlib
 import json
 import math
+import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from ..common.content import marks, trained_on
 from ..common.errors import InputError, UsageError, parsed, parsing
@@ -36,10 +37,10 @@ from ..common.geodesy import azimuth_rad, elevation_rad
 from ..common.outputs import explained_os_errors, file_digest
 from ..common.text import counted, guarded_comment
 from ..common.units import FloatArray, db_from_power, power_from_db
-from ..common.yamlfile import StrictModel, dump_yaml, load_yaml
+from ..common.yamlfile import StrictModel, dump_yaml, load_yaml, parse_yaml
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power
 
-_INDEX = "learned.yaml"
+_INDEX, DAMAGED = "learned.yaml", "learned.damaged.yaml"
 
 # Relative difference of carriers up to which an antenna of a tower is used.
 # The bands of Lake Wheeler at 3.3, 3.4 and 3.51 GHz differ by 3 % and have different antennas and gains.
@@ -272,8 +273,7 @@ class Entry(StrictModel):
     @property
     def digest(self) -> str:
         """Return the SHA-256 of the values without ``sha256``."""
-        values = self.model_dump(mode="json", exclude={"sha256"}, exclude_none=True)
-        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+        return _digest(self.model_dump(mode="json", exclude_none=True))
 
     def about(self, errors: Errors | None = None, kind: str = "on another flight") -> str:
         """Return a sentence about the training flights and the expected error (default: held-out flights)."""
@@ -322,7 +322,11 @@ def read_learned(site: str | Path) -> Learned:
         If the index names a file outside its folder.
     """
     folder = folder_of(site)
-    memory = read_index(folder)
+    memory, lost, damage = mended_index(folder)
+    if damage is not None:
+        again = "; ".join(lost.values()) or "aerpaw-cmp calibrate CALIBRATION.yaml --into-site SITE"
+        wanted = f"an index as calibrate writes it; learn it again: {again}"
+        raise UsageError(damage.found, expected=wanted, cause="a damaged file", path=damage.path, line=damage.line)
     for name, entry in memory.entries.items():
         if entry.sha256 != entry.digest:
             raise UsageError(
@@ -334,22 +338,82 @@ def read_learned(site: str | Path) -> Learned:
     return memory
 
 
-def read_index(folder: Path) -> Learned:
-    """Read the index in a folder of learned models, also if values of an entry were edited.
+def mended_index(folder: Path) -> tuple[Learned, dict[str, str], UsageError | None]:
+    """Read the index in a folder of learned models, also if it is damaged or values of an entry were edited.
+
+    Returns
+    -------
+    Learned
+        The index without unreadable entries.
+    dict of str to str
+        The commands that learn these entries again, by name.
+    UsageError or None
+        The damage, or None for an index that is not damaged.
 
     Raises
     ------
     UsageError
-        If the index is damaged or has another version.
+        If the index or an entry has another version.
     InputError
         If the index names a file outside its folder.
     """
-    index = inside(folder, _INDEX, folder / _INDEX)
-    memory = load_yaml(index, Learned) if index.is_file() else Learned()
+    index, lost, damage = inside(folder, _INDEX, folder / _INDEX), dict[str, str](), None
+    try:
+        memory = load_yaml(index, Learned) if index.is_file() else Learned()
+    except UsageError as error:
+        damage, memory = error, Learned()
+        text = read_bounded(index, LARGEST_TABLE, "an index").decode("utf-8", "replace")
+        if re.search(rf"^format: (?!{memory.format}\s*$)", text, re.M):
+            raise
+        for block in re.split(r"^(?=  [A-Za-z0-9][\w.-]*:\s*$)", text, flags=re.M)[1:]:
+            name = block.split(":")[0].strip()
+            entry = _entry_of(block, name, error)
+            if isinstance(entry, str):
+                lost[name] = entry
+            else:
+                memory.entries[name] = entry
     for name in {name for entry in memory.entries.values() for name in (*files_of(entry), *entry.tables)}:
         # check before a file is opened, because an index may be untrusted
         inside(folder, name, index, plain=True)
-    return memory
+    return memory, lost, damage
+
+
+def mend_remark(folder: Path, learning: Container[str]) -> list[str]:
+    """Return a sentence about a damaged index that is written again while the entries ``learning`` are learned."""
+    _, lost, damage = mended_index(folder)
+    if damage is None:
+        return []
+    again = [f"{name} ({command})" for name, command in lost.items() if name not in learning]
+    text = f"{damage.path} was damaged and is written again; its damaged content is kept in {DAMAGED}"
+    return [text + (f"; learn again: {', '.join(again)}" if again else "")]
+
+
+class _AnyEntries(BaseModel):
+    """The entries of an index of any version."""
+
+    entries: dict[str, dict[str, Any]]
+
+
+def _entry_of(block: str, name: str, damage: UsageError) -> Entry | str:
+    """Return the entry in its lines of an index, or the command that learns it again if these lines are damaged.
+
+    Raise ``damage`` if they are as another version of this program wrote them.
+    """
+    text, values = f"entries:\n{block}", dict[str, Any]()
+    with suppress(UsageError):
+        return parse_yaml(text, Learned).entries[name]
+    with suppress(UsageError):
+        values = parse_yaml(text, _AnyEntries).entries[name]
+    if values.get("sha256") == _digest(values):
+        raise damage
+    command = re.search(r"^    command: (.+(\n      .+)*)$", block, re.M)
+    return " ".join(command[1].split()) if command else f"the calibration of {name}"
+
+
+def _digest(values: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of the values of an entry without ``sha256``."""
+    known = {key: value for key, value in values.items() if key != "sha256"}
+    return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
 
 
 def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, bytes]) -> list[Path]:
@@ -383,7 +447,9 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
         folder.mkdir(exist_ok=True)
         # if two calibrations of one site run at once, each must see the entry of the other
         with locked(folder):
-            memory = read_index(folder)
+            memory, _, damage = mended_index(folder)
+            if damage is not None:
+                write_whole(folder / DAMAGED, (folder / _INDEX).read_bytes())
             # files with a digest in an entry are ours, and so are an edited table and tables of a killed calibration
             written = {item for known in memory.entries.values() for item in known.tables.items()}
             for file in packed:

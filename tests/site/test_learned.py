@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.outputs import file_digest
+from aerpaw_cmp.common.yamlfile import dump_yaml
 from aerpaw_cmp.flight.drafting.proposals import all_learned_links, learned_towers
 from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
@@ -260,7 +262,9 @@ def test_a_second_entry_joins_the_first_and_one_of_the_same_name_replaces_it(fol
 def test_an_index_of_another_version_stays_as_it_was(folder: Path) -> None:
     site = folder / "mine.yaml"
     index = folder_of(site) / "learned.yaml"
-    index.write_text(before := index.read_text().replace(" sd_db:", " spread_db:"))
+    values = yaml.safe_load(index.read_text())["entries"]["d12"] | {"spread_db": 1.5}
+    values["sha256"] = memory._digest(values)
+    index.write_text(before := dump_yaml({"format": memory.Learned().format, "entries": {"d12": values}}))
     for attempt in (lambda: read_learned(site), lambda: remember(site, "other", entry("B"), learned_tables("B"))):
         with pytest.raises(UsageError, match="spread_db"):
             attempt()
@@ -472,6 +476,34 @@ def test_an_edited_value_is_refused_and_replaced_by_learning_again(folder: Path)
         read_learned(site)
     remember(site, "d12", entry("A"), learned_tables("A"))
     assert read_learned(site).entries["d12"].series[0].spread.noise_sd_db == 0.0
+
+
+DAMAGES: dict[str, Callable[[str], str]] = {
+    "empty": lambda _: "",
+    "not text": lambda text: "\0" + text,
+    "a deleted line": lambda text: text.replace("    flights: [a, b]\n", "", 1),
+    "a number that is text": lambda text: text.replace("sd_db: 1.5", "sd_db: 1,5", 1),
+    "an open quote": lambda text: text.replace("made: ", 'made: "', 1),
+    "cut": lambda text: text[: text.index("  other:") + 300],
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_index_is_refused_and_written_again_with_its_intact_entries(folder: Path, damage: str) -> None:
+    site, index = folder / "mine.yaml", folder_of(folder / "mine.yaml") / "learned.yaml"
+    remember(
+        site, "other", learned_entry(learned_series("B"), command="aerpaw-cmp calibrate o.yaml"), learned_tables("B")
+    )
+    index.write_text(DAMAGES[damage](index.read_text()))
+    before, intact = index.read_text(), {"cut": {"d12"}, "empty": set(), "not text": {"d12", "other"}}
+    with pytest.raises(UsageError, match="learn it again: aerpaw-cmp calibrate"):
+        read_learned(site)
+    (remark,) = memory.mend_remark(index.parent, ["d12"])
+    assert ("learn again: other (aerpaw-cmp calibrate o.yaml)" in remark) is (damage == "cut")
+    remember(site, "new", entry("C"), learned_tables("C"))
+    assert read_learned(site).entries.keys() == {*intact.get(damage, {"other"}), "new"}
+    assert (index.parent / memory.DAMAGED).read_text() == before
+    assert memory.mend_remark(index.parent, []) == []
 
 
 def test_the_error_to_expect_is_that_of_flights_of_the_same_kind() -> None:

@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 
 from aerpaw_cmp.common.yamlfile import dump_yaml
-from aerpaw_cmp.compare.referee import PredictedLevel, level_card
+from aerpaw_cmp.compare.referee import level_card
 from aerpaw_cmp.compare.statistics import FEWEST
 from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
@@ -114,11 +114,8 @@ def predicted(
         samples = flown.samples
         part = split_by_series(given.table, samples.tower, samples.channel)
         said, near = predicted_at(given, part, samples.time_s, samples.position_m, flown.heading_deg)
-        predicted = PredictedLevel(
-            level_db=said["level"], sd_db=said.get("sd_db"), q05_db=said.get("q05_db"), q95_db=said.get("q95_db")
-        )
         if near.sum() >= FEWEST:
-            card = level_card(samples.time_s, samples.residual_db + flown.free_space_db, predicted, ())
+            card = level_card(samples.time_s, samples.residual_db + flown.free_space_db, said)
             sd_db = float(np.sqrt(np.nanmean(np.square(said["sd_db"]))))
             numbers = card.coverage_90, card.rmse_db, card.rmse_offset_db, sd_db, card.crps_db
             rows.append(dict(zip(NAMES, numbers, strict=True)))

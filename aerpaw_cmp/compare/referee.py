@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,13 +22,8 @@ OURS = "ray tracing (this report)"
 AVERAGED = ("bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "correlation", "crps_db", "coverage_90")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Exceedance:
-    """The share of samples at or above a threshold [dB], predicted and measured."""
-
-    threshold_db: float
-    predicted: float
-    measured: float
+# Columns of a prediction with the two parts of its distribution, for a receiver that can lose its lock.
+LOCK = ("p_lock", "locked_db", "lost_db", "locked_sd_db", "lost_sd_db")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,8 +45,9 @@ class LevelCard:
         constant.
     crps_db, coverage_90 : float, optional
         Continuous ranked probability score and share inside the 90 % band; None without a band.
-    exceedance : tuple of Exceedance
-        Shares of samples above thresholds. If the levels have no common reference, the offset is applied first.
+    exceedance : tuple of mapping
+        ``predicted`` and ``measured`` share of samples at or above ``threshold_db``. If the levels have no common
+        reference, the offset is applied first.
     outages_missed, outages_invented : int
         Number of outages where a level was predicted, and of levels where an outage was predicted.
     """
@@ -66,42 +62,18 @@ class LevelCard:
     slope: float
     crps_db: float | None
     coverage_90: float | None
-    exceedance: tuple[Exceedance, ...]
+    exceedance: tuple[Mapping[str, float], ...]
     outages_missed: int
     outages_invented: int
-
-
-@dataclass(frozen=True, slots=True)
-class PredictedLevel:
-    """Levels (n,) of one prediction at the samples of a series. NaN where nothing is predicted [dB].
-
-    Parameters
-    ----------
-    level_db : (n,)
-        The predicted median.
-    absolute : bool
-        True if the levels have the reference of the measurement, so that no offset is needed.
-    sd_db : (n,), optional
-        Standard deviation of one sample.
-    q05_db, q95_db : (n,), optional
-        Ends of the 90 % interval. By default, they follow from a normal distribution with ``sd_db``.
-    lock : LostLock, optional
-        The two parts of the distribution for a receiver that can lose its lock. By default, the error is normal.
-    """
-
-    level_db: FloatArray
-    absolute: bool = True
-    sd_db: FloatArray | None = None
-    q05_db: FloatArray | None = None
-    q95_db: FloatArray | None = None
-    lock: LostLock | None = None
 
 
 def level_card(
     time_s: FloatArray,
     measured_db: FloatArray,
-    predicted: PredictedLevel,
-    thresholds_db: Sequence[float],
+    predicted: Mapping[str, FloatArray],
+    thresholds_db: Sequence[float] = (),
+    *,
+    absolute: bool = True,
     scored: BoolArray | None = None,
 ) -> LevelCard:
     """Return the scores of a predicted level.
@@ -112,9 +84,15 @@ def level_card(
         Times of the samples [s], rising. At least one sample has both levels.
     measured_db : (n,)
         Measured levels; NaN is an outage.
-    predicted : PredictedLevel
+    predicted : mapping of str to (n,)
+        ``level``: predicted median [dB], NaN where nothing is predicted. Optional, and used if they are known on all
+        samples with both levels: ``sd_db`` (standard deviation of one sample; the error is normal), ``q05_db`` and
+        ``q95_db`` (ends of the 90 % interval, else those of the distribution), and the columns :data:`LOCK` (two parts,
+        instead of a normal error).
     thresholds_db : sequence of float
         Measured levels whose exceedance is compared.
+    absolute : bool
+        True if the levels have the reference of the measurement, so that no offset is needed.
     scored : (n,) bool, optional
         Samples that the prediction covers. There, a predicted NaN means a predicted outage. By default, samples with a
         predicted level.
@@ -123,7 +101,7 @@ def level_card(
     -------
     LevelCard
     """
-    level = predicted.level_db
+    level = predicted["level"]
     scored = np.isfinite(level) if scored is None else scored
     heard, reached = np.isfinite(measured_db) & scored, np.isfinite(level) & scored
     both = heard & reached
@@ -132,7 +110,6 @@ def level_card(
     slow = local_mean_db(time_s[both], measured, WINDOW_S) - local_mean_db(time_s[both], expected, WINDOW_S)
     # rounding would give a constant prediction a correlation
     r = correlation(measured, np.round(expected, 6))
-    absolute = predicted.absolute
     crps, inside = _distribution(measured_db, predicted, both) if absolute else (None, None)
     # an outage counts as below any threshold
     theirs = np.where(reached, level + (0.0 if absolute else error.mean()), -np.inf)[scored]
@@ -149,7 +126,7 @@ def level_card(
         crps_db=crps,
         coverage_90=inside,
         exceedance=tuple(
-            Exceedance(threshold_db=x, predicted=float(np.mean(theirs >= x)), measured=float(np.mean(ours >= x)))
+            {"threshold_db": x, "predicted": float(np.mean(theirs >= x)), "measured": float(np.mean(ours >= x))}
             for x in thresholds_db
         ),
         outages_missed=int((reached & ~heard).sum()),
@@ -158,20 +135,30 @@ def level_card(
 
 
 def _distribution(
-    measured_db: FloatArray, predicted: PredictedLevel, both: BoolArray
+    measured_db: FloatArray, predicted: Mapping[str, FloatArray], both: BoolArray
 ) -> tuple[float | None, float | None]:
     """Return CRPS and coverage of the predicted 90 % band. None if the prediction does not state them."""
-    low_db, high_db, crps = predicted.q05_db, predicted.q95_db, None
-    if low_db is None or high_db is None or not np.isfinite((low_db + high_db)[both]).all():
-        low_db = high_db = None
-    if predicted.sd_db is not None and np.isfinite(predicted.sd_db[both]).all():
-        stated = StatedSpread(gain_sd_db=predicted.sd_db, spread=NO_SPREAD, lock=predicted.lock)
-        crps = stated.crps_db(np.where(both, measured_db - predicted.level_db, np.nan))
-        if low_db is None or high_db is None:
-            low_db, high_db = (predicted.level_db + end for end in stated.band_db(BAND))
-    if low_db is None or high_db is None:
-        return crps, None
-    return crps, float(np.mean(((measured_db >= low_db) & (measured_db <= high_db))[both]))
+
+    def known(*names: str) -> bool:
+        return all(name in predicted and np.isfinite(predicted[name][both]).all() for name in names)
+
+    level, crps, lock, band = predicted["level"], None, None, None
+    if known("sd_db"):
+        if known(*LOCK):
+            lock = LostLock(
+                probability=predicted["p_lock"],
+                locked_db=predicted["locked_db"] - level,
+                lost_db=predicted["lost_db"] - level,
+                locked_sd_db=float(np.nanmean(predicted["locked_sd_db"])),
+                lost_sd_db=float(np.nanmean(predicted["lost_sd_db"])),
+            )
+        stated = StatedSpread(gain_sd_db=predicted["sd_db"], spread=NO_SPREAD, lock=lock)
+        crps = stated.crps_db(np.where(both, measured_db - level, np.nan))
+        low_db, high_db = stated.band_db(BAND)
+        band = level + low_db, level + high_db
+    if known("q05_db", "q95_db"):
+        band = predicted["q05_db"], predicted["q95_db"]
+    return crps, band and float(np.mean(((measured_db >= band[0]) & (measured_db <= band[1]))[both]))
 
 
 # Largest difference between the headings of a predicted point and a sample [deg].
@@ -179,11 +166,7 @@ _TURNED_DEG = 45.0
 
 
 def nearest_points(
-    position_m: FloatArray,
-    heading_deg: FloatArray | None,
-    points_m: FloatArray,
-    yaw_deg: FloatArray | None,
-    reach_m: float,
+    position_m: FloatArray, points_m: FloatArray, reach_m: float, nose_deg: tuple[FloatArray, FloatArray] | None = None
 ) -> tuple[IntArray, BoolArray]:
     """Return the nearest predicted point (n,) of each sample, and whether it is near (n,).
 
@@ -191,13 +174,11 @@ def nearest_points(
     ----------
     position_m : (n, 3)
         East, north, up of the samples; a sample with a NaN is near no point.
-    heading_deg : (n,), optional
-        Headings of the nose at the samples.
     points_m : (points, 3)
-    yaw_deg : (points,), optional
-        Headings of the predicted points. Headings are used only if all points and at least one sample have one.
     reach_m : float
         Largest distance of a near point.
+    nose_deg : ((n,), (points,)), optional
+        Headings of samples and points. They are used only if all points and at least one sample have one.
 
     Returns
     -------
@@ -207,17 +188,16 @@ def nearest_points(
     from scipy.spatial import cKDTree
 
     samples, points = position_m / reach_m, points_m / reach_m
-    turned = None if yaw_deg is None or heading_deg is None else (heading_deg, yaw_deg)
-    if turned is not None and np.isfinite(turned[0]).any() and np.isfinite(turned[1]).all():
+    if nose_deg is not None and np.isfinite(nose_deg[0]).any() and np.isfinite(nose_deg[1]).all():
+        apart = 2.0 * np.sin(np.radians(_TURNED_DEG) / 2.0)
         samples, points = (
-            np.column_stack([place, np.sin(np.radians(nose)), np.cos(np.radians(nose))])
-            / np.r_[1.0, 1.0, 1.0, np.full(2, 2.0 * np.sin(np.radians(_TURNED_DEG) / 2.0))]
-            for place, nose in zip((samples, points), turned, strict=True)
+            np.column_stack([place, np.sin(np.radians(nose)) / apart, np.cos(np.radians(nose)) / apart])
+            for place, nose in zip((samples, points), nose_deg, strict=True)
         )
     known = np.asarray(np.isfinite(samples).all(axis=1))
     index = np.asarray(cKDTree(points).query(np.where(known[:, None], samples, 0.0))[1])
-    apart = samples - points[index]
-    return index, known & (np.linalg.norm(apart[:, :3], axis=1) <= 1.0) & (np.linalg.norm(apart[:, 3:], axis=1) <= 1.0)
+    away = samples - points[index]
+    return index, known & (np.linalg.norm(away[:, :3], axis=1) <= 1.0) & (np.linalg.norm(away[:, 3:], axis=1) <= 1.0)
 
 
 # The lowest level is a detection floor if at least this share, and this number, of the samples have it.

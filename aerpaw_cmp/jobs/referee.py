@@ -29,20 +29,10 @@ from ..common.outputs import file_digest
 from ..common.text import counted
 from ..common.units import FOOT_M, AnyArray, BoolArray, FloatArray, db_from_power
 from ..common.yamlfile import parse_yaml
-from ..compare.gains import LostLock
+from ..compare import referee
 from ..compare.level import nearest_in_time
 from ..compare.rank import MAX_RANK, compare_ranks
 from ..compare.receiver import score_forecast
-from ..compare.referee import (
-    AVERAGED,
-    OURS,
-    LevelCard,
-    PredictedLevel,
-    detection_floor_db,
-    level_card,
-    measured_thresholds,
-    nearest_points,
-)
 from ..compare.result import BASELINE_TITLE, FlightResult, RankResult, RssResult
 from ..compare.statistics import FEWEST, PairedDifference, paired_difference
 from ..flight.data import FlightData, load_data
@@ -61,9 +51,8 @@ from .options import AGAINST_DISTANCE_M, RANKS
 QUANTITIES = ("level_dbm", "level_db", "path_loss_db")
 _PLACE = ("east_m", "north_m", "height_m")
 _GEOGRAPHIC = ("latitude_deg", "longitude_deg", "height_m")
-_LOCK = ("p_lock", "locked_db", "lost_db", "locked_sd_db", "lost_sd_db")
 _LEVELS = ("level", "q05_db", "q95_db", "locked_db", "lost_db")
-_NUMBERS = ("sd_db", "q05_db", "q95_db", "rank", "yaw_deg", "time_s", *RANKS, *_LOCK)
+_NUMBERS = ("sd_db", "q05_db", "q95_db", "rank", "yaw_deg", "time_s", *RANKS, *referee.LOCK)
 _COLUMNS = ("time", "time_utc", "tower", "channel", *_PLACE, *_GEOGRAPHIC[:2], *QUANTITIES, *_NUMBERS)
 
 _EXPECTED = (
@@ -473,7 +462,7 @@ class SeriesVerdict:
         Samples of the flight with and without a prediction nearby.
     floor_db : float, optional
         Detection floor that the predicted levels show, such as those of an emulated receiver.
-    cards : mapping of str to LevelCard
+    cards : mapping of str to referee.LevelCard
         By model, the prediction first, then ray tracing and the baselines, on the same samples. A model with too few
         levels has no card.
     differences : mapping of str to PairedDifference
@@ -486,7 +475,7 @@ class SeriesVerdict:
     matched: int
     unmatched: int
     floor_db: float | None
-    cards: Mapping[str, LevelCard]
+    cards: Mapping[str, referee.LevelCard]
     differences: Mapping[str, PairedDifference]
 
 
@@ -522,7 +511,7 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     name, predicted = given.path.name, set(given.table["tower"])
     scored = {(entry.tower, entry.channel) for entry in series}
     # means over different channels could not be compared
-    models: Mapping[str, LevelCard] = max((entry.cards for entry in series), key=len, default={})
+    models: Mapping[str, referee.LevelCard] = max((entry.cards for entry in series), key=len, default={})
     common = [entry for entry in series if entry.cards.keys() >= models.keys()]
     means = [_means(model, [entry.cards[model] for entry in common]) for model in models]
     remarks = [*given.remarks]
@@ -558,10 +547,10 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     return score
 
 
-def _means(model: str, cards: Sequence[LevelCard]) -> dict[str, Any]:
+def _means(model: str, cards: Sequence[referee.LevelCard]) -> dict[str, Any]:
     """Return the mean scores of a model over channels. NaN if a channel does not have the number."""
-    values = np.array([[getattr(card, key) for key in AVERAGED] for card in cards], dtype=np.float64)
-    return {"model": model, "channels": len(cards), **dict(zip(AVERAGED, values.mean(axis=0), strict=True))}
+    values = np.array([[getattr(card, key) for key in referee.AVERAGED] for card in cards], dtype=np.float64)
+    return {"model": model, "channels": len(cards), **dict(zip(referee.AVERAGED, values.mean(axis=0), strict=True))}
 
 
 def _sentence(
@@ -573,12 +562,12 @@ def _sentence(
     """Return both errors, whether the difference is significant, the errors as predicted, and the scored samples."""
     mean, errors = means[0], {row["model"]: row["rmse_offset_db"] for row in means}
     text = f"{given.path.name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel"
-    if OURS in errors:
-        verdicts = Counter(entry.differences[OURS].verdict for entry in common)
+    if referee.OURS in errors:
+        verdicts = Counter(entry.differences[referee.OURS].verdict for entry in common)
         decided = [f"significantly {kind} on {verdicts[kind]}" for kind in ("better", "worse") if verdicts[kind]]
         text += (
-            f", ray tracing {errors[OURS]:.1f} dB on the same samples ({counted(len(common), 'channel')}). It is "
-            f"{' and '.join(decided) or 'on no channel significantly different from ray tracing'} (95 %)."
+            f", ray tracing {errors[referee.OURS]:.1f} dB on the same samples ({counted(len(common), 'channel')}). It "
+            f"is {' and '.join(decided) or 'on no channel significantly different from ray tracing'} (95 %)."
         )
     else:
         text += ". Ray tracing has no score there."
@@ -602,50 +591,33 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> Seri
     heading_deg = item.geometry.get("heading_deg")
     predicted, near = predicted_at(given, part, item.time, item.position_m, heading_deg)
     near &= item.posed
-    level, heard, absolute = predicted["level"], np.isfinite(item.measured_db), given.absolute(item.unit)
+    level, heard = predicted["level"], np.isfinite(item.measured_db)
     scored = near & heard & np.isfinite(level)
     if scored.sum() < FEWEST:
         return None
     same = near & (np.isfinite(level) | ~heard)
     name = given.path.name
-    stated = {key: predicted[key] for key in ("sd_db", "q05_db", "q95_db")}
-    foreign = PredictedLevel(level, absolute, lock=_lock(predicted), **stated)
-    models = {name: (foreign, near)}
+    # by model: its columns, whether it has the reference of the log, and the samples that it covers
+    models = {name: (predicted, given.absolute(item.unit), near)}
     if not item.training:  # its antennas know these samples
-        models[OURS] = PredictedLevel(item.simulated_dbm, item.unit == "dBm"), same
-    models |= {
-        BASELINE_TITLE[key]: (PredictedLevel(of.level_dbm, absolute=False), same) for key, of in item.baselines.items()
-    }
+        models[referee.OURS] = {"level": item.simulated_dbm}, item.unit == "dBm", same
+    models |= {BASELINE_TITLE[key]: ({"level": of.level_dbm}, False, same) for key, of in item.baselines.items()}
     seconds = (item.time - item.time[0]) / np.timedelta64(1, "s")
-    thresholds = measured_thresholds(item.measured_db[near], ratio=item.unit == "dB")
+    thresholds = referee.measured_thresholds(item.measured_db[near], ratio=item.unit == "dB")
     cards = {
-        key: level_card(seconds, item.measured_db, model, thresholds, on)
-        for key, (model, on) in models.items()
-        if (np.isfinite(model.level_db) & heard & on).sum() >= FEWEST
+        key: referee.level_card(seconds, item.measured_db, columns, thresholds, absolute=absolute, scored=on)
+        for key, (columns, absolute, on) in models.items()
+        if (np.isfinite(columns["level"]) & heard & on).sum() >= FEWEST
     }
-    errors = {key: np.where(scored, item.measured_db - models[key][0].level_db, np.nan) for key in cards}
+    errors = {key: np.where(scored, item.measured_db - models[key][0]["level"], np.nan) for key in cards}
     theirs = errors.pop(name)
     return SeriesVerdict(
         tower=item.tower, channel=item.channel, unit=item.unit,
         matched=int(near.sum()), unmatched=int((item.posed & ~near).sum()),
-        floor_db=detection_floor_db(part["level"].to_numpy(np.float64)),
+        floor_db=referee.detection_floor_db(part["level"].to_numpy(np.float64)),
         cards=cards,
         differences={key: paired_difference(theirs, of, place_m=item.position_m) for key, of in errors.items()},
     )  # fmt: skip
-
-
-def _lock(predicted: Mapping[str, FloatArray]) -> LostLock | None:
-    """Return the predicted distribution of a receiver that can lose its lock, if ``predict`` wrote one."""
-    level = predicted["level"]
-    if not np.isfinite(np.stack([predicted[key] for key in _LOCK])[:, np.isfinite(level)]).all():
-        return None
-    return LostLock(
-        probability=predicted["p_lock"],
-        locked_db=predicted["locked_db"] - level,
-        lost_db=predicted["lost_db"] - level,
-        locked_sd_db=float(np.nanmean(predicted["locked_sd_db"])),
-        lost_sd_db=float(np.nanmean(predicted["lost_sd_db"])),
-    )
 
 
 def split_by_series(table: pd.DataFrame, tower: str, channel: str) -> pd.DataFrame:
@@ -687,8 +659,10 @@ def predicted_at(
         most_s = max(_NEAR_S, 0.51 * float(np.median(steps_s)) if len(steps_s) else 0.0)
         near = np.asarray(apart / np.timedelta64(1, "s") <= most_s)
     else:
-        points, yaw_deg = part[list(_PLACE)].to_numpy(np.float64), part["yaw_deg"].to_numpy(np.float64)
-        index, near = nearest_points(position_m, heading_deg, points, yaw_deg, given.near_m)
+        nose_deg = None if heading_deg is None else (heading_deg, part["yaw_deg"].to_numpy(np.float64))
+        index, near = referee.nearest_points(
+            position_m, part[list(_PLACE)].to_numpy(np.float64), given.near_m, nose_deg
+        )
     return {name: np.where(near, part[name].to_numpy(np.float64)[index], np.nan) for name in names}, near
 
 
@@ -743,7 +717,7 @@ def _wrong_heights(given: ForeignPrediction, data: FlightData, result: FlightRes
         return None
     flown = np.vstack([s.position_m[np.isfinite(s.position_m).all(axis=1)] for s in result.series])
     points, flat = given.table[list(_PLACE)].dropna().to_numpy(), np.array([1.0, 1.0, 0.0])
-    index, near = nearest_points(flown * flat, None, points * flat, None, given.near_m)
+    index, near = referee.nearest_points(flown * flat, points * flat, given.near_m)
     apart_m = float(np.median((points[index] - flown)[near, 2])) if near.any() else 0.0
     datum = (
         f"another height datum: the predicted positions are {abs(apart_m):.0f} m "
@@ -753,7 +727,7 @@ def _wrong_heights(given: ForeignPrediction, data: FlightData, result: FlightRes
     ground = data.site.takeoff_ground_m * (1.0 - flat)
     corrected = {datum: points - apart_m * (1.0 - flat), "heights in feet": ground + (points - ground) * [1, 1, FOOT_M]}
     shares = {
-        cause: float(nearest_points(flown, None, places, None, given.near_m)[1].mean())
+        cause: float(referee.nearest_points(flown, places, given.near_m)[1].mean())
         for cause, places in corrected.items()
     }
     cause = max(corrected, key=shares.__getitem__)

@@ -351,7 +351,7 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return f"'ls {one_line(str(place))}' shows what the folder contains"
     if words[:1] == ["ingest"]:
         # a recognised file, or a hint about columns, already contains the next step
-        unknown = "no reader knows" in error.found and "--map" not in (error.cause or "")
+        unknown = "no reader recognises" in error.found and "--map" not in (error.cause or "")
         return "'aerpaw-cmp formats' lists what can be read" if unknown else ""
     if "--tower NAME=" in (error.expected or ""):
         return "the same command with --tower NAME=LATITUDE,LONGITUDE,HEIGHT"

@@ -68,7 +68,7 @@ class Quantity:
 
 _FULL_SCALE = "dB re full scale"
 # Words for a height, which patterns of the file name HEIGHT.
-_HEIGHT = r"(alt|altitude|height|hgt|elevation|ele|hoehe|h he)"
+_HEIGHT = r"(alt|altitude|height|hgt|elevation|ele)"
 # PyYAML's C loader, which all its wheels have, reads the file in 5 ms, with every value as text.
 _FILE: Mapping[str, Any] = yaml.load(
     Path(__file__).with_name("dictionary.yaml").read_text(encoding="utf-8"),
@@ -86,6 +86,7 @@ def _quantity(row: Mapping[str, Any]) -> Quantity:
 
 
 QUANTITIES = tuple(_quantity(row) for row in _FILE["quantities"])
+ZONES: Mapping[str, Mapping[str, str]] = _FILE["zones"]
 
 
 @cache
@@ -160,22 +161,36 @@ class Meaning:
     part: str = ""
 
 
+_WORDS = {word: english for english, words in _FILE["translations"].items() for word in words}
+# Latin and Cyrillic words are complete, Chinese, Japanese and Korean words have no spaces between them.
+_TRANSLATED = re.compile(
+    "|".join(
+        rf"(?<![^\W\d_]){word}(?![^\W\d_])" if word < "\u2e80" else word
+        for word in (*sorted(_WORDS, key=len, reverse=True), "[\u3040-\u9fff\uac00-\ud7af]+")
+    )
+)
+
+
+@cache
 def plain(name: str) -> str:
-    """Return a name in lower case with its punctuation as single spaces.
+    """Return a name in lower case and in English, with its punctuation as single spaces.
 
     Examples
     --------
     >>> plain("RSRP (LTE detected) - 1")
     'rsrp lte detected 1'
+    >>> plain("H\u00f6he [m]"), plain("\u7ecf\u5ea6")
+    ('height m', 'longitude')
     """
     # headers copied from web pages contain zero-width spaces
-    return re.sub(r"[^a-z0-9]+", " ", name.lower().replace("\u200b", "")).strip()
+    english = _TRANSLATED.sub(lambda word: f" {_WORDS.get(word[0], 'other')} ", name.lower().replace("\u200b", ""))
+    return re.sub(r"[^a-z0-9]+", " ", english).strip()
 
 
-_BRACKETS = re.compile(r"[\[(]([^\[\]()]{1,24})[\])]")
+_BRACKETS = re.compile(r"[\[(\uff08]([^\[\]()\uff09]{1,24})[\])\uff09]")
 _BRACKET = re.compile(_BRACKETS.pattern + r"\s*$")
-# The words of 'RsrpDbm', but not of 'dBm' and 'eNB'.
-_CAMEL = re.compile(r"(?<=[a-z])(?<!\b[a-z])(?<!_[a-z])(?=[A-Z])")
+# The words of 'RsrpDbm' and 'RSRPDbm', but not of 'dBm' and 'eNB'.
+_CAMEL = re.compile(r"(?<=[a-z])(?<!\b[a-z])(?<!_[a-z])(?=[A-Z])(?!Bm?$)|(?<=[A-Z0-9])(?=[dD][bB][mM]?$)")
 _A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5\u03bc%\u00b0]{1,7}(/[a-z]{1,3})?")
 
 
@@ -385,22 +400,7 @@ ACROSS_50_OHM = ("dbuv", "db\u00b5v", "db\u03bcv")
 _DBUV_OF_0_DBM = 90 + 10 * float(np.log10(50.0))
 
 # Units that a name or a cell may have, by the unit after conversion, with their factors.
-_FACTORS: dict[str, dict[str, float]] = {
-    "m": {
-        "ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "kft": 304.8, "m": 1.0, "meter": 1.0, "meters": 1.0,
-        "metres": 1.0, "dm": 0.1, "cm": 0.01, "mm": 1e-3, "km": 1e3, "yd": 0.9144, "in": 0.0254, "inch": 0.0254,
-        "inches": 0.0254},
-    "m/s": {
-        "mph": 0.44704, "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "kts": 0.514444,
-        "kt": 0.514444, "kn": 0.514444, "knots": 0.514444, "cm/s": 0.01, "ft/s": 0.3048},
-    "deg": {
-        "deg": 1.0, "degree": 1.0, "degrees": 1.0, "\u00b0": 1.0, "rad": 180 / np.pi, "radians": 180 / np.pi,
-        "dege7": 1e-7, "deg e7": 1e-7, "semicircles": 180 / 2**31, "degrees e7": 1e-7, "e7": 1e-7, "deg*1e7": 1e-7,
-        "1e7": 1e-7, "e6": 1e-6, "microdegrees": 1e-6, "cdeg": 0.01, "centidegrees": 0.01, "mrad": 0.18 / np.pi},
-    "bit/s": {
-        "bps": 1.0, "bit/s": 1.0, "kbps": 1e3, "kbit/s": 1e3, "mbps": 1e6, "mbit/s": 1e6, "gbps": 1e9, "gbit/s": 1e9},
-    "dB": {"db": 1.0}, _FULL_SCALE: {"dbfs": 1.0}, "dBm": {"dbm": 1.0}, "dBuV/m": {"dbuv/m": 1.0}, "V": {"mv": 1e-3},
-}  # fmt: skip
+_FACTORS = {unit: {word: float(factor) for word, factor in words.items()} for unit, words in _FILE["units"].items()}
 # Powers by their number of milliwatts, which become dBm.
 _POWERS = {"mw": 1.0, "w": 1e3, "uw": 1e-3, "\u00b5w": 1e-3, "nw": 1e-6, "pw": 1e-9}
 # Each unit: the unit after conversion, and the function that converts it.
@@ -414,9 +414,7 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
 # Units of MAVLink's integers: a converter that writes decimals has already scaled them.
 OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7", "semicircles")
 _DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
-# Units that a name may have without brackets: 'alt_ft_agl', 'rsrp_dbm'.
-_SUFFIXES = ("ft", "kft", "feet", "m", "meters", "metres", "cm", "mm", "km", "deg", "degrees", "rad", "mph", "mps",
-             "dbm", "dbfs", "dbw", "mw", "uw", "nw", "e6", "e7", "cdeg", "kbps", "mbps", "db", "linear")  # fmt: skip
+_SUFFIXES = _FILE["suffixes"]
 
 
 # A factor before a unit: '0.1 dBm', '1e-7 deg'.

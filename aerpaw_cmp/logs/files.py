@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import io
 import json
-import lzma
 import struct
 import tarfile
 import zipfile
@@ -34,6 +33,11 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.units import AnyArray
+
+try:
+    from lzma import LZMAError
+except ImportError:  # some Python builds do not have the module
+    LZMAError = OSError  # type: ignore[assignment,misc]
 
 _MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\x00": "xz"}
 _MODULES = {"gzip": "gzip", "bzip2": "bz2", "xz": "lzma"}
@@ -86,7 +90,7 @@ def unpacked_pieces(file: BinaryIO, path: str | Path) -> Iterator[bytes]:
     except EOFError as error:
         raise InputError(f"the {name} file ends too early", cause="a truncated download", path=path) from error
     # the header of an xz file may ask for more memory than there is
-    except (OSError, ValueError, zlib.error, lzma.LZMAError, MemoryError) as error:
+    except (OSError, ValueError, zlib.error, LZMAError, MemoryError) as error:
         raise InputError(f"a damaged {name} file ({error})", cause="a truncated download", path=path) from error
 
 
@@ -130,7 +134,7 @@ _FREE_BYTES = 2**28
 _RATIO = 1200
 # Errors of Python's libraries for damaged archives, ValueError for a directory that begins before the file does.
 _DAMAGE = (
-    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, ValueError, IndexError,
+    zipfile.BadZipFile, zlib.error, LZMAError, struct.error, EOFError, OSError, ValueError, IndexError,
     OverflowError, NotImplementedError,
 )  # fmt: skip
 

@@ -182,8 +182,8 @@ def _below(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> _
     """Read a file, a folder, an archive or a flight file: return its logs and the skipped files."""
     if (is_folder := _is_folder(place)) or _is_archive(place):
         inside, skipped = (_folder if is_folder else _archive)(place, options, chosen)
-    elif _head(place).startswith(_HDF5):
-        return [replace(_of_kind(item, chosen, place), holder=str(place)) for item in read_flight(place)], []
+    elif _is_flight_file(place):
+        return _flight_file(place, chosen), []
     else:
         return [read_file(place, options=options, reader=chosen)], []
     if not inside and not any(isinstance(item.error, UsageError) for item in skipped):
@@ -196,6 +196,14 @@ def _below(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> _
             path=place,
         )
     return _join(inside), skipped
+
+
+def _is_flight_file(place: Path) -> bool:
+    return _head(place, len(_HDF5)) == _HDF5
+
+
+def _flight_file(place: Path, chosen: Reader | None) -> list[IngestedFile]:
+    return [replace(_of_kind(item, chosen, place), holder=str(place)) for item in read_flight(place)]
 
 
 def as_utf8(data: bytes) -> bytes:
@@ -330,10 +338,10 @@ def _refuse_other_kind(path: Path, reader: Reader) -> None:
     )
 
 
-def _head(place: Path) -> bytes:
+def _head(place: Path, count: int = HEAD_BYTES) -> bytes:
     """Return the first bytes of a file, or no bytes if it cannot be read, which is reported later."""
     try:
-        return _raw(place, HEAD_BYTES)
+        return _raw(place, count)
     except InputError:
         return b""
 
@@ -438,7 +446,7 @@ def _of_kind(file: IngestedFile, chosen: Reader | None, flight_file: Path) -> In
 def _in_flight_file(path: Path) -> tuple[Path, str] | None:
     """Return the flight file that contains the log of a path, and the name of the log in it."""
     part = _part_of(path)
-    return part if part is not None and _head(part[0]).startswith(_HDF5) else None
+    return part if part is not None and _is_flight_file(part[0]) else None
 
 
 def name_inside(path: str) -> str:
@@ -555,7 +563,7 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
         places = sorted(p for p in folder.rglob("*") if not p.name.startswith(".") and (p.is_file() or p.is_symlink()))
     except OSError as error:
         raise InputError(f"the folder cannot be searched ({error})", path=folder) from error
-    for place in places:
+    for place in sorted(places, key=_is_flight_file):  # flight files last, because they may contain logs of the folder
         if not place.is_file():  # links to folders are not followed, because they may form a circle
             what = "a link to a folder: name that folder as well" if place.is_dir() else "a broken link"
             skipped.append(Skipped(str(place), what))
@@ -564,6 +572,11 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
             if _is_archive(place):
                 inside, skipped_inside = _archive(place, options, chosen)
                 files, skipped = files + inside, skipped + skipped_inside
+            elif _is_flight_file(place):
+                known = {file.sha256 for file in files}
+                inside = [file for file in _flight_file(place, chosen) if file.sha256 not in known]
+                files += inside
+                skipped += [] if inside else [Skipped(str(place), "a flight file without further logs")]
             else:
                 files.append(read_file(place, options=options, reader=chosen))
         except AerpawCmpError as error:

@@ -259,14 +259,16 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
 
 def _way_out(head: bytes) -> str:
     titled = re.sub(rb"\A(?:\s*#[^\n]*\n)+", b"", head.lstrip(b"\xef\xbb\xbf \r\n"))
-    first = titled.split(b"\n", 1)[0].decode("utf-8", "replace").strip()
+    first, *below = (line.decode("utf-8", "replace").strip() for line in titled.split(b"\n")[:20])
     # the most frequent sign is the separator, because decimal commas are rarer
     sign = max(",;\t|", key=first.count)
     names = [name.strip().strip('"') for name in first.split(sign)]
     if len(names) > 1 and not first.startswith(("{", "[", "<", "$")) and all(not name[:1].isdigit() for name in names):
         if len(head) == HEAD_BYTES and b"\n" not in head:
             return f"no line ends in the first {HEAD_BYTES >> 10} KiB: an aborted copy, or not a table"
-        return _way_to_map(names)
+        if "\ufffd" in first:
+            return "text in another encoding than UTF-8: save the table as UTF-8"
+        return _way_to_map(names, [line.split(sign) for line in below])
     words = re.split(r"[,;\s|]+", first)
     if len(words) > 1 and (re.fullmatch(r"[-+.\d]+", words[0] + words[-1]) or "time" in words):
         return "a table without names or commas: write a line such as 'time,rss_db' above it, commas between its cells"
@@ -280,19 +282,31 @@ _LIKE = {
 }  # fmt: skip
 
 
-def _way_to_map(names: list[str]) -> str:
-    """Return the options that read a table of another kind, if its names allow a track or a level."""
+_NEGATIVE = re.compile(r'[ "]*-\d{1,3}(\.\d*)?[ "]*')
+
+
+def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return the options that read a table of another kind, if its names or cells allow a track or a level."""
     from . import dictionary
 
     elsewhere = next(row.names[0] for row in dictionary.QUANTITIES if row.name == "elsewhere")
+    known = [*map(dictionary.meaning, names)]
+    rows = [row for row in rows if len(row) == len(names)]
+    levels = [
+        name for i, name in enumerate(names)
+        if not known[i] and rows and all(_NEGATIVE.fullmatch(row[i]) for row in rows)
+        and not dictionary.UNLIKE_A_LEVEL.search(dictionary.plain(name))
+    ]  # fmt: skip
     names = [name for name in names if not re.search(elsewhere, dictionary.plain(name))]
     fits = {
         what: [name for words in forms for name in names if re.search(words, dictionary.plain(name))]
         for what, forms in _LIKE.items()
-    } | {"rss_db": [name for name in dictionary.like_levels(names) if dictionary.can_be_level(name)]}
+    } | {"rss_db": [name for name in dictionary.like_levels(names) if dictionary.can_be_level(name)] or levels}
     if not fits["time"] or not (fits["rss_db"] or all(fits[what] for what in _LIKE)):
         lacking = " or ".join(what for what in ("time", "rss_db") if not fits[what])
         return f"a table of another kind; no column looks like {lacking}"
+    if not (fits["latitude_deg"] and fits["longitude_deg"]):
+        fits = {what: fits[what] for what in ("time", "rss_db")}
     pairs = [f"--map {named[0]!r}={what}" for what, named in fits.items() if named]
     return f"a table of another kind: name its columns: {' '.join(pairs)}"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -125,11 +125,12 @@ def first(head: bytes) -> dict[str, Any] | None:
 
 # Names of objects that only group values and do not describe them.
 _GROUPS = re.compile(
-    r"(?:(?:gps|gnss|pos(?:ition)?|loc(?:ation)?|coord(?:inate)?s?|geo|data|meta(?:data)?|info|sample|record|measurement"
-    r"|payload|fix|state|telemetry)\.)+"
+    r"(?:(?<=\.)|^)(?:(?:gps|gnss|pos(?:ition)?|loc(?:ation)?|coord(?:inate)?s?|geo|data|meta(?:data)?|info|sample|record"
+    r"|measurement|(?:decoded_?)?payload|fix|state|telemetry|uplink_?message|\w+_ids)\.)+"
 )
 # Largest nesting depth of objects and number of list entries that become columns.
-_DEPTH, _ENTRIES = 4, 32
+_DEPTH, _ENTRIES = 6, 32
+_LISTED = re.compile(r"(.*?)\.(\d{1,2})\.(.+)")
 
 
 def flat(entry: dict[str, Any]) -> dict[str, str]:
@@ -144,6 +145,42 @@ def flat(entry: dict[str, Any]) -> dict[str, str]:
     bare = Counter(_GROUPS.sub("", name, count=1) for name in written)
     short = {name: _GROUPS.sub("", name, count=1) for name in written}
     return {short[name] if bare[short[name]] == 1 else name: text for name, text in written.items()}
+
+
+def readings(entry: dict[str, Any]) -> list[dict[str, str]]:
+    """Return the readings of an object: one per receiver if it has a list of receivers with levels, else one.
+
+    Examples
+    --------
+    >>> readings({"t": 1, "gateways": [{"gateway_id": "a", "rssi": -80}, {"gateway_id": "b", "rssi": -90}]})
+    [{'t': '1', 'gateway': 'a', 'rssi': '-80'}, {'t': '1', 'gateway': 'b', 'rssi': '-90'}]
+    """
+    common, lists = flat(entry), dict[str, dict[str, dict[str, str]]]()
+    for name, text in common.items():
+        if (part := _LISTED.fullmatch(name)) is not None:
+            lists.setdefault(part[1], {}).setdefault(part[2], {})[_GROUPS.sub("", part[3])] = text
+    for place, members in lists.items():
+        known = {name: dictionary.meaning(name) for item in members.values() for name in item}
+        roles = {name: what.quantity.role for name, what in known.items() if what is not None}
+        named = [name for name in known if roles.get(name) == "identity" or name in ("id", "name")]
+        if not named or "rss" not in roles.values() or "cell" in roles.values():
+            continue
+        rest = {name: text for name, text in common.items() if not name.startswith(f"{place}.")}
+        return [
+            {
+                **rest,
+                "gateway": "_".join(filter(None, map(item.pop, named, [""] * len(named)))),
+                **_of_gateway(item, roles),
+            }
+            for item in members.values()
+        ]
+    return [common]
+
+
+def _of_gateway(item: Mapping[str, str], roles: Mapping[str, str]) -> dict[str, str]:
+    # The Things Network writes the RSSI twice. The position and the clock of a gateway are not those of the device
+    once = {name: text for name, text in item.items() if name != "channel_rssi" or "rssi" not in item}
+    return {name if roles.get(name) in ("rss", "kpi") else f"gateway.{name}": text for name, text in once.items()}
 
 
 def _values(value: Any, *names: str) -> Iterator[tuple[str, str]]:

@@ -64,7 +64,7 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
             # below
             grouped = any(name and not group for group, name in zip(names, below, strict=False))
             grouped &= len(below) == len(names) and not any(map(_VALUE.match, below))
-            if len(names) > 1 and is_header(filled if grouped else names):
+            if len(names) > 1 and is_header(filled if grouped else names) and not any(map(_stamps.is_dated, names)):
                 return i + grouped, separator, filled if grouped else names
     return None
 
@@ -73,7 +73,7 @@ def starts(head: bytes, is_header: _IsHeader) -> bool:
     """Check whether a file begins with a header of this kind, perhaps below title lines, and with rows of its width."""
     if _json.BEGIN.match(head):  # JSON lines: the names of the values in the first object are the header
         entry = None if _OF_PROGRAMS.search(head) else _json.first(head)
-        return entry is not None and is_header([*_json.flat(entry)])
+        return entry is not None and is_header([*_json.readings(entry)[0]])
     lines = [line.rstrip(b"\r") for line in head.split(b"\n")[: 2 * TITLES]]
     header = _header_of(lines, is_header)
     if header is None:
@@ -454,14 +454,42 @@ def read(data: bytes, is_header: _IsHeader) -> Sheet:
     if _json.BEGIN.match(data):
         lines = _text.split(data)
         parsed = _json.objects(lines)
-        readings = [(int(i), _json.flat(entry)) for i, entry in zip(parsed.row, parsed.values, strict=True)]
+        entries = zip(parsed.row.tolist(), parsed.values, strict=True)
+        readings = [(i, reading) for i, entry in entries for reading in _json.readings(entry)]
         return of_readings(lines, readings, parsed.rejected)
     header = _header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
     if header is None:
         raise InputError("no header with a time and a level, ratio, rank or position", expected="names of columns")
     sheet = cut(_text.split(data), *header)
     _split_places(sheet)
+    _join_times(sheet)
     return sheet
+
+
+_DATE_PARTS = (("year", "yyyy", "yr"), ("month", "mon"), ("day", "doy", "day of year"))
+_CLOCK_PARTS = (("hour", "hours", "hr"), ("minute", "minutes", "min"), ("second", "seconds", "sec"))
+
+
+def has_date_in_parts(names: Iterable[str]) -> bool:
+    """Check whether there are columns of the year, the day and the hour."""
+    known = {*map(dictionary.plain, names)}
+    return all(known & {*words} for words in (_DATE_PARTS[0], _DATE_PARTS[2], _CLOCK_PARTS[0]))
+
+
+def _join_times(sheet: Sheet) -> None:
+    """Add a column of dates, with the time of day if possible, if year, month and day have columns."""
+    year, month, day = date = [sheet.named(*words) for words in _DATE_PARTS]
+    clock = [sheet.named(*words) for words in _CLOCK_PARTS]
+    if year is None or day is None or sheet.find("date") is not None:
+        return
+    sheet.used |= {i for i in (*date, *clock) if i is not None}
+    parts = [np.zeros(len(sheet)) if i is None else sheet.numbers(i) for i in (year, month, day, *clock)]
+    form = "{0:.0f}-{1:.0f}-{2:.0f}" if month is not None else "{0:.0f}-{2:03.0f}"
+    form += "" if clock[0] is None else " {3:.0f}:{4:02.0f}:{5:09.6f}"
+    rows = zip(*parts, strict=True)
+    sheet.add(
+        "date", ["" if math.isnan(sum(row)) else form.format(row[0] + 2000 * (row[0] < 100), *row[1:]) for row in rows]
+    )
 
 
 # Latitude and longitude in one cell, in brackets or not: ``35.7275 -78.6960``; WKT has the longitude first.

@@ -8,6 +8,7 @@ is assumed and a warning reports it.
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from functools import cache
@@ -16,7 +17,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 import numpy as np
 
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.readers import AnyArray, FloatArray, InputError, IntArray, ReadOptions, UsageError
+from aerpaw_cmp.readers import AnyArray, FloatArray, InputError, IntArray, ReadOptions, UsageError, dictionary
 
 _NAMED_ZONE = r"Z|[A-Z][A-Za-z]+/[A-Z][\w/]+|[A-Z]{2,5}(?![A-Za-z])|(?:UTC|GMT)? ?[+-]\d{1,2}(?::?\d\d)?"
 # Java writes the place after the offset: 10:00-04:00[America/New_York], 14:00Z[UTC].
@@ -24,19 +25,20 @@ _PLACE = re.compile(r"(Z|[+-]\d\d:\d\d)\[[\w/+-]+\]$")
 # AM and PM have the position of a zone, but are not a zone.
 _ZONE = rf"(?: ?[(\[]?(?P<zone>(?:UTC|GMT) ?[+-]\d{{1,2}}(?::?\d\d)?|(?![AaPp][Mm]\b)(?:{_NAMED_ZONE}))[)\]]?)?"
 _CLOCK = (
-    r"(?P<hour>\d{1,2})[:.h-](?P<minute>\d\d)(?:[:.m-](?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,40}))?)?"
+    r"(?P<hour>\d{1,2})[:.h_-](?P<minute>\d\d)(?:[:.m_-](?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,40}))?s?)?(?: Uhr)?"
     r" ?(?P<half>[AaPp]\.? ?[Mm]\.?)?"
 )
-_GAP = r"[T _,:;-]{1,3}(?:at )?"
-_DAY = r"(?:(?:[Mm]on|[Tt]ue|[Ww]ed|[Tt]hu|[Ff]ri|[Ss]at|[Ss]un)[a-z]{0,6}[., ]{1,2})?"
-_WORD = r"(?P<word>[A-Za-z]{3,9})\.?"
+_GAP = r"[T _,.:;-]{1,3}(?:at )?"
+_DAY = r"(?:[^\W\d_]{2,10}[., ]{1,3})?"  # a day of the week in any language
+_WORD = r"(?P<word>[^\W\d_]{3,10})\.?"
 # The date before the clock; date(1) writes the year and the zone after it.
 _DATES = (
-    r"(?P<year>\d{4})[-/._ ](?P<month>\d{1,2})[-/._ ](?P<day>\d{1,2})",
+    r"(?P<year>\d{4})[-/._ ]{1,2}(?P<month>\d{1,2})[-/._ ]{1,2}(?P<day>\d{1,2})",
     rf"(?P<year>\d{{4}})[-/._ ]?{_WORD}[-/._ ]?(?P<day>\d{{1,2}})",
     r"(?P<a>\d{1,2})(?P<mark>[-/.])(?P<b>\d{1,2})(?P=mark)(?P<c>\d{4}|\d\d)",
-    rf"(?P<day>\d{{1,2}})[-/._ ]?{_WORD}[-/._, ]{{0,2}}(?P<year>\d{{4}}|\d\d)",
-    rf"{_WORD} (?P<day>\d{{1,2}})(?:st|nd|rd|th)?,? (?P<year>\d{{4}})",
+    rf"(?P<day>\d{{1,2}})[-/._ ]{{0,2}}(?:de )?{_WORD}[-/._, ]{{0,2}}(?:de )?(?P<year>\d{{4}}|\d\d)",
+    r"(?P<year>\d{4})[-/: ](?P<of_year>(?!000)(?:[0-2]\d\d|3[0-5]\d|36[0-6]))",
+    rf"{_WORD}[ -](?P<day>\d{{1,2}})(?:st|nd|rd|th)?[, -]{{1,2}}(?P<year>\d{{4}})",
 )
 _DIGITS = re.compile(
     r"(?P<year>20\d\d)(?P<month>\d\d)(?P<day>\d\d)[T_ -]?(?P<hour>\d\d):?(?P<minute>\d\d):?(?P<second>\d\d)"
@@ -53,7 +55,7 @@ def _forms() -> tuple[re.Pattern[str], ...]:
     return (*before, within, _DIGITS, *behind)
 
 
-_OF_DAY = re.compile(r"T?" + _CLOCK.replace("[:.h-]", ":", 1).replace("[:.m-](?P<second>", ":(?P<second>") + _ZONE)
+_OF_DAY = re.compile(r"T?" + _CLOCK.replace("[:.h_-]", ":", 1).replace("[:.m_-](?P<second>", ":(?P<second>") + _ZONE)
 # Python, pandas and C print up to 17 digits (0.30000000000000004), programs with decimal arithmetic more.
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,40})?(?:[eE][-+]?\d{1,3})?")
 # An epoch shortened by a spreadsheet, ``1.74093E+12``: fewer than nine digits after the first omit seconds.
@@ -61,7 +63,11 @@ _ROUNDED = re.compile(r"\d(?:[.,]\d{0,8})?[eE]\+?0?(?:9|1\d)")
 # A time as a spreadsheet shows it: minutes, seconds and tenths without the hour.
 _MINUTES = re.compile(r"\d{1,2}:\d\d[.,]\d")
 _COMMON = re.compile((_text.TIME + rb"(?:Z|[+-]\d\d:\d\d)?").decode())
-_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+# The twelve months, by the first letters of their names in languages of Europe, without accents.
+_MONTHS = re.compile(
+    "(jan|ene|gen)|(feb|fev)|(mar|mrt|mae)|(apr|avr|abr)|(may|mai|maj|mag|mei)|(jun|juin|giu)|(jul|juil|lug)|(aug|aou|ago)"
+    "|(sep|set)|(oct|okt|out|ott)|(nov)|(dec|dez|dic)"
+)
 # Dates with or without hyphens, and Nemo's: its summary of the log ``24Feb09`` contains the date ``2024 Feb 09``.
 _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
@@ -69,16 +75,9 @@ _IN_NAME = (
 )
 # Hours east of UTC of unambiguous abbreviations. Winter zones are in text.WINTER, because EST in summer is doubtful and
 # CST is the name of two zones.
-_HOURS = {
-    "Z": 0.0, "UT": 0.0, "UTC": 0.0, "GMT": 0.0, "EDT": -4.0, "CDT": -5.0, "MDT": -6.0, "PDT": -7.0,
-    "HST": -10.0, "CEST": 2.0, "MESZ": 2.0, "EEST": 3.0, "BST": 1.0, "JST": 9.0, "KST": 9.0, "AKDT": -8.0, "AEDT": 11.0,
-    "WEST": 1.0, "MSK": 3.0, "SGT": 8.0, "HKT": 8.0, "NZDT": 13.0,
-}  # fmt: skip
+_HOURS = {word: float(hours) for word, hours in dictionary.ZONES["hours"].items()}
 # Names of a zone with its summer time.
-_WITH_SUMMER = {
-    "ET": "America/New_York", "EASTERN": "America/New_York", "CT": "America/Chicago", "CENTRAL": "America/Chicago",
-    "MT": "America/Denver", "PT": "America/Los_Angeles", "PACIFIC": "America/Los_Angeles",
-}  # fmt: skip
+_WITH_SUMMER = dictionary.ZONES["with_summer"]
 _OFFSET = re.compile(r"(?:UTC|GMT)? ?([+-])(\d{1,2}):?(\d\d)?")
 
 
@@ -101,7 +100,8 @@ def _date_in_name(name: str) -> str | None:
 
 
 def _month(word: str) -> int:
-    return _MONTHS.index(word[:3].lower()) + 1 if word[:3].lower() in _MONTHS else 0
+    known = _MONTHS.match(unicodedata.normalize("NFKD", word.lower()).encode("ascii", "ignore").decode())
+    return 0 if known is None else known.lastindex or 0
 
 
 # Two orders of the same dates are distinguished if their spans differ by this number of days.
@@ -160,6 +160,9 @@ def _are_years(numbers: Iterable[int]) -> bool:
 def _parts(match: re.Match[str], order: str) -> tuple[str, int, int]:
     """Return year, month and day."""
     groups = match.groupdict()
+    if of_year := groups.get("of_year"):
+        date = str(np.datetime64(f"{groups['year']}-01-01") + int(of_year) - 1)
+        return date[:4], int(date[5:7]), int(date[8:])
     if groups.get("a") is None:
         year, month = groups["year"], int(groups["month"]) if groups.get("month") else _month(groups["word"])
         day = groups["day"]
@@ -343,8 +346,7 @@ def read(
         The times for this function, as bytes or floats.
     warnings : list of str
     """
-    # browsers write a narrow space before AM
-    texts = [text.replace("\u202f", " ").replace("\xa0", " ") for text in texts]
+    texts = [text if text.isascii() else _in_ascii(text) for text in texts]
     shown = [
         text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else _PLACE.sub(r"\1", text.strip())
         for text in texts
@@ -377,6 +379,21 @@ def read(
         else _written(text, order, zone, options.timezone) for text in shown
     ]  # fmt: skip
     return "wall", _text.cells(cells), warnings
+
+
+# The marks of Chinese, Japanese and Korean dates, and the spaces that browsers write before AM.
+_MARKS = str.maketrans(
+    "\u5e74\ub144\u6708\uc6d4\u65e5\uc77c\u65f6\u6642\u70b9\uc2dc\u5206\ubd84\uff1a\u79d2\ucd08\u202f\xa0",
+    "----  :::::::    ",
+)
+_HALF_FIRST = re.compile("(\u4e0a\u5348|\u5348\u524d|\uc624\uc804)|\u4e0b\u5348|\u5348\u5f8c|\uc624\ud6c4")
+
+
+def _in_ascii(text: str) -> str:
+    """Return a time with the marks of Chinese, Japanese or Korean as hyphens, colons, AM and PM."""
+    half = _HALF_FIRST.search(text)
+    text = _HALF_FIRST.sub(" ", text).translate(_MARKS).strip(" :")
+    return text if half is None else f"{' '.join(text.split())} {'AM' if half[1] else 'PM'}"
 
 
 _COUNTED = re.compile(r"(.*\d:\d\d:\d\d:)(\d{1,9})(?!\d)(.*)")

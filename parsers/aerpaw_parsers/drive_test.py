@@ -57,13 +57,14 @@ def has_radio(names: list[str]) -> bool:
 
 
 def _quantities(names: list[str]) -> set[str]:
-    return {meaning.quantity.name for name in names if (meaning := dictionary.meaning(name)) is not None}
+    return {what.quantity.name for what, *_ in dictionary.described(names)[1] if what is not None}
 
 
 def _has_time(names: list[str]) -> bool:
     """Check whether a name is that of a time, a date, or GPS weeks."""
     known = _quantities(names)
-    return not known.isdisjoint(("time", "date")) or {"gps_week", "gps_seconds"} <= known
+    of_parts = {"gps_week", "gps_seconds"} <= known or _sheet.has_date_in_parts(names)
+    return of_parts or not known.isdisjoint(("time", "date"))
 
 
 # Readers of specific tables that pass the same test. They know units that are not in the names.
@@ -496,7 +497,10 @@ _FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero
 
 def _other(rows: Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream | None:
     values, name = sheet.numbers(column), sheet.plain[column]
-    meaning, about = sheet.meanings[column], {"node": f"LW{tower[1]}"} if (tower := _TOWER.search(name)) else {}
+    meaning, about = (
+        sheet.meanings[column],
+        {"node": f"LW{tower[1]}"} if (tower := _TOWER.search(dictionary.without_unit(name)[0])) else {},
+    )
     if meaning is not None and meaning.place.startswith("cell") and "cell" in name:
         about |= {"cell": meaning.place, "part": meaning.place}  # unlike 'rsrp 2', not a second reading of one cell
     if tower and name == f"snr {tower[0]}":

@@ -318,13 +318,27 @@ def test_symlink_loops_end(tmp_path: Path) -> None:
     assert len(ingest(tmp_path, options=OPTIONS)) == 1
 
 
-def test_a_flight_file_is_not_a_log_and_a_folder_says_why_nothing_was_read(tmp_path: Path) -> None:
+def test_a_folder_with_a_flight_file_has_each_log_once(tmp_path: Path) -> None:
+    (tmp_path / "vehicle.txt").write_bytes(VEHICLE)
+    logs = ingest(tmp_path, options=OPTIONS)
+    write_flight(tmp_path / "flight.h5", logs)
+    again = ingest(tmp_path, options=OPTIONS)
+    assert [file.path for file in again] == [file.path for file in logs]
+    assert [item.reason for item in again.skipped] == ["a flight file without further logs"]
+    (tmp_path / "vehicle.txt").unlink()
+    (alone,) = ingest(tmp_path, options=OPTIONS)
+    assert (alone.sha256, alone.holder) == (logs[0].sha256, str(tmp_path / "flight.h5"))
+    with pytest.raises(InputError, match="no log that reader 'pose_csv' can read"):
+        ingest(tmp_path, reader="pose_csv")
+
+
+def test_a_folder_says_why_nothing_was_read(tmp_path: Path) -> None:
     write_flight(tmp_path / "flight.h5", [])
     assert ingest(tmp_path / "flight.h5") == []
-    with pytest.raises(InputError, match=r"no log that a reader recognises \(1 file tested\); flight.h5: an HDF5 file"):
+    with pytest.raises(
+        InputError, match=r"recognises \(1 file tested\); flight.h5: a flight file without further logs"
+    ):
         ingest(tmp_path)
-    with pytest.raises(InputError, match="no log that reader 'vehicle_out' can read"):
-        ingest(tmp_path, reader="vehicle_out")
 
 
 def test_links_in_a_folder_are_told(tmp_path: Path) -> None:

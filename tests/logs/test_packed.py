@@ -5,6 +5,8 @@ import gzip
 import hashlib
 import io
 import lzma
+import subprocess
+import sys
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
@@ -85,3 +87,9 @@ def test_words_that_begin_as_a_packed_file_does_are_text() -> None:
     assert files.packed_form(b"BZh, a word\n") is None
     assert files.packed_form(bz2.compress(b"a")) == "bzip2"
     assert files.packed_form(lzma.compress(b"a")) == "xz"
+
+
+def test_logs_are_read_by_a_python_without_lzma() -> None:
+    """pyenv builds Python without it if its headers are missing."""
+    code = "import sys; sys.modules['lzma'] = None; import aerpaw_cmp.logs.files"
+    subprocess.run([sys.executable, "-c", code], check=True)

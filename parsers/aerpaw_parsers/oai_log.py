@@ -29,7 +29,7 @@ _UE = re.compile(
     rb"SINR = (?P<sinr>-?\d{1,3}) dB, CQI = (?P<cqi>\d{1,2})"
 )
 _UE_LEVEL = re.compile(rb"\[UE \d{1,2}\] RSRP = (?P<rsrp>-?\d{1,3}) dBm")
-_STAMP = re.compile(rb"^\[?(" + TIME + ZONE + rb")\]?[ :]")
+_STAMP = re.compile(rb"^\[?(" + TIME + ZONE + rb")\]?(?:[ :]|\r?$)")
 _SECONDS = re.compile(rb"^(?:\x1b\[[0-9;]{0,8}m)?(\d{1,10}\.\d{3,9}) ")
 _FRAME = re.compile(rb"Frame\.Slot \d")
 _FRAMES_S = 1.28

@@ -1,7 +1,8 @@
 """CSVs of AERPAW's Quectel logger (``csv_kpi``): rank indicator and serving-cell level, from both generations.
 
-A console of the modem (RM500Q to RM520N) with time stamps contains the same answers, with each radio access on a
-separate line.
+A console of the modem (EC25, RM500Q to RM520N) with time stamps contains the same answers, with each radio access on a
+separate line. The stamp is in front of the answer or on a line above it, as ``date``, Python's logging or an epoch
+writes it.
 
 There is no header, and a first line may be a bare ``OK``. Fields are raw pieces of AT answers with their
 ``+QNWCFG: "nr5g_csi"`` prefix. Rows are distinguished by their RAT token and not by the file name, because the logger
@@ -27,6 +28,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from datetime import datetime, timezone
 
 import numpy as np
 
@@ -53,7 +55,7 @@ def _fields(rat: bytes, names: str) -> bytes:
 
 _CSI = {rat: _answer(b"QNWCFG", rat + b"_csi", rat, "mcs ri cqi pmi") for rat in (b"lte", b"nr5g")}
 _SERVING = rb"(?:" + _answer(b"QENG", b"servingcell", b"", ".") + rb",)?"
-_LTE = _SERVING + _answer(b"QENG", b"LTE", b"lte", ". . . . pci arfcn . . . . rsrp rsrq rssi sinr . . .")
+_LTE = _SERVING + _answer(b"QENG", b"LTE", b"lte", ". . . . pci arfcn . . . . rsrp rsrq rssi sinr")
 _SA = _SERVING + _answer(b"QENG", b"NR5G-SA", b"nr", ". . . . pci . arfcn . . rsrp rsrq sinr")
 _NSA = _answer(b"QENG", b"NR5G-NSA", b"nr", ". . pci rsrp sinr rsrq")
 _ARFCN = _fields(b"nr", "arfcn")
@@ -63,8 +65,9 @@ _FIFTH, _INFO = rb"(?:,-?\d{1,7})?", (_C + rb",") * 4
 _FORMS = tuple(
     re.compile(_T + form + rb"[ \t]*\r?$", re.MULTILINE) for form in (
         rb"(?:" + _INFO + rb")?" + _CSI[b"lte"] + b"," + _CSI[b"nr5g"] + _FIFTH + rb"(?:(?:," + _C + rb"){4})?",
-        _LTE + rb"(?:," + _NSA + rb"(?:" + _ARFCN + rb"(?:," + _C + rb"){3})?)?",
-        _SA + rb"(?:," + _C + rb"){0,3}",  # firmware versions differ after the SINR
+        # firmware versions differ after the SINR
+        _LTE + rb"(?:," + _C + rb"){1,3}(?:," + _NSA + rb"(?:" + _ARFCN + rb"(?:," + _C + rb"){3})?)?",
+        _SA + rb"(?:," + _C + rb"){0,3}",
         _NSA + rb"(?:" + _ARFCN + rb"(?:," + _C + rb"){1,4})?",
         _CSI[b"lte"] + _FIFTH, _CSI[b"nr5g"] + _FIFTH,
     )
@@ -77,8 +80,34 @@ _RSRP_RANGE = (-156.0, -31.0)
 _SINR_RANGE = (-23.0, 40.0)
 
 
+# Time at the beginning of a line: with Python's comma in front of the milliseconds, or as an epoch.
+_STAMP = re.compile(rb"\[?(?:(" + TIME + rb")(?:,(\d{3}))?(" + ZONE + rb")|(1\d{9}(?:\.\d{1,6})?))\]?(?![^ \t\r])")
+_CONSOLE = re.compile(rb'(?:"?\+[A-Z]{2,8}: ?|AT\+)[^\r\n]*')
+
+
+def _stamped(data: bytes) -> bytes:
+    """Return a console with ``[time] `` before each answer: the time of its line, or of the last line that has one."""
+    stamp, lines = b"", data.split(b"\n")
+    for i, line in enumerate(lines):
+        found = _STAMP.match(line)
+        if found:
+            wall, milliseconds, zone, epoch = found.groups(b"")
+            stamp = wall + (b"." + milliseconds if milliseconds else b"") + zone
+            if epoch:
+                stamp = datetime.fromtimestamp(float(epoch), timezone.utc).isoformat().encode()
+        # the program's words between time and answer are not kept
+        answer = _CONSOLE.search(line, found.end()) if found else _CONSOLE.match(line)
+        if stamp and (answer or found):
+            lines[i] = b"[" + stamp + b"] " + (answer[0] if answer else b"")
+    return b"\n".join(lines)
+
+
 def sniff(head: bytes) -> bool:
-    """Check whether most of the first lines, except a bare OK, are AT answers after a time."""
+    """Check whether most of the first lines, except commands and OK, are AT answers with a time."""
+    return _is_known(head) or (b"+Q" in head and _is_known(_stamped(head)))
+
+
+def _is_known(head: bytes) -> bool:
     lines = [line for line in _text.first_lines(head) if line != b"OK" and not _TALK.match(line)]
     return bool(lines) and 2 * sum(_ANY.match(line) is not None for line in lines) > len(lines)
 
@@ -94,6 +123,8 @@ def _reason(line: bytes) -> str | None:
         return "no time stamp at the beginning (truncated or stray modem line)"
     if b"neighbourcell" in line:
         return "neighbour-cell row: not read"
+    if re.search(rb'"servingcell"+,"+(?:NOCONN|CONNECT|LIMSRV)"+\s*$', line):
+        return None  # the cells are on the lines below
     if b"SEARCH" in line:
         return "the modem was searching: no serving cell"
     if b"csi" in line:
@@ -183,7 +214,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If no time zone is given.
     """
-    lines = _text.split(data)
+    lines = _text.split(data if _is_known(data) else _stamped(data))
     row, table = _table(lines)
     rows = built(lines, row, table, options, reader="quectel_csv", others=OtherLines(_reason))
     form = rows.columns["form"]

@@ -34,7 +34,7 @@ from ..compare.level import nearest_in_time
 from ..compare.rank import MAX_RANK, compare_ranks
 from ..compare.receiver import score_forecast
 from ..compare.result import BASELINE_TITLE, FlightResult, RankResult, RssResult
-from ..compare.statistics import FEWEST, PairedDifference, paired_difference
+from ..compare.statistics import FEWEST, paired_difference
 from ..flight.data import FlightData, load_data
 from ..flight.drafting.draft import DraftOptions, drafts
 from ..flight.gains import load_with_learned
@@ -451,34 +451,6 @@ def _check_names(table: pd.DataFrame, data: FlightData) -> None:
 # --- scores --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeriesVerdict:
-    """The cards of one tower and channel.
-
-    Parameters
-    ----------
-    tower, channel, unit : str
-    matched, unmatched : int
-        Samples of the flight with and without a prediction nearby.
-    floor_db : float, optional
-        Detection floor that the predicted levels show, such as those of an emulated receiver.
-    cards : mapping of str to referee.LevelCard
-        By model, the prediction first, then ray tracing and the baselines, on the same samples. A model with too few
-        levels has no card.
-    differences : mapping of str to PairedDifference
-        By model, RMSE of the prediction minus that of the model, each after one offset, with its interval.
-    """
-
-    tower: str
-    channel: str
-    unit: str
-    matched: int
-    unmatched: int
-    floor_db: float | None
-    cards: Mapping[str, referee.LevelCard]
-    differences: Mapping[str, PairedDifference]
-
-
 def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> dict[str, Any]:
     """Score a prediction on a flight.
 
@@ -499,7 +471,7 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     InputError
         If none of the predictions is near a sample.
     """
-    series = [s for item in result.rss if given.quantity and (s := _series(given, item, data))]
+    series = {item.name: entry for item in result.rss if given.quantity and (entry := _series(given, item, data))}
     ranks = {item.tower: r for item in result.rank if (r := _ranks(given, item, data))}
     if not series and not ranks:
         raise InputError(
@@ -508,39 +480,38 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
             cause=_why_none(given, data, result),
             path=given.path,
         )
-    name, predicted = given.path.name, set(given.table["tower"])
-    scored = {(entry.tower, entry.channel) for entry in series}
+    name, predicted, every = given.path.name, set(given.table["tower"]), list(series.values())
     # means over different channels could not be compared
-    models: Mapping[str, referee.LevelCard] = max((entry.cards for entry in series), key=len, default={})
-    common = [entry for entry in series if entry.cards.keys() >= models.keys()]
-    means = [_means(model, [entry.cards[model] for entry in common]) for model in models]
+    models: Mapping[str, referee.LevelCard] = max((entry["cards"] for entry in every), key=len, default={})
+    common = {link: entry for link, entry in series.items() if entry["cards"].keys() >= models.keys()}
+    means = [_means(model, [entry["cards"][model] for entry in common.values()]) for model in models]
     remarks = [*given.remarks]
-    if relative := sorted({s.unit for s in series if s.cards[name].bias_db is None}):
+    if relative := sorted({entry["unit"] for entry in every if entry["cards"][name].bias_db is None}):
         units = f"{name}: {given.unit or given.quantity}; log: {', '.join(relative)}"
         remarks.append(f"No bias is stated, because levels and log have no common reference ({units}).")
     if unknown := sorted(predicted - {s.tower for _, s in data.series}):
         remarks.append(f"{name}: the flight has no log of {', '.join(unknown)}; not scored.")
-    if sum(entry.matched - entry.unmatched for entry in series) < 0 and (cause := _wrong_heights(given, data, result)):
+    if sum(s["unmatched"] - s["matched"] for s in every) > 0 and (cause := _wrong_heights(given, data, result)):
         remarks.append(f"{name}: most samples have no prediction. Likely cause: {cause}.")
-    if series and (few := [i.name for i in result.rss if i.tower in predicted and (i.tower, i.channel) not in scored]):
+    if series and (few := [item.name for item in result.rss if item.tower in predicted and item.name not in series]):
         remarks.append(f"{name}: fewer than {FEWEST} samples of {', '.join(few)} have a predicted level; not scored.")
-    if trained := [i.name for i in result.rss if i.training and (i.tower, i.channel) in scored]:
+    if trained := [item.name for item in result.rss if item.training and item.name in series]:
         names = ", ".join(trained)
         remarks.append(f"Ray tracing has no score on {names}: its antennas were learned from this flight.")
     if len(common) < len(series):
-        channels = f"{', '.join(f'{s.tower} {s.channel}' for s in common)} only"
+        channels = f"{', '.join(common)} only"
         remarks.append(f"The means are over {channels}: the other channels are not predicted by all models.")
     score: dict[str, Any] = json_safe({
         "prediction": name,
         "sha256": given.sha256,
         "fitted_on_this_flight": ["the offset of each model and channel"],
-        "sentence": _sentence(given, series, common, means) if series else f"{name}: ranks only.",
+        "sentence": _sentence(given, every, list(common.values()), means) if series else f"{name}: ranks only.",
         "remarks": remarks,
         "means": means,
-        "levels": {s.tower: {other.channel: other for other in series if other.tower == s.tower} for s in series},
+        "levels": {s["tower"]: {o["channel"]: o for o in every if o["tower"] == s["tower"]} for s in every},
         "nodes": [
-            {"series": f"{s.tower} {s.channel}", "offset_db": s.cards[name].offset_db, "slope": s.cards[name].slope,
-             "floor_db": s.floor_db} for s in series
+            {"series": link, "offset_db": entry["cards"][name].offset_db, "slope": entry["cards"][name].slope,
+             "floor_db": entry["floor_db"]} for link, entry in series.items()
         ],
         "rank": ranks,
     })  # fmt: skip
@@ -555,15 +526,15 @@ def _means(model: str, cards: Sequence[referee.LevelCard]) -> dict[str, Any]:
 
 def _sentence(
     given: ForeignPrediction,
-    series: Sequence[SeriesVerdict],
-    common: Sequence[SeriesVerdict],
+    series: Sequence[Mapping[str, Any]],
+    common: Sequence[Mapping[str, Any]],
     means: Sequence[Mapping[str, Any]],
 ) -> str:
     """Return both errors, whether the difference is significant, the errors as predicted, and the scored samples."""
     mean, errors = means[0], {row["model"]: row["rmse_offset_db"] for row in means}
     text = f"{given.path.name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel"
     if referee.OURS in errors:
-        verdicts = Counter(entry.differences[referee.OURS].verdict for entry in common)
+        verdicts = Counter(entry["differences"][referee.OURS].verdict for entry in common)
         decided = [f"significantly {kind} on {verdicts[kind]}" for kind in ("better", "worse") if verdicts[kind]]
         text += (
             f", ray tracing {errors[referee.OURS]:.1f} dB on the same samples ({counted(len(common), 'channel')}). It "
@@ -575,15 +546,21 @@ def _sentence(
         inside = f"; the 90 % band contains {100 * mean['coverage_90']:.0f} % of the samples"
         text += f" As predicted, without an offset: RMSE {mean['rmse_db']:.1f} dB"
         text += f"{inside if np.isfinite(mean['coverage_90']) else ''}."
-    matched, lost = sum(s.matched for s in series), sum(s.unmatched for s in series)
+    matched, lost = (sum(entry[key] for entry in series) for key in ("matched", "unmatched"))
     if not lost:
         return f"{text} All {counted(matched, 'sample')} have a prediction."
     where = "other times" if given.timed else f"positions more than {given.near_m:g} m from it (--against-distance)"
     return f"{text} {counted(matched, 'sample')} have a prediction; {counted(lost, 'sample')} at {where} have none."
 
 
-def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> SeriesVerdict | None:
-    """Return the cards of one tower and channel. None if too few samples have a prediction."""
+def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> dict[str, Any] | None:
+    """Return the scores of one tower and channel. None if too few samples have a prediction.
+
+    ``matched`` and ``unmatched`` count the samples with and without a prediction nearby. ``floor_db`` is the detection
+    floor that the predicted levels show, such as those of an emulated receiver. ``cards`` (of all models with enough
+    levels, on the same samples; the prediction first, then ray tracing and the baselines) and ``differences`` (RMSE of
+    the prediction minus that of the model, each after one offset) are by model.
+    """
     part = split_by_series(given.table, item.tower, item.channel)
     if given.quantity == "path_loss_db":
         link = next(s.link for s in data.rss if (s.tower, s.channel) == (item.tower, item.channel))
@@ -611,13 +588,13 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> Seri
     }
     errors = {key: np.where(scored, item.measured_db - models[key][0]["level"], np.nan) for key in cards}
     theirs = errors.pop(name)
-    return SeriesVerdict(
-        tower=item.tower, channel=item.channel, unit=item.unit,
-        matched=int(near.sum()), unmatched=int((item.posed & ~near).sum()),
-        floor_db=referee.detection_floor_db(part["level"].to_numpy(np.float64)),
-        cards=cards,
-        differences={key: paired_difference(theirs, of, place_m=item.position_m) for key, of in errors.items()},
-    )  # fmt: skip
+    return {
+        "tower": item.tower, "channel": item.channel, "unit": item.unit,
+        "matched": int(near.sum()), "unmatched": int((item.posed & ~near).sum()),
+        "floor_db": referee.detection_floor_db(part["level"].to_numpy(np.float64)),
+        "cards": cards,
+        "differences": {key: paired_difference(theirs, of, place_m=item.position_m) for key, of in errors.items()},
+    }  # fmt: skip
 
 
 def split_by_series(table: pd.DataFrame, tower: str, channel: str) -> pd.DataFrame:

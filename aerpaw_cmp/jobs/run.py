@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
@@ -229,6 +228,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
     from ..report.flight import metrics as metrics_of
     from ..report.flight import write_report
     from ..report.flight_data import pose_paths, report_data
+    from ..report.page import json_text, write_file
     from .flight_run import check_recommended, recommended_text, report_stages, run_flight
     from .referee import judge, read_foreign
     from .tasks import other_inputs
@@ -272,8 +272,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
                 record, place, drawn=chosen.figures, kmz=chosen.kmz, netcdf=chosen.netcdf, stages=stages
             )
             if cards:
-                text = json.dumps(cards, indent=1, ensure_ascii=False)
-                (place / "card.json").write_text(text + "\n", encoding="utf-8")
+                write_file(place / "card.json", json_text(cards, indent=1))
     metrics = metrics_of(written.data)
     return JobOutcome(folder=folder, metrics=metrics, failed_checks=_failed_checks(metrics))
 

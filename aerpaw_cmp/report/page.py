@@ -42,7 +42,7 @@ def merge(into: dict[str, Any], numbers: Mapping[str, Any]) -> None:
             into[key] = value
 
 
-def json_text(numbers: Mapping[str, Any], indent: int | None = 2) -> str:
+def json_text(numbers: Mapping[str, Any] | Sequence[Any], indent: int | None = 2) -> str:
     """Return numbers as the JSON text of a file."""
     return json.dumps(numbers, indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 

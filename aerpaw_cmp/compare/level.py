@@ -821,6 +821,20 @@ def compare_serving(served: ArrayLike, predicted_dbm: ArrayLike, cells: Sequence
     return ServingComparison(cells=tuple(cells), confusion=confusion, n=int(known.sum()))
 
 
+# The lowest level is the floor of a receiver if at least this share, and this number, of the samples have it.
+_FLOOR_SHARE, _FLOOR_COUNT = 0.01, 10
+
+
+def detection_floor_db(level_db: FloatArray, within_db: float = 0.0) -> float | None:
+    """Return the floor of a receiver [dB]: its lowest level, if it is repeated often within a tolerance, else None."""
+    known = level_db[np.isfinite(level_db)]
+    if not len(known) or np.ptp(known) == 0.0:
+        return None
+    lowest = float(known.min())
+    repeated = int((known <= lowest + within_db).sum())
+    return lowest if repeated >= max(_FLOOR_COUNT, _FLOOR_SHARE * len(known)) else None
+
+
 def nearest_in_time(times: AnyArray, of: AnyArray) -> tuple[IntArray, AnyArray]:
     """Return the index in ``of`` (m,) nearest to each of ``times`` (n,) (the earlier of two), and its distance."""
     order = np.argsort(of, kind="stable")

@@ -200,20 +200,6 @@ def nearest_points(
     return index, known & (np.linalg.norm(away[:, :3], axis=1) <= 1.0) & (np.linalg.norm(away[:, 3:], axis=1) <= 1.0)
 
 
-# The lowest level is a detection floor if at least this share, and this number, of the samples have it.
-_FLOOR_SHARE, _FLOOR_COUNT = 0.01, 10
-
-
-def detection_floor_db(level_db: FloatArray) -> float | None:
-    """Return the detection floor of a receiver [dB], which is its lowest level if that is repeated often, else None."""
-    known = level_db[np.isfinite(level_db)]
-    if not len(known) or np.ptp(known) == 0.0:
-        return None
-    lowest = float(known.min())
-    repeated = int((known <= lowest + 0.05).sum())
-    return lowest if repeated >= max(_FLOOR_COUNT, _FLOOR_SHARE * len(known)) else None
-
-
 def measured_thresholds(measured_db: FloatArray, *, ratio: bool) -> tuple[float, ...]:
     """Return thresholds for exceedance: 0, 10 and 20 dB of an SNR, else measured deciles 1, 5 and 9 in whole dB."""
     if ratio:

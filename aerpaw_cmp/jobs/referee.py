@@ -30,7 +30,7 @@ from ..common.text import counted
 from ..common.units import FOOT_M, AnyArray, BoolArray, FloatArray, db_from_power
 from ..common.yamlfile import parse_yaml
 from ..compare import referee
-from ..compare.level import nearest_in_time
+from ..compare.level import detection_floor_db, nearest_in_time
 from ..compare.rank import MAX_RANK, compare_ranks
 from ..compare.receiver import score_forecast
 from ..compare.result import BASELINE_TITLE, FlightResult, RankResult, RssResult
@@ -591,7 +591,7 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> dict
     return {
         "tower": item.tower, "channel": item.channel, "unit": item.unit,
         "matched": int(near.sum()), "unmatched": int((item.posed & ~near).sum()),
-        "floor_db": referee.detection_floor_db(part["level"].to_numpy(np.float64)),
+        "floor_db": detection_floor_db(part["level"].to_numpy(np.float64), within_db=0.05),
         "cards": cards,
         "differences": {key: paired_difference(theirs, of, place_m=item.position_m) for key, of in errors.items()},
     }  # fmt: skip

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from aerpaw_cmp.compare.level import detection_floor_db
 from aerpaw_cmp.compare.referee import (
-    detection_floor_db,
     level_card,
     measured_thresholds,
     nearest_points,
@@ -96,6 +96,8 @@ def test_floor_is_the_lowest_level_if_it_is_repeated() -> None:
     level = np.linspace(-120.0, -60.0, 600)
     assert detection_floor_db(level) is None
     assert detection_floor_db(np.maximum(level, -110.0)) == -110.0
+    dithered = np.maximum(level, np.linspace(-110.0, -109.96, 600))
+    assert (detection_floor_db(dithered), detection_floor_db(dithered, 0.05)) == (None, pytest.approx(-110.0, abs=0.01))
     assert detection_floor_db(np.full(50, -90.0)) is None
     assert detection_floor_db(np.full(3, np.nan)) is None
 

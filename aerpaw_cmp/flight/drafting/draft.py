@@ -23,6 +23,7 @@ from ...common.geodesy import rough_m
 from ...common.text import counted
 from ...common.units import BoolArray, FloatArray
 from ...common.yamlfile import parse_yaml
+from ...compare.level import detection_floor_db
 from ...logs.ingest import IngestedFile, name_inside, read_log
 from ...logs.readers import named_tower
 from ...logs.records import Stream, has_wall_clock
@@ -531,22 +532,15 @@ def _has_attitude(frame: Any, names: Sequence[str] = ("roll_deg", "pitch_deg", "
     return bool(known and frame["yaw_deg"].any())
 
 
-_CLIPPED_SHARE = 0.01
-
-
 def receiver_floor_db(levels: Sequence[Stream]) -> float | None:
     """Return the floor of the receivers of a log [dB]. None if the levels do not show a floor.
 
     A receiver at its floor repeats its lowest level: in at least 1 % of the samples, and at least ten times.
     """
-    floors = []
     # RSRP is reported in whole decibels, so its lowest value repeats without a floor
-    for stream in (s for s in levels if s.attributes.get("quantity") != "RSRP"):
-        level = stream.frame["rss_db"].to_numpy(np.float64)
-        level = level[np.isfinite(level)]
-        if len(level) and np.sum(level == level.min()) >= max(10.0, _CLIPPED_SHARE * len(level)) and np.ptp(level) > 0:
-            floors.append(float(level.min()))
-    return max(floors) if floors else None
+    compared = [stream for stream in levels if stream.attributes.get("quantity") != "RSRP"]
+    floors = (detection_floor_db(stream.frame["rss_db"].to_numpy(np.float64)) for stream in compared)
+    return max((floor for floor in floors if floor is not None), default=None)
 
 
 def floor_of(level: Stream, *, locks: bool) -> float:

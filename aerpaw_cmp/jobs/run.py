@@ -39,7 +39,11 @@ def mapping(pairs: list[str]) -> dict[str, Any]:
         if not mark or not column or not quantity:
             raise UsageError(f"--map {pair!r}", expected="COLUMN=quantity, e.g. --map 'Power (dBm)=rss_db'")
         if quantity in columns:
-            raise UsageError(f"--map names two columns for {quantity!r}", expected="one column per quantity")
+            raise UsageError(
+                f"--map names two columns for {quantity!r}",
+                expected="one column per quantity",
+                cause="several levels: list the table in flight.yaml once per level, with 'columns:'",
+            )
         columns[quantity] = column.strip()
     kind = next((kind for quantity, kind in _KIND_OF.items() if quantity in columns), "telemetry")
     return {"columns": columns, "kind": kind, **({"ri_base": "one"} if kind == "rank" else {})}

@@ -57,8 +57,8 @@ class ReadOptions:
         Tower and channel to which the log belongs.
     frequency_hz : float, optional
         Carrier.
-    unit : str, optional
-        Unit of RSS, if the file does not specify it.
+    unit : {"dBm", "dBFS", "dB"}, optional
+        Unit of RSS, if the file does not specify it. ``dBFS`` is stored as ``dB re full scale``; ``dB`` is a ratio.
     floor_db : float
         RSS at or below this is out of coverage.
     file_name : str
@@ -66,6 +66,11 @@ class ReadOptions:
     neighbour : callable, optional
         Return the content of another file in the log's folder by its name, or None if it is missing. Set by ``ingest``,
         for formats with samples in a second file.
+
+    Raises
+    ------
+    UsageError
+        If the unit is not one of these.
     """
 
     timezone: str | None = None
@@ -82,6 +87,20 @@ class ReadOptions:
     floor_db: float = -200.0
     file_name: str = ""
     neighbour: Callable[[str], bytes | None] | None = None
+
+    def __post_init__(self) -> None:
+        """Write the unit as logs do, or refuse it."""
+        known = None if self.unit is None else _LEVEL_UNITS.get(self.unit.lower())
+        if self.unit is not None and known is None:
+            raise UsageError(
+                f"the unit {self.unit!r} of levels",
+                expected="dBm, dBFS or dB (a ratio to the noise)",
+                cause="a linear unit belongs into the name of the column, such as power_mw, and is converted",
+            )
+        object.__setattr__(self, "unit", known)
+
+
+_LEVEL_UNITS = {"dbm": "dBm", "dbfs": "dB re full scale", "db re full scale": "dB re full scale", "db": "dB"}
 
 
 ASSUMED_CLOCK, ASSUMED_HEIGHT = "assumed: local wall time", "assumed: above take-off"

@@ -198,6 +198,8 @@ def named(
         quantity = replace(quantity, name="SNR", role="rss")
     short = re.sub(r"\W+", "_", dictionary.plain(name))
     direct = meaning is not None and not (meaning.indirect or meaning.place.startswith("n") or unit == "%")
+    # a power in dB has no reference, unlike a ratio
+    unit = quantity.unit if (quantity.name, unit) == ("power", "dB") else unit
     if quantity.kind == "rss" and direct and "statistic" not in (about or {}):
         level, flag = rows.level(np.where(dictionary.is_none(quantity, values), np.nan, values))
         return rows.stream(

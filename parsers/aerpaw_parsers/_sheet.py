@@ -953,8 +953,8 @@ def way_to_level(sheet: Sheet) -> list[str]:
     pairs = [(time, "time"), *((sheet.find(quantity), quantity) for quantity in _MAPPED), (filled[0], "rss_db")]
     sheet.used.update(filled)
     options = " ".join(f"--map {sheet.names[i]!r}={quantity}" for i, quantity in pairs if i is not None)
-    relative = sheet.meanings[filled[0]] or "dbfs" in sheet.names[filled[0]].lower()
-    unit = "dBm" if (sheet.unit_read(filled[0]) or "dBm") == "dBm" and not relative else "dB"
+    absolute = (sheet.unit_read(filled[0]) or "dBm") == "dBm" and "dbfs" not in sheet.names[filled[0]].lower()
+    unit = "dB" if sheet.meanings[filled[0]] else "dBm" if absolute else "dBFS"
     others = f" (so may {', '.join(repr(sheet.names[i]) for i in filled[1:5])})" if filled[1:] else ""
     return [f"{sheet.names[filled[0]]!r} may be a level, but is not read as one{others}: {options} --unit {unit}"]
 

@@ -40,7 +40,7 @@ def ingest(
         list[str] | None,
         Option("--map", metavar="COLUMN=QUANTITY", help="Content of a CSV column: time, rss_db, rank, ..."),
     ] = None,
-    unit: Annotated[str | None, Option(help="Unit of levels, if the file does not state it.")] = None,
+    unit: Annotated[str | None, Option(help="dBm, dBFS or dB: unit of levels, if the file does not state it.")] = None,
     every_stream: Annotated[bool, Option("--all", help="Name every stream of a wide table.")] = False,
     force: Force = False,
 ) -> None:

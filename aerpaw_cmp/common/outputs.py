@@ -683,13 +683,13 @@ def _sync_folder(folder: Path) -> None:
 
 
 _REMEDIES = {
-    errno.ENOSPC: "the disk is full: free some space, or name another place with -o",
-    errno.EDQUOT: "your quota is used up: free some space, or name another place with -o",
+    errno.ENOSPC: "the disk is full: free some space, or choose another place for the output",
+    errno.EDQUOT: "your quota is used up: free some space, or choose another place for the output",
     errno.EFBIG: "a limit on file sizes (ulimit -f or the file system)",
-    errno.EIO: "the disk has errors: name a place on another disk with -o",
-    errno.EROFS: "the disk is mounted read-only: name another place with -o",
-    errno.EACCES: "no right to write here: name another place with -o",
-    errno.EPERM: "no right to write here: name another place with -o",
+    errno.EIO: "the disk has errors: choose a place on another disk",
+    errno.EROFS: "the disk is mounted read-only: choose another place for the output",
+    errno.EACCES: "no right to write here: choose another place for the output",
+    errno.EPERM: "no right to write here: choose another place for the output",
     errno.ENOENT: "a folder that does not accept files, or was removed during the run",
 }
 _WRONG_NAMES = (errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)

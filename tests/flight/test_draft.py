@@ -264,6 +264,14 @@ def test_levels_without_positions_do_not_spoil_ranks_that_have_them(logs: Path) 
 def test_nothing_to_compare_is_said_with_options_to_paste(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(UsageError, match="no log of RSS or rank"):
         draft(ingest(logs.glob("UAV/*vehicleOut.txt"), options=OPTIONS), logs)
+    tracks = [logs / "today.csv", logs / "tomorrow.csv"]
+    for day, track in enumerate(tracks, 1):
+        rows = (f"2025-06-0{day}T10:00:{s:02d}Z,35.73,{-78.7 + s * 1e-4},30\n" for s in range(60))
+        track.write_text("time,lat,lon,alt\n" + "".join(rows))
+    with pytest.raises(
+        UsageError, match=r"no log of RSS or rank for a flight(?!.*at the time)"
+    ):  # the other track is no reason
+        draft(ingest(tracks, options=OPTIONS), logs)
     table = logs / "table.csv"
     table.write_text("by hand\nDate,Time,lat,lon,alt,rx's power\n2025-06-01,10:00:00,35.73,-78.7,30,-60\n")
     with pytest.raises(UsageError, match="may be a level") as refused:

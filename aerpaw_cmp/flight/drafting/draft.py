@@ -213,8 +213,11 @@ def draft(
     if not kinds & {"rss", "rank"}:
         # a table of positions may contain levels under an unknown name, which its warnings list
         unread = [text for file in files for text in file.result.warnings if "--map" in text]
+        # a track of another flight is no reason
+        radio = [line for line in lines if any(s.kind != "telemetry" for s in line.file.result.streams)]
+        reasons = unread + sorted(remark for line in radio for remark in line.remarks)
         raise UsageError(
-            "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in (*out, *unread)),
+            "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in reasons),
             expected="telemetry and levels or ranks of one flight",
         )
     name = _name(flown, files) if flight is None else flight.name

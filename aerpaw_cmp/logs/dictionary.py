@@ -86,52 +86,18 @@ def _quantity(row: Mapping[str, Any]) -> Quantity:
 
 
 QUANTITIES = tuple(_quantity(row) for row in _FILE["quantities"])
-ZONES: Mapping[str, Mapping[str, str]] = _FILE["zones"]
+_PATTERNS = {name: re.compile("".join(pieces)) for name, pieces in _FILE["patterns"].items()}
+ZONES: Mapping[str, Mapping[str, Any]] = _FILE["zones"]
+# Hours east of UTC, and a zone with summer time, of each meaning of an ambiguous abbreviation.
+WINTER = {
+    word: [(float(hours), zone) for zone, hours in meanings.items()] for word, meanings in ZONES["winter"].items()
+}
 
 
 @cache
 def _forms() -> tuple[tuple[re.Pattern[str], Quantity], ...]:
     """Return one expression per row, so that a single search excludes all patterns of a row for most names."""
     return tuple((re.compile("|".join(f"(?:{pattern})" for pattern in row.names)), row) for row in QUANTITIES)
-
-
-_NEIGHBOUR = re.compile(
-    r"\b(detected|neigh(bou?rs?)?\d{0,2}|ngh?br?s?\d{0,2}|nbr?\d{0,2}|nc(ell)? ?\d{0,2}|n ?\d{1,2}|nrx|nlte\w*"
-    r"|adj(acent)?\d{0,2}|top ?\d{1,2})\b|^nrx"
-)
-# A neighbour whose name is one word with its quantity: 'NRSRP1', 'nei1Pci', 'NCellRSRP2'.
-_JOINED = re.compile(
-    r"\b(?:n|nb|nbr|nc|ncell|nrx|nei|neigh|neighbou?r|neighbou?r?cell|ngbr|adj|det(?:ected)?)(\d{0,2})"
-    r"(?=(?:pci|rsrp|rsrq|rssi|rscp|sinr|e?arfcn|rxlev)\d{0,2}\b)"
-)
-_NR = re.compile(r"\b(nr|5g|spcell|(ss|csi) ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss|\bnrpci\b|\bnr ?arfcn\b|\bnci\b")
-_LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
-# A secondary carrier, which serves together with the primary one.
-_SECONDARY = re.compile(r"\bsc(?:ell|c) ?(\d{0,2})\b")
-_NUMBER = re.compile(
-    r"(?:^| )(?:n|nb|nbr|nc|ngbr|neigh|neighbou?r|ncell|adj|top|rsrp|rsrq|pci|e?arfcn)? ?(\d{1,2})(?: |$)"
-)
-# Another cell of a table, or the cell of another device, by its number or its order.
-_OTHER = re.compile(
-    r"\b((?:sim|dev(?:ice)?|modem|ue|phone|slot) ?\d{1,2}|wi ?fi|wlan|ble|bluetooth|lw ?[1-5])\b"
-    r"|\b(second|third|2nd|3rd|other|inter|intra|pscell|secondary)\b"
-    r"|\b(?:cell|pci|rsrp|rsrq|rssi|sinr|e?arfcn) ?(\d{1,2})\b"
-)
-# Levels that the receiver did not measure: those of the base station, statistics, and predictions of a model.
-_INDIRECT = re.compile(
-    r"\b(ul|uplink|pusch|pucch|srs|at (the )?(gnb|enb|bs)|(gnb|enb|bs) (rx|rssi|received)|min|minimum|max|maximum|std"
-    r"|stdev|sigma|var|variance|thresh(old)?|predicted|prediction|simulated|expected|target|model(led)?|error|delta|diff"
-    r"|offset|count|ref|des(ired)?|set ?point|cmd|command)\b"
-)
-
-
-# Levels in addition to the measured one: averages over time, and those of single ports.
-_MEAN = re.compile(
-    r"\b(mean|avg|average|averaged|filtered|filt|smooth(ed)?|median|ema|rolling|moving|kalman|low ?pass|lpf|savgol"
-    r"|denoised|interp(olated)?|fitted|percentile|quantile|p\d)\d*\b"
-)
-# SS-RSRP is the level of an NR cell, even next to its CSI-RSRP
-_PORT = re.compile(r"\b(rx|ant(enna)?|port|branch|chain|path) ?\d\b|\bcsi ?rsrp\b")
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +185,9 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     if texts[0] == plain(name):
         # 'Time (+02:00)'; 'heightAboveGround'
         texts += [bare, plain(in_brackets(name)[2]), plain(_CAMEL.sub(" ", name))]
-    texts = [_JOINED.sub(r"neighbour \1 ", text).replace("  ", " ") for text in dict.fromkeys(texts)]
+    texts = [
+        _PATTERNS["joined_neighbour"].sub(r"neighbour \1 ", text).replace("  ", " ") for text in dict.fromkeys(texts)
+    ]
     hits = ((row, text) for text in texts for form, row in _forms() if form.search(text))
     row, text = next(hits, (None, ""))
     if row is not None and row.role == "other":  # a tower, a target and an antenna have levels, too
@@ -229,19 +197,21 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
         return None
     if row.unit and unit in UNITS and (UNITS[unit][0] != row.unit) and row.role in ("position", "angle", "velocity"):
         unit = ""  # the W of 'Longitude (W)' is not watts, and the m of 'vel_n_m_s' is not metres
-    rat = "nr" if _NR.search(text) else "lte" if _LTE.search(text) else ""
-    digits = _NUMBER.search(re.sub(r"\b[45] ?g\b", "", text))
+    rat = "nr" if _PATTERNS["nr"].search(text) else "lte" if _PATTERNS["lte"].search(text) else ""
+    digits = _PATTERNS["number"].search(re.sub(r"\b[45] ?g\b", "", text))
     number = next((group for group in digits.groups() if group), "0") if digits else "0"
-    second = _SECONDARY.search(text)
-    place = f"n{number}" if _NEIGHBOUR.search(text) else f"scell{second[1]}" if second else "serving"
-    if place == "serving" and (other := _OTHER.search(text)):
+    second = _PATTERNS["secondary"].search(text)
+    place = f"n{number}" if _PATTERNS["neighbour"].search(text) else f"scell{second[1]}" if second else "serving"
+    if place == "serving" and (other := _PATTERNS["other"].search(text)):
         place = (other[1] or other[2] or f"cell{other[3]}").replace(" ", "")
-    part = "mean" if _MEAN.search(text) else "port" if _PORT.search(text) else ""
-    return Meaning(row, unit, rat, place, indirect=_INDIRECT.search(text) is not None, part=part)
+    part = "mean" if _PATTERNS["mean"].search(text) else "port" if _PATTERNS["port"].search(text) else ""
+    return Meaning(row, unit, rat, place, indirect=_PATTERNS["indirect"].search(text) is not None, part=part)
 
 
 # Words that pairs of an identity and a level do not share, or that only name the radio access or the serving cell.
-_UNPAIRED = re.compile(rf"{_MEAN.pattern}|\b(nr|ss|lte|4g|5g|cell|serving|primary|pcell|pscell|spcell|dbm?)\b")
+_UNPAIRED = re.compile(
+    rf"{_PATTERNS['mean'].pattern}|\b(nr|ss|lte|4g|5g|cell|serving|primary|pcell|pscell|spcell|dbm?)\b"
+)
 
 _PAIRED = ("RSRP", "RSSI", "RSCP")
 # Words for a cell, a beam or an access point, and words that follow them.
@@ -298,7 +268,7 @@ def with_places(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning |
         if what is not None and rest in shared and rest in cells.get(("level", what.place), {}):
             several = any(shared[rest] & rats for other, rats in shared.items() if other != rest)
             # the target of a handover has an identity, the target of a model has none
-            indirect = what.indirect and _INDIRECT.search(rest.replace("target", "")) is not None
+            indirect = what.indirect and _PATTERNS["indirect"].search(rest.replace("target", "")) is not None
             what = replace(what, place=f"cell {rest}" if several and rest else what.place, indirect=indirect)
         placed.append(what)
     return placed
@@ -487,29 +457,14 @@ PROGRAMS = tuple(
 AERPAW_MAT = next(known for known in PROGRAMS if known.name == "AERPAW .mat")
 
 
-# Names that a level of another program may have, and names that only look like levels, such as an altitude above sea
-# level or a battery.
-_LIKE_A_LEVEL = re.compile(
-    r"^value$|power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs|w)?\b|\bd ?bu ?v\b|\brss|strength|\bampl|magnitude|rsrp"
-)
-UNLIKE_A_LEVEL = re.compile(
-    r"batt|volt|current|throttle|gps|water|fuel|noise|gain|loss|\btx|transmit|\be?irp\b|\berp\b|interfer|alt|height|elev|\bsea\b|type|quality|source|bars"
-    r"|\basu|mode|state|status|charge|energy|consum|\b(avg|mean|min|max|std|log|audio|sound|light|id)\b|threshold|count"
-    r"|\b([xyz]|down|home|gyro|mag)\b|\b(lat|lon|lng|acc|vel|speed|temp|yaw|roll|pitch|heading|offset)"
-)
-
-
-_OF_A_CELL = re.compile(
-    r"((serving|lte|nr|nr5g|4g|5g|e ?utran?|global|full|dl|rx|tx|carrier|cent(er|re)) )*(tower|node|site|base ?station"
-    r"|bs|[eg]nb|cell|sector|e?ci|nci|l?cid|[en]?cgi|psc|bsic|channel|(antenna |ant )?port|antenna|ant|beam|ssb|csi ?rs"
-    r"|pol(ari[sz]ation)?|freq(uency)?|band)( (global|beam|port))? ?(id(entity|x)?|name|no|num(ber)?|index|[mgk]?hz)?"
-)
-_CELL_ID = re.compile(r"\b(cell ?id|l?cid|e?ci|nci|[en]?cgi|[eg]nb ?id|sector ?id|beam ?id|bssid|rnti|pci\d?)\b")
+UNLIKE_A_LEVEL = _PATTERNS["unlike_a_level"]
 
 
 def names_a_cell(words: str, *, alone: bool = False) -> bool:
     """Check whether a plain name names a cell, an antenna or a beam, without other words if ``alone``."""
-    return _OF_A_CELL.fullmatch(words) is not None or (not alone and _CELL_ID.search(words) is not None)
+    return _PATTERNS["of_a_cell"].fullmatch(words) is not None or (
+        not alone and _PATTERNS["cell_id"].search(words) is not None
+    )
 
 
 def like_levels(names: Iterable[str]) -> list[str]:
@@ -518,7 +473,7 @@ def like_levels(names: Iterable[str]) -> list[str]:
     electric = any(re.search(r"volt|batt|\bcurrent", text) for text in words.values())
     return [
         name for name, text in words.items()
-        if _LIKE_A_LEVEL.search(text) and not UNLIKE_A_LEVEL.search(text)
+        if _PATTERNS["like_a_level"].search(text) and not UNLIKE_A_LEVEL.search(text)
         and not (electric and re.fullmatch(r"(.* )?(power|pwr)( m?w)?", text))
     ]  # fmt: skip
 

@@ -218,6 +218,8 @@ def as_utf8(data: bytes) -> bytes:
         text = data.decode("utf-16", errors="replace")
         # a binary file may begin with the same two bytes
         return data if "\0" in text or text.count("\ufffd") > 8 else text.encode()
+    if b"\n" not in data and b"\r" in data and b"\0" not in data:  # line ends of old versions of Mac OS
+        data = data.replace(b"\r", b"\n")
     return data.removeprefix(b"\xef\xbb\xbf")
 
 
@@ -412,12 +414,6 @@ def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: R
             raise InputError(f"the archive has no member {name!r}", cause="a misspelt path", path=archive)
         return _member(place, content[name], content, options, reader)
     head = _beginning(place)
-    if head.startswith(_HDF5):
-        raise InputError(
-            "an HDF5 file, such as the flight file that 'ingest -o' writes",
-            expected="the logs themselves, or only the flight file: 'ingest' then returns its logs",
-            path=path,
-        )
     if reader is None and head:
         # identify the file before reading the rest, because folders contain large files of other kinds
         reader = identify(head, path=str(path))
@@ -512,7 +508,7 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
     expected, cause = f"lines such as {reader.sample!r}", "a log of another kind, or a damaged one"
     with parsing(path, expected, cause), blaming(reader.plugin, f"reader {reader.name!r} read it", InputError):
         result = readers.stated(limits.check(_later(read(), options.gps_rollovers)), reader, options)
-    if not result.accepted:
+    if not any(len(stream.frame) for stream in result.streams):
         first = f": {result.rejected[0].reason}" if result.rejected else ""
         raise InputError(
             f"reader {reader.name!r} found no record in {counted(result.lines, 'line')}{first}",
@@ -527,6 +523,8 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
 ROLLOVER_DAYS = 7 * 1024
 # Start of the first LTE networks. Earlier dates of logs are wrong.
 _PLAUSIBLE_FROM = datetime(2009, 12, 1)
+# Relative times after this date are not the duration of a log, but count from another epoch.
+_RELATIVE_UNTIL = datetime(1979, 1, 1)
 # Dates after this are wrong: counts of LabVIEW (from 1904) and NTP (from 1900), read as Unix time, are after 2080.
 _FUTURE = datetime(2050, 1, 1)
 
@@ -544,6 +542,8 @@ def _later(result: ReadResult, rollovers: int) -> ReadResult:
         text = f"{counted(rollovers, 'rollover')} of the GPS week number: {days} days were added to the times"
     elif first >= _FUTURE:
         text = f"the dates begin on {first:%Y-%m-%d}, in the future: do the times count from 1904 or 1900, not 1970?"
+    elif _RELATIVE_UNTIL < first < _PLAUSIBLE_FROM and streams[0].attributes.get("clock") == "relative":
+        text = f"the times begin on {first:%Y-%m-%d} if they count from 1970: do they count from 2001 or 1980?"
     elif _PLAUSIBLE_FROM - timedelta(days=ROLLOVER_DAYS) < first < _PLAUSIBLE_FROM:
         text = (
             f"the dates begin on {first:%Y-%m-%d}: if the week number of the GPS receiver rolled over, "

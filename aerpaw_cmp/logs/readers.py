@@ -296,8 +296,11 @@ def _way_out(head: bytes) -> str:
 
 # Words in column names that the dictionary does not know, by quantity; the most reliable word first.
 _LIKE = {
-    "time": (r"time", r"date|clock|stamp|epoch|utc|^when"), "latitude_deg": (r"\blat",),
-    "longitude_deg": (r"\b(lon|lng)",), "altitude_m": (r"\b(alt|height|elev)",),
+    "time": (
+        r"^(?!.*(elapsed|boot|up ?time)).*time", r"^(?!.*start).*(date|clock|stamp|epoch|utc)|^when|\bt\b",
+        r"time|second|\bm?jd\b", r"date",
+    ),
+    "latitude_deg": (r"\blat",), "longitude_deg": (r"\b(lon|lng)",), "altitude_m": (r"\b(alt|height|elev)",),
 }  # fmt: skip
 
 
@@ -321,6 +324,7 @@ def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
         what: [name for words in forms for name in names if re.search(words, dictionary.plain(name))]
         for what, forms in _LIKE.items()
     } | {"rss_db": [name for name in dictionary.like_levels(names) if dictionary.can_be_level(name)] or levels}
+    fits["rss_db"].sort(key=lambda name: dictionary.without_unit(name)[1] != "dbm")
     if not fits["time"] or not (fits["rss_db"] or all(fits[what] for what in _LIKE)):
         lacking = " or ".join(what for what in ("time", "rss_db") if not fits[what])
         return f"a table of another kind; no column looks like {lacking}"

@@ -24,6 +24,7 @@ import pandas as pd
 from ..common.errors import UsageError
 from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, IntArray
+from .dictionary import WINTER
 from .readers import ReadOptions
 from .records import COLUMNS, KEPT_REJECTED, Attribute, Kind, RejectedLine, RejectedReason, by_reason
 
@@ -294,17 +295,6 @@ TIME = rb"\d{4}[-/]\d\d[-/]\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,9})?"
 # Optional offset after :data:`TIME`.
 ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
 
-# Ambiguous abbreviations: winter time that is also written in summer, and names that several countries use. Each has
-# hours east of UTC and a zone with summer time.
-WINTER = {
-    "EST": ((-5.0, "America/New_York"),), "MST": ((-7.0, "America/Denver"),),
-    "PST": ((-8.0, "America/Los_Angeles"),), "AKST": ((-9.0, "America/Anchorage"),), "CET": ((1.0, "Europe/Berlin"),),
-    "MEZ": ((1.0, "Europe/Berlin"),), "EET": ((2.0, "Europe/Athens"),), "WET": ((0.0, "Europe/Lisbon"),),
-    "AEST": ((10.0, "Australia/Sydney"),), "NZST": ((12.0, "Pacific/Auckland"),),
-    "CST": ((-6.0, "America/Chicago"), (8.0, "Asia/Shanghai")),
-    "IST": ((5.5, "Asia/Kolkata"), (1.0, "Europe/Dublin"), (2.0, "Asia/Jerusalem")),
-}  # fmt: skip
-
 
 class Count(NamedTuple):
     """A unit of clocks: its nanoseconds, its pattern in column names, and the smallest count that is an epoch."""
@@ -418,7 +408,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     where = zone(name, needed_by=needed_by)
     starts, buckets, index = _runs(wall_ns)
     first, second = (_offsets_s(buckets, where, fold) for fold in (0, 1))
-    hours, turned = WINTER.get(name or "", ((0.0, ""),))[0]
+    hours, turned = WINTER.get(name or "", [(0.0, "")])[0]
     if turned and (first != _offsets_s(buckets, zone(turned, needed_by=needed_by), 0)).any():
         raise UsageError(
             f"{name} is a winter time, but times of {needed_by} are in summer",

@@ -70,7 +70,7 @@ QUANTITIES = {"pci": "PCI", "arfcn": "ARFCN", "rsrp_dbm": "RSRP", "rsrq_db": "RS
 
 def streams(
     rows: Rows, readings: pd.DataFrame | Iterable[Reading], *, source: str, quantity: str = "RSRP",
-    more: Mapping[str, Mapping[str, Attribute]] | None = None,
+    more: Mapping[str, Mapping[str, Attribute]] | None = None, unit: str = "dBm",
 ) -> list[Stream]:  # fmt: skip
     """Return a stream per cell, which is a radio access, PCI and carrier. Every reading with a level is a record.
 
@@ -89,6 +89,8 @@ def streams(
         Quantity of the levels.
     more : mapping, optional
         Further attributes of the cells; the keys are values of ``more`` in the readings.
+    unit : str
+        Unit of the levels. Many programs write dB for dBm, so that dB are relative only if they cannot be dBm.
     """
     rows_or_table = readings if isinstance(readings, pd.DataFrame) else [*readings]
     table = pd.DataFrame(rows_or_table, columns=list(Reading._fields))
@@ -103,14 +105,14 @@ def streams(
         for carrier in [*carriers, np.nan] if several else [*carriers, np.nan][:1]:
             mine = cell_rows["arfcn"].eq(carrier) | (cell_rows["arfcn"].isna() & np.isnan(carrier))
             of_carrier = cell_rows[mine] if several else cell_rows
-            about: dict[str, Attribute | None] = {"quantity": quantity, "rat": rat or None}
+            about: dict[str, Attribute | None] = {"quantity": quantity, "rat": rat or None, "unit": unit}
             about["pci"] = int(identity) if identity >= 0 else None
             about["arfcn"] = int(carrier) if np.isfinite(carrier) else None
             level = quantity.lower() if quantity in QUANTITIES.values() else "rsrp"
             words = [rat, f"pci{about['pci']}" if identity >= 0 else level]
             words += [level] if identity >= 0 and level != "rsrp" else []
             words += [f"arfcn{about['arfcn']}"] if several and np.isfinite(carrier) else []
-            for further, part in of_carrier.groupby("more") if more else [("", of_carrier)][: len(of_carrier)]:
+            for further, part in of_carrier.groupby("more"):
                 name = "_".join(word for word in (*words, str(further)) if word)
                 known = {**about, **(more or {}).get(str(further), {}), "source": source}
                 per_cell.append(_stream(rows, part, name, known))
@@ -138,7 +140,11 @@ def _stream(rows: Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attr
     row, level = table["row"].to_numpy(), table["rsrp_dbm"].to_numpy(np.float64, copy=True)
     flag = rows.flag[row]
     outside = ~((level >= _RANGE_DBM[0]) & (level <= _RANGE_DBM[1]))
-    if 2 * outside.sum() > len(level):
+    relative = about["unit"] == "dB re full scale" or (about["unit"] == "dB" and 2 * outside.sum() > len(level))
+    unit = about["unit"] if relative else "dBm"
+    if relative:
+        outside = ~np.isfinite(level)
+    elif 2 * outside.sum() > len(level):
         rows.warnings.append(
             f"{cell}: {outside.sum()} of {counted(len(level), 'level')} outside {_RANGE_DBM[0]:g} .. "
             f"{_RANGE_DBM[1]:g} dBm (the first: {level[outside][0]:g}; another unit, or an index?): "
@@ -162,7 +168,7 @@ def _stream(rows: Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attr
         if finite.any():
             values[name] = np.where(finite, quality, np.nan)
     stream = rows.stream(
-        "rss", cell, values, pick=row, flag=flag, channel=rows.options.channel or cell, unit=rows.options.unit or "dBm",
+        "rss", cell, values, pick=row, flag=flag, channel=rows.options.channel or cell, unit=rows.options.unit or unit,
         about=about,
     )  # fmt: skip
     assert stream is not None
@@ -203,7 +209,8 @@ def named(
     if quantity.kind == "rss" and direct and "statistic" not in (about or {}):
         level, flag = rows.level(np.where(dictionary.is_none(quantity, values), np.nan, values))
         return rows.stream(
-            "rss", short, {"rss_db": level}, where=where, flag=flag, channel=rows.options.channel or short,
+            "rss", short, {"rss_db": level}, where=where, flag=flag,
+            channel=rows.options.channel or (about or {}).get("channel", short),
             unit=rows.options.unit or unit or quantity.unit, quantity=quantity.name, about=about,
         )  # fmt: skip
     unit = unit or ("unknown" if quantity.open_unit else quantity.unit)

@@ -280,12 +280,14 @@ def _typical(steps: FloatArray) -> float:
     return float(np.median(known)) if len(known) else np.nan
 
 
+# Networks that count from 0, unlike codes of operators.
+_COUNTED = ("sim", "slot", "sub", "anchor", "beacon", "gateway", "peer")
+
+
 def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
     """Return the texts of a column, empty where a text is not a name: a network 0 is not, but a device 0 is."""
     meaning = sheet.meanings[column]
-    zero = (
-        meaning is None or meaning.quantity.name != "network" or sheet.plain[column].startswith(("sim", "slot", "sub"))
-    )
+    zero = meaning is None or meaning.quantity.name != "network" or sheet.plain[column].startswith(_COUNTED)
     texts = sheet.texts(column)
     # 'lw1' and 'LW1' are one tower
     spelling = {text.casefold(): text for text in reversed(texts)}

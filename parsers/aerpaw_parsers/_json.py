@@ -111,6 +111,12 @@ BEGIN = re.compile(rb"(?:\xef\xbb\xbf)?[\s\[]*\{")
 _ON_A_LINE = re.compile(rb"^(?:\xef\xbb\xbf)?[ \t\[]*\{", re.MULTILINE)
 
 
+def beginning(head: bytes) -> list[dict[str, Any]]:
+    """Return the first objects of a file for sniffers: those on its first lines, or one over several lines."""
+    alone = (_loaded(_bare(line))[0] for line in head.split(b"\n")[:_ENTRIES])
+    return [value for value in (*alone, first(head)) if isinstance(value, dict)]
+
+
 def first(head: bytes) -> dict[str, Any] | None:
     """Return the first object of a file for sniffers, or None if it is longer than the sniffed bytes."""
     begin = _ON_A_LINE.search(head)
@@ -130,7 +136,8 @@ _GROUPS = re.compile(
 )
 # Largest nesting depth of objects and number of list entries that become columns.
 _DEPTH, _ENTRIES = 6, 32
-_LISTED = re.compile(r"(.*?)\.(\d{1,2})\.(.+)")
+# Names of values in a list: 'gateways.0.rssi'.
+LISTED = re.compile(r"(.*?)\.(\d{1,2})\.(.+)")
 
 
 def flat(entry: dict[str, Any]) -> dict[str, str]:
@@ -157,7 +164,7 @@ def readings(entry: dict[str, Any]) -> list[dict[str, str]]:
     """
     common, lists = flat(entry), dict[str, dict[str, dict[str, str]]]()
     for name, text in common.items():
-        if (part := _LISTED.fullmatch(name)) is not None:
+        if (part := LISTED.fullmatch(name)) is not None:
             lists.setdefault(part[1], {}).setdefault(part[2], {})[_GROUPS.sub("", part[3])] = text
     for place, members in lists.items():
         known = {name: dictionary.meaning(name) for item in members.values() for name in item}

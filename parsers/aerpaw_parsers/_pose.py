@@ -181,14 +181,17 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
             said = {dictionary.meaning(f"altitude {text}") for text in sheet.texts(i)}
             if len(said) == 1 and (one := said.pop()) is not None and one.quantity.datum not in ("", "unknown"):
                 rows.height_from, datum = "written", one.quantity.datum
-    height = sheet.numbers(column)
+    height, time_s = sheet.numbers(column), (rows.time - rows.time[:1]) / np.timedelta64(1, "s")
+    home = next((i for i, words in enumerate(sheet.plain) if _OF_HOME.fullmatch(words)), None)
+    if datum in ("sea level", "unknown") and home is not None and (is_set := sheet.numbers(home) > UNSET_M).any():
+        sheet.used.add(home)
+        return "take-off", above_home(rows, time_s, height, time_s[is_set], sheet.numbers(home)[is_set])
     if datum != "take-off":
         return datum, height
     for i, what in enumerate(sheet.meanings):
         own = "" if what is None else what.quantity.datum
         if own == "sea level" or (own == "unknown" and sheet.program and sheet.program.datum == "sea level"):
             sheet.used.add(i)
-            time_s = (rows.time - rows.time[:1]) / np.timedelta64(1, "s")
             altitude = sheet.numbers(i)
             above = from_logged_heights(rows, time_s, altitude, height, altitude - height)
             if above is None:
@@ -199,6 +202,8 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
 
 
 _IMPERIAL = ("mph", "ft", "feet", "foot", "ft/s")
+# Columns of the altitude of the home point, but not of the height of a return to home.
+_OF_HOME = re.compile(r"(home|take ?off|launch)( point)? (alt|altitude|elevation|msl|amsl)( (msl|amsl))?( m| ft)?")
 # Columns that name the datum of the heights.
 _OF_DATUM = re.compile(r"(vertical )?(alt|altitude|height)? ?(ref|reference|type|datum|mode|frame)( frame)?")
 # Home has moved if its altitude changes by more than ``MOVED_M``; an aircraft has taken off if it climbs by ``_OFF_M``.

@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import compress, islice
 from typing import NamedTuple
 
@@ -39,13 +39,17 @@ _IsHeader = Callable[[list[str]], bool]
 def split_row(line: bytes, separator: str) -> list[str]:
     """Split a line into fields, but not at separators inside quotes."""
     text = line.decode("utf-8-sig", errors="replace")
+    if separator == "|" and text.startswith("|"):  # a table of Markdown
+        text = text.strip("| ")
     if '"' not in text:
         return text.split(separator)
     try:
         # the csv module raises for NUL (Python 3.10) and for a bare carriage return
-        return next(csv.reader([text.replace("\0", "\ufffd").replace("\r", " ")], delimiter=separator), [])
+        fields = next(csv.reader([text.replace("\0", "\ufffd").replace("\r", " ")], delimiter=separator), [])
     except csv.Error:
-        return text.split(separator)
+        fields = []
+    # a spreadsheet may write each line as one quoted cell
+    return fields if len(fields) > 1 else text.strip('"').split(separator)
 
 
 def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, list[str]] | None:
@@ -72,8 +76,8 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
 def starts(head: bytes, is_header: _IsHeader) -> bool:
     """Check whether a file begins with a header of this kind, perhaps below title lines, and with rows of its width."""
     if _json.BEGIN.match(head):  # JSON lines: the names of the values in the first object are the header
-        entry = None if _OF_PROGRAMS.search(head) else _json.first(head)
-        return entry is not None and is_header([*_json.readings(entry)[0]])
+        entries = [] if _OF_PROGRAMS.search(head) else _json.beginning(head)
+        return bool(entries) and is_header([*{name: "" for entry in entries for name in _json.readings(entry)[0]}])
     lines = [line.rstrip(b"\r") for line in head.split(b"\n")[: 2 * TITLES]]
     header = _header_of(lines, is_header)
     if header is None:
@@ -221,13 +225,21 @@ class Sheet:
         return bool(cells) and all(map(_RAT.fullmatch, cells))
 
     def find(self, *quantities: str) -> int | None:
-        """Return the column that fits one of the quantities best, an empty column only if there is no other."""
+        """Return the column that fits one of the quantities best, an empty column only if there is no other.
+
+        Of equally good columns, such as the positions of two receivers, a column that was used before is better.
+        """
         known = [
-            (not any(cells[i].strip() for cells in self.cells), dictionary.rank_of(meaning.quantity, self.plain[i]), i)
+            (
+                not any(cells[i].strip() for cells in self.cells),
+                dictionary.rank_of(meaning.quantity, self.plain[i]),
+                i not in self.used,
+                i,
+            )
             for i, meaning in enumerate(self.meanings)
             if meaning is not None and meaning.quantity.name in quantities
         ]
-        return min(known)[2] if known else None
+        return min(known)[-1] if known else None
 
     def named(self, *names: str) -> int | None:
         """Return the first column whose plain name is one of ``names``, or None."""
@@ -389,7 +401,7 @@ class Sheet:
         left = [i for i in range(len(self.names)) if i not in self.used and self._is_of_interest(i)]
         shown = ", ".join(repr(self.names[i]) for i in left[:_MOST_NAMED])
         more = f" and {len(left) - _MOST_NAMED} more" if left[_MOST_NAMED:] else ""
-        said = [self.notes[column] for column in sorted(self.notes)]
+        said = [text for i, text in sorted(self.notes.items()) if i in self.used or "dBuV" not in text]
         if left:
             said.append(f"not read, though they look like levels, identities, positions or times: {shown}{more}")
         gains = [i for i in left if _GAIN.search(self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
@@ -461,6 +473,10 @@ def read(data: bytes, is_header: _IsHeader) -> Sheet:
     if header is None:
         raise InputError("no header with a time and a level, ratio, rank or position", expected="names of columns")
     sheet = cut(_text.split(data), *header)
+    if any(map(_json.LISTED.fullmatch, sheet.names)):  # JSON that was saved as CSV
+        rows = zip(sheet.row.tolist(), sheet.cells, strict=True)
+        listed = [(i, one) for i, row in rows for one in _json.readings(dict(zip(sheet.names, row, strict=True)))]
+        sheet = replace(of_readings(sheet.lines, listed, sheet.rejected), closed=False, notes=sheet.notes)
     _split_places(sheet)
     _join_times(sheet)
     return sheet
@@ -559,6 +575,8 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     numbers = np.flatnonzero(below).tolist()
     group = [text.strip() for text in split_row(lines.raw(at - 1), separator)] if at else []
     written = list(_logical([(i, lines.raw(i)) for i in numbers], separator, len(names)))
+    if [(len(row), row[0]) for _, row in written[:3] if row[-1].strip()] == [(len(names) + 1, i) for i in "123"]:
+        names = ["", *names]  # R writes no name above the numbers of rows
     # the further lines of a row are comments
     comments = [*range(at + 1), *sorted({*numbers} - {i for i, _ in written})]
     header, rows, begun = _Header(_unique_names(names, group)), list[_Row](), False
@@ -810,7 +828,8 @@ def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None
         return column
     if "utc" not in sheet.plain[column].split():
         utc = [i for i in times if "utc" in sheet.plain[i].split()]
-        both = [i for i in utc if all(_ZONELESS.fullmatch(text) for j in (i, column) for text in sheet.texts(j)[:3])]
+        zoneless = all(map(_ZONELESS.fullmatch, sheet.texts(column)[:3]))
+        both = [i for i in utc if zoneless and all(_ZONELESS.match(text) for text in sheet.texts(i)[:3])]
         column = next(iter(utc if "local" in sheet.plain[column] else both), column)
     time_of = dictionary.QUANTITIES[0]
     ranked = sorted(times, key=lambda i: dictionary.rank_of(time_of, sheet.plain[i]))
@@ -876,7 +895,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         )
         sheet.notes[column], count = f"column {sheet.names[column]!r}: {text}", None
     zone = _stamps.header_zone(sheet.names[column], dictionary.in_brackets(sheet.names[column])[1])
-    if day is not None and not zone:
+    if day is not None and not zone and "local" not in name:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
     if day is not None and "local" in sheet.names[day].lower() and zone == "UTC":
         text = "dates are local but times are UTC: between midnight in the two zones, the date is wrong by a day"
@@ -886,10 +905,15 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     gps = re.search(r"\bgps", name) is not None
     heads = " ".join(sheet.names[i].lower() for i in (day, column) if i is not None)
     first = _DAY_OR_MONTH.search(heads)
-    return _stamps.read(
-        texts, options, unit=count, european=sheet.has_decimal_commas or _EUROPEAN.search(heads) is not None,
+    read = partial(
+        _stamps.read, unit=count, european=sheet.has_decimal_commas or _EUROPEAN.search(heads) is not None,
         zone=zone, gps=gps, day_first=None if first is None else first[1].startswith("d"), device=_devices(sheet),
     )  # fmt: skip
+    if day is not None and len({*sheet.texts(day)}) == 1 and _stamps.passes_midnight(clocks := sheet.texts(column)):
+        text = "the dates are all equal, but the clock passes midnight: a day was added to the times after it"
+        sheet.notes[day] = f"column {sheet.names[day]!r}: {text}"
+        texts, options = clocks, replace(options, time_origin=read(sheet.texts(day)[:1], options)[1][0].decode()[:10])
+    return read(texts, options)
 
 
 def _devices(sheet: Sheet) -> IntArray | None:
@@ -938,16 +962,24 @@ _OF_LEVELS = ("", "dBm", "dB", "dB re full scale")
 _MAPPED = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg")
 
 
+def unread_levels(sheet: Sheet) -> list[int]:
+    """Return the columns with unknown names that may be levels, those in dBm first."""
+    like = dictionary.like_levels(sheet.names)
+    unknown = [i for i, meaning in enumerate(sheet.meanings) if meaning is None and np.isfinite(sheet.numbers(i)).any()]
+    named = [
+        i for i in unknown
+        if sheet.unit_read(i) in _OF_LEVELS and (sheet.names[i] in like or _has_levels(sheet, i))
+        # a level in dBm is negative: other numbers are percentages or steps
+        and (sheet.unit_read(i) == "dB" or np.nanmedian(sheet.numbers(i)) < 0)
+    ]  # fmt: skip
+    return sorted(named, key=lambda i: sheet.unit(i) != "dbm")
+
+
 def way_to_level(sheet: Sheet) -> list[str]:
     """Return a sentence with the options that read an unknown column or the RSRQ as a level."""
-    like = dictionary.like_levels(sheet.names)
-    named = [
-        i
-        for i, meaning in enumerate(sheet.meanings)
-        if meaning is None and sheet.unit_read(i) in _OF_LEVELS and (sheet.names[i] in like or _has_levels(sheet, i))
-    ]
-    filled = [i for i in (*named, sheet.find("RSRQ")) if i is not None and np.isfinite(sheet.numbers(i)).any()]
-    time = _time_column(sheet) if sheet.find("time") is not None else sheet.find("gps_seconds")
+    ratio = sheet.find("RSRQ")
+    filled = unread_levels(sheet) or [i for i in [ratio] if i is not None and np.isfinite(sheet.numbers(i)).any()]
+    time = _time_column(sheet) if sheet.find("time") is not None else sheet.find("gps_seconds", "date")
     if not filled or time is None:
         return []
     pairs = [(time, "time"), *((sheet.find(quantity), quantity) for quantity in _MAPPED), (filled[0], "rss_db")]
@@ -971,7 +1003,7 @@ def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:
     week, second = sheet.find("gps_week"), sheet.find("gps_seconds")
     if second is None and time is not None and "gps" in sheet.plain[time]:
         second = time
-    if week is None or second is None or (time is not None and time != second and not _counts(sheet, time)):
+    if week is None or second is None or (time not in (None, second) and _is_dated(sheet, time)):
         return None
     weeks, seconds = sheet.numbers(week), sheet.numbers(second)
     if not np.isfinite(weeks).any():
@@ -985,12 +1017,6 @@ def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:
     # a week has 604 800 s: larger counts are milliseconds
     scale = 1e-3 if np.nanmax(seconds) > 604_800 else 1.0
     return np.asarray(weeks * 604_800.0 + seconds * scale + _stamps.GPS_S - _stamps.LEAP_S)
-
-
-def _counts(sheet: Sheet, column: int) -> bool:
-    """Check whether a column of times counts from an unknown origin."""
-    values = sheet.numbers(column)
-    return bool(np.isfinite(values).any() and np.nanmedian(np.abs(values)) < 0.9e9)
 
 
 def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]]) -> None:

@@ -73,8 +73,7 @@ _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
     re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
 )
-# Hours east of UTC of unambiguous abbreviations. Winter zones are in text.WINTER, because EST in summer is doubtful and
-# CST is the name of two zones.
+# Hours east of UTC of unambiguous abbreviations. EST in summer is doubtful, and CST is the name of two zones.
 _HOURS = {word: float(hours) for word, hours in dictionary.ZONES["hours"].items()}
 # Names of a zone with its summer time.
 _WITH_SUMMER = dictionary.ZONES["with_summer"]
@@ -226,16 +225,16 @@ def _offset(zone: str, date: str, own: str | None) -> str:
     if word in _WITH_SUMMER or "/" in word:
         here = _at(_WITH_SUMMER.get(word, word), moment)
         return "" if here is None else _shown(here[0])
-    if word not in _text.WINTER:
+    if word not in dictionary.WINTER:
         raise UsageError(
             f"the times have an unknown zone: {word}",
             expected="UTC, an offset such as -04:00, or an abbreviation such as EDT",
             cause="a misspelt zone: correct it in the file",
         )
-    (hours, zone), *others = _text.WINTER[word]
+    (hours, zone), *others = dictionary.WINTER[word]
     if others:
         doubt, more = "which is the zone of several countries", ", or state the zone of the log with --timezone"
-        ways = [f"{_shown(east)} ({name})" for east, name in _text.WINTER[word]]
+        ways = [f"{_shown(east)} ({name})" for east, name in dictionary.WINTER[word]]
     else:
         here = _at(zone, moment)
         if here is None or here[0] == hours:
@@ -280,7 +279,7 @@ def header_zone(name: str, brackets: str) -> str:
     if {word.lower() for word in words} & {"utc", "gps", "gmt", "zulu", *SCALES_S}:
         return "UTC"
     last = words[-1].upper() if len(words[-1]) > 2 else ""  # 'time_edt'
-    return next((word for word in (*words, last) if word in {*_HOURS, *_text.WINTER, *_WITH_SUMMER}), "")
+    return next((word for word in (*words, last) if word in {*_HOURS, *dictionary.WINTER, *_WITH_SUMMER}), "")
 
 
 def in_seconds(text: str) -> str:
@@ -307,7 +306,9 @@ def zone_of_cell(text: str) -> str:
     """
     number = re.fullmatch(r"[+-]?\d{1,5}(?:\.\d{1,2})?", text)
     if number is None or re.fullmatch(r"[+-]\d{4}", text):
-        word = text.upper() if text.upper() in {*_HOURS, *_text.WINTER, *_WITH_SUMMER} else text  # 'home' is not a zone
+        word = (
+            text.upper() if text.upper() in {*_HOURS, *dictionary.WINTER, *_WITH_SUMMER} else text
+        )  # 'home' is not a zone
         return word if re.fullmatch(_NAMED_ZONE, word) and ("/" not in word or _at(word, datetime.min)) else ""
     hours = float(text)
     # zones are at most 14 h from UTC: larger numbers are minutes (840) or seconds
@@ -567,6 +568,12 @@ def _are_days(value: FloatArray, low: float, high: float) -> bool:
     if len(finite) < 3 or finite.min() < low or finite.max() >= high or np.ptp(finite) > 2.0:
         return False
     return bool(0 < np.median(np.abs(np.diff(finite))) < 1e-3)
+
+
+def passes_midnight(texts: Iterable[str]) -> bool:
+    """Check whether times of day step back by more than half a day."""
+    matches = [match for text in texts if (match := _OF_DAY.fullmatch(text))]
+    return bool((np.diff([_seconds(match.groupdict()) for match in matches]) < -43_200).any())
 
 
 def _of_day(

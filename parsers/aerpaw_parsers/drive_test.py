@@ -30,8 +30,8 @@ from aerpaw_cmp.readers import Attribute, Reader, ReadOptions, ReadResult, Rows,
 from . import _cells, _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, rtklib_pos, vehicle_out
 
 _IsHeader = Callable[[list[str]], bool]
-# A tower of Lake Wheeler in the name of a column.
-_TOWER = re.compile(r"\blw ?([1-5])\b")
+# A tower of AERPAW in the name of a column, and its channel.
+_TOWER = re.compile(r"\b(lw|cc) ?([1-5])\b(?: ?(usrp) ?(\d)\b)?")
 # Values with which the columns "serving", "neighbouring" and "technology" mark a cell that does not serve.
 _NO, _YES = ("false", "0", "no", "", "n/a", "none", "null", "nan", "-"), ("true", "1", "yes")
 _NEIGHBOURS = ("neighbor", "neighbour", "neighboring", "neighbouring", "detected", "monitored")
@@ -104,6 +104,8 @@ class _Cell:
 
 
 _IDENTITY = ("pci", "arfcn")
+# Prefixes of places with a secondary carrier.
+_SECONDARY = ("scell", "secondary")
 # Prefixes of devices and SIMs, whose cells are separate series.
 _OWNERS = ("sim", "slot", "dev", "modem", "phone", "ue")
 
@@ -216,6 +218,7 @@ def _readings(
         about = {
             "row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle,
             "more": more if cell.place == "serving" else "", "mark": _identity.labels(sheet, cell.marks, known),
+            "carrier": cell.place.replace(" ", "_") if cell.place.startswith(_SECONDARY) else "",
             "column": "" if cell.place == "serving" and not cell.marks else cell.place.replace(" ", "_"),
         }  # fmt: skip
         # an absent leg or neighbour is not a reading
@@ -230,11 +233,14 @@ def _marked(readings: pd.DataFrame) -> pd.DataFrame:
     Next to a PCI, such an identity counts only if one PCI has two of them.
     """
     known, marks = readings["pci"].notna(), readings["mark"]
+    # carriers of one mast often have one PCI
+    twice = readings.assign(arfcn=readings["arfcn"].fillna(-1)).duplicated(["row", "rat", "pci", "arfcn"], keep=False)
+    carriers = readings["carrier"].where(readings["carrier"].isin(readings["carrier"][twice & known]), "")
     both = (known & marks.ne("")).to_numpy()
     if not _identity.dividing_columns({0: marks.tolist()}, both, readings["pci"].astype(str).tolist()):
         marks = marks.where(~known, "")
     marks = marks.where(known | marks.ne(""), readings["column"])
-    more = ["_".join(filter(None, pair)) for pair in zip(readings["more"], marks, strict=True)]
+    more = ["_".join(filter(None, names)) for names in zip(readings["more"], carriers, marks, strict=True)]
     marked: pd.DataFrame = readings.assign(more=more)
     return marked
 
@@ -341,34 +347,37 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     identities = [sheet.texts(serving[name]) for name in _IDENTITY if name in serving]
     base = ["\t".join(row) for row in zip(*identities, strict=True)] or [""] * len(sheet)
     more, about = _identity.cell_names(sheet, base)
-    owned: dict[tuple[str, str, str], list[_Cell]] = {}
+    owned: dict[tuple[str, ...], list[_Cell]] = {}
     for cell in cells:
         owner = cell.place if cell.place.startswith(_OWNERS) else ""
-        owned.setdefault((owner, "", cell.quantity), []).append(cell)
+        unit = written if (written := sheet.unit_read(cell.columns["rsrp_dbm"])).startswith("dB") else "dBm"
+        owned.setdefault((owner, "", cell.quantity, unit), []).append(cell)
         for port in cell.ports:  # the same cell under another name
             of_port = {name: i for name, i in cell.columns.items() if name in _IDENTITY} | {"rsrp_dbm": port}
-            owned.setdefault((owner, _short(sheet, port), cell.quantity), []).append(replace(cell, columns=of_port))
+            owned.setdefault((owner, _short(sheet, port), cell.quantity, unit), []).append(
+                replace(cell, columns=of_port)
+            )
     several = len({owner for owner, *_ in owned}) > 1
     levels = [
         _renamed(stream, "_".join(word for word in (owner if several else "", port) if word))
-        for (owner, port, quantity), part in owned.items()
+        for (owner, port, quantity, unit), part in owned.items()
         for stream in _cells.streams(
             rows, _of_one_phone(_readings(sheet, part, more, about), rows.time), source="drive test", more=about,
-            quantity=quantity,
+            quantity=quantity, unit=unit,
         )
     ]  # fmt: skip
     _name_others(rows, sheet, cells, others)
     columns = [*ranks, *others, *_event_columns(sheet, cells)]
     direct = [what.quantity.role for what in sheet.meanings if what is not None and not what.indirect]
     # without a level or rank, the ratio to the noise is the receiver's level
-    alone = not {"rss", "rank"} & {*direct} and not _of_a_scheduler(rows, sheet)
+    alone = not {"rss", "rank"} & {*direct} and not _of_a_scheduler(rows, sheet) and not _sheet.unread_levels(sheet)
     shown: list[Stream | None] = []
     for i in columns:
-        if i in ranks or not _is_level(sheet, i, alone):
-            shown.append(_rank(rows, sheet, i) if i in ranks else _other(rows, sheet, i, alone))
-        else:
-            parts = _identity.parts(rows, sheet, "PCI", "ARFCN", found=False)
-            shown += [_renamed(_other(part, inner, i, alone), label) for label, part, inner in parts]
+        # a rank next to levels is that of the serving cell, which changes
+        of_cells = "rss" not in direct if i in ranks else _is_level(sheet, i, alone)
+        parts = _identity.parts(rows, sheet, "PCI", "ARFCN", found=False) if of_cells else [("", rows, sheet)]
+        for label, part, inner in parts:
+            shown.append(_renamed(_rank(part, inner, i) if i in ranks else _other(part, inner, i, alone), label))
     return [*levels, *shown]
 
 
@@ -497,10 +506,10 @@ _FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero
 
 def _other(rows: Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream | None:
     values, name = sheet.numbers(column), sheet.plain[column]
-    meaning, about = (
-        sheet.meanings[column],
-        {"node": f"LW{tower[1]}"} if (tower := _TOWER.search(dictionary.without_unit(name)[0])) else {},
-    )
+    meaning, tower = sheet.meanings[column], _TOWER.search(dictionary.without_unit(name)[0])
+    about = {"node": f"{tower[1]}{tower[2]}".upper()} if tower else {}
+    if tower and tower[3]:
+        about["channel"] = f"{tower[3]}{tower[4]}".upper()
     if meaning is not None and meaning.place.startswith("cell") and "cell" in name:
         about |= {"cell": meaning.place, "part": meaning.place}  # unlike 'rsrp 2', not a second reading of one cell
     if tower and name == f"snr {tower[0]}":

@@ -221,11 +221,12 @@ def _stream(rows: Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], 
 
 
 def _above_takeoff(rows: Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], where: dict[str, int]) -> _pose.Height:
-    """Convert altitudes to heights above take-off if the header names sea level or the ellipsoid as their datum."""
-    height = sheet.meanings[where["altitude_m"]] if "altitude_m" in where else None
-    if height is None or height.quantity.datum not in ("sea level", "ellipsoid") or "latitude_deg" not in values:
+    """Convert altitudes to heights above take-off unless the header has another name or datum."""
+    height = sheet.meanings[where["altitude_m"]] if "altitude_m" in where and "latitude_deg" in values else None
+    known = height is not None and dictionary.meaning(sheet.names[where["altitude_m"]]) is not None
+    if height is None or not known or height.quantity.datum in ("take-off", "ground"):
         return {}
-    rows.height_from = "written"
+    rows.height_from = "assumed" if height.quantity.datum == "unknown" else "written"
     lost = np.isnan(values["latitude_deg"])
     values["altitude_m"], about = _pose.above_takeoff(rows, values, height.quantity.datum, lost)
     return about

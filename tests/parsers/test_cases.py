@@ -183,13 +183,23 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
     "a table of nobody": (
         table("index,when_utc,Breite,rx_power_dbm,temperature", "{i},2025-06-10 10:00:0{i},35,{l},20"), InputError,
         "--map 'when_utc'=time --map 'rx_power_dbm'=rss_db$"),
+    "channels of a receiver": (
+        table("time,temp,USRP1,USRP2", EPOCH + ",-5,{l},{l}"), InputError, "--map 'time'=time --map 'USRP1'=rss_db$"),
+    "two powers of nobody": (
+        table("elapsed_time,utc_stamp,node,raw_dbfs,cal_dbm", f"{{i}},{EPOCH},A,{{l}},{{l}}"), InputError,
+        "--map 'utc_stamp'=time --map 'cal_dbm'=rss_db$"),
+    "a table in another encoding": ("time,h\udcf6he\n1,2\n", InputError, "another encoding than UTF-8"),
+    "levels in lists": (
+        table("time,pci,rsrp", EPOCH + ',5,"[{l}, -99]"'), InputError, "found no record"),
+    "a local position of PX4": (
+        table("timestamp,x,y,z,ref_lat,ref_lon", "9123456{i},0.0,0.0,0.0,35.72751,-78.69604"), InputError, "positions on a grid"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_what_cannot_be_read_is_refused_with_its_cause(name: str, tmp_path: Path) -> None:
     text, error, words = BAD[name]
-    (tmp_path / "table.csv").write_text(text)
+    (tmp_path / "table.csv").write_text(text, errors="surrogateescape")
     with pytest.raises(error, match=words):
         read(tmp_path / "table.csv", (), {})
 
